@@ -1,0 +1,44 @@
+"""A pinhole camera, in OpenCV's convention."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera without distortion: x right, y down, z forward; pixel centres at half-integers.
+
+    A world point p is seen at pixel (fx·x/z + cx, fy·y/z + cy), where (x, y, z, 1) = world_to_camera @ (p, 1).
+    `world_to_camera` is a rigid 4×4 float64 matrix; focal lengths and principal point are in pixels.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: np.ndarray
+
+    @property
+    def camera_to_world(self) -> np.ndarray:
+        """4×4 rigid matrix; its columns are the camera's right, down and forward axes and its position."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation.T
+        matrix[:3, 3] = -rotation.T @ translation
+        return matrix
+
+    @property
+    def position(self) -> np.ndarray:
+        """The camera's centre in the world, (3,)."""
+        return self.camera_to_world[:3, 3]
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same camera over an image of another size in pixels."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
