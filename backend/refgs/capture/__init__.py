@@ -1,0 +1,123 @@
+"""From a folder on disk to cameras and images: one module a layout."""
+
+import hashlib
+import os
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from refgs.capture.cameras import read_cameras, read_run_cameras, write_cameras
+from refgs.capture.images import LoadedView, load_view
+from refgs.capture.nerf_blender import read_nerf_blender
+from refgs.capture.poses import in_frame
+from refgs.capture.region import find_region, run_frame, sample_silhouettes, up_direction
+from refgs.capture.types import Capture, View
+from refgs.errors import InputError
+
+__all__ = [
+    "Capture",
+    "LoadedView",
+    "View",
+    "load_view",
+    "read_cameras",
+    "read_capture",
+    "read_run_cameras",
+    "write_cameras",
+]
+
+
+def read_capture(folder: Path) -> Capture:
+    """Reads the cameras of a capture, whatever its layout, and works out the run's frame.
+
+    Photos are not decoded, only their headers read, and some masks. Raises InputError, one line for the artist.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
+    points = colors = None
+    if (folder / "transforms_train.json").is_file():
+        layout, views = "nerf-blender", read_nerf_blender(folder)
+    else:
+        raise InputError(
+            f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender). "
+            "Photos alone need camera poses first: run structure from motion, such as COLMAP."
+        )
+    views = _hold_out(views)
+    _check(folder, views)
+    silhouettes = sample_silhouettes(views)
+    if not silhouettes:  # alpha channels that are opaque everywhere mask nothing
+        views = [replace(view, mask_path=None, has_alpha=False) for view in views]
+    region = find_region(views, points, silhouettes)
+    digest = _digest(folder, layout, views)
+    to_capture = np.eye(4)
+    if layout != "nerf-blender":
+        to_capture = run_frame(up_direction(views), region)
+        to_run = np.linalg.inv(to_capture)
+        views = [replace(view, camera=in_frame(view.camera, to_run)) for view in views]
+        points = None if points is None else points @ to_run[:3, :3].T + to_run[:3, 3]
+        region = replace(region, centre=np.zeros(3), radius=1.0)
+    return Capture(
+        folder=folder,
+        layout=layout,
+        views=views,
+        to_capture=to_capture,
+        points=points,
+        point_colors=colors,
+        bounded=region.bounded,
+        bounded_because=region.because,
+        centre=region.centre,
+        radius=region.radius,
+        digest=digest,
+    )
+
+
+def _hold_out(views: list[View]) -> list[View]:
+    """The capture's own split, else every eighth view by name held out for testing, and names unique in each split."""
+    if not any(view.split == "test" for view in views):
+        views = sorted(views, key=lambda view: view.image_path.as_posix())
+        views = [replace(view, split="train" if i % 8 else "test") for i, view in enumerate(views)]
+    return _unique_names(views)
+
+
+def _unique_names(views: list[View]) -> list[View]:
+    """Names that are unique in each split: photos of one name in two folders get their folders in front."""
+    files = Counter((view.split, view.image_path) for view in views)
+    (_, twice), count = files.most_common(1)[0] if files else ((None, None), 0)
+    if count > 1:
+        raise InputError(f"{twice}: the capture names this photo {count} times. Remove all of its frames but one.")
+    names = Counter((view.split, view.camera.name) for view in views)
+    top = os.path.commonpath([view.image_path.parent for view in views]) if views else ""
+
+    def name(view: View) -> str:
+        if names[view.split, view.camera.name] == 1:
+            return view.camera.name
+        return Path(os.path.relpath(view.image_path, top)).as_posix().replace("/", "_")
+
+    return [replace(view, camera=replace(view.camera, name=name(view))) for view in views]
+
+
+def _check(folder: Path, views: list[View]) -> None:
+    train = [view for view in views if view.split == "train"]
+    if len(train) < 3:
+        raise InputError(
+            f"{folder}: {len(train)} training views (of {len(views)}; the rest are held out for testing). "
+            "At least three are needed, thirty or more are good: add photos."
+        )
+    positions = np.array([view.camera.position for view in train])
+    if np.ptp(positions, axis=0).max() <= 1e-6 * max(1.0, np.abs(positions).max()):
+        raise InputError(f"{folder}: all cameras are in one place, so no depth can be seen. Photograph from around it.")
+
+
+def _digest(folder: Path, layout: str, views: list[View]) -> str:
+    digest = hashlib.sha256(layout.encode())
+    for view in views:
+        camera = view.camera
+        digest.update(f"{camera.name} {view.split}".encode())
+        for path in (view.image_path, view.mask_path):
+            if path is not None:
+                digest.update(f" {Path(os.path.relpath(path, folder)).as_posix()} {path.stat().st_size}".encode())
+        digest.update(np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())
+        digest.update(camera.world_to_camera.tobytes())
+    return digest.hexdigest()

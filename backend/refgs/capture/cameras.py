@@ -1,0 +1,84 @@
+"""Camera files: the paths that `refgs render --cameras` follows, and a run folder's cameras.json."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+
+from refgs.camera import Camera
+from refgs.capture.files import find_image
+from refgs.capture.images import read_header
+from refgs.capture.poses import OPENGL_TO_OPENCV, in_frame
+from refgs.capture.transforms import frame_camera, read_frames
+from refgs.capture.types import Capture
+from refgs.errors import InputError
+
+
+def read_cameras(file: Path) -> list[Camera]:
+    """The cameras of a NeRF-Blender or nerfstudio JSON in the capture's frame, named after their `file_path`.
+
+    Photos are looked at only for their size, and only where the file names none. Distorted lenses give the pinhole
+    that their photos are undistorted to. A run's own cameras.json is brought to the capture's frame as well.
+    Raises InputError.
+    """
+    file = Path(file)
+    shared, frames = read_frames(file)
+    if not frames:
+        raise InputError(f"{file}: there are no frames in it. Export the cameras again.")
+    cameras = []
+    for frame in frames:
+        image = None if "w" in frame.values and "h" in frame.values else find_image(file.parent / frame.path)
+        camera, lens = frame_camera(frame, read_header(image)[:2] if image else None)
+        cameras.append(lens.pinhole(camera, frame.where) if lens else camera)
+    if "to_capture" in shared:
+        to_capture = _similarity(shared["to_capture"], file)
+        cameras = [in_frame(camera, to_capture) for camera in cameras]
+    return cameras
+
+
+def write_cameras(file: Path, capture: Capture) -> None:
+    """Writes the run folder's cameras.json: the capture's undistorted cameras in the run's frame, OpenGL axes."""
+    frames = []
+    for view in capture.views:
+        camera = view.camera
+        frames.append(
+            {
+                "file_path": f"images/{camera.name}",
+                "transform_matrix": (camera.camera_to_world @ OPENGL_TO_OPENCV).tolist(),
+                "fl_x": camera.fx,
+                "fl_y": camera.fy,
+                "cx": camera.cx,
+                "cy": camera.cy,
+                "w": camera.width,
+                "h": camera.height,
+                "split": view.split,
+            }
+        )
+    file = Path(file)
+    temporary = file.with_name(file.name + ".tmp")
+    text = json.dumps({"frames": frames, "to_capture": capture.to_capture.tolist()}, indent=1)
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, file)
+
+
+def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray]:
+    """The cameras of a run folder's cameras.json in the run's frame, their splits, and run → capture (4, 4)."""
+    file = Path(file)
+    shared, frames = read_frames(file)
+    cameras = [frame_camera(frame)[0] for frame in frames]
+    return (
+        cameras,
+        [frame.values.get("split", "train") for frame in frames],
+        _similarity(shared.get("to_capture"), file),
+    )
+
+
+def _similarity(matrix: object, file: Path) -> np.ndarray:
+    try:
+        matrix = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) <= 0:
+        raise InputError(f'{file}: "to_capture" is not a similarity. Use the file that the training wrote.')
+    return matrix

@@ -1,0 +1,95 @@
+"""Finding a capture's photos and masks on disk, and putting a view together from them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from refgs.camera import Camera
+from refgs.capture.images import read_header
+from refgs.capture.lens import Lens
+from refgs.capture.types import Split, View
+from refgs.errors import InputError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+
+
+def find_image(path: Path) -> Path | None:
+    """The file at `path`, or at `path` with an image's extension added; None where there is none."""
+    if path.is_file():
+        return path
+    names = (path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES + tuple(map(str.upper, IMAGE_SUFFIXES)))
+    return next((name for name in names if name.is_file()), None)
+
+
+def report_missing(source: Path, missing: list[str], total: int) -> None:
+    """Raises InputError where `source` names photos that are not there."""
+    if missing:
+        raise InputError(
+            f"{source}: {len(missing)} of the {total} images it names are missing, the first is {missing[0]}. "
+            "Put them back, or remove them from the file."
+        )
+
+
+class Masks:
+    """The masks of a capture: its folder `masks`, NAME.any or NAME.jpg.any, with the photos' sub-folders if any."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        root = folder / "masks"
+        self.files = {
+            path.relative_to(root).as_posix().removesuffix(path.suffix): path
+            for path in (sorted(root.rglob("*")) if root.is_dir() else [])
+            if path.suffix.lower() in IMAGE_SUFFIXES
+        }
+
+    def find(self, image: Path, named: object, where: str) -> Path | None:
+        """The mask of a photo: the one `named` relative to the folder, else one of the same name; None without one."""
+        if named:
+            path = find_image(self.folder / str(named).replace("\\", "/"))
+            if path is None:
+                raise InputError(
+                    f"{where}: the mask {named} is missing. Put it back, or remove mask_path from the file."
+                )
+            return path
+        parts = image.relative_to(self.folder).parts if image.is_relative_to(self.folder) else ()
+        for name in ("/".join(parts), "/".join(parts[1:])):
+            mask = self.files.get(name) or self.files.get(name.removesuffix(image.suffix))
+            if mask is not None:
+                return mask
+        return None
+
+
+def photo_view(
+    image: Path,
+    camera_of: Callable[[tuple[int, int]], tuple[Camera, Lens | None]],
+    split: Split,
+    mask: Path | None,
+    where: str,
+) -> View:
+    """The view of a photo: `camera_of` (width, height) gives the camera and lens as the file has them.
+
+    Intrinsics given for another resolution are scaled to the photo's. Raises InputError where the shapes or the
+    mask's size disagree.
+    """
+    width, height, has_alpha = read_header(image)
+    camera, lens = camera_of((width, height))
+    if (camera.width, camera.height) != (width, height):
+        sx, sy = width / camera.width, height / camera.height
+        if abs(sx / sy - 1) > 0.01:
+            raise InputError(
+                f"{where}: the camera is for {camera.width}×{camera.height} pixels but the photo has {width}×{height}. "
+                "Use the photos that the poses were made from (not rotated or cropped)."
+            )
+        camera = camera.resized(width, height)
+        if lens is not None:
+            lens = replace(lens, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
+    if lens is not None:
+        camera = lens.pinhole(camera, where)
+    if mask is not None:
+        mask_size = read_header(mask)[:2]
+        if mask_size != (width, height):
+            raise InputError(
+                f"{mask}: the mask has {mask_size[0]}×{mask_size[1]} pixels but its photo {image.name} "
+                f"{width}×{height}. Make the mask the photo's size."
+            )
+    return View(camera, image, mask, split, lens, has_alpha and mask is None)

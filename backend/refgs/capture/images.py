@@ -1,0 +1,130 @@
+"""Photos and masks from disk, as they are trained on: undistorted, downsized, 8-bit sRGB with straight alpha."""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from refgs.camera import Camera
+from refgs.capture.types import View
+from refgs.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedView:
+    """A view's pixels: `image` (H, W, 3) uint8 sRGB-encoded, `alpha` (H, W) uint8 or None without a mask, both straight.
+
+    Where a photo had to be resampled, the colour of a fully transparent pixel is 0; `camera` has the loaded size.
+    """
+
+    image: np.ndarray
+    alpha: np.ndarray | None
+    camera: Camera
+
+
+def read_header(path: Path) -> tuple[int, int, bool]:
+    """Width, height and whether there is an alpha channel, without decoding. Raises InputError naming the file."""
+    with _open(path) as picture:
+        return *picture.size, picture.has_transparency_data
+
+
+def read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Decodes a photo as stored (no EXIF rotation, as COLMAP and nerfstudio do): RGB (H, W, 3) and alpha (H, W) uint8.
+
+    16-bit and greyscale files become 8-bit RGB. Raises InputError naming the file where it is cut short or unreadable.
+    """
+    with _open(path) as picture:
+        pixels = np.asarray(_decode(picture, path))
+    return np.ascontiguousarray(pixels[..., :3]), (pixels[..., 3].copy() if pixels.shape[2] == 4 else None)
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """A mask file as alpha (H, W) uint8: white is the object. Cut-outs (alpha) and 0/1 masks are understood."""
+    image, alpha = read_image(path)
+    if alpha is None or alpha.min() == 255:
+        alpha = image.max(axis=2)
+    return alpha * np.uint8(255) if alpha.max() == 1 else alpha
+
+
+def read_alpha(view: View) -> np.ndarray | None:
+    """The view's mask as stored, before undistortion: (H, W) uint8, or None where it has none."""
+    if view.mask_path is not None:
+        return read_mask(view.mask_path)
+    return read_image(view.image_path)[1] if view.has_alpha else None
+
+
+def load_view(view: View, max_side: int | None = None) -> LoadedView:
+    """Decodes a view: mask applied, undistorted, and its longer side brought down to `max_side` pixels (None: as it is).
+
+    Pixels are averaged by area in linear light, weighted by alpha, as a coarser sensor would have seen them; so the
+    colours outside the mask do not bleed into its edge. Raises InputError naming the file.
+    """
+    image, own_alpha = read_image(view.image_path)
+    alpha = read_mask(view.mask_path) if view.mask_path is not None else (own_alpha if view.has_alpha else None)
+    camera = view.camera
+    if image.shape[:2] != (camera.height, camera.width):
+        raise InputError(f"{view.image_path}: the photo changed its size since the capture was read. Start again.")
+    scale = min(1.0, max_side / max(camera.width, camera.height)) if max_side else 1.0
+    if view.lens is None and scale == 1.0:
+        return LoadedView(image, alpha, camera)
+
+    linear = _decoding_table()[image]
+    if alpha is not None:
+        weight = alpha.astype(np.float32) / 255
+        linear = np.dstack([linear * weight[..., None], weight])
+    if view.lens is not None:
+        # Linear interpolation: a wider kernel overshoots at highlights, which a shiny object is full of.
+        linear = cv2.remap(linear, *view.lens.maps(camera), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    if scale < 1.0:
+        camera = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+        linear = cv2.resize(linear, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    if alpha is not None:
+        weight = linear[..., 3]
+        linear = linear[..., :3] / np.maximum(weight, 1e-6)[..., None]
+        alpha = np.rint(np.clip(weight, 0, 1) * 255).astype(np.uint8)
+        linear[alpha == 0] = 0
+    return LoadedView(_encode(linear), alpha, camera)
+
+
+def _open(path: Path) -> Image.Image:
+    try:
+        return Image.open(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: the image is missing. Put it back, or remove it from the capture.") from None
+    except Exception as error:
+        raise InputError(f"{path}: this is not an image that can be read ({_reason(error)}). Replace it.") from error
+
+
+def _decode(picture: Image.Image, path: Path) -> Image.Image:
+    """8-bit RGB or RGBA. Pillow, unlike OpenCV, notices a file that is cut short."""
+    try:
+        if picture.mode.startswith("I;16"):
+            values = np.asarray(picture, dtype=np.float64) / 257
+            picture = Image.fromarray(np.rint(values).astype(np.uint8))
+        elif picture.mode in ("I", "F"):
+            raise InputError(f"{path}: the image holds 32-bit numbers; save it as 8- or 16-bit PNG, sRGB-encoded.")
+        return picture.convert("RGBA" if picture.has_transparency_data else "RGB")
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path}: the image is cut short or broken ({_reason(error)}). Replace it.") from error
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:120] or type(error).__name__
+
+
+@cache
+def _decoding_table() -> np.ndarray:
+    """sRGB's decoding (IEC 61966-2-1) of the 256 codes to linear float32."""
+    code = np.arange(256) / 255
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def _encode(linear: np.ndarray) -> np.ndarray:
+    linear = np.clip(linear, 0, 1)
+    code = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - 0.055)
+    return np.rint(code * 255).astype(np.uint8)

@@ -1,0 +1,56 @@
+"""Checking poses, and moving cameras between frames."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from refgs.camera import Camera
+from refgs.errors import InputError
+
+# OpenGL camera axes (y up, looking along −z) to OpenCV's (y down, looking along +z), and back.
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def world_to_camera(camera_to_world: object, where: str) -> np.ndarray:
+    """The rigid inverse, (4, 4) float64, of a camera-to-world matrix from a file (4×4 or 3×4 numbers, same axes).
+
+    A uniform scale says nothing about what a camera sees and is dropped; rounding is orthonormalised away.
+    Raises InputError, naming `where`, for NaN, a matrix that has no inverse, mirrors, or stretches by more than 1 %.
+    """
+    advice = "Export the cameras again, or remove this frame."
+    try:
+        matrix = np.array(camera_to_world, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise InputError(f"{where}: the pose is not a 4×4 matrix of numbers. {advice}")
+    if not np.isfinite(matrix).all():
+        raise InputError(f"{where}: the pose holds NaN or infinity. {advice}")
+    rotation, position = matrix[:3, :3], matrix[:3, 3]
+    u, stretch, vt = np.linalg.svd(rotation)
+    if stretch[2] <= 1e-9 * stretch[0] or (len(matrix) == 4 and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6)):
+        raise InputError(f"{where}: the pose matrix cannot be inverted to a rigid pose. {advice}")
+    if np.linalg.det(rotation) < 0:
+        raise InputError(f"{where}: the pose is left-handed (it mirrors the world). {advice}")
+    if stretch[0] > 1.01 * stretch[2]:
+        raise InputError(f"{where}: the pose stretches or skews by {stretch[0] / stretch[2] - 1:.0%}. {advice}")
+    rotation = (u @ vt).T
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation, -rotation @ position
+    return result
+
+
+def split_similarity(matrix: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """The scale, rotation (3, 3) and translation (3,) of a 4×4 similarity."""
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    return scale, matrix[:3, :3] / scale, matrix[:3, 3]
+
+
+def in_frame(camera: Camera, to_frame: np.ndarray) -> Camera:
+    """The camera seen from another world frame: p_new = to_frame @ p_old, a 4×4 similarity; the image is the same."""
+    scale, rotation, translation = split_similarity(to_frame)
+    old = camera.world_to_camera
+    pose = np.eye(4)
+    pose[:3, :3] = old[:3, :3] @ rotation.T
+    pose[:3, 3] = scale * old[:3, 3] - pose[:3, :3] @ translation
+    return replace(camera, world_to_camera=pose)

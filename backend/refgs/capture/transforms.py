@@ -1,0 +1,140 @@
+"""The JSON that NeRF-Blender, instant-ngp and nerfstudio share: cameras as `frames` with a `transform_matrix`.
+
+Poses are camera-to-world with OpenGL's axes. Intrinsics (`fl_x fl_y cx cy w h`, or `camera_angle_x` and
+`camera_angle_y` in radians) and distortion (`k1 k2 k3 k4 p1 p2`) stand at the top or in a frame, whose own value wins.
+The format is documented in nerfstudio's "Data conventions" and instant-ngp's "Tips for training NeRF models".
+instant-ngp's `aabb_scale`, `scale` and `offset` place the scene in its own cube and are not needed here.
+"""
+
+import json
+import math
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from refgs.camera import Camera
+from refgs.capture.files import Masks, find_image, photo_view, report_missing
+from refgs.capture.lens import Lens
+from refgs.capture.poses import OPENGL_TO_OPENCV, world_to_camera
+from refgs.capture.types import Split, View
+from refgs.errors import InputError
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One entry of `frames` with the values it shares with the others filled in."""
+
+    values: dict
+    file: Path
+
+    @property
+    def path(self) -> str:
+        """The photo's path as written, relative to the file, with forward slashes."""
+        return str(self.values["file_path"]).replace("\\", "/")
+
+    @property
+    def where(self) -> str:
+        return f"{self.file}, frame {self.path}"
+
+    def number(self, key: str) -> float | None:
+        """The value of a key, None where it is absent. Raises InputError where it is not a number."""
+        value = self.values.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError(f"{self.where}: {key} is not a number. Correct the file.")
+        return float(value)
+
+
+def read_frames(file: Path) -> tuple[dict, list[Frame]]:
+    """The file's top level and its frames. Raises InputError for JSON that is not of this format."""
+    try:
+        data = json.loads(file.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise InputError(f"{file}: there is no such file. Name a transforms JSON.") from None
+    except json.JSONDecodeError as error:
+        raise InputError(f"{file}: not JSON: line {error.lineno}: {error.msg}. Export the file again.") from error
+    except (UnicodeDecodeError, OSError) as error:
+        raise InputError(f"{file}: cannot be read as text ({error}). Export the file again.") from error
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list):
+        raise InputError(f'{file}: there is no list "frames" in it. Export the cameras again.')
+    shared = {key: value for key, value in data.items() if key != "frames"}
+    for number, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
+            raise InputError(f"{file}: frame {number} has no file_path. Export the cameras again.")
+    return shared, [Frame({**shared, **frame}, file) for frame in frames]
+
+
+def frame_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> tuple[Camera, Lens | None]:
+    """The camera of a frame in the file's world, and its lens where it distorts.
+
+    `image_size` (width, height) stands in where the frame names no size. Raises InputError naming the frame.
+    """
+    if frame.values.get("is_fisheye") or str(frame.values.get("camera_model", "")).upper() in _NOT_PERSPECTIVE:
+        raise InputError(f"{frame.where}: the camera is not a perspective one. Undistort the photos to pinholes first.")
+    width, height = frame.number("w"), frame.number("h")
+    if width is None or height is None:
+        if image_size is None:
+            raise InputError(f"{frame.where}: no image size. Add w and h (pixels) to the file.")
+        width, height = image_size
+    fx = _focal(frame, "fl_x", "camera_angle_x", width)
+    fy = _focal(frame, "fl_y", "camera_angle_y", height) or fx
+    fx = fx or fy
+    if fx is None:
+        raise InputError(f"{frame.where}: no focal length. Add fl_x (pixels) or camera_angle_x (radians) to the file.")
+    cx, cy = frame.number("cx"), frame.number("cy")
+    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
+    if not all(math.isfinite(x) for x in (fx, fy, cx, cy, width, height)) or min(fx, fy, width, height) <= 0:
+        raise InputError(f"{frame.where}: focal length or size is zero, negative or NaN. Correct the file.")
+    pose = world_to_camera(_from_opengl(frame), frame.where)
+    camera = Camera(camera_name(frame.path), round(width), round(height), fx, fy, cx, cy, pose)
+    k1, k2, k3, k4, p1, p2 = (frame.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if not all(math.isfinite(x) for x in (k1, k2, k3, k4, p1, p2)):
+        raise InputError(f"{frame.where}: a distortion coefficient is NaN or infinite. Correct the file.")
+    if not any((k1, k2, k3, k4, p1, p2)):
+        return camera, None
+    return camera, Lens(fx, fy, cx, cy, (k1, k2, k3, k4), (p1, p2))
+
+
+def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> list[View]:
+    """The views of frames whose photos lie relative to `file`, in the file's world. Raises InputError."""
+    folder = file.parent
+    found = [(frame, split, find_image(folder / frame.path)) for frame, split in frames]
+    report_missing(file, [frame.path for frame, _, path in found if path is None], len(found))
+    masks = Masks(folder)
+    views = []
+    for frame, split, image in found:
+        mask = masks.find(image, frame.values.get("mask_path"), frame.where)
+        views.append(photo_view(image, partial(frame_camera, frame), split, mask, frame.where))
+    return views
+
+
+def camera_name(path: str) -> str:
+    """The last part of a frame's `file_path`, without an image's extension."""
+    name = path.replace("\\", "/").rsplit("/", 1)[-1]
+    stem, dot, suffix = name.rpartition(".")
+    return stem if dot and suffix.lower() in _IMAGE_SUFFIXES else name
+
+
+_NOT_PERSPECTIVE = {"OPENCV_FISHEYE", "FISHEYE", "FISHEYE624", "EQUIRECTANGULAR", "ORTHOPHOTO"}
+_IMAGE_SUFFIXES = {"png", "jpg", "jpeg", "tif", "tiff", "webp", "bmp", "exr"}
+
+
+def _focal(frame: Frame, focal: str, angle: str, size: float) -> float | None:
+    value = frame.number(focal)
+    if value is not None:
+        return value
+    radians = frame.number(angle)
+    if radians is None:
+        return None
+    return size / 2 / math.tan(radians / 2) if 0 < radians < math.pi else math.nan
+
+
+def _from_opengl(frame: Frame) -> object:
+    try:
+        return np.array(frame.values.get("transform_matrix"), dtype=np.float64) @ OPENGL_TO_OPENCV
+    except (TypeError, ValueError):
+        return None
