@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from refgs.capture.cameras import read_cameras, read_run_cameras, write_cameras
+from refgs.capture.colmap import find_model, read_colmap
 from refgs.capture.images import LoadedView, load_view
 from refgs.capture.nerf_blender import read_nerf_blender
+from refgs.capture.nerfstudio import read_nerfstudio
 from refgs.capture.poses import in_frame
 from refgs.capture.region import find_region, run_frame, sample_silhouettes, up_direction
 from refgs.capture.types import Capture, View
@@ -37,23 +39,32 @@ def read_capture(folder: Path) -> Capture:
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
     points = colors = None
+    warnings = []
     if (folder / "transforms_train.json").is_file():
         layout, views = "nerf-blender", read_nerf_blender(folder)
+    elif (folder / "transforms.json").is_file():
+        layout = "nerfstudio"
+        views, points, colors, warnings = read_nerfstudio(folder)
+    elif (model := find_model(folder)) is not None:
+        layout = "colmap"
+        views, points, colors = read_colmap(folder, model)
     else:
         raise InputError(
-            f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender). "
-            "Photos alone need camera poses first: run structure from motion, such as COLMAP."
+            f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender), transforms.json (nerfstudio, "
+            "instant-ngp) and sparse/0 (COLMAP). Photos alone need camera poses first, from COLMAP for instance."
         )
     views = _hold_out(views)
     _check(folder, views)
     silhouettes = sample_silhouettes(views)
-    if not silhouettes:  # alpha channels that are opaque everywhere mask nothing
+    if not silhouettes and any(view.masked for view in views):
+        warnings.append("the masks are white (opaque) everywhere, so they are not used")
         views = [replace(view, mask_path=None, has_alpha=False) for view in views]
-    region = find_region(views, points, silhouettes)
+    up = up_direction(views)
+    region = find_region(views, up, points, silhouettes)
     digest = _digest(folder, layout, views)
     to_capture = np.eye(4)
     if layout != "nerf-blender":
-        to_capture = run_frame(up_direction(views), region)
+        to_capture = run_frame(up, region)
         to_run = np.linalg.inv(to_capture)
         views = [replace(view, camera=in_frame(view.camera, to_run)) for view in views]
         points = None if points is None else points @ to_run[:3, :3].T + to_run[:3, 3]
@@ -70,6 +81,7 @@ def read_capture(folder: Path) -> Capture:
         centre=region.centre,
         radius=region.radius,
         digest=digest,
+        warnings=warnings,
     )
 
 
@@ -118,6 +130,7 @@ def _digest(folder: Path, layout: str, views: list[View]) -> str:
         for path in (view.image_path, view.mask_path):
             if path is not None:
                 digest.update(f" {Path(os.path.relpath(path, folder)).as_posix()} {path.stat().st_size}".encode())
-        digest.update(np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]).tobytes())
-        digest.update(camera.world_to_camera.tobytes())
+        numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+        # Rounded, because the last bits differ from one processor's arithmetic to another's.
+        digest.update((np.round([*numbers, *camera.world_to_camera.ravel()], 6) + 0.0).tobytes())
     return digest.hexdigest()

@@ -1,6 +1,5 @@
 """Finding a capture's photos and masks on disk, and putting a view together from them."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,9 +46,7 @@ class Masks:
         if named:
             path = find_image(self.folder / str(named).replace("\\", "/"))
             if path is None:
-                raise InputError(
-                    f"{where}: the mask {named} is missing. Put it back, or remove mask_path from the file."
-                )
+                raise InputError(f"{where}: the mask {named} is missing. Put it back, or remove its mask_path.")
             return path
         parts = image.relative_to(self.folder).parts if image.is_relative_to(self.folder) else ()
         for name in ("/".join(parts), "/".join(parts[1:])):
@@ -61,18 +58,18 @@ class Masks:
 
 def photo_view(
     image: Path,
-    camera_of: Callable[[tuple[int, int]], tuple[Camera, Lens | None]],
+    as_given: tuple[Camera, Lens | None],
     split: Split,
     mask: Path | None,
     where: str,
 ) -> View:
-    """The view of a photo: `camera_of` (width, height) gives the camera and lens as the file has them.
+    """The view of a photo: `as_given` is the camera and its lens as the capture's file has them.
 
     Intrinsics given for another resolution are scaled to the photo's. Raises InputError where the shapes or the
     mask's size disagree.
     """
     width, height, has_alpha = read_header(image)
-    camera, lens = camera_of((width, height))
+    camera, lens = as_given
     if (camera.width, camera.height) != (width, height):
         sx, sy = width / camera.width, height / camera.height
         if abs(sx / sy - 1) > 0.01:

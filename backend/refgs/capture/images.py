@@ -15,7 +15,7 @@ from refgs.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class LoadedView:
-    """A view's pixels: `image` (H, W, 3) uint8 sRGB-encoded, `alpha` (H, W) uint8 or None without a mask, both straight.
+    """A view's pixels: `image` (H, W, 3) uint8 sRGB-encoded, `alpha` (H, W) uint8, None without a mask; straight.
 
     Where a photo had to be resampled, the colour of a fully transparent pixel is 0; `camera` has the loaded size.
     """
@@ -57,7 +57,7 @@ def read_alpha(view: View) -> np.ndarray | None:
 
 
 def load_view(view: View, max_side: int | None = None) -> LoadedView:
-    """Decodes a view: mask applied, undistorted, and its longer side brought down to `max_side` pixels (None: as it is).
+    """Decodes a view: masked, undistorted, its longer side brought down to `max_side` pixels (None: as it is).
 
     Pixels are averaged by area in linear light, weighted by alpha, as a coarser sensor would have seen them; so the
     colours outside the mask do not bleed into its edge. Raises InputError naming the file.

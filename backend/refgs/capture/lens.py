@@ -46,9 +46,7 @@ class Lens:
         """The undistorted camera (module docstring) of a photo of `camera`'s size. Raises InputError naming `where`."""
         factor = _focal_factor(self, camera.width, camera.height)
         if factor is None:
-            raise InputError(
-                f"{where}: the distortion is too strong for a perspective photo. Undistort the photos first."
-            )
+            raise InputError(f"{where}: the distortion is too strong for a perspective photo. Undistort it first.")
         return replace(camera, fx=self.fx * factor, fy=self.fy * factor, cx=self.cx, cy=self.cy)
 
     def maps(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,9 @@ class Region:
     because: str
 
 
-def find_region(views: list[View], points: np.ndarray | None, silhouettes: list[tuple[View, np.ndarray]]) -> Region:
+def find_region(
+    views: list[View], up: np.ndarray, points: np.ndarray | None, silhouettes: list[tuple[View, np.ndarray]]
+) -> Region:
     """The region of interest from poses alone, then made sharper by masks, else by structure-from-motion points."""
     centre, distances, miss = look_at_centre(views)
     ahead = float((distances > 0).mean())
@@ -32,7 +34,6 @@ def find_region(views: list[View], points: np.ndarray | None, silhouettes: list[
         return Region(centre, spread, False, "the cameras look outwards")
     seen = np.abs(distances) * np.array([_half_view(view) for view in views])
     radius = float(np.median(seen))
-    coverage = _coverage(views, centre)
     if silhouettes:
         carved = _carve(silhouettes, centre, 1.5 * float(seen.max()))
         centre, radius = carved if carved is not None else (centre, radius)
@@ -41,10 +42,8 @@ def find_region(views: list[View], points: np.ndarray | None, silhouettes: list[
         centre, radius = _foreground(views, points, centre, radius)
     if miss > 0.25:
         return Region(centre, radius, False, "there are no masks and the cameras do not look at one place")
-    if coverage > 0.6:
-        return Region(
-            centre, radius, False, "there are no masks and the cameras stand on one side of what they look at"
-        )
+    if _one_sided(views, centre, up) > 0.6:
+        return Region(centre, radius, False, "there are no masks and the cameras stand on one side")
     return Region(centre, radius, True, "the cameras surround one place they look at (no masks: a guess)")
 
 
@@ -104,7 +103,7 @@ def sample_silhouettes(views: list[View], count: int = 24) -> list[tuple[View, n
     if masks and not any(mask.any() for mask in masks) and not any(read_alpha(view).any() for view in masked):
         name = (masked[0].mask_path or masked[0].image_path).name
         raise InputError(
-            f"{masked[0].image_path.parent}: all {len(masked)} masks are empty ({name} …). Make them anew."
+            f"{masked[0].image_path.parent}: all {len(masked)} masks are empty, {name} too. Make them anew."
         )
     if all(mask.all() for mask in masks):
         return []
@@ -124,10 +123,11 @@ def _half_view(view: View) -> float:
     return min(camera.width / camera.fx, camera.height / camera.fy) / 2
 
 
-def _coverage(views: list[View], centre: np.ndarray) -> float:
-    """How one-sided the cameras stand: the length of the mean direction from the centre, 0 all round … 1 in one place."""
+def _one_sided(views: list[View], centre: np.ndarray, up: np.ndarray) -> float:
+    """Length of the mean horizontal direction from the centre to the cameras: 0 all round, 1 on one side."""
     away = np.array([view.camera.position for view in views]) - centre
-    return float(np.linalg.norm((away / np.linalg.norm(away, axis=1, keepdims=True)).mean(axis=0)))
+    away -= np.outer(away @ up, up)
+    return float(np.linalg.norm((away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)).mean(axis=0)))
 
 
 def _carve(silhouettes: list[tuple[View, np.ndarray]], centre: np.ndarray, half: float) -> tuple | None:

@@ -9,13 +9,13 @@ instant-ngp's `aabb_scale`, `scale` and `offset` place the scene in its own cube
 import json
 import math
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from refgs.camera import Camera
 from refgs.capture.files import Masks, find_image, photo_view, report_missing
+from refgs.capture.images import read_header
 from refgs.capture.lens import Lens
 from refgs.capture.poses import OPENGL_TO_OPENCV, world_to_camera
 from refgs.capture.types import Split, View
@@ -108,7 +108,8 @@ def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> list[View]:
     views = []
     for frame, split, image in found:
         mask = masks.find(image, frame.values.get("mask_path"), frame.where)
-        views.append(photo_view(image, partial(frame_camera, frame), split, mask, frame.where))
+        camera = frame_camera(frame, read_header(image)[:2])
+        views.append(photo_view(image, camera, split, mask, frame.where))
     return views
 
 

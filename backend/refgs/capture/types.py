@@ -43,6 +43,7 @@ class Capture:
     the run's frame with `point_colors` (M, 3) sRGB-encoded in 0..1, both None where the layout has none. `centre` (3,)
     and `radius` are the region of interest: the object, or a room's foreground. `bounded` is a guess: the photos
     surround one object (True) or look at a place (False); `bounded_because` is its reason in words.
+    `warnings` are lines about what was left out or looks wrong but does not stop the reading.
     """
 
     folder: Path
@@ -56,6 +57,7 @@ class Capture:
     centre: np.ndarray
     radius: float
     digest: str
+    warnings: list[str]
 
     @property
     def train_views(self) -> list[View]:

@@ -1,0 +1,224 @@
+"""COLMAP: a sparse model in `sparse/0` or `sparse`, binary or text, with the photos in `images`.
+
+The files are those of COLMAP's documentation, "Output Format". COLMAP's own reader is a large dependency that answers
+a file cut short with an unrelated message or a request for terabytes of memory; this one names the file.
+"""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from refgs.camera import Camera
+from refgs.capture.files import Masks, photo_view, report_missing
+from refgs.capture.lens import Lens
+from refgs.capture.poses import world_to_camera
+from refgs.capture.transforms import camera_name
+from refgs.capture.types import View
+from refgs.errors import InputError
+
+# COLMAP's "Camera Models" by number: name and count of parameters. Text files use the names.
+MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+}
+SUPPORTED = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+
+
+@dataclass(frozen=True)
+class _Intrinsics:
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Image:
+    name: str
+    camera_id: int
+    pose: tuple[float, ...]  # qw qx qy qz tx ty tz, world to camera
+
+
+def find_model(folder: Path) -> Path | None:
+    """The folder of a capture's sparse model, None where there is none."""
+    candidates = (folder / "sparse" / "0", folder / "sparse")
+    names = ("cameras.bin", "cameras.txt", "images.bin", "images.txt")
+    return next((path for path in candidates if any((path / name).is_file() for name in names)), None)
+
+
+def read_colmap(folder: Path, model: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None]:
+    """The views, points (M, 3) and their colours (M, 3) in 0..1, in the model's frame. Raises InputError."""
+    suffix = ".bin" if (model / "images.bin").is_file() else ".txt"
+    cameras_file, images_file, points_file = (model / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
+    for file in (cameras_file, images_file):
+        if not file.is_file():
+            raise InputError(f"{file}: the file is missing. Export the sparse model again.")
+    readers = _BINARY if suffix == ".bin" else _TEXT
+    cameras = _parse(cameras_file, readers[0])
+    images = sorted(_parse(images_file, readers[1]), key=lambda image: image.name)
+    points, colors = _parse(points_file, readers[2]) if points_file.is_file() else (None, None)
+
+    photos = folder / "images"
+    found = [(image, photos / image.name) for image in images]
+    report_missing(images_file, [f"images/{i.name}" for i, path in found if not path.is_file()], len(found))
+    masks = Masks(folder)
+    views = []
+    for image, path in found:
+        where = f"{images_file}, image {image.name}"
+        if image.camera_id not in cameras:
+            raise InputError(f"{where}: its camera {image.camera_id} is not in {cameras_file.name}. Export it again.")
+        mask = masks.find(path, None, where)
+        views.append(photo_view(path, _camera(image, cameras[image.camera_id], where), "train", mask, where))
+    return views, points, colors
+
+
+def _camera(image: _Image, intrinsics: _Intrinsics, where: str) -> tuple[Camera, Lens | None]:
+    if intrinsics.model not in SUPPORTED:
+        raise InputError(
+            f"{where}: COLMAP's camera model {intrinsics.model} is not supported, only {', '.join(SUPPORTED)}. "
+            "Undistort the photos with COLMAP's image_undistorter and use its output."
+        )
+    radial, tangential = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0)
+    match intrinsics.model, intrinsics.params:
+        case "SIMPLE_PINHOLE", (f, cx, cy):
+            fx = fy = f
+        case "PINHOLE", (fx, fy, cx, cy):
+            pass
+        case "SIMPLE_RADIAL", (f, cx, cy, k1):
+            fx, fy, radial = f, f, (k1, 0.0, 0.0, 0.0)
+        case "RADIAL", (f, cx, cy, k1, k2):
+            fx, fy, radial = f, f, (k1, k2, 0.0, 0.0)
+        case "OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2):
+            radial, tangential = (k1, k2, 0.0, 0.0), (p1, p2)
+        case _:
+            raise InputError(f"{where}: camera model {intrinsics.model} with {len(intrinsics.params)} parameters.")
+    if not np.isfinite(intrinsics.params).all() or min(fx, fy, intrinsics.width, intrinsics.height) <= 0:
+        raise InputError(f"{where}: focal length or size is zero, negative or NaN. Export the sparse model again.")
+    qw, qx, qy, qz, *translation = image.pose
+    rotation = _rotation(np.array([qw, qx, qy, qz]))
+    # Through camera-to-world, so that the one check of poses sees it.
+    camera_to_world = np.column_stack([rotation.T, -rotation.T @ translation])
+    pose = world_to_camera(camera_to_world, where)
+    name = camera_name(image.name)
+    camera = Camera(name, intrinsics.width, intrinsics.height, fx, fy, cx, cy, pose)
+    return camera, Lens(fx, fy, cx, cy, radial, tangential) if any(radial + tangential) else None
+
+
+def _rotation(q: np.ndarray) -> np.ndarray:
+    """The rotation matrix of a quaternion wxyz, normalised; NaN for a zero one."""
+    with np.errstate(invalid="ignore"):
+        w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _parse(file: Path, parser):
+    try:
+        return parser(file)
+    except (struct.error, ValueError, IndexError, UnicodeDecodeError, OverflowError) as error:
+        raise InputError(f"{file}: the file is cut short or not COLMAP's. Export the sparse model again.") from error
+
+
+class _Bytes:
+    """A binary file read from front to back; struct.error where it ends too early."""
+
+    def __init__(self, file: Path):
+        self.data, self.at = file.read_bytes(), 0
+
+    def take(self, layout: str) -> tuple:
+        layout = "<" + layout
+        values = struct.unpack_from(layout, self.data, self.at)
+        self.at += struct.calcsize(layout)
+        return values
+
+    def name(self) -> str:
+        end = self.data.index(b"\0", self.at)
+        text = self.data[self.at : end].decode("utf-8")
+        self.at = end + 1
+        return text
+
+    def skip(self, count: int) -> None:
+        self.at += count
+        if self.at > len(self.data):
+            raise ValueError("cut short")
+
+
+def _binary_cameras(file: Path) -> dict[int, _Intrinsics]:
+    source, cameras = _Bytes(file), {}
+    for _ in range(source.take("Q")[0]):
+        number, model, width, height = source.take("iiQQ")
+        if model not in MODELS:
+            raise InputError(f"{file}: camera model number {model} is not supported, only {', '.join(SUPPORTED)}.")
+        name, count = MODELS[model]
+        cameras[number] = _Intrinsics(name, width, height, source.take(f"{count}d"))
+    return cameras
+
+
+def _binary_images(file: Path) -> list[_Image]:
+    source, images = _Bytes(file), []
+    for _ in range(source.take("Q")[0]):
+        _, *pose, camera_id = source.take("I7di")
+        images.append(_Image(source.name(), camera_id, tuple(pose)))
+        source.skip(24 * source.take("Q")[0])  # keypoints: x, y, point id
+    return images
+
+
+def _binary_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    source, rows = _Bytes(file), []
+    for _ in range(source.take("Q")[0]):
+        rows.append(source.take("Q3d3Bd")[1:7])
+        source.skip(8 * source.take("Q")[0])  # track: image id, keypoint
+    return _points(rows)
+
+
+def _points(rows: list) -> tuple[np.ndarray, np.ndarray]:
+    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    table = table[np.isfinite(table).all(axis=1)]
+    return table[:, :3], table[:, 3:] / 255.0
+
+
+def _lines(file: Path) -> list[str]:
+    return [line for line in file.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+
+
+def _text_cameras(file: Path) -> dict[int, _Intrinsics]:
+    cameras = {}
+    for line in _lines(file):
+        if line.strip():
+            number, model, width, height, *params = line.split()
+            cameras[int(number)] = _Intrinsics(model, int(width), int(height), tuple(map(float, params)))
+    return cameras
+
+
+def _text_images(file: Path) -> list[_Image]:
+    lines, images = _lines(file), []
+    while lines and not lines[-1].strip():
+        lines.pop()
+    for line in lines[::2]:  # the lines between hold keypoints
+        _, *pose, camera_id, name = line.split(maxsplit=9)
+        images.append(_Image(name.strip(), int(camera_id), tuple(map(float, pose))))
+    return images
+
+
+def _text_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    return _points([[float(value) for value in line.split()[1:7]] for line in _lines(file) if line.strip()])
+
+
+_BINARY = (_binary_cameras, _binary_images, _binary_points)
+_TEXT = (_text_cameras, _text_images, _text_points)

@@ -1,0 +1,67 @@
+"""nerfstudio and instant-ngp: one `transforms.json` with the intrinsics shared or per frame, and perhaps masks.
+
+`train_filenames`, `test_filenames` and `val_filenames` are nerfstudio's split (validation takes the place of a missing
+test list); `ply_file_path` names its structure-from-motion points.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData
+
+from refgs.capture.files import find_image
+from refgs.capture.transforms import Frame, read_frames, read_views
+from refgs.capture.types import Split, View
+from refgs.errors import InputError
+
+
+def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
+    """The views, points (M, 3) and their colours (M, 3) in 0..1, in the capture's frame, and warnings.
+
+    Raises InputError.
+    """
+    file = folder / "transforms.json"
+    shared, frames = read_frames(file)
+    train = shared.get("train_filenames")
+    test = shared.get("test_filenames") or shared.get("val_filenames") or []
+
+    def split(frame: Frame) -> Split | None:
+        name = frame.values["file_path"]
+        if name in test:
+            return "test"
+        return "train" if train is None or name in train else None
+
+    frames, warnings = _without_deleted(shared, frames, file)
+    chosen = [(frame, split(frame)) for frame in frames]
+    views = read_views(file, [(frame, which) for frame, which in chosen if which is not None])
+    named = shared.get("ply_file_path")
+    points, colors = _read_points(folder / named) if named else (None, None)
+    return views, points, colors, warnings
+
+
+def _without_deleted(shared: dict, frames: list[Frame], file: Path) -> tuple[list[Frame], list[str]]:
+    """instant-ngp's files (they have an `aabb_scale`) keep the frames of photos deleted for being blurred: drop those.
+
+    That is instant-ngp's own rule, and its sample captures rely on it. Where more are gone than there, or in any
+    other file, missing photos are an error.
+    """
+    missing = [frame.path for frame in frames if find_image(file.parent / frame.path) is None]
+    if "aabb_scale" not in shared or not missing or 2 * len(missing) > len(frames):
+        return frames, []
+    kept = [frame for frame in frames if frame.path not in set(missing)]
+    warning = f"{len(missing)} of the {len(frames)} images in {file.name} are missing and left out, first {missing[0]}"
+    return kept, [warning]
+
+
+def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        vertices = PlyData.read(path)["vertex"]
+        points = np.stack([vertices[name] for name in "xyz"], axis=1).astype(np.float64)
+        names = [prop.name for prop in vertices.properties]
+        colors = np.full_like(points, 0.5)
+        if "red" in names:
+            colors = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1) / 255.0
+    except Exception as error:
+        raise InputError(f"{path}: the points cannot be read ({error}). Remove ply_file_path to do without.") from error
+    good = np.isfinite(points).all(axis=1)
+    return points[good], colors[good]
