@@ -1,0 +1,52 @@
+"""`python -m benchmarks.scenes NAME --out DIR`: render a capture with ground truth.
+
+Standard output carries JSON lines: {"event": "progress", "done": 3, "total": 104, "what": "train views"}; Blender's own
+chatter goes to standard error. Exit status 2 and one line: the input is wrong.
+"""
+
+import argparse
+import importlib
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+
+from refgs.errors import InputError
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.scenes", description=__doc__.split("\n")[0])
+    parser.add_argument("name", choices=["jar", "ball", "rings"])
+    parser.add_argument("--out", type=Path, required=True, help="a new folder")
+    parser.add_argument("--size", type=int, default=256, help="pixels, of both sides (256)")
+    parser.add_argument("--train", type=int, default=80, help="training views (80)")
+    parser.add_argument("--test", type=int, default=8, help="held-out views, which get ground truth (8)")
+    parser.add_argument("--samples", type=int, default=16, help="Cycles samples a pixel, before denoising (16)")
+    parser.add_argument("--relight", nargs="*", default=[], metavar="HDRI", help="Blender's HDRIs by name")
+    options = parser.parse_args()
+
+    # Blender prints to the file descriptor, so it is the descriptor that has to be moved out of the way.
+    events = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    # Ended from outside, it still removes its half-written folder.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+
+    def progress(done: int, total: int, what: str) -> None:
+        print(json.dumps({"event": "progress", "done": done, "total": total, "what": what}), file=events)
+
+    from benchmarks.scenes.capture import write_capture  # after the descriptor: importing bpy may print too
+
+    scene = importlib.import_module(f"benchmarks.scenes.{options.name}").build()
+    try:
+        write_capture(
+            scene, options.out, options.size, options.train, options.test, options.samples, options.relight, progress
+        )
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
