@@ -42,3 +42,10 @@ class Camera:
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
+
+    def fitted(self, max_side: int) -> "Camera":
+        """The same camera, its longer side brought down to `max_side` pixels; itself where it is not longer."""
+        scale = max_side / max(self.width, self.height)
+        if scale >= 1:
+            return self
+        return self.resized(max(1, round(self.width * scale)), max(1, round(self.height * scale)))

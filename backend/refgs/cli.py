@@ -1,0 +1,139 @@
+"""The command line."""
+
+import signal
+import sys
+import traceback
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from refgs.errors import InputError
+
+app = typer.Typer(
+    help=__import__("refgs").__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
+)
+RunFolder = Annotated[Path, typer.Argument(help="a run folder, made by `refgs train`")]
+
+
+@app.command()
+def check(capture: Annotated[Path, typer.Argument(help="a folder with photos and cameras")]) -> None:
+    """Read a capture whole and say what it is and what is wrong with it."""
+    from refgs.capture import read_capture
+    from refgs.capture.check import describe
+
+    for line in describe(read_capture(capture)):
+        print(line)
+
+
+@app.command()
+def train(
+    capture: Annotated[Path, typer.Argument(help="a folder with photos and cameras")],
+    out: Annotated[Path, typer.Option(help="the run folder to make")],
+    preset: Annotated[str, typer.Option(help="quick, standard, or a TOML file")] = "standard",
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
+    minutes: Annotated[float | None, typer.Option(min=0.05, help="train for this long instead of the preset's iterations")] = None,
+    changes: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, e.g. train.iterations=2000")] = None,
+    resume: Annotated[bool, typer.Option(help="go on with the run in --out")] = False,
+) -> None:
+    """Learn surfels, materials and light from a capture."""
+    from refgs import commands
+
+    commands.train(capture, out, preset, device, minutes, changes or [], resume)
+
+
+@app.command()
+def render(
+    run: RunFolder,
+    cameras: Annotated[Path, typer.Option(help="NeRF-Blender or nerfstudio JSON, in the capture's frame")],
+    out: Annotated[Path, typer.Option(help="folder for the images: OUT/PASS/NAME.png")],
+    passes: Annotated[str, typer.Option(help="of color,normal,albedo,roughness,metallic,depth,alpha")] = "color",
+    hdri: Annotated[Path | None, typer.Option(help="light it with this panorama instead")] = None,
+    format: Annotated[str, typer.Option(help="png or exr")] = "png",
+) -> None:
+    """Render a run from any cameras."""
+    from refgs import commands
+
+    commands.render(run, cameras, out, passes.split(","), hdri, format)
+
+
+@app.command()
+def evaluate(
+    run: RunFolder,
+    split: Annotated[str, typer.Option(help="test or train")] = "test",
+    ground_truth: Annotated[Path | None, typer.Option(help="folder with normal/, albedo/ … of the views, as EXR")] = None,
+) -> None:
+    """Compare renderings with photos that were held out; writes metrics.json and pictures/."""
+    from refgs import commands
+
+    commands.evaluate(run, split, ground_truth)
+
+
+@app.command()
+def export(
+    run: RunFolder,
+    mesh: Annotated[Path | None, typer.Option(help="the mesh's file (default: RUN/mesh.glb)")] = None,
+    texture: Annotated[int | None, typer.Option(min=64, max=8192, help="side of the textures, in pixels")] = None,
+    splats: Annotated[Path | None, typer.Option(help="also write the splats to this file")] = None,
+    overwrite: Annotated[bool, typer.Option(help="replace files that exist")] = False,
+) -> None:
+    """Make the textured mesh: fuse depth, simplify, unwrap, bake."""
+    from refgs import commands
+
+    commands.export(run, mesh, texture, splats, overwrite)
+
+
+@app.command()
+def report(
+    runs: Annotated[list[Path], typer.Argument(help="run folders; several are shown side by side")],
+    out: Annotated[Path | None, typer.Option(help="the page's file (default: RUN/report.html)")] = None,
+) -> None:
+    """Write one self-contained page: pictures, figures, error against run time."""
+    from refgs.report.page import write_report
+
+    target = out or runs[0] / "report.html"
+    write_report(runs, target)
+    print(target)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="folder for everything that is made")] = Path("demo"),
+) -> None:
+    """The whole way on a small capture, ending in relit Eevee previews and a report."""
+    from refgs import demo as whole
+
+    whole.run(out)
+
+
+@app.command()
+def bench(what: Annotated[str, typer.Argument(help="kernels or iteration")] = "kernels") -> None:
+    """Measure the parts in milliseconds."""
+    from refgs import commands
+
+    commands.bench(what)
+
+
+def _end(*_) -> None:
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    """Entry point: 0 done, 2 the input is wrong (one line), 1 our fault (a traceback), 130 interrupted."""
+    signal.signal(signal.SIGTERM, _end)
+    try:
+        app(standalone_mode=True)
+    except InputError as error:
+        print(f"refgs: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("refgs: interrupted", file=sys.stderr)
+        sys.exit(130)
+    except Exception as error:
+        traceback.print_exc()
+        print(f"refgs: a fault of ours: {type(error).__name__}: {error}", file=sys.stderr)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

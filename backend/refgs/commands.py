@@ -1,0 +1,304 @@
+"""What the command line does, one function a command."""
+
+import json
+import os
+import resource
+import runpy
+import signal
+import sys
+import traceback
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from refgs.camera import Camera
+from refgs.capture import load_view, read_cameras, read_capture
+from refgs.color import srgb_encode
+from refgs.errors import InputError
+from refgs.export.environment import read_environment, read_exr, write_exr
+from refgs.export.splats import write_splats
+from refgs.model.environment import Environment
+from refgs.paths import clone_root
+from refgs.render.renderer import Rendering
+from refgs.report import metrics
+from refgs.run import Run, camera_in_run, check_free, create_run, open_run, read_run_facts, write_text
+from refgs.settings import load_settings
+
+console = Console(highlight=False, soft_wrap=True)
+PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha")
+
+
+@contextmanager
+def progress_bar(what: str, total: int):
+    """A progress bar with the time left; yields a function to call with how many are done and a few words."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(what, total=total, note="")
+        yield lambda done, note="", total=total: progress.update(task, completed=done, note=note, total=total)
+
+
+def choose_device(device: str) -> str:
+    """The device to train on. Raises InputError where it cannot be had."""
+    if device not in ("auto", "cpu", "cuda"):
+        raise InputError(f"--device {device}: take auto, cpu or cuda")
+    if device == "cuda":
+        why = "this release trains on the CPU" if torch.cuda.is_available() else "there is no CUDA device here"
+        raise InputError(f"--device cuda: {why}; take --device cpu or auto")
+    return "cpu"
+
+
+def train(
+    capture_folder: Path, out: Path, preset: str, device: str, minutes: float | None, changes: list[str], resume: bool
+) -> None:
+    """Train a capture into a run folder; Ctrl-C leaves a run that `--resume` goes on with."""
+    from refgs.train.asset import write_asset
+    from refgs.train.trainer import Trainer
+
+    choose_device(device)
+    if resume:
+        facts, settings = read_run_facts(out)
+        if changes:
+            raise InputError("--set cannot change a run that is resumed: train into a new folder")
+        if (out / "splats.ply").exists():
+            raise InputError(f"{out}: this training has ended; there is nothing to resume")
+    else:
+        settings = load_settings(preset, changes)
+        check_free(out)
+    capture = read_capture(capture_folder)
+    if resume and capture.fingerprint() != facts["fingerprint"]:
+        raise InputError(f"{capture_folder} is not the capture that {out} was trained on, or it was changed since")
+
+    stopped = []
+    with progress_bar("training", settings.train.iterations) as bar:
+
+        def report(event: str, facts: dict) -> None:
+            if event == "progress":
+                note = f"loss {facts['loss']:.4f}  {facts['psnr']:.2f} dB  {facts['splats']:,} surfels"
+                bar(facts["iteration"], note, facts["total"])
+            else:
+                console.print(facts["what"])
+
+        trainer = Trainer(capture, settings, out, report, minutes)
+        if resume:
+            trainer.resume()
+            report("stage", {"what": f"going on from iteration {trainer.iteration}"})
+        else:
+            create_run(out, capture, settings, preset)
+        before = signal.signal(signal.SIGINT, lambda *_: stopped.append(True))
+        try:
+            ended = trainer.run(lambda: bool(stopped))
+        except InputError:
+            raise
+        except Exception:
+            (out / "log.txt").write_text(traceback.format_exc(), encoding="utf-8")
+            raise
+        finally:
+            signal.signal(signal.SIGINT, before)
+    if not ended:
+        console.print(f"stopped at iteration {trainer.iteration}; go on with: refgs train {capture_folder} --out {out} --resume")
+        raise KeyboardInterrupt
+    write_asset(trainer)
+    quality = trainer.test_psnr(most=len(trainer.test))
+    held_out = "" if quality is None else f", {quality:.2f} dB on {len(trainer.test)} held-out views"
+    console.print(f"trained {trainer.iteration} iterations in {trainer.seconds:.0f} s{held_out}: {out}")
+
+
+def _images(rendering: Rendering) -> dict[str, np.ndarray]:
+    """A rendering's passes as float arrays: colours (H, W, 4) premultiplied, the rest (H, W, 3) or (H, W)."""
+    alpha = rendering.alpha.numpy()
+    normal = torch.nn.functional.normalize(rendering.normal, dim=-1).numpy()
+    images = {"normal": normal, "depth": rendering.depth.numpy(), "alpha": alpha}
+    if rendering.radiance is not None:
+        images["color"] = np.dstack([rendering.radiance.numpy() * alpha[..., None], alpha])
+        images["albedo"] = rendering.albedo.numpy()
+        images["metallic"] = rendering.metallic.numpy()
+        images["roughness"] = rendering.roughness.numpy()
+    return images
+
+
+def _as_png(name: str, rendering: Rendering, background: np.ndarray) -> np.ndarray:
+    """A pass as 8-bit RGB(A) to look at: colours sRGB-encoded, straight alpha; normals n/2 + 1/2; depth divided by its largest."""
+    alpha = rendering.alpha.numpy()
+    if name == "color":
+        over = rendering.color.numpy() - background * (1 - alpha[..., None])
+        straight = over / np.maximum(alpha, 1e-6)[..., None]
+        return _bytes(np.dstack([straight, alpha]))
+    value = _images(rendering)[name]
+    if name == "normal":
+        value = (value * 0.5 + 0.5) * (alpha > 0.5)[..., None]
+    elif name == "albedo":
+        value = srgb_encode(value)
+    elif name == "depth":
+        value = value / max(float(value.max()), 1e-12)
+    return _bytes(value)
+
+
+def _bytes(value: np.ndarray) -> np.ndarray:
+    return np.rint(np.clip(np.nan_to_num(value), 0, 1) * 255).astype(np.uint8)
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Write (H, W), (H, W, 3) or (H, W, 4) uint8 as PNG, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if pixels.ndim == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR if pixels.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
+    os.replace(temporary, path)
+
+
+def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path | None, format: str) -> None:
+    """Write OUT/PASS/NAME.png or .exr for each camera."""
+    run = open_run(folder)
+    known = [p for p in PASSES if run.environment is not None or p in ("color", "normal", "depth", "alpha")]
+    unknown = [p for p in passes if p not in known]
+    if unknown:
+        raise InputError(f"--passes {unknown[0]}: this run has {', '.join(known)}")
+    if format not in ("png", "exr"):
+        raise InputError(f"--format {format}: take png or exr")
+    if format == "exr" and "color" in passes and run.environment is None:
+        raise InputError("--format exr: a run with shading = sh has no linear radiance; take png")
+    light = None
+    if hdri is not None:
+        if run.environment is None:
+            raise InputError("--hdri: a run with shading = sh has no materials to relight")
+        light = Environment.from_panorama(read_environment(hdri), run.settings.environment.resolution)
+    views = [camera_in_run(camera, run.to_capture) for camera in read_cameras(cameras)]
+    background = np.array(run.settings.image.background)
+    with progress_bar("rendering", len(views)) as bar:
+        for done, camera in enumerate(views):
+            rendering = run.render(camera, light)
+            for name in passes:
+                path = out / name / f"{camera.name}.{format}"
+                if format == "png":
+                    write_png(path, _as_png(name, rendering, background))
+                else:
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    write_exr(path, _images(rendering)[name])
+            bar(done + 1)
+    console.print(f"{len(views)} views, {', '.join(passes)}: {out}")
+
+
+def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
+    """Compare renderings with held-out photos, and with ground truth where there is some; write metrics.json and pictures."""
+    run = open_run(folder)
+    if split not in ("test", "train"):
+        raise InputError(f"--split {split}: take test or train")
+    capture = read_capture(run.capture_folder)
+    if capture.fingerprint() != run.fingerprint:
+        raise InputError(f"{run.capture_folder} was changed since {folder} was trained on it")
+    views = capture.test_views if split == "test" else capture.train_views
+    if not views:
+        raise InputError(f"{run.capture_folder} has no {split} views")
+    background = np.array(run.settings.image.background, dtype=np.float32)
+    rows: dict[str, list[float]] = {"psnr": [], "ssim": [], "normal_mae_degrees": []}
+    with progress_bar("evaluating", len(views)) as bar:
+        for done, view in enumerate(views):
+            loaded = load_view(view, run.settings.image.max_side)
+            rendering = run.render(loaded.camera)
+            color = np.clip(rendering.color.numpy(), 0, 1)
+            photo = loaded.image / np.float32(255)
+            if loaded.alpha is not None:
+                alpha = loaded.alpha[..., None] / np.float32(255)
+                photo = photo * alpha + background * (1 - alpha)
+            rows["psnr"].append(metrics.psnr(color, photo))
+            rows["ssim"].append(metrics.ssim(color, photo))
+            truth = _true_normals(ground_truth, loaded.camera) if ground_truth else None
+            if truth is not None:
+                images = _images(rendering)
+                rows["normal_mae_degrees"].append(
+                    metrics.normal_mae_degrees(images["normal"], truth[0], images["alpha"], truth[1])
+                )
+            _write_pictures(folder / "pictures" / split, loaded.camera.name, rendering, photo, background)
+            bar(done + 1)
+    result = {name: float(np.mean(values)) for name, values in rows.items() if values}
+    facts = _read_json(folder / "metrics.json")
+    facts |= result | {"views": len(views), "split": split, "splats": len(run.splats)}
+    facts["peak_memory_bytes"] = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    write_text(folder / "metrics.json", json.dumps(facts, indent=1))
+    if run.environment is not None:
+        panorama = run.environment.panorama(256)
+        write_png(folder / "pictures" / "environment.png", _bytes(srgb_encode(panorama)))
+    console.print(", ".join(f"{name} {value:.4g}" for name, value in result.items()) + f" on {len(views)} {split} views")
+
+
+def _true_normals(folder: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray] | None:
+    normal, alpha = (folder / name / f"{camera.name}.exr" for name in ("normal", "alpha"))
+    if not normal.exists() or not alpha.exists():
+        raise InputError(f"{folder}: {normal.relative_to(folder)} or {alpha.relative_to(folder)} is missing")
+    normals, alphas = read_exr(normal), read_exr(alpha)
+    if normals.shape[:2] != (camera.height, camera.width):
+        raise InputError(f"{normal}: its size is not the view's ({camera.width}×{camera.height})")
+    return normals[..., :3], alphas[..., 0] if alphas.ndim == 3 else alphas
+
+
+def _write_pictures(folder: Path, name: str, rendering: Rendering, photo: np.ndarray, background: np.ndarray) -> None:
+    write_png(folder / "photo" / f"{name}.png", _bytes(photo))
+    write_png(folder / "color" / f"{name}.png", _bytes(rendering.color.numpy()))
+    write_png(folder / "normal" / f"{name}.png", _as_png("normal", rendering, background))
+    if rendering.radiance is not None:
+        for what in ("albedo", "metallic", "roughness"):
+            write_png(folder / what / f"{name}.png", _as_png(what, rendering, background))
+
+
+def _read_json(file: Path) -> dict:
+    return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+
+
+def render_depths(run: Run) -> tuple[list[np.ndarray], list[np.ndarray], list[Camera]]:
+    """Depth and alpha maps of the training views, for fusion."""
+    cameras = run.training_cameras()
+    depths, alphas = [], []
+    for camera in cameras:
+        rendering = run.render(camera)
+        depths.append(rendering.depth.numpy())
+        alphas.append(rendering.alpha.numpy())
+    return depths, alphas, cameras
+
+
+def export(
+    folder: Path, mesh_file: Path | None, texture: int | None, splats_file: Path | None, overwrite: bool
+) -> None:
+    """Fuse, clean, unwrap, bake; write the mesh and its textures."""
+    from refgs.export.bake import bake, unwrap
+    from refgs.export.mesh import write_glb
+    from refgs.geometry.mesh import clean
+    from refgs.geometry.tsdf import fuse
+
+    run = open_run(folder)
+    target = mesh_file or folder / "mesh.glb"
+    for file in (target, splats_file):
+        if file is not None and file.exists() and not overwrite:
+            raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
+    if splats_file is not None:
+        write_splats(splats_file, run.splats)
+        console.print(f"splats: {splats_file}")
+    settings = run.settings.mesh
+    mesh = fuse(*render_depths(run), run.centre, run.radius, settings.resolution)
+    console.print(f"fused {len(mesh.faces):,} triangles")
+    mesh = clean(mesh, settings.triangles)
+    console.print(f"simplified to {len(mesh.faces):,} triangles; unwrapping")
+    mesh = unwrap(mesh)
+    textures = bake(mesh, run.splats, texture or settings.texture)
+    write_glb(target, mesh, textures)
+    console.print(f"mesh: {target}")
+
+
+def bench(what: str) -> None:
+    """Run a benchmark of the repository."""
+    names = sorted(file.stem for file in (clone_root() / "benchmarks").glob("*.py") if file.stem != "__init__")
+    if what not in names:
+        raise InputError(f"no benchmark {what}: take one of {', '.join(names)}")
+    sys.path.insert(0, str(clone_root()))
+    runpy.run_module(f"benchmarks.{what}", run_name="__main__")

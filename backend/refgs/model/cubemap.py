@@ -1,0 +1,134 @@
+"""Cubemaps as flat lists of texels: directions, solid angles, seamless bilinear look-up.
+
+A cubemap of side R has 6·R² texels in the order face, row, column. Faces are +x, −x, +y, −y, +z, −z of the world; a
+face's (s, t) coordinates in [−1, 1] run along the two world axes that follow the face's own cyclically. There is no
+image convention to respect: cubemaps never leave the program (environment.exr is equirectangular).
+"""
+
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+
+def _face_direction(face: Tensor, s: Tensor, t: Tensor) -> Tensor:
+    """Unnormalised direction of (s, t) on a face (see the module's text)."""
+    face, s, t = torch.broadcast_tensors(face, s, t)
+    axis, sign = face // 2, (1 - 2 * (face % 2)).to(s.dtype)
+    direction = torch.stack([sign, s, t], dim=-1)  # along the face's own axis and the two that follow it
+    place = (torch.arange(3) - axis[..., None]) % 3
+    direction = direction.gather(-1, place)
+    return direction
+
+
+def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Face index and (s, t) in [−1, 1] of directions (..., 3), differentiable in s and t. A zero direction gives face 0, s = t = 0."""
+    axis = directions.detach().abs().argmax(dim=-1)
+    major = directions.gather(-1, axis[..., None])[..., 0]
+    face = 2 * axis + (major < 0)
+    scale = 1 / major.abs().clamp_min(1e-20)
+    s = directions.gather(-1, ((axis + 1) % 3)[..., None])[..., 0] * scale
+    t = directions.gather(-1, ((axis + 2) % 3)[..., None])[..., 0] * scale
+    return face, s, t
+
+
+@lru_cache(maxsize=32)
+def texel_directions(resolution: int) -> Tensor:
+    """Unit directions (6·R², 3) of the texels' centres, float64."""
+    centres = (torch.arange(resolution, dtype=torch.float64) + 0.5) * (2 / resolution) - 1
+    face = torch.arange(6)[:, None, None]
+    direction = _face_direction(face, centres[None, None, :], centres[None, :, None])
+    return torch.nn.functional.normalize(direction.reshape(-1, 3), dim=-1)
+
+
+@lru_cache(maxsize=32)
+def texel_solid_angles(resolution: int) -> Tensor:
+    """Exact solid angles (6·R²,) in steradians, float64: they sum to 4π."""
+    edges = torch.arange(resolution + 1, dtype=torch.float64) * (2 / resolution) - 1
+    s, t = edges[None, :], edges[:, None]
+    corner = torch.atan2(s * t, torch.sqrt(s * s + t * t + 1))  # area of the rectangle from the face's centre to (s, t)
+    face = corner[1:, 1:] - corner[:-1, 1:] - corner[1:, :-1] + corner[:-1, :-1]
+    return face.flatten().repeat(6)
+
+
+@lru_cache(maxsize=32)
+def _padded_texels(resolution: int) -> Tensor:
+    """Texel index of every texel of the faces padded by one, (6, R+2, R+2): the neighbour across the edge, so that look-up has no seams."""
+    centres = (torch.arange(-1, resolution + 1, dtype=torch.float64) + 0.5) * (2 / resolution) - 1
+    face = torch.arange(6)[:, None, None]
+    inside = centres.clamp(-1, 1)
+    # Fold what lies beyond the edge by direction; a point just outside one face is just inside its neighbour.
+    direction = _face_direction(face, centres[None, None, :], centres[None, :, None])
+    neighbour, s, t = face_coordinates(direction)
+    column = ((s + 1) * (resolution / 2)).floor().long().clamp(0, resolution - 1)
+    row = ((t + 1) * (resolution / 2)).floor().long().clamp(0, resolution - 1)
+    index = (neighbour * resolution + row) * resolution + column
+    # At the cube's corners three faces meet and there is no fourth texel: repeat the face's own.
+    own_row = ((inside + 1) * (resolution / 2)).floor().long().clamp(0, resolution - 1)
+    own = (face * resolution + own_row[None, :, None]) * resolution + own_row[None, None, :]
+    for i in (0, -1):
+        for j in (0, -1):
+            index[:, i, j] = own[:, i, j]
+    return index
+
+
+@lru_cache(maxsize=8)
+def _stack(sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """For cubemaps stacked one after another: padded texel indices into the stack, and where each level's start; the sides."""
+    padded, starts, texels = [], [], 0
+    for side in sides:
+        starts.append(sum(len(p) for p in padded))
+        padded.append(_padded_texels(side).flatten() + texels)
+        texels += 6 * side * side
+    return torch.cat(padded), torch.tensor(starts), torch.tensor(sides)
+
+
+def _bilinear(face: Tensor, s: Tensor, t: Tensor, level: Tensor, sides: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    padded, starts, all_sides = _stack(sides)
+    side = all_sides[level]
+    half = side.to(s.dtype) / 2
+    x = (s + 1) * half + 0.5  # in texels of the padded face
+    y = (t + 1) * half + 0.5
+    column = torch.minimum(x.detach().floor().long().clamp_min(0), side)
+    row = torch.minimum(y.detach().floor().long().clamp_min(0), side)
+    fx, fy = x - column, y - row
+    width = side + 2
+    corner = starts[level] + (face * width + row) * width + column
+    corners = torch.stack([corner, corner + 1, corner + width, corner + width + 1], dim=-1)
+    gx, gy = 1 - fx, 1 - fy
+    return padded[corners], torch.stack([gx * gy, fx * gy, gx * fy, fx * fy], dim=-1)
+
+
+def sample(levels: Tensor, sides: tuple[int, ...], directions: Tensor, level: Tensor) -> Tensor:
+    """Trilinear look-up: bilinear in direction (P, 3), linear in level (P,) of [0, len(sides) − 1]; → (P, 3).
+
+    `levels` (Σ 6·side², 3) are cubemaps one after another. Differentiable in all of levels, directions and level.
+    """
+    face, s, t = face_coordinates(directions)
+    lower = level.detach().floor().long().clamp(0, max(len(sides) - 2, 0))
+    texels, weights = _bilinear(face, s, t, lower, sides)
+    if len(sides) > 1:
+        fraction = (level - lower)[:, None]
+        above, above_weights = _bilinear(face, s, t, lower + 1, sides)
+        texels = torch.cat([texels, above], dim=-1)
+        weights = torch.cat([weights * (1 - fraction), above_weights * fraction], dim=-1)
+    return _Gather.apply(levels, texels, weights)
+
+
+class _Gather(torch.autograd.Function):
+    """Σ_j w_pj · table[i_pj], with the table's gradient summed in the order of the pixels, so that it is the same for any thread count."""
+
+    @staticmethod
+    def forward(ctx, table: Tensor, index: Tensor, weight: Tensor) -> Tensor:
+        ctx.save_for_backward(table, index, weight)
+        return torch.einsum("pj,pjc->pc", weight, table[index])
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor):
+        table, index, weight = ctx.saved_tensors
+        for_weight = torch.einsum("pc,pjc->pj", gradient, table[index]) if ctx.needs_input_grad[2] else None
+        for_table = None
+        if ctx.needs_input_grad[0]:
+            for_table = torch.zeros_like(table)
+            for_table.index_add_(0, index.flatten(), (weight[..., None] * gradient[:, None]).flatten(0, 1))
+        return for_table, None, for_weight

@@ -1,0 +1,61 @@
+"""The light: a cubemap of linear HDR radiance, prefiltered for the split sum, with the irradiance that lights the diffuse part."""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refgs.export.environment import directions as panorama_directions
+from refgs.export.environment import sample as sample_panorama
+
+from refgs.model import cubemap, harmonics, prefilter
+
+# A clamped cosine's harmonics divided by π, by degree (Ramamoorthi and Hanrahan 2001, eq. 8).
+COSINE = (1.0,) + (2 / 3,) * 3 + (1 / 4,) * 5
+
+
+@lru_cache(maxsize=4)
+def _projection(resolution: int) -> Tensor:
+    """(9, 6·R²): radiance → the nine coefficients of irradiance / π."""
+    y = harmonics.basis(cubemap.texel_directions(resolution), 2) * cubemap.texel_solid_angles(resolution)[:, None]
+    return (y * torch.tensor(COSINE, dtype=torch.float64)).T.float().contiguous()
+
+
+class Environment:
+    """Light from afar. `radiance` (6·R², 3), linear, in the order of `refgs.model.cubemap`."""
+
+    def __init__(self, radiance: Tensor):
+        self.radiance = radiance
+        self.resolution = math.isqrt(len(radiance) // 6)
+        self.sides = tuple(prefilter.level_sides(self.resolution))
+        self.levels = prefilter.prefilter(radiance, self.resolution)
+        self.irradiance = _projection(self.resolution) @ radiance  # (9, 3)
+
+    def specular(self, directions: Tensor, roughness: Tensor) -> Tensor:
+        """Radiance (P, 3) filtered by the GGX lobe of a roughness (P,) about a direction (P, 3)."""
+        known = torch.tensor(prefilter.ROUGHNESS)
+        interval = (torch.bucketize(roughness.detach(), known) - 1).clamp(0, len(known) - 2)
+        low, high = known[interval], known[interval + 1]
+        return cubemap.sample(self.levels, self.sides, directions, interval + (roughness - low) / (high - low))
+
+    def diffuse(self, normals: Tensor) -> Tensor:
+        """Irradiance / π (P, 3) about unit normals (P, 3): what a white matte surface sends out."""
+        return (harmonics.basis(normals, 2) @ self.irradiance).clamp_min(0)
+
+    def panorama(self, height: int) -> np.ndarray:
+        """Equirectangular radiance (height, 2·height, 3) in Blender's orientation."""
+        directions = torch.from_numpy(panorama_directions(height, 2 * height)).reshape(-1, 3).float()
+        level = torch.zeros(len(directions))
+        colour = cubemap.sample(self.radiance.detach(), (self.resolution,), directions, level)
+        return colour.reshape(height, 2 * height, 3).numpy()
+
+    @classmethod
+    def from_panorama(cls, panorama: np.ndarray, resolution: int) -> "Environment":
+        """The light of an equirectangular picture (H, W, 3) in Blender's orientation, averaged over each texel."""
+        fine = max(1, math.ceil(panorama.shape[0] / (2 * resolution)))  # so that no pixel of the picture is passed over
+        directions = cubemap.texel_directions(resolution * fine).numpy()
+        colour = torch.from_numpy(np.ascontiguousarray(sample_panorama(panorama, directions), dtype=np.float32))
+        colour = colour.reshape(6, resolution, fine, resolution, fine, 3).mean(dim=(2, 4))
+        return cls(colour.reshape(-1, 3))

@@ -1,0 +1,161 @@
+"""GGX prefiltering of a cubemap: the second factor of the split sum (paper Eq. 8) at a few fixed roughnesses.
+
+With N = V = R (Karis, "Real Shading in Unreal Engine 4", 2013) the filtered radiance is Σ L(l) K(θ) / Σ K(θ),
+K(θ) = D(cos θ/2) cos θ, θ the angle between l and the lobe's axis. K depends on θ and roughness alone, so each level is
+one fixed sparse matrix over the texels of the cubemap and of its pooled mips: fine texels at the lobe's core,
+coarse ones in its tail.
+"""
+
+import hashlib
+import os
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import platformdirs
+import torch
+from scipy import integrate, sparse
+from torch import Tensor
+
+from refgs.model import cubemap
+
+ROUGHNESS = (0.0, 0.18, 0.35, 0.6, 1.0)  # of the levels; level 0 is the cubemap itself
+DIVISOR = (1, 2, 4, 8, 8)  # a level's side is the cubemap's divided by this
+CELLS = (0, 64, 128, 256, 256)  # a texel of the pyramid is split while it holds more than 1/CELLS of the lobe
+COARSEST = 4  # side of the last pooled mip
+SAMPLES = 3  # sub-samples of the lobe along each side of a texel
+
+
+def level_sides(resolution: int) -> list[int]:
+    """Side of each prefiltered level, in texels."""
+    return [max(resolution // d, COARSEST) for d in DIVISOR]
+
+
+def _pyramid_sides(resolution: int) -> list[int]:
+    sides = [resolution]
+    while sides[-1] > COARSEST:
+        sides.append(sides[-1] // 2)
+    return sides
+
+
+def ggx_lobe(cosine: np.ndarray, roughness: float) -> np.ndarray:
+    """K(θ) up to a factor, for cos θ; zero below the horizon."""
+    a2 = roughness**4  # α² with α = roughness²
+    half = (1 + cosine) / 2  # cos²(θ/2)
+    return np.maximum(cosine, 0) / (half * (a2 - 1) + 1) ** 2
+
+
+def _level_matrix(resolution: int, side: int, roughness: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One level's rows as (row, pyramid texel, weight), rows summing to one."""
+    axes = cubemap.texel_directions(side).numpy()
+    sides = _pyramid_sides(resolution)
+    offsets = np.concatenate([[0], np.cumsum([6 * s * s for s in sides])])
+    cosine = 1 - np.linspace(0, 1, 100_001) ** 4  # dense where a narrow lobe is
+    whole = -2 * np.pi * integrate.trapezoid(ggx_lobe(cosine, roughness), cosine)
+    rows, columns, weights = [], [], []
+    row = np.repeat(np.arange(len(axes)), 6 * COARSEST**2)
+    texel = np.tile(np.arange(6 * COARSEST**2), len(axes))
+    for mip in reversed(range(len(sides))):
+        n = sides[mip]
+        area = cubemap.texel_solid_angles(n).numpy()[texel]
+        share = _lobe_over_texels(axes[row], texel, n, roughness) * area / whole
+        seen = share > 1e-5
+        row, texel, share = row[seen], texel[seen], share[seen]
+        keep = share < 1 / cells if mip else np.ones(len(share), dtype=bool)
+        rows.append(row[keep])
+        columns.append(texel[keep] + offsets[mip])
+        weights.append(share[keep])
+        split = texel[~keep]
+        face, r, c = split // (n * n), split // n % n, split % n
+        children = [(face * 2 * n + 2 * r + i) * 2 * n + 2 * c + j for i in (0, 1) for j in (0, 1)]
+        row, texel = np.tile(row[~keep], 4), np.concatenate(children)
+    rows, columns, weights = np.concatenate(rows), np.concatenate(columns), np.concatenate(weights)
+    return rows, columns, weights / np.bincount(rows, weights, len(axes))[rows]
+
+
+def _lobe_over_texels(axes: np.ndarray, texel: np.ndarray, side: int, roughness: float) -> np.ndarray:
+    """The lobe about each axis, averaged over its texel: it changes within one."""
+    fine = cubemap.texel_directions(side * SAMPLES).numpy().reshape(6, side, SAMPLES, side, SAMPLES, 3)
+    face, row, column = texel // (side * side), texel // side % side, texel % side
+    value = np.zeros(len(texel))
+    for i in range(SAMPLES):
+        for j in range(SAMPLES):
+            value += ggx_lobe(np.einsum("ij,ij->i", axes, fine[face, row, i, column, j]), roughness)
+    return value / SAMPLES**2
+
+
+def _cache_file(resolution: int) -> Path:
+    # The source is part of the key: a change of the lobe or of a constant must not read an older file.
+    source = Path(__file__).read_bytes() + Path(cubemap.__file__).read_bytes()
+    key = hashlib.sha256(source).hexdigest()[:16]
+    return Path(platformdirs.user_cache_dir("refgs")) / f"prefilter-{resolution}-{key}.npz"
+
+
+@lru_cache(maxsize=4)
+def matrices(resolution: int) -> tuple[Tensor, Tensor]:
+    """The levels above 0 stacked, as a sparse CSR matrix over the pyramid's texels, and its transpose (float32)."""
+    file = _cache_file(resolution)
+    if file.exists():
+        matrix = sparse.load_npz(file)
+    else:
+        parts, offset = [], 0
+        for side, roughness, cells in zip(level_sides(resolution)[1:], ROUGHNESS[1:], CELLS[1:], strict=True):
+            row, column, weight = _level_matrix(resolution, side, roughness, cells)
+            parts.append((row + offset, column, weight))
+            offset += 6 * side * side
+        row, column, weight = (np.concatenate(p) for p in zip(*parts, strict=True))
+        width = sum(6 * s * s for s in _pyramid_sides(resolution))
+        matrix = sparse.csr_matrix((weight.astype(np.float32), (row, column)), shape=(offset, width))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        temporary = file.with_suffix(f".{os.getpid()}.npz")
+        sparse.save_npz(temporary, matrix, compressed=False)
+        os.replace(temporary, file)
+    return _to_torch(matrix), _to_torch(matrix.T.tocsr())
+
+
+def _to_torch(matrix) -> Tensor:
+    # 32-bit indices: with 64-bit ones torch leaves MKL and is thirty times slower.
+    return torch.sparse_csr_tensor(
+        torch.from_numpy(matrix.indptr.astype(np.int32)),
+        torch.from_numpy(matrix.indices.astype(np.int32)),
+        torch.from_numpy(matrix.data.astype(np.float32)),
+        size=matrix.shape,
+        check_invariants=False,
+    )
+
+
+@lru_cache(maxsize=4)
+def _pool_weights(resolution: int) -> list[Tensor]:
+    """Each texel's share of its parent's solid angle, a mip after another."""
+    shares = []
+    for side in _pyramid_sides(resolution)[:-1]:
+        area = cubemap.texel_solid_angles(side).reshape(6, side // 2, 2, side // 2, 2)
+        shares.append((area / area.sum(dim=(2, 4), keepdim=True)).float()[..., None])
+    return shares
+
+
+def _pyramid(radiance: Tensor, resolution: int) -> Tensor:
+    mips = [radiance]
+    for share in _pool_weights(resolution):
+        half = share.shape[1]
+        mips.append((mips[-1].reshape(6, half, 2, half, 2, 3) * share).sum(dim=(2, 4)).reshape(-1, 3))
+    return torch.cat(mips)
+
+
+class _Product(torch.autograd.Function):
+    """Sparse matrix times dense; the gradient is the product with the stored transpose."""
+
+    @staticmethod
+    def forward(ctx, dense: Tensor, matrix: Tensor, transpose: Tensor) -> Tensor:
+        ctx.transpose = transpose
+        return matrix @ dense
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor):
+        return ctx.transpose @ gradient.contiguous(), None, None
+
+
+def prefilter(radiance: Tensor, resolution: int) -> Tensor:
+    """All levels of a cubemap (6·R², 3) one after another, (Σ 6·side², 3): linear radiance in, linear radiance out."""
+    matrix, transpose = matrices(resolution)
+    return torch.cat([radiance, _Product.apply(_pyramid(radiance, resolution), matrix, transpose)])

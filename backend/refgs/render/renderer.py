@@ -1,0 +1,163 @@
+"""The one renderer: surfels and light in, picture and maps out. Training, evaluation and export all call it."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from refgs.camera import Camera
+from refgs.color import srgb_encode
+from refgs.model import harmonics
+from refgs.model.environment import Environment
+from refgs.model.surfels import Surfels
+from refgs.render import brdf
+from refgs.render.rasterize import rasterize
+from refgs.settings import RenderSettings
+
+NEAR = 0.01  # the nearest depth that is drawn, in scene radii
+COVERED = 1 / 255  # pixels with less alpha than this are background
+SHIFT_LIMIT = 8.0  # pixels
+SHIFT_ALPHA = 0.3  # a silhouette's blended position says nothing about its surface
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What a camera sees. `color` is sRGB-encoded, over the background; the maps are alpha-weighted means over the splats
+    of a pixel (zero where nothing is), linear; `normal` (H, W, 3) is in world space, not normalised, towards the
+    camera; `depth` (H, W) is along the camera's axis."""
+
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor
+    normal: Tensor
+    albedo: Tensor | None = None
+    metallic: Tensor | None = None
+    roughness: Tensor | None = None
+    radiance: Tensor | None = None  # linear, before the background; deferred shading alone
+
+
+def near_plane(radius: float) -> float:
+    """The nearest depth that is drawn in a scene of this radius, both in world units."""
+    return NEAR * radius
+
+
+def camera_rays(camera: Camera) -> Tensor:
+    """Directions (H, W, 3) in the world through the pixels' centres, with unit depth along the camera's axis; float32."""
+    x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
+    y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
+    rotation = torch.from_numpy(camera.world_to_camera[:3, :3].copy())
+    rays = rotation[2] + x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1]
+    return rays.float()
+
+
+def facing_normals(surfels: Surfels, camera: Camera) -> Tensor:
+    """The surfels' normals (N, 3), each turned towards the camera."""
+    normals = surfels.normals()
+    towards = torch.from_numpy(camera.position).float() - surfels.positions.detach()
+    away = (normals.detach() * towards).sum(dim=-1, keepdim=True) < 0
+    return torch.where(away, -normals, normals)
+
+
+def _appearance(surfels: Surfels, camera: Camera) -> Tensor:
+    """SH colour (N, 3) of each surfel towards the camera, not negative."""
+    towards = surfels.positions.detach() - torch.from_numpy(camera.position).float()
+    return harmonics.evaluate(surfels.sh, torch.nn.functional.normalize(towards, dim=-1)).clamp_min(0)
+
+
+def _unshifted(features: Tensor, alpha: Tensor, positions: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
+    """Features (P, C), alpha-weighted means, read where the blend's own surface point projects to the pixel.
+
+    Discs sorted and blended by their centres favour those in front: on a curved surface the blend at a pixel is that of
+    a point nearer to the camera, whose normal leans towards it. The blended positions tell which point; the pixel whose
+    blend is *this* pixel's point lies the same way back. Gradients go through the displacement.
+    """
+    height, width, channels = features.shape
+    rotation = torch.from_numpy(camera.world_to_camera[:3, :3].copy()).float()
+    translation = torch.from_numpy(camera.world_to_camera[:3, 3].copy()).float()
+    here = alpha[pixels[0], pixels[1]]
+    centre = torch.stack([pixels[1], pixels[0]], dim=-1) + 0.5
+    point = (positions[pixels[0], pixels[1]] / here[:, None]) @ rotation.T + translation
+    focal = torch.tensor([camera.fx, camera.fy])
+    projected = point[:, :2] / point[:, 2:].clamp_min(1e-12) * focal + torch.tensor([camera.cx, camera.cy])
+    shift = (projected - centre).clamp(-SHIFT_LIMIT, SHIFT_LIMIT) * (here.detach() > SHIFT_ALPHA)[:, None]
+    grid = (centre - shift) * torch.tensor([2 / width, 2 / height]) - 1
+    stacked = torch.cat([features, alpha[..., None]], dim=-1).permute(2, 0, 1)[None]
+    sampled = torch.nn.functional.grid_sample(
+        stacked, grid[None, :, None], mode="bilinear", padding_mode="border", align_corners=False
+    )[0, :, :, 0]
+    return (sampled[:channels] / sampled[channels].clamp_min(COVERED / 2)).T
+
+
+def render(
+    surfels: Surfels,
+    environment: Environment | None,
+    camera: Camera,
+    background: Tensor,
+    settings: RenderSettings,
+    near: float,
+) -> Rendering:
+    """Render surfels for a camera over a background (3,), sRGB-encoded.
+
+    `settings.shading` is "deferred" (split-sum shading of blended maps, paper Eq. 5–8) or "sh" (view-dependent colour
+    of each surfel, blended). `near` is in world units.
+    """
+    deferred = settings.shading == "deferred"
+    parts = {"normal": facing_normals(surfels, camera)}
+    if deferred:
+        parts |= {"position": surfels.positions, "albedo": surfels.albedo}
+        parts |= {"metallic": surfels.metallic[:, None], "roughness": surfels.roughness[:, None]}
+    if not deferred or settings.diffuse == "sh":
+        parts["appearance"] = _appearance(surfels, camera)
+    widths = [p.shape[1] for p in parts.values()]
+    raster = rasterize(
+        surfels.positions,
+        surfels.rotations,
+        surfels.scales,
+        surfels.opacities,
+        torch.cat(list(parts.values()), dim=1),
+        camera,
+        near=near,
+    )
+    alpha = raster.alpha
+    depth = raster.depth / alpha.clamp_min(COVERED)
+    if not deferred:
+        maps = dict(zip(parts, raster.features.split(widths, dim=-1), strict=True))
+        color = maps["appearance"] + (1 - alpha[..., None]) * background
+        return Rendering(color, alpha, depth, maps["normal"] / alpha.clamp_min(COVERED)[..., None])
+
+    pixels = torch.nonzero(alpha.detach() > COVERED, as_tuple=True)
+    start = list(parts).index("position")
+    offset = sum(widths[:start])
+    positions = raster.features[..., offset : offset + 3]
+    features = _unshifted(raster.features, alpha, positions, torch.stack(pixels), camera)
+    maps = dict(zip(parts, features.split(widths, dim=-1), strict=True))
+
+    view = -torch.nn.functional.normalize(camera_rays(camera)[pixels], dim=-1)
+    normal = torch.nn.functional.normalize(maps["normal"], dim=-1, eps=1e-6)
+    n_v = (normal * view).sum(dim=-1).clamp(1e-4, 1)
+    metallic, roughness = maps["metallic"][:, 0], maps["roughness"][:, 0]
+    light = environment.specular(brdf.reflect(view, normal), roughness)
+    radiance, base = brdf.specular(maps["albedo"], metallic, n_v, roughness, light)
+    if settings.diffuse == "sh":  # the paper's substitute: SH colour in place of integrated diffuse light
+        radiance = radiance + (1 - metallic[:, None]) * maps["appearance"]
+    else:
+        radiance = radiance + base * maps["albedo"] * environment.diffuse(normal)
+
+    covered = alpha[pixels][:, None]
+    over = srgb_encode(radiance) * covered + (1 - covered) * background
+    shape = (camera.height, camera.width, 3)
+
+    def image(values: Tensor, fill: Tensor | float = 0.0) -> Tensor:
+        base = torch.zeros(*shape[:2], values.shape[1]) + fill
+        return base.index_put(pixels, values)
+
+    return Rendering(
+        image(over, background),
+        alpha,
+        depth,
+        image(maps["normal"]),
+        image(maps["albedo"]),
+        image(maps["metallic"])[..., 0],
+        image(maps["roughness"])[..., 0],
+        image(radiance),
+    )

@@ -1,0 +1,151 @@
+"""The run folder: what a training leaves, and the only thing that rendering, evaluation, export and Blender read."""
+
+import os
+import platform
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import tomli_w
+import torch
+
+from refgs import __version__
+from refgs.camera import Camera
+from refgs.capture import Capture, read_run_cameras, write_cameras
+from refgs.errors import InputError
+from refgs.export.environment import read_environment
+from refgs.export.splats import Splats, read_splats
+from refgs.model.environment import Environment
+from refgs.model.surfels import Surfels, from_splats
+from refgs.render.renderer import Rendering, near_plane, render
+from refgs.settings import Settings, validate
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run, ready to render. Cameras are in the run's frame and of the photos' full size."""
+
+    folder: Path
+    settings: Settings
+    capture_folder: Path
+    fingerprint: str
+    centre: np.ndarray
+    radius: float
+    bounded: bool
+    near: float
+    cameras: list[Camera]
+    splits: list[str]
+    to_capture: np.ndarray
+    splats: Splats
+    environment: Environment | None
+
+    def surfels(self) -> Surfels:
+        """The asset's surfels as tensors."""
+        return from_splats(self.splats)
+
+    def training_cameras(self) -> list[Camera]:
+        """The cameras of the photos that were trained on, at the size they were trained at."""
+        side = self.settings.image.max_side
+        return [c.fitted(side) for c, split in zip(self.cameras, self.splits, strict=True) if split == "train"]
+
+    def render(self, camera: Camera, environment: Environment | None = None) -> Rendering:
+        """Render a camera of the run's frame, under another light where one is given."""
+        with torch.no_grad():
+            return render(
+                self.surfels(),
+                environment or self.environment,
+                camera,
+                torch.tensor(self.settings.image.background),
+                self.settings.render,
+                self.near,
+            )
+
+
+def create_run(folder: Path, capture: Capture, settings: Settings, preset: str) -> None:
+    """Make a new run folder with its run.toml and cameras.json. Raises InputError where the folder is taken."""
+    check_free(folder)
+    try:
+        (folder / "checkpoints").mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"{folder}: the folder cannot be made ({error.strerror}): choose another with --out") from None
+    facts = {
+        "run": {
+            "refgs": __version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+            "device": "cpu",
+            "threads": torch.get_num_threads(),
+            "preset": preset,
+            "capture": str(capture.folder.resolve()),
+            "fingerprint": capture.fingerprint(),
+            "layout": capture.layout,
+            "centre": [float(x) for x in capture.centre],
+            "radius": float(capture.radius),
+            "bounded": bool(capture.bounded),
+        },
+        "settings": settings.model_dump(mode="json"),
+    }
+    write_text(folder / "run.toml", tomli_w.dumps(facts))
+    write_cameras(folder / "cameras.json", capture)
+
+
+def check_free(folder: Path) -> None:
+    """Raise InputError unless a new run can go into the folder."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        what = "holds another run" if (folder / "run.toml").exists() else "is not empty"
+        raise InputError(f"{folder} {what}: choose another folder with --out, or go on with that run with --resume")
+
+
+def read_run_facts(folder: Path) -> tuple[dict, Settings]:
+    """What run.toml says: its [run] table and its settings."""
+    file = folder / "run.toml"
+    try:
+        facts = tomllib.loads(file.read_text(encoding="utf-8"))
+        return facts["run"], validate(facts["settings"], str(file))
+    except FileNotFoundError:
+        raise InputError(f"{folder} is not a run folder: there is no run.toml in it") from None
+    except (OSError, KeyError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{file} is broken ({error}): train again") from None
+
+
+def open_run(folder: Path) -> Run:
+    """Read a finished run. Raises InputError naming what is missing."""
+    facts, settings = read_run_facts(folder)
+    if not (folder / "splats.ply").exists():
+        raise InputError(f"{folder}: the training has not ended: go on with `refgs train … --out {folder} --resume`")
+    cameras, splits, to_capture = read_run_cameras(folder / "cameras.json")
+    environment = None
+    if settings.render.shading == "deferred":
+        panorama = read_environment(folder / "environment.exr")
+        environment = Environment.from_panorama(panorama, settings.environment.resolution)
+    return Run(
+        folder=folder,
+        settings=settings,
+        capture_folder=Path(facts["capture"]),
+        fingerprint=facts["fingerprint"],
+        centre=np.array(facts["centre"]),
+        radius=facts["radius"],
+        bounded=facts["bounded"],
+        near=near_plane(facts["radius"]),
+        cameras=cameras,
+        splits=splits,
+        to_capture=to_capture,
+        splats=read_splats(folder / "splats.ply"),
+        environment=environment,
+    )
+
+
+def write_text(file: Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    temporary = file.with_name(file.name + ".tmp")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, file)
+
+
+def camera_in_run(camera: Camera, to_capture: np.ndarray) -> Camera:
+    """A camera of the capture's frame, in the run's: world_to_camera stays rigid, lengths are the run's."""
+    scale = np.cbrt(np.linalg.det(to_capture[:3, :3]))
+    matrix = camera.world_to_camera @ to_capture
+    matrix[:3] /= scale
+    return replace(camera, world_to_camera=matrix)

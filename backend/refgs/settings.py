@@ -1,0 +1,174 @@
+"""Settings: what a preset may say, within which range. The numbers themselves live in presets/*.toml."""
+
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from refgs.errors import InputError
+from refgs.paths import PRESETS
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ImageSettings(_Section):
+    max_side: int = Field(ge=16, le=8192, description="photos are reduced to this many pixels on their longer side")
+    background: tuple[float, float, float] = Field(description="sRGB colour behind masked objects, 0..1")
+
+
+class RenderSettings(_Section):
+    shading: Literal["deferred", "sh"] = Field(description="split-sum materials, or plain view-dependent colour")
+    diffuse: Literal["irradiance", "sh"] = Field(description="diffuse light: from the environment, or SH per surfel")
+
+
+class SurfelSettings(_Section):
+    start: int = Field(ge=1, le=10_000_000, description="surfels at the start")
+    budget: int = Field(ge=1, le=10_000_000, description="surfels at the most")
+    sh_degree: int = Field(ge=0, le=3)
+    opacity: float = Field(gt=0, lt=1, description="at the start")
+    albedo: float = Field(gt=0, lt=1, description="at the start")
+    metallic: float = Field(gt=0, lt=1, description="at the start")
+    roughness: float = Field(gt=0, lt=1, description="at the start")
+
+
+class EnvironmentSettings(_Section):
+    resolution: Literal[16, 32, 64, 128, 256] = Field(description="side of the cubemap's faces, in texels")
+    radiance: float = Field(gt=0, le=1e6, description="at the start")
+
+
+class TrainSettings(_Section):
+    iterations: int = Field(ge=1, le=10_000_000)
+    light_first: int = Field(ge=0, description="iterations in which only light and materials learn")
+    checkpoint_every: int = Field(ge=1, description="iterations")
+    seed: int = Field(ge=0)
+
+
+class RateSettings(_Section):
+    """Adam's learning rates, at the start; `decay` is the factor reached at the end. Position is in scene radii."""
+
+    position: float = Field(ge=0)
+    rotation: float = Field(ge=0)
+    scale: float = Field(ge=0)
+    opacity: float = Field(ge=0)
+    sh_dc: float = Field(ge=0)
+    sh_rest: float = Field(ge=0)
+    albedo: float = Field(ge=0)
+    metallic: float = Field(ge=0)
+    roughness: float = Field(ge=0)
+    environment: float = Field(ge=0)
+    decay: float = Field(gt=0, le=1, description="every rate's factor at the end of the training")
+
+
+class LossSettings(_Section):
+    dssim: float = Field(ge=0, le=1, description="λ of (1 − λ) L1 + λ D-SSIM")
+    normal: float = Field(ge=0, description="weight of normal consistency with the depth")
+    smooth: float = Field(ge=0, description="weight of edge-aware normal smoothness")
+    alpha: float = Field(ge=0, description="weight of the mask, where there is one")
+
+
+class DensifySettings(_Section):
+    start: float = Field(ge=0, le=1, description="part of the training after which surfels are added")
+    stop: float = Field(ge=0, le=1, description="part of the training after which no more are")
+    every: int = Field(ge=1, description="iterations")
+    gradient: float = Field(ge=0, description="mean gradient per pixel of motion above which a surfel is divided")
+    prune_opacity: float = Field(ge=0, lt=1, description="surfels fainter than this are removed")
+
+
+class MeshSettings(_Section):
+    resolution: int = Field(ge=16, le=1024, description="voxels along each side of the fused volume")
+    triangles: int = Field(ge=100, le=10_000_000)
+    texture: int = Field(ge=64, le=8192, description="side of the baked textures, in pixels")
+
+
+class Settings(_Section):
+    """Every number of a run. All are in the preset; there are no defaults in the code."""
+
+    image: ImageSettings
+    render: RenderSettings
+    surfels: SurfelSettings
+    environment: EnvironmentSettings
+    train: TrainSettings
+    rates: RateSettings
+    loss: LossSettings
+    densify: DensifySettings
+    mesh: MeshSettings
+
+
+SHORT = {"shading": "render.shading", "diffuse": "render.diffuse"}  # keys that `--set` takes without their section
+
+
+def preset_names() -> list[str]:
+    """Names of the presets that come with the program."""
+    return sorted(file.stem for file in PRESETS.glob("*.toml"))
+
+
+def load_settings(preset: str, changes: list[str] = ()) -> Settings:
+    """Settings from a preset's name or a TOML file, with `section.key=value` changes.
+
+    A file may start from another with `base = "NAME"`. Raises InputError with the key and what it may be.
+    """
+    tables = _read_preset(preset)
+    for change in changes:
+        key, equals, value = change.partition("=")
+        key = SHORT.get(key.strip(), key.strip())
+        section, dot, name = key.partition(".")
+        if not equals or not dot:
+            raise InputError(f"--set {change}: write it as section.key=value, e.g. train.iterations=2000")
+        if not isinstance(tables.setdefault(section, {}), dict):
+            raise InputError(f"--set {change}: there is no section {section}")
+        tables[section][name] = _parse(value)
+    return validate(tables, preset)
+
+
+def validate(tables: dict[str, Any], source: str) -> Settings:
+    """Settings from nested tables. Raises InputError naming the first key that is wrong and what it may be."""
+    try:
+        return Settings.model_validate(tables)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            known = _known_keys(first["loc"][:-1])
+            raise InputError(f"{source}: unknown key {key}; known here: {', '.join(known)}") from None
+        if first["type"] == "missing":
+            raise InputError(f'{source}: {key} is missing; add it, or start the file with base = "standard"') from None
+        raise InputError(f"{source}: {key} = {first['input']!r}: {first['msg'].lower()}") from None
+
+
+def _known_keys(location: tuple) -> list[str]:
+    model = Settings
+    for part in location:
+        model = model.model_fields[part].annotation
+    return list(model.model_fields)
+
+
+def _parse(value: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return value.strip()  # a bare word is a string
+
+
+def _read_preset(preset: str) -> dict[str, Any]:
+    file = PRESETS / f"{preset}.toml" if preset in preset_names() else Path(preset)
+    try:
+        tables = tomllib.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"no preset {preset}: take one of {', '.join(preset_names())}, or a TOML file") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{file}: cannot be read as TOML ({error}): mend the file") from None
+    base = tables.pop("base", None)
+    if base is None:
+        return tables
+    if base not in preset_names() or base == preset:
+        raise InputError(f"{file}: base = {base!r}: take one of {', '.join(preset_names())}")
+    merged = _read_preset(base)
+    for section, values in tables.items():
+        if isinstance(values, dict) and isinstance(merged.get(section, {}), dict):
+            merged[section] = {**merged.get(section, {}), **values}
+        else:
+            merged[section] = values
+    return merged

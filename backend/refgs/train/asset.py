@@ -1,0 +1,87 @@
+"""What a training leaves when it has ended: surfels whose materials relight, and the light."""
+
+import json
+
+import torch
+
+from refgs.color import srgb_encode
+from refgs.export.environment import write_environment
+from refgs.export.splats import write_splats
+from refgs.model import harmonics
+from refgs.model.environment import Environment
+from refgs.model.surfels import Surfels, to_splats
+from refgs.render.rasterize import rasterize
+from refgs.run import write_text
+from refgs.train.trainer import Trainer
+
+
+def write_asset(trainer: Trainer) -> None:
+    """Write splats.ply, environment.exr and needs.json of a training that has ended."""
+    folder, settings = trainer.folder, trainer.settings
+    with torch.no_grad():
+        surfels, environment = trainer.surfels(), trainer.environment()
+    if environment is not None:
+        write_environment(folder / "environment.exr", environment.panorama(4 * environment.resolution))
+        surfels = _with_relightable_albedo(surfels, environment, settings.render.diffuse)
+    surfels, unseen = _facing_outward(surfels, trainer)
+    write_splats(folder / "splats.ply", to_splats(surfels))
+    write_text(folder / "needs.json", json.dumps(_left_out(trainer, unseen), indent=1))
+
+
+def _with_relightable_albedo(surfels: Surfels, environment: Environment, diffuse: str) -> Surfels:
+    """Albedo under the recovered light, and the SH that a viewer without lights shows.
+
+    Where the diffuse part was learned as SH, a dielectric's albedo is that colour divided by the irradiance it stood in;
+    a metal's is its reflectance. Where it was learned as albedo, the SH becomes the matte look under that irradiance.
+    """
+    received = environment.diffuse(surfels.normals()).clamp_min(1e-6)
+    metallic = surfels.metallic[:, None]
+    if diffuse == "sh":
+        sent = (0.5 + harmonics.DC * surfels.sh[:, 0]).clamp_min(0)  # the mean over all directions
+        albedo = metallic * surfels.albedo + (1 - metallic) * (sent / received).clamp(0, 1)
+        return surfels._replace(albedo=albedo)
+    look = srgb_encode((surfels.albedo * received).clamp(0, 1))
+    return surfels._replace(sh=((look - 0.5) / harmonics.DC)[:, None])
+
+
+def _facing_outward(surfels: Surfels, trainer: Trainer) -> tuple[Surfels, int]:
+    """Turn each surfel's normal to the side it is seen from, and drop those that no training view sees.
+
+    A surfel's weight in a view is the gradient of the sum of a constant feature.
+    """
+    count = len(surfels.positions)
+    side, seen = torch.zeros(count), torch.zeros(count)
+    normals = surfels.normals()
+    for view in trainer.views:
+        feature = torch.ones(count, 1, requires_grad=True)
+        raster = rasterize(*surfels[:4], feature, view.camera, near=trainer.near)
+        raster.features.sum().backward()
+        weight = feature.grad[:, 0]
+        towards = torch.from_numpy(view.camera.position).float() - surfels.positions
+        side += weight * torch.sign((normals * towards).sum(dim=-1))
+        seen += weight
+    w, x, y, z = surfels.rotations.unbind(-1)
+    turned = torch.stack([-x, w, z, -y], dim=-1)  # q · (0, 1, 0, 0): half a turn about t_u
+    rotations = torch.where((side < 0)[:, None], turned, surfels.rotations)
+    keep = seen > 0
+    if not keep.any():
+        keep[:] = True
+    surfels = Surfels(*(value[keep] for value in surfels._replace(rotations=rotations)))
+    return surfels, int(count - keep.sum())
+
+
+def _left_out(trainer: Trainer, unseen: int) -> list[dict[str, str]]:
+    """What this run did without, why, and what that saved."""
+    settings, left = trainer.settings, []
+    if settings.render.shading == "sh":
+        left.append({"what": "materials and light", "why": "shading = sh", "saved": "shading and the light's prefilter"})
+    elif settings.render.diffuse == "irradiance":
+        per = 3 * (settings.surfels.sh_degree + 1) ** 2
+        saved = f"{per} parameters a surfel"
+        left.append({"what": "spherical harmonics", "why": "diffuse light comes from the environment", "saved": saved})
+    if any(view.alpha is None for view in trainer.views):
+        left.append({"what": "the mask loss", "why": "not every photo has a mask", "saved": "one term of the loss"})
+    if unseen:
+        saved = f"{unseen} rows of splats.ply"
+        left.append({"what": f"{unseen} surfels", "why": "no training view sees them", "saved": saved})
+    return left

@@ -1,0 +1,96 @@
+"""Adding surfels where the picture asks for them, and removing those that nobody sees."""
+
+import torch
+from torch import Tensor
+
+from refgs.camera import Camera
+from refgs.model.surfels import Parameters
+from refgs.settings import DensifySettings
+
+
+class ScreenGradient:
+    """Mean gradient of the loss by a surfel's motion on the screen, in half image widths (as 3D Gaussian splatting counts it)."""
+
+    def __init__(self, count: int):
+        self.total = torch.zeros(count)
+        self.views = torch.zeros(count)
+
+    @torch.no_grad()
+    def add(self, position: Tensor, gradient: Tensor, camera: Camera) -> None:
+        """Account for one view's gradient (N, 3) by the world position (N, 3)."""
+        matrix = torch.from_numpy(camera.world_to_camera).float()
+        depth = (position @ matrix[2, :3] + matrix[2, 3]).clamp_min(0)
+        across = gradient @ matrix[:2, :3].T  # gradient by motion parallel to the picture plane
+        # One pixel at depth z is z / f wide.
+        self.total += across.norm(dim=-1) * depth / camera.fx * (camera.width / 2)
+        self.views += gradient.abs().amax(dim=-1) > 0
+
+    def mean(self) -> Tensor:
+        """(N,), zero where a surfel was never seen."""
+        return self.total / self.views.clamp_min(1)
+
+
+@torch.no_grad()
+def densify(
+    parameters: Parameters,
+    optimizer: torch.optim.Adam,
+    gradient: Tensor,
+    settings: DensifySettings,
+    budget: int,
+    divide: bool,
+) -> int:
+    """Remove faint surfels; divide those with the largest screen gradient in two along their longer axis, up to the budget.
+
+    Parameters are replaced in the dictionary and in the optimiser; the moments of the survivors are kept, those of the
+    new ones are zero. Returns how many were divided. At least one surfel is kept.
+    """
+    opacity = parameters["opacity"].sigmoid()
+    keep = (opacity >= settings.prune_opacity) & torch.stack(
+        [p.flatten(1).isfinite().all(dim=1) if p.dim() > 1 else p.isfinite() for p in parameters.values()]
+    ).all(dim=0)
+    if not keep.any():
+        keep[opacity.nan_to_num(-1).argmax()] = True
+    chosen = torch.zeros(0, dtype=torch.long)
+    if divide:
+        candidates = torch.where(keep, gradient, -1.0)
+        room = max(budget - int(keep.sum()), 0)
+        count = min(room, int((candidates > settings.gradient).sum()))
+        chosen = candidates.topk(count).indices.sort().values
+    kept = torch.nonzero(keep)[:, 0]
+    index = torch.cat([kept, chosen])  # each chosen one stands twice
+    if len(index) == len(keep) and len(chosen) == 0:
+        return 0
+    halves = torch.isin(kept, chosen).nonzero()[:, 0], torch.arange(len(kept), len(index))
+    for group in optimizer.param_groups:
+        old = group["params"][0]
+        new = old.detach()[index].clone()
+        state = optimizer.state.pop(old, None)
+        if state:
+            for key in ("exp_avg", "exp_avg_sq"):
+                state[key] = state[key][index].clone()
+                for half in halves:
+                    state[key][half] = 0
+        new.requires_grad_()
+        group["params"][0] = new
+        parameters[group["name"]] = new
+        if state:
+            optimizer.state[new] = state
+    if len(chosen):
+        _divide(parameters, *halves)
+    return len(chosen)
+
+
+def _divide(parameters: Parameters, first: Tensor, second: Tensor) -> None:
+    """Move two copies apart along the longer axis, so that together they cover what the one did."""
+    scale = parameters["scale"][first]
+    longer = scale.argmax(dim=1)
+    rows = torch.arange(len(first))
+    sigma = scale[rows, longer].exp()
+    w, x, y, z = torch.nn.functional.normalize(parameters["rotation"][first], dim=-1).unbind(-1)
+    t_u = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
+    t_v = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1)
+    axis = torch.where(longer[:, None] == 0, t_u, t_v)
+    # Two Gaussians of 0.8 σ, 0.6 σ either side of the centre: the same variance as the one, 0.8² + 0.6² = 1.
+    for half, sign in ((first, 1.0), (second, -1.0)):
+        parameters["position"][half] += sign * 0.6 * sigma[:, None] * axis
+        parameters["scale"][half, longer] = scale[rows, longer] + torch.log(torch.tensor(0.8))

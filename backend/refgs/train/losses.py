@@ -1,0 +1,65 @@
+"""The objective (paper §3.3): colour, normal consistency, edge-aware smoothness; and the mask."""
+
+import torch
+from torch import Tensor
+
+from refgs.camera import Camera
+from refgs.render.renderer import Rendering, camera_rays
+from refgs.render.ssim import dssim
+from refgs.settings import LossSettings
+
+SATURATED = 0.998  # a photo's value above which the true radiance is unknown
+
+
+def color_loss(color: Tensor, photo: Tensor, weight: float) -> Tensor:
+    """(1 − λ) L1 + λ D-SSIM on sRGB-encoded (H, W, 3).
+
+    The rendering is clipped only where the photo is: elsewhere an over-bright pixel must feel its gradient.
+    """
+    color = torch.where(photo >= SATURATED, color.clamp_max(1.0), color)
+    loss = (1 - weight) * (color - photo).abs().mean()
+    return loss + weight * dssim(color, photo) if weight > 0 else loss
+
+
+def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
+    """Unit normals (H − 2, W − 2, 3) of the depth map's surface, towards the camera, by central differences."""
+    points = camera_rays(camera) * depth[..., None]
+    across = points[1:-1, 2:] - points[1:-1, :-2]
+    down = points[2:, 1:-1] - points[:-2, 1:-1]
+    return torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=-1, eps=1e-20)
+
+
+def normal_loss(rendering: Rendering, camera: Camera) -> Tensor:
+    """1 − ÑᵀN, Ñ from the depth, where the surface is opaque around the pixel."""
+    solid = rendering.alpha.detach() > 0.5
+    solid = solid[1:-1, 2:] & solid[1:-1, :-2] & solid[2:, 1:-1] & solid[:-2, 1:-1]
+    normal = torch.nn.functional.normalize(rendering.normal[1:-1, 1:-1], dim=-1, eps=1e-6)
+    disagreement = 1 - (depth_normals(rendering.depth, camera) * normal).sum(dim=-1)
+    return (disagreement * solid).mean()
+
+
+def smoothness_loss(rendering: Rendering, photo: Tensor) -> Tensor:
+    """‖∇N‖ exp(−‖∇C_gt‖), forward differences, where the surface is opaque."""
+    normal, solid = rendering.normal, rendering.alpha.detach() > 0.5
+    total = normal.new_zeros(())
+    for axis in (0, 1):
+        n = photo.shape[axis] - 1
+        change = (normal.narrow(axis, 1, n) - normal.narrow(axis, 0, n)).abs().sum(dim=-1)
+        edge = (photo.narrow(axis, 1, n) - photo.narrow(axis, 0, n)).abs().sum(dim=-1)
+        both = solid.narrow(axis, 1, n) & solid.narrow(axis, 0, n)
+        total = total + (change * torch.exp(-edge) * both).mean()
+    return total
+
+
+def objective(
+    rendering: Rendering, photo: Tensor, mask: Tensor | None, camera: Camera, weights: LossSettings
+) -> Tensor:
+    """The training loss of one view; terms with weight zero cost nothing."""
+    loss = color_loss(rendering.color, photo, weights.dssim)
+    if weights.normal > 0:
+        loss = loss + weights.normal * normal_loss(rendering, camera)
+    if weights.smooth > 0:
+        loss = loss + weights.smooth * smoothness_loss(rendering, photo)
+    if mask is not None and weights.alpha > 0:
+        loss = loss + weights.alpha * (rendering.alpha - mask).abs().mean()
+    return loss

@@ -1,0 +1,78 @@
+"""Where surfels start: on the visual hull, on structure-from-motion points, or at random."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from refgs.capture import Capture, LoadedView
+from refgs.geometry.hull import visual_hull_points
+from refgs.model.surfels import Parameters, initial_parameters
+from refgs.settings import Settings
+
+
+def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings) -> tuple[Parameters, str]:
+    """Initial parameters and one line that says where they came from."""
+    count, seed = min(settings.surfels.start, settings.surfels.budget), settings.train.seed
+    colours = None
+    if all(view.alpha is not None for view in views):
+        positions, normals, spacing = visual_hull_points(
+            [view.alpha for view in views],
+            [view.camera for view in views],
+            capture.centre,
+            capture.radius,
+            count,
+            seed=seed,
+        )
+        source = "the visual hull of the masks"
+    elif capture.points is not None and len(capture.points) >= 100:
+        positions, colours = _thinned(capture.points, capture.point_colors, count, seed)
+        normals, spacing = _towards_cameras(positions, views), _spacing(positions)
+        source = f"{len(positions)} structure-from-motion points"
+    else:
+        positions = _random(capture, count, seed)
+        normals, spacing = _towards_cameras(positions, views), _spacing(positions)
+        source = "random points (no masks and no structure-from-motion points)"
+    s = settings.surfels
+    parameters = initial_parameters(
+        positions,
+        normals,
+        spacing,
+        colours,
+        opacity=s.opacity if colours is None and source.startswith("the visual") else min(s.opacity, 0.1),
+        sh_degree=s.sh_degree,
+        albedo=s.albedo,
+        metallic=s.metallic,
+        roughness=s.roughness,
+    )
+    return parameters, f"{len(positions)} surfels start on {source}"
+
+
+def _thinned(points: np.ndarray, colours: np.ndarray | None, count: int, seed: int):
+    if len(points) > count:
+        chosen = np.random.default_rng(seed).choice(len(points), count, replace=False)
+        points, colours = points[chosen], None if colours is None else colours[chosen]
+    return points, colours
+
+
+def _random(capture: Capture, count: int, seed: int) -> np.ndarray:
+    """Uniform in the ball of interest; where the capture is a room, half of them beyond it, uniform in inverse distance."""
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    distance = np.cbrt(rng.random(count))
+    if not capture.bounded:
+        distance[::2] = 1 / rng.uniform(0.1, 1, len(distance[::2]))
+    return capture.centre + capture.radius * distance[:, None] * direction
+
+
+def _towards_cameras(positions: np.ndarray, views: list[LoadedView]) -> np.ndarray:
+    """Unit vectors (N, 3) from each point to the nearest camera: a surface that was seen faces someone."""
+    cameras = np.stack([view.camera.position for view in views])
+    towards = cameras[cKDTree(cameras).query(positions)[1]] - positions
+    return towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+
+
+def _spacing(positions: np.ndarray) -> np.ndarray:
+    """Mean distance (N,) to the three nearest neighbours."""
+    k = min(4, len(positions))
+    distance = cKDTree(positions).query(positions, k=k)[0][:, 1:] if k > 1 else np.ones((len(positions), 1))
+    return np.maximum(distance.mean(axis=1), 1e-7)

@@ -1,0 +1,257 @@
+"""The training loop: one view, one step, until the iterations are done."""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refgs.capture import Capture, LoadedView, load_view
+from refgs.model.environment import Environment
+from refgs.model.surfels import Surfels, activate
+from refgs.render.renderer import Rendering, near_plane, render
+from refgs.settings import Settings
+from refgs.train import checkpoint
+from refgs.train.densify import ScreenGradient, densify
+from refgs.train.losses import objective
+from refgs.train.start import start_parameters
+
+Report = Callable[[str, dict[str, Any]], None]
+"""Called with an event's name and its facts: "stage", "progress", "warning"."""
+
+GEOMETRY = ("position", "rotation", "scale", "opacity")
+REPORT_EVERY = 10  # iterations
+HISTORY_EVERY = 100  # iterations
+PLAN_EVERY = 50  # iterations
+
+
+def composite(view: LoadedView, background: Tensor) -> Tensor:
+    """The photo over the background, sRGB-encoded float (H, W, 3) in 0..1."""
+    image = torch.from_numpy(view.image).float() / 255
+    if view.alpha is None:
+        return image
+    alpha = torch.from_numpy(view.alpha).float()[..., None] / 255
+    return image * alpha + background * (1 - alpha)
+
+
+def psnr(image: Tensor, photo: Tensor) -> float:
+    """Peak signal-to-noise ratio in dB of a rendering, clipped to 0..1."""
+    return float(-10 * torch.log10(((image.clamp(0, 1) - photo) ** 2).mean().clamp_min(1e-10)))
+
+
+class Trainer:
+    """A capture being learned. State is on the run folder's disk after every checkpoint."""
+
+    def __init__(
+        self, capture: Capture, settings: Settings, folder: Path, report: Report, minutes: float | None = None
+    ):
+        self.total, self.minutes = settings.train.iterations, minutes
+        self.capture, self.settings, self.folder, self.report = capture, settings, folder, report
+        side = settings.image.max_side
+        self.views = [load_view(view, side) for view in capture.train_views]
+        self.test = [load_view(view, side) for view in capture.test_views]
+        self.background = torch.tensor(settings.image.background)
+        self.near = near_plane(capture.radius)
+        self.iteration, self.seconds = 0, 0.0
+
+        self.parameters, source = start_parameters(capture, self.views, settings)
+        report("stage", {"what": source})
+        self.light = torch.full(
+            (6 * settings.environment.resolution**2, 3), math.log(math.expm1(settings.environment.radiance))
+        ).requires_grad_()
+        self.from_hull = all(view.alpha is not None for view in self.views)
+        self._drop_unused()
+        groups = [
+            {"params": [value], "name": name, "rate": self._rate(name)} for name, value in self.parameters.items()
+        ]
+        if settings.render.shading == "deferred":
+            groups.append({"params": [self.light], "name": "environment", "rate": settings.rates.environment})
+        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
+        self.motion = ScreenGradient(len(self.parameters["position"]))
+
+    def _rate(self, name: str) -> float:
+        rate = getattr(self.settings.rates, name)
+        return rate * self.capture.radius if name == "position" else rate
+
+    def _drop_unused(self) -> None:
+        """What this run's shading never reads does not learn."""
+        render = self.settings.render
+        unused = []
+        if render.shading == "sh":
+            unused = ["albedo", "metallic", "roughness"]
+        elif render.diffuse == "irradiance":
+            unused = ["sh_dc", "sh_rest"]
+        self.constant = {name: self.parameters.pop(name).detach()[:1] for name in unused}
+
+    def surfels(self) -> Surfels:
+        """The activated surfels, with what does not learn filled in."""
+        count = len(self.parameters["position"])
+        fixed = {name: value.expand(count, *value.shape[1:]) for name, value in self.constant.items()}
+        return activate({**self.parameters, **fixed})
+
+    def environment(self) -> Environment | None:
+        """The light as it is now; none where nothing is lit."""
+        if self.settings.render.shading == "sh":
+            return None
+        return Environment(torch.nn.functional.softplus(self.light))
+
+    def render(self, view: LoadedView) -> Rendering:
+        """Render one view without gradients."""
+        with torch.no_grad():
+            return render(
+                self.surfels(), self.environment(), view.camera, self.background, self.settings.render, self.near
+            )
+
+    def test_psnr(self, most: int = 4) -> float | None:
+        """Mean PSNR over at most this many of the held-out views; None where there are none."""
+        chosen = self.test[:: max(1, len(self.test) // most)][:most]
+        if not chosen:
+            return None
+        return float(np.mean([psnr(self.render(v).color, composite(v, self.background)) for v in chosen]))
+
+    def step(self) -> dict[str, float]:
+        """One iteration. Returns its loss and PSNR."""
+        settings = self.settings
+        view = self._next_view()
+        progress = min(self.iteration / self.total, 1.0)
+        decay = settings.rates.decay**progress
+        frozen = self.from_hull and self.iteration < settings.train.light_first and settings.render.shading == "deferred"
+        for group in self.optimizer.param_groups:
+            group["lr"] = 0.0 if frozen and group["name"] in GEOMETRY else group["rate"] * decay
+
+        surfels = self.surfels()
+        rendering = render(
+            surfels, self.environment(), view.camera, self.background, settings.render, self.near
+        )
+        photo = composite(view, self.background)
+        mask = None if view.alpha is None else torch.from_numpy(view.alpha).float() / 255
+        loss = objective(rendering, photo, mask, view.camera, settings.loss)
+        loss.backward()
+        position = self.parameters["position"]
+        self.motion.add(position.detach(), position.grad, view.camera)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.iteration += 1
+        self._densify(progress)
+        return {"loss": float(loss.detach()), "psnr": psnr(rendering.color.detach(), photo)}
+
+    def _next_view(self) -> LoadedView:
+        """Every view once an epoch, in an order that depends on the seed and the epoch alone, so that a resumed run goes on alike."""
+        epoch, place = divmod(self.iteration, len(self.views))
+        order = torch.randperm(
+            len(self.views), generator=torch.Generator().manual_seed(self.settings.train.seed * 1_000_003 + epoch)
+        )
+        return self.views[int(order[place])]
+
+    def _densify(self, progress: float) -> None:
+        settings = self.settings.densify
+        if self.iteration % settings.every or progress < settings.start:
+            return
+        densify(
+            self.parameters,
+            self.optimizer,
+            self.motion.mean(),
+            settings,
+            self.settings.surfels.budget,
+            divide=progress < settings.stop,
+        )
+        self.motion = ScreenGradient(len(self.parameters["position"]))
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
+        """Train to the end, or until `stop` says so; a checkpoint is written either way. True when the end was reached."""
+        loss, quality, started, first = 0.0, 0.0, time.perf_counter(), self.iteration
+        while self.iteration < self.total and not stop():
+            begun = time.perf_counter()
+            figures = self.step()
+            self.seconds += time.perf_counter() - begun
+            self._plan()
+            if not math.isfinite(figures["loss"]):
+                raise FloatingPointError(f"the loss is {figures['loss']} at iteration {self.iteration}")
+            fresh = 1.0 if self.iteration - first == 1 else 0.05  # running means
+            loss += fresh * (figures["loss"] - loss)
+            quality += fresh * (figures["psnr"] - quality)
+            if self.iteration % REPORT_EVERY == 0 or self.iteration == self.total:
+                pace = (time.perf_counter() - started) / (self.iteration - first)
+                self.report(
+                    "progress",
+                    {
+                        "iteration": self.iteration,
+                        "total": self.total,
+                        "seconds": self.seconds,
+                        "seconds_left": pace * (self.total - self.iteration),
+                        "loss": loss,
+                        "psnr": quality,
+                        "splats": len(self.parameters["position"]),
+                    },
+                )
+            if self.iteration % HISTORY_EVERY == 0:
+                self._record(loss, quality)
+            if self.iteration % self.settings.train.checkpoint_every == 0 and self.iteration < self.total:
+                self.save()
+        self.save()
+        return self.iteration >= self.total
+
+    def _plan(self) -> None:
+        """Where minutes were given: as many iterations as the pace allows, looked at again now and then."""
+        if self.minutes is not None and self.iteration % PLAN_EVERY == 0:
+            left = 60 * self.minutes - self.seconds
+            self.total = self.iteration + max(0, int(left * self.iteration / self.seconds))
+
+    def _record(self, loss: float, quality: float) -> None:
+        facts = {
+            "iteration": self.iteration,
+            "seconds": round(self.seconds, 3),
+            "loss": loss,
+            "psnr_train": quality,
+            "psnr_test": self.test_psnr(),
+            "splats": len(self.parameters["position"]),
+        }
+        with open(self.folder / "history.jsonl", "a", encoding="utf-8") as file:
+            file.write(json.dumps(facts) + "\n")
+
+    def save(self) -> None:
+        """Write a checkpoint of everything that the next iteration depends on."""
+        tensors = {f"parameter.{name}": value for name, value in self.parameters.items()}
+        tensors |= {f"constant.{name}": value for name, value in self.constant.items()}
+        tensors |= {"environment": self.light, "motion.total": self.motion.total, "motion.views": self.motion.views}
+        for group in self.optimizer.param_groups:
+            state = self.optimizer.state.get(group["params"][0], {})
+            tensors |= {f"adam.{group['name']}.{key}": value for key, value in state.items()}
+        facts = {"seconds": self.seconds, "total": self.total}
+        checkpoint.save(self.folder / "checkpoints", self.iteration, tensors, facts)
+
+    def resume(self) -> None:
+        """Go back to the last complete checkpoint."""
+        tensors, facts = checkpoint.load(self.folder / "checkpoints")
+        self.iteration, self.seconds = facts["iteration"], facts["seconds"]
+        self.total = facts["total"]
+        self.motion.total, self.motion.views = tensors["motion.total"], tensors["motion.views"]
+        self.optimizer.state.clear()
+        for group in self.optimizer.param_groups:
+            name = group["name"]
+            value = tensors["environment"] if name == "environment" else tensors[f"parameter.{name}"]
+            value.requires_grad_()
+            group["params"][0] = value
+            if name == "environment":
+                self.light = value
+            else:
+                self.parameters[name] = value
+            prefix = f"adam.{name}."
+            state = {key.removeprefix(prefix): t for key, t in tensors.items() if key.startswith(prefix)}
+            if state:
+                self.optimizer.state[value] = state
+        self.constant = {name: tensors[f"constant.{name}"] for name in self.constant}
+        self._trim_history()
+
+    def _trim_history(self) -> None:
+        """Forget what was recorded after the checkpoint: it will be recorded again."""
+        file = self.folder / "history.jsonl"
+        if file.exists():
+            lines = file.read_text(encoding="utf-8").splitlines()
+            kept = [line for line in lines if json.loads(line)["iteration"] <= self.iteration]
+            file.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
