@@ -1,0 +1,68 @@
+import pytest
+
+from refgs.errors import InputError
+from refgs.settings import load_settings, preset_names
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_is_valid(name):
+    settings = load_settings(name)
+    assert settings.surfels.start <= settings.surfels.budget
+
+
+def test_set_changes_one_value():
+    settings = load_settings("quick", ["train.iterations=7", "shading=sh", "image.background=[0.0, 0.5, 1.0]"])
+    assert settings.train.iterations == 7
+    assert settings.render.shading == "sh"
+    assert settings.image.background == (0.0, 0.5, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("train.iteration=5", ["train.iteration", "iterations"]),
+        ("trian.iterations=5", ["trian"]),
+        ("train.iterations=0", ["train.iterations", "greater than or equal to 1"]),
+        ("train.iterations=many", ["train.iterations", "integer"]),
+        ("shading=phong", ["render.shading", "deferred"]),
+        ("iterations", ["section.key=value"]),
+        ("rates.decay=2", ["rates.decay", "less than or equal to 1"]),
+    ],
+)
+def test_a_wrong_change_is_named(change, words):
+    with pytest.raises(InputError) as error:
+        load_settings("quick", [change])
+    assert "\n" not in str(error.value)
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_a_file_may_start_from_a_preset(tmp_path):
+    file = tmp_path / "mine é.toml"
+    file.write_text('base = "quick"\n[train]\niterations = 12\n', encoding="utf-8")
+    settings = load_settings(str(file))
+    assert settings.train.iterations == 12
+    assert settings.train.seed == load_settings("quick").train.seed
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("[train]\niterations = 3\n", "missing"),
+        ('base = "nothing"\n', "nothing"),
+        ("[train\n", "TOML"),
+        ('base = "quick"\n[loss]\nlambda = 1\n', "loss.lambda"),
+        ('base = "quick"\nloss = 3\n', "loss"),
+    ],
+)
+def test_a_wrong_file_is_named(tmp_path, text, word):
+    file = tmp_path / "mine.toml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=word) as error:
+        load_settings(str(file))
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_preset_lists_the_known():
+    with pytest.raises(InputError, match="quick, standard"):
+        load_settings("fast")
