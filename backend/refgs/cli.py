@@ -32,8 +32,12 @@ def train(
     out: Annotated[Path, typer.Option(help="the run folder to make")],
     preset: Annotated[str, typer.Option(help="quick, standard, or a TOML file")] = "standard",
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
-    minutes: Annotated[float | None, typer.Option(min=0.05, help="train for this long instead of the preset's iterations")] = None,
-    changes: Annotated[list[str] | None, typer.Option("--set", help="section.key=value, e.g. train.iterations=2000")] = None,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.05, help="train for this long instead of the preset's iterations")
+    ] = None,
+    changes: Annotated[
+        list[str] | None, typer.Option("--set", help="section.key=value, e.g. train.iterations=2000")
+    ] = None,
     resume: Annotated[bool, typer.Option(help="go on with the run in --out")] = False,
 ) -> None:
     """Learn surfels, materials and light from a capture."""
@@ -61,7 +65,9 @@ def render(
 def evaluate(
     run: RunFolder,
     split: Annotated[str, typer.Option(help="test or train")] = "test",
-    ground_truth: Annotated[Path | None, typer.Option(help="folder with normal/, albedo/ … of the views, as EXR")] = None,
+    ground_truth: Annotated[
+        Path | None, typer.Option(help="folder with normal/, albedo/ … of the views, as EXR")
+    ] = None,
 ) -> None:
     """Compare renderings with photos that were held out; writes metrics.json and pictures/."""
     from refgs import commands

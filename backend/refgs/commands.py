@@ -106,7 +106,9 @@ def train(
         finally:
             signal.signal(signal.SIGINT, before)
     if not ended:
-        console.print(f"stopped at iteration {trainer.iteration}; go on with: refgs train {capture_folder} --out {out} --resume")
+        console.print(
+            f"stopped at iteration {trainer.iteration}; go on with: refgs train {capture_folder} --out {out} --resume"
+        )
         raise KeyboardInterrupt
     write_asset(trainer)
     quality = trainer.test_psnr(most=len(trainer.test))
@@ -230,7 +232,9 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     if run.environment is not None:
         panorama = run.environment.panorama(256)
         write_png(folder / "pictures" / "environment.png", _bytes(srgb_encode(panorama)))
-    console.print(", ".join(f"{name} {value:.4g}" for name, value in result.items()) + f" on {len(views)} {split} views")
+    console.print(
+        ", ".join(f"{name} {value:.4g}" for name, value in result.items()) + f" on {len(views)} {split} views"
+    )
 
 
 def _true_normals(folder: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray] | None:

@@ -9,7 +9,9 @@ from refgs.model.environment import Environment
 def light(side: int) -> torch.Tensor:
     """A sky with a soft sun and some stripes."""
     d = cubemap.texel_directions(side)
-    sun = torch.exp(20 * (d @ torch.nn.functional.normalize(torch.tensor([0.3, 0.5, 0.8], dtype=torch.float64), dim=0) - 1))
+    sun = torch.exp(
+        20 * (d @ torch.nn.functional.normalize(torch.tensor([0.3, 0.5, 0.8], dtype=torch.float64), dim=0) - 1)
+    )
     stripes = 0.3 + 0.2 * torch.sin(6 * d[:, 2])
     return torch.stack([stripes + 5 * sun, stripes + 3 * sun, stripes + sun], dim=-1).float()
 

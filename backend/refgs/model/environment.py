@@ -9,7 +9,6 @@ from torch import Tensor
 
 from refgs.export.environment import directions as panorama_directions
 from refgs.export.environment import sample as sample_panorama
-
 from refgs.model import cubemap, harmonics, prefilter
 
 # A clamped cosine's harmonics divided by π, by degree (Ramamoorthi and Hanrahan 2001, eq. 8).

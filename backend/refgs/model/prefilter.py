@@ -45,7 +45,9 @@ def ggx_lobe(cosine: np.ndarray, roughness: float) -> np.ndarray:
     return np.maximum(cosine, 0) / (half * (a2 - 1) + 1) ** 2
 
 
-def _level_matrix(resolution: int, side: int, roughness: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _level_matrix(
+    resolution: int, side: int, roughness: float, cells: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One level's rows as (row, pyramid texel, weight), rows summing to one."""
     axes = cubemap.texel_directions(side).numpy()
     sides = _pyramid_sides(resolution)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import torch
+from refgs.render.rasterize import rasterize
 from torch import Tensor
 
 from refgs.camera import Camera
@@ -11,7 +12,6 @@ from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render import brdf
-from refgs.render.rasterize import rasterize
 from refgs.settings import RenderSettings
 
 NEAR = 0.01  # the nearest depth that is drawn, in scene radii

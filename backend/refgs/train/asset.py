@@ -74,7 +74,9 @@ def _left_out(trainer: Trainer, unseen: int) -> list[dict[str, str]]:
     """What this run did without, why, and what that saved."""
     settings, left = trainer.settings, []
     if settings.render.shading == "sh":
-        left.append({"what": "materials and light", "why": "shading = sh", "saved": "shading and the light's prefilter"})
+        left.append(
+            {"what": "materials and light", "why": "shading = sh", "saved": "shading and the light's prefilter"}
+        )
     elif settings.render.diffuse == "irradiance":
         per = 3 * (settings.surfels.sh_degree + 1) ** 2
         saved = f"{per} parameters a surfel"

@@ -35,7 +35,11 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
         for file in temporary:
             file.unlink(missing_ok=True)
         # safetensors wraps the system's error in its own and keeps only its text.
-        if getattr(error, "errno", None) == errno.ENOSPC or "No space left" in str(error) or "os error 28" in str(error):
+        if (
+            getattr(error, "errno", None) == errno.ENOSPC
+            or "No space left" in str(error)
+            or "os error 28" in str(error)
+        ):
             last = complete(folder)
             kept = f"the checkpoint of iteration {last[-1]} is whole" if last else "there is no earlier checkpoint"
             raise InputError(f"{folder}: the disk is full; {kept}: free some space, then train with --resume") from None
@@ -48,7 +52,9 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
 def complete(folder: Path) -> list[int]:
     """Iterations of the complete checkpoints, ascending."""
     return sorted(
-        int(file.stem) for file in folder.glob("*.toml") if file.stem.isdigit() and file.with_suffix(".safetensors").exists()
+        int(file.stem)
+        for file in folder.glob("*.toml")
+        if file.stem.isdigit() and file.with_suffix(".safetensors").exists()
     )
 
 

@@ -120,14 +120,14 @@ class Trainer:
         view = self._next_view()
         progress = min(self.iteration / self.total, 1.0)
         decay = settings.rates.decay**progress
-        frozen = self.from_hull and self.iteration < settings.train.light_first and settings.render.shading == "deferred"
+        frozen = (
+            self.from_hull and self.iteration < settings.train.light_first and settings.render.shading == "deferred"
+        )
         for group in self.optimizer.param_groups:
             group["lr"] = 0.0 if frozen and group["name"] in GEOMETRY else group["rate"] * decay
 
         surfels = self.surfels()
-        rendering = render(
-            surfels, self.environment(), view.camera, self.background, settings.render, self.near
-        )
+        rendering = render(surfels, self.environment(), view.camera, self.background, settings.render, self.near)
         photo = composite(view, self.background)
         mask = None if view.alpha is None else torch.from_numpy(view.alpha).float() / 255
         loss = objective(rendering, photo, mask, view.camera, settings.loss)

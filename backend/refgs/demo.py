@@ -1,0 +1,134 @@
+"""`refgs demo`: from nothing to a relit picture in Blender, on a capture that it makes itself."""
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from refgs import commands
+from refgs.color import srgb_encode
+from refgs.errors import InputError
+from refgs.export.environment import read_exr
+from refgs.paths import clone_root
+from refgs.report import metrics
+from refgs.report.page import write_report
+from refgs.run import write_text
+
+SCENE = "jar"
+HDRIS = ("studio", "courtyard")  # Blender's own; the capture is lit by another
+VIEWS = ("test_002", "test_004")
+
+
+def run(out: Path) -> None:
+    """Make capture, run, mesh, .blend, previews and report under `out`; what is already there is gone on from."""
+    started = time.perf_counter()
+    root, out = clone_root(), out.resolve()
+    capture, folder = out / "capture", out / "run"
+    _check_blender(root)
+    if (folder / "report.html").exists():
+        raise InputError(
+            f"{out} holds a finished demo: see {folder / 'report.html'}, or choose another folder with --out"
+        )
+    out.mkdir(parents=True, exist_ok=True)
+
+    def stage(what: str) -> None:
+        commands.console.print(f"[{time.perf_counter() - started:4.0f} s] {what}")
+
+    if not capture.exists():
+        stage("rendering a capture with Cycles: 80 photos of a jar of gold, copper and glazed ceramic")
+        _child(root, "rendering", "benchmarks.scenes", SCENE, "--out", capture, "--relight", *HDRIS)
+    if not (folder / "splats.ply").exists():
+        stage("training surfels, materials and light")
+        commands.train(capture, folder, "quick", "auto", None, [], resume=(folder / "run.toml").exists())
+    if not (folder / "mesh.glb").exists():
+        stage("fusing and baking the mesh")
+        commands.export(folder, None, None, None, overwrite=False)
+    stage("measuring against the ground truth")
+    commands.evaluate(folder, "test", capture / "ground_truth")
+    stage("importing into Blender and relighting in Eevee")
+    previews = folder / "previews"
+    hdris = [capture / "ground_truth" / "relight" / f"{name}.exr" for name in HDRIS]
+    blend = folder / f"{SCENE}.blend"
+    _child(
+        root, "relighting", "refgs_addon.preview", folder,
+        *(word for hdri in hdris for word in ("--hdri", hdri)), "--views", *VIEWS, "--out", previews, "--blend", blend,
+    )  # fmt: skip
+    _compare(folder, capture / "ground_truth" / "relight", previews)
+    _record(folder, time.perf_counter() - started)
+    write_report([folder], folder / "report.html")
+    stage("done")
+    names = ("splats.ply", "environment.exr", "mesh.glb", blend.name, "previews", "report.html")
+    for name in names:
+        commands.console.print(f"  {os.path.relpath(folder / name)}")
+
+
+def _check_blender(root: Path) -> None:
+    """Raise InputError with the program's own line where Blender cannot be loaded."""
+    done = subprocess.run(
+        [sys.executable, "-m", "refgs_addon.preview", "--check"], cwd=root, capture_output=True, text=True
+    )
+    if done.returncode:
+        raise InputError(done.stderr.strip().splitlines()[-1])
+
+
+def _child(root: Path, what: str, module: str, *arguments: object) -> None:
+    """Run a module that needs Blender in a process of its own, and show the progress that it prints as JSON lines."""
+    command = [sys.executable, "-m", module, *map(str, arguments)]
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
+        with (
+            subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
+            commands.progress_bar(what, 1) as bar,
+        ):
+            for line in process.stdout:
+                if line.startswith("{"):
+                    event = json.loads(line)
+                    if event["event"] == "progress":
+                        bar(event["done"], event["what"], event["total"])
+        if process.returncode:
+            errors.seek(0)
+            said = errors.read().strip().splitlines() or ["it said nothing"]
+            if process.returncode == 2:
+                raise InputError(said[-1])
+            raise RuntimeError(f"{module} ended with status {process.returncode}:\n" + "\n".join(said[-30:]))
+
+
+def _compare(folder: Path, truth: Path, previews: Path) -> None:
+    """PSNR of the Eevee previews against Cycles' under the same light; pictures of both for the report."""
+    result: dict[str, dict[str, dict[str, float]]] = {}
+    pictures = folder / "pictures" / "relight"
+    for hdri in HDRIS:
+        for kind in ("splats", "mesh"):
+            rows = []
+            for view in VIEWS:
+                preview = previews / f"{hdri}_{kind}_{view}"
+                rows.append(metrics.compare_relight(preview.with_suffix(".exr"), truth / hdri / f"{view}.exr"))
+                (pictures / kind).mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(preview.with_suffix(".png"), pictures / kind / f"{hdri}_{view}.png")
+            result.setdefault(hdri, {})[kind] = {key: float(np.mean([r[key] for r in rows])) for key in rows[0]}
+        for view in VIEWS:
+            pixels = read_exr(truth / hdri / f"{view}.exr")
+            straight = pixels[..., :3] / np.maximum(pixels[..., 3:], 1e-6)
+            encoded = np.dstack([srgb_encode(straight), pixels[..., 3]])
+            (pictures / "truth").mkdir(parents=True, exist_ok=True)
+            bgra = cv2.cvtColor(np.rint(encoded.clip(0, 1) * 255).astype(np.uint8), cv2.COLOR_RGBA2BGRA)
+            cv2.imwrite(str(pictures / "truth" / f"{hdri}_{view}.png"), bgra)
+    file = folder / "metrics.json"
+    facts = json.loads(file.read_text(encoding="utf-8")) | {"relight": result}
+    write_text(file, json.dumps(facts, indent=1))
+
+
+def _record(folder: Path, seconds: float) -> None:
+    """Add the demo's own time and the largest memory of any of its processes to metrics.json."""
+    file = folder / "metrics.json"
+    largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    facts = json.loads(file.read_text(encoding="utf-8"))
+    facts |= {"seconds": seconds, "peak_memory_bytes": 1024 * largest}
+    write_text(file, json.dumps(facts, indent=1))
