@@ -53,8 +53,16 @@ def read_capture(folder: Path) -> Capture:
             f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender), transforms.json (nerfstudio, "
             "instant-ngp) and sparse/0 (COLMAP). Photos alone need camera poses first, from COLMAP for instance."
         )
+    photos = Counter((view.split, view.image_path) for view in views)
+    for (_, path), count in photos.items():
+        if count > 1:
+            raise InputError(f"{path}: the capture names this photo {count} times. Remove all of its frames but one.")
+    shared = {path for split, path in photos if split == "test"} & {path for split, path in photos if split == "train"}
+    if shared:
+        warnings.append(f"{len(shared)} photos are both trained and tested on, first {min(shared).name}")
     views = _hold_out(views)
     _check(folder, views)
+    views = _unique_names(views)
     silhouettes = sample_silhouettes(views)
     if not silhouettes and any(view.masked for view in views):
         warnings.append("the masks are white (opaque) everywhere, so they are not used")
@@ -86,21 +94,17 @@ def read_capture(folder: Path) -> Capture:
 
 
 def _hold_out(views: list[View]) -> list[View]:
-    """The capture's own split, else every eighth view by name held out for testing, and names unique in each split."""
-    if not any(view.split == "test" for view in views):
-        views = sorted(views, key=lambda view: view.image_path.as_posix())
-        views = [replace(view, split="train" if i % 8 else "test") for i, view in enumerate(views)]
-    return _unique_names(views)
+    """The capture's own split, else every eighth view by name held out for testing."""
+    if any(view.split == "test" for view in views):
+        return views
+    views = sorted(views, key=lambda view: view.image_path.as_posix())
+    return [replace(view, split="train" if i % 8 else "test") for i, view in enumerate(views)]
 
 
 def _unique_names(views: list[View]) -> list[View]:
     """Names that are unique in each split: photos of one name in two folders get their folders in front."""
-    files = Counter((view.split, view.image_path) for view in views)
-    (_, twice), count = files.most_common(1)[0] if files else ((None, None), 0)
-    if count > 1:
-        raise InputError(f"{twice}: the capture names this photo {count} times. Remove all of its frames but one.")
     names = Counter((view.split, view.camera.name) for view in views)
-    top = os.path.commonpath([view.image_path.parent for view in views]) if views else ""
+    top = os.path.commonpath([view.image_path.parent for view in views])
 
     def name(view: View) -> str:
         if names[view.split, view.camera.name] == 1:

@@ -4,6 +4,7 @@ The files are those of COLMAP's documentation, "Output Format". COLMAP's own rea
 a file cut short with an unrelated message or a request for terabytes of memory; this one names the file.
 """
 
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,8 +102,6 @@ def _camera(image: _Image, intrinsics: _Intrinsics, where: str) -> tuple[Camera,
             fx, fy, radial = f, f, (k1, k2, 0.0, 0.0)
         case "OPENCV", (fx, fy, cx, cy, k1, k2, p1, p2):
             radial, tangential = (k1, k2, 0.0, 0.0), (p1, p2)
-        case _:
-            raise InputError(f"{where}: camera model {intrinsics.model} with {len(intrinsics.params)} parameters.")
     if not np.isfinite(intrinsics.params).all() or min(fx, fy, intrinsics.width, intrinsics.height) <= 0:
         raise InputError(f"{where}: focal length or size is zero, negative or NaN. Export the sparse model again.")
     qw, qx, qy, qz, *translation = image.pose
@@ -131,7 +130,7 @@ def _rotation(q: np.ndarray) -> np.ndarray:
 def _parse(file: Path, parser):
     try:
         return parser(file)
-    except (struct.error, ValueError, IndexError, UnicodeDecodeError, OverflowError) as error:
+    except (struct.error, ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{file}: the file is cut short or not COLMAP's. Export the sparse model again.") from error
 
 
@@ -193,31 +192,39 @@ def _points(rows: list) -> tuple[np.ndarray, np.ndarray]:
     return table[:, :3], table[:, 3:] / 255.0
 
 
-def _lines(file: Path) -> list[str]:
-    return [line for line in file.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+def _entries(file: Path, lines_each: int = 1) -> list[str]:
+    """The first line of each entry; ValueError where there are fewer than the file's own header counts."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    entries = [line for line in lines if not line.startswith("#") and (lines_each > 1 or line.strip())]
+    while entries and not entries[-1].strip():  # an image's line of keypoints may be empty
+        entries.pop()
+    entries = entries[::lines_each]
+    counted = next((match for line in lines if (match := re.match(r"# Number of \w+: (\d+)", line))), None)
+    if counted and len(entries) < int(counted[1]):
+        raise ValueError("fewer entries than counted")
+    return entries
 
 
 def _text_cameras(file: Path) -> dict[int, _Intrinsics]:
     cameras = {}
-    for line in _lines(file):
-        if line.strip():
-            number, model, width, height, *params = line.split()
-            cameras[int(number)] = _Intrinsics(model, int(width), int(height), tuple(map(float, params)))
+    for line in _entries(file):
+        number, model, width, height, *params = line.split()
+        if len(params) != dict(MODELS.values()).get(model, len(params)):
+            raise ValueError("parameters missing")
+        cameras[int(number)] = _Intrinsics(model, int(width), int(height), tuple(map(float, params)))
     return cameras
 
 
 def _text_images(file: Path) -> list[_Image]:
-    lines, images = _lines(file), []
-    while lines and not lines[-1].strip():
-        lines.pop()
-    for line in lines[::2]:  # the lines between hold keypoints
+    images = []
+    for line in _entries(file, lines_each=2):  # the second line holds keypoints
         _, *pose, camera_id, name = line.split(maxsplit=9)
         images.append(_Image(name.strip(), int(camera_id), tuple(map(float, pose))))
     return images
 
 
 def _text_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    return _points([[float(value) for value in line.split()[1:7]] for line in _lines(file) if line.strip()])
+    return _points([[float(value) for value in line.split()[1:7]] for line in _entries(file)])
 
 
 _BINARY = (_binary_cameras, _binary_images, _binary_points)

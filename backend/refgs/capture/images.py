@@ -10,6 +10,7 @@ from PIL import Image
 
 from refgs.camera import Camera
 from refgs.capture.types import View
+from refgs.color import srgb_decode, srgb_encode
 from refgs.errors import InputError
 
 
@@ -67,26 +68,28 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
     camera = view.camera
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(f"{view.image_path}: the photo changed its size since the capture was read. Start again.")
-    scale = min(1.0, max_side / max(camera.width, camera.height)) if max_side else 1.0
-    if view.lens is None and scale == 1.0:
+    fitted = camera.fitted(max_side) if max_side else camera
+    if view.lens is None and fitted is camera:
         return LoadedView(image, alpha, camera)
 
     linear = _decoding_table()[image]
     if alpha is not None:
         weight = alpha.astype(np.float32) / 255
-        linear = np.dstack([linear * weight[..., None], weight])
+        premultiplied = np.empty((*weight.shape, 4), np.float32)
+        np.multiply(linear, weight[..., None], out=premultiplied[..., :3])
+        premultiplied[..., 3] = weight
+        linear = premultiplied
     if view.lens is not None:
         # Linear interpolation: a wider kernel overshoots at highlights, which a shiny object is full of.
         linear = cv2.remap(linear, *view.lens.maps(camera), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    if scale < 1.0:
-        camera = camera.resized(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
-        linear = cv2.resize(linear, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    if fitted is not camera:
+        linear = cv2.resize(linear, (fitted.width, fitted.height), interpolation=cv2.INTER_AREA)
     if alpha is not None:
         weight = linear[..., 3]
         linear = linear[..., :3] / np.maximum(weight, 1e-6)[..., None]
         alpha = np.rint(np.clip(weight, 0, 1) * 255).astype(np.uint8)
         linear[alpha == 0] = 0
-    return LoadedView(_encode(linear), alpha, camera)
+    return LoadedView(_encode(linear), alpha, fitted)
 
 
 def _open(path: Path) -> Image.Image:
@@ -119,12 +122,9 @@ def _reason(error: Exception) -> str:
 
 @cache
 def _decoding_table() -> np.ndarray:
-    """sRGB's decoding (IEC 61966-2-1) of the 256 codes to linear float32."""
-    code = np.arange(256) / 255
-    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    """The 256 codes of a photo as linear float32."""
+    return srgb_decode(np.arange(256) / 255).astype(np.float32)
 
 
 def _encode(linear: np.ndarray) -> np.ndarray:
-    linear = np.clip(linear, 0, 1)
-    code = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** np.float32(1 / 2.4) - 0.055)
-    return np.rint(code * 255).astype(np.uint8)
+    return np.rint(srgb_encode(np.clip(linear, 0, 1)) * 255).astype(np.uint8)

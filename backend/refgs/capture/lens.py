@@ -69,8 +69,8 @@ def _focal_factor(lens: Lens, width: int, height: int) -> float | None:
 
     low, high = 0.25, 1.0
     while not fits(high):
-        low, high = high, high * 1.25
-        if high > 8:
+        low, high = high, high * 1.1
+        if high > 2:  # more than half of the photo's width would be lost
             return None
     for _ in range(20):  # the region sampled shrinks as the factor grows, so `fits` changes only once
         middle = (low + high) / 2

@@ -36,8 +36,9 @@ def find_region(
     radius = float(np.median(seen))
     if silhouettes:
         carved = _carve(silhouettes, centre, 1.5 * float(seen.max()))
-        centre, radius = carved if carved is not None else (centre, radius)
-        return Region(centre, radius, True, "the photos have masks")
+        if carved is None:
+            return Region(centre, radius, False, "the masks do not agree on a solid object")
+        return Region(*carved, True, "the photos have masks")
     if points is not None:
         centre, radius = _foreground(views, points, centre, radius)
     if miss > 0.25:
@@ -169,5 +170,6 @@ def _foreground(views: list[View], points: np.ndarray, centre: np.ndarray, radiu
     near = points[(seen >= 0.5 * len(views)) & (np.linalg.norm(points - centre, axis=1) < 2 * radius)]
     if len(near) < 20:
         return centre, radius
-    centre = np.median(near, axis=0)
-    return centre, float(np.quantile(np.linalg.norm(near - centre, axis=1), 0.95))
+    middle = np.median(near, axis=0)
+    reach = float(np.quantile(np.linalg.norm(near - middle, axis=1), 0.95))
+    return (middle, reach) if reach > 0.05 * radius else (centre, radius)

@@ -81,8 +81,8 @@ def frame_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> tup
             raise InputError(f"{frame.where}: no image size. Add w and h (pixels) to the file.")
         width, height = image_size
     fx = _focal(frame, "fl_x", "camera_angle_x", width)
-    fy = _focal(frame, "fl_y", "camera_angle_y", height) or fx
-    fx = fx or fy
+    fy = _focal(frame, "fl_y", "camera_angle_y", height)
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None:
         raise InputError(f"{frame.where}: no focal length. Add fl_x (pixels) or camera_angle_x (radians) to the file.")
     cx, cy = frame.number("cx"), frame.number("cy")
@@ -136,6 +136,7 @@ def _focal(frame: Frame, focal: str, angle: str, size: float) -> float | None:
 
 def _from_opengl(frame: Frame) -> object:
     try:
-        return np.array(frame.values.get("transform_matrix"), dtype=np.float64) @ OPENGL_TO_OPENCV
+        with np.errstate(invalid="ignore"):  # infinity is reported where the pose is checked
+            return np.array(frame.values.get("transform_matrix"), dtype=np.float64) @ OPENGL_TO_OPENCV
     except (TypeError, ValueError):
         return None

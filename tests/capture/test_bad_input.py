@@ -1,0 +1,215 @@
+"""What is wrong with a capture is said in one line that names the place."""
+
+import json
+
+import numpy as np
+import pytest
+from makers import colmap, edit, nerf_blender, nerfstudio, ring, write
+from refgs.capture import load_view, read_cameras, read_capture
+from refgs.errors import InputError
+
+
+def refused(read, *parts: str) -> None:
+    """`read` raises an InputError of one line that holds all `parts`."""
+    with pytest.raises(InputError) as error:
+        read()
+    message = str(error.value)
+    assert "\n" not in message
+    for part in parts:
+        assert part in message, message
+
+
+def test_no_such_folder(tmp_path):
+    refused(lambda: read_capture(tmp_path / "nowhere"), "nowhere", "no such folder")
+
+
+def test_folder_without_a_capture(tmp_path):
+    write(tmp_path / "images" / "a.png", np.zeros((8, 8), np.uint8))
+    refused(lambda: read_capture(tmp_path), "transforms_train.json", "transforms.json", "sparse/0")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('{"frames": [\n{"file_path": "a",,}]}', "line 2"),
+        ("", "line 1"),
+        ("[1, 2]", "frames"),
+        ('{"frames": 3}', "frames"),
+        ('{"frames": [{"transform_matrix": []}]}', "file_path"),
+        ('{"frames": ["a"]}', "file_path"),
+        ('{"frames": []}', "0 training views"),
+    ],
+)
+def test_transforms_that_are_not(tmp_path, text, says):
+    (tmp_path / "transforms.json").write_text(text)
+    refused(lambda: read_capture(tmp_path), says)
+
+
+def test_transforms_that_are_binary(tmp_path):
+    (tmp_path / "transforms.json").write_bytes(b"\xff\xd8\xff\x00")
+    refused(lambda: read_capture(tmp_path), "transforms.json", "text")
+
+
+def _number(path):
+    return int(path.stem.removeprefix("r_"))
+
+
+@pytest.mark.parametrize("make", [nerf_blender, nerfstudio, colmap])
+def test_missing_images(tmp_path, make):
+    folder = make(tmp_path)
+    paths = sorted((path for path in folder.rglob("*.png") if "test" not in path.parts), key=_number)
+    for path in paths[3:6]:
+        path.unlink()
+    refused(lambda: read_capture(folder), "3 of the", "missing", paths[3].stem)
+
+
+def test_most_images_of_an_instant_ngp_file_missing(tmp_path):
+    folder = nerfstudio(tmp_path)
+    for path in sorted((folder / "images").iterdir())[:9]:
+        path.unlink()
+    edit(folder / "transforms.json", lambda data: data.update(aabb_scale=4))
+    refused(lambda: read_capture(folder), "9 of the 16", "0000.png")
+
+
+def test_two_views(tmp_path):
+    refused(lambda: read_capture(nerf_blender(tmp_path, {"train": 2, "test": 4})), "2 training views", "three")
+
+
+def test_three_views_of_which_one_is_held_out(tmp_path):
+    refused(lambda: read_capture(nerfstudio(tmp_path, count=3)), "2 training views (of 3")
+
+
+def test_cameras_in_one_place(tmp_path):
+    poses = ring(12)
+    for pose in poses:
+        pose[:3, 3] = (4, 5, 6)
+    refused(lambda: read_capture(nerfstudio(tmp_path, poses=poses)), "one place")
+
+
+def _pose(row, column, value):
+    def change(matrix):
+        matrix[row][column] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (_pose(1, 3, float("nan")), "NaN"),
+        (_pose(0, 0, float("inf")), "NaN or infinity"),
+        (_pose(0, 0, "abc"), "4×4"),
+        (lambda m: m.pop(), None),  # 3×4 is read
+        (lambda m: m.pop(0) and m.pop(0), "4×4"),
+        (lambda m: [row.__setitem__(0, 0.0) for row in m], "inverted"),
+        (lambda m: [row.__setitem__(slice(0, 3), [0, 0, 0]) for row in m], "inverted"),
+        (_pose(3, 0, 0.5), "inverted"),
+        (lambda m: [row.__setitem__(0, -row[0]) for row in m[:3]], "left-handed"),
+        (lambda m: [row.__setitem__(0, 1.3 * row[0]) for row in m[:3]], "30%"),
+        (lambda m: [row.__setitem__(0, 1.004 * row[0]) for row in m[:3]], None),
+    ],
+)
+def test_poses(tmp_path, change, says):
+    folder = nerf_blender(tmp_path)
+    edit(folder / "transforms_train.json", lambda data: change(data["frames"][5]["transform_matrix"]))
+    if says is None:
+        rotation = read_capture(folder).views[5].camera.world_to_camera[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    else:
+        refused(lambda: read_capture(folder), says, "train/r_5")
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"fl_x": 0}, "focal length"),
+        ({"fl_x": float("nan")}, "focal length"),
+        ({"fl_x": "wide"}, "fl_x is not a number"),
+        ({"fl_x": None, "fl_y": None}, "no focal length"),
+        ({"fl_x": None, "fl_y": None, "camera_angle_x": 0}, "focal length"),
+        ({"k1": float("inf")}, "distortion"),
+        ({"k1": -30.0}, "distortion is too strong"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "perspective"),
+        ({"is_fisheye": True}, "perspective"),
+        ({"h": 64}, "64×64 pixels but the photo has 64×48"),
+        ({"mask_path": "masks/gone.png"}, "masks/gone.png is missing"),
+        ({"file_path": "images/0000.png"}, "0000.png: the capture names this photo 2 times"),
+    ],
+)
+def test_frame_values(tmp_path, values, says):
+    folder = nerfstudio(tmp_path)
+    edit(folder / "transforms.json", lambda data: data["frames"][8].update(values))
+    refused(lambda: read_capture(folder), says)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize("kept", [0.1, 0.55, 0.93])
+def test_colmap_files_cut_short(tmp_path, name, binary, kept):
+    file = colmap(tmp_path, binary) / "sparse" / "0" / f"{name}.{'bin' if binary else 'txt'}"
+    data = file.read_bytes()
+    header = data.rfind(b"# ") if not binary else 0
+    cut = max(int(kept * len(data)), data.index(b"\n", header) + 1 if not binary else 0)
+    file.write_bytes(data[:cut])
+    refused(lambda: read_capture(tmp_path), file.name, "cut short")
+
+
+def test_colmap_without_its_cameras(tmp_path):
+    folder = colmap(tmp_path)
+    (folder / "sparse" / "0" / "cameras.bin").unlink()
+    refused(lambda: read_capture(folder), "cameras.bin", "missing")
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_colmap_model_not_supported(tmp_path, binary):
+    model = (5, "OPENCV_FISHEYE", [60.0, 60.0, 32.0, 24.0, 0.0, 0.0, 0.0, 0.0])
+    refused(lambda: read_capture(colmap(tmp_path, binary, model)), "OPENCV_FISHEYE", "image_undistorter")
+
+
+def test_colmap_focal_length_nan(tmp_path):
+    model = (1, "PINHOLE", [float("nan"), 60.0, 32.0, 24.0])
+    refused(lambda: read_capture(colmap(tmp_path, True, model)), "0000.png", "focal length")
+
+
+def test_colmap_pose_nan(tmp_path):
+    file = colmap(tmp_path, binary=False) / "sparse" / "0" / "images.txt"
+    lines = file.read_text().splitlines()
+    lines[2] = "1 nan 0 0 0 1 2 3 7 0000.png"
+    file.write_text("\n".join(lines))
+    refused(lambda: read_capture(tmp_path), "0000.png", "NaN")
+
+
+def test_mask_of_another_size(tmp_path):
+    folder = nerfstudio(tmp_path)
+    write(folder / "masks" / "0004.png", np.full((24, 32), 255, np.uint8))
+    refused(lambda: read_capture(folder), "0004.png", "32×24", "64×48")
+
+
+def test_masks_all_empty(tmp_path):
+    folder = nerfstudio(tmp_path)
+    for i in range(16):
+        write(folder / "masks" / f"{i:04d}.png", np.zeros((48, 64), np.uint8))
+    refused(lambda: read_capture(folder), "all 16 masks are empty")
+
+
+def test_image_truncated_since(tmp_path):
+    view = read_capture(nerfstudio(tmp_path)).views[5]
+    data = view.image_path.read_bytes()
+    view.image_path.write_bytes(data[: len(data) // 2])
+    refused(lambda: load_view(view, 32), view.image_path.name, "cut short")
+
+
+def test_image_that_is_text(tmp_path):
+    folder = nerfstudio(tmp_path)
+    (folder / "images" / "0002.png").write_text("not a picture")
+    refused(lambda: read_capture(folder), "0002.png", "not an image")
+
+
+def test_camera_file(tmp_path):
+    refused(lambda: read_cameras(tmp_path / "gone.json"), "gone.json", "no such file")
+    file = tmp_path / "path.json"
+    frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
+    file.write_text(json.dumps({"camera_angle_x": 1.0, "frames": [frame]}))
+    refused(lambda: read_cameras(file), "image size", "w and h")
+    file.write_text(json.dumps({"frames": []}))
+    refused(lambda: read_cameras(file), "no frames")

@@ -1,0 +1,51 @@
+"""Camera files: to a run folder and back, and from the capture's own JSON."""
+
+import numpy as np
+import pytest
+from makers import colmap, nerf_blender, nerfstudio
+from refgs.capture import read_cameras, read_capture, read_run_cameras, write_cameras
+from refgs.capture.poses import in_frame
+
+
+def assert_same(a, b):
+    assert (a.name, a.width, a.height) == (b.name, b.width, b.height)
+    np.testing.assert_allclose((a.fx, a.fy, a.cx, a.cy), (b.fx, b.fy, b.cx, b.cy), rtol=1e-12)
+    np.testing.assert_allclose(a.world_to_camera, b.world_to_camera, atol=1e-9)
+
+
+@pytest.mark.parametrize("make", [nerf_blender, nerfstudio, colmap])
+def test_run_cameras_round_trip(tmp_path, make):
+    capture = read_capture(make(tmp_path / "capture"))
+    file = tmp_path / "cameras.json"
+    write_cameras(file, capture)
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["cameras.json"]
+    cameras, splits, to_capture = read_run_cameras(file)
+    assert splits == [view.split for view in capture.views]
+    np.testing.assert_array_equal(to_capture, capture.to_capture)
+    for camera, view in zip(cameras, capture.views, strict=True):
+        assert_same(camera, view.camera)
+    # The same file as a camera path is in the capture's frame.
+    for camera, view in zip(read_cameras(file), capture.views, strict=True):
+        assert_same(camera, in_frame(view.camera, capture.to_capture))
+
+
+@pytest.mark.parametrize(("make", "name"), [(nerf_blender, "transforms_test.json"), (nerfstudio, "transforms.json")])
+def test_the_captures_own_file_gives_its_cameras(tmp_path, make, name):
+    capture = read_capture(make(tmp_path))
+    views = {view.camera.name: view for view in (capture.test_views if make is nerf_blender else capture.views)}
+    cameras = read_cameras(tmp_path / name)
+    assert len(cameras) == len(views)
+    for camera in cameras:
+        assert_same(camera, in_frame(views[camera.name].camera, capture.to_capture))
+
+
+def test_moving_between_frames_keeps_the_picture(tmp_path):
+    camera = read_capture(nerf_blender(tmp_path)).views[0].camera
+    to_frame = np.eye(4)
+    to_frame[:3, :3] = 2.5 * np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    to_frame[:3, 3] = (1, -2, 3)
+    moved = in_frame(camera, to_frame)
+    point = np.array([1.2, 2.1, 2.9, 1])
+    old, new = camera.world_to_camera @ point, moved.world_to_camera @ (to_frame @ point)
+    np.testing.assert_allclose(new[:3], 2.5 * old[:3], rtol=1e-12)
+    assert_same(in_frame(moved, np.linalg.inv(to_frame)), camera)

@@ -1,0 +1,162 @@
+"""Photos are decoded whole or refused, masked, undistorted and downsized without inventing colours."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from makers import colmap, edit, nerf_blender, nerfstudio, write
+from refgs.capture import load_view, read_capture
+from refgs.capture.images import read_image
+from refgs.errors import InputError
+
+OPENCV = (4, "OPENCV", [60.0, 61.0, 31.0, 25.0, -0.2, 0.05, 0.003, -0.002])
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff"])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_16_bit_and_greyscale_are_read(tmp_path, suffix, channels):
+    rng = np.random.default_rng(0)
+    values = rng.integers(0, 65536, (20, 30, channels)).astype(np.uint16)
+    path = tmp_path / f"ö{suffix}"
+    write(path, values if channels > 1 else values[..., 0])
+    image, alpha = read_image(path)
+    assert image.shape == (20, 30, 3) and image.dtype == np.uint8
+    assert np.abs(image - values[..., : min(3, channels)] / 257.0).max() < 1
+    if channels == 4:
+        assert np.abs(alpha - values[..., 3] / 257.0).max() < 1
+    else:
+        assert alpha is None
+
+
+def test_greyscale_with_8_bits_is_read(tmp_path):
+    grey = np.arange(200, dtype=np.uint8).reshape(10, 20)
+    write(tmp_path / "a.png", grey)
+    assert np.array_equal(read_image(tmp_path / "a.png")[0], np.repeat(grey[..., None], 3, axis=2))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp", ".tiff"])
+@pytest.mark.parametrize("kept", [0.2, 0.6, 0.97])
+def test_truncated_images_are_refused_by_name(tmp_path, suffix, kept):
+    path = tmp_path / f"photo{suffix}"
+    write(path, np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(kept * len(data))])
+    with pytest.raises(InputError, match=f"photo{suffix}") as error:
+        read_image(path)
+    assert "\n" not in str(error.value)
+
+
+def test_downsizing_averages_linear_light_and_does_not_bleed(tmp_path):
+    folder = nerf_blender(tmp_path)
+    image = np.zeros((48, 64, 4), np.uint8)
+    image[:, ::2, :3] = 255  # columns of white and black, opaque on the left
+    image[:, :33, 3] = 255
+    image[:, 33:, :3] = (255, 0, 255)  # a garish colour where it is transparent
+    write(folder / "train" / "r_0.png", image)
+    view = next(view for view in read_capture(folder).train_views if view.camera.name == "r_0")
+    loaded = load_view(view, 32)
+    assert loaded.image.shape == (24, 32, 3) and (loaded.camera.width, loaded.camera.height) == (32, 24)
+    assert loaded.camera.fx == pytest.approx(view.camera.fx / 2)
+    np.testing.assert_array_equal(loaded.image[:, :16], 188)  # sRGB of half the light
+    np.testing.assert_array_equal(loaded.image[:, 16], 255)  # half covered, its opaque half white
+    assert abs(int(loaded.alpha[0, 16]) - 128) <= 1
+    assert not loaded.image[:, 17:].any() and not loaded.alpha[:, 17:].any()
+
+
+def test_full_size_is_returned_as_stored(tmp_path):
+    view = read_capture(nerf_blender(tmp_path)).views[0]
+    loaded = load_view(view, None)
+    stored = cv2.imread(str(view.image_path), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(loaded.image, stored[..., 2::-1]) and np.array_equal(loaded.alpha, stored[..., 3])
+
+
+def distorted_dots(width, height, matrix, coefficients):
+    """A photo of dots through OpenCV's own distortion, and their rays (n, 3)."""
+    rays = np.stack([*np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.4, 0.4, 4)), np.ones((4, 5))], -1)
+    rays = rays.reshape(-1, 3)
+    pixels = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
+    v, u = np.mgrid[:height, :width] + 0.5
+    distance = np.hypot(u[..., None] - pixels[:, 0], v[..., None] - pixels[:, 1]).min(axis=-1)
+    return np.rint(255 * np.exp(-0.5 * (distance / 3) ** 2)).astype(np.uint8)[..., None].repeat(3, axis=2), rays
+
+
+@pytest.mark.parametrize("k1", [-0.25, 0.2])
+@pytest.mark.parametrize("side", [None, 160])
+def test_undistortion_against_opencv(tmp_path, k1, side):
+    """Dots drawn through OpenCV's projectPoints lie where the pinhole camera expects them."""
+    width, height, fx, fy, cx, cy = 320, 240, 290.0, 300.0, 155.0, 124.0
+    coefficients = np.array([k1, 0.05, 0.004, -0.003, 0.02])  # k1 k2 p1 p2 k3
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    image, rays = distorted_dots(width, height, matrix, coefficients)
+    folder = nerfstudio(tmp_path)
+    write(folder / "images" / "0001.png", image)
+    lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), coefficients.tolist(), strict=True))
+    own = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height, **lens}
+    edit(folder / "transforms.json", lambda data: data["frames"][1].update(own))
+    view = next(view for view in read_capture(folder).views if view.camera.name == "0001")
+    loaded = load_view(view, side)
+    camera = loaded.camera
+    assert camera.fx / camera.fy == pytest.approx(fx / fy)
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    found = 0
+    for x, y, _ in rays:
+        expected = np.array([camera.fx * x + camera.cx, camera.fy * y + camera.cy])
+        if not (6 < expected[0] < camera.width - 6 and 6 < expected[1] < camera.height - 6):
+            continue
+        weight = loaded.image[..., 0] * (np.hypot(u - expected[0], v - expected[1]) < 5.0)
+        centroid = np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
+        assert np.linalg.norm(centroid - expected) < 0.15
+        found += 1
+    assert found >= 6
+
+
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize(
+    "model",
+    [
+        (0, "SIMPLE_PINHOLE", [60.0, 32.0, 24.0]),
+        (2, "SIMPLE_RADIAL", [60.0, 32.0, 24.0, -0.1]),
+        (3, "RADIAL", [60.0, 32.0, 24.0, 0.1, 0.02]),
+        OPENCV,
+    ],
+)
+def test_colmap_models_leave_no_invalid_pixels(tmp_path, model, binary):
+    """A white photo stays white to its corners, whichever way the lens bends, and the map is the model's."""
+    folder = colmap(tmp_path, binary, model)
+    for path in (folder / "images").iterdir():
+        write(path, np.full((48, 64, 3), 255, np.uint8))
+    view = read_capture(folder).views[0]
+    assert load_view(view, None).image.min() == 255
+    if model[1] == "SIMPLE_PINHOLE":
+        assert view.lens is None
+        return
+    across, down = view.lens.maps(view.camera)
+    assert across.min() >= -0.51 and across.max() <= 63.51 and down.min() >= -0.51 and down.max() <= 47.51
+    # As little is lost as can be: somewhere the border of the photo is reached.
+    slack = min(across.min() + 0.5, 63.5 - across.max(), down.min() + 0.5, 47.5 - down.max())
+    assert slack < 1.0
+    fx, fy, cx, cy, k1, k2, p1, p2 = {
+        "SIMPLE_RADIAL": lambda f, cx, cy, k: (f, f, cx, cy, k, 0, 0, 0),
+        "RADIAL": lambda f, cx, cy, k1, k2: (f, f, cx, cy, k1, k2, 0, 0),
+        "OPENCV": lambda *p: p,
+    }[model[1]](*model[2])
+    camera = view.camera
+    ray = np.array([[(3.5 - camera.cx) / camera.fx, (40.5 - camera.cy) / camera.fy, 1.0]])
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    expected = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), matrix, np.array([k1, k2, p1, p2], float))[0][0, 0]
+    np.testing.assert_allclose([across[40, 3] + 0.5, down[40, 3] + 0.5], expected, atol=1e-4)
+
+
+def test_masks_are_undistorted_with_their_photo(tmp_path):
+    folder = colmap(tmp_path, model=OPENCV)
+    for path in (folder / "images").iterdir():
+        image = cv2.imread(str(path))
+        write(folder / "masks" / path.name, np.where(image.max(axis=2) > 0, 255, 0).astype(np.uint8))
+    view = read_capture(folder).views[0]
+    loaded = load_view(view, None)
+    plain = load_view(replace(view, lens=None), None)
+    inside = loaded.alpha > 250
+    assert (loaded.image[inside].max(axis=1) > 150).all()
+    assert not loaded.image[loaded.alpha == 0].any()
+    assert (loaded.alpha != plain.alpha).any()

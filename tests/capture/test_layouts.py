@@ -1,0 +1,263 @@
+"""Every layout is read to the same cameras: what they see lies where their photos show it."""
+
+import json
+
+import numpy as np
+import pytest
+from makers import CENTRE, RADIUS, ball, colmap, edit, nerf_blender, nerfstudio, ring, write
+from plyfile import PlyData, PlyElement
+from refgs.capture import load_view, read_capture
+
+RED, GREEN, NOTHING = (220, 0, 0), (20, 200, 0), (0, 0, 0)
+
+
+def project(camera, point):
+    x, y, z = camera.world_to_camera[:3, :3] @ point + camera.world_to_camera[:3, 3]
+    assert z > 0
+    return np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
+
+
+def assert_sees_the_ball(capture):
+    """Points of the ball project onto the colours they have, and points just beside it onto nothing."""
+    to_run = np.linalg.inv(capture.to_capture)
+    for view in capture.views:
+        loaded = load_view(view, None)
+        towards = (capture.to_capture @ np.append(view.camera.position, 1))[:3] - CENTRE
+        towards[2] = 0
+        towards /= np.linalg.norm(towards)
+        up, right = np.array([0, 0, 1.0]), np.array([-towards[1], towards[0], 0])
+        for offset, expected in (
+            (0.8 * towards + 0.4 * up, RED),
+            (0.8 * towards - 0.4 * up, GREEN),
+            (0.7 * right + 0.3 * up, RED),
+            (-0.7 * right + 0.3 * up, RED),
+            (1.2 * right, NOTHING),
+            (-1.2 * right, NOTHING),
+        ):
+            point = (to_run @ np.append(CENTRE + RADIUS * offset, 1))[:3]
+            u, v = project(view.camera, point).astype(int)
+            assert tuple(loaded.image[v, u]) == expected
+
+
+@pytest.fixture(params=["nerf-blender", "nerfstudio", "colmap", "colmap-text"])
+def capture(request, tmp_path):
+    folder = tmp_path / "été dans le jardin"
+    make = {
+        "nerf-blender": nerf_blender,
+        "nerfstudio": nerfstudio,
+        "colmap": colmap,
+        "colmap-text": lambda path: colmap(path, binary=False),
+    }
+    capture = read_capture(make[request.param](folder))
+    assert capture.layout == request.param.removesuffix("-text")
+    return capture
+
+
+def test_cameras_see_what_the_photos_show(capture):
+    assert_sees_the_ball(capture)
+
+
+def test_region_is_the_ball_and_up_is_z(capture):
+    scale = np.cbrt(np.linalg.det(capture.to_capture[:3, :3]))
+    centre = (capture.to_capture @ np.append(capture.centre, 1))[:3]
+    assert np.linalg.norm(centre - CENTRE) < 0.35 * RADIUS
+    assert 0.8 * RADIUS < capture.radius * scale < 3 * RADIUS
+    np.testing.assert_allclose(capture.to_capture[:3, 2] / scale, (0, 0, 1), atol=0.02)
+    if capture.layout == "nerf-blender":
+        assert np.array_equal(capture.to_capture, np.eye(4))
+    else:
+        assert capture.radius == 1 and not capture.centre.any()
+    assert capture.bounded
+    for view in capture.views:
+        rotation = view.camera.world_to_camera[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_points_go_with_the_cameras(capture):
+    if capture.layout != "colmap":
+        assert capture.points is None
+        return
+    points = capture.points @ capture.to_capture[:3, :3].T + capture.to_capture[:3, 3]
+    np.testing.assert_allclose(np.linalg.norm(points - CENTRE, axis=1), RADIUS, rtol=1e-9)
+    np.testing.assert_allclose(capture.point_colors[0], (1, 128 / 255, 0))
+
+
+def test_split(tmp_path):
+    capture = read_capture(nerf_blender(tmp_path / "a"))
+    assert (len(capture.train_views), len(capture.test_views)) == (12, 4)
+    capture = read_capture(nerf_blender(tmp_path / "b", {"train": 12, "val": 3}))
+    assert (len(capture.train_views), len(capture.test_views)) == (12, 3)
+    capture = read_capture(nerf_blender(tmp_path / "c", {"train": 12}))
+    assert [view.camera.name for view in capture.test_views] == ["r_0", "r_6"]  # by name: r_0 r_1 r_10 r_11 r_2 … r_6
+    folder = nerfstudio(tmp_path / "d")
+    assert [view.camera.name for view in read_capture(folder).test_views] == ["0000", "0008"]
+
+    def split(data):
+        data["train_filenames"] = [f"images/{i:04d}.png" for i in range(10)]
+        data["test_filenames"] = ["images/0012.png", "images/0013.png"]
+
+    edit(folder / "transforms.json", split)
+    capture = read_capture(folder)
+    assert len(capture.train_views) == 10
+    assert [view.camera.name for view in capture.test_views] == ["0012", "0013"]
+
+
+def test_mixed_sizes_and_intrinsics_per_frame(tmp_path):
+    folder = nerfstudio(tmp_path)
+
+    def mix(data):
+        for i, frame in enumerate(data["frames"]):
+            if i % 2:
+                w, h, f = 40, 56, 75.0
+                write(folder / frame["file_path"], ball(np.array(frame["transform_matrix"]), w, h, f)[..., :3])
+                frame.update(fl_x=f, fl_y=f, cx=w / 2, cy=h / 2, w=w, h=h)
+
+    edit(folder / "transforms.json", mix)
+    capture = read_capture(folder)
+    assert {(view.camera.width, view.camera.height) for view in capture.views} == {(64, 48), (40, 56)}
+    assert_sees_the_ball(capture)
+
+
+def test_intrinsics_for_another_resolution_are_scaled(tmp_path):
+    folder = nerfstudio(tmp_path)
+    double = {"fl_x": 120.0, "fl_y": 120.0, "cx": 64.0, "cy": 48.0, "w": 128, "h": 96}
+    edit(folder / "transforms.json", lambda data: data.update(double))
+    assert_sees_the_ball(read_capture(folder))
+
+
+@pytest.mark.parametrize("named", ["masks/{}.png", "masks/{}.png.png", "masks/{}.webp", "silhouettes/{}.png"])
+def test_masks(tmp_path, named):
+    folder = nerfstudio(tmp_path)
+
+    def add_masks(data):
+        for i, pose in enumerate(ring(16)):
+            mask = named.format(f"{i:04d}")
+            write(folder / mask, ball(pose, 64, 48, 60.0)[..., 3])
+            if not mask.startswith("masks"):
+                data["frames"][i]["mask_path"] = mask
+
+    edit(folder / "transforms.json", add_masks)
+    capture = read_capture(folder)
+    assert capture.masked and capture.bounded and "masks" in capture.bounded_because
+    scale = np.cbrt(np.linalg.det(capture.to_capture[:3, :3]))
+    assert RADIUS < scale < 1.35 * RADIUS
+    np.testing.assert_allclose(capture.to_capture[:3, 3], CENTRE, atol=0.1 * RADIUS)
+    loaded = load_view(capture.views[3], None)
+    assert np.array_equal(loaded.alpha > 127, ball(ring(16)[3], 64, 48, 60.0)[..., 3] > 127)
+
+
+def test_masks_of_ones_are_masks(tmp_path):
+    folder = colmap(tmp_path)
+    for i, pose in enumerate(ring(16)):
+        write(folder / "masks" / f"{i:04d}.png", ball(pose, 64, 48, 60.0)[..., 3] // 255)
+    assert load_view(read_capture(folder).views[0], None).alpha.max() == 255
+
+
+def test_opaque_alpha_is_no_mask(tmp_path):
+    folder = nerf_blender(tmp_path)
+    for path in folder.rglob("*.png"):
+        write(path, np.full((48, 64, 4), 255, np.uint8))
+    capture = read_capture(folder)
+    assert not capture.masked
+    assert load_view(capture.views[0], None).alpha is None
+    assert any("opaque" in warning for warning in capture.warnings)
+
+
+def test_same_name_in_two_folders(tmp_path):
+    folder = nerfstudio(tmp_path)
+
+    def move(data):
+        for i, frame in enumerate(data["frames"]):
+            path = f"images/{'left' if i % 2 else 'right'}/{i // 2:04d}.png"
+            (folder / path).parent.mkdir(exist_ok=True)
+            (folder / frame["file_path"]).rename(folder / path)
+            frame["file_path"] = path
+
+    edit(folder / "transforms.json", move)
+    names = [view.camera.name for view in read_capture(folder).train_views]
+    assert len(set(names)) == len(names) == 14
+    assert "left_0003.png" in names
+
+
+def test_photos_both_trained_and_tested_on_are_warned_of(tmp_path):
+    file = nerf_blender(tmp_path, {"train": 12}) / "transforms_train.json"
+    (tmp_path / "transforms_test.json").write_bytes(file.read_bytes())
+    assert "12 photos are both trained and tested on, first r_0.png" in read_capture(tmp_path).warnings
+
+
+def test_instant_ngp_deleted_photos_are_left_out(tmp_path):
+    folder = nerfstudio(tmp_path)
+    (folder / "images" / "0003.png").unlink()
+    edit(folder / "transforms.json", lambda data: data.update(aabb_scale=4))
+    capture = read_capture(folder)
+    assert len(capture.views) == 15
+    assert "1 of the 16 images" in capture.warnings[0] and "0003.png" in capture.warnings[0]
+
+
+def test_nerfstudio_points(tmp_path):
+    folder = nerfstudio(tmp_path)
+    rows = np.zeros(30, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")])
+    rows["x"], rows["y"], rows["z"], rows["red"] = *CENTRE, 255
+    PlyData([PlyElement.describe(rows, "vertex")]).write(folder / "sparse_pc.ply")
+    edit(folder / "transforms.json", lambda data: data.update(ply_file_path="sparse_pc.ply"))
+    capture = read_capture(folder)
+    back = capture.points @ capture.to_capture[:3, :3].T + capture.to_capture[:3, 3]
+    np.testing.assert_allclose(back, np.tile(CENTRE, (30, 1)), atol=1e-6)
+    np.testing.assert_allclose(capture.point_colors[0], (1, 0, 0))
+
+
+def test_scaled_poses_and_rounding_are_made_rigid(tmp_path):
+    folder = nerf_blender(tmp_path)
+
+    def scale(data):
+        for frame in data["frames"]:
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, :3] = np.round(1.7 * pose[:3, :3], 4)
+            frame["transform_matrix"] = pose.tolist()
+
+    edit(folder / "transforms_train.json", scale)
+    assert_sees_the_ball(read_capture(folder))
+
+
+def test_one_sided_cameras_are_not_taken_for_an_object(tmp_path):
+    poses = [pose for pose in ring(48) if pose[0, 3] > CENTRE[0] + 1.2]
+    capture = read_capture(nerfstudio(tmp_path, poses=poses))
+    assert not capture.bounded and "one side" in capture.bounded_because
+
+
+def test_cameras_that_look_outwards_are_a_room(tmp_path):
+    poses = []
+    for pose in ring(16, distance=0.5):
+        pose[:3, [0, 2]] *= -1  # turned round
+        poses.append(pose)
+    capture = read_capture(nerfstudio(tmp_path, poses=poses))
+    assert not capture.bounded and "outwards" in capture.bounded_because
+
+
+def test_up_is_found_though_cameras_look_down_from_one_side(tmp_path):
+    tilt = np.eye(4)
+    tilt[1:3, 1:3] = [[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]  # the capture's frame leans
+    poses = [tilt @ pose for pose in ring(24)[1:12:2]]
+    capture = read_capture(nerfstudio(tmp_path, poses=poses))
+    up = capture.to_capture[:3, 2] / np.linalg.norm(capture.to_capture[:3, 2])
+    assert np.degrees(np.arccos(up @ tilt[:3, 2])) < 8
+
+
+def test_fingerprint(tmp_path):
+    folder = nerf_blender(tmp_path)
+    first = read_capture(folder).fingerprint()
+    assert first == read_capture(folder).fingerprint()
+    moved = tmp_path.rename(tmp_path.with_name("moved"))
+    assert first == read_capture(moved).fingerprint()
+    file = moved / "transforms_train.json"
+    edit(file, lambda data: data["frames"][2]["transform_matrix"][0].__setitem__(3, 5.0))
+    changed = read_capture(moved).fingerprint()
+    assert changed != first
+    (moved / "train" / "r_1.png").write_bytes((moved / "train" / "r_1.png").read_bytes() + b"\0")
+    assert read_capture(moved).fingerprint() not in (first, changed)
+
+
+def test_json_with_a_byte_order_mark(tmp_path):
+    file = nerfstudio(tmp_path) / "transforms.json"
+    file.write_text(json.dumps(json.loads(file.read_text())), encoding="utf-8-sig")
+    assert len(read_capture(tmp_path).views) == 16
