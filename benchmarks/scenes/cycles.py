@@ -78,8 +78,8 @@ class Renderer:
             path = Path(folder, "view.exr")
             self.scene.render.filepath = str(path)
             bpy.ops.render.render(write_still=True)
-            channels = OpenEXR.File(str(path), separate_channels=True).channels()
-        return _passes({name: channel.pixels for name, channel in channels.items()})
+            parts = OpenEXR.File(str(path), separate_channels=True).parts  # one; a part a pass from Blender 5.0
+            return _passes({name: channel.pixels for part in parts for name, channel in part.channels.items()})
 
     def _object(self, mesh: Mesh, materials: tuple[Material, ...]) -> None:
         data = bpy.data.meshes.new("Object")

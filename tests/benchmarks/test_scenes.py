@@ -1,0 +1,204 @@
+"""Captures with ground truth: the files agree with each other, with the true mesh and with the light."""
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+import trimesh
+from PIL import Image
+from refgs.color import srgb_encode
+
+from benchmarks.scenes.shapes import lathe
+
+ROOT = Path(__file__).parents[2]
+SIZE = 48
+
+
+def run(*arguments, check=True):
+    command = [sys.executable, "-m", "benchmarks.scenes", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=check)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    pytest.importorskip("bpy", reason="Blender as a Python module renders the scenes")
+    out = tmp_path_factory.mktemp("scenes") / "ball"
+    options = ("--size", SIZE, "--train", 2, "--test", 1, "--samples", 64, "--relight", "sunset")
+    return out, run("ball", "--out", out, *options)
+
+
+def read(path):
+    channels = OpenEXR.File(str(path)).channels()
+    assert len(channels) == 1
+    (name, channel), *_ = channels.items()
+    assert channel.pixels.dtype == np.float32
+    return name, channel.pixels.astype(np.float64)
+
+
+def passes(capture):
+    truth = capture[0] / "ground_truth"
+    kinds = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha")
+    return {kind: read(truth / kind / "test_000.exr")[1] for kind in kinds}
+
+
+def camera_rays(capture, per_side=1):
+    """Origin (3,), unit directions (SIZE·n, SIZE·n, 3) and the camera's axis, from the file alone."""
+    transforms = json.loads((capture[0] / "transforms_test.json").read_text())
+    matrix = np.array(transforms["frames"][0]["transform_matrix"])
+    focal = SIZE * per_side / 2 / np.tan(transforms["camera_angle_x"] / 2)
+    assert focal == pytest.approx(transforms["fl_x"] * per_side)
+    pixel = np.arange(SIZE * per_side) + 0.5 - SIZE * per_side / 2
+    x, y = np.meshgrid(pixel / focal, -pixel / focal)
+    directions = np.stack([x, y, -np.ones_like(x)], -1) @ matrix[:3, :3].T
+    return matrix[:3, 3], directions / np.linalg.norm(directions, axis=-1, keepdims=True), -matrix[:3, 2]
+
+
+def test_the_folder_and_the_progress(capture):
+    out, process = capture
+    events = [json.loads(line) for line in process.stdout.splitlines()]
+    assert [event["done"] for event in events] == [1, 2, 3, 4]
+    assert {(event["event"], event["total"]) for event in events} == {("progress", 4)}
+    for split, count in (("train", 2), ("test", 1)):
+        transforms = json.loads((out / f"transforms_{split}.json").read_text())
+        assert len(transforms["frames"]) == count
+        for frame in transforms["frames"]:
+            with Image.open(out / (frame["file_path"] + ".png")) as photo:
+                assert (photo.mode, photo.size) == ("RGBA", (SIZE, SIZE))
+    truth = out / "ground_truth"
+    assert {path.name for path in truth.iterdir()} == {
+        *("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha", "relight", "light.exr", "mesh.ply")
+    }
+    names = {"color": "RGBA", "normal": "RGB", "albedo": "RGB", "relight/sunset": "RGBA"}
+    for kind in ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha", "relight/sunset"):
+        name, pixels = read(truth / kind / "test_000.exr")
+        assert name == names.get(kind, "Y") and pixels.shape[:2] == (SIZE, SIZE)
+    assert read(truth / "relight/sunset.exr")[1].shape == read(truth / "light.exr")[1].shape == (512, 1024, 3)
+    assert [path.name for path in out.parent.iterdir()] == ["ball"], "a temporary folder was left"
+
+
+def test_depth_and_normals_are_the_true_mesh_seen_by_the_camera(capture):
+    images = passes(capture)
+    mesh = trimesh.load(capture[0] / "ground_truth/mesh.ply", process=False)
+    origin, directions, axis = camera_rays(capture)
+    rays = directions.reshape(-1, 3)
+    points, ray, triangle = mesh.ray.intersects_location(np.broadcast_to(origin, rays.shape), rays, multiple_hits=False)
+    hit = np.zeros(SIZE * SIZE, bool)
+    hit[ray] = True
+    alpha = images["alpha"].ravel()
+    clear = np.abs(alpha - 0.5) > 0.4
+    np.testing.assert_array_equal(hit[clear], alpha[clear] > 0.5)
+
+    normals = mesh.face_normals[triangle]
+    depth = (points - origin) @ axis
+    # Away from the silhouette a pixel's mean is close to what its centre sees.
+    inner = (np.einsum("ij,ij->i", normals, -rays[ray]) > 0.4) & (alpha[ray] > 0.999)
+    assert inner.sum() > 500
+    assert np.abs(images["depth"].ravel()[ray] - depth)[inner].max() < 5e-3
+    cosine = np.einsum("ij,ij->i", images["normal"].reshape(-1, 3)[ray], normals)
+    assert np.degrees(np.arccos(cosine[inner].clip(-1, 1))).max() < 1.5
+    np.testing.assert_allclose(np.linalg.norm(images["normal"], axis=-1)[images["alpha"] > 0], 1, atol=1e-5)
+
+
+def test_materials_are_where_they_belong(capture):
+    images = passes(capture)
+    origin, directions, axis = camera_rays(capture)
+    distance = images["depth"] / (directions @ axis)
+    height = np.abs((origin + directions * distance[..., None])[..., 2])
+    inner = images["alpha"] > 0.999
+    for part, color, roughness in (
+        (inner & (height > 0.28), (0.95, 0.93, 0.88), 0.03),
+        (inner & (height < 0.12), (0.70, 0.30, 0.20), 0.40),
+    ):
+        assert part.sum() > 50
+        np.testing.assert_allclose(images["albedo"][part], np.broadcast_to(color, (part.sum(), 3)), atol=1e-5)
+        np.testing.assert_allclose(images["roughness"][part], roughness, atol=1e-5)
+        np.testing.assert_allclose(images["metallic"][part], 1, atol=1e-5)
+
+
+def lookup(panorama, directions):
+    """Radiance of a panorama in Blender's orientation: u = 0.5 − atan2(y, x)/2π, v = 0.5 + asin(z)/π from below."""
+    height, width = panorama.shape[:2]
+    u = 0.5 - np.arctan2(directions[..., 1], directions[..., 0]) / (2 * np.pi)
+    v = 0.5 - np.arcsin(directions[..., 2].clip(-1, 1)) / np.pi
+    return panorama[(v * height).astype(int).clip(0, height - 1), (u * width).astype(int) % width]
+
+
+@pytest.mark.parametrize(
+    ("light", "picture"), [("light.exr", "color/test_000.exr"), ("relight/sunset.exr", "relight/sunset/test_000.exr")]
+)
+def test_the_mirror_shows_the_light_where_it_is(capture, light, picture):
+    truth = capture[0] / "ground_truth"
+    panorama, color = read(truth / light)[1], read(truth / picture)[1]
+    per_side = 8
+    origin, directions, _ = camera_rays(capture, per_side)
+    # The unit sphere, so hits and normals are known without the renderer.
+    along = directions @ -origin
+    discriminant = along**2 - (origin @ origin - 1)
+    distance = along - np.sqrt(discriminant.clip(0))
+    normal = origin + directions * distance[..., None]
+    facing = -(normal * directions).sum(-1)
+    mirrored = directions + 2 * facing[..., None] * normal
+
+    def mean(values):
+        return values.reshape(SIZE, per_side, SIZE, per_side, -1).mean((1, 3))
+
+    good = mean((discriminant > 0) & (facing > 0.7) & (np.abs(normal[..., 2]) > 0.25))[..., 0] == 1
+    assert good.sum() > 100
+
+    def error(turn):
+        expected = mean(lookup(np.roll(panorama, turn, axis=1), mirrored)) * (0.95, 0.93, 0.88)
+        return np.median(np.abs(np.log(color[..., :3][good] / expected[good])))
+
+    assert error(0) < 0.05
+    assert error(512) > 5 * error(0), "a picture that looks the same when the light is turned shows nothing"
+    assert min(error(20), error(-20)) > 2 * error(0)
+
+
+def test_photos_are_straight_alpha_and_srgb(capture):
+    color = passes(capture)["color"]
+    with Image.open(capture[0] / "test/test_000.png") as image:
+        photo = np.asarray(image) / 255
+    alpha = color[..., 3]
+    edge = (alpha > 0.1) & (alpha < 0.9)
+    assert edge.sum() > 20
+    np.testing.assert_allclose(photo[..., 3], alpha, atol=0.5001 / 255)
+    covered = alpha > 0
+    straight = srgb_encode(color[covered][:, :3] / alpha[covered][:, None]).clip(0, 1)
+    np.testing.assert_allclose(photo[covered][:, :3], straight, atol=0.5001 / 255)
+    assert not photo[~covered].any()
+
+
+@pytest.mark.parametrize("name", ["jar", "ball", "rings"])
+def test_meshes_face_outward_and_stand_about_the_origin(name):
+    scene = importlib.import_module(f"benchmarks.scenes.{name}").build()
+    mesh = trimesh.Trimesh(scene.mesh.vertices, scene.mesh.triangles, process=False)
+    assert np.abs(mesh.bounds.mean(0)).max() < 0.01
+    assert all(part.volume > 0 for part in mesh.split(only_watertight=False))
+    assert mesh.area_faces.min() > 0
+    assert set(scene.mesh.material) == set(range(len(scene.materials))) and len(scene.mesh.material) == len(mesh.faces)
+
+
+def test_a_lathe_is_closed_and_its_materials_end_where_the_profile_says():
+    profile = [(0, [(0.0, -1.0), (0.5, -0.9), (0.5, 0.0)]), (1, [(0.5, 0.4), (0.3, 0.9), (0.0, 1.0)])]
+    mesh = lathe(profile, rows=60, columns=24)
+    solid = trimesh.Trimesh(mesh.vertices, mesh.triangles, process=False)
+    assert solid.is_watertight and solid.volume > 0
+    heights = mesh.vertices[mesh.triangles][..., 2]
+    assert heights[mesh.material == 0].max() == pytest.approx(0, abs=1e-9)
+    assert heights[mesh.material == 1].min() == pytest.approx(0, abs=1e-9)
+
+
+def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path):
+    pytest.importorskip("bpy")
+    (tmp_path / "taken").mkdir()
+    for options, words in ((("--out", tmp_path / "taken"), "exists"), (("--relight", "moon"), "no HDRI 'moon'")):
+        out = () if "--out" in options else ("--out", tmp_path / "new")
+        process = run("ball", *out, *options, check=False)
+        assert process.returncode == 2 and process.stdout == ""
+        assert words in process.stderr.splitlines()[-1] and "Traceback" not in process.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
