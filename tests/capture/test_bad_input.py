@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from makers import colmap, edit, nerf_blender, nerfstudio, ring, write
+
 from refgs.capture import load_view, read_cameras, read_capture
 from refgs.errors import InputError
 
@@ -177,6 +178,14 @@ def test_colmap_pose_nan(tmp_path):
     lines[2] = "1 nan 0 0 0 1 2 3 7 0000.png"
     file.write_text("\n".join(lines))
     refused(lambda: read_capture(tmp_path), "0000.png", "NaN")
+
+
+def test_photos_that_differ_in_their_endings_only(tmp_path):
+    folder = nerfstudio(tmp_path)
+    (folder / "images" / "0002.png").rename(folder / "images" / "0003.webp")
+    change = {"file_path": "images/0003.webp"}
+    edit(folder / "transforms.json", lambda data: data["frames"][2].update(change))
+    refused(lambda: read_capture(folder), "2 photos are named 0003")
 
 
 def test_mask_of_another_size(tmp_path):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from makers import ball, colmap, edit, nerf_blender, nerfstudio, ring, write
+
 from refgs.capture import read_capture
 from refgs.capture.check import describe
 from refgs.errors import InputError

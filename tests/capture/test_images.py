@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from makers import colmap, edit, nerf_blender, nerfstudio, write
+
 from refgs.capture import load_view, read_capture
 from refgs.capture.images import read_image
 from refgs.errors import InputError

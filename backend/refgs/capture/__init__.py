@@ -109,9 +109,13 @@ def _unique_names(views: list[View]) -> list[View]:
     def name(view: View) -> str:
         if names[view.split, view.camera.name] == 1:
             return view.camera.name
-        return Path(os.path.relpath(view.image_path, top)).as_posix().replace("/", "_")
+        return Path(os.path.relpath(view.image_path, top)).with_suffix("").as_posix().replace("/", "_")
 
-    return [replace(view, camera=replace(view.camera, name=name(view))) for view in views]
+    views = [replace(view, camera=replace(view.camera, name=name(view))) for view in views]
+    (_, twice), count = Counter((view.split, view.camera.name) for view in views).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"{top}: {count} photos are named {twice}, with different endings. Rename them apart.")
+    return views
 
 
 def _check(folder: Path, views: list[View]) -> None:
