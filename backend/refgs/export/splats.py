@@ -1,0 +1,117 @@
+"""splats.ply: one row a splat, in the property names of 3D Gaussian splatting, with materials."""
+
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from refgs.errors import InputError
+
+
+@dataclass
+class Splats:
+    """N surfels with appearance and materials; float32 numpy arrays.
+
+    positions (N, 3), normals (N, 3) unit and pointing outward where that is known, sh (N, K, 3) spherical harmonics
+    with K = (degree + 1)² and colour = 0.5 + SH (the 3DGS convention), opacities (N,) in 0..1, scales (N, 2) standard
+    deviations in world units, rotations (N, 4) unit quaternions wxyz, albedo (N, 3) linear Rec.709, metallic (N,) and
+    perceptual roughness (N,) in 0..1.
+    """
+
+    positions: np.ndarray
+    normals: np.ndarray
+    sh: np.ndarray
+    opacities: np.ndarray
+    scales: np.ndarray
+    rotations: np.ndarray
+    albedo: np.ndarray
+    metallic: np.ndarray
+    roughness: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+_HEAD = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+_TAIL = ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
+_MATERIAL = ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
+
+
+def write_splats(path: str | os.PathLike, splats: Splats) -> None:
+    """Write a binary little-endian PLY with one `vertex` element; see docs for the properties.
+
+    Opacity is stored as a logit and scales as logarithms, as 3DGS viewers expect; spherical harmonics of the first
+    degree and above are channel-major; materials are stored as they are. Opacities are clipped to 1e-6 .. 1 - 1e-6.
+    """
+    path = Path(path)
+    count, coefficients = splats.sh.shape[:2]
+    opacity = np.clip(splats.opacities.astype(np.float64), 1e-6, 1 - 1e-6)
+    columns = [
+        splats.positions,
+        splats.normals,
+        splats.sh[:, 0],
+        splats.sh[:, 1:].transpose(0, 2, 1).reshape(count, -1),
+        np.log(opacity / (1 - opacity)),
+        np.log(np.maximum(splats.scales.astype(np.float64), 1e-30)),
+        splats.rotations,
+        splats.albedo,
+        splats.metallic,
+        splats.roughness,
+    ]
+    names = [*_HEAD, *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))), *_TAIL, *_MATERIAL]
+    table = np.concatenate([np.reshape(c, (count, -1)) for c in columns], axis=1).astype("<f4")
+    rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names])[:, 0]
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_splats(path: str | os.PathLike) -> Splats:
+    """Read what `write_splats` wrote. Raises InputError for a file that is missing, broken, or without materials."""
+    path = Path(path)
+    try:
+        vertex = PlyData.read(str(path))["vertex"]
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
+    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError):
+        raise InputError(f"{path} is not a whole PLY file of splats: export it again") from None
+    names = {p.name for p in vertex.properties}
+    missing = [name for name in [*_HEAD, *_TAIL, *_MATERIAL] if name not in names]
+    if missing:
+        raise InputError(f"{path} lacks {', '.join(missing)}: it is not a splats.ply that RefGS wrote")
+    rest = sum(name.startswith("f_rest_") for name in names)
+    if rest not in (0, 9, 24, 45):
+        raise InputError(
+            f"{path} has {rest} f_rest values a splat: spherical harmonics of degree 0 to 3 have 0, 9, 24, 45"
+        )
+
+    def columns(*wanted: str) -> np.ndarray:
+        return np.stack([np.asarray(vertex[name], np.float32) for name in wanted], axis=1)
+
+    higher = columns(*(f"f_rest_{i}" for i in range(rest))) if rest else np.zeros((vertex.count, 0), np.float32)
+    splats = Splats(
+        positions=columns("x", "y", "z"),
+        normals=columns("nx", "ny", "nz"),
+        sh=np.concatenate(
+            [
+                columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None],
+                higher.reshape(vertex.count, 3, rest // 3).transpose(0, 2, 1),
+            ],
+            axis=1,
+        ),
+        opacities=1 / (1 + np.exp(-columns("opacity")[:, 0])),
+        scales=np.exp(columns("scale_0", "scale_1")),
+        rotations=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        albedo=columns("albedo_r", "albedo_g", "albedo_b"),
+        metallic=columns("metallic")[:, 0],
+        roughness=columns("roughness")[:, 0],
+    )
+    for field in fields(splats):
+        if not np.isfinite(getattr(splats, field.name)).all():
+            raise InputError(f"{path} holds values that are not finite in its {field.name}: export it again")
+    return splats

@@ -1,0 +1,41 @@
+"""Looking world points up in a camera's image."""
+
+import cv2
+import numpy as np
+
+from refgs.camera import Camera
+
+_ROW = 4096  # cv2.remap takes pictures, not lists: points go through it in rows of this length
+
+
+def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel positions (N, 2) and depths (N,) along the camera's axis, float32, of world points (N, 3).
+
+    Pixel positions of points with depth ≤ 0 mean nothing.
+    """
+    intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    matrix = (intrinsics @ camera.world_to_camera[:3]).astype(np.float32)
+    x, y, z = matrix[:, :3] @ np.asarray(points, np.float32).T + matrix[:, 3:]
+    inverse = 1 / np.where(np.abs(z) > 1e-12, z, np.float32(1e-12))
+    return np.stack([x * inverse, y * inverse], axis=1), z
+
+
+def sample(image: np.ndarray, pixels: np.ndarray, clamp: bool = False) -> np.ndarray:
+    """Values (N,) or (N, C) of a float32 image (H, W) or (H, W, C) at pixel positions (N, 2), bilinear.
+
+    Outside is 0, or with `clamp` the nearest pixel. Pixel centres are at half-integers. OpenCV rounds positions to 1/32 of a pixel.
+    """
+    count = len(pixels)
+    rows = max(1, -(-count // _ROW))
+    maps = np.full((rows * _ROW, 2), -10, np.float32)
+    np.clip(pixels - np.float32(0.5), -10, 32000, out=maps[:count])
+    maps = maps.reshape(rows, _ROW, 2)
+    border = cv2.BORDER_REPLICATE if clamp else cv2.BORDER_CONSTANT
+    values = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=border, borderValue=0)
+    return values.reshape(rows * _ROW, *image.shape[2:])[:count]
+
+
+def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Which points (N,) fall in front of the camera and on its image."""
+    x, y = pixels[:, 0], pixels[:, 1]
+    return (depth > 0) & (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)

@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from refgs.errors import InputError
+from refgs.export.splats import Splats, read_splats, write_splats
+
+
+def make(count=7, coefficients=16):
+    rng = np.random.default_rng(1)
+
+    def f(*shape):
+        return rng.random(shape).astype(np.float32)
+
+    return Splats(
+        positions=f(count, 3) - 0.5,
+        normals=f(count, 3),
+        sh=f(count, coefficients, 3) - 0.5,
+        opacities=0.02 + 0.96 * f(count),
+        scales=1e-3 + f(count, 2),
+        rotations=f(count, 4),
+        albedo=f(count, 3),
+        metallic=f(count),
+        roughness=f(count),
+    )
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+def test_round_trip(tmp_path, coefficients):
+    splats = make(coefficients=coefficients)
+    path = tmp_path / "a run, été.ply"
+    write_splats(path, splats)
+    again = read_splats(path)
+    assert list(tmp_path.iterdir()) == [path]
+    for name, value in vars(splats).items():
+        read = getattr(again, name)
+        assert read.dtype == np.float32 and read.shape == value.shape
+        if name in ("opacities", "scales"):
+            np.testing.assert_allclose(read, value, rtol=2e-6)
+        else:
+            np.testing.assert_array_equal(read, value)
+
+
+def test_layout_is_what_other_programs_expect(tmp_path):
+    splats = make()
+    splats.opacities[0] = 1
+    write_splats(tmp_path / "s.ply", splats)
+    data = PlyData.read(tmp_path / "s.ply")
+    assert not data.text and data.byte_order == "<" and [e.name for e in data.elements] == ["vertex"]
+    vertex = data["vertex"]
+    assert [p.name for p in vertex.properties] == (
+        ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+        + [f"f_rest_{i}" for i in range(45)]
+        + ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
+        + ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
+    )
+    # All of red's fifteen higher coefficients, then green's, then blue's.
+    np.testing.assert_array_equal(vertex["f_rest_2"], splats.sh[:, 3, 0])
+    np.testing.assert_array_equal(vertex["f_rest_15"], splats.sh[:, 1, 1])
+    np.testing.assert_allclose(vertex["scale_1"], np.log(splats.scales[:, 1]), rtol=1e-6)
+    opacity = splats.opacities[1:]
+    np.testing.assert_allclose(vertex["opacity"][1:], np.log(opacity / (1 - opacity)), rtol=1e-4, atol=1e-5)
+    assert np.isfinite(vertex["opacity"]).all()
+
+
+def test_broken_files_are_named(tmp_path):
+    path = tmp_path / "splats.ply"
+    with pytest.raises(InputError, match="cannot read"):
+        read_splats(path)
+    write_splats(path, make())
+    whole = path.read_bytes()
+    for broken in (whole[:-10], whole[:60], b"", b"not a ply file", b"\xff\xfe\x00" * 50):
+        path.write_bytes(broken)
+        with pytest.raises(InputError, match="not a whole PLY"):
+            read_splats(path)
+    path.write_bytes(whole.replace(b"property float roughness", b"property float roughmess"))
+    with pytest.raises(InputError, match="lacks roughness"):
+        read_splats(path)
+    splats = make()
+    splats.positions[2, 1] = np.nan
+    write_splats(path, splats)
+    with pytest.raises(InputError, match="not finite in its positions"):
+        read_splats(path)
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
+    path = tmp_path / "splats.ply"
+    write_splats(path, make())
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("plyfile.PlyElement._write", full)
+    with pytest.raises(OSError):
+        write_splats(path, make(9))
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
