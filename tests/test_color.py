@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+
 from refgs.color import srgb_decode, srgb_encode
 
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import trimesh
-from refgs.color import srgb_encode
-from refgs.errors import InputError
 
 from benchmarks.scenes.cycles import FIELD_OF_VIEW, Renderer
 from benchmarks.scenes.light import read_light, turn_light, write_exr
 from benchmarks.scenes.shapes import Scene
+from refgs.color import srgb_encode
+from refgs.errors import InputError
 
 
 def write_capture(

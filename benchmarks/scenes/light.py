@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
+
 from refgs.errors import InputError
 
 

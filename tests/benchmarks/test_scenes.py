@@ -11,9 +11,9 @@ import OpenEXR
 import pytest
 import trimesh
 from PIL import Image
-from refgs.color import srgb_encode
 
 from benchmarks.scenes.shapes import lathe
+from refgs.color import srgb_encode
 
 ROOT = Path(__file__).parents[2]
 SIZE = 48
