@@ -1,0 +1,100 @@
+"""OpenEXR pictures, and the light as an equirectangular panorama in Blender's orientation."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+from refgs.errors import InputError
+
+# Rec.709 / sRGB: x and y of red, green, blue and the D65 white (ITU-R BT.709-6, table 1).
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+
+
+def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
+    """Write float32 linear Rec.709: (H, W, 4) as premultiplied RGBA, (H, W, 3) as RGB, (H, W) as Y; ZIP, scan lines."""
+    path = Path(path)
+    pixels = np.ascontiguousarray(pixels, np.float32)
+    name = "Y" if pixels.ndim == 2 else {3: "RGB", 4: "RGBA"}[pixels.shape[2]]
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "chromaticities": _REC709,
+    }
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        OpenEXR.File(header, {name: pixels}).write(str(temporary))
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_exr(path: str | os.PathLike) -> np.ndarray:
+    """Read the first part of an EXR as float32: (H, W, 4) RGBA, (H, W, 3) RGB, or (H, W) where it has one channel.
+
+    Raises InputError for a file that is missing, broken, or has none of these.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path} is missing")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: channel.pixels for name, channel in file.channels().items()}
+    except Exception:  # the binding raises RuntimeError, ValueError or its own, by what is broken
+        raise InputError(f"{path} is not a whole OpenEXR file: write or copy it again") from None
+    if {"R", "G", "B"} <= channels.keys():
+        names = [name for name in "RGBA" if name in channels]
+        return np.stack([channels[name] for name in names], axis=-1).astype(np.float32)
+    if len(channels) == 1:
+        return next(iter(channels.values())).astype(np.float32)
+    raise InputError(
+        f"{path} has the channels {', '.join(sorted(channels))}: save it as plain RGB, RGBA or one channel"
+    )
+
+
+def write_environment(path: str | os.PathLike, radiance: np.ndarray) -> None:
+    """Write a panorama (H, W, 3) of linear Rec.709 radiance, in Blender's orientation (see `directions`)."""
+    write_exr(path, radiance)
+
+
+def read_environment(path: str | os.PathLike) -> np.ndarray:
+    """Read a panorama (H, W, 3), float32 linear radiance. Raises InputError where `path` does not hold one.
+
+    Overflown pixels (half-float suns) become the largest half float; NaN and negative radiance becomes 0.
+    """
+    pixels = read_exr(path)
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[..., None], 3, axis=2)
+    height, width = pixels.shape[:2]
+    if width != 2 * height:
+        raise InputError(f"{path} is {width}×{height}: an equirectangular panorama is twice as wide as it is high")
+    return np.nan_to_num(pixels[..., :3], nan=0, posinf=65504, neginf=0).clip(min=0)
+
+
+def directions(height: int, width: int) -> np.ndarray:
+    """Unit directions (height, width, 3), float32, of the panorama's pixel centres, Z up.
+
+    Blender's orientation: u = 0.5 − atan2(y, x)/2π from the left, v = asin(z)/π + 0.5 from the bottom; the first row is
+    the top.
+    """
+    azimuth = 2 * np.pi * (0.5 - (np.arange(width) + 0.5) / width)
+    elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
+    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], axis=-1).astype(np.float32)
+
+
+def sample(panorama: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Radiance (..., C) of a panorama (H, W, C) in directions (..., 3) of any length: bilinear, wrapping sideways."""
+    height, width = panorama.shape[:2]
+    x, y, z = np.moveaxis(np.asarray(directions, np.float32), -1, 0)
+    column = (0.5 - np.arctan2(y, x) / (2 * np.pi)) * width - 0.5
+    row = np.clip((0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * height - 0.5, 0, height - 1)
+    left = np.floor(column).astype(int)
+    top = np.minimum(np.floor(row).astype(int), max(height - 2, 0))
+    bottom = np.minimum(top + 1, height - 1)
+    s, t = (column - left)[..., None], (row - top)[..., None]
+    left, right = left % width, (left + 1) % width
+    above = panorama[top, left] * (1 - s) + panorama[top, right] * s
+    below = panorama[bottom, left] * (1 - s) + panorama[bottom, right] * s
+    return (above * (1 - t) + below * t).astype(np.float32)

@@ -1,0 +1,128 @@
+import numpy as np
+import OpenEXR
+import pytest
+
+from refgs.errors import InputError
+from refgs.export.environment import (
+    directions,
+    read_environment,
+    read_exr,
+    sample,
+    write_environment,
+    write_exr,
+)
+
+RNG = np.random.default_rng(5)
+
+
+@pytest.mark.parametrize("shape", [(9, 7), (9, 7, 3), (9, 7, 4)])
+def test_round_trip(tmp_path, shape):
+    pixels = RNG.normal(size=shape).astype(np.float32) * 1e5
+    path = tmp_path / "un été.exr"
+    write_exr(path, pixels)
+    np.testing.assert_array_equal(read_exr(path), pixels)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_file_says_what_it_is(tmp_path):
+    write_environment(tmp_path / "e.exr", np.ones((4, 8, 3), np.float32))
+    with OpenEXR.File(str(tmp_path / "e.exr")) as file:
+        header = file.header()
+        assert list(file.channels()) == ["RGB"]
+        assert header["compression"] == OpenEXR.ZIP_COMPRESSION
+        np.testing.assert_allclose(
+            header["chromaticities"], (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329), rtol=1e-6
+        )
+
+
+def test_half_float_panoramas_are_read(tmp_path):
+    pixels = np.ones((4, 8, 3), np.float16)
+    pixels[0, 0] = [np.inf, np.nan, -1]
+    header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"RGB": pixels}).write(str(tmp_path / "h.exr"))
+    radiance = read_environment(tmp_path / "h.exr")
+    assert radiance.dtype == np.float32
+    np.testing.assert_array_equal(radiance[0, 0], [65504, 0, 0])
+    np.testing.assert_array_equal(radiance[1:], 1)
+
+
+def test_bad_files_are_named(tmp_path):
+    with pytest.raises(InputError, match="missing"):
+        read_exr(tmp_path / "none.exr")
+    path = tmp_path / "a.exr"
+    write_exr(path, RNG.random((64, 64, 3)))
+    whole = path.read_bytes()
+    for broken in (b"", b"text", whole[:100], whole[: len(whole) // 2]):
+        path.write_bytes(broken)
+        with pytest.raises(InputError, match="not a whole OpenEXR"):
+            read_exr(path)
+    write_exr(path, np.ones((10, 10, 3)))
+    with pytest.raises(InputError, match="10×10"):
+        read_environment(path)
+
+
+def test_six_known_directions():
+    # +x is in the middle, +y a quarter turn to its left, +z at the top: what Blender's background shader looks up.
+    grid = directions(180, 360)
+    np.testing.assert_allclose(np.linalg.norm(grid, axis=-1), 1, atol=1e-6)
+    for row, column, expected in [
+        (90, 180, (1, 0, 0)),
+        (90, 90, (0, 1, 0)),
+        (90, 0, (-1, 0, 0)),
+        (90, 270, (0, -1, 0)),
+        (0, 10, (0, 0, 1)),
+        (179, 10, (0, 0, -1)),
+    ]:
+        assert grid[row, column] @ expected > np.cos(np.radians(1.1))
+
+
+def test_a_bright_texel_comes_back_at_its_direction():
+    grid = directions(32, 64)
+    for row, column in [(3, 0), (16, 63), (16, 31), (31, 40), (0, 5)]:
+        panorama = np.zeros((32, 64, 3), np.float32)
+        panorama[row, column] = (1, 2, 3)
+        np.testing.assert_allclose(sample(panorama, 7 * grid[row, column]), (1, 2, 3), rtol=1e-3)
+        brightest = sample(panorama, grid)[..., 1].argmax()
+        assert brightest == row * 64 + column
+
+
+def test_sampling_is_smooth_across_the_seam_and_finite_at_the_poles():
+    grid = directions(64, 128)
+    panorama = 1 + grid  # a smooth function on the sphere
+    rays = RNG.normal(size=(5000, 3))
+    rays[:4] = [(-1, 1e-7, 0), (-1, -1e-7, 0), (0, 0, 1), (0, 0, -1)]
+    unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    assert np.abs(sample(panorama, rays) - (1 + unit)).max() < 0.05
+    assert np.abs(sample(panorama, rays) - (1 + unit)).mean() < 2e-3
+
+
+def test_blender_sees_the_same_panorama(tmp_path):
+    bpy = pytest.importorskip("bpy")
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    write_environment(tmp_path / "light.exr", 0.5 + 0.4 * directions(64, 128))
+    scene = bpy.context.scene
+    world = scene.world = bpy.data.worlds.new("light")
+    world.use_nodes = True
+    tree = world.node_tree
+    texture = tree.nodes.new("ShaderNodeTexEnvironment")
+    texture.image = bpy.data.images.load(str(tmp_path / "light.exr"))
+    tree.links.new(texture.outputs["Color"], tree.nodes["Background"].inputs["Color"])
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples = 1
+    scene.render.resolution_x = scene.render.resolution_y = 8
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.image_settings.color_depth = "32"
+    # Looking along -z of the camera: at +x, +y and up.
+    for rotation, expected in [
+        ((np.pi / 2, 0, -np.pi / 2), (1, 0, 0)),
+        ((np.pi / 2, 0, 0), (0, 1, 0)),
+        ((np.pi, 0, 0), (0, 0, 1)),
+    ]:
+        camera.rotation_euler = rotation
+        scene.render.filepath = str(tmp_path / "view.exr")
+        bpy.ops.render.render(write_still=True)
+        seen = read_exr(tmp_path / "view.exr")[3:5, 3:5, :3].mean((0, 1))
+        np.testing.assert_allclose(seen, 0.5 + 0.4 * np.array(expected), atol=0.03)
