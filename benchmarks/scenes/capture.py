@@ -11,10 +11,11 @@ import numpy as np
 import trimesh
 
 from benchmarks.scenes.cycles import FIELD_OF_VIEW, Renderer
-from benchmarks.scenes.light import read_light, turn_light, write_exr
+from benchmarks.scenes.light import read_light
 from benchmarks.scenes.shapes import Scene
 from refgs.color import srgb_encode
 from refgs.errors import InputError
+from refgs.export.environment import write_exr
 
 
 def write_capture(
@@ -45,9 +46,10 @@ def write_capture(
     """
     if out.exists():
         raise InputError(f"{out} exists: choose another folder, or remove it")
-    light = turn_light(read_light(scene.light), scene.light_turn) * scene.light_strength
+    light = read_light(scene.light)
     panoramas = {name: read_light(name) for name in relight}
-    distance = np.linalg.norm(scene.mesh.vertices, axis=1).max() / np.sin(FIELD_OF_VIEW / 2)
+    # The object's bounding sphere just fits, with a margin, so that no silhouette touches the edge of a photo.
+    distance = 1.04 * np.linalg.norm(scene.mesh.vertices, axis=1).max() / np.sin(FIELD_OF_VIEW / 2)
     total, done = train + test * (1 + len(relight)), 0
     out.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))

@@ -28,15 +28,12 @@ class Mesh:
 class Scene:
     """An object about the origin, Z up, and how it is photographed.
 
-    `light` names one of Blender's HDRIs, which is turned by `light_turn` (radians, counter-clockwise seen from above)
-    and multiplied by `light_strength`. `lowest` is the smallest z of a camera's direction from the origin.
+    `light` names one of Blender's HDRIs; `lowest` is the smallest z of a camera's direction from the origin.
     """
 
     mesh: Mesh
     materials: tuple[Material, ...]
     light: str
-    light_turn: float = 0.0
-    light_strength: float = 1.0
     lowest: float = -0.3
 
 
