@@ -85,7 +85,11 @@ def _unshifted(features: Tensor, alpha: Tensor, positions: Tensor, pixels: Tenso
     sampled = torch.nn.functional.grid_sample(
         stacked, grid[None, :, None], mode="bilinear", padding_mode="border", align_corners=False
     )[0, :, :, 0]
-    return (sampled[:channels] / sampled[channels].clamp_min(COVERED / 2)).T
+    # At a silhouette the way back leads off the object: there the pixel keeps its own blend.
+    there = sampled[channels]
+    trust = ((there.detach() - SHIFT_ALPHA) / SHIFT_ALPHA).clamp(0, 1)[:, None]
+    moved = (sampled[:channels] / there.clamp_min(SHIFT_ALPHA)).T
+    return trust * moved + (1 - trust) * features[pixels[0], pixels[1]] / here[:, None]
 
 
 def render(
