@@ -1,0 +1,1 @@
+"""The C++ kernels: sources, how they are built and loaded, and the reference that they are tested against."""

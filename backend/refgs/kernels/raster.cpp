@@ -1,0 +1,593 @@
+// Surfels to pixels and back on the CPU: project, sort, bin into tiles, blend front to back; then the derivatives.
+//
+// Every function works on one Raster that the caller allocates. The ones marked `parallel` may be entered by several threads at
+// once: they share the work through `next`, which the caller sets to zero. No result depends on who does what.
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "vector.h"
+
+#include "splat.h"
+
+#if defined(_WIN32)
+#define EXPORT extern "C" __declspec(dllexport)
+#else
+#define EXPORT extern "C" __attribute__((visibility("default")))
+#endif
+
+using refgs::Splat;
+
+namespace {
+
+constexpr int TILE = 16;  // pixels
+constexpr int PIXELS = TILE * TILE;
+constexpr int BLOCK_X = LANES == 4 ? 2 : 4;  // a block is one vector of pixels
+constexpr int BLOCK_Y = LANES / BLOCK_X;
+constexpr int BLOCKS_X = TILE / BLOCK_X, BLOCKS_Y = TILE / BLOCK_Y;
+constexpr int BLOCKS = BLOCKS_X * BLOCKS_Y;
+constexpr int CHUNK = 64;      // splats of a tile that are treated together
+constexpr int GEOMETRY = 16;   // floats of a gradient row before its features; 14 are used
+constexpr int CHANNEL_STEP = LANES == 4 ? 4 : 8;
+
+struct Projected {
+  double n0[3], n1[3], n2[3];  // as in Splat, the origin at the image's corner
+  double x, y;
+  float determinant, n2_min, n2_max, depth, opacity, rho_max;
+  int32_t x0, y0, x1, y1;  // pixels that it can cover, inclusive; x1 < x0 where there are none
+  bool tiles(int& tx0, int& ty0, int& tx1, int& ty1) const {
+    tx0 = x0 / TILE, ty0 = y0 / TILE, tx1 = x1 / TILE, ty1 = y1 / TILE;
+    return x1 >= x0;
+  }
+};
+
+struct Raster {
+  int64_t splats, channels, width, height;
+  const float *positions, *rotations, *scales, *opacities, *features;
+  double view[12];  // world to camera, 3x4, row-major
+  double fx, fy, cx, cy, near;
+  Projected* projected;       // (splats)
+  uint32_t* keys;             // (4 splats) scratch of the sort
+  int32_t* order;             // (visible) splats, front to back
+  int64_t visible, pairs;     // pairs: (splat, tile) that meet
+  int64_t* splat_start;       // (splats + 1) into `places`
+  int64_t* tile_start;        // (tiles + 1) into `members`
+  int32_t* members;           // (pairs) splats of each tile, front to back
+  int32_t* places;            // (pairs) of each splat's tiles, row by row: where in the tile's members it is
+  float *out_features, *out_depth, *out_alpha;
+  int32_t* reach;             // (tiles) members after which every pixel is finished
+  const float *by_features, *by_depth, *by_alpha;
+  int64_t* row_start;         // (tiles + 1) into `rows`
+  float* rows;                // (row_start[tiles], GEOMETRY + padded channels) derivatives of a pair
+  float *by_positions, *by_rotations, *by_scales, *by_opacities, *by_splat_features;
+  int64_t next;
+};
+
+int64_t tiles_x(const Raster& r) { return (r.width + TILE - 1) / TILE; }
+int64_t tiles_y(const Raster& r) { return (r.height + TILE - 1) / TILE; }
+int64_t padded(int64_t channels) { return (channels + CHANNEL_STEP - 1) / CHANNEL_STEP * CHANNEL_STEP; }
+int64_t take(int64_t& next, int64_t n) { return __atomic_fetch_add(&next, n, __ATOMIC_RELAXED); }
+
+struct Vec3 {
+  double x, y, z;
+};
+Vec3 operator+(Vec3 a, Vec3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+Vec3 operator*(double s, Vec3 a) { return {s * a.x, s * a.y, s * a.z}; }
+double dot(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+Vec3 cross(Vec3 a, Vec3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
+
+// A splat in camera space: centre c, axes a = s_u t_u and b = s_v t_v.
+struct Disc {
+  double q[4], norm;  // unit quaternion; the norm it came with, 0 where it had none and stands for the identity
+  Vec3 u, v;          // unit tangents, camera space
+  double scale_u, scale_v;
+  Vec3 a, b, c;
+};
+
+Vec3 rotate(const double* view, Vec3 p) {
+  return {view[0] * p.x + view[1] * p.y + view[2] * p.z, view[4] * p.x + view[5] * p.y + view[6] * p.z,
+          view[8] * p.x + view[9] * p.y + view[10] * p.z};
+}
+
+Vec3 rotate_back(const double* view, Vec3 p) {
+  return {view[0] * p.x + view[4] * p.y + view[8] * p.z, view[1] * p.x + view[5] * p.y + view[9] * p.z,
+          view[2] * p.x + view[6] * p.y + view[10] * p.z};
+}
+
+constexpr double MIN_NORM = 1e-12;  // a quaternion shorter than this says nothing
+
+Disc disc(const Raster& r, int64_t i) {
+  Disc d;
+  const float* q = r.rotations + 4 * i;
+  d.norm = sqrt((double)q[0] * q[0] + (double)q[1] * q[1] + (double)q[2] * q[2] + (double)q[3] * q[3]);
+  if (d.norm < MIN_NORM) d.norm = 0;
+  for (int k = 0; k < 4; k++) d.q[k] = d.norm > 0 ? q[k] / d.norm : k == 0;
+  double w = d.q[0], x = d.q[1], y = d.q[2], z = d.q[3];
+  d.u = rotate(r.view, {1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)});
+  d.v = rotate(r.view, {2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)});
+  d.scale_u = r.scales[2 * i], d.scale_v = r.scales[2 * i + 1];
+  d.a = d.scale_u * d.u, d.b = d.scale_v * d.v;
+  const float* p = r.positions + 3 * i;
+  d.c = rotate(r.view, {p[0], p[1], p[2]}) + Vec3{r.view[3], r.view[7], r.view[11]};
+  return d;
+}
+
+// The factor that makes the coefficients of Eq. 4 of the order of one, and the determinant positive; 0 for a degenerate disc.
+double normaliser(const Raster& r, const Disc& d, Vec3 n0, Vec3 n1, Vec3 n2, double determinant) {
+  double largest = fabs(determinant) / d.c.z;
+  const Vec3 rows[] = {n0, n1, n2};
+  for (Vec3 n : rows) largest = fmax(largest, fmax(fabs(n.x) / r.fx, fabs(n.y) / r.fy));
+  if (!(largest > 0) || fabs(determinant) / d.c.z <= 1e-18 * largest) return 0;
+  return (determinant < 0 ? -1 : 1) / largest;
+}
+
+struct Interval {
+  double low, high;
+};
+
+// Bounds of the image of {c + u a + v b: u^2 + v^2 <= k^2}, wholly in front of the camera, along an image axis whose
+// homogeneous coordinate has the components (au, bu, cu): the tangents to its outline, a conic.
+Interval extent(double au, double bu, double cu, const Disc& d, double k2) {
+  double zz = k2 * (d.a.z * d.a.z + d.b.z * d.b.z) - d.c.z * d.c.z;  // < 0
+  double uz = k2 * (au * d.a.z + bu * d.b.z) - cu * d.c.z;
+  double uu = k2 * (au * au + bu * bu) - cu * cu;
+  double root = sqrt(fmax(uz * uz - uu * zz, 0));
+  return {(uz + root) / zz, (uz - root) / zz};
+}
+
+int32_t pixel(double x, int64_t limit) { return (int32_t)fmin(fmax(x, -1), (double)limit); }
+
+void project(const Raster& r, int64_t i) {
+  Projected& p = r.projected[i];
+  p.x0 = p.y0 = 0, p.x1 = p.y1 = -1;
+  Disc d = disc(r, i);
+  double rho_max = 2 * log(r.opacities[i] / (double)refgs::ALPHA_CUT);
+  if (!(d.c.z >= r.near && d.c.z <= refgs::FAR && rho_max >= 0)) return;
+  p.x = r.fx * d.c.x / d.c.z + r.cx;
+  p.y = r.fy * d.c.y / d.c.z + r.cy;
+  p.depth = d.c.z;
+  p.opacity = r.opacities[i];
+  p.rho_max = rho_max;
+
+  Vec3 n0 = cross(d.b, d.c), n1 = cross(d.c, d.a), n2 = cross(d.a, d.b);
+  double determinant = dot(d.c, n2);
+  double k = normaliser(r, d, n0, n1, n2, determinant);
+  auto affine = [&](Vec3 n, double* out) {
+    out[1] = k * n.x / r.fx, out[2] = k * n.y / r.fy;
+    out[0] = k * n.z - out[1] * r.cx - out[2] * r.cy;
+  };
+  affine(n0, p.n0), affine(n1, p.n1), affine(n2, p.n2);
+  determinant *= k;
+  p.determinant = determinant;
+  p.n2_min = k != 0 ? fmax(determinant / refgs::FAR, 1e-18) : 1;
+  p.n2_max = k != 0 ? determinant / r.near : -1;
+
+  double radius = sqrt(rho_max / refgs::LOW_PASS);
+  Interval x = {p.x - radius, p.x + radius}, y = {p.y - radius, p.y + radius};
+  auto include = [](Interval& a, double low, double high) { a.low = fmin(a.low, low), a.high = fmax(a.high, high); };
+  if (k != 0) {
+    double reach = sqrt(rho_max), slope = sqrt(d.a.z * d.a.z + d.b.z * d.b.z);  // z = c.z + slope t along `t`
+    if (d.c.z - reach * slope >= r.near) {
+      Interval e = extent(d.a.x, d.b.x, d.c.x, d, rho_max);
+      include(x, r.fx * e.low + r.cx, r.fx * e.high + r.cx);
+      e = extent(d.a.y, d.b.y, d.c.y, d, rho_max);
+      include(y, r.fy * e.low + r.cy, r.fy * e.high + r.cy);
+    } else {  // what is left of the disc lies in a rectangle, cut off at the near plane, whose image is convex
+      double eu = d.a.z / slope, ev = d.b.z / slope;
+      const double ts[] = {(r.near - d.c.z) / slope, reach}, ss[] = {-reach, reach};
+      for (double t : ts)
+        for (double s : ss) {
+          Vec3 corner = d.c + (t * eu - s * ev) * d.a + (t * ev + s * eu) * d.b;
+          double z = fmax(corner.z, r.near), px = r.fx * corner.x / z + r.cx, py = r.fy * corner.y / z + r.cy;
+          include(x, px, px), include(y, py, py);
+        }
+    }
+  }
+  const double slack = 1e-3;  // pixels: for the rounding of the tiles' float arithmetic
+  p.x0 = pixel(ceil(x.low - 0.5 - slack), r.width), p.x1 = pixel(floor(x.high - 0.5 + slack), r.width - 1);
+  p.y0 = pixel(ceil(y.low - 0.5 - slack), r.height), p.y1 = pixel(floor(y.high - 0.5 + slack), r.height - 1);
+  if (p.x0 < 0) p.x0 = 0;
+  if (p.y0 < 0) p.y0 = 0;
+  if (p.y1 < p.y0) p.x1 = p.x0 - 1;
+}
+
+struct Tile {
+  int64_t index, x, y, width, height;  // x, y: its first pixel; width, height: its part inside the image
+  Tile(const Raster& r, int64_t i) : index(i), x(i % tiles_x(r) * TILE), y(i / tiles_x(r) * TILE) {
+    width = r.width - x < TILE ? r.width - x : TILE;
+    height = r.height - y < TILE ? r.height - y : TILE;
+  }
+  int64_t pixel(const Raster& r, int px, int py) const { return (y + py) * r.width + x + px; }
+};
+
+// Pixel centres of a tile from its middle, block by block.
+struct Centres {
+  alignas(64) float x[PIXELS], y[PIXELS];
+  constexpr Centres() : x(), y() {
+    for (int i = 0; i < PIXELS; i++) {
+      int block = i / LANES, lane = i % LANES;
+      x[i] = block % BLOCKS_X * BLOCK_X + lane % BLOCK_X + 0.5f - TILE / 2;
+      y[i] = block / BLOCKS_X * BLOCK_Y + lane / BLOCK_X + 0.5f - TILE / 2;
+    }
+  }
+};
+constexpr Centres CENTRES;
+
+int slot(int px, int py) {  // where a tile's pixel is in block order
+  return (py / BLOCK_Y * BLOCKS_X + px / BLOCK_X) * LANES + py % BLOCK_Y * BLOCK_X + px % BLOCK_X;
+}
+
+float near_zero(double x) { return (float)fmin(fmax(x, -1e9), 1e9); }
+
+Splat localise(const Projected& p, const Tile& t) {
+  double x = t.x + TILE / 2, y = t.y + TILE / 2;
+  Splat s;
+  auto shift = [&](const double* n, float* out) {
+    out[0] = n[0] + n[1] * x + n[2] * y, out[1] = n[1], out[2] = n[2];
+  };
+  shift(p.n0, s.n0), shift(p.n1, s.n1), shift(p.n2, s.n2);
+  s.determinant = p.determinant, s.n2_min = p.n2_min, s.n2_max = p.n2_max;
+  s.x = near_zero(p.x - x), s.y = near_zero(p.y - y), s.depth = p.depth;
+  s.opacity = p.opacity, s.rho_max = p.rho_max;
+  return s;
+}
+
+uint64_t bits(int low, int high) { return (~0ull >> (63 - (high - low))) << low; }
+
+// Blocks of the tile that the splat's bounds meet, one bit each.
+uint64_t blocks(const Projected& p, const Tile& t) {
+  int x0 = (int)(p.x0 > t.x ? p.x0 - t.x : 0) / BLOCK_X, x1 = (int)(p.x1 < t.x + TILE ? p.x1 - t.x : TILE - 1) / BLOCK_X;
+  int y0 = (int)(p.y0 > t.y ? p.y0 - t.y : 0) / BLOCK_Y, y1 = (int)(p.y1 < t.y + TILE ? p.y1 - t.y : TILE - 1) / BLOCK_Y;
+  uint64_t row = bits(x0, x1), mask = 0;
+  for (int y = y0; y <= y1; y++) mask |= row << (y * BLOCKS_X);
+  return mask;
+}
+
+// sums[c] += sum_k weights[k] features[which[k]][c], for N channels of a block.
+template <int N>
+void blend(float* sums, const Vector* weights, const float* const* rows, int count, int64_t channel) {
+  Vector s[N];
+  for (int c = 0; c < N; c++) s[c] = load(sums + c * LANES);
+  for (int k = 0; k < count; k++) {
+    const float* row = rows[k] + channel;
+    for (int c = 0; c < N; c++) s[c] += weights[k] * row[c];
+  }
+  for (int c = 0; c < N; c++) store(sums + c * LANES, s[c]);
+}
+
+void blend_all(float* sums, const Vector* weights, const float* const* rows, int count, int64_t channels) {
+  int64_t c = 0;
+  for (; c + 8 <= channels; c += 8) blend<8>(sums + c * LANES, weights, rows, count, c);
+  if (c + 4 <= channels) blend<4>(sums + c * LANES, weights, rows, count, c), c += 4;
+  for (; c < channels; c++) blend<1>(sums + c * LANES, weights, rows, count, c);
+}
+
+struct Scratch {
+  float* memory;
+  explicit Scratch(int64_t floats) { memory = (float*)calloc(floats + 16, sizeof(float)); }
+  ~Scratch() { free(memory); }
+  float* aligned() const { return (float*)(((uintptr_t)memory + 63) & ~(uintptr_t)63); }
+};
+
+void forward_tile(Raster& r, int64_t index, float* sums) {
+  Tile t(r, index);
+  alignas(64) float transmittance[PIXELS], depth[PIXELS], alpha[PIXELS];
+  memset(depth, 0, sizeof depth), memset(alpha, 0, sizeof alpha), memset(transmittance, 0, sizeof transmittance);
+  for (int y = 0; y < t.height; y++)
+    for (int x = 0; x < t.width; x++) transmittance[slot(x, y)] = 1;
+  memset(sums, 0, r.channels * PIXELS * sizeof(float));
+
+  uint64_t live = 0;
+  for (int b = 0; b < BLOCKS; b++) live |= (uint64_t)any(load(transmittance + b * LANES) > 0.0f) << b;
+  const int32_t* members = r.members + r.tile_start[index];
+  int64_t count = r.tile_start[index + 1] - r.tile_start[index], reach = 0;
+  Splat splats[CHUNK];
+  uint8_t lists[BLOCKS][CHUNK];
+  Vector weights[CHUNK];
+  const float* rows[CHUNK];
+  for (int64_t start = 0; start < count && live; start += CHUNK) {
+    int lengths[BLOCKS] = {};
+    int n = (int)(count - start < CHUNK ? count - start : CHUNK);
+    for (int k = 0; k < n; k++) {
+      const Projected& p = r.projected[members[start + k]];
+      splats[k] = localise(p, t);
+      for (uint64_t m = blocks(p, t) & live; m; m &= m - 1) {
+        int b = __builtin_ctzll(m);
+        lists[b][lengths[b]++] = (uint8_t)k;
+      }
+    }
+    for (uint64_t m = live; m; m &= m - 1) {
+      int b = __builtin_ctzll(m), used = 0;
+      Vector x = load(CENTRES.x + b * LANES), y = load(CENTRES.y + b * LANES);
+      Vector T = load(transmittance + b * LANES), Z = load(depth + b * LANES), A = load(alpha + b * LANES);
+      int64_t last = start + n;
+      for (int j = 0; j < lengths[b]; j++) {
+        int k = lists[b][j];
+        const Splat& s = splats[k];
+        auto hit = refgs::intersect<Vector>(s, x, y);
+        Mask covered = hit.covered & (T >= refgs::MIN_TRANSMITTANCE);
+        if (!any(covered)) continue;
+        Vector a = select(covered, refgs::alpha(s, refgs::gaussian(hit)), Vector());
+        Vector w = a * T;
+        T = T * (1.0f - a);
+        Z += w * hit.z;
+        A += w;
+        weights[used] = w;
+        rows[used++] = r.features + members[start + k] * r.channels;
+        if (!any(T >= refgs::MIN_TRANSMITTANCE)) {
+          live &= ~(1ull << b);
+          last = start + k + 1;
+          break;
+        }
+      }
+      if (last > reach) reach = last;
+      store(transmittance + b * LANES, T), store(depth + b * LANES, Z), store(alpha + b * LANES, A);
+      blend_all(sums + b * LANES * r.channels, weights, rows, used, r.channels);
+    }
+  }
+  r.reach[index] = (int32_t)reach;
+  for (int y = 0; y < t.height; y++)
+    for (int x = 0; x < t.width; x++) {
+      int s = slot(x, y);
+      int64_t p = t.pixel(r, x, y);
+      r.out_depth[p] = depth[s], r.out_alpha[p] = alpha[s];
+      const float* from = sums + s / LANES * LANES * r.channels + s % LANES;
+      for (int64_t c = 0; c < r.channels; c++) r.out_features[p * r.channels + c] = from[c * LANES];
+    }
+}
+
+// row[c] += sum over the block's pixels of weight * by_features[pixel][c]
+INLINE void scatter_features(float* row, const float* weights, const float* by_features, int64_t channels) {
+  for (int64_t c = 0; c < channels; c += LANES) {
+    if (LANES == 16 && c + LANES > channels) {  // half a vector is left
+      typedef float Half __attribute__((vector_size(32), aligned(4)));
+      Half s0 = *(const Half*)(row + c), s1 = {};
+      for (int i = 0; i < LANES; i += 2) {
+        s0 += weights[i] * *(const Half*)(by_features + i * channels + c);
+        s1 += weights[i + 1] * *(const Half*)(by_features + (i + 1) * channels + c);
+      }
+      *(Half*)(row + c) = s0 + s1;
+      break;
+    }
+    Vector s0 = load(row + c), s1 = {}, s2 = {}, s3 = {};
+    for (int i = 0; i < LANES; i += 4) {
+      s0 += weights[i] * load(by_features + i * channels + c);
+      s1 += weights[i + 1] * load(by_features + (i + 1) * channels + c);
+      s2 += weights[i + 2] * load(by_features + (i + 2) * channels + c);
+      s3 += weights[i + 3] * load(by_features + (i + 3) * channels + c);
+    }
+    store(row + c, (s0 + s1) + (s2 + s3));
+  }
+}
+
+float total(Vector v) {
+  float lanes[LANES];
+  store(lanes, v);
+  for (int n = LANES / 2; n; n /= 2)
+    for (int i = 0; i < n; i++) lanes[i] += lanes[i + n];
+  return lanes[0];
+}
+
+// Front to back again. What lies behind a splat is what is left of the pixel's total, so one scalar a pixel suffices.
+void backward_tile(Raster& r, int64_t index, float* scratch) {
+  Tile t(r, index);
+  int64_t channels = r.channels, C = padded(channels);
+  float* planes = scratch;              // derivatives by features, (block, channel, lane)
+  float* pixels = planes + PIXELS * C;  // and (block, lane, channel)
+  alignas(64) float transmittance[PIXELS] = {}, by_depth[PIXELS] = {}, by_alpha[PIXELS] = {}, rest[PIXELS] = {};
+  memset(scratch, 0, 2 * PIXELS * C * sizeof(float));
+  for (int y = 0; y < t.height; y++)
+    for (int x = 0; x < t.width; x++) {
+      int s = slot(x, y);
+      int64_t p = t.pixel(r, x, y);
+      transmittance[s] = 1;
+      by_depth[s] = r.by_depth[p], by_alpha[s] = r.by_alpha[p];
+      float sum = by_depth[s] * r.out_depth[p] + by_alpha[s] * r.out_alpha[p];
+      const float *by = r.by_features + p * channels, *out = r.out_features + p * channels;
+      float* plane = planes + s / LANES * LANES * C + s % LANES;
+      for (int64_t c = 0; c < channels; c++) {
+        sum += by[c] * out[c];
+        plane[c * LANES] = by[c];
+      }
+      memcpy(pixels + s * C, by, channels * sizeof(float));
+      rest[s] = sum;
+    }
+  uint64_t live = ~0ull >> (64 - BLOCKS);
+  const int32_t* members = r.members + r.tile_start[index];
+  int64_t count = r.row_start[index + 1] - r.row_start[index];
+  float* row = r.rows + r.row_start[index] * (GEOMETRY + C);
+  for (int64_t k = 0; k < count; k++, row += GEOMETRY + C) {
+    const Projected& p = r.projected[members[k]];
+    const float* features = r.features + members[k] * channels;
+    Splat s = localise(p, t);
+    Vector n0 = {}, n0x = {}, n0y = {}, n1 = {}, n1x = {}, n1y = {}, n2 = {}, n2x = {}, n2y = {};
+    Vector determinant = {}, px = {}, py = {}, depth = {}, opacity = {};
+    memset(row, 0, (GEOMETRY + C) * sizeof(float));
+    for (uint64_t m = blocks(p, t) & live; m; m &= m - 1) {
+      int b = __builtin_ctzll(m);
+      Vector x = load(CENTRES.x + b * LANES), y = load(CENTRES.y + b * LANES), T = load(transmittance + b * LANES);
+      auto hit = refgs::intersect<Vector>(s, x, y);
+      Mask covered = hit.covered & (T >= refgs::MIN_TRANSMITTANCE);
+      if (!any(covered)) continue;
+      Vector g = refgs::gaussian(hit);
+      Vector a = select(covered, refgs::alpha(s, g), Vector());
+      Vector w = a * T, by_z = load(by_depth + b * LANES);
+      const float* plane = planes + b * LANES * C;
+      Vector here = load(by_alpha + b * LANES) + by_z * hit.z, h1 = {}, h2 = {}, h3 = {};
+      int64_t c = 0;
+      for (; c + 4 <= channels; c += 4) {
+        here += features[c] * load(plane + c * LANES);
+        h1 += features[c + 1] * load(plane + (c + 1) * LANES);
+        h2 += features[c + 2] * load(plane + (c + 2) * LANES);
+        h3 += features[c + 3] * load(plane + (c + 3) * LANES);
+      }
+      for (; c < channels; c++) h1 += features[c] * load(plane + c * LANES);
+      here = (here + h1) + (h2 + h3);
+      Vector behind = load(rest + b * LANES) - w * here;
+      Vector by_a = select(covered, T * here - behind / (1.0f - a), Vector());
+      T = T * (1.0f - a);
+      store(rest + b * LANES, behind), store(transmittance + b * LANES, T);
+      if (!any(T >= refgs::MIN_TRANSMITTANCE)) live &= ~(1ull << b);
+      alignas(64) float weights[LANES];
+      store(weights, w);
+      scatter_features(row + GEOMETRY, weights, pixels + b * LANES * C, C);
+
+      auto d = refgs::differentiate(s, hit, g, by_a, w * by_z);
+      n0 += d.n0, n0x += d.n0 * x, n0y += d.n0 * y;
+      n1 += d.n1, n1x += d.n1 * x, n1y += d.n1 * y;
+      n2 += d.n2, n2x += d.n2 * x, n2y += d.n2 * y;
+      determinant += d.determinant, px += d.x, py += d.y, depth += d.depth, opacity += d.opacity;
+    }
+    Vector sums[] = {n0, n0x, n0y, n1, n1x, n1y, n2, n2x, n2y, determinant, px, py, depth, opacity};
+    for (int i = 0; i < 14; i++) row[i] = total(sums[i]);
+  }
+}
+
+float finite(double x) { return (float)fmin(fmax(x, -3.4028234e38), 3.4028234e38); }
+
+// Add up a splat's rows, and carry the derivatives from its projection to its parameters.
+void gather(const Raster& r, int64_t i) {
+  const Projected& p = r.projected[i];
+  int64_t channels = r.channels, stride = GEOMETRY + padded(channels);
+  double n[3][3] = {}, determinant = 0, x = 0, y = 0, depth = 0, opacity = 0;
+  float* by_features = r.by_splat_features + i * channels;
+  for (int64_t c = 0; c < channels; c++) by_features[c] = 0;
+  bool touched = false;
+  int tx0, ty0, tx1, ty1;
+  if (p.tiles(tx0, ty0, tx1, ty1)) {
+    const int32_t* place = r.places + r.splat_start[i];
+    for (int ty = ty0; ty <= ty1; ty++)
+      for (int tx = tx0; tx <= tx1; tx++, place++) {
+        int64_t tile = ty * tiles_x(r) + tx;
+        if (*place >= r.row_start[tile + 1] - r.row_start[tile]) continue;
+        const float* row = r.rows + (r.row_start[tile] + *place) * stride;
+        touched = true;
+        double mx = tx * TILE + TILE / 2, my = ty * TILE + TILE / 2;
+        for (int k = 0; k < 3; k++) {
+          n[k][0] += row[3 * k];
+          n[k][1] += row[3 * k + 1] + mx * row[3 * k];
+          n[k][2] += row[3 * k + 2] + my * row[3 * k];
+        }
+        determinant += row[9], x += row[10], y += row[11], depth += row[12], opacity += row[13];
+        for (int64_t c = 0; c < channels; c++) by_features[c] += row[GEOMETRY + c];
+      }
+  }
+  float *by_position = r.by_positions + 3 * i, *by_rotation = r.by_rotations + 4 * i, *by_scale = r.by_scales + 2 * i;
+  by_position[0] = by_position[1] = by_position[2] = 0;
+  by_rotation[0] = by_rotation[1] = by_rotation[2] = by_rotation[3] = 0;
+  by_scale[0] = by_scale[1] = r.by_opacities[i] = 0;
+  if (!touched) return;
+  r.by_opacities[i] = finite(opacity);
+
+  Disc d = disc(r, i);
+  Vec3 v0 = cross(d.b, d.c), v1 = cross(d.c, d.a), v2 = cross(d.a, d.b);
+  double k = normaliser(r, d, v0, v1, v2, dot(d.c, v2));
+  auto raw = [&](const double* g) {
+    return Vec3{k * (g[1] - g[0] * r.cx) / r.fx, k * (g[2] - g[0] * r.cy) / r.fy, k * g[0]};
+  };
+  determinant *= k;
+  Vec3 g0 = raw(n[0]), g1 = raw(n[1]), g2 = raw(n[2]) + determinant * d.c;
+  Vec3 by_a = cross(g1, d.c) + cross(d.b, g2);
+  Vec3 by_b = cross(d.c, g0) + cross(g2, d.a);
+  Vec3 by_c = cross(g0, d.b) + cross(d.a, g1) + determinant * v2;
+  by_c.x += x * r.fx / d.c.z, by_c.y += y * r.fy / d.c.z;
+  by_c.z += depth - (x * r.fx * d.c.x + y * r.fy * d.c.y) / (d.c.z * d.c.z);
+
+  Vec3 position = rotate_back(r.view, by_c);
+  by_position[0] = finite(position.x), by_position[1] = finite(position.y), by_position[2] = finite(position.z);
+  by_scale[0] = finite(dot(by_a, d.u)), by_scale[1] = finite(dot(by_b, d.v));
+  if (d.norm == 0) return;
+  Vec3 g = rotate_back(r.view, d.scale_u * by_a), h = rotate_back(r.view, d.scale_v * by_b);
+  double qw = d.q[0], qx = d.q[1], qy = d.q[2], qz = d.q[3];
+  double by_q[4] = {2 * (qz * g.y - qy * g.z - qz * h.x + qx * h.z),
+                    2 * (qy * g.y + qz * g.z + qy * h.x - 2 * qx * h.y + qw * h.z),
+                    2 * (-2 * qy * g.x + qx * g.y - qw * g.z + qx * h.x + qz * h.z),
+                    2 * (-2 * qz * g.x + qw * g.y + qx * g.z - qw * h.x - 2 * qz * h.y + qy * h.z)};
+  double along = by_q[0] * qw + by_q[1] * qx + by_q[2] * qy + by_q[3] * qz;
+  for (int j = 0; j < 4; j++) by_rotation[j] = finite((by_q[j] - along * d.q[j]) / d.norm);
+}
+
+}  // namespace
+
+EXPORT int64_t refgs_projected_size() { return sizeof(Projected); }
+EXPORT int64_t refgs_row_size(int64_t channels) { return GEOMETRY + padded(channels); }
+EXPORT int64_t refgs_tiles(const Raster* r) { return tiles_x(*r) * tiles_y(*r); }
+
+// parallel
+EXPORT void refgs_project(Raster* r) {
+  for (int64_t i; (i = take(r->next, 256)) < r->splats;)
+    for (int64_t j = i; j < i + 256 && j < r->splats; j++) project(*r, j);
+}
+
+// Order the visible splats by depth (in float, ties by index) and count the pairs.
+EXPORT void refgs_sort(Raster* r) {
+  int64_t n = 0, pairs = 0;
+  uint32_t *keys = r->keys, *values = keys + r->splats, *keys2 = values + r->splats, *values2 = keys2 + r->splats;
+  int64_t tiles = tiles_x(*r) * tiles_y(*r);
+  memset(r->tile_start, 0, (tiles + 1) * sizeof(int64_t));
+  for (int64_t i = 0; i < r->splats; i++) {
+    const Projected& p = r->projected[i];
+    r->splat_start[i] = pairs;
+    int tx0, ty0, tx1, ty1;
+    if (!p.tiles(tx0, ty0, tx1, ty1)) continue;
+    memcpy(keys + n, &p.depth, 4);  // a positive float's bits are in its order
+    values[n++] = (uint32_t)i;
+    pairs += (int64_t)(tx1 - tx0 + 1) * (ty1 - ty0 + 1);
+    for (int ty = ty0; ty <= ty1; ty++)
+      for (int tx = tx0; tx <= tx1; tx++) r->tile_start[ty * tiles_x(*r) + tx + 1]++;
+  }
+  r->splat_start[r->splats] = r->pairs = pairs;
+  r->visible = n;
+  for (int64_t t = 0; t < tiles; t++) r->tile_start[t + 1] += r->tile_start[t];
+  for (int shift = 0; shift < 33; shift += 11) {
+    uint32_t starts[2049] = {};
+    for (int64_t i = 0; i < n; i++) starts[(keys[i] >> shift & 2047) + 1]++;
+    for (int d = 0; d < 2048; d++) starts[d + 1] += starts[d];
+    for (int64_t i = 0; i < n; i++) {
+      uint32_t to = starts[keys[i] >> shift & 2047]++;
+      keys2[to] = keys[i], values2[to] = values[i];
+    }
+    uint32_t* swap = keys;
+    keys = keys2, keys2 = swap;
+    swap = values, values = values2, values2 = swap;
+  }
+  for (int64_t i = 0; i < n; i++) r->order[i] = (int32_t)values[i];
+}
+
+// Counting scatter of the sorted splats into tiles.
+EXPORT void refgs_bin(Raster* r) {
+  int64_t tiles = tiles_x(*r) * tiles_y(*r);
+  int32_t* counts = (int32_t*)calloc(tiles, sizeof(int32_t));
+  for (int64_t k = 0; k < r->visible; k++) {
+    int32_t i = r->order[k];
+    int32_t* place = r->places + r->splat_start[i];
+    int tx0, ty0, tx1, ty1;
+    r->projected[i].tiles(tx0, ty0, tx1, ty1);
+    for (int ty = ty0; ty <= ty1; ty++)
+      for (int tx = tx0; tx <= tx1; tx++) {
+        int64_t tile = ty * tiles_x(*r) + tx;
+        *place = counts[tile]++;
+        r->members[r->tile_start[tile] + *place++] = i;
+      }
+  }
+  free(counts);
+}
+
+// parallel
+EXPORT void refgs_forward(Raster* r) {
+  Scratch sums(r->channels * PIXELS);
+  for (int64_t t; (t = take(r->next, 1)) < tiles_x(*r) * tiles_y(*r);) forward_tile(*r, t, sums.aligned());
+}
+
+// parallel
+EXPORT void refgs_backward(Raster* r) {
+  Scratch scratch(2 * PIXELS * padded(r->channels));
+  for (int64_t t; (t = take(r->next, 1)) < tiles_x(*r) * tiles_y(*r);) backward_tile(*r, t, scratch.aligned());
+}
+
+// parallel
+EXPORT void refgs_gather(Raster* r) {
+  for (int64_t i; (i = take(r->next, 256)) < r->splats;)
+    for (int64_t j = i; j < i + 256 && j < r->splats; j++) gather(*r, j);
+}

@@ -1,0 +1,103 @@
+// One splat at one pixel: what it covers there, at what depth, and the derivatives. Everything that every backend must
+// agree on is here; F is the number type, `float` or a vector of floats, one lane a pixel.
+//
+// The includer provides, for its F: select(mask, a, b), exp_half(x) = exp(-x/2) for x >= 0, and smaller(a, b).
+#pragma once
+
+#ifdef __CUDACC_RTC__
+#define REFGS_INLINE __device__ __forceinline__
+#else
+#define REFGS_INLINE static inline __attribute__((always_inline))
+#endif
+
+namespace refgs {
+
+constexpr float ALPHA_CUT = 1.0f / 255.0f;  // a splat ends where its alpha falls below this
+constexpr float ALPHA_CAP = 0.99f;          // a single splat never hides what is behind it completely
+constexpr float MIN_TRANSMITTANCE = 1e-4f;  // a pixel is finished below this
+constexpr float LOW_PASS = 2.0f;            // 1 / variance of the screen-space filter, in pixels^-2 (2DGS: sigma = sqrt(2) / 2)
+constexpr double FAR = 1e12;                // depths beyond this are not drawn: keeps every product finite in float
+
+// A splat as a pixel (x, y) sees it, x and y in pixels from any agreed origin. With M = [s_u t_u, s_v t_v, p] in camera
+// space, Eq. 4 reads M (u, v, 1)^T = z (X, Y, 1)^T, so (n0, n1, n2) = k det(M) M^-1 (X, Y, 1)^T is affine in the pixel,
+// u = n0 / n2, v = n1 / n2, z = k det(M) / n2. The factor k is free.
+struct Splat {
+  float n0[3], n1[3], n2[3];  // value at the origin, slope along x, slope along y
+  float determinant;          // k det(M), >= 0
+  float n2_min, n2_max;       // the plane is met between the near plane and FAR where n2_min <= n2 <= n2_max
+  float x, y, depth;          // projected centre, and its depth
+  float opacity;
+  float rho_max;              // alpha >= ALPHA_CUT  <=>  rho <= 2 ln(opacity / ALPHA_CUT)
+};
+
+template <class F>
+struct Hit {
+  F u, v, inverse, dx, dy;  // `inverse` is 1 / n2
+  F rho, z;                 // squared distance in standard deviations; depth
+  decltype(F() < F()) on_plane, covered;
+};
+
+// rho = min(u^2 + v^2, LOW_PASS |pixel - centre|^2), the low-pass of 2DGS; the depth is that of whichever it is. Where the ray
+// misses the plane, or meets it nearer than the near plane, the low-pass alone remains: an edge-on splat is a dot.
+// Comparisons are written so that a NaN (0/0 at a horizon) counts as a miss.
+template <class F>
+REFGS_INLINE Hit<F> intersect(const Splat& s, F x, F y) {
+  Hit<F> h;
+  F n0 = s.n0[0] + s.n0[1] * x + s.n0[2] * y;
+  F n1 = s.n1[0] + s.n1[1] * x + s.n1[2] * y;
+  F n2 = s.n2[0] + s.n2[1] * x + s.n2[2] * y;
+  h.inverse = 1.0f / n2;
+  h.u = n0 * h.inverse;
+  h.v = n1 * h.inverse;
+  h.dx = x - s.x;
+  h.dy = y - s.y;
+  F plane = h.u * h.u + h.v * h.v;
+  F screen = LOW_PASS * (h.dx * h.dx + h.dy * h.dy);
+  h.on_plane = (n2 >= s.n2_min) & (n2 <= s.n2_max) & (plane <= screen);
+  h.rho = select(h.on_plane, plane, screen);
+  h.z = select(h.on_plane, s.determinant * h.inverse, F() + s.depth);
+  h.covered = h.rho <= s.rho_max;
+  return h;
+}
+
+template <class F>
+REFGS_INLINE F gaussian(const Hit<F>& h) {
+  return exp_half(h.rho);
+}
+
+template <class F>
+REFGS_INLINE F alpha(const Splat& s, F gaussian) {
+  return smaller(s.opacity * gaussian, F() + ALPHA_CAP);
+}
+
+// Derivatives of the loss by what Splat holds, at one pixel; those by n0, n1, n2 are by their values at the pixel.
+template <class F>
+struct Derivative {
+  F n0, n1, n2, determinant, x, y, depth, opacity;
+};
+
+// From the derivatives by the pixel's alpha and by the splat's z. Lanes that the splat doesn't cover come out zero if both are.
+template <class F>
+REFGS_INLINE Derivative<F> differentiate(const Splat& s, const Hit<F>& h, F gaussian, F by_alpha, F by_z) {
+  Derivative<F> d;
+  F zero = F();
+  F raw = s.opacity * gaussian;
+  by_alpha = select(raw < ALPHA_CAP, by_alpha, zero);
+  d.opacity = by_alpha * gaussian;
+  F by_rho = -0.5f * raw * by_alpha;
+  F by_rho_plane = select(h.on_plane, by_rho, zero);
+  F by_rho_screen = by_rho - by_rho_plane;
+  F by_z_plane = select(h.on_plane, by_z, zero);
+  F inverse = select(h.on_plane, h.inverse, zero);
+  F scale = 2.0f * by_rho_plane * inverse;
+  d.n0 = select(h.on_plane, scale * h.u, zero);
+  d.n1 = select(h.on_plane, scale * h.v, zero);
+  d.n2 = -inverse * (2.0f * by_rho_plane * h.rho + by_z_plane * h.z);
+  d.determinant = by_z_plane * inverse;
+  d.depth = by_z - by_z_plane;
+  d.x = -2.0f * LOW_PASS * by_rho_screen * h.dx;
+  d.y = -2.0f * LOW_PASS * by_rho_screen * h.dy;
+  return d;
+}
+
+}  // namespace refgs

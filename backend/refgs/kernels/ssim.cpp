@@ -1,0 +1,142 @@
+// Structural similarity of two images (Wang et al. 2004): 11x11 Gaussian window, sigma 1.5, zero padding, and its derivative.
+//
+// Images are (height, width * channels) rows; with the channels interleaved, a neighbour along x is `channels` floats away. Windows
+// are separable: columns first, straight from the image, then rows of what that gave.
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "vector.h"
+
+#if defined(_WIN32)
+#define EXPORT extern "C" __declspec(dllexport)
+#else
+#define EXPORT extern "C" __attribute__((visibility("default")))
+#endif
+
+namespace {
+
+struct Ssim {
+  int64_t height, width, channels;
+  const float *image, *target;
+  float *by_mean, *by_square, *by_product;  // derivatives of a pixel's SSIM by the windowed image, x^2 + y^2 and x y; or null
+  double* sums;                             // (height) of SSIM over a row
+  double scale;                             // of the derivative
+  float* by_image;
+  int64_t next;
+};
+
+constexpr int RADIUS = 5;
+constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
+// exp(-k^2 / (2 1.5^2)) over their sum
+constexpr float WINDOW[RADIUS + 1] = {0.26601171f, 0.21300553f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
+
+// Zeros, a row, zeros: what a window along x may touch.
+struct Lines {
+  int64_t margin, stride;
+  float* memory;
+  Lines(const Ssim& s, int count) {
+    margin = (RADIUS * s.channels + LANES - 1) / LANES * LANES;
+    stride = 2 * margin + s.width * s.channels + LANES;
+    memory = (float*)calloc(count * stride, sizeof(float));
+  }
+  ~Lines() { free(memory); }
+  float* operator[](int i) const { return memory + i * stride + margin; }
+};
+
+INLINE Vector along(const float* line, int64_t step) {
+  Vector sum = WINDOW[0] * load(line);
+  for (int k = 1; k <= RADIUS; k++) sum += WINDOW[k] * (load(line - k * step) + load(line + k * step));
+  return sum;
+}
+
+// Calls body(load, store, x) for a row: the last vector, which may be shorter, through a buffer.
+template <class Body>
+INLINE void each(int64_t n, Body body) {
+  for (int64_t x = 0; x < n; x += LANES) body(x, n - x < LANES ? n - x : LANES);
+}
+
+INLINE Vector read(const float* p, int64_t n) {
+  if (n == LANES) return load(p);
+  float lanes[LANES] = {};
+  memcpy(lanes, p, n * sizeof(float));
+  return load(lanes);
+}
+
+INLINE void write(float* p, Vector v, int64_t n) {
+  if (n == LANES) return store(p, v);
+  float lanes[LANES];
+  store(lanes, v);
+  memcpy(p, lanes, n * sizeof(float));
+}
+
+void forward_row(const Ssim& s, int64_t y, const Lines& lines) {
+  int64_t n = s.width * s.channels;
+  each(n, [&](int64_t i, int64_t count) {
+    Vector x = {}, t = {}, square = {}, product = {};
+    for (int k = -RADIUS; k <= RADIUS; k++) {
+      if (y + k < 0 || y + k >= s.height) continue;
+      Vector a = read(s.image + (y + k) * n + i, count), b = read(s.target + (y + k) * n + i, count);
+      Vector w = Vector() + WINDOW[k < 0 ? -k : k], wa = w * a, wb = w * b;
+      x += wa, t += wb, square += wa * a + wb * b, product += wa * b;
+    }
+    write(lines[0] + i, x, count), write(lines[1] + i, t, count);
+    write(lines[2] + i, square, count), write(lines[3] + i, product, count);
+  });
+  double sum = 0;
+  each(n, [&](int64_t i, int64_t count) {
+    Vector x = along(lines[0] + i, s.channels), t = along(lines[1] + i, s.channels);
+    Vector square = along(lines[2] + i, s.channels), product = along(lines[3] + i, s.channels);
+    Vector xt = x * t, means = x * x + t * t;
+    Vector a1 = 2.0f * xt + C1, a2 = 2.0f * (product - xt) + C2, b1 = means + C1, b2 = square - means + C2;
+    Vector inverse1 = 1.0f / b1, inverse2 = 1.0f / b2, both = inverse1 * inverse2;
+    Vector ssim = a1 * a2 * both;
+    float lanes[LANES];
+    store(lanes, ssim);
+    for (int64_t k = 0; k < count; k++) sum += lanes[k];
+    if (!s.by_mean) return;
+    write(s.by_mean + y * n + i, 2.0f * (t * (a2 - a1) * both + x * ssim * (inverse2 - inverse1)), count);
+    write(s.by_square + y * n + i, -ssim * inverse2, count);
+    write(s.by_product + y * n + i, 2.0f * a1 * both, count);
+  });
+  s.sums[y] = sum;
+}
+
+// The window is symmetric, so the derivative of windowing is windowing.
+void backward_row(const Ssim& s, int64_t y, const Lines& lines) {
+  int64_t n = s.width * s.channels;
+  each(n, [&](int64_t i, int64_t count) {
+    Vector mean = {}, square = {}, product = {};
+    for (int k = -RADIUS; k <= RADIUS; k++) {
+      if (y + k < 0 || y + k >= s.height) continue;
+      float w = WINDOW[k < 0 ? -k : k];
+      int64_t at = (y + k) * n + i;
+      mean += w * read(s.by_mean + at, count), square += w * read(s.by_square + at, count);
+      product += w * read(s.by_product + at, count);
+    }
+    write(lines[0] + i, mean, count), write(lines[1] + i, square, count), write(lines[2] + i, product, count);
+  });
+  each(n, [&](int64_t i, int64_t count) {
+    int64_t at = y * n + i;
+    Vector mean = along(lines[0] + i, s.channels), square = along(lines[1] + i, s.channels);
+    Vector product = along(lines[2] + i, s.channels);
+    Vector by = mean + 2.0f * read(s.image + at, count) * square + read(s.target + at, count) * product;
+    write(s.by_image + at, by * (float)s.scale, count);
+  });
+}
+
+int64_t take(int64_t& next) { return __atomic_fetch_add(&next, 1, __ATOMIC_RELAXED); }
+
+}  // namespace
+
+// parallel
+EXPORT void refgs_ssim_forward(Ssim* s) {
+  Lines lines(*s, 4);
+  for (int64_t y; (y = take(s->next)) < s->height;) forward_row(*s, y, lines);
+}
+
+// parallel
+EXPORT void refgs_ssim_backward(Ssim* s) {
+  Lines lines(*s, 3);
+  for (int64_t y; (y = take(s->next)) < s->height;) backward_row(*s, y, lines);
+}

@@ -1,0 +1,1 @@
+"""Pictures from surfels: rasterising, shading, comparing."""

@@ -1,0 +1,61 @@
+"""The structural dissimilarity of two images."""
+
+import ctypes
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from refgs.kernels.load import kernels, parallel
+
+
+class _Work(ctypes.Structure):
+    """`struct Ssim` of ssim.cpp."""
+
+    _fields_ = (
+        [(n, ctypes.c_int64) for n in ("height", "width", "channels")]
+        + [(n, ctypes.c_void_p) for n in ("image", "target", "by_mean", "by_square", "by_product", "sums")]
+        + [("scale", ctypes.c_double), ("by_image", ctypes.c_void_p), ("next", ctypes.c_int64)]
+    )
+
+
+class _Dssim(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, image, target):
+        image, target = image.contiguous(), target.contiguous()
+        height, width, channels = image.shape
+        work = _Work(height, width, channels, image.data_ptr(), target.data_ptr())
+        sums = torch.empty(height, dtype=torch.float64)
+        work.sums = sums.data_ptr()
+        if ctx.needs_input_grad[0]:
+            ctx.maps = torch.empty(3, height, width, channels)
+            work.by_mean, work.by_square, work.by_product = (m.data_ptr() for m in ctx.maps)
+            ctx.save_for_backward(image, target)
+            ctx.work = work
+        parallel(kernels().refgs_ssim_forward, work)
+        return (1 - sums.sum() / image.numel()).float()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, by_dssim):
+        image, _ = ctx.saved_tensors
+        by_image = torch.empty_like(image)
+        ctx.work.scale = -float(by_dssim) / image.numel()
+        ctx.work.by_image = by_image.data_ptr()
+        parallel(kernels().refgs_ssim_backward, ctx.work)
+        return by_image, None
+
+
+def dssim(image: Tensor, target: Tensor) -> Tensor:
+    """1 − mean SSIM (Wang et al. 2004) of two float32 images (H, W, 3) with values of about [0, 1]; a scalar.
+
+    Each channel by itself, 11×11 Gaussian window with σ 1.5, C1 = 0.01², C2 = 0.03², zeros beyond the border, mean over all
+    pixels. The gradient goes to `image` alone.
+    """
+    if image.shape != target.shape or image.ndim != 3 or image.numel() == 0:
+        raise ValueError(
+            f"expected two images (H, W, C) of one shape, got {tuple(image.shape)} and {tuple(target.shape)}"
+        )
+    if {image.dtype, target.dtype} != {torch.float32} or {image.device.type, target.device.type} != {"cpu"}:
+        raise ValueError("expected float32 images on the CPU")
+    return _Dssim.apply(image, target)
