@@ -13,12 +13,10 @@ from refgs.errors import InputError
 
 HERE = Path(__file__).parent
 SOURCES = ("raster.cpp", "ssim.cpp")
-HEADERS = ("splat.h", "vector.h")
-FLAGS = (
-    "-shared -O3 -std=c++20 -fno-exceptions -fno-rtti -fvisibility=hidden -nostdlib++ "
-    # The same rounding wherever a formula is inlined: fused within an expression, never across.
-    "-ffp-contract=on -fno-math-errno -mprefer-vector-width=512"
-).split()
+HEADERS = ("library.h", "splat.h", "vector.h")
+# -ffp-contract=on: fused within an expression, never across, so that a formula rounds the same wherever it is inlined.
+FLAGS = ["-shared", "-s", "-O3", "-std=c++20", "-fno-exceptions", "-fno-rtti", "-nostdlib", "-fvisibility=hidden"]
+FLAGS += ["-ffp-contract=on", "-fno-math-errno", "-mprefer-vector-width=512"]
 
 
 @dataclass(frozen=True)
@@ -82,8 +80,8 @@ def build(target: Target, cache: Path) -> Path:
         ]
         if target.extension != "dll":
             command.append("-fPIC")
-        # Zig's own cache goes with the scratch folder: it may not be writable elsewhere, and is of no use afterwards.
-        environment = os.environ | {"ZIG_LOCAL_CACHE_DIR": scratch.name, "ZIG_GLOBAL_CACHE_DIR": str(cache / "zig")}
+        # Zig's own cache goes with the scratch folder: tens of megabytes that save nothing the next time.
+        environment = os.environ | {"ZIG_LOCAL_CACHE_DIR": scratch.name, "ZIG_GLOBAL_CACHE_DIR": scratch.name}
         done = subprocess.run(
             [*command, *SOURCES, "-o", str(made)], cwd=HERE, env=environment, capture_output=True, text=True
         )

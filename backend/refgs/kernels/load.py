@@ -16,6 +16,8 @@ from refgs.errors import InputError
 from refgs.kernels.build import build, target
 
 MACHINES = {"AMD64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
+# Functions that return how large a buffer must be, and how many integers they take.
+SIZES = {"refgs_projected_size": 0, "refgs_row_size": 1, "refgs_scratch_size": 1, "refgs_ssim_scratch_size": 2}
 
 
 def supported() -> list[str]:
@@ -35,9 +37,9 @@ def cache_folder() -> Path:
 def _load(isa: str) -> ctypes.CDLL:
     path = build(target(sys.platform, MACHINES[platform.machine()], isa), cache_folder())
     library = ctypes.CDLL(str(path))
-    for name in ("refgs_projected_size", "refgs_row_size", "refgs_tiles"):
+    for name, arguments in SIZES.items():
         getattr(library, name).restype = ctypes.c_int64
-    library.refgs_row_size.argtypes = [ctypes.c_int64]
+        getattr(library, name).argtypes = [ctypes.c_int64] * arguments
     return library
 
 
@@ -76,10 +78,21 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="refgs-kernels")
 
 
-def parallel(function: Callable, work: ctypes.Structure) -> None:
-    """Call `function(&work)` on torch.get_num_threads() threads at once; they share the work through `work.next`."""
-    work.next = 0
+class Shared(ctypes.Structure):
+    """`struct Shared` of library.h."""
+
+    _fields_ = (("next", ctypes.c_int64), ("thread", ctypes.c_int64))
+
+
+def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0) -> None:
+    """Call `function(&work)` on torch.get_num_threads() threads at once; they share the work through `work.shared`.
+
+    Each thread gets `scratch` floats of `work.scratch`.
+    """
     threads = torch.get_num_threads()
+    memory = torch.empty(threads * scratch)
+    work.scratch = memory.data_ptr()
+    work.shared = Shared()
     if threads == 1:
         function(ctypes.byref(work))
     elif openmp := _openmp():

@@ -1,21 +1,11 @@
 // Surfels to pixels and back on the CPU: project, sort, bin into tiles, blend front to back; then the derivatives.
 //
 // Every function works on one Raster that the caller allocates. The ones marked `parallel` may be entered by several threads at
-// once: they share the work through `next`, which the caller sets to zero. No result depends on who does what.
-#include <math.h>
-#include <stdint.h>
-#include <stdlib.h>
-#include <string.h>
-
+// once: they share the work through `shared`, which the caller sets to zero. No result depends on who does what.
+#include "library.h"
 #include "vector.h"
 
 #include "splat.h"
-
-#if defined(_WIN32)
-#define EXPORT extern "C" __declspec(dllexport)
-#else
-#define EXPORT extern "C" __attribute__((visibility("default")))
-#endif
 
 using refgs::Splat;
 
@@ -61,13 +51,13 @@ struct Raster {
   int64_t* row_start;         // (tiles + 1) into `rows`
   float* rows;                // (row_start[tiles], GEOMETRY + padded channels) derivatives of a pair
   float *by_positions, *by_rotations, *by_scales, *by_opacities, *by_splat_features;
-  int64_t next;
+  float* scratch;             // (threads, refgs_scratch_size)
+  Shared shared;
 };
 
 int64_t tiles_x(const Raster& r) { return (r.width + TILE - 1) / TILE; }
 int64_t tiles_y(const Raster& r) { return (r.height + TILE - 1) / TILE; }
 int64_t padded(int64_t channels) { return (channels + CHANNEL_STEP - 1) / CHANNEL_STEP * CHANNEL_STEP; }
-int64_t take(int64_t& next, int64_t n) { return __atomic_fetch_add(&next, n, __ATOMIC_RELAXED); }
 
 struct Vec3 {
   double x, y, z;
@@ -100,7 +90,7 @@ constexpr double MIN_NORM = 1e-12;  // a quaternion shorter than this says nothi
 Disc disc(const Raster& r, int64_t i) {
   Disc d;
   const float* q = r.rotations + 4 * i;
-  d.norm = sqrt((double)q[0] * q[0] + (double)q[1] * q[1] + (double)q[2] * q[2] + (double)q[3] * q[3]);
+  d.norm = __builtin_sqrt((double)q[0] * q[0] + (double)q[1] * q[1] + (double)q[2] * q[2] + (double)q[3] * q[3]);
   if (d.norm < MIN_NORM) d.norm = 0;
   for (int k = 0; k < 4; k++) d.q[k] = d.norm > 0 ? q[k] / d.norm : k == 0;
   double w = d.q[0], x = d.q[1], y = d.q[2], z = d.q[3];
@@ -115,10 +105,10 @@ Disc disc(const Raster& r, int64_t i) {
 
 // The factor that makes the coefficients of Eq. 4 of the order of one, and the determinant positive; 0 for a degenerate disc.
 double normaliser(const Raster& r, const Disc& d, Vec3 n0, Vec3 n1, Vec3 n2, double determinant) {
-  double largest = fabs(determinant) / d.c.z;
+  double largest = __builtin_fabs(determinant) / d.c.z;
   const Vec3 rows[] = {n0, n1, n2};
-  for (Vec3 n : rows) largest = fmax(largest, fmax(fabs(n.x) / r.fx, fabs(n.y) / r.fy));
-  if (!(largest > 0) || fabs(determinant) / d.c.z <= 1e-18 * largest) return 0;
+  for (Vec3 n : rows) largest = __builtin_fmax(largest, __builtin_fmax(__builtin_fabs(n.x) / r.fx, __builtin_fabs(n.y) / r.fy));
+  if (!(largest > 0) || __builtin_fabs(determinant) / d.c.z <= 1e-18 * largest) return 0;
   return (determinant < 0 ? -1 : 1) / largest;
 }
 
@@ -132,17 +122,17 @@ Interval extent(double au, double bu, double cu, const Disc& d, double k2) {
   double zz = k2 * (d.a.z * d.a.z + d.b.z * d.b.z) - d.c.z * d.c.z;  // < 0
   double uz = k2 * (au * d.a.z + bu * d.b.z) - cu * d.c.z;
   double uu = k2 * (au * au + bu * bu) - cu * cu;
-  double root = sqrt(fmax(uz * uz - uu * zz, 0));
+  double root = __builtin_sqrt(__builtin_fmax(uz * uz - uu * zz, 0));
   return {(uz + root) / zz, (uz - root) / zz};
 }
 
-int32_t pixel(double x, int64_t limit) { return (int32_t)fmin(fmax(x, -1), (double)limit); }
+int32_t pixel(double x, int64_t limit) { return (int32_t)__builtin_fmin(__builtin_fmax(x, -1), (double)limit); }
 
 void project(const Raster& r, int64_t i) {
   Projected& p = r.projected[i];
   p.x0 = p.y0 = 0, p.x1 = p.y1 = -1;
   Disc d = disc(r, i);
-  double rho_max = 2 * log(r.opacities[i] / (double)refgs::ALPHA_CUT);
+  double rho_max = 2 * __builtin_log(r.opacities[i] / (double)refgs::ALPHA_CUT);
   if (!(d.c.z >= r.near && d.c.z <= refgs::FAR && rho_max >= 0)) return;
   p.x = r.fx * d.c.x / d.c.z + r.cx;
   p.y = r.fy * d.c.y / d.c.z + r.cy;
@@ -160,14 +150,14 @@ void project(const Raster& r, int64_t i) {
   affine(n0, p.n0), affine(n1, p.n1), affine(n2, p.n2);
   determinant *= k;
   p.determinant = determinant;
-  p.n2_min = k != 0 ? fmax(determinant / refgs::FAR, 1e-18) : 1;
+  p.n2_min = k != 0 ? __builtin_fmax(determinant / refgs::FAR, 1e-18) : 1;
   p.n2_max = k != 0 ? determinant / r.near : -1;
 
-  double radius = sqrt(rho_max / refgs::LOW_PASS);
+  double radius = __builtin_sqrt(rho_max / refgs::LOW_PASS);
   Interval x = {p.x - radius, p.x + radius}, y = {p.y - radius, p.y + radius};
-  auto include = [](Interval& a, double low, double high) { a.low = fmin(a.low, low), a.high = fmax(a.high, high); };
+  auto include = [](Interval& a, double low, double high) { a.low = __builtin_fmin(a.low, low), a.high = __builtin_fmax(a.high, high); };
   if (k != 0) {
-    double reach = sqrt(rho_max), slope = sqrt(d.a.z * d.a.z + d.b.z * d.b.z);  // z = c.z + slope t along `t`
+    double reach = __builtin_sqrt(rho_max), slope = __builtin_sqrt(d.a.z * d.a.z + d.b.z * d.b.z);  // z = c.z + slope t along `t`
     if (d.c.z - reach * slope >= r.near) {
       Interval e = extent(d.a.x, d.b.x, d.c.x, d, rho_max);
       include(x, r.fx * e.low + r.cx, r.fx * e.high + r.cx);
@@ -179,14 +169,14 @@ void project(const Raster& r, int64_t i) {
       for (double t : ts)
         for (double s : ss) {
           Vec3 corner = d.c + (t * eu - s * ev) * d.a + (t * ev + s * eu) * d.b;
-          double z = fmax(corner.z, r.near), px = r.fx * corner.x / z + r.cx, py = r.fy * corner.y / z + r.cy;
+          double z = __builtin_fmax(corner.z, r.near), px = r.fx * corner.x / z + r.cx, py = r.fy * corner.y / z + r.cy;
           include(x, px, px), include(y, py, py);
         }
     }
   }
   const double slack = 1e-3;  // pixels: for the rounding of the tiles' float arithmetic
-  p.x0 = pixel(ceil(x.low - 0.5 - slack), r.width), p.x1 = pixel(floor(x.high - 0.5 + slack), r.width - 1);
-  p.y0 = pixel(ceil(y.low - 0.5 - slack), r.height), p.y1 = pixel(floor(y.high - 0.5 + slack), r.height - 1);
+  p.x0 = pixel(__builtin_ceil(x.low - 0.5 - slack), r.width), p.x1 = pixel(__builtin_floor(x.high - 0.5 + slack), r.width - 1);
+  p.y0 = pixel(__builtin_ceil(y.low - 0.5 - slack), r.height), p.y1 = pixel(__builtin_floor(y.high - 0.5 + slack), r.height - 1);
   if (p.x0 < 0) p.x0 = 0;
   if (p.y0 < 0) p.y0 = 0;
   if (p.y1 < p.y0) p.x1 = p.x0 - 1;
@@ -218,7 +208,7 @@ int slot(int px, int py) {  // where a tile's pixel is in block order
   return (py / BLOCK_Y * BLOCKS_X + px / BLOCK_X) * LANES + py % BLOCK_Y * BLOCK_X + px % BLOCK_X;
 }
 
-float near_zero(double x) { return (float)fmin(fmax(x, -1e9), 1e9); }
+float near_zero(double x) { return (float)__builtin_fmin(__builtin_fmax(x, -1e9), 1e9); }
 
 Splat localise(const Projected& p, const Tile& t) {
   double x = t.x + TILE / 2, y = t.y + TILE / 2;
@@ -263,20 +253,13 @@ void blend_all(float* sums, const Vector* weights, const float* const* rows, int
   for (; c < channels; c++) blend<1>(sums + c * LANES, weights, rows, count, c);
 }
 
-struct Scratch {
-  float* memory;
-  explicit Scratch(int64_t floats) { memory = (float*)calloc(floats + 16, sizeof(float)); }
-  ~Scratch() { free(memory); }
-  float* aligned() const { return (float*)(((uintptr_t)memory + 63) & ~(uintptr_t)63); }
-};
-
 void forward_tile(Raster& r, int64_t index, float* sums) {
   Tile t(r, index);
   alignas(64) float transmittance[PIXELS], depth[PIXELS], alpha[PIXELS];
-  memset(depth, 0, sizeof depth), memset(alpha, 0, sizeof alpha), memset(transmittance, 0, sizeof transmittance);
+  __builtin_memset(depth, 0, sizeof depth), __builtin_memset(alpha, 0, sizeof alpha), __builtin_memset(transmittance, 0, sizeof transmittance);
   for (int y = 0; y < t.height; y++)
     for (int x = 0; x < t.width; x++) transmittance[slot(x, y)] = 1;
-  memset(sums, 0, r.channels * PIXELS * sizeof(float));
+  __builtin_memset(sums, 0, r.channels * PIXELS * sizeof(float));
 
   uint64_t live = 0;
   for (int b = 0; b < BLOCKS; b++) live |= (uint64_t)any(load(transmittance + b * LANES) > 0.0f) << b;
@@ -376,7 +359,7 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
   float* planes = scratch;              // derivatives by features, (block, channel, lane)
   float* pixels = planes + PIXELS * C;  // and (block, lane, channel)
   alignas(64) float transmittance[PIXELS] = {}, by_depth[PIXELS] = {}, by_alpha[PIXELS] = {}, rest[PIXELS] = {};
-  memset(scratch, 0, 2 * PIXELS * C * sizeof(float));
+  __builtin_memset(scratch, 0, 2 * PIXELS * C * sizeof(float));
   for (int y = 0; y < t.height; y++)
     for (int x = 0; x < t.width; x++) {
       int s = slot(x, y);
@@ -390,7 +373,7 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
         sum += by[c] * out[c];
         plane[c * LANES] = by[c];
       }
-      memcpy(pixels + s * C, by, channels * sizeof(float));
+      __builtin_memcpy(pixels + s * C, by, channels * sizeof(float));
       rest[s] = sum;
     }
   uint64_t live = ~0ull >> (64 - BLOCKS);
@@ -403,7 +386,7 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
     Splat s = localise(p, t);
     Vector n0 = {}, n0x = {}, n0y = {}, n1 = {}, n1x = {}, n1y = {}, n2 = {}, n2x = {}, n2y = {};
     Vector determinant = {}, px = {}, py = {}, depth = {}, opacity = {};
-    memset(row, 0, (GEOMETRY + C) * sizeof(float));
+    __builtin_memset(row, 0, (GEOMETRY + C) * sizeof(float));
     for (uint64_t m = blocks(p, t) & live; m; m &= m - 1) {
       int b = __builtin_ctzll(m);
       Vector x = load(CENTRES.x + b * LANES), y = load(CENTRES.y + b * LANES), T = load(transmittance + b * LANES);
@@ -444,7 +427,7 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
   }
 }
 
-float finite(double x) { return (float)fmin(fmax(x, -3.4028234e38), 3.4028234e38); }
+float finite(double x) { return (float)__builtin_fmin(__builtin_fmax(x, -3.4028234e38), 3.4028234e38); }
 
 // Add up a splat's rows, and carry the derivatives from its projection to its parameters.
 void gather(const Raster& r, int64_t i) {
@@ -512,11 +495,11 @@ void gather(const Raster& r, int64_t i) {
 
 EXPORT int64_t refgs_projected_size() { return sizeof(Projected); }
 EXPORT int64_t refgs_row_size(int64_t channels) { return GEOMETRY + padded(channels); }
-EXPORT int64_t refgs_tiles(const Raster* r) { return tiles_x(*r) * tiles_y(*r); }
+EXPORT int64_t refgs_scratch_size(int64_t channels) { return 2 * PIXELS * padded(channels); }
 
 // parallel
 EXPORT void refgs_project(Raster* r) {
-  for (int64_t i; (i = take(r->next, 256)) < r->splats;)
+  for (int64_t i; (i = take(r->shared.next, 256)) < r->splats;)
     for (int64_t j = i; j < i + 256 && j < r->splats; j++) project(*r, j);
 }
 
@@ -525,13 +508,13 @@ EXPORT void refgs_sort(Raster* r) {
   int64_t n = 0, pairs = 0;
   uint32_t *keys = r->keys, *values = keys + r->splats, *keys2 = values + r->splats, *values2 = keys2 + r->splats;
   int64_t tiles = tiles_x(*r) * tiles_y(*r);
-  memset(r->tile_start, 0, (tiles + 1) * sizeof(int64_t));
+  __builtin_memset(r->tile_start, 0, (tiles + 1) * sizeof(int64_t));
   for (int64_t i = 0; i < r->splats; i++) {
     const Projected& p = r->projected[i];
     r->splat_start[i] = pairs;
     int tx0, ty0, tx1, ty1;
     if (!p.tiles(tx0, ty0, tx1, ty1)) continue;
-    memcpy(keys + n, &p.depth, 4);  // a positive float's bits are in its order
+    __builtin_memcpy(keys + n, &p.depth, 4);  // a positive float's bits are in its order
     values[n++] = (uint32_t)i;
     pairs += (int64_t)(tx1 - tx0 + 1) * (ty1 - ty0 + 1);
     for (int ty = ty0; ty <= ty1; ty++)
@@ -557,8 +540,8 @@ EXPORT void refgs_sort(Raster* r) {
 
 // Counting scatter of the sorted splats into tiles.
 EXPORT void refgs_bin(Raster* r) {
-  int64_t tiles = tiles_x(*r) * tiles_y(*r);
-  int32_t* counts = (int32_t*)calloc(tiles, sizeof(int32_t));
+  int32_t* counts = r->reach;  // not in use yet
+  __builtin_memset(counts, 0, tiles_x(*r) * tiles_y(*r) * sizeof(int32_t));
   for (int64_t k = 0; k < r->visible; k++) {
     int32_t i = r->order[k];
     int32_t* place = r->places + r->splat_start[i];
@@ -571,23 +554,22 @@ EXPORT void refgs_bin(Raster* r) {
         r->members[r->tile_start[tile] + *place++] = i;
       }
   }
-  free(counts);
 }
 
 // parallel
 EXPORT void refgs_forward(Raster* r) {
-  Scratch sums(r->channels * PIXELS);
-  for (int64_t t; (t = take(r->next, 1)) < tiles_x(*r) * tiles_y(*r);) forward_tile(*r, t, sums.aligned());
+  float* scratch = r->scratch + take(r->shared.thread, 1) * refgs_scratch_size(r->channels);
+  for (int64_t t; (t = take(r->shared.next, 1)) < tiles_x(*r) * tiles_y(*r);) forward_tile(*r, t, scratch);
 }
 
 // parallel
 EXPORT void refgs_backward(Raster* r) {
-  Scratch scratch(2 * PIXELS * padded(r->channels));
-  for (int64_t t; (t = take(r->next, 1)) < tiles_x(*r) * tiles_y(*r);) backward_tile(*r, t, scratch.aligned());
+  float* scratch = r->scratch + take(r->shared.thread, 1) * refgs_scratch_size(r->channels);
+  for (int64_t t; (t = take(r->shared.next, 1)) < tiles_x(*r) * tiles_y(*r);) backward_tile(*r, t, scratch);
 }
 
 // parallel
 EXPORT void refgs_gather(Raster* r) {
-  for (int64_t i; (i = take(r->next, 256)) < r->splats;)
+  for (int64_t i; (i = take(r->shared.next, 256)) < r->splats;)
     for (int64_t j = i; j < i + 256 && j < r->splats; j++) gather(*r, j);
 }

@@ -2,17 +2,8 @@
 //
 // Images are (height, width * channels) rows; with the channels interleaved, a neighbour along x is `channels` floats away. Windows
 // are separable: columns first, straight from the image, then rows of what that gave.
-#include <stdint.h>
-#include <stdlib.h>
-#include <string.h>
-
+#include "library.h"
 #include "vector.h"
-
-#if defined(_WIN32)
-#define EXPORT extern "C" __declspec(dllexport)
-#else
-#define EXPORT extern "C" __attribute__((visibility("default")))
-#endif
 
 namespace {
 
@@ -23,7 +14,8 @@ struct Ssim {
   double* sums;                             // (height) of SSIM over a row
   double scale;                             // of the derivative
   float* by_image;
-  int64_t next;
+  float* scratch;                           // (threads, refgs_ssim_scratch_size)
+  Shared shared;
 };
 
 constexpr int RADIUS = 5;
@@ -31,16 +23,18 @@ constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
 // exp(-k^2 / (2 1.5^2)) over their sum
 constexpr float WINDOW[RADIUS + 1] = {0.26601171f, 0.21300553f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
 
-// Zeros, a row, zeros: what a window along x may touch.
+// Of a thread: four rows with zeros around, as far as a window along x may reach.
 struct Lines {
   int64_t margin, stride;
   float* memory;
-  Lines(const Ssim& s, int count) {
-    margin = (RADIUS * s.channels + LANES - 1) / LANES * LANES;
-    stride = 2 * margin + s.width * s.channels + LANES;
-    memory = (float*)calloc(count * stride, sizeof(float));
+  Lines(int64_t width, int64_t channels) : memory() {
+    margin = (RADIUS * channels + LANES - 1) / LANES * LANES;
+    stride = 2 * margin + (width * channels + LANES - 1) / LANES * LANES;
   }
-  ~Lines() { free(memory); }
+  explicit Lines(Ssim& s) : Lines(s.width, s.channels) {
+    memory = s.scratch + take(s.shared.thread, 1) * 4 * stride;
+    __builtin_memset(memory, 0, 4 * stride * sizeof(float));
+  }
   float* operator[](int i) const { return memory + i * stride + margin; }
 };
 
@@ -50,7 +44,7 @@ INLINE Vector along(const float* line, int64_t step) {
   return sum;
 }
 
-// Calls body(load, store, x) for a row: the last vector, which may be shorter, through a buffer.
+// body(first, count) for each vector of a row; the last may be shorter.
 template <class Body>
 INLINE void each(int64_t n, Body body) {
   for (int64_t x = 0; x < n; x += LANES) body(x, n - x < LANES ? n - x : LANES);
@@ -59,7 +53,7 @@ INLINE void each(int64_t n, Body body) {
 INLINE Vector read(const float* p, int64_t n) {
   if (n == LANES) return load(p);
   float lanes[LANES] = {};
-  memcpy(lanes, p, n * sizeof(float));
+  __builtin_memcpy(lanes, p, n * sizeof(float));
   return load(lanes);
 }
 
@@ -67,7 +61,7 @@ INLINE void write(float* p, Vector v, int64_t n) {
   if (n == LANES) return store(p, v);
   float lanes[LANES];
   store(lanes, v);
-  memcpy(p, lanes, n * sizeof(float));
+  __builtin_memcpy(p, lanes, n * sizeof(float));
 }
 
 void forward_row(const Ssim& s, int64_t y, const Lines& lines) {
@@ -125,18 +119,23 @@ void backward_row(const Ssim& s, int64_t y, const Lines& lines) {
   });
 }
 
-int64_t take(int64_t& next) { return __atomic_fetch_add(&next, 1, __ATOMIC_RELAXED); }
-
 }  // namespace
+
+EXPORT int64_t refgs_ssim_scratch_size(int64_t width, int64_t channels) { return 4 * Lines(width, channels).stride; }
 
 // parallel
 EXPORT void refgs_ssim_forward(Ssim* s) {
-  Lines lines(*s, 4);
-  for (int64_t y; (y = take(s->next)) < s->height;) forward_row(*s, y, lines);
+  Lines lines(*s);
+  for (int64_t y; (y = take(s->shared.next, 1)) < s->height;) forward_row(*s, y, lines);
 }
 
 // parallel
 EXPORT void refgs_ssim_backward(Ssim* s) {
-  Lines lines(*s, 3);
-  for (int64_t y; (y = take(s->next)) < s->height;) backward_row(*s, y, lines);
+  Lines lines(*s);
+  for (int64_t y; (y = take(s->shared.next, 1)) < s->height;) backward_row(*s, y, lines);
 }
+
+#if defined(_WIN32)
+extern "C" int _fltused = 0;  // names that Windows' linker wants
+extern "C" int _DllMainCRTStartup(void*, unsigned, void*) { return 1; }
+#endif

@@ -8,7 +8,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
-from refgs.kernels.load import kernels, parallel
+from refgs.kernels.load import Shared, kernels, parallel
+
+TILE = 16  # pixels; as in raster.cpp
 
 
 class Raster(NamedTuple):
@@ -37,7 +39,7 @@ class _Work(ctypes.Structure):
         + [(n, ctypes.c_void_p) for n in ("out_features", "out_depth", "out_alpha", "reach")]
         + [(n, ctypes.c_void_p) for n in ("by_features", "by_depth", "by_alpha", "row_start", "rows")]
         + [(n, ctypes.c_void_p) for n in ("by_positions", "by_rotations", "by_scales", "by_opacities")]
-        + [("by_splat_features", ctypes.c_void_p), ("next", ctypes.c_int64)]
+        + [("by_splat_features", ctypes.c_void_p), ("scratch", ctypes.c_void_p), ("shared", Shared)]
     )
 
     def attach(self, **tensors: Tensor) -> None:
@@ -53,7 +55,7 @@ def _project_and_bin(work: _Work, camera: Camera, near: float) -> dict[str, Tens
     work.width, work.height = camera.width, camera.height
     work.view[:] = camera.world_to_camera[:3].reshape(-1).tolist()
     work.fx, work.fy, work.cx, work.cy, work.near = camera.fx, camera.fy, camera.cx, camera.cy, near
-    tiles = library.refgs_tiles(ctypes.byref(work))
+    tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
     bins = {
         "projected": torch.empty(n * library.refgs_projected_size(), dtype=torch.uint8),
         "order": torch.empty(n, dtype=torch.int32),
@@ -93,7 +95,8 @@ class _Rasterize(torch.autograd.Function):
             "out_alpha": torch.empty(camera.height, camera.width),
         }
         work.attach(**outputs)
-        parallel(kernels().refgs_forward, work)
+        library = kernels()
+        parallel(library.refgs_forward, work, library.refgs_scratch_size(work.channels))
         ctx.save_for_backward(*inputs.values(), *outputs.values())
         ctx.work, ctx.bins = work, bins
         return tuple(outputs.values())
@@ -120,7 +123,7 @@ class _Rasterize(torch.autograd.Function):
             "by_splat_features": torch.empty_like(saved[4]),
         }
         work.attach(**buffers, **gradients)
-        parallel(library.refgs_backward, work)
+        parallel(library.refgs_backward, work, library.refgs_scratch_size(work.channels))
         parallel(library.refgs_gather, work)
         return *gradients.values(), None, None
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from refgs.kernels.load import kernels, parallel
+from refgs.kernels.load import Shared, kernels, parallel
 
 
 class _Work(ctypes.Structure):
@@ -15,7 +15,7 @@ class _Work(ctypes.Structure):
     _fields_ = (
         [(n, ctypes.c_int64) for n in ("height", "width", "channels")]
         + [(n, ctypes.c_void_p) for n in ("image", "target", "by_mean", "by_square", "by_product", "sums")]
-        + [("scale", ctypes.c_double), ("by_image", ctypes.c_void_p), ("next", ctypes.c_int64)]
+        + [("scale", ctypes.c_double), ("by_image", ctypes.c_void_p), ("scratch", ctypes.c_void_p), ("shared", Shared)]
     )
 
 
@@ -32,7 +32,8 @@ class _Dssim(torch.autograd.Function):
             work.by_mean, work.by_square, work.by_product = (m.data_ptr() for m in ctx.maps)
             ctx.save_for_backward(image, target)
             ctx.work = work
-        parallel(kernels().refgs_ssim_forward, work)
+        library = kernels()
+        parallel(library.refgs_ssim_forward, work, library.refgs_ssim_scratch_size(width, channels))
         return (1 - sums.sum() / image.numel()).float()
 
     @staticmethod
@@ -42,7 +43,9 @@ class _Dssim(torch.autograd.Function):
         by_image = torch.empty_like(image)
         ctx.work.scale = -float(by_dssim) / image.numel()
         ctx.work.by_image = by_image.data_ptr()
-        parallel(kernels().refgs_ssim_backward, ctx.work)
+        library = kernels()
+        scratch = library.refgs_ssim_scratch_size(*image.shape[1:])
+        parallel(library.refgs_ssim_backward, ctx.work, scratch)
         return by_image, None
 
 

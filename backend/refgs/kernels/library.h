@@ -1,0 +1,17 @@
+// What every exported function needs, without a C library: the result depends on nothing but the processor.
+#pragma once
+
+#include <stdint.h>
+
+#if defined(_WIN32)
+#define EXPORT extern "C" __declspec(dllexport)
+#else
+#define EXPORT extern "C" __attribute__((visibility("default")))
+#endif
+
+// How the threads inside a function share its work.
+struct Shared {
+  int64_t next, thread;
+};
+
+static inline int64_t take(int64_t& next, int64_t n) { return __atomic_fetch_add(&next, n, __ATOMIC_RELAXED); }
