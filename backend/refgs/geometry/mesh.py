@@ -1,0 +1,73 @@
+"""Triangle meshes and their clean-up."""
+
+from dataclasses import dataclass
+
+import fast_simplification
+import numpy as np
+import trimesh
+
+from refgs.errors import InputError
+
+
+@dataclass
+class Mesh:
+    """Triangles. vertices (V, 3) float64 in world units, faces (F, 3) integers, counter-clockwise seen from outside;
+    smooth unit normals (V, 3) and uv (V, 2) in 0..1 with v upward, where they have been made."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None = None
+    uv: np.ndarray | None = None
+
+    @classmethod
+    def empty(cls) -> "Mesh":
+        return cls(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+
+
+def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
+    """The mesh without what is not the object, with at most about `triangles` faces, and smooth normals.
+
+    Keeps the connected parts with at least `keep` of the largest part's area: floaters go, the rings of a chain
+    stay. Faces keep their winding. Simplification is by quadric error (Garland and Heckbert 1997). Raises InputError where nothing is left.
+    """
+    work = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    work.update_faces(np.isfinite(work.triangles).all((1, 2)))
+    work.remove_unreferenced_vertices()
+    work.merge_vertices(digits_vertex=None)
+    work.update_faces(work.nondegenerate_faces() & work.unique_faces())
+    if len(work.faces) == 0:
+        raise InputError(
+            "the depth maps have no surface in common, so there is no mesh: check that the renderings show the object "
+            "and that it lies in the region of interest"
+        )
+    work = _largest_parts(work, keep)
+    if len(work.faces) > triangles:
+        vertices, faces = fast_simplification.simplify(work.vertices, work.faces, target_count=triangles)
+        work = trimesh.Trimesh(vertices, faces, process=False)
+        work.update_faces(work.nondegenerate_faces() & work.unique_faces())
+    used, faces = np.unique(work.faces, return_inverse=True)
+    vertices = np.asarray(work.vertices)[used]
+    faces = faces.reshape(-1, 3)
+    return Mesh(vertices, faces, smooth_normals(vertices, faces))
+
+
+def _largest_parts(mesh: trimesh.Trimesh, keep: float) -> trimesh.Trimesh:
+    parts = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
+    area = np.bincount(parts, mesh.area_faces)
+    mesh.update_faces((area >= keep * area.max())[parts])
+    return mesh
+
+
+def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals (V, 3): the faces' normals weighted by their angle at the vertex (Thürmer and Wüthrich 1998)."""
+    corners = vertices[faces]
+    edges = np.roll(corners, -1, axis=1) - corners
+    length = np.maximum(np.linalg.norm(edges, axis=-1, keepdims=True), 1e-30)
+    edges /= length
+    angle = np.arccos(np.clip(-(edges * np.roll(edges, 1, axis=1)).sum(-1), -1, 1))
+    face = np.cross(edges[:, 0], edges[:, 1])
+    face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-30)
+    weighted = (angle[..., None] * face[:, None]).reshape(-1, 3)
+    normals = np.stack([np.bincount(faces.ravel(), weighted[:, a], len(vertices)) for a in range(3)], axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])

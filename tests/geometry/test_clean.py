@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+import trimesh
+
+from refgs.errors import InputError
+from refgs.geometry.mesh import Mesh, clean, smooth_normals
+
+
+def as_mesh(*parts):
+    whole = trimesh.util.concatenate(parts)
+    return Mesh(np.array(whole.vertices), np.array(whole.faces))
+
+
+def ball(radius=1.0, at=(0, 0, 0), level=4):
+    return trimesh.creation.icosphere(level, radius).apply_translation(at)
+
+
+def parts(mesh):
+    return trimesh.Trimesh(mesh.vertices, mesh.faces).body_count
+
+
+def test_floaters_go_and_large_parts_stay():
+    mesh = clean(as_mesh(ball(), ball(0.5, (3, 0, 0)), ball(0.1, (0, 3, 0))), 100000)
+    assert parts(mesh) == 2
+    assert mesh.vertices[:, 1].max() < 1.01 and mesh.vertices[:, 0].max() > 3.4
+    assert mesh.faces.max() == len(mesh.vertices) - 1
+
+
+def test_simplification_keeps_shape_winding_and_budget():
+    mesh = clean(as_mesh(ball(level=6)), 4000)
+    assert 3000 < len(mesh.faces) <= 4000
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1).max() < 0.01
+    corners = mesh.vertices[mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert ((normal * corners.mean(1)).sum(1) > 0).all()
+    agreement = (mesh.normals * mesh.vertices).sum(1)
+    assert agreement.mean() > 0.999 and agreement.min() > 0.9
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
+
+
+def test_degenerate_duplicate_and_not_finite_faces_go():
+    good = ball(level=2)
+    vertices = np.vstack([good.vertices, [[np.nan, 0, 0]]])
+    faces = np.vstack([good.faces, good.faces[:5], [[0, 0, 1]], [[0, 1, len(vertices) - 1]]])
+    mesh = clean(Mesh(vertices, faces), 100000)
+    assert len(mesh.faces) == len(good.faces) and np.isfinite(mesh.vertices).all()
+
+
+def test_an_empty_mesh_is_explained():
+    with pytest.raises(InputError, match="no surface in common"):
+        clean(Mesh.empty(), 100)
+
+
+def test_smooth_normals_do_not_depend_on_the_triangulation():
+    # Angle weights: a cube's corner normal is its diagonal, however its square faces are cut.
+    cube = trimesh.creation.box()
+    normals = smooth_normals(cube.vertices, cube.faces)
+    np.testing.assert_allclose(normals, cube.vertices / np.linalg.norm(cube.vertices, axis=1, keepdims=True), atol=1e-9)

@@ -1,0 +1,77 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from analytic import around, box, depth, gradient, look_at, sphere, torus
+
+from refgs.geometry.tsdf import fuse
+
+VIEWS = around(24, 128)
+
+
+def fused(sdf, resolution, views=VIEWS, noise=0.0, radius=1.3):
+    pictures = [depth(view, sdf) for view in views]
+    rng = np.random.default_rng(0)
+    depths = [d + noise * rng.normal(size=d.shape).astype(np.float32) for d, _ in pictures]
+    mesh = fuse(depths, [a for _, a in pictures], views, (0.05, 0, 0), radius, resolution)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+def outward(mesh, sdf):
+    return (mesh.face_normals * gradient(sdf, mesh.triangles_center)).sum(1) > 0
+
+
+@pytest.mark.parametrize("shape", [sphere, box, torus])
+def test_error_falls_with_the_voxel(shape):
+    errors = []
+    for resolution in (32, 64):
+        mesh = fused(shape, resolution)
+        error = np.abs(shape(mesh.vertices))
+        assert error.max() < 2.6 / resolution
+        assert outward(mesh, shape).mean() > 0.999
+        assert mesh.is_watertight
+        errors.append(np.sqrt((error**2).mean()))
+    assert errors[1] < 0.55 * errors[0]
+    assert errors[1] < 0.2 * 2.6 / 64
+    assert mesh.euler_number == (0 if shape is torus else 2)
+
+
+def test_noise_averages_out():
+    mesh = fused(sphere, 64, noise=0.04)
+    assert np.abs(sphere(mesh.vertices)).mean() < 0.01
+
+
+def test_what_no_view_saw_has_no_surface():
+    above = [view for view in VIEWS if view.position[2] > 2.5]
+    mesh = fused(sphere, 64, views=above)
+    assert not mesh.is_watertight
+    assert np.abs(sphere(mesh.vertices)).max() < 2 * 2.6 / 64
+    assert mesh.vertices[:, 2].min() > -0.76 and mesh.vertices[:, 2].max() > 0.97
+
+
+def test_a_room_seen_from_inside_faces_the_cameras():
+    def room(p):
+        return -sphere(p)
+
+    inner = [replace(look_at(-0.1 * view.position, 128), fx=60.0, fy=60.0) for view in VIEWS]
+    mesh = fused(room, 48, views=inner, radius=1.2)
+    assert np.abs(room(mesh.vertices)).max() < 0.01
+    assert outward(mesh, room).all()
+
+
+def test_one_wrong_depth_map_is_outvoted():
+    pictures = [depth(view, sphere) for view in VIEWS]
+    depths = [d for d, _ in pictures]
+    depths[5] = np.where(depths[5] > 0, depths[5] - 0.3, 0)
+    mesh = fuse(depths, [a for _, a in pictures], VIEWS, (0, 0, 0), 1.4, 64)
+    parts = trimesh.Trimesh(mesh.vertices, mesh.faces).split(only_watertight=False)
+    largest = max(parts, key=lambda part: part.area)
+    assert np.abs(sphere(largest.vertices)).max() < 0.05
+
+
+def test_nothing_to_see():
+    blank = [np.zeros((128, 128), np.float32)] * len(VIEWS)
+    assert len(fuse(blank, blank, VIEWS, (0, 0, 0), 1.0, 32).faces) == 0
+    behind = [np.full((128, 128), np.nan, np.float32)] * len(VIEWS)
+    assert len(fuse(behind, [np.ones((128, 128))] * len(VIEWS), VIEWS, (0, 0, 0), 1.0, 32).faces) == 0
