@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from refgs.camera import Camera
 from refgs.capture import load_view, read_cameras, read_capture
+from refgs.capture.poses import in_frame
 from refgs.color import srgb_encode
 from refgs.errors import InputError
 from refgs.export.environment import read_environment, read_exr, write_exr
@@ -26,7 +27,7 @@ from refgs.model.environment import Environment
 from refgs.paths import clone_root
 from refgs.render.renderer import Rendering
 from refgs.report import metrics
-from refgs.run import Run, camera_in_run, check_free, create_run, open_run, read_run_facts, write_text
+from refgs.run import Run, check_free, create_run, open_run, read_run_facts, write_text
 from refgs.settings import load_settings
 
 console = Console(highlight=False, soft_wrap=True)
@@ -176,7 +177,8 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
         if run.environment is None:
             raise InputError("--hdri: a run with shading = sh has no materials to relight")
         light = Environment.from_panorama(read_environment(hdri), run.settings.environment.resolution)
-    views = [camera_in_run(camera, run.to_capture) for camera in read_cameras(cameras)]
+    to_run = np.linalg.inv(run.to_capture)
+    views = [in_frame(camera, to_run) for camera in read_cameras(cameras)]
     background = np.array(run.settings.image.background)
     with progress_bar("rendering", len(views)) as bar:
         for done, camera in enumerate(views):

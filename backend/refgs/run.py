@@ -3,7 +3,7 @@
 import os
 import platform
 import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -141,11 +141,3 @@ def write_text(file: Path, text: str) -> None:
     temporary = file.with_name(file.name + ".tmp")
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, file)
-
-
-def camera_in_run(camera: Camera, to_capture: np.ndarray) -> Camera:
-    """A camera of the capture's frame, in the run's: world_to_camera stays rigid, lengths are the run's."""
-    scale = np.cbrt(np.linalg.det(to_capture[:3, :3]))
-    matrix = camera.world_to_camera @ to_capture
-    matrix[:3] /= scale
-    return replace(camera, world_to_camera=matrix)

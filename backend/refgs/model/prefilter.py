@@ -8,6 +8,7 @@ coarse ones in its tail.
 
 import hashlib
 import os
+import warnings
 from functools import lru_cache
 from pathlib import Path
 
@@ -117,13 +118,10 @@ def matrices(resolution: int) -> tuple[Tensor, Tensor]:
 
 def _to_torch(matrix) -> Tensor:
     # 32-bit indices: with 64-bit ones torch leaves MKL and is thirty times slower.
-    return torch.sparse_csr_tensor(
-        torch.from_numpy(matrix.indptr.astype(np.int32)),
-        torch.from_numpy(matrix.indices.astype(np.int32)),
-        torch.from_numpy(matrix.data.astype(np.float32)),
-        size=matrix.shape,
-        check_invariants=False,
-    )
+    parts = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data.astype(np.float32)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(*map(torch.from_numpy, parts), size=matrix.shape, check_invariants=False)
 
 
 @lru_cache(maxsize=4)

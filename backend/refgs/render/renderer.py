@@ -16,6 +16,7 @@ from refgs.settings import RenderSettings
 
 NEAR = 0.01  # the nearest depth that is drawn, in scene radii
 COVERED = 1 / 255  # pixels with less alpha than this are background
+PAST_HORIZON = -0.3  # cosine below which a surfel shows its back
 SHIFT_LIMIT = 8.0  # pixels
 SHIFT_ALPHA = 0.3  # a silhouette's blended position says nothing about its surface
 
@@ -51,11 +52,15 @@ def camera_rays(camera: Camera) -> Tensor:
 
 
 def facing_normals(surfels: Surfels, camera: Camera) -> Tensor:
-    """The surfels' normals (N, 3), each turned towards the camera."""
+    """The surfels' normals (N, 3), turned towards the camera where they look well away from it.
+
+    Not where they hardly do: on a closed surface those lie just past the horizon and show at the silhouette, where
+    turning them would point the blend anywhere.
+    """
     normals = surfels.normals()
     towards = torch.from_numpy(camera.position).float() - surfels.positions.detach()
-    away = (normals.detach() * towards).sum(dim=-1, keepdim=True) < 0
-    return torch.where(away, -normals, normals)
+    cosine = (normals.detach() * torch.nn.functional.normalize(towards, dim=-1)).sum(dim=-1, keepdim=True)
+    return torch.where(cosine < PAST_HORIZON, -normals, normals)
 
 
 def _appearance(surfels: Surfels, camera: Camera) -> Tensor:

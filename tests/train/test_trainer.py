@@ -1,0 +1,207 @@
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from refgs.capture import read_capture
+from refgs.errors import InputError
+from refgs.export.environment import directions
+from refgs.run import create_run, open_run
+from refgs.settings import load_settings
+from refgs.train.asset import write_asset
+from refgs.train.trainer import Trainer
+from tests.conftest import F0, sky
+
+SMALL = ["surfels.start=1500", "surfels.budget=1800", "environment.resolution=16", "train.light_first=20"]
+
+
+def trainer(capture_folder, folder, *changes, total=150):
+    capture = read_capture(capture_folder)
+    settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
+    made = Trainer(capture, settings, folder, lambda event, facts: None)
+    if not folder.exists():
+        create_run(folder, capture, settings, "quick")
+    return made
+
+
+@pytest.fixture(scope="module")
+def ball(ball_capture, tmp_path_factory):
+    """The ball, learned as metal for 600 iterations, its asset written."""
+    folder = tmp_path_factory.mktemp("runs") / "ball"
+    made = trainer(ball_capture, folder, "train.checkpoint_every=200", "surfels.metallic=0.9", total=600)
+    made.run()
+    write_asset(made)
+    return made
+
+
+def test_the_ball_is_recovered(ball):
+    """Novel views, normals, light and metal, each against what the capture was made from."""
+    assert ball.test_psnr() > 30
+    surfels = ball.surfels()
+    solid = surfels.opacities > 0.5
+    outward = torch.nn.functional.normalize(surfels.positions, dim=-1)
+    cosine = (surfels.normals() * outward).sum(dim=-1).abs()[solid]
+    assert math.degrees(float(torch.acos(cosine.clamp(0, 1)).mean())) < 4
+    assert abs(float(surfels.positions[solid].norm(dim=-1).mean()) - 1) < 0.03
+    assert float(surfels.metallic[solid].mean()) > 0.8
+    # Albedo and light share a scale: compare their product, and the light's shape.
+    panorama = ball.environment().panorama(32)
+    truth = sky(directions(32, 64))
+    albedo = surfels.albedo[solid].mean(dim=0).detach().numpy()
+    product = panorama.mean(axis=(0, 1)) * albedo / (truth.mean(axis=(0, 1)) * F0)
+    np.testing.assert_allclose(product, 1, atol=0.12)
+    assert np.corrcoef(panorama.ravel() * np.tile(albedo, 32 * 64), (truth * F0).ravel())[0, 1] > 0.97
+
+
+def test_the_asset_renders_as_the_training_did(ball):
+    run = open_run(ball.folder)
+    view = ball.test[0]
+    trained, asset = ball.render(view), run.render(view.camera)
+    assert float((trained.color - asset.color).abs().mean()) < 2e-3
+    assert json.loads((ball.folder / "needs.json").read_text())[0]["what"] == "spherical harmonics"
+
+
+def test_the_assets_normals_point_outward(ball):
+    splats = open_run(ball.folder).splats
+    solid = splats.opacities > 0.5
+    assert ((splats.normals * splats.positions).sum(axis=1)[solid] > 0).mean() > 0.99
+
+
+def test_history_grows_with_time(ball):
+    rows = [json.loads(line) for line in (ball.folder / "history.jsonl").read_text().splitlines()]
+    assert [row["iteration"] for row in rows] == [100, 200, 300, 400, 500, 600]
+    assert all(a["seconds"] < b["seconds"] for a, b in zip(rows, rows[1:], strict=False))
+    assert rows[-1]["psnr_test"] > rows[0]["psnr_test"]
+
+
+@pytest.mark.parametrize("changes", [[], ["shading=sh"], ["diffuse=sh"]])
+def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
+    """Bit for bit, through densification."""
+    changes = [*changes, "train.checkpoint_every=40", "densify.every=25"]
+    whole = trainer(ball_capture, tmp_path / "whole", *changes, total=80)
+    whole.run()
+    first = trainer(ball_capture, tmp_path / "cut", *changes, total=80)
+    first.run(stop=lambda: first.iteration >= 47)
+    (tmp_path / "cut" / "checkpoints" / "00000047.toml").unlink()  # killed before that one was complete
+    second = trainer(ball_capture, tmp_path / "cut", *changes, total=80)
+    second.resume()
+    assert second.iteration == 40
+    second.run()
+    assert whole.parameters.keys() == second.parameters.keys()
+    for name, value in whole.parameters.items():
+        assert torch.equal(value, second.parameters[name]), name
+    assert torch.equal(whole.light, second.light)
+
+
+def test_shading_sh_learns_colour_alone(ball_capture, tmp_path):
+    made = trainer(ball_capture, tmp_path / "sh", "shading=sh", total=100)
+    before = made.test_psnr()
+    made.run()
+    assert made.test_psnr() > before + 3
+    write_asset(made)
+    assert not (tmp_path / "sh" / "environment.exr").exists()
+    run = open_run(tmp_path / "sh")
+    assert float((made.render(made.test[0]).color - run.render(made.test[0].camera).color).abs().mean()) < 1e-3
+
+
+def test_sh_diffuse_leaves_an_albedo_that_relights(ball_capture, tmp_path):
+    made = trainer(ball_capture, tmp_path / "run", "diffuse=sh", "surfels.metallic=0.1", total=100)
+    made.run()
+    write_asset(made)
+    run = open_run(tmp_path / "run")
+    received = run.environment.diffuse(torch.from_numpy(run.splats.normals))
+    sent = 0.5 + 0.28209479 * run.splats.sh[:, 0]
+    dull = run.splats.metallic < 0.05
+    if dull.any():
+        expected = np.clip(sent / received.numpy(), 0, 1)[dull]
+        np.testing.assert_allclose(run.splats.albedo[dull], expected, atol=0.06)
+    assert np.isfinite(run.splats.albedo).all()
+
+
+def refgs(*words, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "refgs.cli", *map(str, words)], capture_output=True, text=True, timeout=300, **options
+    )
+
+
+def small(total):
+    return [
+        word
+        for change in (*SMALL, f"train.iterations={total}", "train.checkpoint_every=20")
+        for word in ("--set", change)
+    ]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+def test_ctrl_c_leaves_a_run_that_goes_on(ball_capture, tmp_path):
+    out = tmp_path / "run"
+    command = [sys.executable, "-m", "refgs.cli", "train", str(ball_capture), "--out", str(out), "--preset", "quick"]
+    process = subprocess.Popen([*command, *small(100_000)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 240
+    while not list(out.glob("checkpoints/*.toml")):
+        assert process.poll() is None and time.monotonic() < deadline, process.stderr.read()
+        time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    said, errors = process.communicate(timeout=120)
+    assert process.returncode == 130, errors
+    assert "--resume" in said
+    assert "Traceback" not in errors
+    assert not (out / "splats.ply").exists()
+
+    taken = refgs("train", ball_capture, "--out", out, "--preset", "quick")
+    assert taken.returncode == 2
+    assert "holds another run" in taken.stderr
+    done = refgs("train", ball_capture, "--out", out, "--resume", "--minutes", "0.05")
+    assert done.returncode == 0, done.stderr
+    assert (out / "splats.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--device", "cuda"], "--device cuda"),
+        (["--device", "gpu"], "auto, cpu or cuda"),
+        (["--set", "train.iterations=0"], "train.iterations"),
+        (["--preset", "fast"], "no preset fast"),
+        (["--resume"], "not a run folder"),
+    ],
+)
+def test_bad_words_give_one_line_and_leave_nothing(ball_capture, tmp_path, words, said):
+    if words[1:] == ["cuda"] and torch.cuda.is_available():
+        pytest.skip("there is a CUDA device here")
+    done = refgs("train", ball_capture, "--out", tmp_path / "run", *words)
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert said in done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_resume_refuses_another_capture(ball_capture, tmp_path):
+    made = trainer(ball_capture, tmp_path / "run", total=20)
+    made.run()
+    other = tmp_path / "other"
+    other.mkdir()
+    for file in ball_capture.rglob("*"):
+        target = other / file.relative_to(ball_capture)
+        target.mkdir(parents=True) if file.is_dir() else target.write_bytes(file.read_bytes())
+    text = (other / "transforms_train.json").read_text()
+    (other / "transforms_train.json").write_text(text.replace('"camera_angle_x": 0.7', '"camera_angle_x": 0.71'))
+    done = refgs("train", other, "--out", tmp_path / "run", "--resume")
+    assert done.returncode == 2
+    assert "not the capture" in done.stderr
+
+
+def test_a_missing_hull_is_an_error_in_words(ball_capture, tmp_path):
+    capture = read_capture(ball_capture)
+    settings = load_settings("quick", SMALL)
+    object.__setattr__(capture, "centre", np.array([100.0, 0, 0]))
+    with pytest.raises(InputError):
+        Trainer(capture, settings, tmp_path / "run", lambda *_: None)
+    assert not (tmp_path / "run").exists()
