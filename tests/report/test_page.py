@@ -1,0 +1,164 @@
+"""The report page: all that a run folder holds is on it, what is missing is said, and nothing is fetched."""
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+
+from refgs.errors import InputError
+from refgs.report.page import write_report
+
+VIEWS = [f"test_{i:03d}" for i in range(8)]
+
+
+class Page(HTMLParser):
+    """Pictures by what is written under them, text, and every address that a browser would follow."""
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.images: list[tuple[str, str]] = []
+        self.addresses: list[str] = []
+        self.words: list[str] = []
+        self.tags: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        found = dict(attributes)
+        self.tags.append(tag)
+        self.addresses += [found[key] for key in ("src", "href", "xlink:href", "srcset", "action") if key in found]
+        if tag == "img":
+            self.images.append((found["alt"], found["src"]))
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+    @property
+    def text(self):
+        return re.sub(r"\s+", " ", " ".join(self.words))
+
+
+def picture(path, value, side=24, channels=3):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shape = (side, side, channels) if channels > 1 else (side, side)
+    cv2.imwrite(str(path), np.full(shape, value, np.uint8))
+
+
+@pytest.fixture
+def run(tmp_path):
+    folder = tmp_path / "vases" / "first <run>"
+    folder.mkdir(parents=True)
+    for index, view in enumerate(VIEWS):
+        for kind in ("photo", "color", "normal", "albedo"):
+            picture(folder / f"pictures/test/{kind}/{view}.png", 10 * index)
+        for kind in ("roughness", "metallic"):
+            picture(folder / f"pictures/test/{kind}/{view}.png", 99, channels=1)
+    for kind in ("truth", "splats", "mesh"):
+        picture(folder / f"pictures/relight/{kind}/studio_test_002.png", 50, channels=4)
+    picture(folder / "pictures/environment.png", 70)
+    relight = {"studio": {"splats": {"psnr_raw": 21.25, "psnr_aligned": 23.5}, "mesh": {"psnr_raw": 20.75}}}
+    figures = {"psnr": 29.604, "ssim": 0.94126, "normal_mae_degrees": 4.2, "seconds": 431.2, "splats": 19832}
+    figures |= {"peak_memory_bytes": 2**31, "relight": relight, "environment": {"log_rmse": 0.3125}, "split": "test"}
+    (folder / "metrics.json").write_text(json.dumps(figures))
+    lines = [
+        {"seconds": s, "iteration": 10 * s, "loss": 1 / s, "psnr_train": 20 + s, "psnr_test": 19 + s}
+        for s in range(1, 9)
+    ]
+    (folder / "history.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (folder / "needs.json").write_text('[{"what": "412 surfels", "why": "no view sees them", "saved": "2 %"}]')
+    (folder / "run.toml").write_text('[run]\ncapture = "/far/away/urn"\n\n[settings.train]\niterations = 4000\n')
+    return folder
+
+
+def test_everything_is_on_the_page_and_in_the_page(run):
+    out = run / "report.html"
+    write_report([run], out)
+    page = Page(out.read_text(encoding="utf-8"))
+    for words in (
+        *("vases/first <run>", "29.60 dB", "0.9413", "4.20°", "7 min 11 s", "19,832", "2.00 GiB", "“urn”"),
+        *("21.25 / 23.50", "20.75", "0.3125", "412 surfels", "no view sees them", "2 %", "iterations = 4000"),
+    ):
+        assert words in page.text, words
+    assert "is not there" not in page.text
+    kinds = [kind for kind, _ in page.images]
+    for kind in ("photo", "rendered", "normal", "base colour", "roughness", "metallic"):
+        assert kinds.count(kind) == 4, "four of eight views, evenly chosen"
+    for kind in ("ground truth (Cycles)", "splats (Eevee)", "mesh (Eevee)", "recovered"):
+        assert kinds.count(kind) == 1
+    assert all(address.startswith(("data:image/png;base64,", "#")) for address in page.addresses)
+    assert not {"script", "link", "iframe"} & set(page.tags)
+    shown = cv2.imdecode(np.frombuffer(base64.b64decode(page.images[0][1].split(",")[1]), np.uint8), -1)
+    assert shown.shape == (24, 24, 4) and (shown == 50).all()
+    assert [path.name for path in run.glob("report*")] == ["report.html"]
+
+
+def test_the_chart_draws_the_history(run):
+    write_report([run], run / "report.html")
+    html = (run / "report.html").read_text(encoding="utf-8")
+    svg = html[html.index("<svg") : html.index("</svg>")]
+    assert "PSNR, dB" in svg and "training loss" in svg and "currentColor" in svg
+    # A path of eight points for each of held-out PSNR, training PSNR and loss.
+    lines = [path for path in re.findall(r' d="([^"]+)"', svg) if path.count("L") == 7]
+    assert len(lines) == 3
+    heights = [[float(y) for y in re.findall(r"[ML] \S+ (\S+)", path)] for path in lines]
+    assert heights[0] == sorted(heights[0], reverse=True), "a growing PSNR rises on the page"
+    assert heights[2] == sorted(heights[2]), "a falling loss falls"
+
+
+def test_several_runs_stand_side_by_side_and_the_best_is_marked(run, tmp_path):
+    other = tmp_path / "vases" / "second"
+    picture(other / "pictures/test/color/test_000.png", 1)
+    (other / "metrics.json").write_text(json.dumps({"psnr": 26.0, "normal_mae_degrees": 3.0}))
+    out = tmp_path / "pages" / "both.html"
+    write_report([run, other], out)
+    html = out.read_text(encoding="utf-8")
+    assert re.findall(r'class="best">([^<]+)<', html) == ["29.60 dB", "3.00°"]
+    page = Page(html)
+    assert "vases/second" in page.text and "26.00 dB" in page.text
+    assert "vases/second : run.toml is not there" in page.text.replace("second:", "second :")
+
+
+def test_an_empty_folder_gives_a_page_that_says_what_is_missing(tmp_path):
+    write_report([tmp_path], tmp_path / "report.html")
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    for name in ("run.toml", "metrics.json", "history.jsonl", "needs.json", "pictures/test", "pictures/relight"):
+        assert f"{name} is not there" in page.text
+    assert not page.images and "svg" not in page.tags
+
+
+def test_broken_parts_are_left_out(run):
+    (run / "metrics.json").write_text('{"psnr": 2')
+    (run / "needs.json").write_text('{"not": "a list"}')
+    (run / "run.toml").write_text("= nonsense")
+    with open(run / "history.jsonl", "a") as file:
+        file.write('\n[1]\n{"seconds": null, "loss": 1}\n{"seconds": 9, "loss": NaN}\n{"seconds": 10, "lo')
+    for path in run.glob("pictures/test/photo/*.png"):
+        path.write_bytes(path.read_bytes()[:30])
+    write_report([run], run / "report.html")
+    page = Page((run / "report.html").read_text(encoding="utf-8"))
+    assert "metrics.json cannot be read" in page.text
+    assert "svg" in page.tags and "photo" not in dict(page.images) and "rendered" in dict(page.images)
+
+
+def test_figures_that_are_no_numbers_are_left_out(tmp_path):
+    (tmp_path / "metrics.json").write_text('{"psnr": NaN, "lpips": null, "views": 8, "split": "test", "flag": true}')
+    write_report([tmp_path], tmp_path / "report.html")
+    text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
+    assert "views 8" in text and "PSNR" not in text and "nan" not in text and "flag" not in text
+
+
+def test_large_pictures_are_made_smaller(tmp_path):
+    picture(tmp_path / "pictures/test/photo/a.png", 90, side=1600)
+    write_report([tmp_path], tmp_path / "report.html")
+    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    data = base64.b64decode(dict(page.images)["photo"].split(",")[1])
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), -1).shape == (512, 512, 3)
+
+
+def test_a_folder_that_is_not_there_is_one_line(tmp_path):
+    with pytest.raises(InputError, match="is not a folder"):
+        write_report([tmp_path / "nowhere"], tmp_path / "report.html")
+    assert not (tmp_path / "report.html").exists()
