@@ -18,6 +18,7 @@ def make(count=20):
         opacity=0.5, sh_degree=1, albedo=0.5, metallic=0.5, roughness=0.3,
     )  # fmt: skip
     groups = [{"params": [value], "name": name} for name, value in parameters.items()]
+    groups.append({"params": [torch.zeros(6, 3, requires_grad=True)], "name": "environment"})
     optimizer = torch.optim.Adam(groups, lr=0.0)
     sum((value**2).sum() for value in parameters.values()).backward()
     optimizer.step()
@@ -30,7 +31,9 @@ def test_the_budget_holds_and_the_largest_gradients_go_first():
     divided = densify(parameters, optimizer, gradient, SETTINGS, budget=23, divide=True)
     assert divided == 3
     assert all(len(value) == 23 for value in parameters.values())
-    for group in optimizer.param_groups:
+    *groups, light = optimizer.param_groups
+    assert light["params"][0].shape == (6, 3)
+    for group in groups:
         assert group["params"][0] is parameters[group["name"]]
         state = optimizer.state[group["params"][0]]
         assert len(state["exp_avg"]) == 23

@@ -62,6 +62,8 @@ def densify(
         return 0
     halves = torch.isin(kept, chosen).nonzero()[:, 0], torch.arange(len(kept), len(index))
     for group in optimizer.param_groups:
+        if group["name"] not in parameters:  # the light
+            continue
         old = group["params"][0]
         new = old.detach()[index].clone()
         state = optimizer.state.pop(old, None)
