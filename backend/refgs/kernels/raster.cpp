@@ -210,13 +210,22 @@ int slot(int px, int py) {  // where a tile's pixel is in block order
 
 float near_zero(double x) { return (float)__builtin_fmin(__builtin_fmax(x, -1e9), 1e9); }
 
+// An affine function of the image's pixels (value at its corner, slopes) as one of a tile's.
+void localise(const double* n, double x, double y, refgs::Affine& f) {
+  const double exact[3] = {n[0] + n[1] * x + n[2] * y, n[1], n[2]};
+  double largest = __builtin_fabs(exact[0]) + TILE * (__builtin_fabs(exact[1]) + __builtin_fabs(exact[2]));
+  // Adding 1.5 * 2^52 q rounds to multiples of q, here 2^-22 of the largest sum: its multiples of q / 2 fit in a float.
+  double round = largest * (1.5 * (1ll << 30));
+  for (int k = 0; k < 3; k++) {
+    f.high[k] = (float)(exact[k] + round - round);
+    f.low[k] = (float)(exact[k] - f.high[k]);
+  }
+}
+
 Splat localise(const Projected& p, const Tile& t) {
   double x = t.x + TILE / 2, y = t.y + TILE / 2;
   Splat s;
-  auto shift = [&](const double* n, float* out) {
-    out[0] = n[0] + n[1] * x + n[2] * y, out[1] = n[1], out[2] = n[2];
-  };
-  shift(p.n0, s.n0), shift(p.n1, s.n1), shift(p.n2, s.n2);
+  localise(p.n0, x, y, s.n0), localise(p.n1, x, y, s.n1), localise(p.n2, x, y, s.n2);
   s.determinant = p.determinant, s.n2_min = p.n2_min, s.n2_max = p.n2_max;
   s.x = near_zero(p.x - x), s.y = near_zero(p.y - y), s.depth = p.depth;
   s.opacity = p.opacity, s.rho_max = p.rho_max;

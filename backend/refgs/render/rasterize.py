@@ -149,10 +149,13 @@ def rasterize(
     on the number of threads.
     """
     tensors = (positions, rotations, scales, opacities, features)
-    shapes = ((3,), (4,), (2,), (), features.shape[1:])
-    for tensor, shape in zip(tensors, shapes, strict=True):
+    shapes = {"positions": (3,), "rotations": (4,), "scales": (2,), "opacities": (), "features": features.shape[1:2]}
+    for tensor, (name, shape) in zip(tensors, shapes.items(), strict=True):
         if tensor.shape != (features.shape[0], *shape) or tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise ValueError(f"expected float32 (N, {shape}) on the CPU, got {tensor.dtype} {tuple(tensor.shape)}")
+            expected = f"float32 {(features.shape[0], *shape)} on the CPU"
+            raise ValueError(
+                f"{name}: expected {expected}, got {tensor.dtype} {tuple(tensor.shape)} on {tensor.device}"
+            )
     if near <= 0:
         raise ValueError(f"near must be positive, got {near}")
     return Raster(*_Rasterize.apply(*tensors, camera, near))

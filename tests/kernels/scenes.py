@@ -1,0 +1,56 @@
+"""Random surfels that are hard to rasterise, each kind by itself and all together."""
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from refgs.camera import Camera
+
+NEAR = 0.1
+KINDS = ("plain", "edge_on", "across_near", "huge", "sub_pixel", "layers", "mixed")
+CHANNELS = {"plain": 3, "edge_on": 1, "across_near": 16, "huge": 5, "sub_pixel": 4, "layers": 33, "mixed": 16}
+
+
+def camera(width: int = 45, height: int = 30, centre: tuple[float, float] | None = None) -> Camera:
+    """A turned camera at (0.3, −0.2, −0.4) that looks along +z; neither square nor of whole tiles."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_euler("xyz", [4, -6, 25], degrees=True).as_matrix()
+    matrix[:3, 3] = -matrix[:3, :3] @ [0.3, -0.2, -0.4]
+    cx, cy = centre or (0.47 * width, 0.55 * height)
+    return Camera("test", width, height, 1.1 * width, 1.0 * width, cx, cy, matrix)
+
+
+def surfels(kind: str, channels: int, seed: int = 0) -> tuple[Tensor, ...]:
+    """Positions, rotations, scales, opacities and features, float32, whose depths differ by more than float rounding."""
+    rng = np.random.default_rng([seed, KINDS.index(kind)])
+    if kind == "mixed":
+        parts = [surfels(k, channels, seed) for k in KINDS if k not in ("mixed", "layers")]
+        return tuple(torch.cat(tensors) for tensors in zip(*parts, strict=True))
+    n = 400 if kind == "layers" else 80
+    position = rng.normal(size=(n, 3)) * [0.9, 0.6, 0.6] + [0.3, -0.2, 1.6]
+    rotation = rng.normal(size=(n, 4)) * rng.uniform(0.1, 5, (n, 1))
+    scale = np.exp(rng.uniform(np.log(0.02), np.log(0.4), (n, 2)))
+    opacity = rng.uniform(0.01, 1, n)
+    if kind == "edge_on":  # the surfel's normal is at right angles to the ray through its centre, or nearly
+        sight = position - camera().position
+        normal = np.cross(sight, rng.normal(size=(n, 3)))
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal += 10.0 ** rng.uniform(-9, -1, (n, 1)) * sight
+        rotation = np.stack([Rotation.align_vectors([v], [[0, 0, 1]])[0].as_quat(scalar_first=True) for v in normal])
+        scale *= 2
+    if kind == "across_near":
+        position[:, 2] = rng.uniform(-0.25, 0.6, n)
+        position[:, :2] = rng.normal(size=(n, 2)) * 0.2 + [0.3, -0.2]
+        scale *= 1.5
+    if kind == "huge":
+        scale *= 200
+        opacity *= 0.2
+    if kind == "sub_pixel":
+        scale *= 0.1
+        scale[::4] = 0
+    if kind == "layers":
+        scale = rng.uniform(1, 3, (n, 2))
+        opacity = rng.uniform(0.004, 0.03, n)
+    feature = rng.normal(size=(n, channels))
+    return tuple(torch.tensor(v, dtype=torch.float32) for v in (position, rotation, scale, opacity, feature))

@@ -1,0 +1,50 @@
+"""Compiling, caching and choosing the kernels."""
+
+import subprocess
+import sys
+
+import pytest
+
+from refgs.errors import InputError
+from refgs.kernels import load
+from refgs.kernels.build import TARGETS, build, target
+
+EVERY = [(system, machine, isa) for (system, machine), (_, _, isas) in TARGETS.items() for isa in isas]
+MAGIC = {"so": b"\x7fELF", "dll": b"MZ", "dylib": b"\xcf\xfa\xed\xfe"}
+
+
+@pytest.mark.parametrize(("system", "machine", "isa"), EVERY)
+def test_compiles_for_every_platform(system, machine, isa, tmp_path):
+    wanted = target(system, machine, isa)
+    library = build(wanted, tmp_path)
+    content = library.read_bytes()
+    assert content.startswith(MAGIC[wanted.extension])
+    for name in (b"refgs_forward", b"refgs_backward", b"refgs_ssim_backward"):
+        assert name in content
+    assert [p.name for p in tmp_path.iterdir()] == [library.name]  # nothing left over
+    made = library.stat().st_mtime_ns
+    assert build(wanted, tmp_path) == library and library.stat().st_mtime_ns == made
+
+
+def test_first_uses_at_the_same_time(tmp_path):
+    program = "from refgs.kernels.load import kernels; print(kernels()._name)"
+    environment = {"REFGS_CACHE": str(tmp_path), "PATH": "", "HOME": str(tmp_path)}
+    both = [
+        subprocess.Popen([sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    names = [p.communicate(timeout=120)[0].strip() for p in both]
+    assert [p.returncode for p in both] == [0, 0]
+    assert names[0] == names[1] and [str(p) for p in tmp_path.iterdir()] == names[:1]
+
+
+def test_cache_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(InputError, match="REFGS_CACHE"):
+        build(target("linux", "x86_64", "sse4"), tmp_path / "file" / "cache")
+
+
+def test_unknown_instruction_set(monkeypatch):
+    monkeypatch.setenv("REFGS_ISA", "mmx")
+    with pytest.raises(InputError, match="REFGS_ISA=mmx"):
+        load.kernels()

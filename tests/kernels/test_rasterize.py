@@ -1,0 +1,214 @@
+"""The rasteriser against the float64 reference, and what it promises besides."""
+
+import functools
+import gc
+import sys
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from refgs.kernels import load, reference
+from refgs.render.rasterize import Raster, rasterize
+from tests.kernels import scenes
+
+NAMES = ("positions", "rotations", "scales", "opacities", "features")
+# A pixel whose value hangs on a comparison (of alpha with its cut, of transmittance with its end …) that float32 may decide
+# otherwise than float64 is left out: closer than this, relative, in float64. Its share of the picture is checked.
+MARGIN = 1e-4
+FORWARD, GRADIENT = 1e-5, 1e-4
+
+
+@functools.cache
+def case(kind: str, channels: int, size: tuple[int, int] = (45, 30), centre: tuple[float, float] | None = None):
+    """Inputs, camera, and the reference's maps, safe pixels, upstream gradients and gradients."""
+    camera, inputs = scenes.camera(*size, centre), scenes.surfels(kind, channels)
+    exact = [v.double().requires_grad_() for v in inputs]
+    *maps, margin = reference.rasterize(*exact, camera, scenes.NEAR)
+    safe = margin > MARGIN
+    torch.manual_seed(1)
+    upstream = [torch.randn_like(m).float() * safe.reshape(safe.shape + (1,) * (m.ndim - 2)) for m in maps]
+    gradients = torch.autograd.grad(maps, exact, [u.double() for u in upstream])
+    return inputs, camera, [m.detach() for m in maps], safe, upstream, gradients
+
+
+def run(inputs: tuple[Tensor, ...], camera, upstream: list[Tensor]) -> tuple[Raster, tuple[Tensor, ...]]:
+    inputs = [v.clone().requires_grad_() for v in inputs]
+    raster = rasterize(*inputs, camera, near=scenes.NEAR)
+    return raster, torch.autograd.grad(raster, inputs, upstream)
+
+
+def check(inputs, camera, maps, safe, upstream, gradients) -> None:
+    """Every error relative to the largest value of the same tensor."""
+    assert safe.float().mean() > 0.9
+    raster, found = run(inputs, camera, upstream)
+    for name, value, expected in zip(raster._fields, (m.detach() for m in raster), maps, strict=True):
+        assert expected[safe].abs().max() > 0.05
+        error = (value - expected)[safe].abs().max() / expected[safe].abs().max()
+        assert error <= FORWARD, (name, error.item())
+    for name, value, expected in zip(NAMES, found, gradients, strict=True):
+        error = (value - expected).abs().max() / expected.abs().max()
+        assert error <= GRADIENT, (name, error.item())
+
+
+@pytest.fixture(params=load.supported())
+def isa(request, monkeypatch) -> str:
+    monkeypatch.setenv("REFGS_ISA", request.param)
+    return request.param
+
+
+@pytest.mark.parametrize("kind", scenes.KINDS)
+def test_matches_reference(kind, isa):
+    check(*case(kind, scenes.CHANNELS[kind]))
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 7, 12, 16, 20, 33])
+def test_any_number_of_channels(channels, isa):
+    check(*case("plain", channels))
+
+
+@pytest.mark.parametrize(("size", "centre"), [((17, 40), None), ((33, 20), (-25.0, 60.0)), ((1, 1), None)])
+def test_any_image(size, centre):
+    check(*case("mixed", 3, size, centre))
+
+
+def test_instruction_sets_differ(monkeypatch):
+    """The variable that the tests above rely on does pick another library."""
+    paths = set()
+    for isa in load.supported():
+        monkeypatch.setenv("REFGS_ISA", isa)
+        paths.add(load.kernels()._name)
+    assert len(paths) == len(load.supported())
+
+
+def test_reference_gradients():
+    """The reference's own derivatives, by finite differences."""
+    inputs, camera, *_ = case("mixed", 2, (11, 8))
+    picked = slice(None, None, 12)
+    exact = [v[picked].double().requires_grad_() for v in inputs]
+    margin = reference.rasterize(*exact, camera, scenes.NEAR)[3]
+
+    def safe_maps(*values):
+        *maps, _ = reference.rasterize(*values, camera, scenes.NEAR)
+        return tuple(m[margin > 1e-3] for m in maps)
+
+    assert (margin > 1e-3).sum() > 40
+    assert torch.autograd.gradcheck(safe_maps, exact, eps=1e-8, atol=1e-4, rtol=1e-3, nondet_tol=0)
+
+
+@pytest.mark.parametrize("private_pool", [False, True])
+def test_same_bits_for_any_number_of_threads(private_pool, isa, monkeypatch):
+    if private_pool:
+        monkeypatch.setattr(load, "_openmp", lambda: None)
+    inputs, camera = scenes.surfels("mixed", 16), scenes.camera(150, 100)
+    upstream = [torch.ones(100, 150, 16), torch.ones(100, 150), torch.ones(100, 150)]
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            raster, gradients = run(inputs, camera, upstream)
+            results.append([*raster, *gradients])
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_shares_torchs_threads():
+    if sys.platform != "linux":
+        pytest.skip("torch's OpenMP is not GNU's here")
+    assert load._openmp() is not None
+
+
+def test_ties_are_drawn_in_order():
+    position = torch.tensor([[0.0, 0, 1]] * 2)
+    camera = scenes.camera(9, 9)
+    one = (position, torch.tensor([[1.0, 0, 0, 0]] * 2), torch.ones(2, 2), torch.tensor([0.8, 0.8]))
+    raster = rasterize(*one, torch.tensor([[1.0, 0], [0, 1]]), camera, near=0.1)
+    first, second = raster.features.unbind(-1)
+    assert (first > second).all() and (second > 0).all()
+
+
+@pytest.mark.parametrize("where", ["none", "behind", "beside", "transparent"])
+def test_nothing_to_see(where):
+    inputs = list(scenes.surfels("plain", 3))
+    if where == "none":
+        inputs = [v[:0] for v in inputs]
+    inputs[0] = inputs[0] + torch.tensor({"behind": [0.0, 0, -50], "beside": [1000.0, 0, 0]}.get(where, [0.0, 0, 0]))
+    if where == "transparent":
+        inputs[3] = torch.full_like(inputs[3], 1 / 256)
+    camera = scenes.camera()
+    upstream = [torch.ones(30, 45, 3), torch.ones(30, 45), torch.ones(30, 45)]
+    raster, gradients = run(tuple(inputs), camera, upstream)
+    assert all((m == 0).all() for m in raster)
+    assert all(g.shape == v.shape and (g == 0).all() for g, v in zip(gradients, inputs, strict=True))
+
+
+def test_absurd_input_stays_finite(isa):
+    torch.manual_seed(0)
+    sizes = torch.tensor([0, 1e-45, 1e-38, 1e-20, 1e-6, 1e-2, 1, 1e3, 1e10, 1e20, 3e38])
+    n = 4000
+    scale = sizes[torch.randint(len(sizes), (n, 2))]
+    sign = torch.randn(n, 3).sign()
+    position = torch.randn(n, 3) * 0.3 + torch.tensor([0.3, -0.2, 0.6])
+    far = torch.arange(n) % 3 == 0
+    position[far] = (sign * sizes[torch.randint(len(sizes), (n, 3))])[far]
+    rotation = torch.randn(n, 4) * sizes[torch.randint(len(sizes), (n, 1))].clamp_max(1e37)
+    rotation[::5] = torch.tensor([1.0, 0, 0, 0])  # many exactly edge-on for a camera that is not turned
+    opacity = torch.rand(n)
+    opacity[::7], opacity[1::7], opacity[2::7] = 0, 1, 1e-45
+    for camera in (scenes.camera(), scenes.camera(1, 40)):
+        shape = (camera.height, camera.width)
+        upstream = [torch.randn(*shape, 3), torch.randn(shape), torch.randn(shape)]
+        raster, gradients = run((position, rotation, scale, opacity, torch.randn(n, 3)), camera, upstream)
+        assert raster.alpha.max() > 0.5
+        for value in (*raster, *gradients):
+            assert value.isfinite().all()
+        assert raster.alpha.max() <= 1 + 1e-5
+
+
+def test_exactly_edge_on_is_a_dot():
+    """A disc seen exactly from its side is drawn by the screen-space filter alone, at its centre's depth."""
+    camera = scenes.camera(9, 9, (4.5, 4.5))
+    centre = torch.tensor(camera.camera_to_world @ [0, 0, 2, 1], dtype=torch.float64)[:3]
+    right, down, forward = camera.camera_to_world[:3, :3].T
+    matrix = np.stack([right, forward, -down], axis=1)
+    rotation = torch.tensor(Rotation.from_matrix(matrix).as_quat(scalar_first=True)).float()
+    raster = rasterize(
+        centre.float()[None], rotation[None], torch.full((1, 2), 0.3), torch.ones(1), torch.ones(1, 1), camera, near=0.1
+    )
+    y, x = torch.meshgrid(torch.arange(9) - 4.0, torch.arange(9) - 4.0, indexing="ij")
+    expected = torch.exp(-(x**2 + y**2)).clamp_max(0.99)
+    off_the_line = y != 0
+    expected = torch.where(expected >= 1 / 255, expected, 0)
+    assert torch.allclose(raster.alpha[off_the_line], expected[off_the_line], atol=1e-5)
+    assert torch.allclose(raster.depth[off_the_line], 2 * expected[off_the_line], atol=1e-4)
+
+
+def _bytes_of_tensors() -> int:
+    gc.collect()
+    return sum(v.untyped_storage().nbytes() for v in gc.get_objects() if type(v) is torch.Tensor)
+
+
+def test_no_grad_keeps_nothing():
+    inputs, camera = scenes.surfels("mixed", 16), scenes.camera(64, 64)
+    before = _bytes_of_tensors()
+    with torch.no_grad():
+        raster = rasterize(*[v.requires_grad_() for v in inputs], camera, near=0.1)
+    assert raster.features.grad_fn is None
+    assert _bytes_of_tensors() - before <= 64 * 64 * (16 + 1 + 1) * 4
+    plain = rasterize(*[v.detach() for v in inputs], camera, near=0.1)
+    assert not plain.alpha.requires_grad
+
+
+def test_wrong_shapes_are_refused():
+    inputs = list(scenes.surfels("plain", 3))
+    with pytest.raises(ValueError, match="float32"):
+        rasterize(inputs[0].double(), *inputs[1:], scenes.camera(), near=0.1)
+    with pytest.raises(ValueError, match="rotations"):
+        rasterize(inputs[0], inputs[1][:, :3], *inputs[2:], scenes.camera(), near=0.1)
+    with pytest.raises(ValueError, match="near"):
+        rasterize(*inputs, scenes.camera(), near=0.0)

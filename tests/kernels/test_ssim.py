@@ -1,0 +1,80 @@
+"""D-SSIM against plain torch in float64."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from refgs.kernels import load
+from refgs.render.ssim import dssim
+
+
+def reference(image: Tensor, target: Tensor) -> Tensor:
+    k = torch.arange(-5, 6, dtype=image.dtype)
+    window = torch.exp(-(k**2) / (2 * 1.5**2))
+    window = torch.outer(window, window) / window.sum() ** 2
+
+    def blur(v: Tensor) -> Tensor:
+        return torch.nn.functional.conv2d(v.permute(2, 0, 1)[:, None], window[None, None], padding=5)
+
+    x, y = blur(image), blur(target)
+    xx, yy, xy = blur(image**2) - x**2, blur(target**2) - y**2, blur(image * target) - x * y
+    ssim = (2 * x * y + 1e-4) * (2 * xy + 9e-4) / ((x**2 + y**2 + 1e-4) * (xx + yy + 9e-4))
+    return 1 - ssim.mean()
+
+
+@pytest.mark.parametrize("shape", [(40, 57), (64, 16), (3, 4), (1, 1), (11, 200)])
+@pytest.mark.parametrize("likeness", [0.0, 0.5, 0.98])
+@pytest.mark.parametrize("isa", load.supported())
+def test_matches_float64(shape, likeness, isa, monkeypatch):
+    monkeypatch.setenv("REFGS_ISA", isa)
+    torch.manual_seed(0)
+    target = torch.rand(*shape, 3)
+    image = (likeness * target + (1 - likeness) * torch.rand(*shape, 3)).requires_grad_()
+    exact = image.detach().double().requires_grad_()
+    expected, found = reference(exact, target.double()), dssim(image, target)
+    assert found.dtype == torch.float32 and found.shape == ()
+    assert abs(found.item() - expected.item()) <= 1e-5 * max(expected.item(), 0.1)
+    (expected_gradient,) = torch.autograd.grad(3 * expected, exact)
+    (gradient,) = torch.autograd.grad(3 * found, image)
+    assert (gradient - expected_gradient).abs().max() <= 1e-4 * expected_gradient.abs().max()
+
+
+def test_flat_images():
+    """Where variances vanish beside C2, float32 computes them as small differences of squares: fewer digits are left."""
+    image, target = torch.full((30, 30, 3), 0.9, requires_grad=True), torch.full((30, 30, 3), 0.8)
+    exact = image.detach().double().requires_grad_()
+    expected = reference(exact, target.double())
+    found = dssim(image, target)
+    assert abs(found.item() - expected.item()) < 1e-4
+    (gradient,) = torch.autograd.grad(found, image)
+    (expected_gradient,) = torch.autograd.grad(expected, exact)
+    assert (gradient - expected_gradient).abs().max() <= 5e-3 * expected_gradient.abs().max()
+
+
+def test_same_image():
+    image = torch.rand(20, 20, 3, requires_grad=True)
+    assert abs(float(dssim(image, image.detach()))) < 1e-6
+
+
+def test_same_bits_for_any_number_of_threads():
+    torch.manual_seed(0)
+    target, before, results = torch.rand(50, 40, 3), torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            image = torch.linspace(0, 1, 6000).reshape(50, 40, 3).requires_grad_()
+            value = dssim(image, target)
+            results.append((value, *torch.autograd.grad(value, image)))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+
+
+def test_no_grad():
+    with torch.no_grad():
+        assert dssim(torch.rand(8, 8, 3, requires_grad=True), torch.rand(8, 8, 3)).grad_fn is None
+
+
+def test_wrong_shapes_are_refused():
+    with pytest.raises(ValueError, match="one shape"):
+        dssim(torch.rand(8, 8, 3), torch.rand(8, 9, 3))
