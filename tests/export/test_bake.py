@@ -1,0 +1,153 @@
+import numpy as np
+import pytest
+import trimesh
+from scipy.ndimage import distance_transform_edt, label
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from refgs.export.bake import bake, unwrap
+from refgs.export.splats import Splats
+from refgs.export.tangents import vertex_tangents
+from refgs.geometry.mesh import Mesh, smooth_normals
+
+
+def paint(p):
+    """A colour that varies smoothly over the unit sphere."""
+    return 0.5 + 0.4 * np.sin(2 * p + [0, 1, 2])
+
+
+def sphere_of_splats(count=4000, radius=1.0, outward=1.0):
+    i = np.arange(count) + 0.5
+    z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
+    ring = np.sqrt(1 - z * z)
+    n = np.stack([np.cos(phi) * ring, np.sin(phi) * ring, z], axis=1)
+    u = np.cross(n, [0.3, 0.5, 0.8])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    rotations = Rotation.from_matrix(np.stack([u, np.cross(n, u), n], axis=2)).as_quat()[:, [3, 0, 1, 2]]
+    f = np.float32
+    return Splats(
+        positions=(radius * n).astype(f),
+        normals=(outward * n).astype(f),
+        sh=np.zeros((count, 1, 3), f),
+        opacities=np.full(count, 0.8, f),
+        scales=np.full((count, 2), radius * np.sqrt(4 * np.pi / count), f),
+        rotations=rotations.astype(f),
+        albedo=paint(n).astype(f),
+        metallic=(0.5 + 0.5 * n[:, 2]).astype(f),
+        roughness=(0.5 - 0.4 * n[:, 0]).astype(f),
+    )
+
+
+def ball(level=3):
+    sphere = trimesh.creation.icosphere(level)
+    return Mesh(np.array(sphere.vertices), np.array(sphere.faces), smooth_normals(sphere.vertices, sphere.faces))
+
+
+@pytest.fixture(scope="module")
+def unwrapped():
+    return unwrap(ball())
+
+
+def on_surface(mesh, count=3000):
+    """Random faces and barycentric weights, and their uv."""
+    rng = np.random.default_rng(2)
+    faces = mesh.faces[rng.integers(len(mesh.faces), size=count)]
+    weights = rng.dirichlet([1, 1, 1], size=count)
+    return faces, weights, np.einsum("nk,nkc->nc", weights, mesh.uv[faces])
+
+
+def look_up(texture, uv):
+    """Bilinear, as a renderer does, v upward."""
+    size = len(texture)
+    x, y = uv[:, 0] * size - 0.5, (1 - uv[:, 1]) * size - 0.5
+    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
+    s, t = (x - x0).reshape(-1, *[1] * (texture.ndim - 2)), (y - y0).reshape(-1, *[1] * (texture.ndim - 2))
+
+    def at(row, column):
+        return texture[row.clip(0, size - 1), column.clip(0, size - 1)]
+
+    return (at(y0, x0) * (1 - s) + at(y0, x0 + 1) * s) * (1 - t) + (
+        at(y0 + 1, x0) * (1 - s) + at(y0 + 1, x0 + 1) * s
+    ) * t
+
+
+def test_unwrap_keeps_the_surface(unwrapped):
+    mesh = ball()
+    assert len(unwrapped.faces) == len(mesh.faces)
+    assert unwrapped.uv.min() >= 0 and unwrapped.uv.max() <= 1
+    np.testing.assert_allclose(unwrapped.vertices[unwrapped.faces], mesh.vertices[mesh.faces])
+    np.testing.assert_allclose(unwrapped.normals, unwrapped.vertices, atol=0.01)
+
+
+def test_materials_come_back_where_they_were(unwrapped):
+    textures = bake(unwrapped, sphere_of_splats(), 256)
+    faces, weights, uv = on_surface(unwrapped)
+    points = np.einsum("nk,nkc->nc", weights, unwrapped.vertices[faces])
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    error = np.abs(look_up(textures.base_color, uv) - paint(points))
+    assert error.mean() < 0.01 and error.max() < 0.05
+    assert np.abs(look_up(textures.metallic, uv) - (0.5 + 0.5 * points[:, 2])).max() < 0.05
+    assert np.abs(look_up(textures.roughness, uv) - (0.5 - 0.4 * points[:, 0])).max() < 0.05
+
+
+def test_the_normal_map_mends_a_coarse_mesh():
+    # Normals of the faces' corners, bent: what the map holds must undo the bend as a shader does.
+    mesh = ball(2)
+    rng = np.random.default_rng(0)
+    mesh.normals = mesh.normals + 0.15 * rng.normal(size=mesh.normals.shape)
+    mesh.normals /= np.linalg.norm(mesh.normals, axis=1, keepdims=True)
+    mesh = unwrap(mesh)
+    textures = bake(mesh, sphere_of_splats(), 512)
+    np.testing.assert_allclose(np.linalg.norm(textures.normal, axis=-1), 1, atol=1e-5)
+    tangents, signs = vertex_tangents(mesh)
+    faces, weights, uv = on_surface(mesh)
+    n, t = (np.einsum("nk,nkc->nc", weights, a[faces]) for a in (mesh.normals, tangents))
+    b = signs[faces[:, :1]] * np.cross(n, t)
+    c = look_up(textures.normal, uv)
+    shaded = c[:, :1] * t + c[:, 1:2] * b + c[:, 2:] * n
+    points = np.einsum("nk,nkc->nc", weights, mesh.vertices[faces])
+
+    def degrees(a):
+        cosine = (a * points).sum(1) / np.linalg.norm(a, axis=1) / np.linalg.norm(points, axis=1)
+        return np.degrees(np.arccos(cosine.clip(-1, 1)))
+
+    assert degrees(n).mean() > 5
+    assert degrees(shaded).mean() < 1
+    assert np.percentile(degrees(shaded), 99) < 4
+
+
+def test_padding_repeats_the_nearest_texel(unwrapped):
+    textures = bake(unwrapped, sphere_of_splats(500), 128)
+    rows, columns = np.nonzero(textures.mask)
+    tree = cKDTree(np.stack([rows, columns], axis=1))
+    outside = np.argwhere(~textures.mask)
+    distance = tree.query(outside)[0]
+    for (row, column), d in list(zip(outside, distance, strict=True))[::37]:
+        near = np.array(tree.query_ball_point((row, column), d + 1e-6))
+        assert (textures.base_color[rows[near], columns[near]] == textures.base_color[row, column]).all(1).any()
+
+
+def test_charts_keep_a_128th_of_the_side_apart(unwrapped):
+    textures = bake(unwrapped, sphere_of_splats(100), 512)
+    charts, count = label(textures.mask, np.ones((3, 3)))
+    assert count > 3
+    for chart in range(1, count + 1):
+        others = distance_transform_edt((charts == 0) | (charts == chart))
+        assert others[charts == chart].min() >= 4
+
+
+def test_the_inside_of_a_shell_does_not_show_outside(unwrapped):
+    outer, inner = sphere_of_splats(), sphere_of_splats(radius=0.97, outward=-1)
+    inner.albedo[:] = 0
+    both = Splats(**{name: np.concatenate([value, getattr(inner, name)]) for name, value in vars(outer).items()})
+    textures = bake(unwrapped, both, 128)
+    assert np.abs(textures.base_color - bake(unwrapped, outer, 128).base_color)[textures.mask].max() < 0.02
+
+
+def test_far_or_transparent_splats_still_give_colour(unwrapped):
+    splats = sphere_of_splats(radius=3)
+    splats.opacities[:] = 0
+    textures = bake(unwrapped, splats, 64)
+    assert np.isfinite(textures.normal).all() and textures.base_color.std() > 0.1
+    one = Splats(**{name: value[:1] for name, value in vars(splats).items()})
+    np.testing.assert_allclose(bake(unwrapped, one, 64).base_color[0, 0], one.albedo[0], rtol=1e-5)
