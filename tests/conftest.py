@@ -1,76 +1,13 @@
-"""A small capture with a known answer, made without the program: a metal ball under a smooth sky."""
-
 import refgs  # noqa: F401, I001  first: it tells OpenMP's idle threads to sleep, which must be said before torch loads
 
-import json
-
-import numpy as np
 import pytest
-from PIL import Image
 
-SIZE, VIEWS, DISTANCE, ANGLE = 64, 24, 4.0, 0.7
-F0 = np.array([0.9, 0.6, 0.3])
-
-
-def sky(direction):
-    """Linear radiance (…, 3): bright above, dark below, warmer to +x. Smooth, so that a low roughness hardly blurs it."""
-    x, y, z = np.moveaxis(direction, -1, 0)
-    return np.stack([0.5 + 0.3 * z + 0.2 * x, 0.5 + 0.35 * z + 0.1 * y, 0.5 + 0.4 * z - 0.2 * x], axis=-1)
-
-
-def encode(linear):
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
-
-
-def ball_photo(matrix, size, samples=4):
-    """RGBA in 0..1 of the unit ball, mirror reflection with Schlick's Fresnel; alpha by `samples`² rays a pixel."""
-    focal = 0.5 * size / np.tan(ANGLE / 2)
-    grid = (np.arange(size * samples) + 0.5) / samples
-    x, y = np.meshgrid(grid - size / 2, grid - size / 2)
-    ray = np.stack([x / focal, -y / focal, -np.ones_like(x)], axis=-1) @ matrix[:3, :3].T
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    origin = matrix[:3, 3]
-    b = ray @ origin
-    inside = b * b - (origin @ origin - 1)
-    hit = inside > 0
-    normal = origin + (-b - np.sqrt(np.maximum(inside, 0)))[..., None] * ray
-    cosine = -(normal * ray).sum(-1, keepdims=True)
-    mirrored = ray + 2 * cosine * normal
-    fresnel = F0 + (1 - F0) * (1 - cosine.clip(0, 1)) ** 5
-    color = np.where(hit[..., None], fresnel * sky(mirrored), 0)
-    blocks = (size, samples, size, samples)
-    alpha = hit.reshape(blocks).mean(axis=(1, 3))
-    color = color.reshape(*blocks, 3).sum(axis=(1, 3)) / np.maximum(hit.reshape(blocks).sum(axis=(1, 3)), 1)[..., None]
-    return np.dstack([encode(color).clip(0, 1), alpha])
-
-
-def camera_matrix(direction):
-    """OpenGL camera-to-world at DISTANCE along a direction, looking at the origin, +z up."""
-    back = direction / np.linalg.norm(direction)
-    right = np.cross([0, 0, 1], back)
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3] = np.stack([right, np.cross(back, right), back, DISTANCE * back], axis=1)
-    return matrix
+from benchmarks.scenes.analytic import write_ball_capture
 
 
 @pytest.fixture(scope="session")
 def ball_capture(tmp_path_factory):
-    """A NeRF-Blender capture of the ball: 24 training and 4 test views of 64 pixels."""
+    """A small capture with a known answer: a metal ball at 64 pixels."""
     folder = tmp_path_factory.mktemp("ball")
-    steps = np.arange(VIEWS + 4) + 0.5
-    z = 0.9 - 1.5 * steps / len(steps)
-    azimuth = steps * np.pi * (3 - np.sqrt(5))
-    directions = np.stack([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z], axis=1)
-    frames = {"train": [], "test": []}
-    for i, direction in enumerate(directions):
-        split = "test" if i % 7 == 3 else "train"
-        matrix = camera_matrix(direction)
-        (folder / split).mkdir(exist_ok=True)
-        pixels = np.rint(ball_photo(matrix, SIZE) * 255).astype(np.uint8)
-        Image.fromarray(pixels).save(folder / split / f"r_{i}.png")
-        frames[split].append({"file_path": f"./{split}/r_{i}", "transform_matrix": matrix.tolist()})
-    for split, entries in frames.items():
-        text = json.dumps({"camera_angle_x": ANGLE, "frames": entries})
-        (folder / f"transforms_{split}.json").write_text(text)
+    write_ball_capture(folder, 64)
     return folder

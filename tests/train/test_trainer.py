@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.scenes.analytic import F0, sky
 from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.export.environment import directions
@@ -18,7 +19,6 @@ from refgs.run import create_run, open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset
 from refgs.train.trainer import Trainer
-from tests.conftest import F0, sky
 
 SMALL = ["surfels.start=1500", "surfels.budget=1800", "environment.resolution=16", "train.light_first=20"]
 

@@ -1,0 +1,70 @@
+"""A whole training iteration of the deferred stage, part by part: `refgs bench iteration`.
+
+The scene is the repository's own, made without Blender: 256×256 photos of a metal ball that fills most of the frame,
+20,000 surfels on its hull. Each part is timed by running the iteration's own functions up to it.
+"""
+
+import refgs  # noqa: F401, I001  first: it tells OpenMP's idle threads to sleep, which must be said before torch loads
+
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import torch
+from benchmarks.scenes.analytic import write_ball_capture
+
+from refgs.capture import read_capture
+from refgs.render.renderer import render
+from refgs.settings import load_settings
+from refgs.train.losses import objective
+from refgs.train.trainer import Trainer, composite
+
+SIZE, SURFELS, REPEATS = 256, 20_000, 30
+
+
+def main() -> None:
+    """Print milliseconds: the least and the median of the repeats."""
+    with tempfile.TemporaryDirectory() as folder:
+        capture_folder = Path(folder) / "ball"
+        write_ball_capture(capture_folder, SIZE, samples=2)
+        changes = [f"surfels.start={SURFELS}", f"surfels.budget={SURFELS}", "train.light_first=0"]
+        settings = load_settings("quick", changes)
+        trainer = Trainer(read_capture(capture_folder), settings, Path(folder), lambda *_: None)
+        for _ in range(5):
+            trainer.step()
+        rows: dict[str, list[float]] = {}
+        for _ in range(REPEATS):
+            _one(trainer, rows)
+    threads = torch.get_num_threads()
+    print(f"{SIZE}×{SIZE}, {len(trainer.parameters['position']):,} surfels, {threads} threads; ms: least, median")
+    for name, seconds in rows.items():
+        print(f"{name:32s} {1e3 * min(seconds):7.1f} {1e3 * statistics.median(seconds):7.1f}")
+
+
+def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
+    """An iteration in pieces, then a whole one."""
+    view, settings, clock = trainer.views[0], trainer.settings, time.perf_counter
+
+    def record(name: str, since: float) -> float:
+        rows.setdefault(name, []).append(clock() - since)
+        return clock()
+
+    at = clock()
+    surfels, environment = trainer.surfels(), trainer.environment()
+    at = record("activations and light's prefilter", at)
+    rendering = render(surfels, environment, view.camera, trainer.background, settings.render, trainer.near)
+    at = record("raster and shading", at)
+    mask = torch.from_numpy(view.alpha).float() / 255
+    loss = objective(rendering, composite(view, trainer.background), mask, view.camera, settings.loss)
+    at = record("losses", at)
+    loss.backward()
+    record("backward of all", at)
+    trainer.optimizer.zero_grad(set_to_none=True)
+    at = clock()
+    trainer.step()
+    record("a whole iteration", at)
+
+
+if __name__ == "__main__":
+    main()
