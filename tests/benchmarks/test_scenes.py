@@ -200,3 +200,14 @@ def test_wrong_input_is_one_line_and_leaves_nothing(tmp_path):
         assert process.returncode == 2 and process.stdout == ""
         assert words in process.stderr.splitlines()[-1] and "Traceback" not in process.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+def test_ended_from_outside_it_leaves_nothing(tmp_path):
+    pytest.importorskip("bpy")
+    command = [sys.executable, "-m", "benchmarks.scenes", "ball", "--out", tmp_path / "new", "--size", "16"]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert json.loads(process.stdout.readline())["done"] == 1
+        assert [path.name.startswith(".new-") for path in tmp_path.iterdir()] == [True]
+        process.terminate()
+    assert process.returncode == 143
+    assert not list(tmp_path.iterdir())
