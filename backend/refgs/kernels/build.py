@@ -16,7 +16,7 @@ SOURCES = ("raster.cpp", "ssim.cpp")
 HEADERS = ("library.h", "splat.h", "vector.h")
 # -ffp-contract=on: fused within an expression, never across, so that a formula rounds the same wherever it is inlined.
 FLAGS = ["-shared", "-s", "-O3", "-std=c++20", "-fno-exceptions", "-fno-rtti", "-nostdlib", "-fvisibility=hidden"]
-FLAGS += ["-ffp-contract=on", "-fno-math-errno", "-mprefer-vector-width=512"]
+FLAGS += ["-fno-builtin", "-ffp-contract=on", "-fno-math-errno", "-mprefer-vector-width=512"]
 
 
 @dataclass(frozen=True)

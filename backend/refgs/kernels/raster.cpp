@@ -17,20 +17,19 @@ constexpr int BLOCK_X = LANES == 4 ? 2 : 4;  // a block is one vector of pixels
 constexpr int BLOCK_Y = LANES / BLOCK_X;
 constexpr int BLOCKS_X = TILE / BLOCK_X, BLOCKS_Y = TILE / BLOCK_Y;
 constexpr int BLOCKS = BLOCKS_X * BLOCKS_Y;
+constexpr int AHEAD = 12;     // splats that are fetched before they are needed
 constexpr int CHUNK = 64;      // splats of a tile that are treated together
 constexpr int GEOMETRY = 16;   // floats of a gradient row before its features; 14 are used
-constexpr int CHANNEL_STEP = LANES == 4 ? 4 : 8;
 
-struct Projected {
+struct alignas(64) Projected {
   double n0[3], n1[3], n2[3];  // as in Splat, the origin at the image's corner
   double x, y;
   float determinant, n2_min, n2_max, depth, opacity, rho_max;
-  int32_t x0, y0, x1, y1;  // pixels that it can cover, inclusive; x1 < x0 where there are none
-  bool tiles(int& tx0, int& ty0, int& tx1, int& ty1) const {
-    tx0 = x0 / TILE, ty0 = y0 / TILE, tx1 = x1 / TILE, ty1 = y1 / TILE;
-    return x1 >= x0;
-  }
+  // Pixels that it can cover, all inclusive: bounds of x, y, x + y and x - y, an octagon; x1 < x0 where there are none.
+  int16_t x0, x1, y0, y1, sum0, sum1, difference0, difference1;
 };
+
+static_assert(sizeof(Projected) == 128, "two cache lines");
 
 struct Raster {
   int64_t splats, channels, width, height;
@@ -55,9 +54,24 @@ struct Raster {
   Shared shared;
 };
 
+int32_t larger(int32_t a, int32_t b) { return a > b ? a : b; }
+int32_t lesser(int32_t a, int32_t b) { return a < b ? a : b; }
 int64_t tiles_x(const Raster& r) { return (r.width + TILE - 1) / TILE; }
 int64_t tiles_y(const Raster& r) { return (r.height + TILE - 1) / TILE; }
-int64_t padded(int64_t channels) { return (channels + CHANNEL_STEP - 1) / CHANNEL_STEP * CHANNEL_STEP; }
+
+// body(tile) for the tiles that the splat's octagon meets, row by row.
+template <class Body>
+INLINE void each_tile(const Raster& r, const Projected& p, Body body) {
+  if (p.x1 < p.x0) return;
+  for (int32_t y = p.y0 / TILE; y <= p.y1 / TILE; y++)
+    for (int32_t x = p.x0 / TILE; x <= p.x1 / TILE; x++) {
+      int32_t sum = (x + y) * TILE, difference = (x - y) * TILE;
+      if (sum <= p.sum1 && sum + 2 * (TILE - 1) >= p.sum0 && difference - TILE < p.difference1 && difference + TILE > p.difference0)
+        body(y * tiles_x(r) + x, x, y);
+    }
+}
+
+int64_t padded(int64_t channels) { return (channels + LANES - 1) / LANES * LANES; }
 
 struct Vec3 {
   double x, y, z;
@@ -116,21 +130,21 @@ struct Interval {
   double low, high;
 };
 
-// Bounds of the image of {c + u a + v b: u^2 + v^2 <= k^2}, wholly in front of the camera, along an image axis whose
-// homogeneous coordinate has the components (au, bu, cu): the tangents to its outline, a conic.
-Interval extent(double au, double bu, double cu, const Disc& d, double k2) {
+// Bounds of the image of {c + u a + v b: u^2 + v^2 <= k^2}, wholly in front of the camera, along an image axis: the tangents to
+// its outline, a conic. (a, b, c) are the axis' homogeneous coordinates of the three vectors.
+Interval extent(double a, double b, double c, const Disc& d, double k2) {
   double zz = k2 * (d.a.z * d.a.z + d.b.z * d.b.z) - d.c.z * d.c.z;  // < 0
-  double uz = k2 * (au * d.a.z + bu * d.b.z) - cu * d.c.z;
-  double uu = k2 * (au * au + bu * bu) - cu * cu;
+  double uz = k2 * (a * d.a.z + b * d.b.z) - c * d.c.z;
+  double uu = k2 * (a * a + b * b) - c * c;
   double root = __builtin_sqrt(__builtin_fmax(uz * uz - uu * zz, 0));
   return {(uz + root) / zz, (uz - root) / zz};
 }
 
-int32_t pixel(double x, int64_t limit) { return (int32_t)__builtin_fmin(__builtin_fmax(x, -1), (double)limit); }
+int16_t integer(double x) { return (int16_t)__builtin_fmin(__builtin_fmax(x, -32767), 32767); }
 
 void project(const Raster& r, int64_t i) {
   Projected& p = r.projected[i];
-  p.x0 = p.y0 = 0, p.x1 = p.y1 = -1;
+  p.x0 = 0, p.x1 = -1;
   Disc d = disc(r, i);
   double rho_max = 2 * __builtin_log(r.opacities[i] / (double)refgs::ALPHA_CUT);
   if (!(d.c.z >= r.near && d.c.z <= refgs::FAR && rho_max >= 0)) return;
@@ -153,34 +167,44 @@ void project(const Raster& r, int64_t i) {
   p.n2_min = k != 0 ? __builtin_fmax(determinant / refgs::FAR, 1e-18) : 1;
   p.n2_max = k != 0 ? determinant / r.near : -1;
 
-  double radius = __builtin_sqrt(rho_max / refgs::LOW_PASS);
-  Interval x = {p.x - radius, p.x + radius}, y = {p.y - radius, p.y + radius};
-  auto include = [](Interval& a, double low, double high) { a.low = __builtin_fmin(a.low, low), a.high = __builtin_fmax(a.high, high); };
-  if (k != 0) {
-    double reach = __builtin_sqrt(rho_max), slope = __builtin_sqrt(d.a.z * d.a.z + d.b.z * d.b.z);  // z = c.z + slope t along `t`
-    if (d.c.z - reach * slope >= r.near) {
-      Interval e = extent(d.a.x, d.b.x, d.c.x, d, rho_max);
-      include(x, r.fx * e.low + r.cx, r.fx * e.high + r.cx);
-      e = extent(d.a.y, d.b.y, d.c.y, d, rho_max);
-      include(y, r.fy * e.low + r.cy, r.fy * e.high + r.cy);
-    } else {  // what is left of the disc lies in a rectangle, cut off at the near plane, whose image is convex
-      double eu = d.a.z / slope, ev = d.b.z / slope;
-      const double ts[] = {(r.near - d.c.z) / slope, reach}, ss[] = {-reach, reach};
+  // The four axes of the octagon, as coefficients of x and y, and where the screen-space filter reaches along them.
+  const double axes[4][2] = {{1, 0}, {0, 1}, {1, 1}, {1, -1}};
+  double radius = __builtin_sqrt(rho_max / refgs::LOW_PASS), reach = __builtin_sqrt(rho_max);
+  double slope = __builtin_sqrt(d.a.z * d.a.z + d.b.z * d.b.z);  // of z over the disc, along (eu, ev)
+  double eu = d.a.z / slope, ev = d.b.z / slope, nearest = (r.near - d.c.z) / slope;
+  Interval bounds[4];
+  for (int i = 0; i < 4; i++) {
+    double mx = axes[i][0] * r.fx, my = axes[i][1] * r.fy, mz = axes[i][0] * r.cx + axes[i][1] * r.cy;
+    double centre = axes[i][0] * p.x + axes[i][1] * p.y, length = i < 2 ? radius : radius * 1.4142135623730951;
+    bounds[i] = {centre - length, centre + length};
+    auto include = [&](double x) {
+      bounds[i].low = __builtin_fmin(bounds[i].low, x), bounds[i].high = __builtin_fmax(bounds[i].high, x);
+    };
+    if (k != 0 && d.c.z - reach * slope >= r.near) {
+      auto homogeneous = [&](Vec3 p) { return mx * p.x + my * p.y + mz * p.z; };
+      Interval e = extent(homogeneous(d.a), homogeneous(d.b), homogeneous(d.c), d, rho_max);
+      include(e.low), include(e.high);
+    } else if (k != 0) {  // what is left of the disc lies in a rectangle, cut off at the near plane, whose image is convex
+      const double ts[] = {nearest, reach}, ss[] = {-reach, reach};
       for (double t : ts)
         for (double s : ss) {
           Vec3 corner = d.c + (t * eu - s * ev) * d.a + (t * ev + s * eu) * d.b;
-          double z = __builtin_fmax(corner.z, r.near), px = r.fx * corner.x / z + r.cx, py = r.fy * corner.y / z + r.cy;
-          include(x, px, px), include(y, py, py);
+          include((mx * corner.x + my * corner.y) / __builtin_fmax(corner.z, r.near) + mz);
         }
     }
   }
   const double slack = 1e-3;  // pixels: for the rounding of the tiles' float arithmetic
-  p.x0 = pixel(__builtin_ceil(x.low - 0.5 - slack), r.width), p.x1 = pixel(__builtin_floor(x.high - 0.5 + slack), r.width - 1);
-  p.y0 = pixel(__builtin_ceil(y.low - 0.5 - slack), r.height), p.y1 = pixel(__builtin_floor(y.high - 0.5 + slack), r.height - 1);
-  if (p.x0 < 0) p.x0 = 0;
-  if (p.y0 < 0) p.y0 = 0;
+  auto first = [&](int i, double offset) { return integer(__builtin_ceil(bounds[i].low - offset - slack)); };
+  auto last = [&](int i, double offset) { return integer(__builtin_floor(bounds[i].high - offset + slack)); };
+  p.x0 = larger(first(0, 0.5), 0), p.x1 = lesser(last(0, 0.5), r.width - 1);
+  p.y0 = larger(first(1, 0.5), 0), p.y1 = lesser(last(1, 0.5), r.height - 1);
+  p.sum0 = first(2, 1), p.sum1 = last(2, 1), p.difference0 = first(3, 0), p.difference1 = last(3, 0);
   if (p.y1 < p.y0) p.x1 = p.x0 - 1;
 }
+
+// A tile's pixels are numbered block by block, and within a block lane by lane.
+constexpr int pixel_x(int i) { return i / LANES % BLOCKS_X * BLOCK_X + i % LANES % BLOCK_X; }
+constexpr int pixel_y(int i) { return i / LANES / BLOCKS_X * BLOCK_Y + i % LANES / BLOCK_X; }
 
 struct Tile {
   int64_t index, x, y, width, height;  // x, y: its first pixel; width, height: its part inside the image
@@ -188,7 +212,8 @@ struct Tile {
     width = r.width - x < TILE ? r.width - x : TILE;
     height = r.height - y < TILE ? r.height - y : TILE;
   }
-  int64_t pixel(const Raster& r, int px, int py) const { return (y + py) * r.width + x + px; }
+  bool inside(int i) const { return pixel_x(i) < width && pixel_y(i) < height; }
+  int64_t pixel(const Raster& r, int i) const { return (y + pixel_y(i)) * r.width + x + pixel_x(i); }
 };
 
 // Pixel centres of a tile from its middle, block by block.
@@ -196,22 +221,17 @@ struct Centres {
   alignas(64) float x[PIXELS], y[PIXELS];
   constexpr Centres() : x(), y() {
     for (int i = 0; i < PIXELS; i++) {
-      int block = i / LANES, lane = i % LANES;
-      x[i] = block % BLOCKS_X * BLOCK_X + lane % BLOCK_X + 0.5f - TILE / 2;
-      y[i] = block / BLOCKS_X * BLOCK_Y + lane / BLOCK_X + 0.5f - TILE / 2;
+      x[i] = pixel_x(i) + 0.5f - TILE / 2;
+      y[i] = pixel_y(i) + 0.5f - TILE / 2;
     }
   }
 };
 constexpr Centres CENTRES;
 
-int slot(int px, int py) {  // where a tile's pixel is in block order
-  return (py / BLOCK_Y * BLOCKS_X + px / BLOCK_X) * LANES + py % BLOCK_Y * BLOCK_X + px % BLOCK_X;
-}
-
 float near_zero(double x) { return (float)__builtin_fmin(__builtin_fmax(x, -1e9), 1e9); }
 
 // An affine function of the image's pixels (value at its corner, slopes) as one of a tile's.
-void localise(const double* n, double x, double y, refgs::Affine& f) {
+INLINE void localise(const double* n, double x, double y, refgs::Affine& f) {
   const double exact[3] = {n[0] + n[1] * x + n[2] * y, n[1], n[2]};
   double largest = __builtin_fabs(exact[0]) + TILE * (__builtin_fabs(exact[1]) + __builtin_fabs(exact[2]));
   // Adding 1.5 * 2^52 q rounds to multiples of q, here 2^-22 of the largest sum: its multiples of q / 2 fit in a float.
@@ -222,7 +242,7 @@ void localise(const double* n, double x, double y, refgs::Affine& f) {
   }
 }
 
-Splat localise(const Projected& p, const Tile& t) {
+INLINE Splat localise(const Projected& p, const Tile& t) {
   double x = t.x + TILE / 2, y = t.y + TILE / 2;
   Splat s;
   localise(p.n0, x, y, s.n0), localise(p.n1, x, y, s.n1), localise(p.n2, x, y, s.n2);
@@ -232,14 +252,27 @@ Splat localise(const Projected& p, const Tile& t) {
   return s;
 }
 
+// Start fetching what a tile's member holds: they lie anywhere.
+INLINE void fetch(const Raster& r, const int32_t* members, int64_t k, int64_t count) {
+  if (k >= count) return;
+  __builtin_prefetch(&r.projected[members[k]]);
+  __builtin_prefetch((const char*)&r.projected[members[k]] + 64);
+  __builtin_prefetch(r.features + members[k] * r.channels);
+}
+
 uint64_t bits(int low, int high) { return (~0ull >> (63 - (high - low))) << low; }
 
-// Blocks of the tile that the splat's bounds meet, one bit each.
+// Blocks of the tile that the splat's octagon meets, one bit each.
 uint64_t blocks(const Projected& p, const Tile& t) {
-  int x0 = (int)(p.x0 > t.x ? p.x0 - t.x : 0) / BLOCK_X, x1 = (int)(p.x1 < t.x + TILE ? p.x1 - t.x : TILE - 1) / BLOCK_X;
-  int y0 = (int)(p.y0 > t.y ? p.y0 - t.y : 0) / BLOCK_Y, y1 = (int)(p.y1 < t.y + TILE ? p.y1 - t.y : TILE - 1) / BLOCK_Y;
-  uint64_t row = bits(x0, x1), mask = 0;
-  for (int y = y0; y <= y1; y++) mask |= row << (y * BLOCKS_X);
+  int32_t tx = (int32_t)t.x, ty = (int32_t)t.y;
+  uint64_t mask = 0;
+  for (int y = larger(p.y0 - ty, 0) / BLOCK_Y; y <= lesser(p.y1 - ty, TILE - 1) / BLOCK_Y; y++) {
+    int32_t top = ty + y * BLOCK_Y, bottom = top + BLOCK_Y - 1;
+    int32_t x0 = larger(larger(p.x0, p.sum0 - bottom), p.difference0 + top) - tx;
+    int32_t x1 = lesser(lesser(p.x1, p.sum1 - top), p.difference1 + bottom) - tx;
+    if (x0 > x1 || x1 < 0 || x0 >= TILE) continue;
+    mask |= bits(larger(x0, 0) / BLOCK_X, lesser(x1, TILE - 1) / BLOCK_X) << (y * BLOCKS_X);
+  }
   return mask;
 }
 
@@ -264,11 +297,9 @@ void blend_all(float* sums, const Vector* weights, const float* const* rows, int
 
 void forward_tile(Raster& r, int64_t index, float* sums) {
   Tile t(r, index);
-  alignas(64) float transmittance[PIXELS], depth[PIXELS], alpha[PIXELS];
-  __builtin_memset(depth, 0, sizeof depth), __builtin_memset(alpha, 0, sizeof alpha), __builtin_memset(transmittance, 0, sizeof transmittance);
-  for (int y = 0; y < t.height; y++)
-    for (int x = 0; x < t.width; x++) transmittance[slot(x, y)] = 1;
-  __builtin_memset(sums, 0, r.channels * PIXELS * sizeof(float));
+  alignas(64) float transmittance[PIXELS], depth[PIXELS] = {}, alpha[PIXELS] = {};
+  for (int i = 0; i < PIXELS; i++) transmittance[i] = t.inside(i) ? 1 : 0;
+  clear(sums, r.channels * PIXELS);
 
   uint64_t live = 0;
   for (int b = 0; b < BLOCKS; b++) live |= (uint64_t)any(load(transmittance + b * LANES) > 0.0f) << b;
@@ -282,6 +313,7 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
     int lengths[BLOCKS] = {};
     int n = (int)(count - start < CHUNK ? count - start : CHUNK);
     for (int k = 0; k < n; k++) {
+      fetch(r, members, start + k + AHEAD, count);
       const Projected& p = r.projected[members[start + k]];
       splats[k] = localise(p, t);
       for (uint64_t m = blocks(p, t) & live; m; m &= m - 1) {
@@ -319,46 +351,37 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
     }
   }
   r.reach[index] = (int32_t)reach;
-  for (int y = 0; y < t.height; y++)
-    for (int x = 0; x < t.width; x++) {
-      int s = slot(x, y);
-      int64_t p = t.pixel(r, x, y);
-      r.out_depth[p] = depth[s], r.out_alpha[p] = alpha[s];
-      const float* from = sums + s / LANES * LANES * r.channels + s % LANES;
-      for (int64_t c = 0; c < r.channels; c++) r.out_features[p * r.channels + c] = from[c * LANES];
+  for (int i = 0; i < PIXELS; i++) {
+    if (!t.inside(i)) continue;
+    r.out_depth[t.pixel(r, i)] = depth[i], r.out_alpha[t.pixel(r, i)] = alpha[i];
+  }
+  for (int b = 0; b < BLOCKS; b++)
+    for (int64_t c = 0; c < r.channels; c += LANES) {
+      Vector v[LANES];
+      for (int k = 0; k < LANES; k++) v[k] = c + k < r.channels ? load(sums + (b * r.channels + c + k) * LANES) : Vector();
+      transpose(v);
+      for (int k = 0; k < LANES; k++) {
+        int i = b * LANES + k;
+        if (t.inside(i)) write(r.out_features + t.pixel(r, i) * r.channels + c, v[k], r.channels - c);
+      }
     }
 }
 
-// row[c] += sum over the block's pixels of weight * by_features[pixel][c]
-INLINE void scatter_features(float* row, const float* weights, const float* by_features, int64_t channels) {
+// row[c] = sum over the pixels of some blocks of weight * by_features[pixel][c]
+void gather_features(float* row, const Vector* weights, const float* const* pixels, int count, int64_t channels) {
   for (int64_t c = 0; c < channels; c += LANES) {
-    if (LANES == 16 && c + LANES > channels) {  // half a vector is left
-      typedef float Half __attribute__((vector_size(32), aligned(4)));
-      Half s0 = *(const Half*)(row + c), s1 = {};
-      for (int i = 0; i < LANES; i += 2) {
-        s0 += weights[i] * *(const Half*)(by_features + i * channels + c);
-        s1 += weights[i + 1] * *(const Half*)(by_features + (i + 1) * channels + c);
+    Vector s0 = {}, s1 = {}, s2 = {}, s3 = {};
+    for (int k = 0; k < count; k++) {
+      const float *w = (const float*)(weights + k), *by = pixels[k] + c;
+      for (int i = 0; i < LANES; i += 4, by += 4 * channels) {
+        s0 += w[i] * load(by);
+        s1 += w[i + 1] * load(by + channels);
+        s2 += w[i + 2] * load(by + 2 * channels);
+        s3 += w[i + 3] * load(by + 3 * channels);
       }
-      *(Half*)(row + c) = s0 + s1;
-      break;
-    }
-    Vector s0 = load(row + c), s1 = {}, s2 = {}, s3 = {};
-    for (int i = 0; i < LANES; i += 4) {
-      s0 += weights[i] * load(by_features + i * channels + c);
-      s1 += weights[i + 1] * load(by_features + (i + 1) * channels + c);
-      s2 += weights[i + 2] * load(by_features + (i + 2) * channels + c);
-      s3 += weights[i + 3] * load(by_features + (i + 3) * channels + c);
     }
     store(row + c, (s0 + s1) + (s2 + s3));
   }
-}
-
-float total(Vector v) {
-  float lanes[LANES];
-  store(lanes, v);
-  for (int n = LANES / 2; n; n /= 2)
-    for (int i = 0; i < n; i++) lanes[i] += lanes[i + n];
-  return lanes[0];
 }
 
 // Front to back again. What lies behind a splat is what is left of the pixel's total, so one scalar a pixel suffices.
@@ -367,35 +390,53 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
   int64_t channels = r.channels, C = padded(channels);
   float* planes = scratch;              // derivatives by features, (block, channel, lane)
   float* pixels = planes + PIXELS * C;  // and (block, lane, channel)
-  alignas(64) float transmittance[PIXELS] = {}, by_depth[PIXELS] = {}, by_alpha[PIXELS] = {}, rest[PIXELS] = {};
-  __builtin_memset(scratch, 0, 2 * PIXELS * C * sizeof(float));
-  for (int y = 0; y < t.height; y++)
-    for (int x = 0; x < t.width; x++) {
-      int s = slot(x, y);
-      int64_t p = t.pixel(r, x, y);
-      transmittance[s] = 1;
-      by_depth[s] = r.by_depth[p], by_alpha[s] = r.by_alpha[p];
-      float sum = by_depth[s] * r.out_depth[p] + by_alpha[s] * r.out_alpha[p];
-      const float *by = r.by_features + p * channels, *out = r.out_features + p * channels;
-      float* plane = planes + s / LANES * LANES * C + s % LANES;
-      for (int64_t c = 0; c < channels; c++) {
-        sum += by[c] * out[c];
-        plane[c * LANES] = by[c];
-      }
-      __builtin_memcpy(pixels + s * C, by, channels * sizeof(float));
-      rest[s] = sum;
+  alignas(64) float transmittance[PIXELS], by_depth[PIXELS] = {}, by_alpha[PIXELS] = {}, rest[PIXELS];
+  for (int y = 0; y < t.height; y++) {
+    int64_t first = ((t.y + y) * r.width + t.x) * channels;
+    for (int64_t c = 0; c < t.width * channels; c += 16) {
+      __builtin_prefetch(r.by_features + first + c);
+      __builtin_prefetch(r.out_features + first + c);
     }
+  }
+  for (int b = 0; b < BLOCKS; b++) {
+    Vector dots[LANES];
+    float* block = pixels + b * LANES * C;
+    for (int k = 0; k < LANES; k++) {
+      int i = b * LANES + k;
+      int64_t p = t.pixel(r, i);
+      bool inside = t.inside(i);
+      transmittance[i] = inside ? 1 : 0;
+      dots[k] = Vector();
+      if (inside) by_depth[i] = r.by_depth[p], by_alpha[i] = r.by_alpha[p];
+      if (inside) dots[k][0] = by_depth[i] * r.out_depth[p] + by_alpha[i] * r.out_alpha[p];
+      for (int64_t c = 0; c < C; c += LANES) {
+        Vector by = inside ? read(r.by_features + p * channels + c, channels - c) : Vector();
+        if (inside) dots[k] += by * read(r.out_features + p * channels + c, channels - c);
+        store(block + k * C + c, by);
+      }
+    }
+    store(rest + b * LANES, sums(dots));
+    for (int64_t c = 0; c < C; c += LANES) {
+      Vector v[LANES];
+      for (int k = 0; k < LANES; k++) v[k] = load(block + k * C + c);
+      transpose(v);
+      for (int k = 0; k < LANES; k++) store(planes + (b * C + c + k) * LANES, v[k]);
+    }
+  }
   uint64_t live = ~0ull >> (64 - BLOCKS);
   const int32_t* members = r.members + r.tile_start[index];
   int64_t count = r.row_start[index + 1] - r.row_start[index];
   float* row = r.rows + r.row_start[index] * (GEOMETRY + C);
   for (int64_t k = 0; k < count; k++, row += GEOMETRY + C) {
+    fetch(r, members, k + AHEAD, count);
     const Projected& p = r.projected[members[k]];
     const float* features = r.features + members[k] * channels;
     Splat s = localise(p, t);
     Vector n0 = {}, n0x = {}, n0y = {}, n1 = {}, n1x = {}, n1y = {}, n2 = {}, n2x = {}, n2y = {};
     Vector determinant = {}, px = {}, py = {}, depth = {}, opacity = {};
-    __builtin_memset(row, 0, (GEOMETRY + C) * sizeof(float));
+    Vector weights[BLOCKS];
+    const float* touched[BLOCKS];
+    int used = 0;
     for (uint64_t m = blocks(p, t) & live; m; m &= m - 1) {
       int b = __builtin_ctzll(m);
       Vector x = load(CENTRES.x + b * LANES), y = load(CENTRES.y + b * LANES), T = load(transmittance + b * LANES);
@@ -421,22 +462,34 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
       T = T * (1.0f - a);
       store(rest + b * LANES, behind), store(transmittance + b * LANES, T);
       if (!any(T >= refgs::MIN_TRANSMITTANCE)) live &= ~(1ull << b);
-      alignas(64) float weights[LANES];
-      store(weights, w);
-      scatter_features(row + GEOMETRY, weights, pixels + b * LANES * C, C);
-
+      weights[used] = w;
+      touched[used++] = pixels + b * LANES * C;
       auto d = refgs::differentiate(s, hit, g, by_a, w * by_z);
       n0 += d.n0, n0x += d.n0 * x, n0y += d.n0 * y;
       n1 += d.n1, n1x += d.n1 * x, n1y += d.n1 * y;
       n2 += d.n2, n2x += d.n2 * x, n2y += d.n2 * y;
       determinant += d.determinant, px += d.x, py += d.y, depth += d.depth, opacity += d.opacity;
     }
-    Vector sums[] = {n0, n0x, n0y, n1, n1x, n1y, n2, n2x, n2y, determinant, px, py, depth, opacity};
-    for (int i = 0; i < 14; i++) row[i] = total(sums[i]);
+    gather_features(row + GEOMETRY, weights, touched, used, C);
+    Vector geometry[] = {n0, n0x, n0y, n1, n1x, n1y, n2, n2x, n2y, determinant, px, py, depth, opacity, Vector(), Vector()};
+    for (int i = 0; i < GEOMETRY; i += LANES) {
+      Vector part[LANES];
+      for (int k = 0; k < LANES; k++) part[k] = geometry[i + k];
+      store(row + i, sums(part));
+    }
   }
 }
 
 float finite(double x) { return (float)__builtin_fmin(__builtin_fmax(x, -3.4028234e38), 3.4028234e38); }
+
+void prefetch(const Raster& r, int64_t i) {
+  int64_t stride = GEOMETRY + padded(r.channels);
+  const int32_t* place = r.places + r.splat_start[i];
+  each_tile(r, r.projected[i], [&](int64_t tile, int, int) {
+    const float* row = r.rows + (r.row_start[tile] + *place++) * stride;
+    for (int64_t c = 0; c < stride; c += 16) __builtin_prefetch(row + c);
+  });
+}
 
 // Add up a splat's rows, and carry the derivatives from its projection to its parameters.
 void gather(const Raster& r, int64_t i) {
@@ -446,25 +499,21 @@ void gather(const Raster& r, int64_t i) {
   float* by_features = r.by_splat_features + i * channels;
   for (int64_t c = 0; c < channels; c++) by_features[c] = 0;
   bool touched = false;
-  int tx0, ty0, tx1, ty1;
-  if (p.tiles(tx0, ty0, tx1, ty1)) {
-    const int32_t* place = r.places + r.splat_start[i];
-    for (int ty = ty0; ty <= ty1; ty++)
-      for (int tx = tx0; tx <= tx1; tx++, place++) {
-        int64_t tile = ty * tiles_x(r) + tx;
-        if (*place >= r.row_start[tile + 1] - r.row_start[tile]) continue;
-        const float* row = r.rows + (r.row_start[tile] + *place) * stride;
-        touched = true;
-        double mx = tx * TILE + TILE / 2, my = ty * TILE + TILE / 2;
-        for (int k = 0; k < 3; k++) {
-          n[k][0] += row[3 * k];
-          n[k][1] += row[3 * k + 1] + mx * row[3 * k];
-          n[k][2] += row[3 * k + 2] + my * row[3 * k];
-        }
-        determinant += row[9], x += row[10], y += row[11], depth += row[12], opacity += row[13];
-        for (int64_t c = 0; c < channels; c++) by_features[c] += row[GEOMETRY + c];
-      }
-  }
+  const int32_t* place = r.places + r.splat_start[i];
+  each_tile(r, p, [&](int64_t tile, int tx, int ty) {
+    int32_t at = *place++;
+    if (at >= r.row_start[tile + 1] - r.row_start[tile]) return;
+    const float* row = r.rows + (r.row_start[tile] + at) * stride;
+    touched = true;
+    double mx = tx * TILE + TILE / 2, my = ty * TILE + TILE / 2;
+    for (int k = 0; k < 3; k++) {
+      n[k][0] += row[3 * k];
+      n[k][1] += row[3 * k + 1] + mx * row[3 * k];
+      n[k][2] += row[3 * k + 2] + my * row[3 * k];
+    }
+    determinant += row[9], x += row[10], y += row[11], depth += row[12], opacity += row[13];
+    for (int64_t c = 0; c < channels; c++) by_features[c] += row[GEOMETRY + c];
+  });
   float *by_position = r.by_positions + 3 * i, *by_rotation = r.by_rotations + 4 * i, *by_scale = r.by_scales + 2 * i;
   by_position[0] = by_position[1] = by_position[2] = 0;
   by_rotation[0] = by_rotation[1] = by_rotation[2] = by_rotation[3] = 0;
@@ -517,17 +566,15 @@ EXPORT void refgs_sort(Raster* r) {
   int64_t n = 0, pairs = 0;
   uint32_t *keys = r->keys, *values = keys + r->splats, *keys2 = values + r->splats, *values2 = keys2 + r->splats;
   int64_t tiles = tiles_x(*r) * tiles_y(*r);
-  __builtin_memset(r->tile_start, 0, (tiles + 1) * sizeof(int64_t));
+  for (int64_t t = 0; t <= tiles; t++) r->tile_start[t] = 0;
   for (int64_t i = 0; i < r->splats; i++) {
     const Projected& p = r->projected[i];
     r->splat_start[i] = pairs;
-    int tx0, ty0, tx1, ty1;
-    if (!p.tiles(tx0, ty0, tx1, ty1)) continue;
+    int64_t before = pairs;
+    each_tile(*r, p, [&](int64_t tile, int, int) { r->tile_start[tile + 1]++, pairs++; });
+    if (pairs == before) continue;
     __builtin_memcpy(keys + n, &p.depth, 4);  // a positive float's bits are in its order
     values[n++] = (uint32_t)i;
-    pairs += (int64_t)(tx1 - tx0 + 1) * (ty1 - ty0 + 1);
-    for (int ty = ty0; ty <= ty1; ty++)
-      for (int tx = tx0; tx <= tx1; tx++) r->tile_start[ty * tiles_x(*r) + tx + 1]++;
   }
   r->splat_start[r->splats] = r->pairs = pairs;
   r->visible = n;
@@ -550,18 +597,14 @@ EXPORT void refgs_sort(Raster* r) {
 // Counting scatter of the sorted splats into tiles.
 EXPORT void refgs_bin(Raster* r) {
   int32_t* counts = r->reach;  // not in use yet
-  __builtin_memset(counts, 0, tiles_x(*r) * tiles_y(*r) * sizeof(int32_t));
+  for (int64_t t = 0; t < tiles_x(*r) * tiles_y(*r); t++) counts[t] = 0;
   for (int64_t k = 0; k < r->visible; k++) {
     int32_t i = r->order[k];
     int32_t* place = r->places + r->splat_start[i];
-    int tx0, ty0, tx1, ty1;
-    r->projected[i].tiles(tx0, ty0, tx1, ty1);
-    for (int ty = ty0; ty <= ty1; ty++)
-      for (int tx = tx0; tx <= tx1; tx++) {
-        int64_t tile = ty * tiles_x(*r) + tx;
-        *place = counts[tile]++;
-        r->members[r->tile_start[tile] + *place++] = i;
-      }
+    each_tile(*r, r->projected[i], [&](int64_t tile, int, int) {
+      *place = counts[tile]++;
+      r->members[r->tile_start[tile] + *place++] = i;
+    });
   }
 }
 
@@ -579,6 +622,10 @@ EXPORT void refgs_backward(Raster* r) {
 
 // parallel
 EXPORT void refgs_gather(Raster* r) {
-  for (int64_t i; (i = take(r->shared.next, 256)) < r->splats;)
-    for (int64_t j = i; j < i + 256 && j < r->splats; j++) gather(*r, j);
+  const int BATCH = 32;  // splats whose rows are on their way while the ones before are added up
+  for (int64_t i; (i = take(r->shared.next, BATCH)) < r->splats;) {
+    int64_t end = i + BATCH < r->splats ? i + BATCH : r->splats;
+    for (int64_t j = i; j < end; j++) prefetch(*r, j);
+    for (int64_t j = i; j < end; j++) gather(*r, j);
+  }
 }

@@ -33,7 +33,7 @@ struct Lines {
   }
   explicit Lines(Ssim& s) : Lines(s.width, s.channels) {
     memory = s.scratch + take(s.shared.thread, 1) * 4 * stride;
-    __builtin_memset(memory, 0, 4 * stride * sizeof(float));
+    clear(memory, 4 * stride);
   }
   float* operator[](int i) const { return memory + i * stride + margin; }
 };
@@ -48,20 +48,6 @@ INLINE Vector along(const float* line, int64_t step) {
 template <class Body>
 INLINE void each(int64_t n, Body body) {
   for (int64_t x = 0; x < n; x += LANES) body(x, n - x < LANES ? n - x : LANES);
-}
-
-INLINE Vector read(const float* p, int64_t n) {
-  if (n == LANES) return load(p);
-  float lanes[LANES] = {};
-  __builtin_memcpy(lanes, p, n * sizeof(float));
-  return load(lanes);
-}
-
-INLINE void write(float* p, Vector v, int64_t n) {
-  if (n == LANES) return store(p, v);
-  float lanes[LANES];
-  store(lanes, v);
-  __builtin_memcpy(p, lanes, n * sizeof(float));
 }
 
 void forward_row(const Ssim& s, int64_t y, const Lines& lines) {

@@ -40,3 +40,56 @@ INLINE Vector exp_half(Vector x) {
   Mask exponent = ((Mask)shifted - (Mask)(Vector() + ROUND)) << 23;
   return (Vector)((Mask)p + exponent);
 }
+
+// Part of a vector: the first n lanes, the others zero.
+INLINE Vector read(const float* p, int64_t n) {
+  if (n >= LANES) return load(p);
+  float lanes[LANES] = {};
+  for (int i = 0; i < n; i++) lanes[i] = p[i];
+  return load(lanes);
+}
+
+INLINE void write(float* p, Vector v, int64_t n) {
+  if (n >= LANES) return store(p, v);
+  float lanes[LANES];
+  store(lanes, v);
+  for (int i = 0; i < n; i++) p[i] = lanes[i];
+}
+
+INLINE void clear(float* p, int64_t n) {  // n: a multiple of LANES
+  for (int64_t i = 0; i < n; i += LANES) store(p + i, Vector());
+}
+
+// The lower and the upper halves of two vectors, lane by lane in turn.
+#if LANES == 16
+#define INTERLEAVE(n) n, n + 16, n + 1, n + 17, n + 2, n + 18, n + 3, n + 19, n + 4, n + 20, n + 5, n + 21, n + 6, n + 22, n + 7, n + 23
+#elif LANES == 8
+#define INTERLEAVE(n) n, n + 8, n + 1, n + 9, n + 2, n + 10, n + 3, n + 11
+#else
+#define INTERLEAVE(n) n, n + 4, n + 1, n + 5
+#endif
+INLINE Vector interleave_low(Vector a, Vector b) { return __builtin_shufflevector(a, b, INTERLEAVE(0)); }
+INLINE Vector interleave_high(Vector a, Vector b) { return __builtin_shufflevector(a, b, INTERLEAVE(LANES / 2)); }
+
+// Lane k of the result is the sum of v[k]'s lanes; v is spoilt.
+INLINE Vector sums(Vector (&v)[LANES]) {
+#pragma unroll
+  for (int n = LANES / 2; n; n /= 2)
+#pragma unroll
+    for (int i = 0; i < n; i++) v[i] = interleave_low(v[i], v[i + n]) + interleave_high(v[i], v[i + n]);
+  return v[0];
+}
+
+INLINE void transpose(Vector (&v)[LANES]) {  // perfect shuffles, as many as a lane's index has bits
+#pragma unroll
+  for (int n = 1; n < LANES; n *= 2) {
+    Vector w[LANES];
+#pragma unroll
+    for (int i = 0; i < LANES / 2; i++) {
+      w[2 * i] = interleave_low(v[i], v[i + LANES / 2]);
+      w[2 * i + 1] = interleave_high(v[i], v[i + LANES / 2]);
+    }
+#pragma unroll
+    for (int i = 0; i < LANES; i++) v[i] = w[i];
+  }
+}

@@ -156,6 +156,8 @@ def rasterize(
             raise ValueError(
                 f"{name}: expected {expected}, got {tensor.dtype} {tuple(tensor.shape)} on {tensor.device}"
             )
+    if max(camera.width, camera.height) > 16383:
+        raise ValueError(f"images are at most 16,383 pixels wide and high, not {camera.width}×{camera.height}")
     if near <= 0:
         raise ValueError(f"near must be positive, got {near}")
     return Raster(*_Rasterize.apply(*tensors, camera, near))

@@ -1,0 +1,114 @@
+"""How long the CPU kernels take: `refgs bench kernels`, or `python -m benchmarks.kernels`.
+
+The scene is a ball that fills most of the picture: 20,000 discs on its surface, at random (uniform), each tangent to it, both scales the
+mean distance to its three nearest neighbours and opacity 0.73 — how training starts on a visual hull. Half of the discs face
+away and are mostly hidden.
+"""
+
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial import cKDTree
+
+from refgs.camera import Camera
+from refgs.kernels import load
+from refgs.render.rasterize import _project_and_bin, _Work, rasterize
+from refgs.render.ssim import dssim
+
+SPLATS, SIDE, CHANNELS, ROUNDS = 20_000, 400, 16, 30
+
+
+def ball() -> tuple[list[torch.Tensor], Camera]:
+    """The surfels (positions, rotations, scales, opacities, features) and a camera at distance 4, the ball's radius being 1."""
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(SPLATS, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    spacing = cKDTree(normal).query(normal, k=4)[0][:, 1:].mean(axis=1)
+    # the shortest rotation from z to the normal, then any about it
+    to_normal = np.concatenate([1 + normal[:, 2:], -normal[:, 1:2], normal[:, :1], np.zeros((SPLATS, 1))], axis=1)
+    surfels = [normal, to_normal, np.stack([spacing, spacing], axis=1), np.full(SPLATS, 0.73)]
+    surfels.append(rng.uniform(size=(SPLATS, CHANNELS)))
+    matrix = np.eye(4)
+    matrix[2, 3] = 4
+    focal = 0.48 * SIDE * np.sqrt(4**2 - 1)  # the outline's radius is 0.48 of the picture's side
+    camera = Camera("ball", SIDE, SIDE, focal, focal, SIDE / 2, SIDE / 2, matrix)
+    return [torch.tensor(v, dtype=torch.float32) for v in surfels], camera
+
+
+def _time(*steps: Callable[[], None]) -> list[list[float]]:
+    """Milliseconds of each step, in each round."""
+    rounds = []
+    for _ in range(ROUNDS + 3):
+        stamps = [time.perf_counter()]
+        for step in steps:
+            step()
+            stamps.append(time.perf_counter())
+        rounds.append(np.diff(stamps) * 1e3)
+    return np.array(rounds[3:]).T.tolist()
+
+
+def measure() -> dict[str, list[float]]:
+    """Milliseconds of each step in each round, with the instruction set in REFGS_ISA and torch's threads."""
+    surfels, camera = ball()
+    detached = [v.clone() for v in surfels]
+    inputs = [v.requires_grad_() for v in surfels]
+    upstream = [torch.rand(SIDE, SIDE, CHANNELS), torch.rand(SIDE, SIDE), torch.rand(SIDE, SIDE)]
+    target, image = torch.rand(SIDE, SIDE, 3), torch.rand(SIDE, SIDE, 3, requires_grad=True)
+    state = {}
+
+    def binning() -> None:
+        work = _Work(splats=SPLATS, channels=CHANNELS)
+        work.attach(**dict(zip(("positions", "rotations", "scales", "opacities", "features"), detached, strict=True)))
+        _project_and_bin(work, camera, 0.1)
+
+    def forward() -> None:
+        state["raster"] = rasterize(*inputs, camera, near=0.1)
+
+    def backward() -> None:
+        torch.autograd.grad(state["raster"], inputs, upstream)
+
+    def ssim() -> None:
+        torch.autograd.grad(dssim(image, target), image)
+
+    times = dict(zip(("forward", "backward"), _time(forward, backward), strict=True))
+    times["both"] = [a + b for a, b in zip(times["forward"], times["backward"], strict=True)]
+    return times | {"binning": _time(binning)[0], "ssim": _time(ssim)[0]}
+
+
+def run(threads: int = 2) -> dict[str, dict[str, list[float]]]:
+    """Print a table, one row an instruction set; returns {set: {step: milliseconds of each round}}."""
+    table = Table(
+        title=f"{SPLATS:,} surfels, {SIDE}×{SIDE}, {CHANNELS} channels, {threads} threads: ms, least (median)"
+    )
+    table.add_column("instructions")
+    steps = {"binning": "binning¹", "forward": "forward", "backward": "backward", "both": "forward + backward"}
+    steps["ssim"] = "D-SSIM, both ways"
+    for title in steps.values():
+        table.add_column(title, justify="right")
+    results, before, chosen = {}, torch.get_num_threads(), os.environ.get("REFGS_ISA")
+    torch.set_num_threads(threads)
+    try:
+        for isa in load.supported():
+            os.environ["REFGS_ISA"] = isa
+            results[isa] = measure()
+            table.add_row(isa, *(f"{min(t):.1f} ({statistics.median(t):.1f})" for t in map(results[isa].get, steps)))
+    finally:
+        torch.set_num_threads(before)
+        os.environ.pop("REFGS_ISA")
+        if chosen:
+            os.environ["REFGS_ISA"] = chosen
+    console = Console()
+    console.print(table)
+    console.print(f"¹ projection, depth sort and tiles; part of forward. {platform.processor() or platform.machine()}")
+    return results
+
+
+if __name__ == "__main__":
+    run()
