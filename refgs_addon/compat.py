@@ -1,0 +1,67 @@
+"""Every difference between Blender 4.3, 4.5 LTS and 5.2 LTS that the add-on meets."""
+
+import bpy
+
+EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
+
+# The image settings that make up a file format, in the order to set them; from 5.0 it is one of a medium's.
+FORMAT = (["media_type"] if bpy.app.version >= (5, 0, 0) else []) + ["file_format", "color_mode", "color_depth"]
+
+
+def set_format(settings: bpy.types.ImageFormatSettings, kind: str, depth: str) -> None:
+    """Save RGBA pictures as `kind` ("PNG", "OPEN_EXR") with `depth` bits."""
+    for name, value in zip(FORMAT, ["IMAGE"] * (len(FORMAT) - 3) + [kind, "RGBA", depth], strict=True):
+        setattr(settings, name, value)
+
+
+def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
+    """A point cloud of `count` points at the origin."""
+    if hasattr(bpy.types.PointCloud, "resize"):  # from 5.1
+        cloud = bpy.data.pointclouds.new(name)
+        cloud.resize(count)
+        return cloud
+    # Before that only the Convert operator makes one of a given size, from a mesh of loose vertices.
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(count)
+    carrier = bpy.data.objects.new(name, mesh)
+    bpy.context.scene.collection.objects.link(carrier)
+    with bpy.context.temp_override(
+        object=carrier, active_object=carrier, selected_objects=[carrier], selected_editable_objects=[carrier]
+    ):
+        bpy.ops.object.convert(target="POINTCLOUD")
+    cloud = carrier.data
+    bpy.data.objects.remove(carrier)
+    if mesh.users == 0:
+        bpy.data.meshes.remove(mesh)
+    cloud.name = name
+    return cloud
+
+
+def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
+    """The node tree of a material or a world, emptied."""
+    if data.node_tree is None:  # from 5.0 there is always one, and `use_nodes` is deprecated
+        data.use_nodes = True
+    data.node_tree.nodes.clear()
+    return data.node_tree
+
+
+def modifier_input(modifier: bpy.types.NodesModifier, name: str) -> tuple[bpy.types.bpy_struct, str]:
+    """Where the value of a geometry-nodes modifier's input lives: what `layout.prop` takes to draw it."""
+    identifier = modifier.node_group.interface.items_tree[name].identifier
+    if hasattr(modifier, "properties"):  # from 5.2
+        return getattr(modifier.properties.inputs, identifier), "value"
+    return modifier, f'["{identifier}"]'
+
+
+def set_modifier_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
+    """Set an input by its name; for a menu, `value` is the item's name."""
+    owner, path = modifier_input(modifier, name)
+    if path == "value":
+        owner.value = value
+    else:
+        key = path[2:-2]
+        if isinstance(value, str):  # before 5.2 a menu is kept as its item's number
+            items = modifier.id_properties_ui(key).as_dict()["items"]
+            value = next(item[4] for item in items if item[0] == value)
+        owner[key] = value
+    modifier.id_data.update_tag()

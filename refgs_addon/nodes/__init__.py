@@ -1,0 +1,25 @@
+"""Node trees, built in Python: one module a tree."""
+
+import bpy
+
+
+def add(tree: bpy.types.NodeTree, kind: str, inputs: dict | None = None, **properties) -> bpy.types.Node:
+    """Add a node. `inputs` maps a socket's name or index to what feeds it: another node's output, or a value."""
+    node = tree.nodes.new(kind)
+    for name, value in properties.items():
+        setattr(node, name, value)
+    for key, value in (inputs or {}).items():
+        # Nodes of many types keep one socket a type under the same name, and enable the one in use.
+        socket = (
+            node.inputs[key] if isinstance(key, int) else next(s for s in node.inputs if s.name == key and s.enabled)
+        )
+        if isinstance(value, bpy.types.NodeSocket):
+            tree.links.new(value, socket)
+        else:
+            socket.default_value = value
+    return node
+
+
+def out(node: bpy.types.Node, name: str | None = None) -> bpy.types.NodeSocket:
+    """The output of this name that is in use; the first in use without a name."""
+    return next(s for s in node.outputs if s.enabled and name in (None, s.name))

@@ -1,0 +1,25 @@
+"""The world's tree: a panorama with a rotation and a strength."""
+
+import bpy
+
+from ..compat import node_tree
+from . import add, out
+
+# The nodes whose values the panel shows and `scene.relight` sets.
+IMAGE, ROTATION, STRENGTH = "RefGS HDRI", "RefGS Rotation", "RefGS Strength"
+
+
+def panorama_world(name: str) -> bpy.types.World:
+    """A new world lit by a panorama, still without its image.
+
+    The mapping is of the type Texture, so that a rotation about z turns the light itself by that angle,
+    counter-clockwise seen from above.
+    """
+    world = bpy.data.worlds.new(name)
+    tree = node_tree(world)
+    direction = add(tree, "ShaderNodeTexCoord").outputs["Generated"]
+    mapping = add(tree, "ShaderNodeMapping", {"Vector": direction}, name=ROTATION, vector_type="TEXTURE")
+    image = add(tree, "ShaderNodeTexEnvironment", {"Vector": out(mapping)}, name=IMAGE)
+    background = add(tree, "ShaderNodeBackground", {"Color": out(image)}, name=STRENGTH)
+    add(tree, "ShaderNodeOutputWorld", {"Surface": out(background)})
+    return world

@@ -1,0 +1,114 @@
+"""A run folder, imported, saved as a .blend and rendered relit, without a window.
+
+    python -m refgs_addon.preview RUN --hdri A.exr --hdri B.exr --out DIR --blend FILE.blend [--views NAME …] [--size N]
+
+renders each view of {splats, mesh} under each HDRI into DIR/HDRI_{splats,mesh}_VIEW.png and .exr, and prints one JSON
+object a line: {"event": "progress", "done": 1, "total": 8, "what": "…"}, and at the end {"event": "done", "files": […]}.
+Exit status 2 and one line on stderr where the input or the machine lacks something.
+"""
+
+import argparse
+import ctypes
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from .errors import InputError
+
+# Debian 12 and 13, Ubuntu 22.04 and later: what Blender links against, and Eevee's way to a picture without a screen.
+APT = "apt-get install libegl1 libgl1 libgl1-mesa-dri libice6 libsm6 libx11-6 libxfixes3 libxi6 libxkbcommon0 libxrender1 libxxf86vm1"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="refgs_addon.preview", description="Render a run in Blender, relit.")
+    parser.add_argument("run", type=Path, help="the run folder")
+    parser.add_argument("--hdri", type=Path, action="append", required=True, help="a panorama to light it with; repeat")
+    parser.add_argument("--out", type=Path, required=True, help="the folder for the pictures")
+    parser.add_argument("--blend", type=Path, required=True, help="the .blend to save")
+    parser.add_argument("--views", nargs="+", help="views to render, by photo name; the first test view by default")
+    parser.add_argument("--size", type=int, help="longer side in pixels; the photo's by default")
+    options = parser.parse_args(arguments)
+    try:
+        check_libraries()
+        preview(options)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+def preview(options: argparse.Namespace) -> None:
+    import bpy
+
+    from .scene.preview import render_preview
+    from .scene.relight import relight
+    from .scene.run import import_run, show
+
+    # Blender and its add-ons print to standard output what they like: that goes to standard error, the events do not.
+    events = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+
+    def say(**event) -> None:
+        print(json.dumps(event), file=events)
+
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    say(event="progress", done=0, total=0, what=f"importing {options.run}")
+    run = import_run(options.run, scene)
+    if not run.cameras:
+        raise InputError(f"{options.run} has no cameras.json: there is no view to render")
+    views = options.views or [next(iter(run.cameras))]
+    if unknown := [view for view in views if view not in run.cameras]:
+        raise InputError(f"{options.run} has no view {unknown[0]}: it has {', '.join(list(run.cameras)[:5])} …")
+    options.out.mkdir(parents=True, exist_ok=True)
+    options.blend.parent.mkdir(parents=True, exist_ok=True)
+    bpy.ops.file.pack_all()
+    bpy.ops.wm.save_as_mainfile(filepath=str(options.blend.resolve()), compress=True)
+
+    # In software, Eevee's shadow maps take ten times as long as the rest of a frame, and splats cast no shadows anyway.
+    scene.eevee.use_shadows = False
+    parts = ["splats", "mesh"] if run.mesh else ["splats"]
+    total, files = len(options.hdri) * len(parts) * len(views), []
+    for hdri in options.hdri:
+        relight(scene, hdri)
+        for part in parts:
+            show(run.collection, part)
+            for view in views:
+                path = options.out / f"{hdri.stem}_{part}_{view}.png"
+                say(event="progress", done=len(files), total=total, what=f"{view}: {part} under {hdri.stem}")
+                render_preview(scene, path, run.cameras[view], options.size, exr=path.with_suffix(".exr"))
+                files.append(str(path))
+    say(event="progress", done=total, total=total, what="rendered")
+    say(event="done", files=files, blend=str(options.blend))
+
+
+def check_libraries() -> None:
+    """Raise InputError naming the system libraries that Blender needs and this machine lacks.
+
+    Blender's module links against X; Eevee loads EGL only when it draws, and ends the process without it.
+    """
+    spec = importlib.util.find_spec("bpy")
+    if spec is None:
+        raise InputError("Blender's Python module is not installed: pip install bpy")
+    if sys.platform != "linux":
+        return
+    missing = []
+    binary = next(Path(spec.origin).parent.glob("__init__*.so"), None)
+    if binary is not None:
+        listing = subprocess.run(["ldd", str(binary)], capture_output=True, text=True, check=False).stdout
+        missing += re.findall(r"(\S+) => not found", listing)
+    for name in ("libEGL.so.1", "libGL.so.1"):
+        try:
+            ctypes.CDLL(name)
+        except OSError:
+            missing.append(name)
+    if missing:
+        raise InputError(f"Blender cannot start without {', '.join(sorted(set(missing)))}: {APT}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,65 @@
+"""Cameras: from cameras.json to Blender's."""
+
+import json
+import math
+from pathlib import Path
+
+import bpy
+from mathutils import Matrix
+
+from ..errors import InputError
+
+SENSOR_WIDTH = 36.0  # mm, Blender's own
+
+
+def read_cameras(path: Path) -> list[dict]:
+    """The frames of a run's cameras.json: camera-to-world matrices with OpenGL's axes, and pinhole intrinsics."""
+    try:
+        frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
+        for frame in frames:
+            matrix = Matrix(frame["transform_matrix"])
+            numbers = [frame[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")]
+            if len(matrix) != 4 or not all(map(math.isfinite, [*numbers, *(x for row in matrix for x in row)])):
+                raise ValueError
+            frame["name"] = Path(frame["file_path"]).stem
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f"{path} is not the cameras.json of a RefGS run: export the run again") from None
+    return frames
+
+
+def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Object:
+    """One frame's camera in a collection: pose, focal length and principal point.
+
+    Blender keeps the size of the picture and the pixels' aspect in the scene, so they ride on the camera's data as the
+    properties `refgs_size` (pixels) and `refgs_pixel_aspect`, for `frame_camera` to read.
+    """
+    data = bpy.data.cameras.new(frame["name"])
+    width, height = frame["w"], frame["h"]
+    aspect = frame["fl_x"] / frame["fl_y"]  # a pixel's height over its width
+    data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR_WIDTH
+    data.lens = SENSOR_WIDTH * frame["fl_x"] / width
+    # Shifts are in widths of the picture, positive to the right and up; cx, cy run right and down.
+    data.shift_x = 0.5 - frame["cx"] / width
+    data.shift_y = (frame["cy"] - 0.5 * height) * aspect / width
+    data["refgs_size"] = [int(width), int(height)]
+    data["refgs_pixel_aspect"] = [max(1.0, 1.0 / aspect), max(1.0, aspect)]
+    camera = bpy.data.objects.new(frame["name"], data)
+    camera.matrix_world = Matrix(frame["transform_matrix"])
+    collection.objects.link(camera)
+    return camera
+
+
+def frame_camera(scene: bpy.types.Scene, camera: bpy.types.Object, size: int | None = None) -> None:
+    """Make a camera the scene's, with its photo's resolution; `size` is another length of the longer side in pixels."""
+    scene.camera = camera
+    render = scene.render
+    if "refgs_size" in camera.data:
+        render.resolution_x, render.resolution_y = camera.data["refgs_size"]
+        render.pixel_aspect_x, render.pixel_aspect_y = camera.data["refgs_pixel_aspect"]
+    if size:
+        longer = max(render.resolution_x, render.resolution_y)
+        render.resolution_x = max(1, round(render.resolution_x * size / longer))
+        render.resolution_y = max(1, round(render.resolution_y * size / longer))
+    render.resolution_percentage = 100

@@ -1,0 +1,79 @@
+"""Previews: a picture in Eevee, whatever the scene's own render settings are."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+
+from .. import compat
+from ..errors import InputError
+from .cameras import frame_camera
+
+
+def render_preview(
+    scene: bpy.types.Scene,
+    png: Path,
+    camera: bpy.types.Object | None = None,
+    size: int | None = None,
+    samples: int = 64,
+    exr: Path | None = None,
+) -> None:
+    """Render a camera's view (the scene's camera by default) in Eevee, over a transparent background.
+
+    `size` is the longer side in pixels; by default the photo's. `png` gets sRGB, 8 bits, straight alpha, through the
+    Standard view transform; `exr`, if given, linear Rec.709 radiance, 32 bits, premultiplied. The scene's own settings
+    are put back. Raises InputError where there is no camera or a file cannot be written.
+    """
+    camera = camera or scene.camera
+    if camera is None:
+        raise InputError("there is no camera to look through: add one, or import a RefGS run with cameras.json")
+    with _restored(scene):
+        frame_camera(scene, camera, size)
+        render, view = scene.render, scene.view_settings
+        render.engine = compat.EEVEE
+        render.film_transparent = True
+        render.use_compositing = render.use_sequencer = False
+        scene.eevee.taa_render_samples = samples
+        scene.display_settings.display_device = "sRGB"
+        view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
+        bpy.ops.render.render(scene=scene.name)
+        picture = bpy.data.images["Render Result"]
+        _save(picture, scene, png, "PNG", "8")
+        if exr is not None:
+            _save(picture, scene, exr, "OPEN_EXR", "32")
+
+
+def _save(picture: bpy.types.Image, scene: bpy.types.Scene, path: Path, kind: str, depth: str) -> None:
+    compat.set_format(scene.render.image_settings, kind, depth)
+    # The ending stays last: Blender adds it where it does not see it.
+    temporary = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        picture.save_render(str(temporary), scene=scene)
+        os.replace(temporary, path)
+    except (RuntimeError, OSError):
+        raise InputError(f"cannot write {path}: is its folder there, with room on the disk?") from None
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _restored(scene: bpy.types.Scene) -> Iterator[None]:
+    """Put back every render setting that a preview touches."""
+    render = scene.render
+    touched = [
+        (scene, ["camera"]),
+        (render, ["engine", "film_transparent", "use_compositing", "use_sequencer", "resolution_x", "resolution_y"]),
+        (render, ["resolution_percentage", "pixel_aspect_x", "pixel_aspect_y"]),
+        (scene.eevee, ["taa_render_samples"]),
+        (scene.display_settings, ["display_device"]),
+        (scene.view_settings, ["view_transform", "look", "exposure", "gamma"]),
+        (render.image_settings, compat.FORMAT),
+    ]
+    values = [(owner, name, getattr(owner, name)) for owner, names in touched for name in names]
+    try:
+        yield
+    finally:
+        for owner, name, value in values:
+            setattr(owner, name, value)

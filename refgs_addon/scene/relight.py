@@ -1,0 +1,58 @@
+"""The light: a run's recovered panorama, or an HDRI in its place."""
+
+from pathlib import Path
+
+import bpy
+
+from ..errors import InputError
+from ..nodes.world import IMAGE, ROTATION, STRENGTH, panorama_world
+
+RECOVERED = "refgs_recovered"  # the world's custom property that keeps the recovered panorama
+
+
+def load_panorama(path: Path) -> bpy.types.Image:
+    """Load an equirectangular picture (EXR or HDR, linear). Raises InputError where there is none."""
+    try:
+        image = bpy.data.images.load(str(path))
+    except RuntimeError:
+        raise InputError(f"cannot read the light {path}: choose an EXR or HDR panorama") from None
+    if min(image.size) == 0:  # Blender loads what it cannot decode as an empty picture
+        bpy.data.images.remove(image)
+        raise InputError(f"cannot read the light {path}: it is not a whole EXR or HDR panorama")
+    return image
+
+
+def light_with_recovered(scene: bpy.types.Scene, name: str, image: bpy.types.Image) -> bpy.types.World:
+    """A new world, lit by a run's recovered panorama, becomes the scene's."""
+    world = panorama_world(name)
+    world[RECOVERED] = image
+    world.node_tree.nodes[IMAGE].image = image
+    scene.world = world
+    return world
+
+
+def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, strength: float = 1.0) -> None:
+    """Light the scene with an HDRI, or with the recovered light again where `hdri` is None.
+
+    `rotation` turns the light about z, in radians, counter-clockwise seen from above; `strength` multiplies it. The
+    recovered light stays with the world. A world that RefGS did not make is left as it is and replaced in the scene.
+    Raises InputError for a picture that cannot be read, and where there is no recovered light to go back to.
+    """
+    world = scene.world if is_ours(scene.world) else None
+    if hdri is not None:
+        image = load_panorama(hdri)
+        if world is None:
+            world = scene.world = panorama_world("RefGS Light")
+    elif world is not None and world.get(RECOVERED) is not None:
+        image = world[RECOVERED]
+    else:
+        raise InputError("this scene has no recovered light: import a RefGS run that has one")
+    nodes = world.node_tree.nodes
+    nodes[IMAGE].image = image
+    nodes[ROTATION].inputs["Rotation"].default_value = (0.0, 0.0, rotation)
+    nodes[STRENGTH].inputs["Strength"].default_value = strength
+
+
+def is_ours(world: bpy.types.World | None) -> bool:
+    """Whether a world has the panorama that `relight` sets."""
+    return world is not None and world.node_tree is not None and IMAGE in world.node_tree.nodes
