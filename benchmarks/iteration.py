@@ -56,7 +56,8 @@ def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
     rendering = render(surfels, environment, view.camera, trainer.background, settings.render, trainer.near)
     at = record("raster and shading", at)
     mask = torch.from_numpy(view.alpha).float() / 255
-    loss = objective(rendering, composite(view, trainer.background), mask, view.camera, settings.loss)
+    photo = composite(view, trainer.background)
+    loss = objective(rendering, environment, photo, mask, view.camera, settings.loss)
     at = record("losses", at)
     loss.backward()
     record("backward of all", at)

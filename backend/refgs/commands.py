@@ -284,7 +284,7 @@ def export(
 
     run = open_run(folder)
     target = mesh_file or folder / "mesh.glb"
-    for file in (target, splats_file):
+    for file in (target, target.parent / "textures", splats_file):
         if file is not None and file.exists() and not overwrite:
             raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
     if splats_file is not None:

@@ -67,6 +67,7 @@ class LossSettings(_Section):
     normal: float = Field(ge=0, description="weight of normal consistency with the depth")
     smooth: float = Field(ge=0, description="weight of edge-aware normal smoothness")
     alpha: float = Field(ge=0, description="weight of the mask, where there is one")
+    light: float = Field(ge=0, description="weight of the light's being neutral on the whole")
 
 
 class DensifySettings(_Section):

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
+from refgs.model.environment import Environment
 from refgs.render.renderer import Rendering, camera_rays
 from refgs.render.ssim import dssim
 from refgs.settings import LossSettings
@@ -51,8 +52,23 @@ def smoothness_loss(rendering: Rendering, photo: Tensor) -> Tensor:
     return total
 
 
+def light_loss(environment: Environment) -> Tensor:
+    """Squared departure from grey of the mean over all directions.
+
+    Warm metal under a neutral light and neutral metal under a warm light look almost alike; without a word for one of
+    them, white balance drifts between the two. Only the mean is held: the light's colours may differ by direction.
+    """
+    mean = environment.irradiance[0]  # the constant harmonic
+    return ((mean / mean.mean().clamp_min(1e-9) - 1) ** 2).mean()
+
+
 def objective(
-    rendering: Rendering, photo: Tensor, mask: Tensor | None, camera: Camera, weights: LossSettings
+    rendering: Rendering,
+    environment: Environment | None,
+    photo: Tensor,
+    mask: Tensor | None,
+    camera: Camera,
+    weights: LossSettings,
 ) -> Tensor:
     """The training loss of one view; terms with weight zero cost nothing."""
     loss = color_loss(rendering.color, photo, weights.dssim)
@@ -62,4 +78,6 @@ def objective(
         loss = loss + weights.smooth * smoothness_loss(rendering, photo)
     if mask is not None and weights.alpha > 0:
         loss = loss + weights.alpha * (rendering.alpha - mask).abs().mean()
+    if environment is not None and weights.light > 0:
+        loss = loss + weights.light * light_loss(environment)
     return loss

@@ -127,10 +127,10 @@ class Trainer:
             group["lr"] = 0.0 if frozen and group["name"] in GEOMETRY else group["rate"] * decay
 
         surfels = self.surfels()
-        rendering = render(surfels, self.environment(), view.camera, self.background, settings.render, self.near)
+        rendering = render(surfels, environment, view.camera, self.background, settings.render, self.near)
         photo = composite(view, self.background)
         mask = None if view.alpha is None else torch.from_numpy(view.alpha).float() / 255
-        loss = objective(rendering, photo, mask, view.camera, settings.loss)
+        loss = objective(rendering, environment, photo, mask, view.camera, settings.loss)
         loss.backward()
         position = self.parameters["position"]
         self.motion.add(position.detach(), position.grad, view.camera)
