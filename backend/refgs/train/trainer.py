@@ -126,7 +126,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = 0.0 if frozen and group["name"] in GEOMETRY else group["rate"] * decay
 
-        surfels = self.surfels()
+        surfels, environment = self.surfels(), self.environment()
         rendering = render(surfels, environment, view.camera, self.background, settings.render, self.near)
         photo = composite(view, self.background)
         mask = None if view.alpha is None else torch.from_numpy(view.alpha).float() / 255
