@@ -72,11 +72,10 @@ def run(out: Path) -> None:
 
 def _check_blender(root: Path) -> None:
     """Raise InputError with the program's own line where Blender cannot be loaded."""
-    done = subprocess.run(
-        [sys.executable, "-m", "refgs_addon.preview", "--check"], cwd=root, capture_output=True, text=True
-    )
+    check = "from refgs_addon.preview import check_libraries; check_libraries()"
+    done = subprocess.run([sys.executable, "-c", check], cwd=root, capture_output=True, text=True)
     if done.returncode:
-        raise InputError(done.stderr.strip().splitlines()[-1])
+        raise InputError(done.stderr.strip().splitlines()[-1].partition(": ")[2])
 
 
 def _child(root: Path, what: str, module: str, *arguments: object) -> None:
