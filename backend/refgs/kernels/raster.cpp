@@ -11,6 +11,11 @@ using refgs::Splat;
 
 namespace {
 
+int32_t larger(int32_t a, int32_t b) { return a > b ? a : b; }
+int32_t lesser(int32_t a, int32_t b) { return a < b ? a : b; }
+double larger(double a, double b) { return a > b ? a : b; }  // b where one is NaN
+double lesser(double a, double b) { return a < b ? a : b; }
+
 constexpr int TILE = 16;  // pixels
 constexpr int PIXELS = TILE * TILE;
 constexpr int BLOCK_X = LANES == 4 ? 2 : 4;  // a block is one vector of pixels
@@ -22,7 +27,7 @@ constexpr int CHUNK = 64;      // splats of a tile that are treated together
 constexpr int GEOMETRY = 16;   // floats of a gradient row before its features; 14 are used
 
 struct alignas(64) Projected {
-  double n0[3], n1[3], n2[3];  // as in Splat, the origin at the image's corner
+  double value[3], slope_x[3], slope_y[3];  // of n0, n1, n2 as in Splat, the origin at the image's corner
   double x, y;
   float determinant, n2_min, n2_max, depth, opacity, rho_max;
   // Pixels that it can cover, all inclusive: bounds of x, y, x + y and x - y, an octagon; x1 < x0 where there are none.
@@ -54,8 +59,9 @@ struct Raster {
   Shared shared;
 };
 
-int32_t larger(int32_t a, int32_t b) { return a > b ? a : b; }
-int32_t lesser(int32_t a, int32_t b) { return a < b ? a : b; }
+typedef double Quad __attribute__((vector_size(32)));
+typedef float FloatQuad __attribute__((vector_size(16)));
+
 int64_t tiles_x(const Raster& r) { return (r.width + TILE - 1) / TILE; }
 int64_t tiles_y(const Raster& r) { return (r.height + TILE - 1) / TILE; }
 
@@ -101,7 +107,7 @@ Vec3 rotate_back(const double* view, Vec3 p) {
 
 constexpr double MIN_NORM = 1e-12;  // a quaternion shorter than this says nothing
 
-Disc disc(const Raster& r, int64_t i) {
+INLINE Disc disc(const Raster& r, int64_t i) {
   Disc d;
   const float* q = r.rotations + 4 * i;
   d.norm = __builtin_sqrt((double)q[0] * q[0] + (double)q[1] * q[1] + (double)q[2] * q[2] + (double)q[3] * q[3]);
@@ -121,26 +127,23 @@ Disc disc(const Raster& r, int64_t i) {
 double normaliser(const Raster& r, const Disc& d, Vec3 n0, Vec3 n1, Vec3 n2, double determinant) {
   double largest = __builtin_fabs(determinant) / d.c.z;
   const Vec3 rows[] = {n0, n1, n2};
-  for (Vec3 n : rows) largest = __builtin_fmax(largest, __builtin_fmax(__builtin_fabs(n.x) / r.fx, __builtin_fabs(n.y) / r.fy));
+  for (Vec3 n : rows) largest = larger(largest, larger(__builtin_fabs(n.x) / r.fx, __builtin_fabs(n.y) / r.fy));
   if (!(largest > 0) || __builtin_fabs(determinant) / d.c.z <= 1e-18 * largest) return 0;
   return (determinant < 0 ? -1 : 1) / largest;
 }
 
-struct Interval {
-  double low, high;
-};
-
-// Bounds of the image of {c + u a + v b: u^2 + v^2 <= k^2}, wholly in front of the camera, along an image axis: the tangents to
-// its outline, a conic. (a, b, c) are the axis' homogeneous coordinates of the three vectors.
-Interval extent(double a, double b, double c, const Disc& d, double k2) {
+// Bounds of the image of {c + u a + v b: u^2 + v^2 <= k2}, wholly in front of the camera, along four image axes: the tangents to
+// its outline, a conic. `a`, `b`, `c` are the axes' homogeneous coordinates of the three vectors.
+INLINE void extent(Quad a, Quad b, Quad c, const Disc& d, double k2, Quad& low, Quad& high) {
   double zz = k2 * (d.a.z * d.a.z + d.b.z * d.b.z) - d.c.z * d.c.z;  // < 0
-  double uz = k2 * (a * d.a.z + b * d.b.z) - c * d.c.z;
-  double uu = k2 * (a * a + b * b) - c * c;
-  double root = __builtin_sqrt(__builtin_fmax(uz * uz - uu * zz, 0));
-  return {(uz + root) / zz, (uz - root) / zz};
+  Quad uz = k2 * (a * d.a.z + b * d.b.z) - c * d.c.z;
+  Quad uu = k2 * (a * a + b * b) - c * c;
+  Quad square = uz * uz - uu * zz;
+  Quad root = __builtin_elementwise_sqrt(square > 0 ? square : Quad());
+  low = (uz + root) / zz, high = (uz - root) / zz;
 }
 
-int16_t integer(double x) { return (int16_t)__builtin_fmin(__builtin_fmax(x, -32767), 32767); }
+int16_t integer(double x) { return (int16_t)lesser(larger(x, -32767.0), 32767.0); }
 
 void project(const Raster& r, int64_t i) {
   Projected& p = r.projected[i];
@@ -157,48 +160,44 @@ void project(const Raster& r, int64_t i) {
   Vec3 n0 = cross(d.b, d.c), n1 = cross(d.c, d.a), n2 = cross(d.a, d.b);
   double determinant = dot(d.c, n2);
   double k = normaliser(r, d, n0, n1, n2, determinant);
-  auto affine = [&](Vec3 n, double* out) {
-    out[1] = k * n.x / r.fx, out[2] = k * n.y / r.fy;
-    out[0] = k * n.z - out[1] * r.cx - out[2] * r.cy;
-  };
-  affine(n0, p.n0), affine(n1, p.n1), affine(n2, p.n2);
+  const Vec3 rows[] = {n0, n1, n2};
+  for (int j = 0; j < 3; j++) {
+    p.slope_x[j] = k * rows[j].x / r.fx, p.slope_y[j] = k * rows[j].y / r.fy;
+    p.value[j] = k * rows[j].z - p.slope_x[j] * r.cx - p.slope_y[j] * r.cy;
+  }
   determinant *= k;
   p.determinant = determinant;
-  p.n2_min = k != 0 ? __builtin_fmax(determinant / refgs::FAR, 1e-18) : 1;
+  p.n2_min = k != 0 ? larger(determinant / refgs::FAR, 1e-18) : 1;
   p.n2_max = k != 0 ? determinant / r.near : -1;
 
-  // The four axes of the octagon, as coefficients of x and y, and where the screen-space filter reaches along them.
-  const double axes[4][2] = {{1, 0}, {0, 1}, {1, 1}, {1, -1}};
+  // The octagon's axes x, y, x + y, x - y, as coefficients of homogeneous coordinates; how far the screen-space filter reaches.
+  const Quad mx = {r.fx, 0, r.fx, r.fx}, my = {0, r.fy, r.fy, -r.fy}, mz = {r.cx, r.cy, r.cx + r.cy, r.cx - r.cy};
+  auto axes = [&](Vec3 p) { return mx * p.x + my * p.y + mz * p.z; };
   double radius = __builtin_sqrt(rho_max / refgs::LOW_PASS), reach = __builtin_sqrt(rho_max);
-  double slope = __builtin_sqrt(d.a.z * d.a.z + d.b.z * d.b.z);  // of z over the disc, along (eu, ev)
-  double eu = d.a.z / slope, ev = d.b.z / slope, nearest = (r.near - d.c.z) / slope;
-  Interval bounds[4];
-  for (int i = 0; i < 4; i++) {
-    double mx = axes[i][0] * r.fx, my = axes[i][1] * r.fy, mz = axes[i][0] * r.cx + axes[i][1] * r.cy;
-    double centre = axes[i][0] * p.x + axes[i][1] * p.y, length = i < 2 ? radius : radius * 1.4142135623730951;
-    bounds[i] = {centre - length, centre + length};
-    auto include = [&](double x) {
-      bounds[i].low = __builtin_fmin(bounds[i].low, x), bounds[i].high = __builtin_fmax(bounds[i].high, x);
-    };
-    if (k != 0 && d.c.z - reach * slope >= r.near) {
-      auto homogeneous = [&](Vec3 p) { return mx * p.x + my * p.y + mz * p.z; };
-      Interval e = extent(homogeneous(d.a), homogeneous(d.b), homogeneous(d.c), d, rho_max);
-      include(e.low), include(e.high);
-    } else if (k != 0) {  // what is left of the disc lies in a rectangle, cut off at the near plane, whose image is convex
-      const double ts[] = {nearest, reach}, ss[] = {-reach, reach};
-      for (double t : ts)
-        for (double s : ss) {
-          Vec3 corner = d.c + (t * eu - s * ev) * d.a + (t * ev + s * eu) * d.b;
-          include((mx * corner.x + my * corner.y) / __builtin_fmax(corner.z, r.near) + mz);
-        }
-    }
+  const Quad diagonal = {1, 1, 1.4142135623730951, 1.4142135623730951}, centre = axes(d.c) / d.c.z;
+  Quad low = centre - radius * diagonal, high = centre + radius * diagonal;
+  auto include = [&](Quad a, Quad b) { low = a < low ? a : low, high = b > high ? b : high; };
+  double slope = __builtin_sqrt(d.a.z * d.a.z + d.b.z * d.b.z);  // of z over the disc, along (d.a.z, d.b.z)
+  if (k != 0 && d.c.z - reach * slope >= r.near) {
+    Quad first, last;
+    extent(axes(d.a), axes(d.b), axes(d.c), d, rho_max, first, last);
+    include(first, last);
+  } else if (k != 0) {  // what is left of the disc lies in a rectangle, cut off at the near plane, whose image is convex
+    double eu = d.a.z / slope, ev = d.b.z / slope;
+    const double ts[] = {(r.near - d.c.z) / slope, reach}, ss[] = {-reach, reach};
+    for (double t : ts)
+      for (double s : ss) {
+        Vec3 corner = d.c + (t * eu - s * ev) * d.a + (t * ev + s * eu) * d.b;
+        corner.z = larger(corner.z, r.near);
+        include(axes(corner) / corner.z, axes(corner) / corner.z);
+      }
   }
-  const double slack = 1e-3;  // pixels: for the rounding of the tiles' float arithmetic
-  auto first = [&](int i, double offset) { return integer(__builtin_ceil(bounds[i].low - offset - slack)); };
-  auto last = [&](int i, double offset) { return integer(__builtin_floor(bounds[i].high - offset + slack)); };
-  p.x0 = larger(first(0, 0.5), 0), p.x1 = lesser(last(0, 0.5), r.width - 1);
-  p.y0 = larger(first(1, 0.5), 0), p.y1 = lesser(last(1, 0.5), r.height - 1);
-  p.sum0 = first(2, 1), p.sum1 = last(2, 1), p.difference0 = first(3, 0), p.difference1 = last(3, 0);
+  const Quad first_pixel = {0.5, 0.5, 1, 0};  // the first pixel's centre along the axes
+  const double slack = 1e-3;                  // pixels: for the rounding of the tiles' float arithmetic
+  low = __builtin_elementwise_ceil(low - first_pixel - slack), high = __builtin_elementwise_floor(high - first_pixel + slack);
+  p.x0 = larger(integer(low[0]), 0), p.x1 = lesser(integer(high[0]), r.width - 1);
+  p.y0 = larger(integer(low[1]), 0), p.y1 = lesser(integer(high[1]), r.height - 1);
+  p.sum0 = integer(low[2]), p.sum1 = integer(high[2]), p.difference0 = integer(low[3]), p.difference1 = integer(high[3]);
   if (p.y1 < p.y0) p.x1 = p.x0 - 1;
 }
 
@@ -228,24 +227,30 @@ struct Centres {
 };
 constexpr Centres CENTRES;
 
-float near_zero(double x) { return (float)__builtin_fmin(__builtin_fmax(x, -1e9), 1e9); }
+float near_zero(double x) { return (float)lesser(larger(x, -1e9), 1e9); }
 
-// An affine function of the image's pixels (value at its corner, slopes) as one of a tile's.
-INLINE void localise(const double* n, double x, double y, refgs::Affine& f) {
-  const double exact[3] = {n[0] + n[1] * x + n[2] * y, n[1], n[2]};
-  double largest = __builtin_fabs(exact[0]) + TILE * (__builtin_fabs(exact[1]) + __builtin_fabs(exact[2]));
-  // Adding 1.5 * 2^52 q rounds to multiples of q, here 2^-22 of the largest sum: its multiples of q / 2 fit in a float.
-  double round = largest * (1.5 * (1ll << 30));
-  for (int k = 0; k < 3; k++) {
-    f.high[k] = (float)(exact[k] + round - round);
-    f.low[k] = (float)(exact[k] - f.high[k]);
-  }
+INLINE Quad load_quad(const double* p) {
+  typedef double Unaligned __attribute__((vector_size(32), aligned(8)));
+  return *(const Unaligned*)p;
 }
+
+INLINE Quad magnitude(Quad v) { return v < 0 ? -v : v; }
 
 INLINE Splat localise(const Projected& p, const Tile& t) {
   double x = t.x + TILE / 2, y = t.y + TILE / 2;
   Splat s;
-  localise(p.n0, x, y, s.n0), localise(p.n1, x, y, s.n1), localise(p.n2, x, y, s.n2);
+  // A fourth lane reads what comes next in `p`, and is not used.
+  Quad slope_x = load_quad(p.slope_x), slope_y = load_quad(p.slope_y), value = load_quad(p.value) + slope_x * x + slope_y * y;
+  // Adding 1.5 * 2^52 q rounds to multiples of q, here 2^-22 of the largest sum: its multiples of q / 2 fit in a float.
+  Quad round = (magnitude(value) + TILE * (magnitude(slope_x) + magnitude(slope_y))) * (1.5 * (1ll << 30));
+  auto split = [&](Quad exact, float* high, float* low) {
+    FloatQuad h = __builtin_convertvector(exact + round - round, FloatQuad);
+    *(FloatQuad*)high = h;
+    *(FloatQuad*)low = __builtin_convertvector(exact - __builtin_convertvector(h, Quad), FloatQuad);
+  };
+  split(value, s.high.value, s.low.value);
+  split(slope_x, s.high.slope_x, s.low.slope_x);
+  split(slope_y, s.high.slope_y, s.low.slope_y);
   s.determinant = p.determinant, s.n2_min = p.n2_min, s.n2_max = p.n2_max;
   s.x = near_zero(p.x - x), s.y = near_zero(p.y - y), s.depth = p.depth;
   s.opacity = p.opacity, s.rho_max = p.rho_max;
@@ -480,7 +485,7 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
   }
 }
 
-float finite(double x) { return (float)__builtin_fmin(__builtin_fmax(x, -3.4028234e38), 3.4028234e38); }
+float finite(double x) { return (float)lesser(larger(x, -3.4028234e38), 3.4028234e38); }
 
 void prefetch(const Raster& r, int64_t i) {
   int64_t stride = GEOMETRY + padded(r.channels);
@@ -496,14 +501,14 @@ void gather(const Raster& r, int64_t i) {
   const Projected& p = r.projected[i];
   int64_t channels = r.channels, stride = GEOMETRY + padded(channels);
   double n[3][3] = {}, determinant = 0, x = 0, y = 0, depth = 0, opacity = 0;
-  float* by_features = r.by_splat_features + i * channels;
+  float* __restrict by_features = r.by_splat_features + i * channels;
   for (int64_t c = 0; c < channels; c++) by_features[c] = 0;
   bool touched = false;
   const int32_t* place = r.places + r.splat_start[i];
   each_tile(r, p, [&](int64_t tile, int tx, int ty) {
     int32_t at = *place++;
     if (at >= r.row_start[tile + 1] - r.row_start[tile]) return;
-    const float* row = r.rows + (r.row_start[tile] + at) * stride;
+    const float* __restrict row = r.rows + (r.row_start[tile] + at) * stride;
     touched = true;
     double mx = tx * TILE + TILE / 2, my = ty * TILE + TILE / 2;
     for (int k = 0; k < 3; k++) {
@@ -599,7 +604,9 @@ EXPORT void refgs_bin(Raster* r) {
   int32_t* counts = r->reach;  // not in use yet
   for (int64_t t = 0; t < tiles_x(*r) * tiles_y(*r); t++) counts[t] = 0;
   for (int64_t k = 0; k < r->visible; k++) {
-    int32_t i = r->order[k];
+    int32_t i = r->order[k], ahead = r->order[k + AHEAD < r->visible ? k + AHEAD : k];
+    __builtin_prefetch((const char*)&r->projected[ahead] + 64);
+    __builtin_prefetch(&r->splat_start[ahead]);
     int32_t* place = r->places + r->splat_start[i];
     each_tile(*r, r->projected[i], [&](int64_t tile, int, int) {
       *place = counts[tile]++;

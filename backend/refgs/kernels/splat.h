@@ -18,31 +18,31 @@ constexpr float MIN_TRANSMITTANCE = 1e-4f;  // a pixel is finished below this
 constexpr float LOW_PASS = 2.0f;            // 1 / variance of the screen-space filter, in pixels^-2 (2DGS: sigma = sqrt(2) / 2)
 constexpr double FAR = 1e12;                // depths beyond this are not drawn: keeps every product finite in float
 
-// An affine function of the pixel, its value at the origin and its slopes along x and y, as a sum of two: `high` is rounded so
-// that it is computed without error at the half-integers of a tile, `low` is what that left out. For a disc near its edge n2 is a
-// small difference of large numbers, and one float each would give up the accuracy of u, v and z.
-struct Affine {
-  float high[3], low[3];
+// Three affine functions of the pixel: values at the origin, slopes along x and y (a fourth lane fills the vector).
+struct alignas(16) Affine {
+  float value[4], slope_x[4], slope_y[4];
 };
-
-template <class F>
-REFGS_INLINE F evaluate(const Affine& f, F x, F y) {
-  F high = f.high[0] + f.high[1] * x + f.high[2] * y;
-  F low = f.low[0] + f.low[1] * x + f.low[2] * y;
-  return high + low;
-}
 
 // A splat as a pixel (x, y) sees it, x and y in pixels from the middle of its tile. With M = [s_u t_u, s_v t_v, p] in camera
 // space, Eq. 4 reads M (u, v, 1)^T = z (X, Y, 1)^T, so (n0, n1, n2) = k det(M) M^-1 (X, Y, 1)^T is affine in the pixel,
-// u = n0 / n2, v = n1 / n2, z = k det(M) / n2. The factor k is free.
+// u = n0 / n2, v = n1 / n2, z = k det(M) / n2. The factor k is free. Each is a sum of two: `high` is rounded so
+// that it is computed without error at the half-integers of a tile, `low` is what that left out. For a disc near its edge n2 is a
+// small difference of large numbers, and one float each would give up the accuracy of u, v and z.
 struct Splat {
-  Affine n0, n1, n2;
+  Affine high, low;
   float determinant;          // k det(M), >= 0
   float n2_min, n2_max;       // the plane is met between the near plane and FAR where n2_min <= n2 <= n2_max
   float x, y, depth;          // projected centre, and its depth
   float opacity;
   float rho_max;              // alpha >= ALPHA_CUT  <=>  rho <= 2 ln(opacity / ALPHA_CUT)
 };
+
+template <class F>
+REFGS_INLINE F affine(const Splat& s, int i, F x, F y) {
+  F high = s.high.value[i] + s.high.slope_x[i] * x + s.high.slope_y[i] * y;
+  F low = s.low.value[i] + s.low.slope_x[i] * x + s.low.slope_y[i] * y;
+  return high + low;
+}
 
 template <class F>
 struct Hit {
@@ -57,9 +57,9 @@ struct Hit {
 template <class F>
 REFGS_INLINE Hit<F> intersect(const Splat& s, F x, F y) {
   Hit<F> h;
-  F n0 = evaluate(s.n0, x, y);
-  F n1 = evaluate(s.n1, x, y);
-  F n2 = evaluate(s.n2, x, y);
+  F n0 = affine(s, 0, x, y);
+  F n1 = affine(s, 1, x, y);
+  F n2 = affine(s, 2, x, y);
   h.inverse = 1.0f / n2;
   h.u = n0 * h.inverse;
   h.v = n1 * h.inverse;
