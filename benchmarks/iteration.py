@@ -4,7 +4,7 @@ The scene is the repository's own, made without Blender: 256×256 photos of a me
 20,000 surfels on its hull. Each part is timed by running the iteration's own functions up to it.
 """
 
-import refgs  # noqa: F401, I001  first: it tells OpenMP's idle threads to sleep, which must be said before torch loads
+import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
 
 import statistics
 import tempfile

@@ -1,4 +1,4 @@
-import refgs  # noqa: F401, I001  first: it tells OpenMP's idle threads to sleep, which must be said before torch loads
+import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
 
 import pytest
 

@@ -27,6 +27,7 @@ class RenderSettings(_Section):
 class SurfelSettings(_Section):
     start: int = Field(ge=1, le=10_000_000, description="surfels at the start")
     budget: int = Field(ge=1, le=10_000_000, description="surfels at the most")
+    hull: int = Field(ge=16, le=512, description="voxels along each side of the visual hull's grid")
     sh_degree: int = Field(ge=0, le=3)
     opacity: float = Field(gt=0, lt=1, description="at the start")
     albedo: float = Field(gt=0, lt=1, description="at the start")

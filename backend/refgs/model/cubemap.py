@@ -22,14 +22,20 @@ def _face_direction(face: Tensor, s: Tensor, t: Tensor) -> Tensor:
 
 
 def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Face index and (s, t) in [−1, 1] of directions (..., 3), differentiable in s and t. A zero direction gives face 0, s = t = 0."""
-    axis = directions.detach().abs().argmax(dim=-1)
-    major = directions.gather(-1, axis[..., None])[..., 0]
-    face = 2 * axis + (major < 0)
+    """Face index and (s, t) in [−1, 1] of directions (..., 3), differentiable in s and t.
+
+    A zero direction gives face 0, s = t = 0.
+    """
+    x, y, z = directions.unbind(-1)
+    with torch.no_grad():
+        ax, ay, az = x.abs(), y.abs(), z.abs()
+        on_x, on_y = (ax >= ay) & (ax >= az), ay >= az
+    major = torch.where(on_x, x, torch.where(on_y, y, z))
     scale = 1 / major.abs().clamp_min(1e-20)
-    s = directions.gather(-1, ((axis + 1) % 3)[..., None])[..., 0] * scale
-    t = directions.gather(-1, ((axis + 2) % 3)[..., None])[..., 0] * scale
-    return face, s, t
+    s = torch.where(on_x, y, torch.where(on_y, z, x)) * scale
+    t = torch.where(on_x, z, torch.where(on_y, x, y)) * scale
+    axis = torch.where(on_x, 0, torch.where(on_y, 1, 2))
+    return 2 * axis + (major.detach() < 0), s, t
 
 
 @lru_cache(maxsize=32)

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import torch
-from refgs.render.rasterize import rasterize
 from torch import Tensor
 
 from refgs.camera import Camera
@@ -12,6 +11,7 @@ from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render import brdf
+from refgs.render.rasterize import rasterize
 from refgs.settings import RenderSettings
 
 NEAR = 0.01  # the nearest depth that is drawn, in scene radii
@@ -23,18 +23,27 @@ SHIFT_ALPHA = 0.3  # a silhouette's blended position says nothing about its surf
 
 @dataclass(frozen=True)
 class Rendering:
-    """What a camera sees. `color` is sRGB-encoded, over the background; the maps are alpha-weighted means over the splats
-    of a pixel (zero where nothing is), linear; `normal` (H, W, 3) is in world space, not normalised, towards the
-    camera; `depth` (H, W) is along the camera's axis."""
+    """What a camera sees. `color` (H, W, 3) is sRGB-encoded, over the background. The maps are alpha-weighted means over
+    the splats of a pixel, linear, zero where nothing is: `normal` (H, W, 3) in world space, not normalised, towards the
+    camera; `depth` (H, W) along the camera's axis. `shaded` has what deferred shading worked with, by covered pixel."""
 
     color: Tensor
     alpha: Tensor
     depth: Tensor
     normal: Tensor
-    albedo: Tensor | None = None
-    metallic: Tensor | None = None
-    roughness: Tensor | None = None
-    radiance: Tensor | None = None  # linear, before the background; deferred shading alone
+    pixels: tuple[Tensor, Tensor] | None = None
+    shaded: dict[str, Tensor] | None = None
+
+    def map(self, name: str) -> Tensor:
+        """ "albedo" or "radiance" (H, W, 3), "metallic" or "roughness" (H, W), linear; radiance is before the background."""
+        values = self.shaded[name]
+        return self.alpha.new_zeros(*self.alpha.shape, *values.shape[1:]).index_put(self.pixels, values)
+
+
+def unit(v: Tensor) -> Tensor:
+    """Vectors (..., 3) made unit length; a zero vector stays zero. Three times as fast as torch's normalize for three numbers."""
+    x, y, z = v.unbind(-1)
+    return v * torch.rsqrt(x * x + y * y + z * z + 1e-24)[..., None]
 
 
 def near_plane(radius: float) -> float:
@@ -59,18 +68,18 @@ def facing_normals(surfels: Surfels, camera: Camera) -> Tensor:
     """
     normals = surfels.normals()
     towards = torch.from_numpy(camera.position).float() - surfels.positions.detach()
-    cosine = (normals.detach() * torch.nn.functional.normalize(towards, dim=-1)).sum(dim=-1, keepdim=True)
+    cosine = (normals.detach() * unit(towards)).sum(dim=-1, keepdim=True)
     return torch.where(cosine < PAST_HORIZON, -normals, normals)
 
 
 def _appearance(surfels: Surfels, camera: Camera) -> Tensor:
     """SH colour (N, 3) of each surfel towards the camera, not negative."""
     towards = surfels.positions.detach() - torch.from_numpy(camera.position).float()
-    return harmonics.evaluate(surfels.sh, torch.nn.functional.normalize(towards, dim=-1)).clamp_min(0)
+    return harmonics.evaluate(surfels.sh, unit(towards)).clamp_min(0)
 
 
-def _unshifted(features: Tensor, alpha: Tensor, positions: Tensor, pixels: Tensor, camera: Camera) -> Tensor:
-    """Features (P, C), alpha-weighted means, read where the blend's own surface point projects to the pixel.
+def _unshifted(features: Tensor, alpha: Tensor, position: int, pixels: tuple[Tensor, Tensor], camera: Camera) -> Tensor:
+    """Features (P, C) of the covered pixels, alpha-weighted means, read where the blend's own surface point projects to the pixel.
 
     Discs sorted and blended by their centres favour those in front: on a curved surface the blend at a pixel is that of
     a point nearer to the camera, whose normal leans towards it. The blended positions tell which point; the pixel whose
@@ -79,22 +88,23 @@ def _unshifted(features: Tensor, alpha: Tensor, positions: Tensor, pixels: Tenso
     height, width, channels = features.shape
     rotation = torch.from_numpy(camera.world_to_camera[:3, :3].copy()).float()
     translation = torch.from_numpy(camera.world_to_camera[:3, 3].copy()).float()
-    here = alpha[pixels[0], pixels[1]]
+    stacked = torch.cat([features, alpha[..., None]], dim=-1)
+    *own, here = stacked[pixels].split([channels, 1], dim=-1)
+    own = own[0] / here
     centre = torch.stack([pixels[1], pixels[0]], dim=-1) + 0.5
-    point = (positions[pixels[0], pixels[1]] / here[:, None]) @ rotation.T + translation
+    point = own[:, position : position + 3] @ rotation.T + translation
     focal = torch.tensor([camera.fx, camera.fy])
     projected = point[:, :2] / point[:, 2:].clamp_min(1e-12) * focal + torch.tensor([camera.cx, camera.cy])
-    shift = (projected - centre).clamp(-SHIFT_LIMIT, SHIFT_LIMIT) * (here.detach() > SHIFT_ALPHA)[:, None]
+    shift = (projected - centre).clamp(-SHIFT_LIMIT, SHIFT_LIMIT) * (here.detach() > SHIFT_ALPHA)
     grid = (centre - shift) * torch.tensor([2 / width, 2 / height]) - 1
-    stacked = torch.cat([features, alpha[..., None]], dim=-1).permute(2, 0, 1)[None]
     sampled = torch.nn.functional.grid_sample(
-        stacked, grid[None, :, None], mode="bilinear", padding_mode="border", align_corners=False
+        stacked.permute(2, 0, 1)[None], grid[None, :, None], mode="bilinear", padding_mode="border", align_corners=False
     )[0, :, :, 0]
     # At a silhouette the way back leads off the object: there the pixel keeps its own blend.
     there = sampled[channels]
     trust = ((there.detach() - SHIFT_ALPHA) / SHIFT_ALPHA).clamp(0, 1)[:, None]
     moved = (sampled[:channels] / there.clamp_min(SHIFT_ALPHA)).T
-    return trust * moved + (1 - trust) * features[pixels[0], pixels[1]] / here[:, None]
+    return trust * moved + (1 - trust) * own
 
 
 def render(
@@ -135,14 +145,11 @@ def render(
         return Rendering(color, alpha, depth, maps["normal"] / alpha.clamp_min(COVERED)[..., None])
 
     pixels = torch.nonzero(alpha.detach() > COVERED, as_tuple=True)
-    start = list(parts).index("position")
-    offset = sum(widths[:start])
-    positions = raster.features[..., offset : offset + 3]
-    features = _unshifted(raster.features, alpha, positions, torch.stack(pixels), camera)
+    features = _unshifted(raster.features, alpha, sum(widths[: list(parts).index("position")]), pixels, camera)
     maps = dict(zip(parts, features.split(widths, dim=-1), strict=True))
 
-    view = -torch.nn.functional.normalize(camera_rays(camera)[pixels], dim=-1)
-    normal = torch.nn.functional.normalize(maps["normal"], dim=-1, eps=1e-6)
+    view = -unit(camera_rays(camera)[pixels])
+    normal = unit(maps["normal"])
     n_v = (normal * view).sum(dim=-1).clamp(1e-4, 1)
     metallic, roughness = maps["metallic"][:, 0], maps["roughness"][:, 0]
     light = environment.specular(brdf.reflect(view, normal), roughness)
@@ -154,19 +161,7 @@ def render(
 
     covered = alpha[pixels][:, None]
     over = srgb_encode(radiance) * covered + (1 - covered) * background
-    shape = (camera.height, camera.width, 3)
-
-    def image(values: Tensor, fill: Tensor | float = 0.0) -> Tensor:
-        base = torch.zeros(*shape[:2], values.shape[1]) + fill
-        return base.index_put(pixels, values)
-
-    return Rendering(
-        image(over, background),
-        alpha,
-        depth,
-        image(maps["normal"]),
-        image(maps["albedo"]),
-        image(maps["metallic"])[..., 0],
-        image(maps["roughness"])[..., 0],
-        image(radiance),
-    )
+    color = background.expand(camera.height, camera.width, 3).index_put(pixels, over)
+    blended = torch.zeros_like(color).index_put(pixels, maps["normal"])
+    shaded = {"albedo": maps["albedo"], "metallic": metallic, "roughness": roughness, "radiance": radiance}
+    return Rendering(color, alpha, depth, blended, pixels, shaded)

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.model.environment import Environment
-from refgs.render.renderer import Rendering, camera_rays
+from refgs.render.renderer import Rendering, camera_rays, unit
 from refgs.render.ssim import dssim
 from refgs.settings import LossSettings
 
@@ -27,14 +27,14 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
     points = camera_rays(camera) * depth[..., None]
     across = points[1:-1, 2:] - points[1:-1, :-2]
     down = points[2:, 1:-1] - points[:-2, 1:-1]
-    return torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=-1, eps=1e-20)
+    return unit(torch.linalg.cross(down, across))
 
 
 def normal_loss(rendering: Rendering, camera: Camera) -> Tensor:
     """1 − ÑᵀN, Ñ from the depth, where the surface is opaque around the pixel."""
     solid = rendering.alpha.detach() > 0.5
     solid = solid[1:-1, 2:] & solid[1:-1, :-2] & solid[2:, 1:-1] & solid[:-2, 1:-1]
-    normal = torch.nn.functional.normalize(rendering.normal[1:-1, 1:-1], dim=-1, eps=1e-6)
+    normal = unit(rendering.normal[1:-1, 1:-1])
     disagreement = 1 - (depth_normals(rendering.depth, camera) * normal).sum(dim=-1)
     return (disagreement * solid).mean()
 

@@ -20,6 +20,7 @@ def start_parameters(capture: Capture, views: list[LoadedView], settings: Settin
             capture.centre,
             capture.radius,
             count,
+            resolution=settings.surfels.hull,
             seed=seed,
         )
         source = "the visual hull of the masks"
