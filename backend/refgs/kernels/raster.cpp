@@ -473,7 +473,12 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
       n0 += d.n0, n0x += d.n0 * x, n0y += d.n0 * y;
       n1 += d.n1, n1x += d.n1 * x, n1y += d.n1 * y;
       n2 += d.n2, n2x += d.n2 * x, n2y += d.n2 * y;
-      determinant += d.determinant, px += d.x, py += d.y, depth += d.depth, opacity += d.opacity;
+      determinant += d.determinant, opacity += d.opacity;
+      if (any(covered & ~hit.on_plane)) {
+        Vector by_x, by_y, by_depth;
+        refgs::differentiate_screen(hit, d, by_x, by_y, by_depth);
+        px += by_x, py += by_y, depth += by_depth;
+      }
     }
     gather_features(row + GEOMETRY, weights, touched, used, C);
     Vector geometry[] = {n0, n0x, n0y, n1, n1x, n1y, n2, n2x, n2y, determinant, px, py, depth, opacity, Vector(), Vector()};

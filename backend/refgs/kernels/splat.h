@@ -87,10 +87,11 @@ REFGS_INLINE F alpha(const Splat& s, F gaussian) {
 // Derivatives of the loss by what Splat holds, at one pixel; those by n0, n1, n2 are by their values at the pixel.
 template <class F>
 struct Derivative {
-  F n0, n1, n2, determinant, x, y, depth, opacity;
+  F opacity, n0, n1, n2, determinant;  // where the splat is on its plane
+  F by_rho, by_z;                      // what passes to the projected centre, elsewhere
 };
 
-// From the derivatives by the pixel's alpha and by the splat's z. Lanes that the splat doesn't cover come out zero if both are.
+// From the derivatives by the pixel's alpha and by the splat's z, both zero where the splat doesn't cover it.
 template <class F>
 REFGS_INLINE Derivative<F> differentiate(const Splat& s, const Hit<F>& h, F gaussian, F by_alpha, F by_z) {
   Derivative<F> d;
@@ -98,20 +99,25 @@ REFGS_INLINE Derivative<F> differentiate(const Splat& s, const Hit<F>& h, F gaus
   F raw = s.opacity * gaussian;
   by_alpha = select(raw < ALPHA_CAP, by_alpha, zero);
   d.opacity = by_alpha * gaussian;
-  F by_rho = -0.5f * raw * by_alpha;
-  F by_rho_plane = select(h.on_plane, by_rho, zero);
-  F by_rho_screen = by_rho - by_rho_plane;
-  F by_z_plane = select(h.on_plane, by_z, zero);
+  d.by_rho = -0.5f * raw * by_alpha;
+  d.by_z = by_z;
   F inverse = select(h.on_plane, h.inverse, zero);
-  F scale = 2.0f * by_rho_plane * inverse;
+  F scale = 2.0f * d.by_rho * inverse;
   d.n0 = select(h.on_plane, scale * h.u, zero);
   d.n1 = select(h.on_plane, scale * h.v, zero);
-  d.n2 = -inverse * (2.0f * by_rho_plane * h.rho + by_z_plane * h.z);
-  d.determinant = by_z_plane * inverse;
-  d.depth = by_z - by_z_plane;
-  d.x = -2.0f * LOW_PASS * by_rho_screen * h.dx;
-  d.y = -2.0f * LOW_PASS * by_rho_screen * h.dy;
+  d.n2 = -inverse * (2.0f * d.by_rho * h.rho + by_z * h.z);
+  d.determinant = by_z * inverse;
   return d;
+}
+
+// The derivatives by the projected centre's x, y and depth: where the low-pass draws the splat.
+template <class F>
+REFGS_INLINE void differentiate_screen(const Hit<F>& h, const Derivative<F>& d, F& by_x, F& by_y, F& by_depth) {
+  F zero = F();
+  F scale = select(h.on_plane, zero, -2.0f * LOW_PASS * d.by_rho);
+  by_x = scale * h.dx;
+  by_y = scale * h.dy;
+  by_depth = select(h.on_plane, zero, d.by_z);
 }
 
 }  // namespace refgs
