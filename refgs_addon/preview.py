@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--hdri", type=Path, action="append", required=True, help="a panorama to light it with; repeat")
     parser.add_argument("--out", type=Path, required=True, help="the folder for the pictures")
     parser.add_argument("--blend", type=Path, required=True, help="the .blend to save")
-    parser.add_argument("--views", nargs="+", help="views to render, by photo name; the first test view by default")
+    parser.add_argument("--views", nargs="+", help="views to render, by photo name; the first by default")
     parser.add_argument("--size", type=int, help="longer side in pixels; the photo's by default")
     options = parser.parse_args(arguments)
     try:
@@ -44,9 +44,10 @@ def main(arguments: list[str] | None = None) -> int:
 def preview(options: argparse.Namespace) -> None:
     import bpy
 
+    from .scene.parts import show
     from .scene.preview import render_preview
     from .scene.relight import relight
-    from .scene.run import import_run, show
+    from .scene.run import import_run
 
     # Blender and its add-ons print to standard output what they like: that goes to standard error, the events do not.
     events = os.fdopen(os.dup(1), "w", buffering=1)
@@ -55,6 +56,9 @@ def preview(options: argparse.Namespace) -> None:
     def say(**event) -> None:
         print(json.dumps(event), file=events)
 
+    for hdri in options.hdri:
+        if not hdri.is_file():
+            raise InputError(f"there is no light {hdri}: choose an EXR or HDR panorama")
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     say(event="progress", done=0, total=0, what=f"importing {options.run}")
@@ -71,11 +75,11 @@ def preview(options: argparse.Namespace) -> None:
 
     # In software, Eevee's shadow maps take ten times as long as the rest of a frame, and splats cast no shadows anyway.
     scene.eevee.use_shadows = False
-    parts = ["splats", "mesh"] if run.mesh else ["splats"]
-    total, files = len(options.hdri) * len(parts) * len(views), []
+    shown = ["splats", "mesh"] if run.mesh else ["splats"]
+    total, files = len(options.hdri) * len(shown) * len(views), []
     for hdri in options.hdri:
         relight(scene, hdri)
-        for part in parts:
+        for part in shown:
             show(run.collection, part)
             for view in views:
                 path = options.out / f"{hdri.stem}_{part}_{view}.png"

@@ -6,24 +6,31 @@ from ..compat import node_tree
 from . import add, out
 
 VALUES_NAME = "RefGS Splat Values"
+COLOR, VECTOR, FACTOR = 0, 1, 2  # the outputs of an Attribute node; the third is Fac up to 4.5 and Factor in 5.2
 
 
 def splat_material(name: str) -> bpy.types.Material:
-    """A new Principled material for the quads of `nodes.splats`: base colour, metallic and roughness of each splat."""
+    """A new Principled material for the quads of `nodes.splats`: base colour, metallic and roughness of each splat.
+
+    The back of a splat is black, as the inside of a solid is dark: lit, it would shine through where the splats in
+    front of it leave a few per cent uncovered.
+    """
     material = bpy.data.materials.new(name)
-    tree = _dithered(material)
+    tree = node_tree(material)
+    normal, front = _normal(tree)
     principled = add(
         tree,
         "ShaderNodeBsdfPrincipled",
         {
-            "Base Color": _attribute(tree, "base_color", "Color"),
-            "Metallic": _attribute(tree, "metallic", "Fac"),
-            "Roughness": _attribute(tree, "roughness", "Fac"),
-            "Alpha": _alpha(tree),
-            "Normal": _normal(tree),
+            "Base Color": _attribute(tree, "base_color", COLOR),
+            "Metallic": _attribute(tree, "metallic", FACTOR),
+            "Roughness": _attribute(tree, "roughness", FACTOR),
+            "Normal": normal,
         },
     )
-    add(tree, "ShaderNodeOutputMaterial", {"Surface": out(principled)})
+    black = add(tree, "ShaderNodeEmission", {"Strength": 0.0})
+    shader = add(tree, "ShaderNodeMixShader", {0: front, 1: out(black), 2: out(principled)})
+    _finish(material, out(shader))
     return material
 
 
@@ -32,22 +39,28 @@ def values_material() -> bpy.types.Material:
     if VALUES_NAME in bpy.data.materials:
         return bpy.data.materials[VALUES_NAME]
     material = bpy.data.materials.new(VALUES_NAME)
-    tree = _dithered(material)
-    emission = add(tree, "ShaderNodeEmission", {"Color": _attribute(tree, "display", "Color")})
-    clear = add(tree, "ShaderNodeBsdfTransparent")
-    mixed = add(tree, "ShaderNodeMixShader", {"Fac": _alpha(tree), 1: out(clear), 2: out(emission)})
-    add(tree, "ShaderNodeOutputMaterial", {"Surface": out(mixed)})
+    tree = node_tree(material)
+    _finish(material, out(add(tree, "ShaderNodeEmission", {"Color": _attribute(tree, "display", COLOR)})))
     return material
 
 
-def _dithered(material: bpy.types.Material) -> bpy.types.NodeTree:
-    # Each Eevee sample keeps or drops a quad at random with its alpha, and the nearest kept one wins: on average this
-    # is front-to-back compositing in the order of each pixel's own depths, however many quads overlap.
+def _finish(material: bpy.types.Material, shader: bpy.types.NodeSocket) -> None:
+    """Show a shader through the splat's alpha, opacity · exp(-(u² + v²) / 2).
+
+    Each Eevee sample keeps or drops a quad at random with its alpha, and the nearest kept one wins: on average this is
+    front-to-back compositing in the order of each pixel's own depths, however many quads overlap.
+    """
     material.surface_render_method = "DITHERED"
-    return node_tree(material)
+    tree = material.node_tree
+    gaussian = _attribute(tree, "gaussian", VECTOR)
+    exponent = _math(tree, "MULTIPLY", _dot(tree, gaussian, gaussian), -0.5)
+    alpha = _math(tree, "MULTIPLY", _attribute(tree, "opacity", FACTOR), _math(tree, "EXPONENT", exponent))
+    clear = add(tree, "ShaderNodeBsdfTransparent")
+    mixed = add(tree, "ShaderNodeMixShader", {0: alpha, 1: out(clear), 2: shader})
+    add(tree, "ShaderNodeOutputMaterial", {"Surface": out(mixed)})
 
 
-def _attribute(tree: bpy.types.NodeTree, name: str, output: str) -> bpy.types.NodeSocket:
+def _attribute(tree: bpy.types.NodeTree, name: str, output: int) -> bpy.types.NodeSocket:
     return add(tree, "ShaderNodeAttribute", attribute_name=name).outputs[output]
 
 
@@ -63,34 +76,27 @@ def _math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSo
     return out(add(tree, "ShaderNodeMath", dict(enumerate(inputs)), operation=operation))
 
 
-def _alpha(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
-    """opacity · exp(-(u² + v²) / 2)."""
-    gaussian = _attribute(tree, "gaussian", "Vector")
-    exponent = _math(tree, "MULTIPLY", _vector(tree, "DOT_PRODUCT", gaussian, gaussian), -0.5)
-    return _math(tree, "MULTIPLY", _attribute(tree, "opacity", "Fac"), _math(tree, "EXPONENT", exponent))
+def _dot(tree: bpy.types.NodeTree, a: bpy.types.NodeSocket, b: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    return add(tree, "ShaderNodeVectorMath", {0: a, 1: b}, operation="DOT_PRODUCT").outputs["Value"]
 
 
-def _normal(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
-    """The splat's own normal, bent across the splat: n + u·dn/du + v·dn/dv, in world space, towards the viewer.
+def _normal(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
+    """The splat's normal bent across the splat, n + u·dn/du + v·dn/dv, in world space; and whether its front is seen.
 
-    A splat that is seen from behind shows its other side. Where bending turns the normal away from the viewer, which it does at
-    silhouettes, it is brought back to a right angle: a BSDF is black under a normal that faces away.
+    Where bending turns the normal away from the viewer, which it does at silhouettes, it is brought back to a right
+    angle: a BSDF is black under a normal that faces away.
     """
-    u_v = add(tree, "ShaderNodeSeparateXYZ", {"Vector": _attribute(tree, "gaussian", "Vector")}).outputs
-    centre = _attribute(tree, "normal", "Vector")
-    bent = _vector(tree, "ADD", centre, _scaled(tree, _attribute(tree, "normal_u", "Vector"), u_v["X"]))
-    bent = _vector(tree, "ADD", bent, _scaled(tree, _attribute(tree, "normal_v", "Vector"), u_v["Y"]))
+    u_v = add(tree, "ShaderNodeSeparateXYZ", {"Vector": _attribute(tree, "gaussian", VECTOR)}).outputs
+    centre = _attribute(tree, "normal", VECTOR)
+    bent = _vector(tree, "ADD", centre, _scaled(tree, _attribute(tree, "normal_u", VECTOR), u_v["X"]))
+    bent = _vector(tree, "ADD", bent, _scaled(tree, _attribute(tree, "normal_v", VECTOR), u_v["Y"]))
 
     def to_world(vector: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         kind = {"vector_type": "NORMAL", "convert_from": "OBJECT", "convert_to": "WORLD"}
         return out(add(tree, "ShaderNodeVectorTransform", {"Vector": vector}, **kind))
 
     viewer = add(tree, "ShaderNodeNewGeometry").outputs["Incoming"]
-    side = _math(tree, "SIGN", _dot(tree, to_world(centre), viewer))
-    bent = _scaled(tree, _vector(tree, "NORMALIZE", to_world(bent)), side)
+    front = _math(tree, "GREATER_THAN", _dot(tree, to_world(centre), viewer), 0.0)
+    bent = _vector(tree, "NORMALIZE", to_world(bent))
     away = _math(tree, "MINIMUM", _dot(tree, bent, viewer), 0.0)
-    return _vector(tree, "NORMALIZE", _vector(tree, "SUBTRACT", bent, _scaled(tree, viewer, away)))
-
-
-def _dot(tree: bpy.types.NodeTree, a: bpy.types.NodeSocket, b: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    return add(tree, "ShaderNodeVectorMath", {0: a, 1: b}, operation="DOT_PRODUCT").outputs["Value"]
+    return _vector(tree, "NORMALIZE", _vector(tree, "SUBTRACT", bent, _scaled(tree, viewer, away))), front

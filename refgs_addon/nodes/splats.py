@@ -4,7 +4,7 @@ import bpy
 
 from . import add, out
 
-NAME = "RefGS Splats"
+NAME = "RefGS Splats"  # of the tree, and of the modifier that uses it
 # The quad reaches three standard deviations: the Gaussian is exp(-4.5) = 1.1 % of its peak there.
 EXTENT = 3.0
 DISPLAYS = ("Shaded", "Base Color", "Roughness", "Metallic", "Normal")

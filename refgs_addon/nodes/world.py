@@ -7,6 +7,7 @@ from . import add, out
 
 # The nodes whose values the panel shows and `scene.relight` sets.
 IMAGE, ROTATION, STRENGTH = "RefGS HDRI", "RefGS Rotation", "RefGS Strength"
+RECOVERED = "refgs_recovered"  # the world's custom property that keeps a run's recovered panorama
 
 
 def panorama_world(name: str) -> bpy.types.World:
@@ -23,3 +24,12 @@ def panorama_world(name: str) -> bpy.types.World:
     background = add(tree, "ShaderNodeBackground", {"Color": out(image)}, name=STRENGTH)
     add(tree, "ShaderNodeOutputWorld", {"Surface": out(background)})
     return world
+
+
+def is_panorama(world: bpy.types.World | None) -> bool:
+    """Whether a world was made by `panorama_world`, and still has the nodes that are set."""
+    return (
+        world is not None
+        and world.node_tree is not None
+        and {IMAGE, ROTATION, STRENGTH} <= set(world.node_tree.nodes.keys())
+    )

@@ -55,7 +55,8 @@ def _save(picture: bpy.types.Image, scene: bpy.types.Scene, path: Path, kind: st
     except (RuntimeError, OSError):
         raise InputError(f"cannot write {path}: is its folder there, with room on the disk?") from None
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # as where its folder is no folder
+            temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

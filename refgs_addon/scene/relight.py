@@ -5,9 +5,7 @@ from pathlib import Path
 import bpy
 
 from ..errors import InputError
-from ..nodes.world import IMAGE, ROTATION, STRENGTH, panorama_world
-
-RECOVERED = "refgs_recovered"  # the world's custom property that keeps the recovered panorama
+from ..nodes.world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama, panorama_world
 
 
 def load_panorama(path: Path) -> bpy.types.Image:
@@ -38,7 +36,7 @@ def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, st
     recovered light stays with the world. A world that RefGS did not make is left as it is and replaced in the scene.
     Raises InputError for a picture that cannot be read, and where there is no recovered light to go back to.
     """
-    world = scene.world if is_ours(scene.world) else None
+    world = scene.world if is_panorama(scene.world) else None
     if hdri is not None:
         image = load_panorama(hdri)
         if world is None:
@@ -51,8 +49,3 @@ def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, st
     nodes[IMAGE].image = image
     nodes[ROTATION].inputs["Rotation"].default_value = (0.0, 0.0, rotation)
     nodes[STRENGTH].inputs["Strength"].default_value = strength
-
-
-def is_ours(world: bpy.types.World | None) -> bool:
-    """Whether a world has the panorama that `relight` sets."""
-    return world is not None and world.node_tree is not None and IMAGE in world.node_tree.nodes

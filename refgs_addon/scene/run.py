@@ -6,11 +6,10 @@ from pathlib import Path
 import bpy
 
 from ..errors import InputError
+from . import parts
 from .cameras import add_camera, frame_camera, read_cameras
 from .relight import light_with_recovered, load_panorama
 from .splats import add_splats, read_splats
-
-PART = "refgs_part"  # the custom property that says what an imported object is: "splats" or "mesh"
 
 
 @dataclass
@@ -29,13 +28,12 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     """Import a run folder into a scene, in a new collection `RefGS NAME`.
 
     splats.ply must be there; mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be
-    missing. The mesh is hidden at first, for it is where the splats are: see `show`. Raises InputError, and then leaves
-    the file as it was.
+    missing. The mesh is hidden at first, for it is where the splats are: see
+    `parts.show`. Raises InputError, and then leaves the file as it was.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: choose the folder that a RefGS run wrote")
-    # A trailing separator, as Blender's file browser gives, hides the folder's name from no one here.
     name = folder.resolve().name
     splats = read_splats(folder / "splats.ply")
     frames = read_cameras(folder / "cameras.json") if (folder / "cameras.json").exists() else []
@@ -44,7 +42,7 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         collection = bpy.data.collections.new(f"RefGS {name}")
         scene.collection.children.link(collection)
         run = Run(collection, add_splats(f"{name} splats", splats, collection))
-        run.splats[PART] = "splats"
+        run.splats[parts.KEY] = "splats"
         if (folder / "mesh.glb").exists():
             run.mesh = _add_mesh(folder / "mesh.glb", f"{name} mesh", collection)
         if (folder / "environment.exr").exists():
@@ -55,19 +53,12 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
             run.cameras = {frame["name"]: add_camera(frame, cameras) for frame in frames}
             if scene.camera is None:
                 frame_camera(scene, next(iter(run.cameras.values())))
-        show(collection, "splats")
+        parts.show(collection, "splats")
     except BaseException:
         scene.world, scene.camera = world, camera
         bpy.data.batch_remove(_data() - before)
         raise
     return run
-
-
-def show(collection: bpy.types.Collection, *parts: str) -> None:
-    """Show the parts of a run that are named ("splats", "mesh") and hide the others, in the viewport and in renders."""
-    for item in collection.objects:
-        if PART in item:
-            item.hide_viewport = item.hide_render = item[PART] not in parts
 
 
 def _add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bpy.types.Object]:
@@ -79,16 +70,20 @@ def _add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[b
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"Blender's glTF add-on did not import {path}: {reason}") from None
     added = [item for item in bpy.data.objects if item not in before]
-    for item in added:
+    bpy.context.view_layer.update()
+    meshes = [item for item in added if item.type == "MESH"]
+    for item in meshes:
+        matrix = item.matrix_world.copy()  # the file's own nodes come as empty parents: keep what they did, drop them
+        item.parent, item.matrix_world = None, matrix
         for other in item.users_collection:
             other.objects.unlink(item)
         collection.objects.link(item)
-        item[PART] = "mesh"
-        if item.type == "MESH":
-            item.name = item.data.name = name
-    if not any(item.type == "MESH" for item in added):
+        item.name = item.data.name = name
+        item[parts.KEY] = "mesh"
+    bpy.data.batch_remove(set(added) - set(meshes))
+    if not meshes:
         raise InputError(f"{path} has no mesh in it: export the run again")
-    return added
+    return meshes
 
 
 def _data() -> set[bpy.types.ID]:

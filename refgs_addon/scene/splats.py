@@ -9,9 +9,8 @@ from mathutils.kdtree import KDTree
 from .. import compat
 from ..errors import InputError
 from ..nodes.materials import splat_material, values_material
-from ..nodes.splats import splats_tree
+from ..nodes.splats import NAME, splats_tree
 
-MODIFIER = "RefGS Splats"
 _NEIGHBOURS = 12
 _TYPES = {"base_color": "FLOAT_COLOR", "rotation": "QUATERNION"}
 
@@ -41,7 +40,7 @@ def add_splats(name: str, splats: dict[str, np.ndarray], collection: bpy.types.C
     result.visible_shadow = False
     material = splat_material(name)
     cloud.materials.append(material)
-    modifier = result.modifiers.new(MODIFIER, "NODES")
+    modifier = result.modifiers.new(NAME, "NODES")
     modifier.node_group = splats_tree(values_material())
     bpy.context.view_layer.update()  # 5.2 makes the modifier's inputs here
     compat.set_modifier_input(modifier, "Material", material)
@@ -52,8 +51,8 @@ def read_splats(path: Path) -> dict[str, np.ndarray]:
     """Read a run's splats.ply (binary, little-endian, float properties in 3DGS's names and RefGS's materials).
 
     Returns float32 arrays: position (N, 3), normal (N, 3) unit, scale (N, 2) standard deviations, rotation (N, 4)
-    unit quaternions wxyz, opacity (N,) 0..1, base_color (N, 3) linear, metallic (N,), roughness (N,). Blender's own
-    PLY importer is not used: it drops nothing but leaves the activations to do, and reports a cut file as success.
+    unit quaternions wxyz, opacity (N,) 0..1, base_color (N, 3) linear, metallic (N,), roughness (N,). Raises InputError
+    for any other file.
     """
     rows = _vertices(path)
     names = {

@@ -1,0 +1,21 @@
+"""The parts of an imported run, and which of them are seen."""
+
+import bpy
+
+KEY = "refgs_part"  # the custom property of an imported object: "splats" or "mesh"
+
+
+def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]:
+    """The objects of a run's collection by part; empty for a collection that is not a run's."""
+    found: dict[str, list[bpy.types.Object]] = {}
+    for item in collection.objects:
+        if KEY in item:
+            found.setdefault(item[KEY], []).append(item)
+    return found
+
+
+def show(collection: bpy.types.Collection, part: str) -> None:
+    """Show one part of a run, "splats" or "mesh", and hide the other, in the viewport and in renders."""
+    for name, items in parts(collection).items():
+        for item in items:
+            item.hide_viewport = item.hide_render = name != part

@@ -1,0 +1,19 @@
+"""Blender as a Python module: one process holds one file, so each test starts an empty one."""
+
+import pytest
+
+from .runs import write_run
+
+bpy = pytest.importorskip("bpy", reason="needs Blender's Python module")
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    return write_run(tmp_path / "pot")
+
+
+@pytest.fixture
+def scene():
+    """The scene of an empty file."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    return bpy.context.scene

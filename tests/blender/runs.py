@@ -1,0 +1,86 @@
+"""A run folder of a few splats, written with public libraries alone."""
+
+import json
+
+import numpy as np
+import OpenEXR
+import trimesh
+from plyfile import PlyData, PlyElement
+
+COUNT, SIZE = 40, 64
+COLUMNS = [
+    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1",
+    "rot_0", "rot_1", "rot_2", "rot_3", "albedo_r", "albedo_g", "albedo_b", "metallic", "roughness",
+]  # fmt: skip
+
+
+def quaternion_matrix(q):
+    """The rotation matrices (N, 3, 3) of unit quaternions wxyz, by rotating the axes: v + 2 q × (q × v + w v)."""
+    w, xyz = q[:, :1, None], q[:, None, 1:]
+    axes = np.eye(3)[None]
+    return np.swapaxes(axes + 2 * np.cross(xyz, np.cross(xyz, axes) + w * axes), 1, 2)
+
+
+def look_at(eye, target=(0, 0, 0)):
+    """A camera-to-world matrix with OpenGL's axes, +z up."""
+    back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
+    right = np.cross([0, 0, 1], back)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)
+    return matrix
+
+
+def write_ply(path, columns):
+    """Write splats.ply from a mapping of property name to values."""
+    rows = np.zeros(len(columns["x"]), dtype=[(name, "<f4") for name in columns])
+    for name, value in columns.items():
+        rows[name] = value
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
+
+
+def write_panorama(path, pixels):
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File(header, {"RGB": np.ascontiguousarray(pixels, np.float32)}).write(str(path))
+
+
+def read_exr(path):
+    """(h, w, 4) float32."""
+    channels = OpenEXR.File(str(path)).channels()
+    return channels["RGBA"].pixels if "RGBA" in channels else np.dstack([channels[c].pixels for c in "RGBA"])
+
+
+def random_columns(count=COUNT, seed=0):
+    """The raw columns of random splats; opacity is a logit and scales are logarithms, as in the file."""
+    rng = np.random.default_rng(seed)
+    columns = {name: rng.normal(size=count) for name in COLUMNS}
+    for name in ("albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"):
+        columns[name] = rng.uniform(size=count)
+    columns["scale_0"], columns["scale_1"] = rng.uniform(-4, -2, (2, count))
+    quaternion = rng.normal(size=(count, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    for i in range(4):
+        columns[f"rot_{i}"] = quaternion[:, i]
+    for i, name in enumerate(("nx", "ny", "nz")):
+        columns[name] = quaternion_matrix(quaternion)[:, i, 2]
+    return columns
+
+
+FRAMES = [
+    {"file_path": "images/front", "transform_matrix": look_at([0.3, -4, 1.5]).tolist(),
+     "fl_x": 90.0, "fl_y": 90.0, "cx": 32.0, "cy": 32.0, "w": SIZE, "h": SIZE, "split": "test"},
+    {"file_path": "images/shifted", "transform_matrix": look_at([3, 2, -1]).tolist(),
+     "fl_x": 80.0, "fl_y": 100.0, "cx": 29.0, "cy": 18.5, "w": SIZE, "h": 40, "split": "train"},
+]  # fmt: skip
+
+
+def write_run(folder):
+    """A whole run: random splats, a box, a grey sky, two cameras."""
+    folder.mkdir()
+    write_ply(folder / "splats.ply", random_columns())
+    write_panorama(folder / "environment.exr", np.full((16, 32, 3), 0.5))
+    (folder / "cameras.json").write_text(json.dumps({"frames": FRAMES, "to_capture": np.eye(4).tolist()}))
+    mesh = trimesh.creation.box(extents=[0.2, 0.4, 0.6])
+    mesh.apply_translation([1.0, 2.0, 3.0])  # glTF's axes: Blender's (1, -3, 2)
+    mesh.export(folder / "mesh.glb")
+    return folder

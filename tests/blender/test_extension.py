@@ -1,0 +1,70 @@
+"""The extension: it registers cleanly, builds and validates with Blender's own tool, and its buttons work."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from refgs_addon import ui
+
+from .runs import COUNT, write_panorama
+
+ROOT = Path(__file__).resolve().parents[2]
+TOOL = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg", "cli", "blender_ext.py")
+
+
+@pytest.fixture
+def addon(scene):
+    ui.register()
+    yield scene
+    ui.unregister()
+
+
+def test_registers_and_unregisters_twice(scene):
+    before = {name for name in dir(bpy.types) if "refgs" in name.lower()} | set(dir(bpy.ops.refgs))
+    for _ in range(2):
+        ui.register()
+        assert bpy.types.REFGS_PT_run.bl_category == "RefGS" and "import_run" in dir(bpy.ops.refgs)
+        ui.unregister()
+        after = {name for name in dir(bpy.types) if "refgs" in name.lower()} | set(dir(bpy.ops.refgs))
+        assert after == before
+
+
+def test_builds_and_validates(tmp_path):
+    archive = tmp_path / "refgs.zip"
+    for arguments in (
+        ["build", "--source-dir", ROOT, "--output-filepath", archive],
+        ["validate", archive],
+    ):
+        done = subprocess.run([sys.executable, TOOL, *arguments], capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+    code = {str(path.relative_to(ROOT)) for path in (ROOT / "refgs_addon").rglob("*.py")}
+    assert set(zipfile.ZipFile(archive).namelist()) == code | {"__init__.py", "blender_manifest.toml", "LICENSE"}
+
+
+def test_the_buttons(run_folder, addon, tmp_path):
+    assert bpy.ops.refgs.import_run(directory=f"{run_folder}/") == {"FINISHED"}
+    splats, mesh = bpy.data.objects["pot splats"], bpy.data.objects["pot mesh"]
+    assert len(splats.data.points) == COUNT
+    bpy.ops.refgs.show(collection="RefGS pot", part="mesh")
+    assert splats.hide_viewport and not mesh.hide_viewport
+    write_panorama(tmp_path / "hdri.exr", np.ones((8, 16, 3)))
+    bpy.ops.refgs.relight(filepath=str(tmp_path / "hdri.exr"), rotation=1.0, strength=3.0)
+    nodes = addon.world.node_tree.nodes
+    assert nodes["RefGS HDRI"].image.name == "hdri.exr"
+    assert nodes["RefGS Strength"].inputs["Strength"].default_value == 3.0
+    bpy.ops.refgs.recovered_light()
+    assert nodes["RefGS HDRI"].image.name == "environment.exr"
+    bpy.ops.refgs.render_preview(filepath=str(tmp_path / "a.png"), size=16, samples=1)
+    assert (tmp_path / "a.png").stat().st_size > 0
+
+
+def test_a_broken_folder_is_reported_in_one_line(run_folder, addon):
+    (run_folder / "splats.ply").write_bytes(b"ply\n")
+    with pytest.raises(RuntimeError, match=r"^Error: .*splats\.ply is not a binary little-endian PLY file[^\n]*\n?$"):
+        bpy.ops.refgs.import_run(directory=str(run_folder))
+    assert not bpy.data.objects and not bpy.data.collections

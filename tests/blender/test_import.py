@@ -1,0 +1,238 @@
+"""Importing a run: what lies in Blender's data, against numpy."""
+
+import json
+
+import bpy
+import numpy as np
+import pytest
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Vector
+
+from refgs_addon import compat
+from refgs_addon.errors import InputError
+from refgs_addon.nodes.splats import EXTENT, NAME
+from refgs_addon.scene.cameras import frame_camera
+from refgs_addon.scene.parts import parts, show
+from refgs_addon.scene.run import import_run
+from refgs_addon.scene.splats import normal_slopes, read_splats
+
+from .runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
+
+
+def values(data, name, width=1, field="value"):
+    result = np.empty((len(data.attributes[name].data), width), np.float32)
+    data.attributes[name].data.foreach_get(field, result.ravel())
+    return result if width > 1 else result[:, 0]
+
+
+def stacked(columns, *names):
+    return np.stack([columns[name] for name in names], axis=1)
+
+
+def evaluated_mesh(item):
+    """The quads that the modifier makes of a point cloud."""
+    graph = bpy.context.evaluated_depsgraph_get()
+    graph.update()
+    for instance in graph.object_instances:
+        if instance.object.original == item and instance.object.type == "MESH":
+            return instance.object.data
+    raise AssertionError("the modifier makes no mesh")
+
+
+def test_points_hold_what_the_file_holds(run_folder, scene):
+    run = import_run(run_folder, scene)
+    columns, cloud = random_columns(), run.splats.data
+    assert len(cloud.points) == COUNT
+    close = {"rtol": 1e-5, "atol": 1e-6}
+    np.testing.assert_allclose(values(cloud, "position", 3, "vector"), stacked(columns, "x", "y", "z"), **close)
+    np.testing.assert_allclose(values(cloud, "normal", 3, "vector"), stacked(columns, "nx", "ny", "nz"), **close)
+    np.testing.assert_allclose(
+        values(cloud, "rotation", 4), stacked(columns, "rot_0", "rot_1", "rot_2", "rot_3"), **close
+    )
+    np.testing.assert_allclose(
+        values(cloud, "scale", 3, "vector")[:, :2], np.exp(stacked(columns, "scale_0", "scale_1")), **close
+    )
+    np.testing.assert_allclose(values(cloud, "opacity"), 1 / (1 + np.exp(-columns["opacity"])), **close)
+    np.testing.assert_allclose(
+        values(cloud, "base_color", 4, "color")[:, :3], stacked(columns, "albedo_r", "albedo_g", "albedo_b"), **close
+    )
+    np.testing.assert_allclose(values(cloud, "metallic"), columns["metallic"], **close)
+    np.testing.assert_allclose(values(cloud, "roughness"), columns["roughness"], **close)
+
+
+def test_quads_lie_in_the_splats_planes(run_folder, scene):
+    run = import_run(run_folder, scene)
+    columns = random_columns()
+    mesh = evaluated_mesh(run.splats)
+    assert len(mesh.polygons) == COUNT and len(mesh.vertices) == 4 * COUNT
+    corners = values(mesh, "position", 3, "vector").reshape(COUNT, 4, 3)
+    u_v = values(mesh, "gaussian", 3, "vector").reshape(COUNT, 4, 3)
+    assert {tuple(c) for c in u_v[0].tolist()} == {(a, b, 0.0) for a in (-EXTENT, EXTENT) for b in (-EXTENT, EXTENT)}
+    axes = quaternion_matrix(stacked(columns, "rot_0", "rot_1", "rot_2", "rot_3"))[:, :, :2]
+    axes = axes * np.exp(stacked(columns, "scale_0", "scale_1"))[:, None]
+    expected = stacked(columns, "x", "y", "z")[:, None] + u_v[:, :, :2] @ np.swapaxes(axes, 1, 2)
+    np.testing.assert_allclose(corners, expected, atol=2e-6)
+    np.testing.assert_allclose(values(mesh, "roughness"), np.repeat(columns["roughness"], 4), atol=1e-6)
+
+
+def test_size_opacity_cut_and_display(run_folder, scene):
+    run = import_run(run_folder, scene)
+    columns, modifier = random_columns(), run.splats.modifiers[NAME]
+    whole = values(evaluated_mesh(run.splats), "position", 3, "vector").reshape(COUNT, 4, 3)
+    compat.set_modifier_input(modifier, "Size", 0.5)
+    half = values(evaluated_mesh(run.splats), "position", 3, "vector").reshape(COUNT, 4, 3)
+    centre = stacked(columns, "x", "y", "z")[:, None]
+    np.testing.assert_allclose(half - centre, (whole - centre) / 2, atol=1e-6)
+
+    compat.set_modifier_input(modifier, "Opacity Cut", 0.6)
+    kept = 1 / (1 + np.exp(-columns["opacity"])) >= 0.6
+    assert 0 < kept.sum() < COUNT
+    compat.set_modifier_input(modifier, "Display", "Metallic")
+    mesh = evaluated_mesh(run.splats)
+    assert mesh.materials[mesh.polygons[0].material_index].name == "RefGS Splat Values"
+    shown = values(mesh, "display", 4, "color")[::4]
+    np.testing.assert_allclose(shown[:, :3], np.repeat(columns["metallic"][kept, None], 3, axis=1), atol=1e-6)
+    compat.set_modifier_input(modifier, "Display", "Normal")
+    shown = values(evaluated_mesh(run.splats), "display", 4, "color")[::4]
+    np.testing.assert_allclose(shown[:, :3], stacked(columns, "nx", "ny", "nz")[kept] / 2 + 0.5, atol=1e-6)
+    compat.set_modifier_input(modifier, "Display", "Shaded")
+    mesh = evaluated_mesh(run.splats)
+    assert mesh.materials[mesh.polygons[0].material_index].name == "pot splats"
+
+
+def test_normals_bend_as_a_sphere_does(tmp_path):
+    count, radius = 600, 2.0
+    columns = random_columns(count)
+    steps = np.arange(count) + 0.5
+    z, azimuth = 1 - 2 * steps / count, steps * np.pi * (3 - np.sqrt(5))
+    normal = np.stack([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z], axis=1)
+    # The shortest rotation from z to the normal: (1 + z, z × n), normalised.
+    quaternion = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(count)], axis=1)
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    for i, axis in enumerate("xyz"):
+        columns[axis], columns["n" + axis] = radius * normal[:, i], normal[:, i]
+    for i in range(4):
+        columns[f"rot_{i}"] = quaternion[:, i]
+    write_ply(tmp_path / "splats.ply", columns)
+    splats = read_splats(tmp_path / "splats.ply")
+    along_u, along_v = normal_slopes(splats)
+    axes = quaternion_matrix(quaternion)
+    for slope, axis, scale in ((along_u, 0, "scale_0"), (along_v, 1, "scale_1")):
+        expected = axes[:, :, axis] * np.exp(columns[scale])[:, None] / radius  # dn = dp / radius
+        error = np.linalg.norm(slope - expected, axis=1) / np.linalg.norm(expected, axis=1)
+        assert np.median(error) < 0.1 and error.max() < 0.3
+
+
+def test_one_splat_alone_is_flat(tmp_path):
+    write_ply(tmp_path / "splats.ply", random_columns(1))
+    assert all((slope == 0).all() for slope in normal_slopes(read_splats(tmp_path / "splats.ply")))
+
+
+def test_mesh_stands_where_the_splats_are(run_folder, scene):
+    run = import_run(run_folder, scene)
+    (mesh,) = run.mesh
+    corners = np.array([mesh.matrix_world @ v.co for v in mesh.data.vertices])
+    np.testing.assert_allclose(corners.min(axis=0), [0.9, -3.3, 1.8], atol=1e-5)
+    np.testing.assert_allclose(corners.max(axis=0), [1.1, -2.7, 2.2], atol=1e-5)
+    assert mesh.users_collection == (run.collection,) and mesh.parent is None
+
+
+def test_cameras_project_as_the_photos_did(run_folder, scene):
+    run = import_run(run_folder, scene)
+    assert list(run.cameras) == ["front", "shifted"] and scene.camera == run.cameras["front"]
+    point = np.array([0.3, -0.2, 0.4])
+    for frame in FRAMES:
+        camera = run.cameras[frame["file_path"].rpartition("/")[2]]
+        frame_camera(scene, camera)
+        bpy.context.view_layer.update()
+        assert (scene.render.resolution_x, scene.render.resolution_y) == (frame["w"], frame["h"])
+        x, y, z = (np.linalg.inv(frame["transform_matrix"]) @ [*point, 1])[:3]
+        u, v = frame["cx"] - frame["fl_x"] * x / z, frame["cy"] + frame["fl_y"] * y / z  # from the top left corner
+        seen = world_to_camera_view(scene, camera, Vector(point))
+        np.testing.assert_allclose([seen.x * frame["w"], (1 - seen.y) * frame["h"], seen.z], [u, v, -z], atol=1e-3)
+
+
+def test_frame_camera_to_another_size(run_folder, scene):
+    run = import_run(run_folder, scene)
+    frame_camera(scene, run.cameras["shifted"], size=SIZE // 2)
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (SIZE // 2, 20)
+
+
+def test_importing_twice_gives_two_runs(run_folder, scene):
+    first, second = import_run(run_folder, scene), import_run(run_folder, scene)
+    assert first.collection.name == "RefGS pot" and second.collection.name == "RefGS pot.001"
+    assert first.splats.modifiers[NAME].node_group == second.splats.modifiers[NAME].node_group
+    assert first.splats.data.materials[0] != second.splats.data.materials[0]
+    assert list(second.cameras) == ["front", "shifted"] and scene.world == second.world
+
+
+def test_optional_parts_may_be_missing(run_folder, scene):
+    for name in ("mesh.glb", "environment.exr", "cameras.json"):
+        (run_folder / name).unlink()
+    run = import_run(run_folder, scene)
+    assert len(run.splats.data.points) == COUNT
+    assert run.mesh == [] and run.world is None and run.cameras == {} and scene.world is None
+
+
+def test_show_hides_the_other_part(run_folder, scene):
+    run = import_run(run_folder, scene)
+    assert set(parts(run.collection)) == {"splats", "mesh"}
+    assert not run.splats.hide_render and run.mesh[0].hide_render
+    show(run.collection, "mesh")
+    assert run.splats.hide_render and run.splats.hide_viewport
+    assert not run.mesh[0].hide_render and not run.mesh[0].hide_viewport
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-7])
+
+
+def not_json(path):
+    path.write_text("{")
+
+
+def infinite(path):
+    write_ply(path, {**random_columns(), "metallic": np.full(COUNT, np.nan)})
+
+
+def without_materials(path):
+    write_ply(path, {k: v for k, v in random_columns().items() if k not in ("metallic", "roughness")})
+
+
+def bent_camera(path):
+    path.write_text(json.dumps({"frames": [{**FRAMES[0], "transform_matrix": [[1, 2], [3, 4]]}]}))
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "says"),
+    [
+        ("splats.ply", lambda path: path.unlink(), "cannot read"),
+        ("splats.ply", cut, "cut short"),
+        ("splats.ply", not_json, "not a binary little-endian PLY"),
+        ("splats.ply", infinite, "metallic that is not a finite number"),
+        ("splats.ply", without_materials, "has no metallic, roughness"),
+        ("cameras.json", not_json, "not the cameras.json"),
+        ("cameras.json", bent_camera, "not the cameras.json"),
+        ("environment.exr", not_json, "not a whole EXR"),
+        ("mesh.glb", cut, "glTF"),
+    ],
+)
+def test_a_broken_folder_leaves_nothing_behind(run_folder, scene, name, spoil, says):
+    spoil(run_folder / name)
+    kinds = (
+        "objects",
+        "pointclouds",
+        "meshes",
+        "cameras",
+        "materials",
+        "images",
+        "worlds",
+        "collections",
+        "node_groups",
+    )
+    before = {kind: set(getattr(bpy.data, kind)) for kind in kinds}
+    with pytest.raises(InputError, match=says) as error:
+        import_run(run_folder, scene)
+    assert "\n" not in str(error.value) and name in str(error.value)
+    assert {kind: set(getattr(bpy.data, kind)) for kind in kinds} == before
+    assert scene.world is None and scene.camera is None

@@ -1,0 +1,182 @@
+"""Light and pictures: Eevee's pixels against the panorama's orientation and the camera's formula."""
+
+import math
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix
+
+from refgs_addon.errors import InputError
+from refgs_addon.nodes.splats import NAME
+from refgs_addon.scene.cameras import add_camera
+from refgs_addon.scene.parts import show
+from refgs_addon.scene.preview import render_preview
+from refgs_addon.scene.relight import relight
+from refgs_addon.scene.run import import_run
+
+from .runs import COLUMNS, look_at, read_exr, write_panorama, write_ply
+
+SIZE = 64
+
+
+@pytest.fixture
+def scene(scene):
+    scene.eevee.use_shadows = False  # most of a frame's time in software
+    return scene
+
+
+def coloured_sky(direction):
+    """A linear radiance that tells every direction from every other."""
+    return 0.5 + 0.4 * np.asarray(direction)
+
+
+def sky_pixels(height=64):
+    """The sky as a panorama in Blender's orientation: u = 0.5 - atan2(y, x) / 2π, v = asin(z) / π + 0.5 from below."""
+    u, v = np.meshgrid((np.arange(2 * height) + 0.5) / (2 * height), 1 - (np.arange(height) + 0.5) / height)
+    azimuth, elevation = 2 * np.pi * (0.5 - u), np.pi * (v - 0.5)
+    return coloured_sky(
+        np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    )
+
+
+def frame(matrix, name="view"):
+    return {"name": name, "transform_matrix": np.asarray(matrix).tolist(),
+            "fl_x": float(SIZE), "fl_y": float(SIZE), "cx": SIZE / 2, "cy": SIZE / 2, "w": SIZE, "h": SIZE}  # fmt: skip
+
+
+def one_mirror(folder, normal):
+    """A run of one large opaque mirror splat at the origin: white, metallic, almost smooth."""
+    folder.mkdir()
+    z = np.asarray(normal, float)
+    quaternion = np.array([1 + z[2], -z[1], z[0], 0]) / np.linalg.norm([1 + z[2], -z[1], z[0]])  # z to the normal
+    values = dict.fromkeys(COLUMNS, 0.0) | dict(zip(["nx", "ny", "nz"], z, strict=True))
+    values |= {f"rot_{i}": quaternion[i] for i in range(4)} | {"opacity": 20.0, "metallic": 1.0, "roughness": 0.02}
+    values |= {"albedo_r": 1.0, "albedo_g": 1.0, "albedo_b": 1.0}
+    write_ply(folder / "splats.ply", {name: np.array([value]) for name, value in values.items()})
+    write_panorama(folder / "environment.exr", sky_pixels())
+    return folder
+
+
+def test_a_mirror_splat_shows_the_sky_it_should(tmp_path, scene):
+    normal, eye = np.array([0.48, -0.6, 0.64]), np.array([1.0, -3.0, 1.5])
+    import_run(one_mirror(tmp_path / "mirror", normal), scene)
+    camera = add_camera(frame(look_at(eye)), scene.collection)
+
+    def seen():
+        render_preview(scene, tmp_path / "a.png", camera, samples=16, exr=tmp_path / "a.exr")
+        return read_exr(tmp_path / "a.exr")[SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1].mean((0, 1))
+
+    toward = eye / np.linalg.norm(eye)
+    mirrored = 2 * (normal @ toward) * normal - toward
+    np.testing.assert_allclose(seen(), [*coloured_sky(mirrored), 1], atol=0.03)
+
+    # The light turned by 90° counter-clockwise, at twice the strength: look the direction up a quarter turn back.
+    write_panorama(tmp_path / "hdri.exr", sky_pixels())
+    relight(scene, tmp_path / "hdri.exr", rotation=math.pi / 2, strength=2.0)
+    x, y, z = mirrored
+    np.testing.assert_allclose(seen(), [*2 * coloured_sky([y, -x, z]), 1], atol=0.06)
+
+    camera.matrix_world = Matrix(look_at(-eye).tolist())  # the back is dark
+    np.testing.assert_allclose(seen(), [0, 0, 0, 1], atol=0.01)
+
+
+def test_the_alpha_is_a_gaussian(tmp_path, scene):
+    run = import_run(one_mirror(tmp_path / "mirror", [0, 0, 1]), scene)
+    run.splats.data.attributes["opacity"].data[0].value = 0.8
+    camera = add_camera(frame(look_at([0, -1e-3, 8.0])), scene.collection)  # 8 standard deviations across the picture
+    render_preview(scene, tmp_path / "a.png", camera, samples=100, exr=tmp_path / "a.exr")
+    alpha = read_exr(tmp_path / "a.exr")[..., 3]
+    x, y = np.meshgrid((np.arange(SIZE) + 0.5 - SIZE / 2) / 8, (np.arange(SIZE) + 0.5 - SIZE / 2) / 8)
+    expected = 0.8 * np.exp(-(x**2 + y**2) / 2) * ((abs(x) < 3) & (abs(y) < 3))
+    error = alpha - expected
+    assert abs(error.mean()) < 0.002 and np.abs(error).mean() < 0.01 and np.abs(error).max() < 0.2
+    np.testing.assert_allclose(
+        alpha.reshape(8, 8, 8, 8).mean((1, 3)), expected.reshape(8, 8, 8, 8).mean((1, 3)), atol=0.01
+    )
+
+
+def test_the_recovered_light_comes_back(run_folder, scene, tmp_path):
+    run = import_run(run_folder, scene)
+    image = run.world.node_tree.nodes["RefGS HDRI"]
+    recovered = image.image
+    write_panorama(tmp_path / "hdri.exr", sky_pixels())
+    relight(scene, tmp_path / "hdri.exr", rotation=1.0)
+    assert image.image != recovered and scene.world == run.world
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "kept.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "kept.blend"))
+    scene = bpy.context.scene
+    relight(scene, None)
+    nodes = scene.world.node_tree.nodes
+    assert nodes["RefGS HDRI"].image.name == "environment.exr"
+    assert tuple(nodes["RefGS Rotation"].inputs["Rotation"].default_value) == (0, 0, 0)
+
+
+def test_relight_leaves_the_artists_own_world_alone(scene, tmp_path):
+    own = scene.world = bpy.data.worlds.new("Mine")
+    with pytest.raises(InputError, match="no recovered light"):
+        relight(scene, None)
+    with pytest.raises(InputError, match=r"missing\.exr"):
+        relight(scene, tmp_path / "missing.exr")
+    assert scene.world == own
+    write_panorama(tmp_path / "hdri.exr", sky_pixels())
+    relight(scene, tmp_path / "hdri.exr")
+    assert scene.world != own and "Mine" in bpy.data.worlds
+
+
+def snapshot(owner):
+    """Every plain property of a settings struct."""
+    kinds = (bool, int, float, str)
+    names = [p.identifier for p in owner.bl_rna.properties if not p.is_readonly]
+    return {name: getattr(owner, name) for name in names if isinstance(getattr(owner, name), kinds)}
+
+
+def test_a_preview_puts_the_settings_back(run_folder, scene, tmp_path):
+    run = import_run(run_folder, scene)
+    scene.render.engine, scene.render.film_transparent = "CYCLES", False
+    scene.render.resolution_x, scene.render.resolution_percentage = 1234, 50
+    scene.render.image_settings.file_format = "JPEG"
+    scene.view_settings.view_transform, scene.view_settings.exposure = "AgX", 2.0
+    scene.eevee.taa_render_samples = 7
+    scene.camera = run.cameras["front"]
+    owners = (scene.render, scene.render.image_settings, scene.view_settings, scene.display_settings, scene.eevee)
+    before = [snapshot(owner) for owner in owners]
+    render_preview(scene, tmp_path / "a.png", run.cameras["shifted"], size=16, samples=1)
+    assert [snapshot(owner) for owner in owners] == before and scene.camera == run.cameras["front"]
+    with pytest.raises(InputError, match=r"cannot write .*b\.png"):
+        render_preview(scene, tmp_path / "a.png" / "b.png", size=16, samples=1)
+    assert [snapshot(owner) for owner in owners] == before
+    assert [p.name for p in tmp_path.glob("*.png")] == ["a.png"]
+    scene.camera = None
+    with pytest.raises(InputError, match="no camera"):
+        render_preview(scene, tmp_path / "b.png")
+
+
+def test_png_and_exr_are_one_picture(run_folder, scene, tmp_path):
+    run = import_run(run_folder, scene)
+    show(run.collection, "mesh")
+    run.mesh[0].location = -np.mean([run.mesh[0].matrix_world @ v.co for v in run.mesh[0].data.vertices], axis=0)
+    scene.view_settings.view_transform = "AgX"
+    render_preview(scene, tmp_path / "a.png", run.cameras["front"], samples=4, exr=tmp_path / "a.exr")
+    image = bpy.data.images.load(str(tmp_path / "a.png"))
+    image.colorspace_settings.name = "Non-Color"
+    assert tuple(image.size) == (SIZE, SIZE)
+    png = np.array(image.pixels[:]).reshape(SIZE, SIZE, 4)[::-1]
+    linear = read_exr(tmp_path / "a.exr")
+    np.testing.assert_allclose(png[..., 3], linear[..., 3], atol=0.003)
+    solid = linear[..., 3] > 0.999
+    assert 20 < solid.sum() < SIZE * SIZE
+    color = linear[solid][:, :3]
+    encoded = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color.clip(1e-9) ** (1 / 2.4) - 0.055).clip(0, 1)
+    np.testing.assert_allclose(png[solid][:, :3], encoded, atol=0.01)
+
+
+def test_the_display_shows_a_value_as_it_is(tmp_path, scene):
+    from refgs_addon import compat
+
+    run = import_run(one_mirror(tmp_path / "mirror", [0, 0, 1]), scene)
+    run.splats.data.attributes["base_color"].data[0].color = (0.2, 0.4, 0.6, 1)
+    compat.set_modifier_input(run.splats.modifiers[NAME], "Display", "Base Color")
+    camera = add_camera(frame(look_at([0, -1e-3, 2.0])), scene.collection)
+    render_preview(scene, tmp_path / "a.png", camera, samples=1, exr=tmp_path / "a.exr")
+    np.testing.assert_allclose(read_exr(tmp_path / "a.exr")[SIZE // 2, SIZE // 2], [0.2, 0.4, 0.6, 1], atol=1e-3)
