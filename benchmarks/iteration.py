@@ -57,7 +57,7 @@ def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
     at = record("raster and shading", at)
     mask = torch.from_numpy(view.alpha).float() / 255
     photo = composite(view, trainer.background)
-    loss = objective(rendering, environment, photo, mask, view.camera, settings.loss)
+    loss = objective(rendering, environment, photo, mask, view.camera, settings.loss, 0.5)
     at = record("losses", at)
     loss.backward()
     record("backward of all", at)

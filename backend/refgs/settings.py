@@ -68,6 +68,7 @@ class LossSettings(_Section):
     normal: float = Field(ge=0, description="weight of normal consistency with the depth")
     smooth: float = Field(ge=0, description="weight of edge-aware normal smoothness")
     alpha: float = Field(ge=0, description="weight of the mask, where there is one")
+    metallic: float = Field(ge=0, description="weight, at the end, of a metallic that is neither 0 nor 1")
     light: float = Field(ge=0, description="weight of the light's being neutral on the whole")
 
 

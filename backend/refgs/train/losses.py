@@ -69,8 +69,9 @@ def objective(
     mask: Tensor | None,
     camera: Camera,
     weights: LossSettings,
+    progress: float,
 ) -> Tensor:
-    """The training loss of one view; terms with weight zero cost nothing."""
+    """The training loss of one view, at a progress of 0..1; terms with weight zero cost nothing."""
     loss = color_loss(rendering.color, photo, weights.dssim)
     if weights.normal > 0:
         loss = loss + weights.normal * normal_loss(rendering, camera)
@@ -78,6 +79,12 @@ def objective(
         loss = loss + weights.smooth * smoothness_loss(rendering, photo)
     if mask is not None and weights.alpha > 0:
         loss = loss + weights.alpha * (rendering.alpha - mask).abs().mean()
+    if rendering.shaded is not None and weights.metallic > 0:
+        # Nothing real is half a metal. Where the metallic is decided, the highlights of dielectrics, 4 % of the light and
+        # without colour, fix the light's scale and white balance, which metals alone cannot. Not before it is known
+        # which is which, hence the square.
+        metallic = rendering.shaded["metallic"]
+        loss = loss + weights.metallic * progress**2 * (metallic * (1 - metallic)).mean()
     if environment is not None and weights.light > 0:
         loss = loss + weights.light * light_loss(environment)
     return loss

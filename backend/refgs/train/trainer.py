@@ -130,7 +130,7 @@ class Trainer:
         rendering = render(surfels, environment, view.camera, self.background, settings.render, self.near)
         photo = composite(view, self.background)
         mask = None if view.alpha is None else torch.from_numpy(view.alpha).float() / 255
-        loss = objective(rendering, environment, photo, mask, view.camera, settings.loss)
+        loss = objective(rendering, environment, photo, mask, view.camera, settings.loss, progress)
         loss.backward()
         position = self.parameters["position"]
         self.motion.add(position.detach(), position.grad, view.camera)
