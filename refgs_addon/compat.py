@@ -20,19 +20,18 @@ def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
         cloud = bpy.data.pointclouds.new(name)
         cloud.resize(count)
         return cloud
-    # Before that only the Convert operator makes one of a given size, from a mesh of loose vertices.
-    mesh = bpy.data.meshes.new(name)
-    mesh.vertices.add(count)
-    carrier = bpy.data.objects.new(name, mesh)
-    bpy.context.scene.collection.objects.link(carrier)
-    with bpy.context.temp_override(
-        object=carrier, active_object=carrier, selected_objects=[carrier], selected_editable_objects=[carrier]
-    ):
-        bpy.ops.object.convert(target="POINTCLOUD")
-    cloud = carrier.data
-    bpy.data.objects.remove(carrier)
-    if mesh.users == 0:
-        bpy.data.meshes.remove(mesh)
+    # Before that only geometry nodes make one of a given size: a copy of what they make is ours to keep.
+    tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    points, output = tree.nodes.new("GeometryNodePoints"), tree.nodes.new("NodeGroupOutput")
+    points.inputs["Count"].default_value = count
+    tree.links.new(points.outputs[0], output.inputs[0])
+    empty = bpy.data.pointclouds.new(name)
+    maker = bpy.data.objects.new(name, empty)
+    maker.modifiers.new(name, "NODES").node_group = tree
+    bpy.context.scene.collection.objects.link(maker)
+    cloud = maker.evaluated_get(bpy.context.evaluated_depsgraph_get()).data.copy()
+    bpy.data.batch_remove([maker, empty, tree])
     cloud.name = name
     return cloud
 

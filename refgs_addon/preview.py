@@ -19,8 +19,11 @@ from pathlib import Path
 
 from .errors import InputError
 
-# Debian 12 and 13, Ubuntu 22.04 and later: what Blender links against, and Eevee's way to a picture without a screen.
-APT = "apt-get install libegl1 libgl1 libgl1-mesa-dri libice6 libsm6 libx11-6 libxfixes3 libxi6 libxkbcommon0 libxrender1 libxxf86vm1"
+# What Blender links against, and Mesa, which draws Eevee's pictures where there is neither screen nor GPU.
+APT = (
+    "apt-get install libegl1 libgl1 libgl1-mesa-dri libsm6 libxext6 libxfixes3 libxi6 libxkbcommon0 libxrender1"
+    " (Debian 12 and later, Ubuntu 22.04 and later)"
+)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,0 +1,64 @@
+"""The extension in a real Blender window: it builds, installs, shows its tab, and goes away again.
+
+Blender is the command in REFGS_BLENDER (one that runs Blender with a window), else `blender` in the PATH, under
+xvfb-run where there is no DISPLAY.
+"""
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+from tests.blender.runs import write_run
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def blender_command():
+    """The command that opens a Blender window, or the reason why there is none."""
+    if "REFGS_BLENDER" in os.environ:
+        return shlex.split(os.environ["REFGS_BLENDER"])
+    if not shutil.which("blender"):
+        pytest.skip("no Blender window: no `blender` in the PATH, and REFGS_BLENDER is not set")
+    version = subprocess.run(["blender", "--version"], capture_output=True, text=True).stdout
+    numbers = tuple(map(int, re.search(r"Blender (\d+)\.(\d+)", version).groups()))
+    if numbers < (4, 3):
+        pytest.skip(f"no Blender window: `blender` is {numbers[0]}.{numbers[1]}, and the extension needs 4.3")
+    if os.environ.get("DISPLAY") or sys.platform in ("win32", "darwin"):
+        return ["blender"]
+    if not shutil.which("xvfb-run"):
+        pytest.skip("no Blender window: neither a DISPLAY nor xvfb-run")
+    return ["xvfb-run", "-a", "-s", "-screen 0 1600x1000x24", "blender", "-p", "0", "0", "1600", "1000"]
+
+
+@pytest.mark.window
+def test_the_tab_shows_in_a_window(tmp_path):
+    command = blender_command()
+    bpy = pytest.importorskip("bpy", reason="the extension is built with the tool in Blender's Python module")
+    tool = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg", "cli", "blender_ext.py")
+    archive = tmp_path / "refgs.zip"
+    subprocess.run([sys.executable, tool, "build", "--source-dir", ROOT, "--output-filepath", archive], check=True)
+    run = write_run(tmp_path / "pot")
+    words = [*command, "--python", Path(__file__).with_name("drive.py"), "--", archive, run, tmp_path]
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
+    done = subprocess.run(list(map(str, words)), env=environment, capture_output=True, text=True, timeout=300)
+    path = tmp_path / "report.json"
+    assert path.exists(), done.stdout[-3000:] + done.stderr[-3000:]
+    report = json.loads(path.read_text())
+    assert "error" not in report, report["error"]
+    assert report["enabled"]
+    assert report["drawn"] == ["REFGS_PT_light", "REFGS_PT_preview", "REFGS_PT_run"]
+    if report["numpy"]:
+        assert report["import"] == ["FINISHED"]
+    else:
+        assert "Blender's Python lacks numpy" in report["import"]
+    assert report["left"] == []
+    picture = cv2.imread(str(tmp_path / "window.png"))
+    assert picture.shape[0] > 500 and picture.shape[1] > 800 and picture.std() > 5
