@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from refgs_addon.preview import main
-
-from .runs import SIZE, read_exr, write_panorama
+from tests.blender.runs import SIZE, read_exr, write_panorama
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from refgs_addon import ui
-
-from .runs import COUNT, write_panorama
+from tests.blender.runs import COUNT, write_panorama
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOL = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg", "cli", "blender_ext.py")
