@@ -61,12 +61,12 @@ def scale_aligned_psnr(image: np.ndarray, reference: np.ndarray) -> tuple[float,
     """PSNR of premultiplied linear RGBA pictures as a screen shows them over white: (raw, aligned, scale).
 
     Albedo and light share one free scale; `aligned` is after multiplying the picture's radiance by the `scale` that
-    fits the reference best in least squares. Pixels in which the reference is brighter than a screen is (a sun in a
-    mirror) are left out of the fit, for a few of them would decide it.
+    fits the reference best in least squares. Pixels in which either is brighter than a screen is (a sun in a mirror) are
+    left out of the fit, for a few of them would decide it.
     """
     image, reference = np.asarray(image, np.float64), np.asarray(reference, np.float64)
     a, b = image[..., :3], reference[..., :3]
-    fit = b.max(-1) < 1
+    fit = (a.max(-1) < 1) & (b.max(-1) < 1)
     power = (a[fit] ** 2).sum()
     scale = float((a[fit] * b[fit]).sum() / power) if power > 0 else 1.0
 
