@@ -76,7 +76,7 @@ def preview(options: argparse.Namespace) -> None:
     bpy.ops.file.pack_all()
     bpy.ops.wm.save_as_mainfile(filepath=str(options.blend.resolve()), compress=True)
 
-    # In software, Eevee's shadow maps take ten times as long as the rest of a frame, and splats cast no shadows anyway.
+    # There are no lamps, so no shadows; in software Eevee spends most of a frame on preparing for some.
     scene.eevee.use_shadows = False
     shown = ["splats", "mesh"] if run.mesh else ["splats"]
     total, files = len(options.hdri) * len(shown) * len(views), []

@@ -1,6 +1,7 @@
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
 
 import pytest
+import torch._dynamo  # noqa: F401  its Triton brings an LLVM that crashes when it is loaded after Mesa's, which Eevee draws with
 
 from benchmarks.scenes.analytic import write_ball_capture
 

@@ -17,6 +17,9 @@ def panorama_world(name: str) -> bpy.types.World:
     counter-clockwise seen from above.
     """
     world = bpy.data.worlds.new(name)
+    # Eevee would take what is brighter than 10 out of the panorama and put it into one lamp: several softboxes become a
+    # single hard sun. Left in, a relit jar came 3 dB closer to Cycles under a studio HDRI, 0.4 dB under a courtyard.
+    world.sun_threshold = 0.0
     tree = node_tree(world)
     direction = add(tree, "ShaderNodeTexCoord").outputs["Generated"]
     mapping = add(tree, "ShaderNodeMapping", {"Vector": direction}, name=ROTATION, vector_type="TEXTURE")

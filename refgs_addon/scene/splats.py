@@ -36,7 +36,7 @@ def add_splats(name: str, splats: dict[str, np.ndarray], collection: bpy.types.C
 
     result = bpy.data.objects.new(name, cloud)
     collection.objects.link(result)
-    # Overlapping quads shadow each other: the surface would be covered in specks, and Eevee four times slower.
+    # Overlapping quads would shadow each other under a lamp, in specks, and take Eevee four times as long.
     result.visible_shadow = False
     material = splat_material(name)
     cloud.materials.append(material)

@@ -21,7 +21,7 @@ SIZE = 64
 
 @pytest.fixture
 def scene(scene):
-    scene.eevee.use_shadows = False  # most of a frame's time in software
+    scene.eevee.use_shadows = False  # there are no lamps, and in software it is most of a frame's time
     return scene
 
 
