@@ -71,10 +71,13 @@ def preview(options: argparse.Namespace) -> None:
     views = options.views or [next(iter(run.cameras))]
     if unknown := [view for view in views if view not in run.cameras]:
         raise InputError(f"{options.run} has no view {unknown[0]}: it has {', '.join(list(run.cameras)[:5])} …")
-    options.out.mkdir(parents=True, exist_ok=True)
-    options.blend.parent.mkdir(parents=True, exist_ok=True)
     bpy.ops.file.pack_all()
-    bpy.ops.wm.save_as_mainfile(filepath=str(options.blend.resolve()), compress=True)
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        options.blend.parent.mkdir(parents=True, exist_ok=True)
+        bpy.ops.wm.save_as_mainfile(filepath=str(options.blend.resolve()), compress=True)
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"cannot write {options.blend} and {options.out}: {str(error).strip()}") from None
 
     # There are no lamps, so no shadows; in software Eevee spends most of a frame on preparing for some.
     scene.eevee.use_shadows = False
