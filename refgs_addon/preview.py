@@ -121,4 +121,6 @@ def check_libraries() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    status = main()
+    sys.stderr.flush()
+    os._exit(status)  # Blender's own clean-up at the end of a process has been seen to hang

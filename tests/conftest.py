@@ -1,5 +1,8 @@
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
 
+import os
+import sys
+
 import pytest
 import torch._dynamo  # noqa: F401  its Triton brings an LLVM that crashes when it is loaded after Mesa's, which Eevee draws with
 
@@ -12,3 +15,20 @@ def ball_capture(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ball")
     write_ball_capture(folder, 64)
     return folder
+
+
+_status = 0
+
+
+def pytest_sessionfinish(exitstatus):
+    global _status
+    _status = exitstatus
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_unconfigure():
+    """Leave at once where Blender was loaded: its own clean-up at the end of a process has been seen to hang."""
+    if "bpy" in sys.modules:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(_status)

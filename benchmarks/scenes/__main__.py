@@ -29,10 +29,15 @@ def main() -> int:
     # Blender prints to the file descriptor, so it is the descriptor that has to be moved out of the way.
     events = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
-    # Ended from outside, it still removes its half-written folder.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    # Ended from outside, it still removes its half-written folder; after the view at hand, for Blender hangs when an
+    # exception leaves one of its callbacks.
+    ended: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda number, _: ended.append(number))
 
     def progress(done: int, total: int, what: str) -> None:
+        if ended:
+            raise InterruptedError
         print(json.dumps({"event": "progress", "done": done, "total": total, "what": what}), file=events)
 
     from benchmarks.scenes.capture import write_capture  # after the descriptor: importing bpy may print too
@@ -45,8 +50,12 @@ def main() -> int:
     except InputError as error:
         print(error, file=sys.stderr)
         return 2
+    except InterruptedError:
+        return 128 + ended[0]
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    status = main()
+    sys.stderr.flush()
+    os._exit(status)  # Blender's own clean-up at the end of a process has been seen to hang
