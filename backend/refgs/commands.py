@@ -29,6 +29,7 @@ from refgs.render.renderer import Rendering
 from refgs.report import metrics
 from refgs.run import Run, check_free, create_run, open_run, read_run_facts, write_text
 from refgs.settings import load_settings
+from refgs.train.trainer import Trainer, composite
 
 console = Console(highlight=False, soft_wrap=True)
 PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha")
@@ -64,7 +65,6 @@ def train(
 ) -> None:
     """Train a capture into a run folder; Ctrl-C leaves a run that `--resume` goes on with."""
     from refgs.train.asset import write_asset
-    from refgs.train.trainer import Trainer
 
     choose_device(device)
     if resume:
@@ -210,10 +210,7 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
             loaded = load_view(view, run.settings.image.max_side)
             rendering = run.render(loaded.camera)
             color = np.clip(rendering.color.numpy(), 0, 1)
-            photo = loaded.image / np.float32(255)
-            if loaded.alpha is not None:
-                alpha = loaded.alpha[..., None] / np.float32(255)
-                photo = photo * alpha + background * (1 - alpha)
+            photo = composite(loaded, torch.from_numpy(background)).numpy()
             rows["psnr"].append(metrics.psnr(color, photo))
             rows["ssim"].append(metrics.ssim(color, photo))
             truth = _true_normals(ground_truth, loaded.camera) if ground_truth else None
@@ -225,10 +222,9 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
             _write_pictures(folder / "pictures" / split, loaded.camera.name, rendering, photo, background)
             bar(done + 1)
     result = {name: float(np.mean(values)) for name, values in rows.items() if values}
-    facts = _read_json(folder / "metrics.json")
-    facts |= result | {"views": len(views), "split": split, "splats": len(run.splats)}
+    facts = result | {"views": len(views), "split": split, "splats": len(run.splats)}
     facts["peak_memory_bytes"] = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    write_text(folder / "metrics.json", json.dumps(facts, indent=1))
+    update_metrics(folder, facts)
     if run.environment is not None:
         panorama = run.environment.panorama(256)
         write_png(folder / "pictures" / "environment.png", _bytes(srgb_encode(panorama)))
@@ -256,8 +252,11 @@ def _write_pictures(folder: Path, name: str, rendering: Rendering, photo: np.nda
             write_png(folder / what / f"{name}.png", _as_png(what, rendering, background))
 
 
-def _read_json(file: Path) -> dict:
-    return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+def update_metrics(folder: Path, facts: dict) -> None:
+    """Put figures into a run's metrics.json beside those that are there, replacing the ones of the same name."""
+    file = folder / "metrics.json"
+    known = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    write_text(file, json.dumps(known | facts, indent=1))
 
 
 def render_depths(run: Run) -> tuple[list[np.ndarray], list[np.ndarray], list[Camera]]:

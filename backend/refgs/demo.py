@@ -10,7 +10,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from refgs import commands
@@ -20,7 +19,6 @@ from refgs.export.environment import read_exr
 from refgs.paths import clone_root
 from refgs.report import metrics
 from refgs.report.page import write_report
-from refgs.run import write_text
 
 SCENE = "jar"
 HDRIS = ("studio", "courtyard")  # Blender's own; the capture is lit by another
@@ -116,18 +114,12 @@ def _compare(folder: Path, truth: Path, previews: Path) -> None:
             pixels = read_exr(truth / hdri / f"{view}.exr")
             straight = pixels[..., :3] / np.maximum(pixels[..., 3:], 1e-6)
             encoded = np.dstack([srgb_encode(straight), pixels[..., 3]])
-            (pictures / "truth").mkdir(parents=True, exist_ok=True)
-            bgra = cv2.cvtColor(np.rint(encoded.clip(0, 1) * 255).astype(np.uint8), cv2.COLOR_RGBA2BGRA)
-            cv2.imwrite(str(pictures / "truth" / f"{hdri}_{view}.png"), bgra)
-    file = folder / "metrics.json"
-    facts = json.loads(file.read_text(encoding="utf-8")) | {"relight": result}
-    write_text(file, json.dumps(facts, indent=1))
+            pixels = np.rint(encoded.clip(0, 1) * 255).astype(np.uint8)
+            commands.write_png(pictures / "truth" / f"{hdri}_{view}.png", pixels)
+    commands.update_metrics(folder, {"relight": result})
 
 
 def _record(folder: Path, seconds: float) -> None:
     """Add the demo's own time and the largest memory of any of its processes to metrics.json."""
-    file = folder / "metrics.json"
     largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    facts = json.loads(file.read_text(encoding="utf-8"))
-    facts |= {"seconds": seconds, "peak_memory_bytes": 1024 * largest}
-    write_text(file, json.dumps(facts, indent=1))
+    commands.update_metrics(folder, {"seconds": seconds, "peak_memory_bytes": 1024 * largest})

@@ -8,11 +8,13 @@ from refgs.geometry.hull import visual_hull_points
 from refgs.model.surfels import Parameters, initial_parameters
 from refgs.settings import Settings
 
+FAINT = 0.1  # opacity, at the most, of points that may lie anywhere
+
 
 def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings) -> tuple[Parameters, str]:
     """Initial parameters and one line that says where they came from."""
     count, seed = min(settings.surfels.start, settings.surfels.budget), settings.train.seed
-    colours = None
+    colours, opacity = None, settings.surfels.opacity
     if all(view.alpha is not None for view in views):
         positions, normals, spacing = visual_hull_points(
             [view.alpha for view in views],
@@ -26,11 +28,11 @@ def start_parameters(capture: Capture, views: list[LoadedView], settings: Settin
         source = "the visual hull of the masks"
     elif capture.points is not None and len(capture.points) >= 100:
         positions, colours = _thinned(capture.points, capture.point_colors, count, seed)
-        normals, spacing = _towards_cameras(positions, views), _spacing(positions)
+        normals, spacing, opacity = _towards_cameras(positions, views), _spacing(positions), min(opacity, FAINT)
         source = f"{len(positions)} structure-from-motion points"
     else:
         positions = _random(capture, count, seed)
-        normals, spacing = _towards_cameras(positions, views), _spacing(positions)
+        normals, spacing, opacity = _towards_cameras(positions, views), _spacing(positions), min(opacity, FAINT)
         source = "random points (no masks and no structure-from-motion points)"
     s = settings.surfels
     parameters = initial_parameters(
@@ -38,7 +40,7 @@ def start_parameters(capture: Capture, views: list[LoadedView], settings: Settin
         normals,
         spacing,
         colours,
-        opacity=s.opacity if colours is None and source.startswith("the visual") else min(s.opacity, 0.1),
+        opacity=opacity,
         sh_degree=s.sh_degree,
         albedo=s.albedo,
         metallic=s.metallic,
