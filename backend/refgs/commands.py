@@ -122,9 +122,9 @@ def _images(rendering: Rendering) -> dict[str, np.ndarray]:
     alpha = rendering.alpha.numpy()
     normal = torch.nn.functional.normalize(rendering.normal, dim=-1).numpy()
     images = {"normal": normal, "depth": rendering.depth.numpy(), "alpha": alpha}
-    if rendering.shaded is not None:
-        images["color"] = np.dstack([rendering.map("radiance").numpy() * alpha[..., None], alpha])
-        images |= {name: rendering.map(name).numpy() for name in ("albedo", "metallic", "roughness")}
+    if rendering.material is not None:
+        images["color"] = np.dstack([rendering.radiance.numpy() * alpha[..., None], alpha])
+        images |= {name: getattr(rendering, name).numpy() for name in ("albedo", "metallic", "roughness")}
     return images
 
 
@@ -247,7 +247,7 @@ def _write_pictures(folder: Path, name: str, rendering: Rendering, photo: np.nda
     write_png(folder / "photo" / f"{name}.png", _bytes(photo))
     write_png(folder / "color" / f"{name}.png", _bytes(rendering.color.numpy()))
     write_png(folder / "normal" / f"{name}.png", _as_png("normal", rendering, background))
-    if rendering.shaded is not None:
+    if rendering.material is not None:
         for what in ("albedo", "metallic", "roughness"):
             write_png(folder / what / f"{name}.png", _as_png(what, rendering, background))
 

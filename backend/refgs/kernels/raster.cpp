@@ -463,7 +463,7 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
       for (; c < channels; c++) h1 += features[c] * load(plane + c * LANES);
       here = (here + h1) + (h2 + h3);
       Vector behind = load(rest + b * LANES) - w * here;
-      Vector by_a = select(covered, T * here - behind / (1.0f - a), Vector());
+      Vector by_a = select(covered, T * here - behind * reciprocal(1.0f - a), Vector());
       T = T * (1.0f - a);
       store(rest + b * LANES, behind), store(transmittance + b * LANES, T);
       if (!any(T >= refgs::MIN_TRANSMITTANCE)) live &= ~(1ull << b);

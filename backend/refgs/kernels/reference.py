@@ -1,4 +1,4 @@
-"""What the kernels compute, in a few lines of torch: dense over pixels × splats, float64, autograd. The tests' oracle."""
+"""What the kernels compute, in a few lines of torch: float64, autograd; the rasteriser dense over pixels × splats. The tests' oracle."""
 
 import math
 
@@ -6,8 +6,12 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
+from refgs.color import srgb_encode
+from refgs.model import cubemap, harmonics, prefilter
+from refgs.render.brdf import DIELECTRIC_F0, fg_table
 
 ALPHA_CUT, ALPHA_CAP, MIN_TRANSMITTANCE, LOW_PASS, FAR = 1 / 255, 0.99, 1e-4, 2.0, 1e12  # as in splat.h
+COVERED, SHIFT_LIMIT, SHIFT_ALPHA = 1 / 255, 8.0, 0.3  # as in shade.cpp
 
 
 def rotation_matrices(q: Tensor) -> Tensor:
@@ -77,3 +81,110 @@ def rasterize(
         margin = torch.where(seen[None], torch.stack(margins), math.inf).amin(dim=0)
         margin = torch.cat([margin, torch.full_like(x, math.inf)[..., None]], dim=-1).amin(dim=-1)
     return *maps, margin
+
+
+def unit(v: Tensor) -> Tensor:
+    return v * torch.rsqrt((v * v).sum(dim=-1, keepdim=True) + 1e-24)
+
+
+def shade(
+    features: Tensor,
+    alpha: Tensor,
+    levels: Tensor,
+    sides: tuple[int, ...],
+    irradiance: Tensor,
+    camera: Camera,
+    background: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """As refgs.render.shade.shade, for float64 tensors; and how far each pixel (H, W) is from a kink of the derivatives,
+    in the units of what has the kink. Bilinear look-ups have one at every texel."""
+    view, pixels = torch.from_numpy(camera.world_to_camera), torch.nonzero(alpha > COVERED, as_tuple=True)
+    here, margins = alpha[pixels], []
+    own = features[pixels] / here[:, None]
+    maps = _displaced(features, alpha, own, pixels, camera, margins)
+    normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
+
+    row, column = (index + 0.5 for index in pixels)
+    ray = torch.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, torch.ones_like(here)], dim=-1)
+    towards = -unit(ray @ view[:3, :3])
+    dot = (normal * towards).sum(dim=-1)
+    n_v = dot.clamp(1e-4, 1)
+    light = specular(levels, sides, 2 * dot[:, None] * normal - towards, roughness, margins)
+    fg0, fg1 = (f[:, None] for f in fg(n_v, roughness, margins))
+    metal = metallic[:, None]
+    f0 = DIELECTRIC_F0 * (1 - metal) + albedo * metal
+    if features.shape[-1] > 11:
+        diffuse = (1 - metal) * maps[:, 8:11]
+    else:
+        received = harmonics.basis(normal, 2) @ irradiance
+        margins += [(dot - 1e-4).abs(), received.abs().amin(dim=-1)]
+        diffuse = (1 - metal) * (1 - DIELECTRIC_F0 * fg0 - fg1) * albedo * received.clamp_min(0)
+    radiance = light * (f0 * fg0 + fg1) + diffuse
+    margins.append((radiance - 0.0031308).abs().amin(dim=-1))
+    color = srgb_encode(radiance) * here[:, None] + (1 - here[:, None]) * background
+
+    def image(values: Tensor) -> Tensor:
+        return values.new_zeros(*alpha.shape, values.shape[-1]).index_put(pixels, values)
+
+    picture = background.expand(*alpha.shape, 3).index_put(pixels, color)
+    margin = torch.full_like(alpha, math.inf).index_put(pixels, torch.stack(margins).amin(dim=0).detach())
+    return picture, image(maps[:, :3]), image(maps[:, 3:8]), image(radiance), margin
+
+
+def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tensor]) -> Tensor:
+    view, (height, width) = torch.from_numpy(camera.world_to_camera), alpha.shape
+    here = alpha[pixels]
+    point = own[:, -3:] @ view[:3, :3].T + view[:3, 3]
+    focal, middle = torch.tensor([camera.fx, camera.fy]).double(), torch.tensor([camera.cx, camera.cy]).double()
+    centre = torch.stack([pixels[1], pixels[0]], dim=-1).double()
+    shift = point[:, :2] / point[:, 2:] * focal + middle - centre - 0.5
+    margins += [*(shift.abs() - SHIFT_LIMIT).abs().unbind(-1), (here - SHIFT_ALPHA).abs()]
+    last = torch.tensor([width - 1, height - 1]).double()
+    to = centre - shift.clamp(-SHIFT_LIMIT, SHIFT_LIMIT) * (here > SHIFT_ALPHA)[:, None]
+    moves = (here > SHIFT_ALPHA)[:, None] & (shift.abs() < SHIFT_LIMIT) & (to > 0) & (to < last)
+    margins += _from_integer(to, moves)
+    to = to.clamp_min(0).minimum(last)
+    stacked = torch.cat([features[..., :-3], alpha[..., None]], dim=-1)
+    low = to.detach().floor()
+    x, y = (to - low).unbind(-1)
+    (x0, y0), (x1, y1) = low.long().unbind(-1), (low + 1).minimum(last).long().unbind(-1)
+    corners = stacked[y0, x0], stacked[y0, x1], stacked[y1, x0], stacked[y1, x1]
+    weights = (1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y
+    sampled = sum(w[:, None] * c for w, c in zip(weights, corners, strict=True))
+    there = sampled[:, -1]
+    margins += [(there - SHIFT_ALPHA).abs()]
+    trust = ((there - SHIFT_ALPHA) / SHIFT_ALPHA).clamp(0, 1).detach()[:, None]
+    moved = sampled[:, :-1] / there.clamp_min(SHIFT_ALPHA)[:, None]
+    return trust * moved + (1 - trust) * own[:, :-3]
+
+
+def _from_integer(x: Tensor, counts: Tensor | bool = True) -> list[Tensor]:
+    distance = (x - x.round()).abs().detach()
+    return list(torch.where(torch.as_tensor(counts), distance, math.inf).unbind(-1))
+
+
+def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor, margins: list) -> Tensor:
+    """Radiance (P, 3) filtered by the GGX lobe of a roughness (P,) about a direction (P, 3)."""
+    known = torch.tensor(prefilter.ROUGHNESS, dtype=roughness.dtype)
+    interval = (torch.bucketize(roughness.detach().contiguous(), known) - 1).clamp(0, len(known) - 2)
+    low, high = known[interval], known[interval + 1]
+    margins.append((roughness[:, None] - known[1:-1]).abs().amin(dim=-1))
+    _, s, t = cubemap.face_coordinates(directions)
+    largest = torch.sort(directions.abs(), dim=-1).values
+    margins.append((largest[:, 2] - largest[:, 1]).abs())
+    for i in (0, 1):
+        half = torch.tensor(sides)[interval + i] / 2
+        margins += _from_integer(torch.stack([(s + 1) * half + 0.5, (t + 1) * half + 0.5], dim=-1))
+    return cubemap.sample(levels, sides, directions, interval + (roughness - low) / (high - low))
+
+
+def fg(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> tuple[Tensor, Tensor]:
+    """FG0 and FG1 (P,) at N·V and roughness in [0, 1], bilinear in the table, differentiable in both."""
+    table = fg_table().to(n_v.dtype)
+    at = torch.stack([n_v, roughness], dim=-1)
+    if margins is not None:
+        margins += _from_integer(at * table.shape[-1] - 0.5)
+    value = torch.nn.functional.grid_sample(
+        table[None], at[None, None] * 2 - 1, mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return value[0, 0, 0], value[0, 1, 0]

@@ -1,7 +1,7 @@
 // One splat at one pixel: what it covers there, at what depth, and the derivatives. Everything that every backend must
 // agree on is here; F is the number type, `float` or a vector of floats, one lane a pixel.
 //
-// The includer provides, for its F: select(mask, a, b), exp_half(x) = exp(-x/2) for x >= 0, and smaller(a, b).
+// The includer provides, for its F: select(mask, a, b), exp_half(x) = exp(-x/2) for x >= 0, smaller(a, b), and reciprocal(x).
 #pragma once
 
 #ifdef __CUDACC_RTC__
@@ -60,7 +60,7 @@ REFGS_INLINE Hit<F> intersect(const Splat& s, F x, F y) {
   F n0 = affine(s, 0, x, y);
   F n1 = affine(s, 1, x, y);
   F n2 = affine(s, 2, x, y);
-  h.inverse = 1.0f / n2;
+  h.inverse = reciprocal(n2);
   h.u = n0 * h.inverse;
   h.v = n1 * h.inverse;
   h.dx = x - s.x;

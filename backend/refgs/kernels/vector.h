@@ -15,13 +15,33 @@ typedef float Vector __attribute__((vector_size(4 * LANES)));
 typedef int32_t Mask __attribute__((vector_size(4 * LANES)));
 typedef float UnalignedVector __attribute__((vector_size(4 * LANES), aligned(4)));
 
-#define INLINE static inline __attribute__((always_inline))
+#define MEMBER inline __attribute__((always_inline))
+#define INLINE static MEMBER
 
 INLINE Vector select(Mask mask, Vector a, Vector b) { return mask ? a : b; }
 INLINE Vector smaller(Vector a, Vector b) { return a < b ? a : b; }
+INLINE Vector larger(Vector a, Vector b) { return a > b ? a : b; }
+INLINE Vector clamp(Vector x, float low, float high) { return larger(smaller(x, Vector() + high), Vector() + low); }
+INLINE Vector root(Vector x) { return __builtin_elementwise_sqrt(x); }
+INLINE float total(Vector x) {
+  float sum = 0;
+  for (int i = 0; i < LANES; i++) sum += x[i];
+  return sum;
+}
 INLINE bool any(Mask mask) { return __builtin_reduce_or(mask) != 0; }
 INLINE Vector load(const float* p) { return *(const UnalignedVector*)p; }
 INLINE void store(float* p, Vector v) { *(UnalignedVector*)p = v; }
+
+// 1/x to 1 ulp or so, from 1e-37 to 1e37 in magnitude; beyond, a NaN may stand for an infinity.
+INLINE Vector reciprocal(Vector x) {
+#if LANES == 16  // a division of 16 numbers stops the arithmetic for as long as four steps of this: an estimate to 2^-14, Newton
+  Vector r = (Vector)__builtin_ia32_rcp14ps512_mask(x, Vector(), 0xffff);
+  Vector error = 1.0f - x * r;
+  return r + r * error;
+#else
+  return 1.0f / x;
+#endif
+}
 
 // exp(-x/2) for x >= 0 to 1.5 ulp; garbage, but no trap, for NaN. 2^t = 2^round(t) 2^f, |f| <= 1/2, the latter by its
 // Chebyshev expansion of degree 6 (error 1e-9).

@@ -79,18 +79,18 @@ def _padded_texels(resolution: int) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _stack(sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """For cubemaps stacked one after another: padded texel indices into the stack, and where each level's start; the sides."""
-    padded, starts, texels = [], [], 0
+def padded(sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """For cubemaps stacked one after another: texel indices under their padded faces, where each level's start, the sides."""
+    indices, starts, texels = [], [], 0
     for side in sides:
-        starts.append(sum(len(p) for p in padded))
-        padded.append(_padded_texels(side).flatten() + texels)
+        starts.append(sum(len(i) for i in indices))
+        indices.append(_padded_texels(side).flatten() + texels)
         texels += 6 * side * side
-    return torch.cat(padded), torch.tensor(starts), torch.tensor(sides)
+    return torch.cat(indices), torch.tensor(starts), torch.tensor(sides)
 
 
 def _bilinear(face: Tensor, s: Tensor, t: Tensor, level: Tensor, sides: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    padded, starts, all_sides = _stack(sides)
+    table, starts, all_sides = padded(sides)
     side = all_sides[level]
     half = side.to(s.dtype) / 2
     x = (s + 1) * half + 0.5  # in texels of the padded face
@@ -102,7 +102,7 @@ def _bilinear(face: Tensor, s: Tensor, t: Tensor, level: Tensor, sides: tuple[in
     corner = starts[level] + (face * width + row) * width + column
     corners = torch.stack([corner, corner + 1, corner + width, corner + width + 1], dim=-1)
     gx, gy = 1 - fx, 1 - fy
-    return padded[corners], torch.stack([gx * gy, fx * gy, gx * fy, fx * fy], dim=-1)
+    return table[corners], torch.stack([gx * gy, fx * gy, gx * fy, fx * fy], dim=-1)
 
 
 def sample(levels: Tensor, sides: tuple[int, ...], directions: Tensor, level: Tensor) -> Tensor:

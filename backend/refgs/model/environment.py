@@ -32,13 +32,6 @@ class Environment:
         self.levels = prefilter.prefilter(radiance, self.resolution)
         self.irradiance = _projection(self.resolution) @ radiance  # (9, 3)
 
-    def specular(self, directions: Tensor, roughness: Tensor) -> Tensor:
-        """Radiance (P, 3) filtered by the GGX lobe of a roughness (P,) about a direction (P, 3)."""
-        known = torch.tensor(prefilter.ROUGHNESS)
-        interval = (torch.bucketize(roughness.detach(), known) - 1).clamp(0, len(known) - 2)
-        low, high = known[interval], known[interval + 1]
-        return cubemap.sample(self.levels, self.sides, directions, interval + (roughness - low) / (high - low))
-
     def diffuse(self, normals: Tensor) -> Tensor:
         """Irradiance / π (P, 3) about unit normals (P, 3): what a white matte surface sends out."""
         return (harmonics.basis(normals, 2) @ self.irradiance).clamp_min(0)

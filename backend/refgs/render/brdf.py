@@ -1,4 +1,4 @@
-"""The Principled material of the metallic-roughness workflow under a prefiltered environment: the split sum (paper Eq. 7, 8)."""
+"""The first factor of the split sum (paper Eq. 7): what a metallic-roughness material reflects of an even light."""
 
 import math
 from functools import lru_cache
@@ -59,25 +59,3 @@ def fg_table(size: int = 64, steps: int = 32) -> Tensor:
         table[0, row] = ((1 - fresnel) * weight) @ area
         table[1, row] = (fresnel * weight) @ area
     return table.float()
-
-
-def fg(n_v: Tensor, roughness: Tensor) -> tuple[Tensor, Tensor]:
-    """FG0 and FG1 (P,) at N·V and roughness in [0, 1], bilinear in the table, differentiable in both."""
-    grid = torch.stack([n_v, roughness], dim=-1)[None, None] * 2 - 1
-    value = torch.nn.functional.grid_sample(
-        fg_table()[None], grid, mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return value[0, 0, 0], value[0, 1, 0]
-
-
-def reflect(view: Tensor, normal: Tensor) -> Tensor:
-    """The mirror direction R = 2(ω·N)N − ω of the direction towards the viewer ω (P, 3)."""
-    return 2 * (view * normal).sum(dim=-1, keepdim=True) * normal - view
-
-
-def specular(albedo: Tensor, metallic: Tensor, n_v: Tensor, roughness: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
-    """Specular radiance (P, 3) from the prefiltered light (P, 3), and what a dielectric's coat leaves to its diffuse base (P, 1)."""
-    fg0, fg1 = (f[:, None] for f in fg(n_v, roughness))
-    metallic = metallic[:, None]
-    f0 = DIELECTRIC_F0 * (1 - metallic) + albedo * metallic
-    return light * (f0 * fg0 + fg1), (1 - metallic) * (1 - DIELECTRIC_F0 * fg0 - fg1)

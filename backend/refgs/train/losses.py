@@ -5,7 +5,7 @@ from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.model.environment import Environment
-from refgs.render.renderer import Rendering, camera_rays, unit
+from refgs.render.renderer import COVERED, Rendering, camera_rays, unit
 from refgs.render.ssim import dssim
 from refgs.settings import LossSettings
 
@@ -79,12 +79,12 @@ def objective(
         loss = loss + weights.smooth * smoothness_loss(rendering, photo)
     if mask is not None and weights.alpha > 0:
         loss = loss + weights.alpha * (rendering.alpha - mask).abs().mean()
-    if rendering.shaded is not None and weights.metallic > 0:
+    if rendering.material is not None and weights.metallic > 0:
         # Nothing real is half a metal. Where the metallic is decided, the highlights of dielectrics, 4 % of the light and
         # without colour, fix the light's scale and white balance, which metals alone cannot. Not before it is known
         # which is which, hence the square.
-        metallic = rendering.shaded["metallic"]
-        loss = loss + weights.metallic * progress**2 * (metallic * (1 - metallic)).mean()
+        metallic, covered = rendering.metallic, (rendering.alpha.detach() > COVERED).sum().clamp_min(1)
+        loss = loss + weights.metallic * progress**2 * (metallic * (1 - metallic)).sum() / covered
     if environment is not None and weights.light > 0:
         loss = loss + weights.light * light_loss(environment)
     return loss

@@ -1,0 +1,137 @@
+"""Maps to a picture: differentiable deferred shading."""
+
+import ctypes
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from refgs.camera import Camera
+from refgs.kernels.load import Shared, kernels, parallel
+from refgs.model import cubemap, prefilter
+from refgs.model.environment import Environment
+from refgs.render.brdf import fg_table
+
+CHANNELS = 11  # normal, albedo, metallic, roughness, position; three more of appearance before the position
+
+
+class Shaded(NamedTuple):
+    """A picture (H, W, 3), sRGB-encoded, over the background; and what it was made of: blended normals (H, W, 3), not
+    normalised, albedo, metallic and roughness (H, W, 5), linear radiance (H, W, 3) before the background: zero where
+    nothing is. Differentiable but for the radiance."""
+
+    color: Tensor
+    normal: Tensor
+    material: Tensor
+    radiance: Tensor
+
+
+class _Levels(ctypes.Structure):
+    """`struct Levels` of light.h."""
+
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        ("side", ctypes.c_int32 * 8),
+        ("start", ctypes.c_int32 * 8),
+        ("roughness", ctypes.c_float * 8),
+        ("texels", ctypes.c_void_p),
+        ("padded", ctypes.c_void_p),
+    )
+
+
+class _Work(ctypes.Structure):
+    """`struct Shade` of shade.cpp."""
+
+    _fields_ = (
+        [(n, ctypes.c_int64) for n in ("width", "height", "channels", "chunk_rows")]
+        + [("view", ctypes.c_double * 12)]
+        + [(n, ctypes.c_double) for n in ("fx", "fy", "cx", "cy")]
+        + [("background", ctypes.c_float * 3), ("features", ctypes.c_void_p), ("alpha", ctypes.c_void_p)]
+        + [("levels", _Levels), ("texels", ctypes.c_int64), ("irradiance", ctypes.c_void_p)]
+        + [("fg", ctypes.c_void_p), ("fg_side", ctypes.c_int64)]
+        + [(n, ctypes.c_void_p) for n in ("color", "normal", "material", "radiance")]
+        + [(n, ctypes.c_void_p) for n in ("by_color", "by_normal", "by_material", "by_features", "by_alpha")]
+        + [(n, ctypes.c_void_p) for n in ("halo", "by_chunk_texels", "by_irradiance", "by_levels")]
+        + [("scratch", ctypes.c_void_p), ("shared", Shared)]
+    )
+
+
+@lru_cache(maxsize=4)
+def _padded(sides: tuple[int, ...]) -> tuple[Tensor, list[int]]:
+    texels, starts, _ = cubemap.padded(sides)
+    return texels.to(torch.int32), starts.tolist()
+
+
+class _Shade(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, features, alpha, levels, irradiance, sides, camera, background):
+        features, alpha, irradiance = features.contiguous(), alpha.contiguous(), irradiance.contiguous()
+        height, width, channels = features.shape
+        table, (padded, starts) = fg_table(), _padded(sides)
+        quads = torch.nn.functional.pad(levels, (0, 1))
+        work = _Work(width=width, height=height, channels=channels, chunk_rows=max(32, -(-height // 16)))
+        work.view[:] = camera.world_to_camera[:3].reshape(-1).tolist()
+        work.fx, work.fy, work.cx, work.cy = camera.fx, camera.fy, camera.cx, camera.cy
+        work.background[:] = background.tolist()
+        work.features, work.alpha, work.irradiance = features.data_ptr(), alpha.data_ptr(), irradiance.data_ptr()
+        work.levels.count, work.texels = len(sides), len(levels)
+        work.levels.side[: len(sides)], work.levels.start[: len(sides)] = sides, starts
+        work.levels.roughness[: len(sides)] = prefilter.ROUGHNESS
+        work.levels.texels, work.levels.padded = quads.data_ptr(), padded.data_ptr()
+        work.fg, work.fg_side = table.data_ptr(), table.shape[-1]
+        shaded = Shaded(*(torch.empty(height, width, c) for c in (3, 3, 5, 3)))
+        work.color, work.normal, work.material, work.radiance = (t.data_ptr() for t in shaded)
+        parallel(kernels().refgs_shade_forward, work)
+        ctx.save_for_backward(features, alpha, irradiance)
+        ctx.work, ctx.quads = work, quads
+        ctx.mark_non_differentiable(shaded.radiance)
+        return tuple(shaded)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, by_color, by_normal, by_material, _):
+        features, alpha, irradiance = ctx.saved_tensors
+        library, work = kernels(), ctx.work
+        given = [g.contiguous() for g in (by_color, by_normal, by_material)]
+        work.by_color, work.by_normal, work.by_material = (g.data_ptr() for g in given)
+        chunks = -(-work.height // work.chunk_rows)
+        by_features, by_alpha, by_levels = (
+            torch.empty_like(features),
+            torch.empty_like(alpha),
+            torch.empty(work.texels, 3),
+        )
+        halo = torch.empty(chunks * library.refgs_shade_halo_size(work.width, work.channels))
+        by_texels, by_irradiance = torch.empty(chunks, work.texels, 4), torch.empty(chunks, *irradiance.shape)
+        work.by_features, work.by_alpha, work.by_levels = (
+            by_features.data_ptr(),
+            by_alpha.data_ptr(),
+            by_levels.data_ptr(),
+        )
+        work.halo, work.by_chunk_texels, work.by_irradiance = (
+            halo.data_ptr(),
+            by_texels.data_ptr(),
+            by_irradiance.data_ptr(),
+        )
+        parallel(library.refgs_shade_backward, work)
+        parallel(library.refgs_shade_gather, work)
+        return by_features, by_alpha, by_levels, by_irradiance.sum(dim=0), None, None, None
+
+
+def shade(features: Tensor, alpha: Tensor, environment: Environment, camera: Camera, background: Tensor) -> Shaded:
+    """Shade what the rasteriser blended by the split sum (paper Eq. 5–8), over a background (3,), sRGB-encoded.
+
+    `features` (H, W, 11) are sums over a pixel's splats of normal in world space, albedo, metallic, roughness and
+    position; or (H, W, 14) with three of appearance before the position: colour by direction in place of integrated
+    diffuse light (the paper's substitute). `alpha` (H, W). float32 on the CPU, differentiable in these and the light.
+    What the blend's mean position says of its bias towards the camera is undone first: shade.cpp has how. The result does
+    not depend on the number of threads.
+    """
+    height, width = alpha.shape
+    if features.shape not in ((height, width, CHANNELS), (height, width, CHANNELS + 3)):
+        raise ValueError(
+            f"expected {CHANNELS} or {CHANNELS + 3} features a pixel of {width}×{height}, got {tuple(features.shape)}"
+        )
+    light = environment.levels, environment.irradiance, environment.sides
+    return Shaded(*_Shade.apply(features, alpha, *light, camera, background))
