@@ -1,7 +1,7 @@
 import pytest
 
 from refgs.errors import InputError
-from refgs.settings import load_settings, preset_names
+from refgs.settings import load_settings, preset_names, recorded_settings
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -66,3 +66,12 @@ def test_a_wrong_file_is_named(tmp_path, text, word):
 def test_an_unknown_preset_lists_the_known():
     with pytest.raises(InputError, match="quick, standard"):
         load_settings("fast")
+
+
+def test_a_run_of_before_a_setting_still_opens():
+    settings = load_settings("quick")
+    recorded = settings.model_dump(mode="json")
+    del recorded["loss"]["light"], recorded["mesh"]
+    opened = recorded_settings(recorded, "run.toml")
+    assert opened.train == settings.train
+    assert opened.mesh == load_settings("standard").mesh

@@ -19,7 +19,7 @@ from refgs.export.splats import Splats, read_splats
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, from_splats
 from refgs.render.renderer import Rendering, near_plane, render
-from refgs.settings import Settings, validate
+from refgs.settings import Settings, recorded_settings
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def read_run_facts(folder: Path) -> tuple[dict, Settings]:
     file = folder / "run.toml"
     try:
         facts = tomllib.loads(file.read_text(encoding="utf-8"))
-        return facts["run"], validate(facts["settings"], str(file))
+        return facts["run"], recorded_settings(facts["settings"], str(file))
     except FileNotFoundError:
         raise InputError(f"{folder} is not a run folder: there is no run.toml in it") from None
     except (OSError, KeyError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

@@ -126,6 +126,11 @@ def load_settings(preset: str, changes: list[str] = ()) -> Settings:
     return validate(tables, preset)
 
 
+def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
+    """Settings that a run wrote down; what the program did not know of yet is as in the standard preset."""
+    return validate(_merge(_read_preset("standard"), tables), source)
+
+
 def validate(tables: dict[str, Any], source: str) -> Settings:
     """Settings from nested tables. Raises InputError naming the first key that is wrong and what it may be."""
     try:
@@ -168,10 +173,12 @@ def _read_preset(preset: str) -> dict[str, Any]:
         return tables
     if base not in preset_names() or base == preset:
         raise InputError(f"{file}: base = {base!r}: take one of {', '.join(preset_names())}")
-    merged = _read_preset(base)
+    return _merge(_read_preset(base), tables)
+
+
+def _merge(base: dict[str, Any], tables: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
     for section, values in tables.items():
-        if isinstance(values, dict) and isinstance(merged.get(section, {}), dict):
-            merged[section] = {**merged.get(section, {}), **values}
-        else:
-            merged[section] = values
+        both = isinstance(values, dict) and isinstance(base.get(section, {}), dict)
+        merged[section] = {**base.get(section, {}), **values} if both else values
     return merged

@@ -39,8 +39,17 @@ def cache_folder() -> Path:
     return Path(os.environ.get("REFGS_CACHE") or platformdirs.user_cache_dir("refgs", appauthor=False))
 
 
+def _keep_memory() -> None:
+    """Have GNU's malloc keep what is freed: by default the buffers of an iteration, a few megabytes each, go back to the
+    system at its end, and the next one faults them in again page by page (4 % of the time)."""
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
+        libc.mallopt(-3, 32 << 20)  # M_MMAP_THRESHOLD, at its largest
+        libc.mallopt(-1, 512 << 20)  # M_TRIM_THRESHOLD
+
+
 @functools.cache
 def _load(isa: str) -> ctypes.CDLL:
+    _keep_memory()
     path = build(target(sys.platform, MACHINES[platform.machine()], isa), cache_folder())
     library = ctypes.CDLL(str(path))
     for name, arguments in SIZES.items():

@@ -16,12 +16,14 @@ int32_t lesser(int32_t a, int32_t b) { return a < b ? a : b; }
 double larger(double a, double b) { return a > b ? a : b; }  // b where one is NaN
 double lesser(double a, double b) { return a < b ? a : b; }
 
-constexpr int TILE = 16;  // pixels
-constexpr int PIXELS = TILE * TILE;
+constexpr int TILE_X = LANES == 4 ? 16 : 32, TILE_Y = 16;  // pixels; 64 blocks at most
+constexpr int PIXELS = TILE_X * TILE_Y;
 constexpr int BLOCK_X = LANES == 4 ? 2 : 4;  // a block is one vector of pixels
 constexpr int BLOCK_Y = LANES / BLOCK_X;
-constexpr int BLOCKS_X = TILE / BLOCK_X, BLOCKS_Y = TILE / BLOCK_Y;
+constexpr int BLOCKS_X = TILE_X / BLOCK_X, BLOCKS_Y = TILE_Y / BLOCK_Y;
 constexpr int BLOCKS = BLOCKS_X * BLOCKS_Y;
+// n0, n1, n2 are taken apart where they sum up terms larger than this many times n2: u and v err by 2^-24 of it.
+constexpr double SPLIT = 32;
 constexpr int AHEAD = 12;     // splats that are fetched before they are needed
 constexpr int CHUNK = 64;      // splats of a tile that are treated together
 constexpr int GEOMETRY = 16;   // floats of a gradient row before its features; 14 are used
@@ -62,17 +64,17 @@ struct Raster {
 typedef double Quad __attribute__((vector_size(32)));
 typedef float FloatQuad __attribute__((vector_size(16)));
 
-int64_t tiles_x(const Raster& r) { return (r.width + TILE - 1) / TILE; }
-int64_t tiles_y(const Raster& r) { return (r.height + TILE - 1) / TILE; }
+int64_t tiles_x(const Raster& r) { return (r.width + TILE_X - 1) / TILE_X; }
+int64_t tiles_y(const Raster& r) { return (r.height + TILE_Y - 1) / TILE_Y; }
 
 // body(tile) for the tiles that the splat's octagon meets, row by row.
 template <class Body>
 INLINE void each_tile(const Raster& r, const Projected& p, Body body) {
   if (p.x1 < p.x0) return;
-  for (int32_t y = p.y0 / TILE; y <= p.y1 / TILE; y++)
-    for (int32_t x = p.x0 / TILE; x <= p.x1 / TILE; x++) {
-      int32_t sum = (x + y) * TILE, difference = (x - y) * TILE;
-      if (sum <= p.sum1 && sum + 2 * (TILE - 1) >= p.sum0 && difference - TILE < p.difference1 && difference + TILE > p.difference0)
+  for (int32_t y = p.y0 / TILE_Y; y <= p.y1 / TILE_Y; y++)
+    for (int32_t x = p.x0 / TILE_X; x <= p.x1 / TILE_X; x++) {
+      int32_t sum = x * TILE_X + y * TILE_Y, difference = x * TILE_X - y * TILE_Y;  // of the tile's first pixel
+      if (sum <= p.sum1 && sum + TILE_X + TILE_Y - 2 >= p.sum0 && difference - TILE_Y < p.difference1 && difference + TILE_X > p.difference0)
         body(y * tiles_x(r) + x, x, y);
     }
 }
@@ -207,9 +209,9 @@ constexpr int pixel_y(int i) { return i / LANES / BLOCKS_X * BLOCK_Y + i % LANES
 
 struct Tile {
   int64_t index, x, y, width, height;  // x, y: its first pixel; width, height: its part inside the image
-  Tile(const Raster& r, int64_t i) : index(i), x(i % tiles_x(r) * TILE), y(i / tiles_x(r) * TILE) {
-    width = r.width - x < TILE ? r.width - x : TILE;
-    height = r.height - y < TILE ? r.height - y : TILE;
+  Tile(const Raster& r, int64_t i) : index(i), x(i % tiles_x(r) * TILE_X), y(i / tiles_x(r) * TILE_Y) {
+    width = r.width - x < TILE_X ? r.width - x : TILE_X;
+    height = r.height - y < TILE_Y ? r.height - y : TILE_Y;
   }
   bool inside(int i) const { return pixel_x(i) < width && pixel_y(i) < height; }
   int64_t pixel(const Raster& r, int i) const { return (y + pixel_y(i)) * r.width + x + pixel_x(i); }
@@ -220,8 +222,8 @@ struct Centres {
   alignas(64) float x[PIXELS], y[PIXELS];
   constexpr Centres() : x(), y() {
     for (int i = 0; i < PIXELS; i++) {
-      x[i] = pixel_x(i) + 0.5f - TILE / 2;
-      y[i] = pixel_y(i) + 0.5f - TILE / 2;
+      x[i] = pixel_x(i) + 0.5f - TILE_X / 2;
+      y[i] = pixel_y(i) + 0.5f - TILE_Y / 2;
     }
   }
 };
@@ -237,20 +239,28 @@ INLINE Quad load_quad(const double* p) {
 INLINE Quad magnitude(Quad v) { return v < 0 ? -v : v; }
 
 INLINE Splat localise(const Projected& p, const Tile& t) {
-  double x = t.x + TILE / 2, y = t.y + TILE / 2;
+  double x = t.x + TILE_X / 2, y = t.y + TILE_Y / 2;
   Splat s;
   // A fourth lane reads what comes next in `p`, and is not used.
   Quad slope_x = load_quad(p.slope_x), slope_y = load_quad(p.slope_y), value = load_quad(p.value) + slope_x * x + slope_y * y;
-  // Adding 1.5 * 2^52 q rounds to multiples of q, here 2^-22 of the largest sum: its multiples of q / 2 fit in a float.
-  Quad round = (magnitude(value) + TILE * (magnitude(slope_x) + magnitude(slope_y))) * (1.5 * (1ll << 30));
-  auto split = [&](Quad exact, float* high, float* low) {
-    FloatQuad h = __builtin_convertvector(exact + round - round, FloatQuad);
-    *(FloatQuad*)high = h;
-    *(FloatQuad*)low = __builtin_convertvector(exact - __builtin_convertvector(h, Quad), FloatQuad);
-  };
-  split(value, s.high.value, s.low.value);
-  split(slope_x, s.high.slope_x, s.low.slope_x);
-  split(slope_y, s.high.slope_y, s.low.slope_y);
+  Quad spread = (TILE_X / 2) * magnitude(slope_x) + (TILE_Y / 2) * magnitude(slope_y), most = magnitude(value) + spread;
+  s.split = !(larger(larger(most[0], most[1]), most[2]) <= SPLIT * (value[2] - spread[2]));
+  if (s.split) {
+    // Adding 1.5 * 2^52 q rounds to multiples of q, here 2^-22 of the largest sum: its multiples of q / 2 fit in a float.
+    Quad round = (most + spread) * (1.5 * (1ll << 30));
+    auto part = [&](Quad exact, float* high, float* low) {
+      FloatQuad h = __builtin_convertvector(exact + round - round, FloatQuad);
+      *(FloatQuad*)high = h;
+      *(FloatQuad*)low = __builtin_convertvector(exact - __builtin_convertvector(h, Quad), FloatQuad);
+    };
+    part(value, s.high.value, s.low.value);
+    part(slope_x, s.high.slope_x, s.low.slope_x);
+    part(slope_y, s.high.slope_y, s.low.slope_y);
+  } else {
+    *(FloatQuad*)s.high.value = __builtin_convertvector(value, FloatQuad);
+    *(FloatQuad*)s.high.slope_x = __builtin_convertvector(slope_x, FloatQuad);
+    *(FloatQuad*)s.high.slope_y = __builtin_convertvector(slope_y, FloatQuad);
+  }
   s.determinant = p.determinant, s.n2_min = p.n2_min, s.n2_max = p.n2_max;
   s.x = near_zero(p.x - x), s.y = near_zero(p.y - y), s.depth = p.depth;
   s.opacity = p.opacity, s.rho_max = p.rho_max;
@@ -271,12 +281,12 @@ uint64_t bits(int low, int high) { return (~0ull >> (63 - (high - low))) << low;
 uint64_t blocks(const Projected& p, const Tile& t) {
   int32_t tx = (int32_t)t.x, ty = (int32_t)t.y;
   uint64_t mask = 0;
-  for (int y = larger(p.y0 - ty, 0) / BLOCK_Y; y <= lesser(p.y1 - ty, TILE - 1) / BLOCK_Y; y++) {
+  for (int y = larger(p.y0 - ty, 0) / BLOCK_Y; y <= lesser(p.y1 - ty, TILE_Y - 1) / BLOCK_Y; y++) {
     int32_t top = ty + y * BLOCK_Y, bottom = top + BLOCK_Y - 1;
     int32_t x0 = larger(larger(p.x0, p.sum0 - bottom), p.difference0 + top) - tx;
     int32_t x1 = lesser(lesser(p.x1, p.sum1 - top), p.difference1 + bottom) - tx;
-    if (x0 > x1 || x1 < 0 || x0 >= TILE) continue;
-    mask |= bits(larger(x0, 0) / BLOCK_X, lesser(x1, TILE - 1) / BLOCK_X) << (y * BLOCKS_X);
+    if (x0 > x1 || x1 < 0 || x0 >= TILE_X) continue;
+    mask |= bits(larger(x0, 0) / BLOCK_X, lesser(x1, TILE_X - 1) / BLOCK_X) << (y * BLOCKS_X);
   }
   return mask;
 }
@@ -372,20 +382,17 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
     }
 }
 
-// row[c] = sum over the pixels of some blocks of weight * by_features[pixel][c]
-void gather_features(float* row, const Vector* weights, const float* const* pixels, int count, int64_t channels) {
+// row[c] = sum over the pixels of some blocks of weight * by_features[pixel][c]; a block's plane is (channel, lane).
+void gather_features(float* row, const Vector* weights, const float* const* planes, int count, int64_t channels) {
   for (int64_t c = 0; c < channels; c += LANES) {
-    Vector s0 = {}, s1 = {}, s2 = {}, s3 = {};
+    Vector s[LANES] = {};
     for (int k = 0; k < count; k++) {
-      const float *w = (const float*)(weights + k), *by = pixels[k] + c;
-      for (int i = 0; i < LANES; i += 4, by += 4 * channels) {
-        s0 += w[i] * load(by);
-        s1 += w[i + 1] * load(by + channels);
-        s2 += w[i + 2] * load(by + 2 * channels);
-        s3 += w[i + 3] * load(by + 3 * channels);
-      }
+      Vector w = weights[k];
+      const float* plane = planes[k] + c * LANES;
+#pragma unroll
+      for (int i = 0; i < LANES; i++) s[i] += w * load(plane + i * LANES);
     }
-    store(row + c, (s0 + s1) + (s2 + s3));
+    store(row + c, sums(s));
   }
 }
 
@@ -393,8 +400,7 @@ void gather_features(float* row, const Vector* weights, const float* const* pixe
 void backward_tile(Raster& r, int64_t index, float* scratch) {
   Tile t(r, index);
   int64_t channels = r.channels, C = padded(channels);
-  float* planes = scratch;              // derivatives by features, (block, channel, lane)
-  float* pixels = planes + PIXELS * C;  // and (block, lane, channel)
+  float* planes = scratch;  // derivatives by features, (block, channel, lane)
   alignas(64) float transmittance[PIXELS], by_depth[PIXELS] = {}, by_alpha[PIXELS] = {}, rest[PIXELS];
   for (int y = 0; y < t.height; y++) {
     int64_t first = ((t.y + y) * r.width + t.x) * channels;
@@ -405,7 +411,6 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
   }
   for (int b = 0; b < BLOCKS; b++) {
     Vector dots[LANES];
-    float* block = pixels + b * LANES * C;
     for (int k = 0; k < LANES; k++) {
       int i = b * LANES + k;
       int64_t p = t.pixel(r, i);
@@ -414,19 +419,19 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
       dots[k] = Vector();
       if (inside) by_depth[i] = r.by_depth[p], by_alpha[i] = r.by_alpha[p];
       if (inside) dots[k][0] = by_depth[i] * r.out_depth[p] + by_alpha[i] * r.out_alpha[p];
-      for (int64_t c = 0; c < C; c += LANES) {
-        Vector by = inside ? read(r.by_features + p * channels + c, channels - c) : Vector();
-        if (inside) dots[k] += by * read(r.out_features + p * channels + c, channels - c);
-        store(block + k * C + c, by);
-      }
     }
-    store(rest + b * LANES, sums(dots));
     for (int64_t c = 0; c < C; c += LANES) {
       Vector v[LANES];
-      for (int k = 0; k < LANES; k++) v[k] = load(block + k * C + c);
+      for (int k = 0; k < LANES; k++) {
+        int64_t at = t.pixel(r, b * LANES + k) * channels + c;
+        bool inside = t.inside(b * LANES + k);
+        v[k] = inside ? read(r.by_features + at, channels - c) : Vector();
+        if (inside) dots[k] += v[k] * read(r.out_features + at, channels - c);
+      }
       transpose(v);
       for (int k = 0; k < LANES; k++) store(planes + (b * C + c + k) * LANES, v[k]);
     }
+    store(rest + b * LANES, sums(dots));
   }
   uint64_t live = ~0ull >> (64 - BLOCKS);
   const int32_t* members = r.members + r.tile_start[index];
@@ -468,7 +473,7 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
       store(rest + b * LANES, behind), store(transmittance + b * LANES, T);
       if (!any(T >= refgs::MIN_TRANSMITTANCE)) live &= ~(1ull << b);
       weights[used] = w;
-      touched[used++] = pixels + b * LANES * C;
+      touched[used++] = plane;
       auto d = refgs::differentiate(s, hit, g, by_a, w * by_z);
       n0 += d.n0, n0x += d.n0 * x, n0y += d.n0 * y;
       n1 += d.n1, n1x += d.n1 * x, n1y += d.n1 * y;
@@ -515,7 +520,7 @@ void gather(const Raster& r, int64_t i) {
     if (at >= r.row_start[tile + 1] - r.row_start[tile]) return;
     const float* __restrict row = r.rows + (r.row_start[tile] + at) * stride;
     touched = true;
-    double mx = tx * TILE + TILE / 2, my = ty * TILE + TILE / 2;
+    double mx = tx * TILE_X + TILE_X / 2, my = ty * TILE_Y + TILE_Y / 2;
     for (int k = 0; k < 3; k++) {
       n[k][0] += row[3 * k];
       n[k][1] += row[3 * k + 1] + mx * row[3 * k];
@@ -561,9 +566,10 @@ void gather(const Raster& r, int64_t i) {
 
 }  // namespace
 
+EXPORT int64_t refgs_tiles(int64_t width, int64_t height) { return ((width + TILE_X - 1) / TILE_X) * ((height + TILE_Y - 1) / TILE_Y); }
 EXPORT int64_t refgs_projected_size() { return sizeof(Projected); }
 EXPORT int64_t refgs_row_size(int64_t channels) { return GEOMETRY + padded(channels); }
-EXPORT int64_t refgs_scratch_size(int64_t channels) { return 2 * PIXELS * padded(channels); }
+EXPORT int64_t refgs_scratch_size(int64_t channels) { return PIXELS * padded(channels); }
 
 // parallel
 EXPORT void refgs_project(Raster* r) {

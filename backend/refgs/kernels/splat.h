@@ -27,21 +27,21 @@ struct alignas(16) Affine {
 // space, Eq. 4 reads M (u, v, 1)^T = z (X, Y, 1)^T, so (n0, n1, n2) = k det(M) M^-1 (X, Y, 1)^T is affine in the pixel,
 // u = n0 / n2, v = n1 / n2, z = k det(M) / n2. The factor k is free. Each is a sum of two: `high` is rounded so
 // that it is computed without error at the half-integers of a tile, `low` is what that left out. For a disc near its edge n2 is a
-// small difference of large numbers, and one float each would give up the accuracy of u, v and z.
+// small difference of large numbers, and one float each would give up the accuracy of u, v and z. Most discs are not: `low` then
+// is not there.
 struct Splat {
   Affine high, low;
   float determinant;          // k det(M), >= 0
   float n2_min, n2_max;       // the plane is met between the near plane and FAR where n2_min <= n2 <= n2_max
   float x, y, depth;          // projected centre, and its depth
   float opacity;
+  int32_t split;              // whether there is a `low`
   float rho_max;              // alpha >= ALPHA_CUT  <=>  rho <= 2 ln(opacity / ALPHA_CUT)
 };
 
 template <class F>
-REFGS_INLINE F affine(const Splat& s, int i, F x, F y) {
-  F high = s.high.value[i] + s.high.slope_x[i] * x + s.high.slope_y[i] * y;
-  F low = s.low.value[i] + s.low.slope_x[i] * x + s.low.slope_y[i] * y;
-  return high + low;
+REFGS_INLINE F affine(const Affine& a, int i, F x, F y) {
+  return a.value[i] + a.slope_x[i] * x + a.slope_y[i] * y;
 }
 
 template <class F>
@@ -57,9 +57,14 @@ struct Hit {
 template <class F>
 REFGS_INLINE Hit<F> intersect(const Splat& s, F x, F y) {
   Hit<F> h;
-  F n0 = affine(s, 0, x, y);
-  F n1 = affine(s, 1, x, y);
-  F n2 = affine(s, 2, x, y);
+  F n0 = affine(s.high, 0, x, y);
+  F n1 = affine(s.high, 1, x, y);
+  F n2 = affine(s.high, 2, x, y);
+  if (s.split) {
+    n0 += affine(s.low, 0, x, y);
+    n1 += affine(s.low, 1, x, y);
+    n2 += affine(s.low, 2, x, y);
+  }
   h.inverse = reciprocal(n2);
   h.u = n0 * h.inverse;
   h.v = n1 * h.inverse;

@@ -10,8 +10,6 @@ from torch.autograd.function import once_differentiable
 from refgs.camera import Camera
 from refgs.kernels.load import Shared, kernels, parallel
 
-TILE = 16  # pixels; as in raster.cpp
-
 
 class Raster(NamedTuple):
     """Sums over the splats of a pixel, front to back, with weights w = α Π (1 − α of those in front) (paper Eq. 5).
@@ -55,7 +53,7 @@ def _project_and_bin(work: _Work, camera: Camera, near: float) -> dict[str, Tens
     work.width, work.height = camera.width, camera.height
     work.view[:] = camera.world_to_camera[:3].reshape(-1).tolist()
     work.fx, work.fy, work.cx, work.cy, work.near = camera.fx, camera.fy, camera.cx, camera.cy, near
-    tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
+    tiles = library.refgs_tiles(camera.width, camera.height)
     bins = {
         "projected": torch.empty(n * library.refgs_projected_size(), dtype=torch.uint8),
         "order": torch.empty(n, dtype=torch.int32),
