@@ -24,7 +24,7 @@ class Raster(NamedTuple):
 
 
 class _Work(ctypes.Structure):
-    """`struct Raster` of raster.cpp."""
+    """`struct Raster` of raster.h."""
 
     _fields_ = (
         [(n, ctypes.c_int64) for n in ("splats", "channels", "width", "height")]
