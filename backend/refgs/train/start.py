@@ -28,14 +28,8 @@ def start_parameters(capture: Capture, views: list[LoadedView], settings: Settin
         source = "the visual hull of the masks"
     elif capture.points is not None and len(capture.points) >= 100:
         positions, colours = _thinned(capture.points, capture.point_colors, count, seed)
-        source = f"{len(positions)} structure-from-motion points"
-        if len(positions) < count // 2:  # too few to show the surroundings, where features are rare
-            around = _random(capture, count // 2 - len(positions), seed)
-            positions = np.concatenate([positions, around])
-            if colours is not None:
-                colours = np.concatenate([colours, np.full(around.shape, colours.mean(axis=0))])
-            source += f" and {len(around)} random ones"
         normals, spacing, opacity = _towards_cameras(positions, views), _spacing(positions), min(opacity, FAINT)
+        source = f"{len(positions)} structure-from-motion points"
     else:
         positions = _random(capture, count, seed)
         normals, spacing, opacity = _towards_cameras(positions, views), _spacing(positions), min(opacity, FAINT)
@@ -63,12 +57,13 @@ def _thinned(points: np.ndarray, colours: np.ndarray | None, count: int, seed: i
 
 
 def _random(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """Half of them uniform in the ball of interest, half beyond it, uniform in inverse distance: nothing masks that out."""
+    """Uniform in the ball of interest; where the capture is a room, half of them beyond it, uniform in inverse distance."""
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     distance = np.cbrt(rng.random(count))
-    distance[::2] = 1 / rng.uniform(0.1, 1, len(distance[::2]))
+    if not capture.bounded:
+        distance[::2] = 1 / rng.uniform(0.1, 1, len(distance[::2]))
     return capture.centre + capture.radius * distance[:, None] * direction
 
 
