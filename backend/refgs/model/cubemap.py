@@ -118,23 +118,4 @@ def sample(levels: Tensor, sides: tuple[int, ...], directions: Tensor, level: Te
         above, above_weights = _bilinear(face, s, t, lower + 1, sides)
         texels = torch.cat([texels, above], dim=-1)
         weights = torch.cat([weights * (1 - fraction), above_weights * fraction], dim=-1)
-    return _Gather.apply(levels, texels, weights)
-
-
-class _Gather(torch.autograd.Function):
-    """Σ_j w_pj · table[i_pj], with the table's gradient summed in the order of the pixels, so that it is the same for any thread count."""
-
-    @staticmethod
-    def forward(ctx, table: Tensor, index: Tensor, weight: Tensor) -> Tensor:
-        ctx.save_for_backward(table, index, weight)
-        return torch.einsum("pj,pjc->pc", weight, table[index])
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor):
-        table, index, weight = ctx.saved_tensors
-        for_weight = torch.einsum("pc,pjc->pj", gradient, table[index]) if ctx.needs_input_grad[2] else None
-        for_table = None
-        if ctx.needs_input_grad[0]:
-            for_table = torch.zeros_like(table)
-            for_table.index_add_(0, index.flatten(), (weight[..., None] * gradient[:, None]).flatten(0, 1))
-        return for_table, None, for_weight
+    return torch.einsum("pj,pjc->pc", weights, levels[texels])
