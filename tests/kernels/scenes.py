@@ -1,5 +1,7 @@
 """Random surfels that are hard to rasterise, each kind by itself and all together."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
@@ -54,3 +56,15 @@ def surfels(kind: str, channels: int, seed: int = 0) -> tuple[Tensor, ...]:
         opacity = rng.uniform(0.004, 0.03, n)
     feature = rng.normal(size=(n, channels))
     return tuple(torch.tensor(v, dtype=torch.float32) for v in (position, rotation, scale, opacity, feature))
+
+
+def check_same_bits_for_any_number_of_threads(run: Callable[[], list[Tensor]]) -> None:
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(run())
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))

@@ -104,17 +104,12 @@ def test_same_bits_for_any_number_of_threads(private_pool, isa, monkeypatch):
         monkeypatch.setattr(load, "_openmp", lambda: None)
     inputs, camera = scenes.surfels("mixed", 16), scenes.camera(150, 100)
     upstream = [torch.ones(100, 150, 16), torch.ones(100, 150), torch.ones(100, 150)]
-    before = torch.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            raster, gradients = run(inputs, camera, upstream)
-            results.append([*raster, *gradients])
-    finally:
-        torch.set_num_threads(before)
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+    def all_of_it() -> list[Tensor]:
+        raster, gradients = run(inputs, camera, upstream)
+        return [*raster, *gradients]
+
+    scenes.check_same_bits_for_any_number_of_threads(all_of_it)
 
 
 def test_shares_torchs_threads():

@@ -99,15 +99,12 @@ def test_matches_reference(appearance, size, isa, monkeypatch):
 
 def test_same_bits_for_any_number_of_threads():
     camera, inputs, _, _, upstream, _ = case(False, (37, 70))
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            maps, gradients = run(camera, inputs, upstream)
-            results.append([*maps, *gradients])
-    finally:
-        torch.set_num_threads(before)
-    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+
+    def all_of_it() -> list[Tensor]:
+        maps, gradients = run(camera, inputs, upstream)
+        return [*maps, *gradients]
+
+    scenes.check_same_bits_for_any_number_of_threads(all_of_it)
 
 
 def test_nothing_there():

@@ -99,6 +99,16 @@ class Shared(ctypes.Structure):
     _fields_ = (("next", ctypes.c_int64), ("thread", ctypes.c_int64))
 
 
+class Work(ctypes.Structure):
+    """What a kernel works on: pointers to tensors among its fields."""
+
+    def attach(self, **tensors: torch.Tensor) -> None:
+        """Point at tensors, which must be contiguous, and outlive the calls that use them."""
+        for name, tensor in tensors.items():
+            assert tensor.is_contiguous()
+            setattr(self, name, tensor.data_ptr())
+
+
 def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0) -> None:
     """Call `function(&work)` on torch.get_num_threads() threads at once; they share the work through `work.shared`.
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
-from refgs.kernels.load import Shared, kernels, parallel
+from refgs.kernels.load import Shared, Work, kernels, parallel
 
 
 class Raster(NamedTuple):
@@ -23,7 +23,7 @@ class Raster(NamedTuple):
     alpha: Tensor
 
 
-class _Work(ctypes.Structure):
+class _Work(Work):
     """`struct Raster` of raster.h."""
 
     _fields_ = (
@@ -39,12 +39,6 @@ class _Work(ctypes.Structure):
         + [(n, ctypes.c_void_p) for n in ("by_positions", "by_rotations", "by_scales", "by_opacities")]
         + [("by_splat_features", ctypes.c_void_p), ("scratch", ctypes.c_void_p), ("shared", Shared)]
     )
-
-    def attach(self, **tensors: Tensor) -> None:
-        """Point at tensors, which must be contiguous, and outlive the calls that use them."""
-        for name, tensor in tensors.items():
-            assert tensor.is_contiguous()
-            setattr(self, name, tensor.data_ptr())
 
 
 def _project_and_bin(work: _Work, camera: Camera, near: float) -> dict[str, Tensor]:

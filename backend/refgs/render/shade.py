@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
-from refgs.kernels.load import Shared, kernels, parallel
+from refgs.kernels.load import Shared, Work, kernels, parallel
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
 from refgs.render.brdf import fg_table
@@ -41,7 +41,7 @@ class _Levels(ctypes.Structure):
     )
 
 
-class _Work(ctypes.Structure):
+class _Work(Work):
     """`struct Shade` of shade.cpp."""
 
     _fields_ = (
@@ -75,14 +75,14 @@ class _Shade(torch.autograd.Function):
         work.view[:] = camera.world_to_camera[:3].reshape(-1).tolist()
         work.fx, work.fy, work.cx, work.cy = camera.fx, camera.fy, camera.cx, camera.cy
         work.background[:] = background.tolist()
-        work.features, work.alpha, work.irradiance = features.data_ptr(), alpha.data_ptr(), irradiance.data_ptr()
+        work.attach(features=features, alpha=alpha, irradiance=irradiance, fg=table)
         work.levels.count, work.texels = len(sides), len(levels)
         work.levels.side[: len(sides)], work.levels.start[: len(sides)] = sides, starts
         work.levels.roughness[: len(sides)] = prefilter.ROUGHNESS
         work.levels.texels, work.levels.padded = quads.data_ptr(), padded.data_ptr()
-        work.fg, work.fg_side = table.data_ptr(), table.shape[-1]
+        work.fg_side = table.shape[-1]
         shaded = Shaded(*(torch.empty(height, width, c) for c in (3, 3, 5, 3)))
-        work.color, work.normal, work.material, work.radiance = (t.data_ptr() for t in shaded)
+        work.attach(**shaded._asdict())
         parallel(kernels().refgs_shade_forward, work)
         ctx.save_for_backward(features, alpha, irradiance)
         ctx.work, ctx.quads = work, quads
@@ -94,26 +94,17 @@ class _Shade(torch.autograd.Function):
     def backward(ctx, by_color, by_normal, by_material, _):
         features, alpha, irradiance = ctx.saved_tensors
         library, work = kernels(), ctx.work
-        given = [g.contiguous() for g in (by_color, by_normal, by_material)]
-        work.by_color, work.by_normal, work.by_material = (g.data_ptr() for g in given)
         chunks = -(-work.height // work.chunk_rows)
-        by_features, by_alpha, by_levels = (
-            torch.empty_like(features),
-            torch.empty_like(alpha),
-            torch.empty(work.texels, 3),
-        )
-        halo = torch.empty(chunks * library.refgs_shade_halo_size(work.width, work.channels))
-        by_texels, by_irradiance = torch.empty(chunks, work.texels, 4), torch.empty(chunks, *irradiance.shape)
-        work.by_features, work.by_alpha, work.by_levels = (
-            by_features.data_ptr(),
-            by_alpha.data_ptr(),
-            by_levels.data_ptr(),
-        )
-        work.halo, work.by_chunk_texels, work.by_irradiance = (
-            halo.data_ptr(),
-            by_texels.data_ptr(),
-            by_irradiance.data_ptr(),
-        )
+        given = {"by_color": by_color.contiguous(), "by_normal": by_normal.contiguous()}
+        given["by_material"] = by_material.contiguous()
+        by_features, by_alpha = torch.empty_like(features), torch.empty_like(alpha)
+        by_levels, by_irradiance = torch.empty(work.texels, 3), torch.empty(chunks, *irradiance.shape)
+        buffers = {
+            "halo": torch.empty(chunks * library.refgs_shade_halo_size(work.width, work.channels)),
+            "by_chunk_texels": torch.empty(chunks, work.texels, 4),
+        }
+        work.attach(**given, **buffers, by_features=by_features, by_alpha=by_alpha)
+        work.attach(by_levels=by_levels, by_irradiance=by_irradiance)
         parallel(library.refgs_shade_backward, work)
         parallel(library.refgs_shade_gather, work)
         return by_features, by_alpha, by_levels, by_irradiance.sum(dim=0), None, None, None
