@@ -27,12 +27,12 @@ from refgs.model.environment import Environment
 from refgs.paths import clone_root
 from refgs.render.renderer import Rendering
 from refgs.report import metrics
-from refgs.run import Run, check_free, create_run, open_run, read_run_facts, write_text
+from refgs.run import check_free, create_run, open_run, read_run_facts, write_text
 from refgs.settings import load_settings
 from refgs.train.trainer import Trainer, composite
 
 console = Console(highlight=False, soft_wrap=True)
-PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha")
+PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha", "visibility")
 
 
 @contextmanager
@@ -125,6 +125,8 @@ def _images(rendering: Rendering) -> dict[str, np.ndarray]:
     if rendering.material is not None:
         images["color"] = np.dstack([rendering.radiance.numpy() * alpha[..., None], alpha])
         images |= {name: getattr(rendering, name).numpy() for name in ("albedo", "metallic", "roughness")}
+    if rendering.visibility is not None:
+        images["visibility"] = rendering.visibility.numpy()
     return images
 
 
@@ -162,7 +164,9 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path | None, format: str) -> None:
     """Write OUT/PASS/NAME.png or .exr for each camera."""
     run = open_run(folder)
-    known = [p for p in PASSES if run.environment is not None or p in ("color", "normal", "depth", "alpha")]
+    without = {"albedo", "roughness", "metallic"} if run.environment is None else set()
+    without |= {"visibility"} if run.occluder is None or hdri is not None else set()
+    known = [p for p in PASSES if p not in without]
     unknown = [p for p in passes if p not in known]
     if unknown:
         raise InputError(f"--passes {unknown[0]}: this run has {', '.join(known)}")
@@ -250,6 +254,8 @@ def _write_pictures(folder: Path, name: str, rendering: Rendering, photo: np.nda
     if rendering.material is not None:
         for what in ("albedo", "metallic", "roughness"):
             write_png(folder / what / f"{name}.png", _as_png(what, rendering, background))
+    if rendering.visibility is not None:
+        write_png(folder / "visibility" / f"{name}.png", _as_png("visibility", rendering, background))
 
 
 def update_metrics(folder: Path, facts: dict) -> None:
@@ -259,25 +265,14 @@ def update_metrics(folder: Path, facts: dict) -> None:
     write_text(file, json.dumps(known | facts, indent=1))
 
 
-def render_depths(run: Run) -> tuple[list[np.ndarray], list[np.ndarray], list[Camera]]:
-    """Depth and alpha maps of the training views, for fusion."""
-    cameras = run.training_cameras()
-    depths, alphas = [], []
-    for camera in cameras:
-        rendering = run.render(camera)
-        depths.append(rendering.depth.numpy())
-        alphas.append(rendering.alpha.numpy())
-    return depths, alphas, cameras
-
-
 def export(
     folder: Path, mesh_file: Path | None, texture: int | None, splats_file: Path | None, overwrite: bool
 ) -> None:
     """Fuse, clean, unwrap, bake; write the mesh and its textures."""
     from refgs.export.bake import bake, unwrap
     from refgs.export.mesh import write_glb
-    from refgs.geometry.mesh import clean
-    from refgs.geometry.tsdf import fuse
+    from refgs.geometry.extract import extract
+    from refgs.geometry.mesh import clean, is_crumbs
 
     run = open_run(folder)
     target = mesh_file or folder / "mesh.glb"
@@ -288,10 +283,15 @@ def export(
         write_splats(splats_file, run.splats)
         console.print(f"splats: {splats_file}")
     settings = run.settings.mesh
-    mesh = fuse(*render_depths(run), run.centre, run.radius, settings.resolution)
+    mesh = extract(run.render, run.training_cameras(), run.centre, run.radius, settings.resolution)
     console.print(f"fused {len(mesh.faces):,} triangles")
     mesh = clean(mesh, settings.triangles)
     console.print(f"simplified to {len(mesh.faces):,} triangles; unwrapping")
+    if is_crumbs(mesh):
+        console.print(
+            "warning: the mesh is in many pieces, none of them half of it: the photos do not agree on a surface; "
+            "give them masks of the object, or take more of them"
+        )
     mesh = unwrap(mesh)
     textures = bake(mesh, run.splats, texture or settings.texture)
     write_glb(target, mesh, textures)

@@ -16,10 +16,14 @@ from refgs.capture import Capture, read_run_cameras, write_cameras
 from refgs.errors import InputError
 from refgs.export.environment import read_environment
 from refgs.export.splats import Splats, read_splats
+from refgs.geometry.mesh import read_mesh
+from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, from_splats
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.settings import Settings, recorded_settings
+
+OCCLUDER = "occluder.ply"  # the mesh that inter-reflection was traced on, where there was any
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,7 @@ class Run:
     to_capture: np.ndarray
     splats: Splats
     environment: Environment | None
+    occluder: Occluder | None
 
     def surfels(self) -> Surfels:
         """The asset's surfels as tensors."""
@@ -50,7 +55,8 @@ class Run:
         return [c.fitted(side) for c, split in zip(self.cameras, self.splits, strict=True) if split == "train"]
 
     def render(self, camera: Camera, environment: Environment | None = None) -> Rendering:
-        """Render a camera of the run's frame, under another light where one is given."""
+        """Render a camera of the run's frame, under another light where one is given: without inter-reflection then,
+        as the surfels know what they mirror of each other under the recovered light alone."""
         with torch.no_grad():
             return render(
                 self.surfels(),
@@ -59,6 +65,7 @@ class Run:
                 torch.tensor(self.settings.image.background),
                 self.settings.render,
                 self.near,
+                self.occluder if environment is None else None,
             )
 
 
@@ -133,6 +140,7 @@ def open_run(folder: Path) -> Run:
         to_capture=to_capture,
         splats=read_splats(folder / "splats.ply"),
         environment=environment,
+        occluder=Occluder(read_mesh(folder / OCCLUDER)) if (folder / OCCLUDER).exists() else None,
     )
 
 

@@ -47,6 +47,15 @@ class TrainSettings(_Section):
     seed: int = Field(ge=0)
 
 
+class IndirectSettings(_Section):
+    start: float = Field(
+        ge=0, le=1, description="part of the training after which inter-reflection joins; 1 does without"
+    )
+    every: int = Field(ge=1, description="iterations between meshes")
+    resolution: int = Field(ge=16, le=1024, description="voxels along each side of the mesh's volume")
+    least: float = Field(ge=0, le=1, description="part of the object that must mirror the object, else it is left out")
+
+
 class RateSettings(_Section):
     """Adam's learning rates, at the start; `decay` is the factor reached at the end. Position is in scene radii."""
 
@@ -59,6 +68,8 @@ class RateSettings(_Section):
     albedo: float = Field(ge=0)
     metallic: float = Field(ge=0)
     roughness: float = Field(ge=0)
+    indirect_dc: float = Field(ge=0)
+    indirect_rest: float = Field(ge=0)
     environment: float = Field(ge=0)
     decay: float = Field(gt=0, le=1, description="every rate's factor at the end of the training")
 
@@ -94,6 +105,7 @@ class Settings(_Section):
     surfels: SurfelSettings
     environment: EnvironmentSettings
     train: TrainSettings
+    indirect: IndirectSettings
     rates: RateSettings
     loss: LossSettings
     densify: DensifySettings

@@ -1,4 +1,4 @@
-"""A metal ball under a smooth sky, photographed by a formula: a capture whose every answer is known, made without Blender."""
+"""Metal balls under a smooth sky, photographed by a formula: a capture whose every answer is known, made without Blender."""
 
 import json
 from pathlib import Path
@@ -10,6 +10,9 @@ from refgs.color import srgb_encode
 
 VIEWS, DISTANCE, ANGLE = 24, 4.0, 0.7  # training views, radii, radians
 F0 = np.array([0.9, 0.6, 0.3])
+BOUNCES = 4
+ONE = np.array([[0.0, 0.0, 0.0, 1.0]])
+TWO = np.array([[-0.6, 0.0, 0.0, 0.5], [0.6, 0.0, 0.0, 0.5]])
 
 
 def sky(direction: np.ndarray) -> np.ndarray:
@@ -18,25 +21,38 @@ def sky(direction: np.ndarray) -> np.ndarray:
     return np.stack([0.5 + 0.3 * z + 0.2 * x, 0.5 + 0.35 * z + 0.1 * y, 0.5 + 0.4 * z - 0.2 * x], axis=-1)
 
 
-def ball_photo(matrix: np.ndarray, size: int, samples: int = 4) -> np.ndarray:
-    """RGBA in 0..1 of the unit ball, mirror reflection with Schlick's Fresnel; alpha by `samples`² rays a pixel."""
+def _meet(origin: np.ndarray, ray: np.ndarray, balls: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether unit rays (P, 3) meet a ball (P,), and where they first do (P, 3), with the normal there (P, 3)."""
+    apart = origin[:, None] - balls[:, :3]
+    b = (apart * ray[:, None]).sum(-1)
+    inside = b * b - ((apart**2).sum(-1) - balls[:, 3] ** 2)
+    way = -b - np.sqrt(np.maximum(inside, 0))
+    way[(inside <= 0) | (way < 1e-9)] = np.inf
+    first = way.argmin(axis=1)
+    hit = np.isfinite(way.min(axis=1))
+    point = origin + np.where(hit, way.min(axis=1), 0)[:, None] * ray
+    return hit, point, (point - balls[first, :3]) / balls[first, 3:]
+
+
+def photo(matrix: np.ndarray, size: int, balls: np.ndarray = ONE, samples: int = 4) -> np.ndarray:
+    """RGBA in 0..1 of balls (B, 4), centre and radius: mirrors with Schlick's Fresnel; alpha by `samples`² rays a pixel."""
     focal = 0.5 * size / np.tan(ANGLE / 2)
     grid = (np.arange(size * samples) + 0.5) / samples
     x, y = np.meshgrid(grid - size / 2, grid - size / 2)
-    ray = np.stack([x / focal, -y / focal, -np.ones_like(x)], axis=-1) @ matrix[:3, :3].T
+    ray = np.stack([x / focal, -y / focal, -np.ones_like(x)], axis=-1).reshape(-1, 3) @ matrix[:3, :3].T
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    origin = matrix[:3, 3]
-    b = ray @ origin
-    inside = b * b - (origin @ origin - 1)
-    hit = inside > 0
-    normal = origin + (-b - np.sqrt(np.maximum(inside, 0)))[..., None] * ray
-    cosine = -(normal * ray).sum(-1, keepdims=True)
-    mirrored = ray + 2 * cosine * normal
-    fresnel = F0 + (1 - F0) * (1 - cosine.clip(0, 1)) ** 5
-    color = np.where(hit[..., None], fresnel * sky(mirrored), 0)
+    origin, share = np.broadcast_to(matrix[:3, 3], ray.shape), np.ones_like(ray)
+    for bounce in range(BOUNCES):
+        hit, point, normal = _meet(origin, ray, balls)
+        if bounce == 0:
+            seen = hit
+        cosine = -(normal * ray).sum(-1, keepdims=True).clip(-1, 0)
+        share = np.where(hit[:, None], share * (F0 + (1 - F0) * (1 - cosine) ** 5), share)
+        origin, ray = point, np.where(hit[:, None], ray + 2 * cosine * normal, ray)
+    color = np.where(seen[:, None], share * sky(ray), 0)
     blocks = (size, samples, size, samples)
-    alpha = hit.reshape(blocks).mean(axis=(1, 3))
-    color = color.reshape(*blocks, 3).sum(axis=(1, 3)) / np.maximum(hit.reshape(blocks).sum(axis=(1, 3)), 1)[..., None]
+    alpha = seen.reshape(blocks).mean(axis=(1, 3))
+    color = color.reshape(*blocks, 3).sum(axis=(1, 3)) / np.maximum(seen.reshape(blocks).sum(axis=(1, 3)), 1)[..., None]
     return np.dstack([srgb_encode(color).clip(0, 1), alpha])
 
 
@@ -50,8 +66,8 @@ def camera_matrix(direction: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def write_ball_capture(folder: Path, size: int, samples: int = 4) -> None:
-    """A NeRF-Blender capture of the ball: 24 training and 4 test views."""
+def write_ball_capture(folder: Path, size: int, balls: np.ndarray = ONE, samples: int = 4) -> None:
+    """A NeRF-Blender capture of balls: 24 training and 4 test views."""
     steps = np.arange(VIEWS + 4) + 0.5
     z = 0.9 - 1.5 * steps / len(steps)
     azimuth = steps * np.pi * (3 - np.sqrt(5))
@@ -61,7 +77,7 @@ def write_ball_capture(folder: Path, size: int, samples: int = 4) -> None:
         split = "test" if i % 7 == 3 else "train"
         matrix = camera_matrix(direction)
         (folder / split).mkdir(exist_ok=True, parents=True)
-        pixels = np.rint(ball_photo(matrix, size, samples) * 255).astype(np.uint8)
+        pixels = np.rint(photo(matrix, size, balls, samples) * 255).astype(np.uint8)
         Image.fromarray(pixels).save(folder / split / f"r_{i}.png")
         frames[split].append({"file_path": f"./{split}/r_{i}", "transform_matrix": matrix.tolist()})
     for split, entries in frames.items():

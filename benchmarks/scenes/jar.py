@@ -1,4 +1,4 @@
-"""A lidded urn of gold, copper and glazed ceramic with a dark band: polished, partly concave, several materials."""
+"""A lidded urn of gold, copper and glazed ceramic with a dark band, in a room: shiny, partly concave, several materials."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ from benchmarks.scenes.shapes import Material, Scene, join, lathe, tube
 
 GOLD, COPPER, IRON, CERAMIC = range(4)
 MATERIALS = (
-    Material((0.944, 0.720, 0.330), metallic=1.0, roughness=0.16),
-    Material((0.920, 0.480, 0.330), metallic=1.0, roughness=0.12),
+    Material((0.944, 0.720, 0.330), metallic=1.0, roughness=0.25),
+    Material((0.920, 0.480, 0.330), metallic=1.0, roughness=0.25),
     Material((0.130, 0.125, 0.130), metallic=1.0, roughness=0.45),
-    Material((0.020, 0.180, 0.220), metallic=0.0, roughness=0.20),
+    Material((0.020, 0.180, 0.220), metallic=0.0, roughness=0.25),
 )
 PROFILE = [
     (
@@ -31,7 +31,7 @@ def build() -> Scene:
     """The urn, two units high, 0.8 from the axis to the handles."""
     side = np.array([(x, 0.0, z) for x, z in HANDLE])
     handles = [tube(side * (sign, 1, 1), 0.045, COPPER, closed=False) for sign in (1, -1)]
-    return Scene(join(lathe(PROFILE, rows=320, columns=288, flutes=_flutes), *handles), MATERIALS, light="sunset")
+    return Scene(join(lathe(PROFILE, rows=320, columns=288, flutes=_flutes), *handles), MATERIALS, light="interior")
 
 
 def _flutes(angle: np.ndarray, z: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from refgs.errors import InputError
 from refgs.export.splats import Splats, read_splats, write_splats
 
 
-def make(count=7, coefficients=16):
+def make(count=7, coefficients=16, indirect=0):
     rng = np.random.default_rng(1)
 
     def f(*shape):
@@ -22,12 +22,14 @@ def make(count=7, coefficients=16):
         albedo=f(count, 3),
         metallic=f(count),
         roughness=f(count),
+        indirect=f(count, indirect, 3),
     )
 
 
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-def test_round_trip(tmp_path, coefficients):
-    splats = make(coefficients=coefficients)
+@pytest.mark.parametrize("indirect", [0, 16])
+def test_round_trip(tmp_path, coefficients, indirect):
+    splats = make(coefficients=coefficients, indirect=indirect)
     path = tmp_path / "a run, été.ply"
     write_splats(path, splats)
     again = read_splats(path)

@@ -3,7 +3,7 @@ import pytest
 import trimesh
 
 from refgs.errors import InputError
-from refgs.geometry.mesh import Mesh, clean, smooth_normals
+from refgs.geometry.mesh import Mesh, clean, is_crumbs, smooth_normals
 
 
 def as_mesh(*parts):
@@ -24,6 +24,13 @@ def test_floaters_go_and_large_parts_stay():
     assert parts(mesh) == 2
     assert mesh.vertices[:, 1].max() < 1.01 and mesh.vertices[:, 0].max() > 3.4
     assert mesh.faces.max() == len(mesh.vertices) - 1
+
+
+def test_crumbs_are_known_from_things_of_several_parts():
+    row = [ball(at=(3 * i, 0, 0), level=1) for i in range(20)]
+    assert is_crumbs(as_mesh(*row))
+    assert not is_crumbs(as_mesh(*row[:5]))
+    assert not is_crumbs(as_mesh(ball(radius=5, at=(0, 9, 0)), *row))
 
 
 def test_simplification_keeps_shape_winding_and_budget():

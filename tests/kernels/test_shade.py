@@ -9,7 +9,8 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.kernels import load, reference
 from refgs.model.environment import Environment
-from refgs.render.shade import shade
+from refgs.render.renderer import camera_rays
+from refgs.render.shade import mirror_directions, shade
 from tests.kernels import scenes
 
 NAMES = ("features", "alpha", "levels", "irradiance")
@@ -30,8 +31,9 @@ class Light:
         self.irradiance = (exact.irradiance + 0.3 * torch.randn(9, 3, generator=generator)).to(dtype).requires_grad_()
 
 
-def means(camera: Camera, appearance: bool) -> tuple[Tensor, Tensor]:
-    """Random maps that change over five pixels, displaced by up to ten; a third is empty."""
+def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
+    """Random maps that change over five pixels, displaced by up to ten; a third is empty. With so many colours between
+    material and position."""
     generator = torch.Generator().manual_seed(1)
 
     def smooth(values: Tensor) -> Tensor:
@@ -50,33 +52,50 @@ def means(camera: Camera, appearance: bool) -> tuple[Tensor, Tensor]:
     point = torch.cat([(at - middle) / focal * depth, depth], dim=-1)
     position = (point - view[:3, 3]) @ view[:3, :3]
     normal = (-view[2, :3] + uniform(3, -0.7, 0.7)) * uniform(1, 0.5, 1)
-    parts = [normal, uniform(5), *([uniform(3, 0, 2)] if appearance else []), position]
+    parts = [normal, uniform(5), *([uniform(3 * colours, 0, 2)] if colours else []), position]
     alpha = (uniform(1, -0.5, 1).clamp_min(0))[..., 0]
     return torch.cat(parts, dim=-1), alpha
 
 
+def visible(alpha: Tensor) -> Tensor:
+    """Free, hidden, and between."""
+    return (2 * torch.rand(alpha.shape, generator=torch.Generator().manual_seed(4)) - 0.5).clamp(0, 1)
+
+
 @functools.cache
-def case(appearance: bool, size: tuple[int, int]):
+def case(appearance: bool, indirect: bool, size: tuple[int, int]):
     camera = scenes.camera(*size)
-    mean, alpha = means(camera, appearance)
+    mean, alpha = means(camera, appearance + indirect)
     inputs = (mean * alpha[..., None], alpha)
     light = Light(torch.float64)
     exact = [*(v.double().requires_grad_() for v in inputs), light.levels, light.irradiance]
-    *maps, margin = reference.shade(*exact[:3], light.sides, exact[3], camera, BACKGROUND.double())
+    visibility = visible(alpha) if indirect else None
+    *maps, margin = reference.shade(
+        *exact[:3],
+        light.sides,
+        exact[3],
+        camera,
+        BACKGROUND.double(),
+        None if visibility is None else visibility.double(),
+    )
     safe = margin > MARGIN
     generator = torch.Generator().manual_seed(3)
     upstream = [torch.randn(m.shape, generator=generator) * safe[..., None] for m in maps[:3]]
     wanted = exact[: 3 if appearance else 4]  # with appearance nothing reads the irradiance
     gradients = torch.autograd.grad(maps[:3], wanted, [u.double() for u in upstream])
-    return camera, inputs, [m.detach() for m in maps], safe, upstream, gradients
+    return camera, inputs, visibility, [m.detach() for m in maps], safe, upstream, gradients
 
 
 def run(
-    camera: Camera, inputs: tuple[Tensor, ...], upstream: list[Tensor], count: int = 4
+    camera: Camera,
+    inputs: tuple[Tensor, ...],
+    visibility: Tensor | None,
+    upstream: list[Tensor],
+    count: int = 4,
 ) -> tuple[list[Tensor], tuple]:
     light = Light(torch.float32)
     leaves = [*(v.clone().requires_grad_() for v in inputs), light.levels, light.irradiance]
-    shaded = shade(*leaves[:2], light, camera, BACKGROUND)
+    shaded = shade(*leaves[:2], light, camera, BACKGROUND, visibility)
     gradients = torch.autograd.grad(shaded[:3], leaves[:count], upstream)
     return [s.detach() for s in shaded], gradients
 
@@ -84,11 +103,12 @@ def run(
 @pytest.mark.parametrize("isa", load.supported())
 @pytest.mark.parametrize("size", [(45, 30), (37, 70), (9, 4)])
 @pytest.mark.parametrize("appearance", [False, True])
-def test_matches_reference(appearance, size, isa, monkeypatch):
+@pytest.mark.parametrize("indirect", [False, True])
+def test_matches_reference(indirect, appearance, size, isa, monkeypatch):
     monkeypatch.setenv("REFGS_ISA", isa)
-    camera, inputs, maps, safe, upstream, gradients = case(appearance, size)
+    camera, inputs, visibility, maps, safe, upstream, gradients = case(appearance, indirect, size)
     assert safe.float().mean() > 0.9
-    found, by = run(camera, inputs, upstream, len(gradients))
+    found, by = run(camera, inputs, visibility, upstream, len(gradients))
     for value, expected in zip(found, maps, strict=True):
         error = (value - expected)[safe].abs().max() / expected.abs().max()
         assert error <= FORWARD
@@ -97,11 +117,24 @@ def test_matches_reference(appearance, size, isa, monkeypatch):
         assert error <= GRADIENT, (name, error.item())
 
 
+@pytest.mark.parametrize("isa", load.supported())
+def test_mirror_directions(isa, monkeypatch):
+    """Of the reference's blended normals."""
+    monkeypatch.setenv("REFGS_ISA", isa)
+    camera, (features, alpha), _, maps, _, _, _ = case(False, True, (37, 70))
+    covered = alpha > reference.COVERED
+    normal, ray = reference.unit(maps[1][covered]), reference.unit(camera_rays(camera)[covered].double())
+    expected = ray - 2 * (ray * normal).sum(dim=-1, keepdim=True) * normal
+    found = mirror_directions(features, alpha, camera)
+    assert (found[covered] - expected).abs().max() <= FORWARD
+    assert found[~covered].eq(0).all()
+
+
 def test_same_bits_for_any_number_of_threads():
-    camera, inputs, _, _, upstream, _ = case(False, (37, 70))
+    camera, inputs, visibility, _, _, upstream, _ = case(False, True, (37, 70))
 
     def all_of_it() -> list[Tensor]:
-        maps, gradients = run(camera, inputs, upstream)
+        maps, gradients = run(camera, inputs, visibility, upstream)
         return [*maps, *gradients]
 
     scenes.check_same_bits_for_any_number_of_threads(all_of_it)

@@ -17,7 +17,8 @@ class Splats:
     positions (N, 3), normals (N, 3) unit and pointing outward where that is known, sh (N, K, 3) spherical harmonics
     with K = (degree + 1)² and colour = 0.5 + SH (the 3DGS convention), opacities (N,) in 0..1, scales (N, 2) standard
     deviations in world units, rotations (N, 4) unit quaternions wxyz, albedo (N, 3) linear Rec.709, metallic (N,) and
-    perceptual roughness (N,) in 0..1.
+    perceptual roughness (N,) in 0..1, indirect (N, K', 3) spherical harmonics of the linear radiance that comes from the
+    object itself; K' is 0 where a scene does without.
     """
 
     positions: np.ndarray
@@ -29,6 +30,7 @@ class Splats:
     albedo: np.ndarray
     metallic: np.ndarray
     roughness: np.ndarray
+    indirect: np.ndarray
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -59,8 +61,10 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
         splats.albedo,
         splats.metallic,
         splats.roughness,
+        splats.indirect.transpose(0, 2, 1).reshape(count, -1),
     ]
     names = [*_HEAD, *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))), *_TAIL, *_MATERIAL]
+    names += [f"ind_{i}" for i in range(3 * splats.indirect.shape[1])]
     table = np.concatenate([np.reshape(c, (count, -1)) for c in columns], axis=1).astype("<f4")
     rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names])[:, 0]
     temporary = path.with_name(path.name + ".tmp")
@@ -84,32 +88,32 @@ def read_splats(path: str | os.PathLike) -> Splats:
     missing = [name for name in [*_HEAD, *_TAIL, *_MATERIAL] if name not in names]
     if missing:
         raise InputError(f"{path} lacks {', '.join(missing)}: it is not a splats.ply that RefGS wrote")
-    rest = sum(name.startswith("f_rest_") for name in names)
-    if rest not in (0, 9, 24, 45):
-        raise InputError(
-            f"{path} has {rest} f_rest values a splat: spherical harmonics of degree 0 to 3 have 0, 9, 24, 45"
-        )
 
     def columns(*wanted: str) -> np.ndarray:
         return np.stack([np.asarray(vertex[name], np.float32) for name in wanted], axis=1)
 
-    higher = columns(*(f"f_rest_{i}" for i in range(rest))) if rest else np.zeros((vertex.count, 0), np.float32)
+    def harmonics(prefix: str, *known: int) -> np.ndarray:
+        """(N, K, 3) from the channel-major values of a name, which must be as many as some degree has."""
+        values = sum(name.startswith(prefix) for name in names)
+        if values not in known:
+            numbers = ", ".join(map(str, known))
+            raise InputError(f"{path} has {values} {prefix} values a splat: spherical harmonics have {numbers}")
+        if values == 0:
+            return np.zeros((vertex.count, 0, 3), np.float32)
+        table = columns(*(f"{prefix}{i}" for i in range(values)))
+        return table.reshape(vertex.count, 3, values // 3).transpose(0, 2, 1)
+
     splats = Splats(
         positions=columns("x", "y", "z"),
         normals=columns("nx", "ny", "nz"),
-        sh=np.concatenate(
-            [
-                columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None],
-                higher.reshape(vertex.count, 3, rest // 3).transpose(0, 2, 1),
-            ],
-            axis=1,
-        ),
+        sh=np.concatenate([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], harmonics("f_rest_", 0, 9, 24, 45)], axis=1),
         opacities=1 / (1 + np.exp(-columns("opacity")[:, 0])),
         scales=np.exp(columns("scale_0", "scale_1")),
         rotations=columns("rot_0", "rot_1", "rot_2", "rot_3"),
         albedo=columns("albedo_r", "albedo_g", "albedo_b"),
         metallic=columns("metallic")[:, 0],
         roughness=columns("roughness")[:, 0],
+        indirect=harmonics("ind_", 0, 3, 12, 27, 48),
     )
     for field in fields(splats):
         if not np.isfinite(getattr(splats, field.name)).all():

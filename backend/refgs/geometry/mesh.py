@@ -1,6 +1,8 @@
 """Triangle meshes and their clean-up."""
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import fast_simplification
 import numpy as np
@@ -24,6 +26,26 @@ class Mesh:
         return cls(np.zeros((0, 3)), np.zeros((0, 3), np.int64))
 
 
+def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
+    """Write vertices and faces as a binary PLY, whole or not at all."""
+    path = Path(path)
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        temporary.write_bytes(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply"))
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_mesh(path: str | os.PathLike) -> Mesh:
+    """Read what `write_mesh` wrote. Raises InputError for a file that is broken."""
+    try:
+        mesh = trimesh.load_mesh(path, file_type="ply", process=False)
+        return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces))
+    except Exception as error:  # trimesh raises what its parsing ran into
+        raise InputError(f"{path} is not a whole PLY file of a mesh ({error}): train again") from None
+
+
 def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
     """The mesh without what is not the object, with at most about `triangles` faces, and smooth normals.
 
@@ -40,7 +62,8 @@ def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
             "the depth maps have no surface in common, so there is no mesh: check that the renderings show the object "
             "and that it lies in the region of interest"
         )
-    work = _largest_parts(work, keep)
+    part, areas = _parts(work)
+    work.update_faces((areas >= keep * areas.max())[part])
     if len(work.faces) > triangles:
         # The gentlest setting that reaches the budget: on a sphere, 3 leaves normals 0.1° off and 7 (the library's own
         # choice) 0.5°, with some vertices at 30°; on a very noisy mesh 3 stops early.
@@ -58,11 +81,16 @@ def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
     return Mesh(vertices, faces, smooth_normals(vertices, faces))
 
 
-def _largest_parts(mesh: trimesh.Trimesh, keep: float) -> trimesh.Trimesh:
-    parts = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
-    area = np.bincount(parts, mesh.area_faces)
-    mesh.update_faces((area >= keep * area.max())[parts])
-    return mesh
+def is_crumbs(mesh: Mesh, many: int = 10) -> bool:
+    """Whether a mesh is hardly a surface: more than so many connected parts, none of which has half of the area."""
+    _, areas = _parts(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
+    return len(areas) > many and areas.max() < areas.sum() / 2
+
+
+def _parts(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    """The connected part of each face (F,), and the parts' areas."""
+    part = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
+    return part, np.bincount(part, mesh.area_faces)
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -95,6 +95,7 @@ def shade(
     irradiance: Tensor,
     camera: Camera,
     background: Tensor,
+    visibility: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """As refgs.render.shade.shade, for float64 tensors; and how far each pixel (H, W) is from a kink of the derivatives,
     in the units of what has the kink. Bilinear look-ups have one at every texel."""
@@ -110,10 +111,13 @@ def shade(
     dot = (normal * towards).sum(dim=-1)
     n_v = dot.clamp(1e-4, 1)
     light = specular(levels, sides, 2 * dot[:, None] * normal - towards, roughness, margins)
+    if visibility is not None:  # Eq. 9
+        free = visibility[pixels][:, None]
+        light = free * light + (1 - free) * maps[:, -3:]
     fg0, fg1 = (f[:, None] for f in fg(n_v, roughness, margins))
     metal = metallic[:, None]
     f0 = DIELECTRIC_F0 * (1 - metal) + albedo * metal
-    if features.shape[-1] > 11:
+    if features.shape[-1] > 11 + 3 * (visibility is not None):
         diffuse = (1 - metal) * maps[:, 8:11]
     else:
         received = harmonics.basis(normal, 2) @ irradiance

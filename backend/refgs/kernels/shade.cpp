@@ -1,4 +1,4 @@
-// Maps to a picture and back: deferred shading of what the rasteriser blended (paper Eq. 5-8).
+// Maps to a picture and back: deferred shading of what the rasteriser blended (paper Eq. 5-10).
 //
 // Pixels that nothing covers cost nothing: the others are taken LANES at a time, wherever they lie. The picture is worked on in
 // chunks of rows whose size does not depend on the threads, and sums are taken in the chunks' order, so neither does any result.
@@ -12,19 +12,22 @@ constexpr float SHIFT_LIMIT = 8;            // pixels
 constexpr float SHIFT_ALPHA = 0.3f;         // a silhouette's blended position says nothing about its surface
 constexpr float DIELECTRIC_F0 = 0.04f;
 constexpr int HALO = (int)SHIFT_LIMIT + 1;  // rows that a displaced look-up reaches beyond its own
-constexpr int NORMAL = 0, ALBEDO = 3, METALLIC = 6, ROUGHNESS = 7, APPEARANCE = 8;  // channels; three of position come last
+constexpr int NORMAL = 0, ALBEDO = 3, METALLIC = 6, ROUGHNESS = 7;  // channels; Shaded has those that may follow
 
 struct Shade {
   int64_t width, height, channels, chunk_rows;
   double view[12];  // world to camera, 3x4, row-major
   double fx, fy, cx, cy;
   float background[3];
+  int64_t harmonics;              // whether there are channels of colour by direction
   const float *features, *alpha;  // (height, width, channels), (height, width): sums over a pixel's splats
+  const float* visibility;        // (height, width): 0 where the object itself stands in the mirror direction; or null
   Levels levels;
   int64_t texels;
   const float* irradiance;  // (9, 3)
   const float* fg;          // (2, fg_side, fg_side)
   int64_t fg_side;
+  float *mirrored;                                        // (height, width, 3)
   float *color, *normal, *material, *radiance;            // (height, width, 3 | 3 | 5 | 3)
   const float *by_color, *by_normal, *by_material;
   float *by_features, *by_alpha;
@@ -34,6 +37,10 @@ struct Shade {
   float* scratch;                          // none is used
   Shared shared;
 };
+
+void zero(float* p, int64_t n) {
+  for (int64_t i = 0; i < n; i++) p[i] = 0;
+}
 
 int64_t chunks(const Shade& s) { return (s.height + s.chunk_rows - 1) / s.chunk_rows; }
 int64_t last_row(const Shade& s, int64_t chunk) {
@@ -188,13 +195,27 @@ struct Displaced {
   }
 };
 
-// The split sum over a metallic-roughness material, of LANES pixels with C channels.
-template <int C>
+INLINE Vector inverse_norm(Vectors n) { return 1.0f / root(dot(n, n) + 1e-24f); }
+
+INLINE Vectors towards_camera(const Shade& s, const int64_t* at) {
+  const double* m = s.view;
+  Vector x, y;
+  for (int k = 0; k < LANES; k++) {
+    x[k] = (float)((s.cx - 0.5 - (double)(at[k] % s.width)) / s.fx), y[k] = (float)((s.cy - 0.5 - (double)(at[k] / s.width)) / s.fy);
+  }
+  auto along = [&](int i) { return x * (float)m[i] + y * (float)m[4 + i] - (float)m[8 + i]; };
+  Vectors v = {along(0), along(1), along(2)};
+  return inverse_norm(v) * v;
+}
+
+// The split sum over a metallic-roughness material, of LANES pixels. HARMONICS: colour by direction in place of the reflected
+// irradiance. INDIRECT: light from the object itself where it stands in the mirror direction (Eq. 9).
+template <bool HARMONICS, bool INDIRECT>
 struct Shaded {
-  static constexpr int S = C - 3;
-  static constexpr bool HARMONICS = S > APPEARANCE;  // colour by direction in place of the reflected irradiance
+  static constexpr int APPEARANCE = HARMONICS ? 8 : 0, FROM_OBJECT = INDIRECT ? 8 + 3 * HARMONICS : 0;  // channels
+  static constexpr int C = 11 + 3 * HARMONICS + 3 * INDIRECT, S = C - 3;
   Displaced<C> map;
-  Vector inverse_length, n_dot_v, coat;
+  Vector inverse_length, n_dot_v, coat, visibility;
   Vectors normal, view;
   Lookup lookup;
   Irradiance irradiance;
@@ -213,9 +234,16 @@ struct Shaded {
     Vector metallic = v[METALLIC];
     Vectors l = lookup.light(s.levels);
     light[0] = l.x, light[1] = l.y, light[2] = l.z;
+    visibility = Vector() + 1.0f;
+    if (INDIRECT) {
+      Vector free[1];
+      gather<1>(s.visibility, at, free);
+      visibility = free[0];
+      for (int c = 0; c < 3; c++) light[c] = visibility * light[c] + (1.0f - visibility) * v[FROM_OBJECT + c];
+    }
     coat = 1.0f - DIELECTRIC_F0 * fg.value[0] - fg.value[1];
     for (int c = 0; c < 3; c++) {
-      received[c] = HARMONICS ? v[HARMONICS ? APPEARANCE + c : 0] : irradiance.value(s.irradiance, c);
+      received[c] = HARMONICS ? v[APPEARANCE + c] : irradiance.value(s.irradiance, c);
       Vector diffuse = (1.0f - metallic) * received[c];
       if (!HARMONICS) diffuse *= coat * v[ALBEDO + c];
       radiance[c] = light[c] * (f0(c) * fg.value[0] + fg.value[1]) + diffuse;
@@ -248,12 +276,16 @@ struct Shaded {
       by_alpha += by_c * (encoded[c] - s.background[c]);
       Vector by_radiance = by_c * map.alpha * slope[c];
       by_light[c] = by_radiance * (f0(c) * fg.value[0] + fg.value[1]);
+      if (INDIRECT) {
+        by[FROM_OBJECT + c] = (1.0f - visibility) * by_light[c];
+        by_light[c] *= visibility;
+      }
       Vector reflected = by_radiance * light[c], by_f0 = reflected * fg.value[0];
       by_fg[0] += reflected * f0(c), by_fg[1] += reflected;
       by[ALBEDO + c] = by_material[c] + by_f0 * metallic;
       by[METALLIC] += by_f0 * (v[ALBEDO + c] - DIELECTRIC_F0);
       if (HARMONICS) {
-        by[HARMONICS ? APPEARANCE + c : 0] = by_radiance * (1.0f - metallic);
+        by[APPEARANCE + c] = by_radiance * (1.0f - metallic);
         by[METALLIC] -= by_radiance * received[c];
       } else {
         Vector by_diffuse = by_radiance * received[c], base = (1.0f - metallic) * coat;
@@ -281,19 +313,6 @@ struct Shaded {
  private:
   MEMBER Vector f0(int c) const { return DIELECTRIC_F0 * (1.0f - map.value[METALLIC]) + map.value[ALBEDO + c] * map.value[METALLIC]; }
 
-  static MEMBER Vector inverse_norm(Vectors n) { return 1.0f / root(dot(n, n) + 1e-24f); }
-
-  static MEMBER Vectors towards_camera(const Shade& s, const int64_t* at) {
-    const double* m = s.view;
-    Vector x, y;
-    for (int k = 0; k < LANES; k++) {
-      x[k] = (float)((s.cx - 0.5 - (double)(at[k] % s.width)) / s.fx), y[k] = (float)((s.cy - 0.5 - (double)(at[k] / s.width)) / s.fy);
-    }
-    auto along = [&](int i) { return x * (float)m[i] + y * (float)m[4 + i] - (float)m[8 + i]; };
-    Vectors v = {along(0), along(1), along(2)};
-    return inverse_norm(v) * v;
-  }
-
   MEMBER Vectors mirrored() {
     n_dot_v = dot(normal, view);
     return 2.0f * n_dot_v * normal - view;
@@ -301,27 +320,37 @@ struct Shaded {
 };
 
 template <int C>
+void mirrored_rows(const Shade& s, int64_t first, int64_t end) {
+  zero(s.mirrored + 3 * first * s.width, 3 * (end - first) * s.width);
+  each_covered(s, first, end, [&](const int64_t* at, int count) {
+    Displaced<C> map(s, at);
+    Vectors normal = {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]}, view = towards_camera(s, at);
+    normal = inverse_norm(normal) * normal;
+    Vectors m = 2.0f * dot(normal, view) * normal - view;
+    scatter<3>(s.mirrored, at, count, {m.x, m.y, m.z});
+  });
+}
+
+template <bool HARMONICS, bool INDIRECT>
 void forward_rows(const Shade& s, int64_t first, int64_t end) {
   for (int64_t i = first * s.width; i < end * s.width; i++) {
     for (int c = 0; c < 3; c++) s.color[3 * i + c] = s.background[c], s.normal[3 * i + c] = s.radiance[3 * i + c] = 0;
     for (int c = 0; c < 5; c++) s.material[5 * i + c] = 0;
   }
-  each_covered(s, first, end, [&](const int64_t* at, int count) { Shaded<C>(s, at).write(s, count); });
+  each_covered(s, first, end, [&](const int64_t* at, int count) { Shaded<HARMONICS, INDIRECT>(s, at).write(s, count); });
 }
 
-void zero(float* p, int64_t n) {
-  for (int64_t i = 0; i < n; i++) p[i] = 0;
-}
-
-template <int C>
+template <bool HARMONICS, bool INDIRECT>
 void backward_chunk(const Shade& s, int64_t chunk) {
+  using Pixels = Shaded<HARMONICS, INDIRECT>;
+  constexpr int C = Pixels::C;
   int64_t first = chunk * s.chunk_rows, end = last_row(s, chunk);
   zero(s.by_features + first * s.width * C, (end - first) * s.width * C);
   zero(s.by_alpha + first * s.width, (end - first) * s.width);
   zero(s.halo + chunk * 2 * HALO * s.width * (C - 2), 2 * HALO * s.width * (C - 2));
   zero(s.by_chunk_texels + chunk * 4 * s.texels, 4 * s.texels);
   Vector by_irradiance[27] = {};
-  each_covered(s, first, end, [&](const int64_t* at, int count) { Shaded<C>(s, at).backward(s, chunk, count, by_irradiance); });
+  each_covered(s, first, end, [&](const int64_t* at, int count) { Pixels(s, at).backward(s, chunk, count, by_irradiance); });
   for (int i = 0; i < 27; i++) s.by_irradiance[chunk * 27 + i] = total(by_irradiance[i]);
 }
 
@@ -348,14 +377,22 @@ constexpr int TEXELS = 1024;   // at a time
 EXPORT int64_t refgs_shade_halo_size(int64_t width, int64_t channels) { return 2 * HALO * width * (channels - 2); }
 
 // parallel
+EXPORT void refgs_shade_mirrored(Shade* s) {
+  auto* rows = s->channels == 14 ? mirrored_rows<14> : mirrored_rows<17>;
+  for (int64_t y; (y = take(s->shared.next, ROWS)) < s->height;) rows(*s, y, y + ROWS < s->height ? y + ROWS : s->height);
+}
+
+// parallel
 EXPORT void refgs_shade_forward(Shade* s) {
-  auto* rows = s->channels == 11 ? forward_rows<11> : forward_rows<14>;
+  auto* rows = s->visibility ? (s->harmonics ? forward_rows<true, true> : forward_rows<false, true>)
+                             : (s->harmonics ? forward_rows<true, false> : forward_rows<false, false>);
   for (int64_t y; (y = take(s->shared.next, ROWS)) < s->height;) rows(*s, y, y + ROWS < s->height ? y + ROWS : s->height);
 }
 
 // parallel
 EXPORT void refgs_shade_backward(Shade* s) {
-  auto* chunk = s->channels == 11 ? backward_chunk<11> : backward_chunk<14>;
+  auto* chunk = s->visibility ? (s->harmonics ? backward_chunk<true, true> : backward_chunk<false, true>)
+                              : (s->harmonics ? backward_chunk<true, false> : backward_chunk<false, false>);
   for (int64_t k; (k = take(s->shared.next, 1)) < chunks(*s);) chunk(*s, k);
 }
 

@@ -32,6 +32,12 @@ class Environment:
         self.levels = prefilter.prefilter(radiance, self.resolution)
         self.irradiance = _projection(self.resolution) @ radiance  # (9, 3)
 
+    @property
+    def harmonics(self) -> Tensor:
+        """Coefficients (16, 3) of the radiance, up to degree 3."""
+        directions, area = cubemap.texel_directions(self.resolution), cubemap.texel_solid_angles(self.resolution)
+        return (harmonics.basis(directions, 3) * area[:, None]).T.float() @ self.radiance
+
     def diffuse(self, normals: Tensor) -> Tensor:
         """Irradiance / π (P, 3) about unit normals (P, 3): what a white matte surface sends out."""
         return (harmonics.basis(normals, 2) @ self.irradiance).clamp_min(0)

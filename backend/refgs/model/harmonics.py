@@ -45,9 +45,3 @@ def basis(directions: Tensor, degree: int) -> Tensor:
             -C3[0] * x * (x * x - 3 * y * y),
         ]
     return torch.stack(values, dim=-1)
-
-
-def evaluate(coefficients: Tensor, directions: Tensor) -> Tensor:
-    """Colour (N, 3) = 0.5 + Σ_k c_k Y_k(d), from coefficients (N, K, 3) and unit directions (N, 3)."""
-    degree = math.isqrt(coefficients.shape[1]) - 1
-    return 0.5 + (coefficients * basis(directions, degree)[..., None]).sum(dim=1)

@@ -11,11 +11,15 @@ from refgs.model import harmonics
 
 Parameters = dict[str, Tensor]
 """Raw leaf tensors, one row a surfel: position (N, 3), rotation (N, 4) wxyz, scale (N, 2) log, opacity (N,) logit,
-sh_dc (N, 1, 3), sh_rest (N, K−1, 3), albedo (N, 3) logit, metallic (N,) logit, roughness (N,) logit."""
+sh_dc (N, 1, 3), sh_rest (N, K−1, 3), albedo (N, 3) logit, metallic (N,) logit, roughness (N,) logit, indirect_dc and
+indirect_rest as the SH."""
 
 
 class Surfels(NamedTuple):
-    """Activated values of N surfels: world units, linear Rec.709 albedo, materials in 0..1, SH with colour = 0.5 + SH."""
+    """Activated values of N surfels: world units, linear Rec.709 albedo, materials in 0..1, SH with colour = 0.5 + SH.
+
+    `indirect` (N, K, 3) are harmonics of the linear radiance that reaches a surfel from the object itself (paper Eq. 10).
+    """
 
     positions: Tensor
     rotations: Tensor
@@ -25,6 +29,7 @@ class Surfels(NamedTuple):
     albedo: Tensor
     metallic: Tensor
     roughness: Tensor
+    indirect: Tensor
 
     def normals(self) -> Tensor:
         """Unit normals t_u × t_v (N, 3): the third column of each rotation."""
@@ -43,6 +48,7 @@ def activate(p: Parameters) -> Surfels:
         albedo=p["albedo"].sigmoid(),
         metallic=p["metallic"].sigmoid(),
         roughness=p["roughness"].sigmoid(),
+        indirect=torch.cat([p["indirect_dc"], p["indirect_rest"]], dim=1),
     )
 
 
@@ -75,6 +81,8 @@ def initial_parameters(
     def logit(value: float, *shape: int) -> Tensor:
         return torch.full(shape, float(np.log(value / (1 - value))))
 
+    rest = (sh_degree + 1) ** 2 - 1
+
     colour = torch.full((n, 3), 0.5) if colours is None else torch.from_numpy(np.asarray(colours, np.float32))
     parameters = {
         "position": torch.from_numpy(np.asarray(positions, np.float32).copy()),
@@ -82,10 +90,12 @@ def initial_parameters(
         "scale": torch.from_numpy(np.log(np.maximum(spacing, 1e-12)).astype(np.float32))[:, None].repeat(1, 2),
         "opacity": logit(opacity, n),
         "sh_dc": ((colour - 0.5) / harmonics.DC)[:, None].contiguous(),
-        "sh_rest": torch.zeros(n, (sh_degree + 1) ** 2 - 1, 3),
+        "sh_rest": torch.zeros(n, rest, 3),
         "albedo": logit(albedo, n, 3),
         "metallic": logit(metallic, n),
         "roughness": logit(roughness, n),
+        "indirect_dc": torch.zeros(n, 1, 3),
+        "indirect_rest": torch.zeros(n, rest, 3),
     }
     return {name: value.requires_grad_() for name, value in parameters.items()}
 
@@ -104,10 +114,10 @@ def to_splats(surfels: Surfels) -> Splats:
             albedo=surfels.albedo.detach().numpy(),
             metallic=surfels.metallic.detach().numpy(),
             roughness=surfels.roughness.detach().numpy(),
+            indirect=surfels.indirect.detach().numpy(),
         )
 
 
 def from_splats(splats: Splats) -> Surfels:
     """The values to render, from the asset's table."""
-    names = ("positions", "rotations", "scales", "opacities", "sh", "albedo", "metallic", "roughness")
-    return Surfels(*(torch.from_numpy(np.ascontiguousarray(getattr(splats, name))) for name in names))
+    return Surfels(*(torch.from_numpy(np.ascontiguousarray(getattr(splats, name))) for name in Surfels._fields))

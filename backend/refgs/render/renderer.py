@@ -2,15 +2,17 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from refgs.camera import Camera
-from refgs.model import harmonics
+from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.render.directional import directional
 from refgs.render.rasterize import rasterize
-from refgs.render.shade import shade
+from refgs.render.shade import mirror_directions, shade
 from refgs.settings import RenderSettings
 
 NEAR = 0.01  # the nearest depth that is drawn, in scene radii
@@ -23,7 +25,8 @@ class Rendering:
     """What a camera sees. `color` (H, W, 3) is sRGB-encoded, over the background. The maps are alpha-weighted means over
     the splats of a pixel, linear, zero where nothing is: `normal` (H, W, 3) in world space, not normalised, towards the
     camera; `depth` (H, W) along the camera's axis. Deferred shading has two more: `material` (H, W, 5) is albedo,
-    metallic, roughness; `radiance` (H, W, 3) is before the background."""
+    metallic, roughness; `radiance` (H, W, 3) is before the background. With inter-reflection, `visibility` (H, W) is 0
+    where the object itself stands in the mirror direction, else 1."""
 
     color: Tensor
     alpha: Tensor
@@ -31,6 +34,7 @@ class Rendering:
     normal: Tensor
     material: Tensor | None = None
     radiance: Tensor | None = None
+    visibility: Tensor | None = None
 
     @property
     def albedo(self) -> Tensor:
@@ -77,10 +81,22 @@ def facing_normals(surfels: Surfels, camera: Camera) -> Tensor:
     return torch.where(cosine < PAST_HORIZON, -normals, normals)
 
 
-def _appearance(surfels: Surfels, camera: Camera) -> Tensor:
-    """SH colour (N, 3) of each surfel towards the camera, not negative."""
-    towards = surfels.positions.detach() - torch.from_numpy(camera.position).float()
-    return harmonics.evaluate(surfels.sh, unit(towards)).clamp_min(0)
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.sqrt(np.einsum("pa,pa->p", v, v) + 1e-24)[:, None]
+
+
+def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, occluder: Occluder) -> Tensor:
+    """1 where the mirror direction of a pixel is free of the object (H, W), else 0."""
+    covered = np.flatnonzero(alpha.detach().numpy() > COVERED)
+    mirrored = mirror_directions(features, alpha, camera).numpy().reshape(-1, 3)[covered]
+    row, column = np.divmod(covered, camera.width)
+    local = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))])
+    rays = local.T @ camera.world_to_camera[:3, :3]
+    points = rays * depth.detach().numpy().reshape(-1, 1)[covered] + camera.position
+    normals = mirrored - _unit(rays)  # half way back to the camera
+    visible = torch.ones_like(alpha)
+    visible.view(-1)[covered] = torch.from_numpy(occluder.visible(points, _unit(normals), mirrored)).float()
+    return visible
 
 
 def render(
@@ -90,26 +106,32 @@ def render(
     background: Tensor,
     settings: RenderSettings,
     near: float,
+    occluder: Occluder | None = None,
 ) -> Rendering:
     """Render surfels for a camera over a background (3,), sRGB-encoded.
 
     `settings.shading` is "deferred" (split-sum shading of blended maps, paper Eq. 5–8) or "sh" (view-dependent colour
-    of each surfel, blended). `near` is in world units.
+    of each surfel, blended). `near` is in world units. With an `occluder`, deferred shading takes the surfels' own
+    light in place of the environment's where that is in the way of the mirror direction (paper Eq. 9).
     """
     deferred = settings.shading == "deferred"
-    parts = [facing_normals(surfels, camera)]
+    normals = facing_normals(surfels, camera)
+    parts = [normals]
     if deferred:
         parts += [surfels.albedo, surfels.metallic[:, None], surfels.roughness[:, None]]
     if not deferred or settings.diffuse == "sh":
-        parts.append(_appearance(surfels, camera))
+        parts.append(directional(surfels.sh, 0.5, surfels.positions, camera))
+    if deferred and occluder is not None:
+        parts.append(directional(surfels.indirect, 0.0, surfels.positions, camera, normals))
     if deferred:
         parts.append(surfels.positions)
     geometry = surfels.positions, surfels.rotations, surfels.scales, surfels.opacities
     features, depth, alpha = rasterize(*geometry, torch.cat(parts, dim=1), camera, near=near)
     depth = depth / alpha.clamp_min(COVERED)
     if deferred:
-        shaded = shade(features, alpha, environment, camera, background)
-        return Rendering(shaded.color, alpha, depth, shaded.normal, shaded.material, shaded.radiance)
+        visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
+        shaded = shade(features, alpha, environment, camera, background, visibility)
+        return Rendering(shaded.color, alpha, depth, shaded.normal, shaded.material, shaded.radiance, visibility)
     normal, appearance = features.split(3, dim=-1)
     color = appearance + (1 - alpha[..., None]) * background
     return Rendering(color, alpha, depth, normal / alpha.clamp_min(COVERED)[..., None])

@@ -7,11 +7,12 @@ import torch
 from refgs.color import srgb_encode
 from refgs.export.environment import write_environment
 from refgs.export.splats import write_splats
+from refgs.geometry.mesh import write_mesh
 from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, to_splats
 from refgs.render.rasterize import rasterize
-from refgs.run import write_text
+from refgs.run import OCCLUDER, write_text
 from refgs.train.trainer import Trainer
 
 
@@ -23,6 +24,10 @@ def write_asset(trainer: Trainer) -> None:
     if environment is not None:
         write_environment(folder / "environment.exr", environment.panorama(4 * environment.resolution))
         surfels = _with_relightable_albedo(surfels, environment, settings.render.diffuse)
+    if trainer.occluder is not None:
+        write_mesh(folder / OCCLUDER, trainer.occluder.mesh)
+    else:
+        surfels = surfels._replace(indirect=surfels.indirect[:, :0])
     surfels, unseen = _facing_outward(surfels, trainer)
     write_splats(folder / "splats.ply", to_splats(surfels))
     write_text(folder / "needs.json", json.dumps(_left_out(trainer, unseen), indent=1))
@@ -81,6 +86,11 @@ def _left_out(trainer: Trainer, unseen: int) -> list[dict[str, str]]:
         per = 3 * (settings.surfels.sh_degree + 1) ** 2
         saved = f"{per} parameters a surfel"
         left.append({"what": "spherical harmonics", "why": "diffuse light comes from the environment", "saved": saved})
+    if settings.render.shading == "deferred" and trainer.occluder is None:
+        why = "the object hardly mirrors itself" if trainer.from_hull else "not every photo has a mask of the object"
+        why = "indirect.start = 1" if settings.indirect.start >= 1 else why
+        saved = "tracing rays, and harmonics of light from the object"
+        left.append({"what": "inter-reflection", "why": why, "saved": saved})
     if any(view.alpha is None for view in trainer.views):
         left.append({"what": "the mask loss", "why": "not every photo has a mask", "saved": "one term of the loss"})
     if unseen:

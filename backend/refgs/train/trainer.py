@@ -11,7 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from refgs.camera import Camera
 from refgs.capture import Capture, LoadedView, load_view
+from refgs.geometry.extract import extract
+from refgs.geometry.mesh import Mesh, clean
+from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, activate
 from refgs.render.renderer import Rendering, near_plane, render
@@ -28,6 +32,9 @@ GEOMETRY = ("position", "rotation", "scale", "opacity")
 REPORT_EVERY = 10  # iterations
 HISTORY_EVERY = 100  # iterations
 PLAN_EVERY = 50  # iterations
+TRACED = (
+    24  # views at the least from which the mesh that inter-reflection is traced on is made; all where there are fewer
+)
 
 
 def composite(view: LoadedView, background: Tensor) -> Tensor:
@@ -73,6 +80,7 @@ class Trainer:
             groups.append({"params": [self.light], "name": "environment", "rate": settings.rates.environment})
         self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
         self.motion = ScreenGradient(len(self.parameters["position"]))
+        self.occluder: Occluder | None = None
 
     def _rate(self, name: str) -> float:
         rate = getattr(self.settings.rates, name)
@@ -86,7 +94,13 @@ class Trainer:
             unused = ["albedo", "metallic", "roughness"]
         elif render.diffuse == "irradiance":
             unused = ["sh_dc", "sh_rest"]
+        if not self._reflects():
+            unused += ["indirect_dc", "indirect_rest"]
         self.constant = {name: self.parameters.pop(name).detach()[:1] for name in unused}
+
+    def _reflects(self) -> bool:
+        """Whether this run looks for inter-reflection: not without masks, where the mesh is of the surroundings too."""
+        return self.from_hull and self.settings.render.shading == "deferred" and self.settings.indirect.start < 1
 
     def surfels(self) -> Surfels:
         """The activated surfels, with what does not learn filled in."""
@@ -100,19 +114,22 @@ class Trainer:
             return None
         return Environment(torch.nn.functional.softplus(self.light))
 
-    def render(self, view: LoadedView) -> Rendering:
-        """Render one view without gradients."""
+    def render(self, camera: Camera) -> Rendering:
+        """Render a camera without gradients."""
         with torch.no_grad():
-            return render(
-                self.surfels(), self.environment(), view.camera, self.background, self.settings.render, self.near
-            )
+            return self._render(self.surfels(), self.environment(), camera)
+
+    def _render(self, surfels: Surfels, environment: Environment | None, camera: Camera) -> Rendering:
+        return render(
+            surfels, environment, camera, self.background, self.settings.render, self.near, occluder=self.occluder
+        )
 
     def test_psnr(self, most: int = 4) -> float | None:
         """Mean PSNR over at most this many of the held-out views; None where there are none."""
         chosen = self.test[:: max(1, len(self.test) // most)][:most]
         if not chosen:
             return None
-        return float(np.mean([psnr(self.render(v).color, composite(v, self.background)) for v in chosen]))
+        return float(np.mean([psnr(self.render(v.camera).color, composite(v, self.background)) for v in chosen]))
 
     def step(self) -> dict[str, float]:
         """One iteration. Returns its loss and PSNR."""
@@ -127,7 +144,7 @@ class Trainer:
             group["lr"] = 0.0 if frozen and group["name"] in GEOMETRY else group["rate"] * decay
 
         surfels, environment = self.surfels(), self.environment()
-        rendering = render(surfels, environment, view.camera, self.background, settings.render, self.near)
+        rendering = self._render(surfels, environment, view.camera)
         photo = composite(view, self.background)
         mask = None if view.alpha is None else torch.from_numpy(view.alpha).float() / 255
         loss = objective(rendering, environment, photo, mask, view.camera, settings.loss, progress)
@@ -138,6 +155,8 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         self.iteration += 1
         self._densify(progress)
+        if self._reflects() and progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0:
+            self._trace()
         return {"loss": float(loss.detach()), "psnr": psnr(rendering.color.detach(), photo)}
 
     def _next_view(self) -> LoadedView:
@@ -161,6 +180,25 @@ class Trainer:
             divide=progress < settings.stop,
         )
         self.motion = ScreenGradient(len(self.parameters["position"]))
+
+    @torch.no_grad()
+    def _trace(self) -> None:
+        """Extract the mesh that inter-reflection is traced on; do without where the object hardly mirrors itself."""
+        capture, settings = self.capture, self.settings.indirect
+        cameras = [view.camera for view in self.views[:: max(1, len(self.views) // TRACED)]]
+        mesh = extract(self.render, cameras, capture.centre, capture.radius, settings.resolution)
+        joins, self.occluder = self.occluder is None, None
+        if len(mesh.faces) == 0:
+            return
+        self.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
+        looked = [self.render(camera) for camera in cameras[::3]]
+        hidden = sum(float((1 - r.visibility).sum()) for r in looked)
+        if hidden < settings.least * sum(float((r.alpha > 0.5).sum()) for r in looked):
+            self.occluder = None
+        elif joins:
+            # What the surfels mirrored until now, so that the picture changes little.
+            start, rest = self.environment().harmonics, self.parameters["indirect_rest"]
+            self.parameters["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
         """Train to the end, or until `stop` says so; a checkpoint is written either way. True when the end was reached."""
@@ -219,6 +257,10 @@ class Trainer:
         tensors = {f"parameter.{name}": value for name, value in self.parameters.items()}
         tensors |= {f"constant.{name}": value for name, value in self.constant.items()}
         tensors |= {"environment": self.light, "motion.total": self.motion.total, "motion.views": self.motion.views}
+        if self.occluder is not None:
+            mesh = self.occluder.mesh
+            tensors |= {"occluder.vertices": torch.from_numpy(mesh.vertices)}
+            tensors |= {"occluder.faces": torch.from_numpy(mesh.faces.astype(np.int32))}
         for group in self.optimizer.param_groups:
             state = self.optimizer.state.get(group["params"][0], {})
             tensors |= {f"adam.{group['name']}.{key}": value for key, value in state.items()}
@@ -246,6 +288,9 @@ class Trainer:
             if state:
                 self.optimizer.state[value] = state
         self.constant = {name: tensors[f"constant.{name}"] for name in self.constant}
+        self.occluder = None
+        if "occluder.faces" in tensors:
+            self.occluder = Occluder(Mesh(tensors["occluder.vertices"].numpy(), tensors["occluder.faces"].numpy()))
         self._trim_history()
 
     def _trim_history(self) -> None:

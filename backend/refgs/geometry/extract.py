@@ -1,0 +1,26 @@
+"""The surface of surfels as a mesh: depth maps of the cameras that saw them, fused."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+
+from refgs.camera import Camera
+from refgs.geometry.mesh import Mesh
+from refgs.geometry.tsdf import fuse
+from refgs.render.renderer import Rendering
+
+
+def extract(
+    render: Callable[[Camera], Rendering],
+    cameras: Sequence[Camera],
+    centre: np.ndarray,
+    radius: float,
+    resolution: int,
+) -> Mesh:
+    """The surface that the cameras' renderings show inside the cube of half-side `radius` about `centre`, in voxels of
+    2 `radius` / `resolution`: as `refgs.geometry.tsdf.fuse` makes it, not cleaned."""
+    with torch.no_grad():
+        renderings = [render(camera) for camera in cameras]
+    depths, alphas = [r.depth.numpy() for r in renderings], [r.alpha.numpy() for r in renderings]
+    return fuse(depths, alphas, cameras, centre, radius, resolution)

@@ -1,0 +1,51 @@
+"""Which ways are free of the object itself: rays traced against a mesh of it (paper §3.2)."""
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from refgs.geometry.mesh import Mesh
+
+_LIFT = 1.0  # of the mesh's mean edge: how far a ray starts above its surface, which the mesh only comes near to
+_PASSES = 3  # front faces are looked for behind this many back faces
+
+
+class Occluder:
+    """A mesh that stands in the way of light. Its vertices may be in any unit and anywhere: rays are traced in single
+    precision about its centre, at its size. `lift` is how far above the surface they start."""
+
+    def __init__(self, mesh: Mesh):
+        self.mesh = mesh
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        self._centre = (low + high) / 2
+        self._size = max(float((high - low).max()) / 2, 1e-30)
+
+        corners = mesh.vertices[mesh.faces]
+        self.lift = _LIFT * float(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1).mean())
+        self._scene = EmbreeScene()
+        TriangleMesh(self._scene, ((corners - self._centre) / self._size).astype(np.float32))
+
+    def visible(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Whether nothing is in the way (P,) of rays from `points` (P, 3) of the surface, in the mesh's own frame, in
+        unit `directions` (P, 3). `normals` (P, 3) are the surface's: rays start a little above it.
+
+        Only the front of a face blocks. A ray that meets a back face first began below the mesh, or comes to its open
+        side: it goes on.
+        """
+        lift = self.lift / self._size
+        directions = np.ascontiguousarray(directions, np.float32)
+        origins = ((points - self._centre) / self._size + lift * normals).astype(np.float32)
+        free = np.ones(len(origins), bool)
+        going = np.arange(len(origins))
+        for _ in range(_PASSES):
+            hit = self._scene.run(origins, directions, query="INTERSECT", output=True)
+            facing = np.einsum("pa,pa->p", hit["Ng"], directions)
+            met = hit["primID"] >= 0
+            front = met & (facing < 0)
+            free[going[front]] = False
+            on = met & ~front
+            if not on.any():
+                break
+            going, directions = going[on], directions[on]
+            origins = origins[on] + (hit["tfar"][on, None] + 0.1 * lift) * directions
+        return free

@@ -1,0 +1,84 @@
+// Colour by direction: real spherical harmonics of each surfel towards a camera, or of the mirrored way (paper Eq. 10), and back.
+#include "library.h"
+#include "vector.h"
+
+namespace {
+
+constexpr int MOST = 16;  // coefficients a colour, at degree 3
+
+struct Harmonics {
+  int64_t count, coefficients;
+  const float *values, *positions, *normals;  // (count, coefficients, 3), (count, 3), (count, 3) or null
+  double camera[3];
+  float offset;
+  float* color;  // (count, 3)
+  const float* by_color;
+  float* by_values;
+  float* scratch;  // none is used
+  Shared shared;
+};
+
+// From the camera to a surfel; where there are normals, mirrored there.
+void direction(const Harmonics& h, int64_t i, float (&d)[3]) {
+  double towards[3], square = 1e-24;
+  for (int a = 0; a < 3; a++) towards[a] = h.camera[a] - h.positions[3 * i + a], square += towards[a] * towards[a];
+  float inverse = (float)(1 / __builtin_sqrt(square)), along = 0;
+  for (int a = 0; a < 3; a++) d[a] = -(float)towards[a] * inverse;
+  if (!h.normals) return;
+  const float* n = h.normals + 3 * i;
+  for (int a = 0; a < 3; a++) along += n[a] * d[a];
+  for (int a = 0; a < 3; a++) d[a] -= 2 * along * n[a];
+}
+
+// In the order and signs of refgs.model.harmonics, whose numbers these are.
+void basis(const float (&d)[3], int64_t coefficients, float (&y)[MOST]) {
+  float x = d[0], v = d[1], z = d[2], xx = x * x, vv = v * v, zz = z * z;
+  y[0] = 0.28209479f;
+  if (coefficients < 4) return;
+  y[1] = -0.48860251f * v, y[2] = 0.48860251f * z, y[3] = -0.48860251f * x;
+  if (coefficients < 9) return;
+  y[4] = 1.0925485f * x * v, y[5] = -1.0925485f * v * z, y[6] = 0.31539157f * (3 * zz - 1);
+  y[7] = -1.0925485f * x * z, y[8] = 0.54627422f * (xx - vv);
+  if (coefficients < 16) return;
+  y[9] = -0.59004359f * v * (3 * xx - vv), y[10] = 2.8906114f * x * v * z, y[11] = -0.45704579f * v * (5 * zz - 1);
+  y[12] = 0.37317633f * z * (5 * zz - 3), y[13] = -0.45704579f * x * (5 * zz - 1);
+  y[14] = 1.4453057f * z * (xx - vv), y[15] = -0.59004359f * x * (xx - 3 * vv);
+}
+
+constexpr int BATCH = 512;  // surfels at a time
+
+template <class Body>
+void each(Harmonics* h, Body body) {
+  for (int64_t first; (first = take(h->shared.next, BATCH)) < h->count;) {
+    int64_t end = first + BATCH < h->count ? first + BATCH : h->count;
+    for (int64_t i = first; i < end; i++) {
+      float d[3], y[MOST];
+      direction(*h, i, d);
+      basis(d, h->coefficients, y);
+      body(i, y);
+    }
+  }
+}
+
+}  // namespace
+
+// parallel
+EXPORT void refgs_harmonics_forward(Harmonics* h) {
+  each(h, [&](int64_t i, const float* y) {
+    const float* v = h->values + 3 * h->coefficients * i;
+    float sum[3] = {h->offset, h->offset, h->offset};
+    for (int64_t k = 0; k < h->coefficients; k++)
+      for (int c = 0; c < 3; c++) sum[c] += y[k] * v[3 * k + c];
+    for (int c = 0; c < 3; c++) h->color[3 * i + c] = sum[c] > 0 ? sum[c] : 0;
+  });
+}
+
+// parallel
+EXPORT void refgs_harmonics_backward(Harmonics* h) {
+  each(h, [&](int64_t i, const float* y) {
+    float by[3], *to = h->by_values + 3 * h->coefficients * i;
+    for (int c = 0; c < 3; c++) by[c] = h->color[3 * i + c] > 0 ? h->by_color[3 * i + c] : 0;
+    for (int64_t k = 0; k < h->coefficients; k++)
+      for (int c = 0; c < 3; c++) to[3 * k + c] = y[k] * by[c];
+  });
+}

@@ -1,0 +1,81 @@
+"""Rays against shapes whose answer is known, at sizes and places far from one and zero."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from refgs.geometry.mesh import Mesh
+from refgs.geometry.visibility import Occluder
+
+FRAMES = [(1.0, 0.0), (1e-3, 0.0), (1e3, 0.0), (1.0, 1e4)]
+
+
+def placed(shape: trimesh.Trimesh, scale: float, moved: float) -> Occluder:
+    return Occluder(Mesh(shape.vertices * scale + moved, np.asarray(shape.faces)))
+
+
+def directions(count: int, seed: int = 0) -> np.ndarray:
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def plate(z: float, up: int) -> trimesh.Trimesh:
+    """The square of half-side 1 at a height, in 2 × 20² triangles, facing up (1) or down (-1)."""
+    at = np.linspace(-1, 1, 21)
+    x, y = np.meshgrid(at, at, indexing="ij")
+    corner = (np.arange(20)[:, None] * 21 + np.arange(20)).ravel()
+    quads = np.stack([corner, corner + 21, corner + 22, corner + 1], axis=1)[:, ::up]
+    faces = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
+    return trimesh.Trimesh(np.stack([x, y, np.full_like(x, z)], axis=-1).reshape(-1, 3), faces, process=False)
+
+
+@pytest.mark.parametrize(("scale", "moved"), FRAMES)
+def test_nothing_is_hidden_on_a_sphere(scale, moved):
+    """Down to directions one degree above the horizon, on a mesh that is inside the sphere and on one outside."""
+    normals, towards = directions(20_000), directions(20_000, seed=1)
+    tangent = np.cross(normals, towards)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    angle = np.radians(np.random.default_rng(2).uniform(1, 90, len(normals)))[:, None]
+    outward = np.cos(angle) * tangent + np.sin(angle) * normals
+    for size in (0.99, 1.0, 1.01):
+        occluder = placed(trimesh.creation.icosphere(5, radius=size), scale, moved)
+        assert occluder.visible(normals * scale + moved, normals, outward).all()
+
+
+@pytest.mark.parametrize(("scale", "moved"), FRAMES)
+def test_two_plates_that_face_each_other(scale, moved):
+    """From the lower one, what goes through the upper one's square and only that is hidden."""
+    occluder = placed(trimesh.util.concatenate(plate(0.0, 1), plate(1.0, -1)), scale, moved)
+    rng = np.random.default_rng(3)
+    points = np.concatenate([rng.uniform(-0.9, 0.9, (20_000, 2)), np.zeros((20_000, 1))], axis=1)
+    ways = directions(20_000, seed=4)
+    ways[:, 2] = np.abs(ways[:, 2]).clip(0.02)
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    lifted = occluder.lift / scale
+    across = np.abs(points[:, :2] + ways[:, :2] / ways[:, 2:] * (1 - lifted)).max(axis=1)
+    clear = np.abs(across - 1) > 1e-4 / scale * max(scale, moved * 1e-3)
+    up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    found = occluder.visible(points * scale + moved, up, ways)
+    np.testing.assert_array_equal(found[clear], across[clear] > 1)
+    assert 0.2 < found.mean() < 0.8
+
+
+@pytest.mark.parametrize(("scale", "moved"), FRAMES)
+def test_the_inside_of_a_bowl(scale, moved):
+    """Half a sphere's inside: from its pole, ways within 45° of the axis are free."""
+    ball = trimesh.creation.icosphere(5)
+    bowl = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0][:, ::-1], process=False)
+    occluder = placed(bowl, scale, moved)
+    ways = directions(20_000, seed=5)
+    ways = ways[ways[:, 2] > 0.05]
+    pole = np.tile([0.0, 0.0, -1.0], (len(ways), 1))
+    found = occluder.visible(pole * scale + moved, -pole, ways)
+    sharp = np.abs(ways[:, 2] - np.sqrt(0.5)) > 0.03  # the rim is a polygon's, and rays start above the pole
+    np.testing.assert_array_equal(found[sharp], ways[sharp, 2] > np.sqrt(0.5))
+
+
+def test_a_point_below_the_mesh_is_not_in_its_shadow():
+    """The surfels' surface may lie inside the mesh that was fused from them."""
+    normals = directions(2000)
+    occluder = placed(trimesh.creation.icosphere(5), 1.0, 0.0)
+    assert occluder.visible(0.8 * normals, normals, normals).all()

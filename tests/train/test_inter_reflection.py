@@ -1,0 +1,98 @@
+"""Two metal balls that mirror each other, with and without inter-reflection."""
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.scenes.analytic import TWO, write_ball_capture
+from refgs.capture import read_capture
+from refgs.render.renderer import camera_rays
+from refgs.run import create_run, open_run
+from refgs.settings import load_settings
+from refgs.train.asset import write_asset
+from refgs.train.trainer import Trainer, composite
+
+SMALL = ["surfels.start=3000", "surfels.budget=4000", "environment.resolution=16", "train.light_first=20"]
+SMALL += ["surfels.metallic=0.9", "train.iterations=600", "indirect.every=200", "indirect.resolution=64"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Both trainings, the one with inter-reflection first; what its test PSNR was whenever the mesh was made anew."""
+    folder = tmp_path_factory.mktemp("two")
+    write_ball_capture(folder / "capture", 64, TWO)
+    capture, made, heard = read_capture(folder / "capture"), [], []
+    for start in (0.3, 1):
+        settings = load_settings("quick", [*SMALL, f"indirect.start={start}"])
+        run = Trainer(capture, settings, folder / str(start), lambda *_: None)
+        create_run(run.folder, capture, settings, "quick")
+        if start < 1:
+            run.run(stop=lambda run=run: run.iteration == 199)
+            heard.append(run.test_psnr())
+            run.step()
+            assert run.occluder is not None
+            heard.append(run.test_psnr())
+        run.run()
+        write_asset(run)
+        made.append(run)
+    return *made, heard
+
+
+def test_pictures_gain_where_the_balls_mirror_each_other(trained):
+    with_it, without, _ = trained
+    assert with_it.test_psnr() > without.test_psnr()
+    errors = [[], []]
+    for view in with_it.test:
+        hidden = with_it.render(view.camera).visibility < 0.5
+        photo = composite(view, with_it.background)
+        for run, error in zip((with_it, without), errors, strict=True):
+            error.append((run.render(view.camera).color - photo)[hidden].square())
+    one, other = (float(torch.cat(error).mean()) for error in errors)
+    assert one < 0.7 * other
+
+
+def test_joining_loses_nothing(trained):
+    """What the surfels know of each other starts as what they mirrored before."""
+    before, after = trained[2]
+    assert after > before - 0.1
+
+
+def test_visibility_is_that_of_the_balls(trained):
+    run = trained[0]
+    hidden, found, both, solid = 0, 0, 0, 0
+    for view in run.test:
+        rendering = run.render(view.camera)
+        balls = torch.from_numpy(TWO)
+        ray = camera_rays(view.camera).double().reshape(-1, 1, 3)
+        ray = ray / ray.norm(dim=-1, keepdim=True)
+        apart = torch.from_numpy(view.camera.position) - balls[:, :3]
+        b = (apart * ray).sum(-1)
+        inside = b * b - ((apart**2).sum(-1) - balls[:, 3] ** 2)
+        way = torch.where(inside > 0, -b - inside.clamp_min(0).sqrt(), torch.inf)
+        first = way.argmin(dim=1)
+        normal = (apart[first] + way.amin(dim=1)[:, None] * ray[:, 0]) / balls[first, 3:]
+        mirrored = ray[:, 0] - 2 * (ray[:, 0] * normal).sum(-1, keepdim=True) * normal
+        other = balls[1 - first]
+        to = balls[first, :3] + balls[first, 3:] * normal - other[:, :3]
+        along = (to * mirrored).sum(-1)
+        meets = (along < 0) & (along**2 > (to**2).sum(-1) - other[:, 3] ** 2)
+        sure = way.amin(dim=1).isfinite() & (rendering.alpha.reshape(-1) > 0.9)
+        traced = (rendering.visibility.reshape(-1) < 0.5) & sure
+        hidden += int((meets & sure).sum())
+        found += int(traced.sum())
+        both += int((traced & meets).sum())
+        solid += int(sure.sum())
+    assert hidden > 0.02 * solid
+    assert hidden + found - 2 * both < 0.03 * solid
+    assert both > 0.6 * found
+
+
+def test_the_run_folder_has_it_all(trained):
+    """Rendered from the files as it was in training; without it under another light, for which it would be wrong."""
+    made = trained[0]
+    run, view = open_run(made.folder), made.test[0]
+    shown, asset = made.render(view.camera), run.render(view.camera)
+    assert float((shown.color - asset.color).abs().mean()) < 2e-3
+    assert run.splats.indirect.shape[1:] == (16, 3) and np.abs(run.splats.indirect).max() > 0
+    assert run.render(view.camera, run.environment).visibility is None
+    assert open_run(trained[1].folder).occluder is None
