@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import torch
 
 from refgs.camera import Camera
 from refgs.geometry.mesh import Mesh
@@ -18,9 +17,11 @@ def extract(
     radius: float,
     resolution: int,
 ) -> Mesh:
-    """The surface that the cameras' renderings show inside the cube of half-side `radius` about `centre`, in voxels of
-    2 `radius` / `resolution`: as `refgs.geometry.tsdf.fuse` makes it, not cleaned."""
-    with torch.no_grad():
-        renderings = [render(camera) for camera in cameras]
-    depths, alphas = [r.depth.numpy() for r in renderings], [r.alpha.numpy() for r in renderings]
+    """The surface that the cameras' renderings, made without gradients, show inside the cube of half-side `radius` about
+    `centre`, in voxels of 2 `radius` / `resolution`: as `refgs.geometry.tsdf.fuse` makes it, not cleaned."""
+    depths, alphas = [], []
+    for camera in cameras:  # a rendering is nine times as large as what is kept of it
+        rendering = render(camera)
+        depths.append(rendering.depth.numpy())
+        alphas.append(rendering.alpha.numpy())
     return fuse(depths, alphas, cameras, centre, radius, resolution)

@@ -191,11 +191,15 @@ class Trainer:
         if len(mesh.faces) == 0:
             return
         self.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
-        looked = [self.render(camera) for camera in cameras[::3]]
-        hidden = sum(float((1 - r.visibility).sum()) for r in looked)
-        if hidden < settings.least * sum(float((r.alpha > 0.5).sum()) for r in looked):
+        hidden, solid = 0.0, 1e-9
+        for camera in cameras[::3]:
+            looked = self.render(camera)
+            hidden += float((1 - looked.visibility).sum())
+            solid += float((looked.alpha > 0.5).sum())
+        if hidden < settings.least * solid:
             self.occluder = None
         elif joins:
+            self.report("stage", {"what": f"the object mirrors itself on {hidden / solid:.0%} of it: tracing rays"})
             # What the surfels mirrored until now, so that the picture changes little.
             start, rest = self.environment().harmonics, self.parameters["indirect_rest"]
             self.parameters["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
