@@ -51,7 +51,9 @@ def render(
     run: RunFolder,
     cameras: Annotated[Path, typer.Option(help="NeRF-Blender or nerfstudio JSON, in the capture's frame")],
     out: Annotated[Path, typer.Option(help="folder for the images: OUT/PASS/NAME.png")],
-    passes: Annotated[str, typer.Option(help="of color,normal,albedo,roughness,metallic,depth,alpha")] = "color",
+    passes: Annotated[
+        str, typer.Option(help="of color,normal,albedo,roughness,metallic,depth,alpha,visibility")
+    ] = "color",
     hdri: Annotated[Path | None, typer.Option(help="light it with this panorama instead")] = None,
     format: Annotated[str, typer.Option(help="png or exr")] = "png",
 ) -> None:

@@ -165,11 +165,13 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
     """Write OUT/PASS/NAME.png or .exr for each camera."""
     run = open_run(folder)
     without = {"albedo", "roughness", "metallic"} if run.environment is None else set()
-    without |= {"visibility"} if run.occluder is None or hdri is not None else set()
+    without |= {"visibility"} if run.occluder is None else set()
     known = [p for p in PASSES if p not in without]
     unknown = [p for p in passes if p not in known]
     if unknown:
         raise InputError(f"--passes {unknown[0]}: this run has {', '.join(known)}")
+    if "visibility" in passes and hdri is not None:
+        raise InputError("--passes visibility: it is not traced under another light; leave out --hdri")
     if format not in ("png", "exr"):
         raise InputError(f"--format {format}: take png or exr")
     if format == "exr" and "color" in passes and run.environment is None:

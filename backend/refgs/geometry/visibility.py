@@ -7,7 +7,7 @@ from embreex.rtcore_scene import EmbreeScene
 from refgs.geometry.mesh import Mesh
 
 _LIFT = 1.0  # of the mesh's mean edge: how far a ray starts above its surface, which the mesh only comes near to
-_PASSES = 3  # front faces are looked for behind this many back faces
+_PASSES = 3  # faces that a ray looks at: behind two back faces, the third
 
 
 class Occluder:

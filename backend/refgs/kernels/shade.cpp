@@ -208,6 +208,11 @@ INLINE Vectors towards_camera(const Shade& s, const int64_t* at) {
   return inverse_norm(v) * v;
 }
 
+INLINE Vectors mirror(Vectors normal, Vectors view, Vector& n_dot_v) {
+  n_dot_v = dot(normal, view);
+  return 2.0f * n_dot_v * normal - view;
+}
+
 // The split sum over a metallic-roughness material, of LANES pixels. HARMONICS: colour by direction in place of the reflected
 // irradiance. INDIRECT: light from the object itself where it stands in the mirror direction (Eq. 9).
 template <bool HARMONICS, bool INDIRECT>
@@ -313,10 +318,7 @@ struct Shaded {
  private:
   MEMBER Vector f0(int c) const { return DIELECTRIC_F0 * (1.0f - map.value[METALLIC]) + map.value[ALBEDO + c] * map.value[METALLIC]; }
 
-  MEMBER Vectors mirrored() {
-    n_dot_v = dot(normal, view);
-    return 2.0f * n_dot_v * normal - view;
-  }
+  MEMBER Vectors mirrored() { return mirror(normal, view, n_dot_v); }
 };
 
 template <int C>
@@ -325,8 +327,8 @@ void mirrored_rows(const Shade& s, int64_t first, int64_t end) {
   each_covered(s, first, end, [&](const int64_t* at, int count) {
     Displaced<C> map(s, at);
     Vectors normal = {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]}, view = towards_camera(s, at);
-    normal = inverse_norm(normal) * normal;
-    Vectors m = 2.0f * dot(normal, view) * normal - view;
+    Vector n_dot_v;
+    Vectors m = mirror(inverse_norm(normal) * normal, view, n_dot_v);
     scatter<3>(s.mirrored, at, count, {m.x, m.y, m.z});
   });
 }

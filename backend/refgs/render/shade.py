@@ -123,7 +123,9 @@ class _Shade(torch.autograd.Function):
 
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
     """Where `shade` looks for light (H, W, 3): the ways to the camera, mirrored at the blended normals; unit vectors in
-    world space, zero where nothing is. `features` and `alpha` as `shade` takes them; without gradients."""
+    world space, zero where nothing is. `features` and `alpha` as `shade` takes them beside a visibility; without gradients."""
+    if features.shape not in ((*alpha.shape, CHANNELS + 3), (*alpha.shape, CHANNELS + 6)):
+        raise ValueError(f"expected {CHANNELS + 3} or {CHANNELS + 6} features a pixel, got {tuple(features.shape)}")
     features, alpha = features.detach().contiguous(), alpha.detach().contiguous()
     work, mirrored = _Work.of(features, alpha, camera), torch.empty(*alpha.shape, 3)
     work.attach(mirrored=mirrored)

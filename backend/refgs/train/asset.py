@@ -87,8 +87,15 @@ def _left_out(trainer: Trainer, unseen: int) -> list[dict[str, str]]:
         saved = f"{per} parameters a surfel"
         left.append({"what": "spherical harmonics", "why": "diffuse light comes from the environment", "saved": saved})
     if settings.render.shading == "deferred" and trainer.occluder is None:
-        why = "the object hardly mirrors itself" if trainer.from_hull else "not every photo has a mask of the object"
-        why = "indirect.start = 1" if settings.indirect.start >= 1 else why
+        indirect = settings.indirect
+        if not trainer.from_hull:
+            why = "not every photo has a mask of the object"
+        elif indirect.start >= 1:
+            why = "indirect.start = 1"
+        elif trainer.total <= max(indirect.every, indirect.start * trainer.total):
+            why = "the training was over before its first mesh"
+        else:
+            why = "the object hardly mirrors itself"
         saved = "tracing rays, and harmonics of light from the object"
         left.append({"what": "inter-reflection", "why": why, "saved": saved})
     if any(view.alpha is None for view in trainer.views):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.capture import Capture, LoadedView, load_view
+from refgs.errors import InputError
 from refgs.geometry.extract import extract
 from refgs.geometry.mesh import Mesh, clean
 from refgs.geometry.visibility import Occluder
@@ -155,7 +156,8 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         self.iteration += 1
         self._densify(progress)
-        if self._reflects() and progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0:
+        due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
+        if self._reflects() and due and self.iteration < self.total:
             self._trace()
         return {"loss": float(loss.detach()), "psnr": psnr(rendering.color.detach(), photo)}
 
@@ -186,22 +188,30 @@ class Trainer:
         """Extract the mesh that inter-reflection is traced on; do without where the object hardly mirrors itself."""
         capture, settings = self.capture, self.settings.indirect
         cameras = [view.camera for view in self.views[:: max(1, len(self.views) // TRACED)]]
-        mesh = extract(self.render, cameras, capture.centre, capture.radius, settings.resolution)
-        joins, self.occluder = self.occluder is None, None
-        if len(mesh.faces) == 0:
+        surfels, environment, self.occluder = self.surfels(), self.environment(), None
+        mesh = extract(
+            lambda camera: self._render(surfels, environment, camera),
+            cameras,
+            capture.centre,
+            capture.radius,
+            settings.resolution,
+        )
+        try:
+            self.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
+        except InputError:  # there is no surface yet
             return
-        self.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
         hidden, solid = 0.0, 1e-9
         for camera in cameras[::3]:
-            looked = self.render(camera)
-            hidden += float((1 - looked.visibility).sum())
-            solid += float((looked.alpha > 0.5).sum())
+            looked = self._render(surfels, environment, camera)
+            opaque = looked.alpha > 0.5
+            hidden += float((1 - looked.visibility)[opaque].sum())
+            solid += float(opaque.sum())
         if hidden < settings.least * solid:
             self.occluder = None
-        elif joins:
+        elif not self.optimizer.state.get(self.parameters["indirect_dc"]):
             self.report("stage", {"what": f"the object mirrors itself on {hidden / solid:.0%} of it: tracing rays"})
             # What the surfels mirrored until now, so that the picture changes little.
-            start, rest = self.environment().harmonics, self.parameters["indirect_rest"]
+            start, rest = environment.harmonics, self.parameters["indirect_rest"]
             self.parameters["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
@@ -274,6 +284,9 @@ class Trainer:
     def resume(self) -> None:
         """Go back to the last complete checkpoint."""
         tensors, facts = checkpoint.load(self.folder / "checkpoints")
+        needed = {f"parameter.{name}" for name in self.parameters} | {f"constant.{name}" for name in self.constant}
+        if not needed <= tensors.keys():
+            raise InputError(f"{self.folder} was begun by another release of RefGS: train again into a new folder")
         self.iteration, self.seconds = facts["iteration"], facts["seconds"]
         self.total = facts["total"]
         self.motion.total, self.motion.views = tensors["motion.total"], tensors["motion.views"]
