@@ -21,7 +21,7 @@ def sky(direction: np.ndarray) -> np.ndarray:
     return np.stack([0.5 + 0.3 * z + 0.2 * x, 0.5 + 0.35 * z + 0.1 * y, 0.5 + 0.4 * z - 0.2 * x], axis=-1)
 
 
-def _meet(origin: np.ndarray, ray: np.ndarray, balls: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def meet(origin: np.ndarray, ray: np.ndarray, balls: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whether unit rays (P, 3) meet a ball (P,), and where they first do (P, 3), with the normal there (P, 3)."""
     apart = origin[:, None] - balls[:, :3]
     b = (apart * ray[:, None]).sum(-1)
@@ -43,7 +43,7 @@ def photo(matrix: np.ndarray, size: int, balls: np.ndarray = ONE, samples: int =
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     origin, share = np.broadcast_to(matrix[:3, 3], ray.shape), np.ones_like(ray)
     for bounce in range(BOUNCES):
-        hit, point, normal = _meet(origin, ray, balls)
+        hit, point, normal = meet(origin, ray, balls)
         if bounce == 0:
             seen = hit
         cosine = -(normal * ray).sum(-1, keepdims=True).clip(-1, 0)

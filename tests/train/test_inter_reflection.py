@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.scenes.analytic import TWO, write_ball_capture
+from benchmarks.scenes.analytic import TWO, meet, write_ball_capture
 from refgs.capture import read_capture
 from refgs.render.renderer import camera_rays
 from refgs.run import create_run, open_run
@@ -62,22 +62,13 @@ def test_visibility_is_that_of_the_balls(trained):
     hidden, found, both, solid = 0, 0, 0, 0
     for view in run.test:
         rendering = run.render(view.camera)
-        balls = torch.from_numpy(TWO)
-        ray = camera_rays(view.camera).double().reshape(-1, 1, 3)
-        ray = ray / ray.norm(dim=-1, keepdim=True)
-        apart = torch.from_numpy(view.camera.position) - balls[:, :3]
-        b = (apart * ray).sum(-1)
-        inside = b * b - ((apart**2).sum(-1) - balls[:, 3] ** 2)
-        way = torch.where(inside > 0, -b - inside.clamp_min(0).sqrt(), torch.inf)
-        first = way.argmin(dim=1)
-        normal = (apart[first] + way.amin(dim=1)[:, None] * ray[:, 0]) / balls[first, 3:]
-        mirrored = ray[:, 0] - 2 * (ray[:, 0] * normal).sum(-1, keepdim=True) * normal
-        other = balls[1 - first]
-        to = balls[first, :3] + balls[first, 3:] * normal - other[:, :3]
-        along = (to * mirrored).sum(-1)
-        meets = (along < 0) & (along**2 > (to**2).sum(-1) - other[:, 3] ** 2)
-        sure = way.amin(dim=1).isfinite() & (rendering.alpha.reshape(-1) > 0.9)
-        traced = (rendering.visibility.reshape(-1) < 0.5) & sure
+        ray = camera_rays(view.camera).double().numpy().reshape(-1, 3)
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        hit, point, normal = meet(np.broadcast_to(view.camera.position, ray.shape), ray, TWO)
+        mirrored = ray - 2 * (ray * normal).sum(-1, keepdims=True) * normal
+        meets, _, _ = meet(point, mirrored, TWO)
+        sure = hit & (rendering.alpha.numpy().reshape(-1) > 0.9)
+        traced = (rendering.visibility.numpy().reshape(-1) < 0.5) & sure
         hidden += int((meets & sure).sum())
         found += int(traced.sum())
         both += int((traced & meets).sum())
