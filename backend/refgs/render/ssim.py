@@ -6,10 +6,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from refgs.kernels.load import Shared, kernels, parallel
+from refgs.kernels.load import Shared, Work, kernels, parallel
 
 
-class _Work(ctypes.Structure):
+class _Work(Work):
     """`struct Ssim` of ssim.cpp."""
 
     _fields_ = (
@@ -24,12 +24,12 @@ class _Dssim(torch.autograd.Function):
     def forward(ctx, image, target):
         image, target = image.contiguous(), target.contiguous()
         height, width, channels = image.shape
-        work = _Work(height, width, channels, image.data_ptr(), target.data_ptr())
+        work = _Work(height=height, width=width, channels=channels)
         sums = torch.empty(height, dtype=torch.float64)
-        work.sums = sums.data_ptr()
+        work.attach(image=image, target=target, sums=sums)
         if ctx.needs_input_grad[0]:
             ctx.maps = torch.empty(3, height, width, channels)
-            work.by_mean, work.by_square, work.by_product = (m.data_ptr() for m in ctx.maps)
+            work.attach(**dict(zip(("by_mean", "by_square", "by_product"), ctx.maps, strict=True)))
             ctx.save_for_backward(image, target)
             ctx.work = work
         library = kernels()
@@ -42,7 +42,7 @@ class _Dssim(torch.autograd.Function):
         image, _ = ctx.saved_tensors
         by_image = torch.empty_like(image)
         ctx.work.scale = -float(by_dssim) / image.numel()
-        ctx.work.by_image = by_image.data_ptr()
+        ctx.work.attach(by_image=by_image)
         library = kernels()
         scratch = library.refgs_ssim_scratch_size(*image.shape[1:])
         parallel(library.refgs_ssim_backward, ctx.work, scratch)
