@@ -42,6 +42,9 @@ INLINE Quad load_quad(const double* p) {
   return *(const Unaligned*)p;
 }
 
+// A pixel's transmittance, zero from where it is finished.
+INLINE Vector unfinished(Vector T) { return select(T >= refgs::MIN_TRANSMITTANCE, T, Vector()); }
+
 INLINE Quad magnitude(Quad v) { return v < 0 ? -v : v; }
 
 INLINE Splat localise(const Projected& p, const Tile& t) {
@@ -50,8 +53,9 @@ INLINE Splat localise(const Projected& p, const Tile& t) {
   // A fourth lane reads what comes next in `p`, and is not used.
   Quad slope_x = load_quad(p.slope_x), slope_y = load_quad(p.slope_y), value = load_quad(p.value) + slope_x * x + slope_y * y;
   Quad spread = (TILE_X / 2) * magnitude(slope_x) + (TILE_Y / 2) * magnitude(slope_y), most = magnitude(value) + spread;
-  s.split = !(larger(larger(most[0], most[1]), most[2]) <= SPLIT * (value[2] - spread[2]));
-  if (s.split) {
+  double n2_low = value[2] - spread[2], n2_high = value[2] + spread[2];
+  s.plain = larger(larger(most[0], most[1]), most[2]) <= SPLIT * n2_low && n2_low >= p.n2_min && n2_high <= p.n2_max;
+  if (!s.plain) {
     // Adding 1.5 * 2^52 q rounds to multiples of q, here 2^-22 of the largest sum: its multiples of q / 2 fit in a float.
     Quad round = (most + spread) * (1.5 * (1ll << 30));
     auto part = [&](Quad exact, float* high, float* low) {
@@ -69,7 +73,7 @@ INLINE Splat localise(const Projected& p, const Tile& t) {
   }
   s.determinant = p.determinant, s.n2_min = p.n2_min, s.n2_max = p.n2_max;
   s.x = near_zero(p.x - x), s.y = near_zero(p.y - y), s.depth = p.depth;
-  s.opacity = p.opacity, s.rho_max = p.rho_max;
+  s.log2_opacity = p.log2_opacity, s.rho_max = p.rho_max;
   return s;
 }
 
@@ -84,7 +88,7 @@ INLINE void fetch(const Raster& r, const int32_t* members, int64_t k, int64_t co
 uint64_t bits(int low, int high) { return (~0ull >> (63 - (high - low))) << low; }
 
 // Blocks of the tile that the splat's octagon meets, one bit each.
-uint64_t blocks(const Projected& p, const Tile& t) {
+uint64_t blocks(const Octagon& p, const Tile& t) {
   int32_t tx = (int32_t)t.x, ty = (int32_t)t.y;
   uint64_t mask = 0;
   for (int y = larger(p.y0 - ty, 0) / BLOCK_Y; y <= lesser(p.y1 - ty, TILE_Y - 1) / BLOCK_Y; y++) {
@@ -116,6 +120,17 @@ void blend_all(float* sums, const Vector* weights, const float* const* rows, int
   for (; c < channels; c++) blend<1>(sums + c * LANES, weights, rows, count, c);
 }
 
+// Two splats' alphas and depths at the pixels of a block. Two at once, step by step: the one's arithmetic goes on while the other's waits.
+template <bool PLAIN>
+INLINE void see(const Splat& s, const Splat& t, Vector x, Vector y, Vector (&alpha)[2], Vector (&z)[2]) {
+  refgs::Hit<Vector> hits[] = {refgs::intersect<PLAIN>(s, x, y), refgs::intersect<PLAIN>(t, x, y)};
+  Vector uncapped[] = {refgs::uncapped_alpha(s, hits[0]), refgs::uncapped_alpha(t, hits[1])};
+  for (int i = 0; i < 2; i++) {
+    alpha[i] = select(hits[i].covered, refgs::cap(uncapped[i]), Vector());
+    z[i] = hits[i].z;
+  }
+}
+
 void forward_tile(Raster& r, int64_t index, float* sums) {
   Tile t(r, index);
   alignas(64) float transmittance[PIXELS], depth[PIXELS] = {}, alpha[PIXELS] = {};
@@ -126,10 +141,11 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
   for (int b = 0; b < BLOCKS; b++) live |= (uint64_t)any(load(transmittance + b * LANES) > 0.0f) << b;
   const int32_t* members = r.members + r.tile_start[index];
   int64_t count = r.tile_start[index + 1] - r.tile_start[index], reach = 0;
-  Splat splats[CHUNK];
-  uint8_t lists[BLOCKS][CHUNK];
-  Vector weights[CHUNK];
-  const float* rows[CHUNK];
+  Splat splats[CHUNK + 1];  // the one after the last covers nothing, and completes an odd list
+  const float* features[CHUNK + 1];
+  uint8_t lists[BLOCKS][CHUNK + 1];
+  Vector weights[CHUNK + 1];
+  const float* rows[CHUNK + 1];
   for (int64_t start = 0; start < count && live; start += CHUNK) {
     int lengths[BLOCKS] = {};
     int n = (int)(count - start < CHUNK ? count - start : CHUNK);
@@ -137,32 +153,38 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
       fetch(r, members, start + k + AHEAD, count);
       const Projected& p = r.projected[members[start + k]];
       splats[k] = localise(p, t);
-      for (uint64_t m = blocks(p, t) & live; m; m &= m - 1) {
+      features[k] = r.features + members[start + k] * r.channels;
+      for (uint64_t m = blocks(p.octagon, t) & live; m; m &= m - 1) {
         int b = __builtin_ctzll(m);
         lists[b][lengths[b]++] = (uint8_t)k;
       }
     }
+    splats[n] = splats[0], splats[n].rho_max = -1, features[n] = features[0];
     for (uint64_t m = live; m; m &= m - 1) {
       int b = __builtin_ctzll(m), used = 0;
       Vector x = load(CENTRES.x + b * LANES), y = load(CENTRES.y + b * LANES);
       Vector T = load(transmittance + b * LANES), Z = load(depth + b * LANES), A = load(alpha + b * LANES);
       int64_t last = start + n;
-      for (int j = 0; j < lengths[b]; j++) {
-        int k = lists[b][j];
-        const Splat& s = splats[k];
-        auto hit = refgs::intersect<Vector>(s, x, y);
-        Mask covered = hit.covered & (T >= refgs::MIN_TRANSMITTANCE);
-        if (!any(covered)) continue;
-        Vector a = select(covered, refgs::alpha(s, refgs::gaussian(hit)), Vector());
-        Vector w = a * T;
-        T = T * (1.0f - a);
-        Z += w * hit.z;
-        A += w;
-        weights[used] = w;
-        rows[used++] = r.features + members[start + k] * r.channels;
-        if (!any(T >= refgs::MIN_TRANSMITTANCE)) {
+      lists[b][lengths[b]] = (uint8_t)n;
+      for (int j = 0; j < lengths[b]; j += 2) {
+        int k[] = {lists[b][j], lists[b][j + 1]};
+        const Splat &s = splats[k[0]], &next = splats[k[1]];
+        Vector a[2], z[2];
+        if (s.plain & next.plain)
+          see<true>(s, next, x, y, a, z);
+        else
+          see<false>(s, next, x, y, a, z);
+        for (int i = 0; i < 2; i++) {
+          Vector w = a[i] * T;
+          T = unfinished(T * (1.0f - a[i]));
+          Z += w * z[i];
+          A += w;
+          weights[used] = w;
+          rows[used++] = features[k[i]];
+        }
+        if (!any(T > 0.0f)) {
           live &= ~(1ull << b);
-          last = start + k + 1;
+          last = start + lesser(k[1] + 1, n);
           break;
         }
       }
@@ -249,18 +271,17 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
     const float* features = r.features + members[k] * channels;
     Splat s = localise(p, t);
     Vector n0 = {}, n0x = {}, n0y = {}, n1 = {}, n1x = {}, n1y = {}, n2 = {}, n2x = {}, n2y = {};
-    Vector determinant = {}, px = {}, py = {}, depth = {}, opacity = {};
+    Vector determinant = {}, px = {}, py = {}, depth = {}, log_opacity = {};
     Vector weights[BLOCKS];
     const float* touched[BLOCKS];
     int used = 0;
-    for (uint64_t m = blocks(p, t) & live; m; m &= m - 1) {
+    for (uint64_t m = blocks(p.octagon, t) & live; m; m &= m - 1) {
       int b = __builtin_ctzll(m);
       Vector x = load(CENTRES.x + b * LANES), y = load(CENTRES.y + b * LANES), T = load(transmittance + b * LANES);
-      auto hit = refgs::intersect<Vector>(s, x, y);
-      Mask covered = hit.covered & (T >= refgs::MIN_TRANSMITTANCE);
+      auto hit = refgs::intersect<false>(s, x, y);
+      Mask covered = hit.covered & (T > 0.0f);
       if (!any(covered)) continue;
-      Vector g = refgs::gaussian(hit);
-      Vector a = select(covered, refgs::alpha(s, g), Vector());
+      Vector uncapped = select(covered, refgs::uncapped_alpha(s, hit), Vector()), a = refgs::cap(uncapped);
       Vector w = a * T, by_z = load(by_depth + b * LANES);
       const float* plane = planes + b * LANES * C;
       Vector here = load(by_alpha + b * LANES) + by_z * hit.z, h1 = {}, h2 = {}, h3 = {};
@@ -275,16 +296,16 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
       here = (here + h1) + (h2 + h3);
       Vector behind = load(rest + b * LANES) - w * here;
       Vector by_a = select(covered, T * here - behind * reciprocal(1.0f - a), Vector());
-      T = T * (1.0f - a);
+      T = unfinished(T * (1.0f - a));
       store(rest + b * LANES, behind), store(transmittance + b * LANES, T);
-      if (!any(T >= refgs::MIN_TRANSMITTANCE)) live &= ~(1ull << b);
+      if (!any(T > 0.0f)) live &= ~(1ull << b);
       weights[used] = w;
       touched[used++] = plane;
-      auto d = refgs::differentiate(s, hit, g, by_a, w * by_z);
+      auto d = refgs::differentiate(hit, uncapped, by_a, w * by_z);
       n0 += d.n0, n0x += d.n0 * x, n0y += d.n0 * y;
       n1 += d.n1, n1x += d.n1 * x, n1y += d.n1 * y;
       n2 += d.n2, n2x += d.n2 * x, n2y += d.n2 * y;
-      determinant += d.determinant, opacity += d.opacity;
+      determinant += d.determinant, log_opacity += d.log_opacity;
       if (any(covered & ~hit.on_plane)) {
         Vector by_x, by_y, by_depth;
         refgs::differentiate_screen(hit, d, by_x, by_y, by_depth);
@@ -292,7 +313,7 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
       }
     }
     gather_features(row + GEOMETRY, weights, touched, used, C);
-    Vector geometry[] = {n0, n0x, n0y, n1, n1x, n1y, n2, n2x, n2y, determinant, px, py, depth, opacity, Vector(), Vector()};
+    Vector geometry[] = {n0, n0x, n0y, n1, n1x, n1y, n2, n2x, n2y, determinant, px, py, depth, log_opacity, Vector(), Vector()};
     for (int i = 0; i < GEOMETRY; i += LANES) {
       Vector part[LANES];
       for (int k = 0; k < LANES; k++) part[k] = geometry[i + k];

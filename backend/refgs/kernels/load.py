@@ -19,6 +19,7 @@ MACHINES = {"AMD64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64"
 # Functions that return how large a buffer must be, and how many integers they take.
 SIZES = {
     "refgs_projected_size": 0,
+    "refgs_octagon_size": 0,
     "refgs_row_size": 1,
     "refgs_scratch_size": 1,
     "refgs_ssim_scratch_size": 2,

@@ -71,14 +71,15 @@ int16_t integer(double x) { return (int16_t)lesser(larger(x, -32767.0), 32767.0)
 
 void project(const Raster& r, int64_t i) {
   Projected& p = r.projected[i];
-  p.x0 = 0, p.x1 = -1;
+  r.octagons[i].x0 = 0, r.octagons[i].x1 = -1;
   Disc d = disc(r, i);
-  double rho_max = 2 * __builtin_log(r.opacities[i] / (double)refgs::ALPHA_CUT);
+  double log_opacity = __builtin_log(r.opacities[i]), rho_max = log_opacity - __builtin_log(refgs::ALPHA_CUT);
   if (!(d.c.z >= r.near && d.c.z <= refgs::FAR && rho_max >= 0)) return;
   p.x = r.fx * d.c.x / d.c.z + r.cx;
   p.y = r.fy * d.c.y / d.c.z + r.cy;
   p.depth = d.c.z;
-  p.opacity = r.opacities[i];
+  __builtin_memcpy(r.keys + 2 * r.splats + i, &p.depth, 4);  // a positive float's bits are in its order
+  p.log2_opacity = log_opacity * refgs::LOG2_E;
   p.rho_max = rho_max;
 
   Vec3 n0 = cross(d.b, d.c), n1 = cross(d.c, d.a), n2 = cross(d.a, d.b);
@@ -86,8 +87,9 @@ void project(const Raster& r, int64_t i) {
   double k = normaliser(r, d, n0, n1, n2, determinant);
   const Vec3 rows[] = {n0, n1, n2};
   for (int j = 0; j < 3; j++) {
-    p.slope_x[j] = k * rows[j].x / r.fx, p.slope_y[j] = k * rows[j].y / r.fy;
-    p.value[j] = k * rows[j].z - p.slope_x[j] * r.cx - p.slope_y[j] * r.cy;
+    double scale = j < 2 ? k / refgs::UNIT : k;
+    p.slope_x[j] = scale * rows[j].x / r.fx, p.slope_y[j] = scale * rows[j].y / r.fy;
+    p.value[j] = scale * rows[j].z - p.slope_x[j] * r.cx - p.slope_y[j] * r.cy;
   }
   determinant *= k;
   p.determinant = determinant;
@@ -97,14 +99,14 @@ void project(const Raster& r, int64_t i) {
   // The octagon's axes x, y, x + y, x - y, as coefficients of homogeneous coordinates; how far the screen-space filter reaches.
   const Quad mx = {r.fx, 0, r.fx, r.fx}, my = {0, r.fy, r.fy, -r.fy}, mz = {r.cx, r.cy, r.cx + r.cy, r.cx - r.cy};
   auto axes = [&](Vec3 p) { return mx * p.x + my * p.y + mz * p.z; };
-  double radius = __builtin_sqrt(rho_max / refgs::LOW_PASS), reach = __builtin_sqrt(rho_max);
+  double k2 = 2 * rho_max, radius = __builtin_sqrt(k2 / refgs::LOW_PASS), reach = __builtin_sqrt(k2);
   const Quad diagonal = {1, 1, 1.4142135623730951, 1.4142135623730951}, centre = axes(d.c) / d.c.z;
   Quad low = centre - radius * diagonal, high = centre + radius * diagonal;
   auto include = [&](Quad a, Quad b) { low = a < low ? a : low, high = b > high ? b : high; };
   double slope = __builtin_sqrt(d.a.z * d.a.z + d.b.z * d.b.z);  // of z over the disc, along (d.a.z, d.b.z)
   if (k != 0 && d.c.z - reach * slope >= r.near) {
     Quad first, last;
-    extent(axes(d.a), axes(d.b), axes(d.c), d, rho_max, first, last);
+    extent(axes(d.a), axes(d.b), axes(d.c), d, k2, first, last);
     include(first, last);
   } else if (k != 0) {  // what is left of the disc lies in a rectangle, cut off at the near plane, whose image is convex
     double eu = d.a.z / slope, ev = d.b.z / slope;
@@ -119,10 +121,12 @@ void project(const Raster& r, int64_t i) {
   const Quad first_pixel = {0.5, 0.5, 1, 0};  // the first pixel's centre along the axes
   const double slack = 1e-3;                  // pixels: for the rounding of the tiles' float arithmetic
   low = __builtin_elementwise_ceil(low - first_pixel - slack), high = __builtin_elementwise_floor(high - first_pixel + slack);
-  p.x0 = larger(integer(low[0]), 0), p.x1 = lesser(integer(high[0]), r.width - 1);
-  p.y0 = larger(integer(low[1]), 0), p.y1 = lesser(integer(high[1]), r.height - 1);
-  p.sum0 = integer(low[2]), p.sum1 = integer(high[2]), p.difference0 = integer(low[3]), p.difference1 = integer(high[3]);
-  if (p.y1 < p.y0) p.x1 = p.x0 - 1;
+  Octagon& o = r.octagons[i];
+  o.x0 = larger(integer(low[0]), 0), o.x1 = lesser(integer(high[0]), r.width - 1);
+  o.y0 = larger(integer(low[1]), 0), o.y1 = lesser(integer(high[1]), r.height - 1);
+  o.sum0 = integer(low[2]), o.sum1 = integer(high[2]), o.difference0 = integer(low[3]), o.difference1 = integer(high[3]);
+  if (o.y1 < o.y0) o.x1 = o.x0 - 1;
+  p.octagon = o;
 }
 
 float finite(double x) { return (float)lesser(larger(x, -3.4028234e38), 3.4028234e38); }
@@ -130,7 +134,7 @@ float finite(double x) { return (float)lesser(larger(x, -3.4028234e38), 3.402823
 void prefetch(const Raster& r, int64_t i) {
   int64_t stride = GEOMETRY + padded(r.channels);
   const int32_t* place = r.places + r.splat_start[i];
-  each_tile(r, r.projected[i], [&](int64_t tile, int, int) {
+  each_tile(r, r.octagons[i], [&](int64_t tile, int, int) {
     const float* row = r.rows + (r.row_start[tile] + *place++) * stride;
     for (int64_t c = 0; c < stride; c += 16) __builtin_prefetch(row + c);
   });
@@ -138,14 +142,13 @@ void prefetch(const Raster& r, int64_t i) {
 
 // Add up a splat's rows, and carry the derivatives from its projection to its parameters.
 void gather(const Raster& r, int64_t i) {
-  const Projected& p = r.projected[i];
   int64_t channels = r.channels, stride = GEOMETRY + padded(channels);
-  double n[3][3] = {}, determinant = 0, x = 0, y = 0, depth = 0, opacity = 0;
+  double n[3][3] = {}, determinant = 0, x = 0, y = 0, depth = 0, log_opacity = 0;
   float* __restrict by_features = r.by_splat_features + i * channels;
   for (int64_t c = 0; c < channels; c++) by_features[c] = 0;
   bool touched = false;
   const int32_t* place = r.places + r.splat_start[i];
-  each_tile(r, p, [&](int64_t tile, int tx, int ty) {
+  each_tile(r, r.octagons[i], [&](int64_t tile, int tx, int ty) {
     int32_t at = *place++;
     if (at >= r.row_start[tile + 1] - r.row_start[tile]) return;
     const float* __restrict row = r.rows + (r.row_start[tile] + at) * stride;
@@ -156,7 +159,7 @@ void gather(const Raster& r, int64_t i) {
       n[k][1] += row[3 * k + 1] + mx * row[3 * k];
       n[k][2] += row[3 * k + 2] + my * row[3 * k];
     }
-    determinant += row[9], x += row[10], y += row[11], depth += row[12], opacity += row[13];
+    determinant += row[9], x += row[10], y += row[11], depth += row[12], log_opacity += row[13];
     for (int64_t c = 0; c < channels; c++) by_features[c] += row[GEOMETRY + c];
   });
   float *by_position = r.by_positions + 3 * i, *by_rotation = r.by_rotations + 4 * i, *by_scale = r.by_scales + 2 * i;
@@ -164,7 +167,7 @@ void gather(const Raster& r, int64_t i) {
   by_rotation[0] = by_rotation[1] = by_rotation[2] = by_rotation[3] = 0;
   by_scale[0] = by_scale[1] = r.by_opacities[i] = 0;
   if (!touched) return;
-  r.by_opacities[i] = finite(opacity);
+  r.by_opacities[i] = finite(log_opacity / r.opacities[i]);
 
   Disc d = disc(r, i);
   Vec3 v0 = cross(d.b, d.c), v1 = cross(d.c, d.a), v2 = cross(d.a, d.b);
@@ -173,7 +176,7 @@ void gather(const Raster& r, int64_t i) {
     return Vec3{k * (g[1] - g[0] * r.cx) / r.fx, k * (g[2] - g[0] * r.cy) / r.fy, k * g[0]};
   };
   determinant *= k;
-  Vec3 g0 = raw(n[0]), g1 = raw(n[1]), g2 = raw(n[2]) + determinant * d.c;
+  Vec3 g0 = 1 / refgs::UNIT * raw(n[0]), g1 = 1 / refgs::UNIT * raw(n[1]), g2 = raw(n[2]) + determinant * d.c;
   Vec3 by_a = cross(g1, d.c) + cross(d.b, g2);
   Vec3 by_b = cross(d.c, g0) + cross(g2, d.a);
   Vec3 by_c = cross(g0, d.b) + cross(d.a, g1) + determinant * v2;
@@ -198,6 +201,7 @@ void gather(const Raster& r, int64_t i) {
 
 EXPORT int64_t refgs_tiles(int64_t width, int64_t height) { return ((width + TILE_X - 1) / TILE_X) * ((height + TILE_Y - 1) / TILE_Y); }
 EXPORT int64_t refgs_projected_size() { return sizeof(Projected); }
+EXPORT int64_t refgs_octagon_size() { return sizeof(Octagon); }
 EXPORT int64_t refgs_row_size(int64_t channels) { return GEOMETRY + padded(channels); }
 
 // parallel
@@ -208,28 +212,27 @@ EXPORT void refgs_project(Raster* r) {
 
 // Order the visible splats by depth (in float, ties by index) and count the pairs.
 EXPORT void refgs_sort(Raster* r) {
+  constexpr int BITS = 11, DIGITS = 3, SIZE = 1 << BITS;  // a positive float has 31 bits
   int64_t n = 0, pairs = 0;
   uint32_t *keys = r->keys, *values = keys + r->splats, *keys2 = values + r->splats, *values2 = keys2 + r->splats;
+  uint32_t starts[DIGITS][SIZE + 1] = {};
   int64_t tiles = tiles_x(*r) * tiles_y(*r);
   for (int64_t t = 0; t <= tiles; t++) r->tile_start[t] = 0;
   for (int64_t i = 0; i < r->splats; i++) {
-    const Projected& p = r->projected[i];
     r->splat_start[i] = pairs;
     int64_t before = pairs;
-    each_tile(*r, p, [&](int64_t tile, int, int) { r->tile_start[tile + 1]++, pairs++; });
+    each_tile(*r, r->octagons[i], [&](int64_t tile, int, int) { r->tile_start[tile + 1]++, pairs++; });
     if (pairs == before) continue;
-    __builtin_memcpy(keys + n, &p.depth, 4);  // a positive float's bits are in its order
-    values[n++] = (uint32_t)i;
+    keys[n] = keys2[i], values[n++] = (uint32_t)i;
+    for (int d = 0; d < DIGITS; d++) starts[d][(keys2[i] >> d * BITS) % SIZE + 1]++;
   }
   r->splat_start[r->splats] = r->pairs = pairs;
   r->visible = n;
   for (int64_t t = 0; t < tiles; t++) r->tile_start[t + 1] += r->tile_start[t];
-  for (int shift = 0; shift < 33; shift += 11) {
-    uint32_t starts[2049] = {};
-    for (int64_t i = 0; i < n; i++) starts[(keys[i] >> shift & 2047) + 1]++;
-    for (int d = 0; d < 2048; d++) starts[d + 1] += starts[d];
+  for (int d = 0; d < DIGITS; d++) {
+    for (int k = 0; k < SIZE; k++) starts[d][k + 1] += starts[d][k];
     for (int64_t i = 0; i < n; i++) {
-      uint32_t to = starts[keys[i] >> shift & 2047]++;
+      uint32_t to = starts[d][(keys[i] >> d * BITS) % SIZE]++;
       keys2[to] = keys[i], values2[to] = values[i];
     }
     uint32_t* swap = keys;
@@ -245,14 +248,22 @@ EXPORT void refgs_bin(Raster* r) {
   for (int64_t t = 0; t < tiles_x(*r) * tiles_y(*r); t++) counts[t] = 0;
   for (int64_t k = 0; k < r->visible; k++) {
     int32_t i = r->order[k], ahead = r->order[k + AHEAD < r->visible ? k + AHEAD : k];
-    __builtin_prefetch((const char*)&r->projected[ahead] + 64);
+    __builtin_prefetch(&r->octagons[ahead]);
     __builtin_prefetch(&r->splat_start[ahead]);
     int32_t* place = r->places + r->splat_start[i];
-    each_tile(*r, r->projected[i], [&](int64_t tile, int, int) {
+    each_tile(*r, r->octagons[i], [&](int64_t tile, int, int) {
       *place = counts[tile]++;
       r->members[r->tile_start[tile] + *place++] = i;
     });
   }
+}
+
+// Where each tile's rows begin, one for each member up to its reach, and how many there are.
+EXPORT void refgs_rows(Raster* r) {
+  int64_t tiles = tiles_x(*r) * tiles_y(*r);
+  r->row_count = 0;
+  for (int64_t t = 0; t < tiles; t++) r->row_start[t] = r->row_count, r->row_count += r->reach[t];
+  r->row_start[tiles] = r->row_count;
 }
 
 // parallel

@@ -24,12 +24,16 @@ constexpr int BLOCKS = BLOCKS_X * BLOCKS_Y;
 constexpr int AHEAD = 12;     // splats that are fetched before they are needed
 constexpr int GEOMETRY = 16;  // floats of a gradient row before its features; 14 are used
 
+// Pixels that a splat can cover, all inclusive: bounds of x, y, x + y and x - y; x1 < x0 where there are none.
+struct alignas(16) Octagon {
+  int16_t x0, x1, y0, y1, sum0, sum1, difference0, difference1;
+};
+
 struct alignas(64) Projected {
   double value[3], slope_x[3], slope_y[3];  // of n0, n1, n2 as in Splat, the origin at the image's corner
   double x, y;
-  float determinant, n2_min, n2_max, depth, opacity, rho_max;
-  // Pixels that it can cover, all inclusive: bounds of x, y, x + y and x - y, an octagon; x1 < x0 where there are none.
-  int16_t x0, x1, y0, y1, sum0, sum1, difference0, difference1;
+  float determinant, n2_min, n2_max, depth, log2_opacity, rho_max;
+  Octagon octagon;
 };
 
 static_assert(sizeof(Projected) == 128, "two cache lines");
@@ -40,7 +44,8 @@ struct Raster {
   double view[12];  // world to camera, 3x4, row-major
   double fx, fy, cx, cy, near;
   Projected* projected;       // (splats)
-  uint32_t* keys;             // (4 splats) scratch of the sort
+  Octagon* octagons;          // (splats) once more, close together: what binning reads
+  uint32_t* keys;             // (4 splats) scratch of the sort; the third quarter begins as the splats' depths
   int32_t* order;             // (visible) splats, front to back
   int64_t visible, pairs;     // pairs: (splat, tile) that meet
   int64_t* splat_start;       // (splats + 1) into `places`
@@ -51,7 +56,8 @@ struct Raster {
   int32_t* reach;             // (tiles) members after which every pixel is finished
   const float *by_features, *by_depth, *by_alpha;
   int64_t* row_start;         // (tiles + 1) into `rows`
-  float* rows;                // (row_start[tiles], GEOMETRY + padded channels) derivatives of a pair
+  int64_t row_count;
+  float* rows;                // (row_count, GEOMETRY + padded channels) derivatives of a pair
   float *by_positions, *by_rotations, *by_scales, *by_opacities, *by_splat_features;
   float* scratch;             // (threads, refgs_scratch_size)
   Shared shared;
@@ -65,7 +71,7 @@ INLINE int64_t tiles_y(const Raster& r) { return (r.height + TILE_Y - 1) / TILE_
 
 // body(tile) for the tiles that the splat's octagon meets, row by row.
 template <class Body>
-INLINE void each_tile(const Raster& r, const Projected& p, Body body) {
+INLINE void each_tile(const Raster& r, const Octagon& p, Body body) {
   if (p.x1 < p.x0) return;
   for (int32_t y = p.y0 / TILE_Y; y <= p.y1 / TILE_Y; y++)
     for (int32_t x = p.x0 / TILE_X; x <= p.x1 / TILE_X; x++) {

@@ -1,7 +1,7 @@
 // One splat at one pixel: what it covers there, at what depth, and the derivatives. Everything that every backend must
 // agree on is here; F is the number type, `float` or a vector of floats, one lane a pixel.
 //
-// The includer provides, for its F: select(mask, a, b), exp_half(x) = exp(-x/2) for x >= 0, smaller(a, b), and reciprocal(x).
+// The includer provides, for its F: select(mask, a, b), exp2(x) = 2^x for -126 <= x <= 0, smaller(a, b), reciprocal(x).
 #pragma once
 
 #ifdef __CUDACC_RTC__
@@ -16,6 +16,8 @@ constexpr float ALPHA_CUT = 1.0f / 255.0f;  // a splat ends where its alpha fall
 constexpr float ALPHA_CAP = 0.99f;          // a single splat never hides what is behind it completely
 constexpr float MIN_TRANSMITTANCE = 1e-4f;  // a pixel is finished below this
 constexpr float LOW_PASS = 2.0f;            // 1 / variance of the screen-space filter, in pixels^-2 (2DGS: sigma = sqrt(2) / 2)
+constexpr double UNIT = 1.4142135623730951;  // u and v count in it, standard deviations: so a splat's alpha is opacity e^-(u^2 + v^2)
+constexpr double LOG2_E = 1.4426950408889634;
 constexpr double FAR = 1e12;                // depths beyond this are not drawn: keeps every product finite in float
 
 // Three affine functions of the pixel: values at the origin, slopes along x and y (a fourth lane fills the vector).
@@ -27,16 +29,16 @@ struct alignas(16) Affine {
 // space, Eq. 4 reads M (u, v, 1)^T = z (X, Y, 1)^T, so (n0, n1, n2) = k det(M) M^-1 (X, Y, 1)^T is affine in the pixel,
 // u = n0 / n2, v = n1 / n2, z = k det(M) / n2. The factor k is free. Each is a sum of two: `high` is rounded so
 // that it is computed without error at the half-integers of a tile, `low` is what that left out. For a disc near its edge n2 is a
-// small difference of large numbers, and one float each would give up the accuracy of u, v and z. Most discs are not: `low` then
-// is not there.
+// small difference of large numbers, and one float each would give up the accuracy of u, v and z. Most discs are not, nor do they
+// meet the near plane, or FAR, within the tile: such a disc is `plain`, has no `low`, and meets every ray of the tile.
 struct Splat {
   Affine high, low;
   float determinant;          // k det(M), >= 0
   float n2_min, n2_max;       // the plane is met between the near plane and FAR where n2_min <= n2 <= n2_max
   float x, y, depth;          // projected centre, and its depth
-  float opacity;
-  int32_t split;              // whether there is a `low`
-  float rho_max;              // alpha >= ALPHA_CUT  <=>  rho <= 2 ln(opacity / ALPHA_CUT)
+  float log2_opacity;
+  float rho_max;              // alpha >= ALPHA_CUT  <=>  rho <= ln(opacity / ALPHA_CUT)
+  int32_t plain;
 };
 
 template <class F>
@@ -47,20 +49,22 @@ REFGS_INLINE F affine(const Affine& a, int i, F x, F y) {
 template <class F>
 struct Hit {
   F u, v, inverse, dx, dy;  // `inverse` is 1 / n2
-  F rho, z;                 // squared distance in standard deviations; depth
+  F rho, z;                 // alpha is opacity e^-rho, rho being half the squared distance in standard deviations; depth
   decltype(F() < F()) on_plane, covered;
 };
 
-// rho = min(u^2 + v^2, LOW_PASS |pixel - centre|^2), the low-pass of 2DGS; the depth is that of whichever it is. Where the ray
+// rho = min(u^2 + v^2, LOW_PASS |pixel - centre|^2 / 2), the low-pass of 2DGS; the depth is that of whichever it is. Where the ray
 // misses the plane, or meets it nearer than the near plane, the low-pass alone remains: an edge-on splat is a dot.
 // Comparisons are written so that a NaN (0/0 at a horizon) counts as a miss.
-template <class F>
+//
+// PLAIN says that the splat is known to be; where it is not known, the splat tells.
+template <bool PLAIN, class F>
 REFGS_INLINE Hit<F> intersect(const Splat& s, F x, F y) {
   Hit<F> h;
   F n0 = affine(s.high, 0, x, y);
   F n1 = affine(s.high, 1, x, y);
   F n2 = affine(s.high, 2, x, y);
-  if (s.split) {
+  if (!PLAIN && !s.plain) {
     n0 += affine(s.low, 0, x, y);
     n1 += affine(s.low, 1, x, y);
     n2 += affine(s.low, 2, x, y);
@@ -71,46 +75,45 @@ REFGS_INLINE Hit<F> intersect(const Splat& s, F x, F y) {
   h.dx = x - s.x;
   h.dy = y - s.y;
   F plane = h.u * h.u + h.v * h.v;
-  F screen = LOW_PASS * (h.dx * h.dx + h.dy * h.dy);
-  h.on_plane = (n2 >= s.n2_min) & (n2 <= s.n2_max) & (plane <= screen);
+  F screen = LOW_PASS / 2 * (h.dx * h.dx + h.dy * h.dy);
+  h.on_plane = plane <= screen;
+  if (!PLAIN && !s.plain) h.on_plane &= (n2 >= s.n2_min) & (n2 <= s.n2_max);
   h.rho = select(h.on_plane, plane, screen);
-  h.z = select(h.on_plane, s.determinant * h.inverse, F() + s.depth);
+  h.z = select(h.on_plane, s.determinant * h.inverse, s.depth - F());
   h.covered = h.rho <= s.rho_max;
   return h;
 }
 
+// Anything, even a NaN, where the splat doesn't cover the pixel.
 template <class F>
-REFGS_INLINE F gaussian(const Hit<F>& h) {
-  return exp_half(h.rho);
+REFGS_INLINE F uncapped_alpha(const Splat& s, const Hit<F>& h) {
+  return exp2(s.log2_opacity - (float)LOG2_E * h.rho);
 }
 
 template <class F>
-REFGS_INLINE F alpha(const Splat& s, F gaussian) {
-  return smaller(s.opacity * gaussian, F() + ALPHA_CAP);
+REFGS_INLINE F cap(F alpha) {
+  return smaller(alpha, F() + ALPHA_CAP);
 }
 
 // Derivatives of the loss by what Splat holds, at one pixel; those by n0, n1, n2 are by their values at the pixel.
 template <class F>
 struct Derivative {
-  F opacity, n0, n1, n2, determinant;  // where the splat is on its plane
-  F by_rho, by_z;                      // what passes to the projected centre, elsewhere
+  F log_opacity, n0, n1, n2, determinant;  // n and determinant: where the splat is on its plane
+  F by_z;                                  // what passes to the centre's depth, elsewhere
 };
 
-// From the derivatives by the pixel's alpha and by the splat's z, both zero where the splat doesn't cover it.
+// From the alpha, and the derivatives by the capped alpha and by the splat's z; all zero where the splat doesn't cover the pixel.
 template <class F>
-REFGS_INLINE Derivative<F> differentiate(const Splat& s, const Hit<F>& h, F gaussian, F by_alpha, F by_z) {
+REFGS_INLINE Derivative<F> differentiate(const Hit<F>& h, F uncapped_alpha, F by_alpha, F by_z) {
   Derivative<F> d;
   F zero = F();
-  F raw = s.opacity * gaussian;
-  by_alpha = select(raw < ALPHA_CAP, by_alpha, zero);
-  d.opacity = by_alpha * gaussian;
-  d.by_rho = -0.5f * raw * by_alpha;
+  d.log_opacity = select(uncapped_alpha < ALPHA_CAP, uncapped_alpha * by_alpha, zero);  // by -rho, too
   d.by_z = by_z;
   F inverse = select(h.on_plane, h.inverse, zero);
-  F scale = 2.0f * d.by_rho * inverse;
+  F twice = 2.0f * d.log_opacity, scale = -twice * inverse;
   d.n0 = select(h.on_plane, scale * h.u, zero);
   d.n1 = select(h.on_plane, scale * h.v, zero);
-  d.n2 = -inverse * (2.0f * d.by_rho * h.rho + by_z * h.z);
+  d.n2 = inverse * (twice * h.rho - by_z * h.z);
   d.determinant = by_z * inverse;
   return d;
 }
@@ -119,7 +122,7 @@ REFGS_INLINE Derivative<F> differentiate(const Splat& s, const Hit<F>& h, F gaus
 template <class F>
 REFGS_INLINE void differentiate_screen(const Hit<F>& h, const Derivative<F>& d, F& by_x, F& by_y, F& by_depth) {
   F zero = F();
-  F scale = select(h.on_plane, zero, -2.0f * LOW_PASS * d.by_rho);
+  F scale = select(h.on_plane, zero, LOW_PASS * d.log_opacity);
   by_x = scale * h.dx;
   by_y = scale * h.dy;
   by_depth = select(h.on_plane, zero, d.by_z);

@@ -31,11 +31,12 @@ class _Work(Work):
         + [(n, ctypes.c_void_p) for n in ("positions", "rotations", "scales", "opacities", "features")]
         + [("view", ctypes.c_double * 12)]
         + [(n, ctypes.c_double) for n in ("fx", "fy", "cx", "cy", "near")]
-        + [(n, ctypes.c_void_p) for n in ("projected", "keys", "order")]
+        + [(n, ctypes.c_void_p) for n in ("projected", "octagons", "keys", "order")]
         + [(n, ctypes.c_int64) for n in ("visible", "pairs")]
         + [(n, ctypes.c_void_p) for n in ("splat_start", "tile_start", "members", "places")]
         + [(n, ctypes.c_void_p) for n in ("out_features", "out_depth", "out_alpha", "reach")]
-        + [(n, ctypes.c_void_p) for n in ("by_features", "by_depth", "by_alpha", "row_start", "rows")]
+        + [(n, ctypes.c_void_p) for n in ("by_features", "by_depth", "by_alpha", "row_start")]
+        + [("row_count", ctypes.c_int64), ("rows", ctypes.c_void_p)]
         + [(n, ctypes.c_void_p) for n in ("by_positions", "by_rotations", "by_scales", "by_opacities")]
         + [("by_splat_features", ctypes.c_void_p), ("scratch", ctypes.c_void_p), ("shared", Shared)]
     )
@@ -50,6 +51,7 @@ def _project_and_bin(work: _Work, camera: Camera, near: float) -> dict[str, Tens
     tiles = library.refgs_tiles(camera.width, camera.height)
     bins = {
         "projected": torch.empty(n * library.refgs_projected_size(), dtype=torch.uint8),
+        "octagons": torch.empty(n * library.refgs_octagon_size(), dtype=torch.uint8),
         "order": torch.empty(n, dtype=torch.int32),
         "splat_start": torch.empty(n + 1, dtype=torch.int64),
         "tile_start": torch.empty(tiles + 1, dtype=torch.int64),
@@ -98,14 +100,14 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, by_features, by_depth, by_alpha):
         library, work = kernels(), ctx.work
         saved = ctx.saved_tensors  # also checks that nobody changed them
-        row_start = torch.zeros(ctx.bins["reach"].numel() + 1, dtype=torch.int64)
-        torch.cumsum(ctx.bins["reach"], dim=0, out=row_start[1:])
+        row_start = torch.empty_like(ctx.bins["tile_start"])
+        work.attach(row_start=row_start)
+        library.refgs_rows(ctypes.byref(work))
         buffers = {
             "by_features": by_features.contiguous(),
             "by_depth": by_depth.contiguous(),
             "by_alpha": by_alpha.contiguous(),
-            "row_start": row_start,
-            "rows": torch.empty(int(row_start[-1]) * library.refgs_row_size(work.channels)),
+            "rows": torch.empty(work.row_count * library.refgs_row_size(work.channels)),
         }
         gradients = {
             "by_positions": torch.empty_like(saved[0]),
