@@ -63,23 +63,24 @@ void forward_row(const Ssim& s, int64_t y, const Lines& lines) {
     write(lines[0] + i, x, count), write(lines[1] + i, t, count);
     write(lines[2] + i, square, count), write(lines[3] + i, product, count);
   });
-  double sum = 0;
+  typedef double Sum __attribute__((vector_size(8 * LANES)));
+  Sum sum = {};
   each(n, [&](int64_t i, int64_t count) {
     Vector x = along(lines[0] + i, s.channels), t = along(lines[1] + i, s.channels);
     Vector square = along(lines[2] + i, s.channels), product = along(lines[3] + i, s.channels);
     Vector xt = x * t, means = x * x + t * t;
     Vector a1 = 2.0f * xt + C1, a2 = 2.0f * (product - xt) + C2, b1 = means + C1, b2 = square - means + C2;
-    Vector inverse1 = 1.0f / b1, inverse2 = 1.0f / b2, both = inverse1 * inverse2;
+    Vector inverse1 = reciprocal(b1), inverse2 = reciprocal(b2), both = inverse1 * inverse2;
     Vector ssim = a1 * a2 * both;
-    float lanes[LANES];
-    store(lanes, ssim);
-    for (int64_t k = 0; k < count; k++) sum += lanes[k];
+    for (int64_t k = count; k < LANES; k++) ssim[k] = 0;  // beyond the row
+    sum += __builtin_convertvector(ssim, Sum);
     if (!s.by_mean) return;
     write(s.by_mean + y * n + i, 2.0f * (t * (a2 - a1) * both + x * ssim * (inverse2 - inverse1)), count);
     write(s.by_square + y * n + i, -ssim * inverse2, count);
     write(s.by_product + y * n + i, 2.0f * a1 * both, count);
   });
-  s.sums[y] = sum;
+  s.sums[y] = 0;
+  for (int k = 0; k < LANES; k++) s.sums[y] += sum[k];
 }
 
 // The window is symmetric, so the derivative of windowing is windowing.
