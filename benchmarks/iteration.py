@@ -18,7 +18,7 @@ from refgs.capture import read_capture
 from refgs.render.renderer import render
 from refgs.settings import load_settings
 from refgs.train.losses import objective
-from refgs.train.trainer import Trainer, composite
+from refgs.train.trainer import Trainer
 
 SIZE, SURFELS, REPEATS = 256, 20_000, 30
 
@@ -55,9 +55,7 @@ def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
     at = record("activations and light's prefilter", at)
     rendering = render(surfels, environment, view.camera, trainer.background, settings.render, trainer.near)
     at = record("raster and shading", at)
-    mask = torch.from_numpy(view.alpha).float() / 255
-    photo = composite(view, trainer.background)
-    loss = objective(rendering, environment, photo, mask, view.camera, settings.loss, 0.5)
+    loss, _ = objective(rendering, environment, view, trainer.background, settings.loss, 0.5)
     at = record("losses", at)
     loss.backward()
     record("backward of all", at)

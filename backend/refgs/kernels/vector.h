@@ -58,19 +58,35 @@ INLINE Vector exp2(Vector x) {
   return (Vector)((Mask)p + exponent);
 }
 
+INLINE Mask first(int64_t n) {
+  Mask lane;
+  for (int i = 0; i < LANES; i++) lane[i] = i;
+  return lane < (int32_t)n;
+}
+
 // Part of a vector: the first n lanes, the others zero.
 INLINE Vector read(const float* p, int64_t n) {
   if (n >= LANES) return load(p);
-  float lanes[LANES] = {};
-  for (int i = 0; i < n; i++) lanes[i] = p[i];
-  return load(lanes);
+#if LANES == 16
+  return __builtin_ia32_loadups512_mask(p, Vector(), (uint16_t)((1 << n) - 1));
+#elif LANES == 8
+  return __builtin_ia32_maskloadps256((const Vector*)p, first(n));
+#else
+  Vector v = {};
+  for (int i = 0; i < n; i++) v[i] = p[i];
+  return v;
+#endif
 }
 
 INLINE void write(float* p, Vector v, int64_t n) {
   if (n >= LANES) return store(p, v);
-  float lanes[LANES];
-  store(lanes, v);
-  for (int i = 0; i < n; i++) p[i] = lanes[i];
+#if LANES == 16
+  __builtin_ia32_storeups512_mask(p, v, (uint16_t)((1 << n) - 1));
+#elif LANES == 8
+  __builtin_ia32_maskstoreps256((Vector*)p, first(n), v);
+#else
+  for (int i = 0; i < n; i++) p[i] = v[i];
+#endif
 }
 
 INLINE void clear(float* p, int64_t n) {  // n: a multiple of LANES

@@ -6,18 +6,21 @@ one fixed sparse matrix over the texels of the cubemap and of its pooled mips: f
 coarse ones in its tail.
 """
 
+import ctypes
 import hashlib
 import os
-import warnings
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import platformdirs
 import torch
 from scipy import integrate, sparse
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from refgs.kernels.load import Shared, Work, kernels, parallel
 from refgs.model import cubemap
 
 ROUGHNESS = (0.0, 0.18, 0.35, 0.6, 1.0)  # of the levels; level 0 is the cubemap itself
@@ -94,9 +97,22 @@ def _cache_file(resolution: int) -> Path:
     return Path(platformdirs.user_cache_dir("refgs")) / f"prefilter-{resolution}-{key}.npz"
 
 
+class Matrix(NamedTuple):
+    """A sparse matrix by rows: where each row's numbers start (rows + 1), int32; the numbers' columns, int32; float32."""
+
+    starts: Tensor
+    columns: Tensor
+    numbers: Tensor
+
+    @classmethod
+    def of(cls, matrix: sparse.csr_matrix) -> "Matrix":
+        parts = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data.astype(np.float32)
+        return cls(*map(torch.from_numpy, parts))
+
+
 @lru_cache(maxsize=4)
-def matrices(resolution: int) -> tuple[Tensor, Tensor]:
-    """The levels above 0 stacked, as a sparse CSR matrix over the pyramid's texels, and its transpose (float32)."""
+def matrices(resolution: int) -> tuple[Matrix, Matrix]:
+    """The levels above 0 stacked, as a matrix over the pyramid's texels, and its transpose."""
     file = _cache_file(resolution)
     if file.exists():
         matrix = sparse.load_npz(file)
@@ -113,15 +129,7 @@ def matrices(resolution: int) -> tuple[Tensor, Tensor]:
         temporary = file.with_suffix(f".{os.getpid()}.npz")
         sparse.save_npz(temporary, matrix, compressed=False)
         os.replace(temporary, file)
-    return _to_torch(matrix), _to_torch(matrix.T.tocsr())
-
-
-def _to_torch(matrix) -> Tensor:
-    # 32-bit indices: with 64-bit ones torch leaves MKL and is thirty times slower.
-    parts = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data.astype(np.float32)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
-        return torch.sparse_csr_tensor(*map(torch.from_numpy, parts), size=matrix.shape, check_invariants=False)
+    return Matrix.of(matrix), Matrix.of(matrix.T.tocsr())
 
 
 @lru_cache(maxsize=4)
@@ -142,17 +150,36 @@ def _pyramid(radiance: Tensor, resolution: int) -> Tensor:
     return torch.cat(mips)
 
 
+class _Work(Work):
+    """`struct Product` of sparse.cpp."""
+
+    _fields_ = (
+        ("rows", ctypes.c_int64),
+        *((n, ctypes.c_void_p) for n in ("starts", "columns", "numbers", "dense", "out", "scratch")),
+        ("shared", Shared),
+    )
+
+
+def _product(matrix: Matrix, dense: Tensor) -> Tensor:
+    rows = len(matrix.starts) - 1
+    work, out, padded = _Work(rows=rows), torch.empty(rows, 3), torch.nn.functional.pad(dense.reshape(-1), (0, 1))
+    work.attach(**matrix._asdict(), dense=padded, out=out)
+    parallel(kernels().refgs_sparse_product, work)
+    return out
+
+
 class _Product(torch.autograd.Function):
     """Sparse matrix times dense; the gradient is the product with the stored transpose."""
 
     @staticmethod
-    def forward(ctx, dense: Tensor, matrix: Tensor, transpose: Tensor) -> Tensor:
+    def forward(ctx, dense: Tensor, matrix: Matrix, transpose: Matrix) -> Tensor:
         ctx.transpose = transpose
-        return matrix @ dense
+        return _product(matrix, dense)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, gradient: Tensor):
-        return ctx.transpose @ gradient.contiguous(), None, None
+        return _product(ctx.transpose, gradient), None, None
 
 
 def prefilter(radiance: Tensor, resolution: int) -> Tensor:

@@ -1,55 +1,95 @@
 """The objective (paper §3.3): colour, normal consistency, edge-aware smoothness; and the mask."""
 
+import ctypes
+import math
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from refgs.camera import Camera
+from refgs.capture import LoadedView
+from refgs.kernels.load import Shared, Work, kernels, parallel
 from refgs.model.environment import Environment
-from refgs.render.renderer import COVERED, Rendering, camera_rays, unit
+from refgs.render.renderer import Rendering
 from refgs.render.ssim import dssim
 from refgs.settings import LossSettings
 
-SATURATED = 0.998  # a photo's value above which the true radiance is unknown
+
+class Objective(NamedTuple):
+    """The training loss of a view, a differentiable scalar, and its peak signal-to-noise ratio in dB, clipped to 0..1."""
+
+    loss: Tensor
+    psnr: float
 
 
-def color_loss(color: Tensor, photo: Tensor, weight: float) -> Tensor:
-    """(1 − λ) L1 + λ D-SSIM on sRGB-encoded (H, W, 3).
+class _Work(Work):
+    """`struct Losses` of losses.cpp."""
 
-    The rendering is clipped only where the photo is: elsewhere an over-bright pixel must feel its gradient.
-    """
-    color = torch.where(photo >= SATURATED, color.clamp_max(1.0), color)
-    loss = (1 - weight) * (color - photo).abs().mean()
-    return loss + weight * dssim(color, photo) if weight > 0 else loss
-
-
-def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
-    """Unit normals (H − 2, W − 2, 3) of the depth map's surface, towards the camera, by central differences."""
-    points = camera_rays(camera) * depth[..., None]
-    across = points[1:-1, 2:] - points[1:-1, :-2]
-    down = points[2:, 1:-1] - points[:-2, 1:-1]
-    return unit(torch.linalg.cross(down, across))
+    _fields_ = (
+        [(n, ctypes.c_int64) for n in ("width", "height")]
+        + [(n, ctypes.c_void_p) for n in ("color", "normal", "depth", "alpha", "material", "image", "mask")]
+        + [("background", ctypes.c_float * 3), ("rotation", ctypes.c_double * 9)]
+        + [(n, ctypes.c_double) for n in ("fx", "fy", "cx", "cy")]
+        + [(f"{n}_weight", ctypes.c_float) for n in ("color", "normal", "smooth_x", "smooth_y", "alpha", "metallic")]
+        + [(n, ctypes.c_void_p) for n in ("photo", "clipped", "by_clipped")]
+        + [(n, ctypes.c_void_p) for n in ("by_color", "by_normal", "by_depth", "by_alpha", "by_material", "slopes")]
+        + [(n, ctypes.c_void_p) for n in ("sums", "scratch")]
+        + [("shared", Shared)]
+    )
 
 
-def normal_loss(rendering: Rendering, camera: Camera) -> Tensor:
-    """1 − ÑᵀN, Ñ from the depth, where the surface is opaque around the pixel."""
-    solid = rendering.alpha.detach() > 0.5
-    solid = solid[1:-1, 2:] & solid[1:-1, :-2] & solid[2:, 1:-1] & solid[:-2, 1:-1]
-    normal = unit(rendering.normal[1:-1, 1:-1])
-    disagreement = 1 - (depth_normals(rendering.depth, camera) * normal).sum(dim=-1)
-    return (disagreement * solid).mean()
+class _Maps(torch.autograd.Function):
+    """The terms that a rendering's maps say, but the light's; the derivatives are had with the value."""
 
+    @staticmethod
+    def forward(ctx, color, normal, depth, alpha, material, view, background, weights, progress):
+        library, camera, (height, width) = kernels(), view.camera, alpha.shape
+        inputs = {"color": color, "normal": normal, "depth": depth, "alpha": alpha}
+        if material is not None:
+            inputs["material"] = material
+        inputs = {name: value.contiguous() for name, value in inputs.items()}
+        gradients = {f"by_{name}": torch.empty_like(value) for name, value in inputs.items()}
+        buffers = {"photo": torch.empty_like(color), "clipped": torch.empty_like(color)}
+        buffers["slopes"] = torch.empty(4, height, width)
+        buffers["sums"] = sums = torch.zeros(height, library.refgs_losses_sums(), dtype=torch.float64)
+        buffers["image"] = torch.from_numpy(view.image)
+        if view.alpha is not None:
+            buffers["mask"] = torch.from_numpy(view.alpha)
 
-def smoothness_loss(rendering: Rendering, photo: Tensor) -> Tensor:
-    """‖∇N‖ exp(−‖∇C_gt‖), forward differences, where the surface is opaque."""
-    normal, solid = rendering.normal, rendering.alpha.detach() > 0.5
-    total = normal.new_zeros(())
-    for axis in (0, 1):
-        n = photo.shape[axis] - 1
-        change = (normal.narrow(axis, 1, n) - normal.narrow(axis, 0, n)).abs().sum(dim=-1)
-        edge = (photo.narrow(axis, 1, n) - photo.narrow(axis, 0, n)).abs().sum(dim=-1)
-        both = solid.narrow(axis, 1, n) & solid.narrow(axis, 0, n)
-        total = total + (change * torch.exp(-edge) * both).mean()
-    return total
+        work = _Work(width=width, height=height, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
+        work.background[:] = background.tolist()
+        work.rotation[:] = camera.world_to_camera[:3, :3].reshape(-1).tolist()
+        work.color_weight = (1 - weights.dssim) / color.numel()
+        work.normal_weight = weights.normal / max((height - 2) * (width - 2), 1)
+        work.smooth_x_weight = weights.smooth / max(height * (width - 1), 1)
+        work.smooth_y_weight = weights.smooth / max((height - 1) * width, 1)
+        work.alpha_weight = weights.alpha / alpha.numel()
+        work.attach(**inputs, **gradients, **buffers)
+        parallel(library.refgs_losses_first, work)
+
+        structure = torch.zeros(())
+        if weights.dssim > 0:
+            with torch.enable_grad():
+                clipped = buffers["clipped"].requires_grad_()
+                structure = dssim(clipped, buffers["photo"])
+                (by_clipped,) = torch.autograd.grad(structure, clipped, torch.tensor(weights.dssim))
+        else:
+            by_clipped = torch.zeros_like(color)
+        metallic, covered, squares = sums[:, 1:].sum(dim=0).tolist()
+        work.metallic_weight = weights.metallic * progress**2 / max(covered, 1)
+        work.attach(by_clipped=by_clipped)
+        parallel(library.refgs_losses_second, work)
+        ctx.gradients = list(gradients.values()) + [None] * (material is None)
+        psnr = -10 * math.log10(max(squares / color.numel(), 1e-10))
+        value = float(sums[:, 0].sum()) + work.metallic_weight * metallic + weights.dssim * float(structure)
+        return torch.tensor(value), psnr
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, by_loss, _):
+        scaled = ctx.gradients if by_loss == 1 else [None if g is None else by_loss * g for g in ctx.gradients]
+        return *scaled, None, None, None, None
 
 
 def light_loss(environment: Environment) -> Tensor:
@@ -65,26 +105,25 @@ def light_loss(environment: Environment) -> Tensor:
 def objective(
     rendering: Rendering,
     environment: Environment | None,
-    photo: Tensor,
-    mask: Tensor | None,
-    camera: Camera,
+    view: LoadedView,
+    background: Tensor,
     weights: LossSettings,
     progress: float,
-) -> Tensor:
-    """The training loss of one view, at a progress of 0..1; terms with weight zero cost nothing."""
-    loss = color_loss(rendering.color, photo, weights.dssim)
-    if weights.normal > 0:
-        loss = loss + weights.normal * normal_loss(rendering, camera)
-    if weights.smooth > 0:
-        loss = loss + weights.smooth * smoothness_loss(rendering, photo)
-    if mask is not None and weights.alpha > 0:
-        loss = loss + weights.alpha * (rendering.alpha - mask).abs().mean()
-    if rendering.material is not None and weights.metallic > 0:
-        # Nothing real is half a metal. Where the metallic is decided, the highlights of dielectrics, 4 % of the light and
-        # without colour, fix the light's scale and white balance, which metals alone cannot. Not before it is known
-        # which is which, hence the square.
-        metallic, covered = rendering.metallic, (rendering.alpha.detach() > COVERED).sum().clamp_min(1)
-        loss = loss + weights.metallic * progress**2 * (metallic * (1 - metallic)).sum() / covered
+) -> Objective:
+    """What training lowers, of one view, at a progress of 0..1.
+
+    Colour: (1 − λ) L1 + λ D-SSIM on sRGB, against the photo over the background. The rendering is clipped only where the
+    photo is: elsewhere an over-bright pixel must feel its gradient. Normals: 1 − ÑᵀN, Ñ from the depth by central
+    differences, where the surface is opaque around the pixel. Smoothness: ‖∇N‖ exp(−‖∇C_gt‖), forward differences, where
+    the surface is opaque. The mask: |α − mask|.
+
+    And m (1 − m) of the metallic m, over the object: nothing real is half a metal. Where the metallic is decided, the
+    highlights of dielectrics, 4 % of the light and without colour, fix the light's scale and white balance, which metals
+    alone cannot. Not before it is known which is which, hence with the square of the progress.
+    """
+    material = rendering.material if weights.metallic > 0 else None
+    maps = rendering.color, rendering.normal, rendering.depth, rendering.alpha, material
+    loss, psnr = _Maps.apply(*maps, view, background, weights, progress)
     if environment is not None and weights.light > 0:
         loss = loss + weights.light * light_loss(environment)
-    return loss
+    return Objective(loss, psnr)

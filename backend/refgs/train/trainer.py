@@ -106,8 +106,8 @@ class Trainer:
     def surfels(self) -> Surfels:
         """The activated surfels, with what does not learn filled in."""
         count = len(self.parameters["position"])
-        fixed = {name: value.expand(count, *value.shape[1:]) for name, value in self.constant.items()}
-        return activate({**self.parameters, **fixed})
+        values = activate({**self.parameters, **self.constant})
+        return Surfels(*(value.expand(count, *value.shape[1:]) for value in values))
 
     def environment(self) -> Environment | None:
         """The light as it is now; none where nothing is lit."""
@@ -146,9 +146,7 @@ class Trainer:
 
         surfels, environment = self.surfels(), self.environment()
         rendering = self._render(surfels, environment, view.camera)
-        photo = composite(view, self.background)
-        mask = None if view.alpha is None else torch.from_numpy(view.alpha).float() / 255
-        loss = objective(rendering, environment, photo, mask, view.camera, settings.loss, progress)
+        loss, quality = objective(rendering, environment, view, self.background, settings.loss, progress)
         loss.backward()
         position = self.parameters["position"]
         self.motion.add(position.detach(), position.grad, view.camera)
@@ -159,7 +157,7 @@ class Trainer:
         due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
         if self._reflects() and due and self.iteration < self.total:
             self._trace()
-        return {"loss": float(loss.detach()), "psnr": psnr(rendering.color.detach(), photo)}
+        return {"loss": float(loss.detach()), "psnr": quality}
 
     def _next_view(self) -> LoadedView:
         """Every view once an epoch, in an order that depends on the seed and the epoch alone, so that a resumed run goes on alike."""

@@ -1,0 +1,227 @@
+// The objective of a view but for D-SSIM, and its derivatives by the rendering's maps: two passes over the rows.
+//
+// Colour: |C - C_gt|, C clipped only where the photo is. Normals: 1 - N.n between the depth's normal N and the blended n. Smoothness:
+// |grad n| exp(-|grad C_gt|). Mask: |alpha - mask|. Metallic: m (1 - m), which is zero at both ends. A weight is that of one pixel's term.
+#include "library.h"
+#include "vector.h"
+
+namespace {
+
+struct Losses {
+  int64_t width, height;
+  const float *color, *normal, *depth, *alpha, *material;  // (H, W, 3), (H, W, 3), (H, W), (H, W), (H, W, 5) or null
+  const uint8_t *image, *mask;                             // (H, W, 3), (H, W) or null: as on disk, 255 is 1
+  float background[3];
+  double rotation[9], fx, fy, cx, cy;  // world to camera
+  float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, alpha_weight, metallic_weight;
+  float *photo, *clipped;   // (H, W, 3) the photo over the background; C as above, for D-SSIM
+  const float* by_clipped;  // (H, W, 3) D-SSIM's share
+  float *by_color, *by_normal, *by_depth, *by_alpha, *by_material;
+  float* slopes;            // (4, H, W) derivatives by the depths to the right, to the left, below and above
+  double* sums;             // (H, SUMS) of a row
+  float* scratch;           // none is used
+  Shared shared;
+};
+
+enum { LOSS, METALLIC, COVERED, SQUARES, SUMS };  // weighted terms but metallic; m (1 - m); pixels with a surface; squared errors
+constexpr float SATURATED = 0.998f;  // a photo's value above which the true radiance is unknown
+constexpr float SOLID = 0.5f, SURFACE = 1 / 255.0f;  // alphas of an opaque pixel, and of one that is not background
+constexpr int MATERIAL = 5, METAL = 3;               // numbers of a material; which is the metallic
+
+typedef double Sum __attribute__((vector_size(8 * LANES)));
+
+// A vector's worth of pixels of a row.
+struct Pixels {
+  int64_t x, width;
+  MEMBER bool whole() const { return x >= 0 && x + LANES <= width; }
+  MEMBER bool has(int lane) const { return x + lane >= 0 && x + lane < width; }
+  MEMBER Pixels beside(int64_t dx) const { return {x + dx, width}; }
+  MEMBER Mask inside() const {
+    Mask m;
+    for (int lane = 0; lane < LANES; lane++) m[lane] = -has(lane);
+    return m;
+  }
+  // One number of each pixel, of `stride` a pixel; zero beyond the row.
+  template <class T>
+  MEMBER Vector get(const T* row, int stride) const {
+    Vector v = {};
+    row += x * stride;
+    if (whole())
+      for (int lane = 0; lane < LANES; lane++) v[lane] = row[lane * stride];
+    else
+      for (int lane = 0; lane < LANES; lane++)
+        if (has(lane)) v[lane] = row[lane * stride];
+    return v;
+  }
+  MEMBER void put(float* row, int stride, Vector v) const {
+    row += x * stride;
+    for (int lane = 0; lane < LANES; lane++)
+      if (has(lane)) row[lane * stride] = v[lane];
+  }
+};
+
+struct Vector3 {
+  Vector x, y, z;
+};
+INLINE Vector dot(Vector3 a, Vector3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+INLINE Vector magnitude(Vector v) { return v < 0 ? -v : v; }
+INLINE Vector sign(Vector v) { return select(v > 0.0f, Vector() + 1.0f, select(v < 0.0f, Vector() - 1.0f, Vector())); }
+INLINE Vector3 operator+(Vector3 a, Vector3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+INLINE Vector3 operator-(Vector3 a, Vector3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+INLINE Vector3 operator*(Vector s, Vector3 a) { return {s * a.x, s * a.y, s * a.z}; }
+INLINE Vector inverse_length(Vector3 v) { return reciprocal(root(dot(v, v) + 1e-24f)); }
+// From the derivative by v / |v|, `unit`, to that by v.
+INLINE Vector3 by_length(Vector3 by, Vector3 unit, Vector inverse) { return inverse * (by - dot(by, unit) * unit); }
+
+// A row of a pass, `at` being some pixels of it.
+struct Row {
+  const Losses& l;
+  int64_t y;
+  Pixels at;
+  Mask inside = at.inside();
+
+  MEMBER const float* of(const float* map, int64_t numbers, int64_t dy = 0) const { return map + (y + dy) * l.width * numbers; }
+  MEMBER float* of(float* map, int64_t numbers, int64_t dy = 0) const { return map + (y + dy) * l.width * numbers; }
+  MEMBER Vector3 get3(const float* map, int64_t dx = 0, int64_t dy = 0) const {
+    const float* row = of(map, 3, dy);
+    Pixels p = at.beside(dx);
+    return {p.get(row, 3), p.get(row + 1, 3), p.get(row + 2, 3)};
+  }
+  MEMBER Vector get(const float* map, int64_t dx = 0, int64_t dy = 0) const { return at.beside(dx).get(of(map, 1, dy), 1); }
+  MEMBER void put(float* map, Vector v) const { at.put(of(map, 1), 1, v); }
+  MEMBER void put3(float* map, Vector3 v) const {
+    float* row = of(map, 3);
+    at.put(row, 3, v.x), at.put(row + 1, 3, v.y), at.put(row + 2, 3, v.z);
+  }
+  MEMBER void add(Sum& sum, Vector v) const { sum += __builtin_convertvector(select(inside, v, Vector()), Sum); }
+};
+
+// The photo over the background; colour, mask and metallic.
+INLINE void pixel_terms(const Row& r, Sum (&sums)[SUMS]) {
+  const Losses& l = r.l;
+  Vector opaque = Vector() + 1.0f;
+  if (l.mask) opaque = r.at.get(l.mask + r.y * l.width, 1) / 255.0f;
+  Vector loss = {}, squares = {};
+  for (int c = 0; c < 3; c++) {
+    Vector photo = r.at.get(l.image + r.y * l.width * 3 + c, 3) / 255.0f;
+    photo = photo * opaque + (1.0f - opaque) * l.background[c];
+    Vector color = r.at.get(r.of(l.color, 3) + c, 3), seen = clamp(color, 0, 1) - photo;
+    Mask open = (photo < SATURATED) | (color <= 1.0f);
+    Vector clipped = select(open, color, Vector() + 1.0f), error = clipped - photo;
+    squares += seen * seen;
+    loss += l.color_weight * magnitude(error);
+    r.at.put(r.of(l.photo, 3) + c, 3, photo);
+    r.at.put(r.of(l.clipped, 3) + c, 3, clipped);
+    r.at.put(r.of(l.by_color, 3) + c, 3, select(open, l.color_weight * sign(error), Vector()));
+  }
+  Vector alpha = r.get(l.alpha), by_alpha = {};
+  if (l.mask) loss += l.alpha_weight * magnitude(alpha - opaque), by_alpha = l.alpha_weight * sign(alpha - opaque);
+  r.put(l.by_alpha, by_alpha);
+  r.add(sums[LOSS], loss), r.add(sums[SQUARES], squares);
+  if (!l.material) return;
+  Vector metallic = r.at.get(r.of(l.material, MATERIAL) + METAL, MATERIAL);
+  r.add(sums[METALLIC], metallic * (1.0f - metallic));
+  r.add(sums[COVERED], select(alpha > SURFACE, Vector() + 1.0f, Vector()));
+}
+
+// The depth's normal at a pixel, by central differences: with X, Y where its ray meets depth 1, p and r the differences of depth along
+// x and y, and q and s the widths there of two pixels, the tangents are (X p + q, Y p, p) and (X r, Y r + s, r), whose product, towards
+// the camera, is N = (p s, q r, -(q s + X p s + Y q r)).
+INLINE void normal_term(const Row& r, Sum& loss) {
+  const Losses& l = r.l;
+  float* slopes[4];
+  for (int i = 0; i < 4; i++) slopes[i] = l.slopes + i * l.width * l.height;
+  Mask solid = l.normal_weight > 0 && r.y > 0 && r.y + 1 < l.height ? r.inside : Mask();
+  for (int lane = 0; lane < LANES; lane++) solid[lane] &= -(r.at.x + lane > 0 && r.at.x + lane + 1 < l.width);
+  if (any(solid))
+    solid &= (r.get(l.alpha, 1) > SOLID) & (r.get(l.alpha, -1) > SOLID) & (r.get(l.alpha, 0, 1) > SOLID) & (r.get(l.alpha, 0, -1) > SOLID);
+  if (!any(solid)) {
+    for (float* slope : slopes) r.put(slope, Vector());
+    return r.put3(l.by_normal, {});
+  }
+  Vector3 n = r.get3(l.normal);
+  float dX = (float)(1 / l.fx), dY = (float)(1 / l.fy), Y = (float)((r.y + 0.5 - l.cy) / l.fy);
+  Vector X;
+  for (int lane = 0; lane < LANES; lane++) X[lane] = (float)((r.at.x + lane + 0.5 - l.cx) / l.fx);
+  Vector right = r.get(l.depth, 1), left = r.get(l.depth, -1), below = r.get(l.depth, 0, 1), above = r.get(l.depth, 0, -1);
+  Vector p = right - left, q = (right + left) * dX, t = below - above, s = (below + above) * dY;
+  Vector3 N = {p * s, q * t, -(q * s + X * p * s + Y * q * t)};
+  float R[9];
+  for (int i = 0; i < 9; i++) R[i] = (float)l.rotation[i];
+  Vector3 m = {R[0] * n.x + R[1] * n.y + R[2] * n.z, R[3] * n.x + R[4] * n.y + R[5] * n.z, R[6] * n.x + R[7] * n.y + R[8] * n.z};
+  Vector inverse_N = inverse_length(N), inverse_m = inverse_length(m);
+  Vector3 of_depth = inverse_N * N, blended = inverse_m * m;
+  Vector w = select(solid, Vector() + l.normal_weight, Vector());
+  r.add(loss, w * (1.0f - dot(of_depth, blended)));
+  Vector3 g = by_length(-w * blended, of_depth, inverse_N), h = by_length(-w * of_depth, blended, inverse_m);
+  r.put3(l.by_normal, {R[0] * h.x + R[3] * h.y + R[6] * h.z, R[1] * h.x + R[4] * h.y + R[7] * h.z, R[2] * h.x + R[5] * h.y + R[8] * h.z});
+  Vector by_p = s * (g.x - X * g.z), by_q = (t * g.y - (s + Y * t) * g.z) * dX;
+  Vector by_t = q * (g.y - Y * g.z), by_s = (p * g.x - (q + X * p) * g.z) * dY;
+  r.put(slopes[0], by_q + by_p), r.put(slopes[1], by_q - by_p), r.put(slopes[2], by_s + by_t), r.put(slopes[3], by_s - by_t);
+}
+
+// The change of the normal towards a neighbour, and its derivative, which both of them feel; counted once, by the pixel before.
+INLINE Vector3 smooth_term(const Row& r, int dx, int dy, float weight, Sum& loss) {
+  const Losses& l = r.l;
+  Mask both = r.inside & r.at.beside(dx).inside();
+  if (weight == 0 || r.y + dy < 0 || r.y + dy >= l.height) return {};
+  both &= (r.get(l.alpha) > SOLID) & (r.get(l.alpha, dx, dy) > SOLID);
+  if (!any(both)) return {};
+  Vector3 n = r.get3(l.normal) - r.get3(l.normal, dx, dy), photo = r.get3(l.photo) - r.get3(l.photo, dx, dy);
+  Vector edge = magnitude(photo.x) + magnitude(photo.y) + magnitude(photo.z);
+  Vector w = select(both, weight * exp2(-1.442695f * edge), Vector());
+  if (dx + dy > 0) r.add(loss, w * (magnitude(n.x) + magnitude(n.y) + magnitude(n.z)));
+  return {w * sign(n.x), w * sign(n.y), w * sign(n.z)};
+}
+
+// Body(row) for all the pixels, rows at a time; its sums are added to those of the row.
+template <class Body>
+void each(Losses* l, Body body) {
+  const int64_t ROWS = 4;
+  for (int64_t first; (first = take(l->shared.next, ROWS)) < l->height;)
+    for (int64_t y = first; y < first + ROWS && y < l->height; y++) {
+      Sum sums[SUMS] = {};
+      for (int64_t x = 0; x < l->width; x += LANES) body(Row{*l, y, {x, l->width}}, sums);
+      for (int i = 0; i < SUMS; i++)
+        for (int lane = 0; lane < LANES; lane++) l->sums[y * SUMS + i] += sums[i][lane];
+    }
+}
+
+}  // namespace
+
+EXPORT int64_t refgs_losses_sums() { return SUMS; }
+
+// parallel: what a pixel says by itself, or by the depths around it
+EXPORT void refgs_losses_first(Losses* l) {
+  each(l, [](const Row& r, Sum (&sums)[SUMS]) {
+    pixel_terms(r, sums);
+    normal_term(r, sums[LOSS]);
+  });
+}
+
+// parallel: what it says with its neighbours, and what they say of it
+EXPORT void refgs_losses_second(Losses* l) {
+  each(l, [](const Row& r, Sum (&sums)[SUMS]) {
+    const Losses& l = r.l;
+    Vector3 by_normal = r.get3(l.by_normal);
+    by_normal = by_normal + smooth_term(r, 1, 0, l.smooth_x_weight, sums[LOSS]) + smooth_term(r, -1, 0, l.smooth_x_weight, sums[LOSS]);
+    by_normal = by_normal + smooth_term(r, 0, 1, l.smooth_y_weight, sums[LOSS]) + smooth_term(r, 0, -1, l.smooth_y_weight, sums[LOSS]);
+    r.put3(l.by_normal, by_normal);
+
+    int64_t size = l.width * l.height;
+    Vector by_depth = r.get(l.slopes, -1) + r.get(l.slopes + size, 1);
+    if (r.y > 0) by_depth += r.get(l.slopes + 2 * size, 0, -1);
+    if (r.y + 1 < l.height) by_depth += r.get(l.slopes + 3 * size, 0, 1);
+    r.put(l.by_depth, by_depth);
+
+    Vector3 color = r.get3(l.color), clipped = r.get3(l.clipped), by = r.get3(l.by_color), share = r.get3(l.by_clipped);
+    auto open = [](Vector color, Vector clipped, Vector share) { return select(color == clipped, share, Vector()); };
+    r.put3(l.by_color, by + Vector3{open(color.x, clipped.x, share.x), open(color.y, clipped.y, share.y), open(color.z, clipped.z, share.z)});
+
+    if (!l.material) return;
+    float* row = r.of(l.by_material, MATERIAL);
+    for (int i = 0; i < MATERIAL; i++) r.at.put(row + i, MATERIAL, Vector());
+    Vector metallic = r.at.get(r.of(l.material, MATERIAL) + METAL, MATERIAL);
+    r.at.put(row + METAL, MATERIAL, l.metallic_weight * (1.0f - 2.0f * metallic));
+  });
+}

@@ -1,0 +1,34 @@
+// A sparse matrix times a dense one of three columns: the light's prefilter.
+#include "library.h"
+#include "vector.h"
+
+namespace {
+
+struct Product {
+  int64_t rows;
+  const int32_t *starts, *columns;  // (rows + 1), of the numbers of each row; their columns
+  const float *numbers, *dense;     // (columns, 3), and one float more that may be read
+  float* out;                       // (rows, 3)
+  float* scratch;                   // none is used
+  Shared shared;
+};
+
+typedef float Four __attribute__((vector_size(16)));
+typedef float UnalignedFour __attribute__((vector_size(16), aligned(4)));
+
+}  // namespace
+
+// parallel
+EXPORT void refgs_sparse_product(Product* p) {
+  const int64_t BATCH = 64, AT_ONCE = 4;  // sums that do not wait for each other
+  for (int64_t first; (first = take(p->shared.next, BATCH)) < p->rows;)
+    for (int64_t row = first; row < first + BATCH && row < p->rows; row++) {
+      Four sums[AT_ONCE] = {};
+      int32_t k = p->starts[row], end = p->starts[row + 1];
+      for (; k + AT_ONCE <= end; k += AT_ONCE)
+        for (int i = 0; i < AT_ONCE; i++) sums[i] += p->numbers[k + i] * *(const UnalignedFour*)(p->dense + 3 * p->columns[k + i]);
+      for (; k < end; k++) sums[0] += p->numbers[k] * *(const UnalignedFour*)(p->dense + 3 * p->columns[k]);
+      Four sum = (sums[0] + sums[1]) + (sums[2] + sums[3]);
+      for (int c = 0; c < 3; c++) p->out[3 * row + c] = sum[c];
+    }
+}

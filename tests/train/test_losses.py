@@ -1,0 +1,146 @@
+"""The objective against plain torch in float64, values and gradients."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from refgs.capture import LoadedView
+from refgs.kernels import load
+from refgs.kernels.reference import unit
+from refgs.render.renderer import COVERED, Rendering, camera_rays
+from refgs.settings import LossSettings
+from refgs.train.losses import objective
+from tests.kernels import scenes, test_ssim
+
+ALL = LossSettings(dssim=0.2, normal=0.3, smooth=0.4, alpha=0.5, metallic=0.6, light=0.0)
+BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
+MAPS = ("color", "normal", "depth", "alpha", "material")
+
+
+def reference(rendering: Rendering, view: LoadedView, weights: LossSettings, progress: float) -> dict[str, Tensor]:
+    """The terms, weighted."""
+    photo = torch.from_numpy(view.image).double() / 255
+    mask = None if view.alpha is None else torch.from_numpy(view.alpha).double() / 255
+    if mask is not None:
+        photo = photo * mask[..., None] + BACKGROUND.double() * (1 - mask[..., None])
+    color = torch.where(photo >= 0.998, rendering.color.clamp_max(1), rendering.color)
+    terms = {"l1": (1 - weights.dssim) * (color - photo).abs().mean()}
+    terms["dssim"] = weights.dssim * test_ssim.reference(color, photo)
+
+    solid = rendering.alpha.detach() > 0.5
+    if min(solid.shape) > 2:
+        points = camera_rays(view.camera).double() * rendering.depth[..., None]
+        across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
+        towards = unit(torch.linalg.cross(down, across))
+        apart = 1 - (towards * unit(rendering.normal[1:-1, 1:-1])).sum(dim=-1)
+        around = solid[1:-1, 2:] & solid[1:-1, :-2] & solid[2:, 1:-1] & solid[:-2, 1:-1]
+        terms["normal"] = weights.normal * (apart * around).mean()
+    for axis, n in enumerate(solid.shape):
+        if n < 2:
+            continue
+
+        def step(v: Tensor, axis: int = axis, n: int = n) -> Tensor:
+            return (v.narrow(axis, 1, n - 1) - v.narrow(axis, 0, n - 1)).abs().sum(dim=-1)
+
+        both = solid.narrow(axis, 1, n - 1) & solid.narrow(axis, 0, n - 1)
+        terms[f"smooth {axis}"] = weights.smooth * (step(rendering.normal) * torch.exp(-step(photo)) * both).mean()
+    if mask is not None:
+        terms["alpha"] = weights.alpha * (rendering.alpha - mask).abs().mean()
+    if rendering.material is not None:
+        m, covered = rendering.metallic, (rendering.alpha.detach() > COVERED).sum().clamp_min(1)
+        terms["metallic"] = weights.metallic * progress**2 * (m * (1 - m)).sum() / covered
+    return terms
+
+
+def pictures(width: int, height: int, masked: bool, material: bool) -> tuple[Rendering, LoadedView]:
+    """A bumpy surface seen by a turned camera: half opaque, some pixels beyond 1; a photo that is like it, partly saturated."""
+    rng, camera = np.random.default_rng([width, height]), scenes.camera(width, height)
+
+    def random(*shape: int) -> Tensor:
+        return torch.tensor(rng.uniform(size=shape), dtype=torch.float32)
+
+    size = height, width
+    y, x = torch.meshgrid(torch.arange(height) / 7, torch.arange(width) / 5, indexing="ij")
+    depth = 2.5 + 0.3 * torch.sin(x) * torch.cos(y) + 0.01 * random(*size)
+    normal = torch.tensor(camera.world_to_camera[2, :3] * -1).float() + 0.6 * (random(*size, 3) - 0.5)
+    alpha = (random(*size) + 0.4).clamp_max(1) - 0.003 * random(*size)
+    maps = [1.2 * random(*size, 3), alpha, depth, normal, random(*size, 5) if material else None]
+    photo = (300 * rng.uniform(size=(*size, 3))).clip(0, 255).astype(np.uint8)
+    mask = (300 * rng.uniform(size=size)).clip(0, 255).astype(np.uint8) if masked else None
+    return Rendering(*maps), LoadedView(photo, mask, camera)
+
+
+def leaves(rendering: Rendering, dtype: torch.dtype) -> Rendering:
+    maps = {name: getattr(rendering, name) for name in MAPS}
+    return Rendering(**{n: None if m is None else m.detach().to(dtype).requires_grad_() for n, m in maps.items()})
+
+
+def gradients(loss: Tensor, rendering: Rendering) -> dict[str, Tensor]:
+    maps = {name: getattr(rendering, name) for name in MAPS if getattr(rendering, name) is not None}
+    return dict(zip(maps, torch.autograd.grad(loss, list(maps.values()), materialize_grads=True), strict=True))
+
+
+@pytest.mark.parametrize("isa", load.supported())
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("material", [False, True])
+@pytest.mark.parametrize("size", [(61, 40), (16, 16), (3, 5), (2, 2), (1, 1), (1, 30)])
+def test_matches_float64(size, material, masked, isa, monkeypatch):
+    monkeypatch.setenv("REFGS_ISA", isa)
+    rendering, view = pictures(*size, masked, material)
+    exact, found = leaves(rendering, torch.float64), leaves(rendering, torch.float32)
+    expected = sum(reference(exact, view, ALL, 0.7).values())
+    loss, psnr = objective(found, None, view, BACKGROUND, ALL, 0.7)
+    assert abs(float(loss.detach()) - float(expected.detach())) <= 1e-5 * float(expected.detach())
+    expected_gradients = gradients(3 * expected, exact)
+    for name, gradient in gradients(3 * loss, found).items():
+        worst = (gradient - expected_gradients[name]).abs().max()
+        assert worst <= 1e-4 * expected_gradients[name].abs().max(), name
+    photo = torch.from_numpy(view.image).double() / 255
+    if masked:
+        mask = torch.from_numpy(view.alpha).double()[..., None] / 255
+        photo = photo * mask + BACKGROUND.double() * (1 - mask)
+    error = ((rendering.color.clamp(0, 1) - photo) ** 2).mean()
+    assert abs(psnr + 10 * float(torch.log10(error))) < 1e-3
+
+
+@pytest.mark.parametrize("term", ["dssim", "normal", "smooth", "alpha", "metallic"])
+def test_a_term_without_weight_is_not_there(term):
+    rendering, view = pictures(30, 20, masked=True, material=True)
+    exact = leaves(rendering, torch.float64)
+    weights = ALL.model_copy(update={term: 0.0})
+    found = leaves(rendering, torch.float32)
+    loss, _ = objective(found, None, view, BACKGROUND, weights, 1.0)
+    expected = sum(reference(exact, view, weights, 1.0).values())
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
+    expected_gradients = gradients(expected, exact)
+    for name, gradient in gradients(loss, found).items():
+        assert (gradient - expected_gradients[name]).abs().max() <= 1e-4 * expected_gradients[name].abs().max()
+
+
+def test_normals_of_a_plane_agree_with_its_depth():
+    camera = scenes.camera(40, 30)
+    normal = np.array([0.2, -0.3, -0.9]) / np.linalg.norm([0.2, -0.3, -0.9])
+    rays = camera_rays(camera).numpy().astype(float)
+    depth = (-3 - normal @ camera.position) / (rays @ normal)
+    one, view = torch.ones(30, 40), LoadedView(np.zeros((30, 40, 3), np.uint8), None, camera)
+    flat = Rendering(
+        torch.zeros(30, 40, 3), one, torch.tensor(depth).float(), torch.tensor(normal).float().expand(30, 40, 3)
+    )
+    only = LossSettings(dssim=0, normal=1, smooth=1, alpha=0, metallic=0, light=0)
+    assert abs(float(objective(flat, None, view, BACKGROUND, only, 1.0).loss)) < 1e-6
+    turned = replace(flat, normal=-flat.normal)
+    assert float(objective(turned, None, view, BACKGROUND, only, 1.0).loss) == pytest.approx(2, abs=1e-6)
+
+
+def test_same_bits_for_any_number_of_threads():
+    rendering, view = pictures(200, 150, masked=True, material=True)
+
+    def all_of_it() -> list[Tensor]:
+        maps = leaves(rendering, torch.float32)
+        loss, _ = objective(maps, None, view, BACKGROUND, ALL, 1.0)
+        return [loss.detach(), *gradients(loss, maps).values()]
+
+    scenes.check_same_bits_for_any_number_of_threads(all_of_it)
