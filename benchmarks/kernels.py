@@ -25,20 +25,20 @@ from refgs.render.ssim import dssim
 SPLATS, SIDE, CHANNELS, ROUNDS = 20_000, 400, 16, 30
 
 
-def ball() -> tuple[list[torch.Tensor], Camera]:
+def ball(splats: int = SPLATS, side: int = SIDE, channels: int = CHANNELS) -> tuple[list[torch.Tensor], Camera]:
     """The surfels (positions, rotations, scales, opacities, features) and a camera at distance 4, the ball's radius being 1."""
     rng = np.random.default_rng(0)
-    normal = rng.normal(size=(SPLATS, 3))
+    normal = rng.normal(size=(splats, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     spacing = cKDTree(normal).query(normal, k=4)[0][:, 1:].mean(axis=1)
     # the shortest rotation from z to the normal, then any about it
-    to_normal = np.concatenate([1 + normal[:, 2:], -normal[:, 1:2], normal[:, :1], np.zeros((SPLATS, 1))], axis=1)
-    surfels = [normal, to_normal, np.stack([spacing, spacing], axis=1), np.full(SPLATS, 0.73)]
-    surfels.append(rng.uniform(size=(SPLATS, CHANNELS)))
+    to_normal = np.concatenate([1 + normal[:, 2:], -normal[:, 1:2], normal[:, :1], np.zeros((splats, 1))], axis=1)
+    surfels = [normal, to_normal, np.stack([spacing, spacing], axis=1), np.full(splats, 0.73)]
+    surfels.append(rng.uniform(size=(splats, channels)))
     matrix = np.eye(4)
     matrix[2, 3] = 4
-    focal = 0.48 * SIDE * np.sqrt(4**2 - 1)  # the outline's radius is 0.48 of the picture's side
-    camera = Camera("ball", SIDE, SIDE, focal, focal, SIDE / 2, SIDE / 2, matrix)
+    focal = 0.48 * side * np.sqrt(4**2 - 1)  # the outline's radius is 0.48 of the picture's side
+    camera = Camera("ball", side, side, focal, focal, side / 2, side / 2, matrix)
     return [torch.tensor(v, dtype=torch.float32) for v in surfels], camera
 
 

@@ -116,8 +116,8 @@ void blend(float* sums, const Vector* weights, const float* const* rows, int cou
 void blend_all(float* sums, const Vector* weights, const float* const* rows, int count, int64_t channels) {
   int64_t c = 0;
   for (; c + 8 <= channels; c += 8) blend<8>(sums + c * LANES, weights, rows, count, c);
-  if (c + 4 <= channels) blend<4>(sums + c * LANES, weights, rows, count, c), c += 4;
-  for (; c < channels; c++) blend<1>(sums + c * LANES, weights, rows, count, c);
+  constexpr decltype(&blend<1>) REST[] = {blend<0>, blend<1>, blend<2>, blend<3>, blend<4>, blend<5>, blend<6>, blend<7>};
+  REST[channels - c](sums + c * LANES, weights, rows, count, c);
 }
 
 // Two splats' alphas and depths at the pixels of a block. Two at once, step by step: the one's arithmetic goes on while the other's waits.
