@@ -23,6 +23,15 @@ def camera(width: int = 45, height: int = 30, centre: tuple[float, float] | None
     return Camera("test", width, height, 1.1 * width, 1.0 * width, cx, cy, matrix)
 
 
+def camera_rays(camera: Camera) -> Tensor:
+    """Directions (H, W, 3) in the world through the pixels' centres, with unit depth along the camera's axis; float32."""
+    x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
+    y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
+    rotation = torch.from_numpy(camera.world_to_camera[:3, :3].copy())
+    rays = rotation[2] + x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1]
+    return rays.float()
+
+
 def surfels(kind: str, channels: int, seed: int = 0) -> tuple[Tensor, ...]:
     """Positions, rotations, scales, opacities and features, float32, whose depths differ by more than float rounding."""
     rng = np.random.default_rng([seed, KINDS.index(kind)])

@@ -9,7 +9,6 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.kernels import load, reference
 from refgs.model.environment import Environment
-from refgs.render.renderer import camera_rays
 from refgs.render.shade import mirror_directions, shade
 from tests.kernels import scenes
 
@@ -123,7 +122,7 @@ def test_mirror_directions(isa, monkeypatch):
     monkeypatch.setenv("REFGS_ISA", isa)
     camera, (features, alpha), _, maps, _, _, _ = case(False, True, (37, 70))
     covered = alpha > reference.COVERED
-    normal, ray = reference.unit(maps[1][covered]), reference.unit(camera_rays(camera)[covered].double())
+    normal, ray = reference.unit(maps[1][covered]), reference.unit(scenes.camera_rays(camera)[covered].double())
     expected = ray - 2 * (ray * normal).sum(dim=-1, keepdim=True) * normal
     found = mirror_directions(features, alpha, camera)
     assert (found[covered] - expected).abs().max() <= FORWARD

@@ -6,11 +6,11 @@ import torch
 
 from benchmarks.scenes.analytic import TWO, meet, write_ball_capture
 from refgs.capture import read_capture
-from refgs.render.renderer import camera_rays
 from refgs.run import create_run, open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset
 from refgs.train.trainer import Trainer, composite
+from tests.kernels import scenes
 
 SMALL = ["surfels.start=3000", "surfels.budget=4000", "environment.resolution=16", "train.light_first=20"]
 SMALL += ["surfels.metallic=0.9", "train.iterations=600", "indirect.every=200", "indirect.resolution=64"]
@@ -62,7 +62,7 @@ def test_visibility_is_that_of_the_balls(trained):
     hidden, found, both, solid = 0, 0, 0, 0
     for view in run.test:
         rendering = run.render(view.camera)
-        ray = camera_rays(view.camera).double().numpy().reshape(-1, 3)
+        ray = scenes.camera_rays(view.camera).double().numpy().reshape(-1, 3)
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         hit, point, normal = meet(np.broadcast_to(view.camera.position, ray.shape), ray, TWO)
         mirrored = ray - 2 * (ray * normal).sum(-1, keepdims=True) * normal

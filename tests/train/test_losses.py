@@ -10,7 +10,7 @@ from torch import Tensor
 from refgs.capture import LoadedView
 from refgs.kernels import load
 from refgs.kernels.reference import unit
-from refgs.render.renderer import COVERED, Rendering, camera_rays
+from refgs.render.renderer import COVERED, Rendering
 from refgs.settings import LossSettings
 from refgs.train.losses import objective
 from tests.kernels import scenes, test_ssim
@@ -32,7 +32,7 @@ def reference(rendering: Rendering, view: LoadedView, weights: LossSettings, pro
 
     solid = rendering.alpha.detach() > 0.5
     if min(solid.shape) > 2:
-        points = camera_rays(view.camera).double() * rendering.depth[..., None]
+        points = scenes.camera_rays(view.camera).double() * rendering.depth[..., None]
         across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
         towards = unit(torch.linalg.cross(down, across))
         apart = 1 - (towards * unit(rendering.normal[1:-1, 1:-1])).sum(dim=-1)
@@ -123,7 +123,7 @@ def test_a_term_without_weight_is_not_there(term):
 def test_normals_of_a_plane_agree_with_its_depth():
     camera = scenes.camera(40, 30)
     normal = np.array([0.2, -0.3, -0.9]) / np.linalg.norm([0.2, -0.3, -0.9])
-    rays = camera_rays(camera).numpy().astype(float)
+    rays = scenes.camera_rays(camera).numpy().astype(float)
     depth = (-3 - normal @ camera.position) / (rays @ normal)
     one, view = torch.ones(30, 40), LoadedView(np.zeros((30, 40, 3), np.uint8), None, camera)
     flat = Rendering(

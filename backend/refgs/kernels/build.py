@@ -12,7 +12,16 @@ from pathlib import Path
 from refgs.errors import InputError
 
 HERE = Path(__file__).parent
-SOURCES = ("blend.cpp", "harmonics.cpp", "losses.cpp", "project.cpp", "shade.cpp", "sparse.cpp", "ssim.cpp")
+SOURCES = (
+    "blend.cpp",
+    "harmonics.cpp",
+    "losses.cpp",
+    "normals.cpp",
+    "project.cpp",
+    "shade.cpp",
+    "sparse.cpp",
+    "ssim.cpp",
+)
 HEADERS = ("library.h", "light.h", "raster.h", "splat.h", "vector.h")
 # -ffp-contract=on: fused within an expression, never across, so that a formula rounds the same wherever it is inlined.
 FLAGS = ["-shared", "-s", "-O3", "-std=c++20", "-fno-exceptions", "-fno-rtti", "-nostdlib", "-fvisibility=hidden"]

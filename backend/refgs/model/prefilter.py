@@ -133,21 +133,20 @@ def matrices(resolution: int) -> tuple[Matrix, Matrix]:
 
 
 @lru_cache(maxsize=4)
-def _pool_weights(resolution: int) -> list[Tensor]:
-    """Each texel's share of its parent's solid angle, a mip after another."""
-    shares = []
+def _pyramid(resolution: int) -> tuple[Matrix, Matrix]:
+    """The cubemap and its pooled mips, means by solid angle, as a matrix over the cubemap's texels; and its transpose."""
+    mip = sparse.identity(6 * resolution**2, format="csr")
+    mips = [mip]
     for side in _pyramid_sides(resolution)[:-1]:
         area = cubemap.texel_solid_angles(side).reshape(6, side // 2, 2, side // 2, 2)
-        shares.append((area / area.sum(dim=(2, 4), keepdim=True)).float()[..., None])
-    return shares
-
-
-def _pyramid(radiance: Tensor, resolution: int) -> Tensor:
-    mips = [radiance]
-    for share in _pool_weights(resolution):
-        half = share.shape[1]
-        mips.append((mips[-1].reshape(6, half, 2, half, 2, 3) * share).sum(dim=(2, 4)).reshape(-1, 3))
-    return torch.cat(mips)
+        share = (area / area.sum(dim=(2, 4), keepdim=True)).reshape(-1).numpy()
+        texel = np.arange(6 * side * side)
+        face, row, column = texel // (side * side), texel // side % side, texel % side
+        parent = (face * (side // 2) + row // 2) * (side // 2) + column // 2
+        mip = sparse.csr_matrix((share, (parent, texel)), shape=(len(texel) // 4, len(texel))) @ mip
+        mips.append(mip)
+    matrix = sparse.vstack(mips, format="csr")
+    return Matrix.of(matrix), Matrix.of(matrix.T.tocsr())
 
 
 class _Work(Work):
@@ -160,29 +159,37 @@ class _Work(Work):
     )
 
 
-def _product(matrix: Matrix, dense: Tensor) -> Tensor:
-    rows = len(matrix.starts) - 1
-    work, out, padded = _Work(rows=rows), torch.empty(rows, 3), torch.nn.functional.pad(dense.reshape(-1), (0, 1))
-    work.attach(**matrix._asdict(), dense=padded, out=out)
+def _product(matrix: Matrix, dense: Tensor, out: Tensor) -> Tensor:
+    """Into `out`; of `dense`, a float more than its numbers is read."""
+    work = _Work(rows=len(matrix.starts) - 1)
+    work.attach(**matrix._asdict(), dense=dense, out=out)
     parallel(kernels().refgs_sparse_product, work)
     return out
 
 
-class _Product(torch.autograd.Function):
-    """Sparse matrix times dense; the gradient is the product with the stored transpose."""
-
+class _Prefilter(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, dense: Tensor, matrix: Matrix, transpose: Matrix) -> Tensor:
-        ctx.transpose = transpose
-        return _product(matrix, dense)
+    def forward(ctx, radiance: Tensor, resolution: int) -> Tensor:
+        ctx.resolution = resolution
+        pool, lobes = _pyramid(resolution)[0], matrices(resolution)[0]
+        pyramid = torch.empty(len(pool.starts), 3)  # a row more than there are, to be read from
+        _product(pool, torch.nn.functional.pad(radiance, (0, 0, 0, 1)), pyramid)
+        levels = torch.empty(len(radiance) + len(lobes.starts) - 1, 3)
+        levels[: len(radiance)] = radiance
+        _product(lobes, pyramid, levels[len(radiance) :])
+        return levels
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, gradient: Tensor):
-        return _product(ctx.transpose, gradient), None, None
+    def backward(ctx, by_levels: Tensor):
+        pool, lobes = _pyramid(ctx.resolution)[1], matrices(ctx.resolution)[1]
+        count = 6 * ctx.resolution**2
+        by_pyramid = torch.empty(len(lobes.starts), 3)
+        _product(lobes, torch.nn.functional.pad(by_levels[count:], (0, 0, 0, 1)), by_pyramid)
+        by_radiance = _product(pool, by_pyramid, torch.empty(count, 3))
+        return by_radiance.add_(by_levels[:count]), None
 
 
 def prefilter(radiance: Tensor, resolution: int) -> Tensor:
     """All levels of a cubemap (6·R², 3) one after another, (Σ 6·side², 3): linear radiance in, linear radiance out."""
-    matrix, transpose = matrices(resolution)
-    return torch.cat([radiance, _Product.apply(_pyramid(radiance, resolution), matrix, transpose)])
+    return _Prefilter.apply(radiance, resolution)

@@ -11,13 +11,13 @@ from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.directional import directional
+from refgs.render.facing import facing_normals
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import mirror_directions, shade
 from refgs.settings import RenderSettings
 
 NEAR = 0.01  # the nearest depth that is drawn, in scene radii
 COVERED = 1 / 255  # pixels with less alpha than this are background
-PAST_HORIZON = -0.3  # cosine below which a surfel shows its back
 
 
 @dataclass(frozen=True)
@@ -49,36 +49,9 @@ class Rendering:
         return self.material[..., 4]
 
 
-def unit(v: Tensor) -> Tensor:
-    """Vectors (..., 3) made unit length; a zero vector stays zero. Three times as fast as torch's normalize for three numbers."""
-    x, y, z = v.unbind(-1)
-    return v * torch.rsqrt(x * x + y * y + z * z + 1e-24)[..., None]
-
-
 def near_plane(radius: float) -> float:
     """The nearest depth that is drawn in a scene of this radius, both in world units."""
     return NEAR * radius
-
-
-def camera_rays(camera: Camera) -> Tensor:
-    """Directions (H, W, 3) in the world through the pixels' centres, with unit depth along the camera's axis; float32."""
-    x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
-    y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
-    rotation = torch.from_numpy(camera.world_to_camera[:3, :3].copy())
-    rays = rotation[2] + x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1]
-    return rays.float()
-
-
-def facing_normals(surfels: Surfels, camera: Camera) -> Tensor:
-    """The surfels' normals (N, 3), turned towards the camera where they look well away from it.
-
-    Not where they hardly do: on a closed surface those lie just past the horizon and show at the silhouette, where
-    turning them would point the blend anywhere.
-    """
-    normals = surfels.normals()
-    towards = torch.from_numpy(camera.position).float() - surfels.positions.detach()
-    cosine = (normals.detach() * unit(towards)).sum(dim=-1, keepdim=True)
-    return torch.where(cosine < PAST_HORIZON, -normals, normals)
 
 
 def _unit(v: np.ndarray) -> np.ndarray:
@@ -115,7 +88,7 @@ def render(
     light in place of the environment's where that is in the way of the mirror direction (paper Eq. 9).
     """
     deferred = settings.shading == "deferred"
-    normals = facing_normals(surfels, camera)
+    normals = facing_normals(surfels.rotations, surfels.positions, camera)
     parts = [normals]
     if deferred:
         parts += [surfels.albedo, surfels.metallic[:, None], surfels.roughness[:, None]]

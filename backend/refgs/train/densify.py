@@ -22,8 +22,9 @@ class ScreenGradient:
         depth = (position @ matrix[2, :3] + matrix[2, 3]).clamp_min(0)
         across = gradient @ matrix[:2, :3].T  # gradient by motion parallel to the picture plane
         # One pixel at depth z is z / f wide.
-        self.total += across.norm(dim=-1) * depth / camera.fx * (camera.width / 2)
-        self.views += gradient.abs().amax(dim=-1) > 0
+        length = across.norm(dim=-1)
+        self.total += length * depth * (camera.width / 2 / camera.fx)
+        self.views += length > 0
 
     def mean(self) -> Tensor:
         """(N,), zero where a surfel was never seen."""

@@ -1,0 +1,68 @@
+// Normals of surfels, turned towards a camera; and back to their rotations.
+#include "library.h"
+
+namespace {
+
+constexpr float PAST_HORIZON = -0.3f;  // cosine below which a surfel shows its back
+constexpr float MIN_NORM = 1e-12f;
+
+struct Normals {
+  int64_t count;
+  const float *rotations, *positions;  // (count, 4) wxyz of any length, (count, 3)
+  double camera[3];
+  float* normals;                      // (count, 3)
+  const float* by_normals;
+  float* by_rotations;
+  float* scratch;                      // none is used
+  Shared shared;
+};
+
+struct Turned {
+  float q[4], inverse, n[3], sign;
+};
+
+// The third column of the rotation, and whether it has to be turned.
+inline Turned turned(const Normals& s, int64_t i) {
+  Turned t;
+  const float* q = s.rotations + 4 * i;
+  float norm = __builtin_sqrtf(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  t.inverse = 1 / (norm > MIN_NORM ? norm : MIN_NORM);
+  for (int k = 0; k < 4; k++) t.q[k] = q[k] * t.inverse;
+  float w = t.q[0], x = t.q[1], y = t.q[2], z = t.q[3];
+  t.n[0] = 2 * (x * z + w * y), t.n[1] = 2 * (y * z - w * x), t.n[2] = 1 - 2 * (x * x + y * y);
+  float along = 0, square = 0;
+  for (int k = 0; k < 3; k++) {
+    float towards = (float)(s.camera[k] - s.positions[3 * i + k]);
+    along += t.n[k] * towards, square += towards * towards;
+  }
+  t.sign = along < PAST_HORIZON * __builtin_sqrtf(square) ? -1 : 1;
+  return t;
+}
+
+template <class Body>
+void each(Normals* s, Body body) {
+  const int64_t BATCH = 512;
+  for (int64_t first; (first = take(s->shared.next, BATCH)) < s->count;)
+    for (int64_t i = first; i < first + BATCH && i < s->count; i++) body(i, turned(*s, i));
+}
+
+}  // namespace
+
+// parallel
+EXPORT void refgs_normals_forward(Normals* s) {
+  each(s, [&](int64_t i, const Turned& t) {
+    for (int k = 0; k < 3; k++) s->normals[3 * i + k] = t.sign * t.n[k];
+  });
+}
+
+// parallel
+EXPORT void refgs_normals_backward(Normals* s) {
+  each(s, [&](int64_t i, const Turned& t) {
+    const float *g = s->by_normals + 3 * i, *q = t.q;
+    float by[4] = {q[2] * g[0] - q[1] * g[1], q[3] * g[0] - q[0] * g[1] - 2 * q[1] * g[2],
+                   q[0] * g[0] + q[3] * g[1] - 2 * q[2] * g[2], q[1] * g[0] + q[2] * g[1]};
+    float along = 0;
+    for (int k = 0; k < 4; k++) along += by[k] * q[k];
+    for (int k = 0; k < 4; k++) s->by_rotations[4 * i + k] = 2 * t.sign * t.inverse * (by[k] - along * q[k]);
+  });
+}

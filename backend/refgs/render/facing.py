@@ -1,0 +1,53 @@
+"""Normals of surfels as a camera sees them."""
+
+import ctypes
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from refgs.camera import Camera
+from refgs.kernels.load import Shared, Work, kernels, parallel
+
+
+class _Work(Work):
+    """`struct Normals` of normals.cpp."""
+
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        *((n, ctypes.c_void_p) for n in ("rotations", "positions")),
+        ("camera", ctypes.c_double * 3),
+        *((n, ctypes.c_void_p) for n in ("normals", "by_normals", "by_rotations", "scratch")),
+        ("shared", Shared),
+    )
+
+
+class _Facing(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, rotations, positions, camera):
+        inputs = {"rotations": rotations.contiguous(), "positions": positions.contiguous()}
+        work, normals = _Work(count=len(positions)), torch.empty(len(positions), 3)
+        work.camera[:] = camera.position.tolist()
+        work.attach(**inputs, normals=normals)
+        parallel(kernels().refgs_normals_forward, work)
+        ctx.save_for_backward(*inputs.values())
+        ctx.work = work
+        return normals
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, by_normals):
+        by_normals, by_rotations = by_normals.contiguous(), torch.empty_like(ctx.saved_tensors[0])
+        ctx.work.attach(by_normals=by_normals, by_rotations=by_rotations)
+        parallel(kernels().refgs_normals_backward, ctx.work)
+        return by_rotations, None, None
+
+
+def facing_normals(rotations: Tensor, positions: Tensor, camera: Camera) -> Tensor:
+    """Unit normals (N, 3), from quaternions wxyz (N, 4) of any length and positions (N, 3), turned towards the camera where
+    they look well away from it. float32 on the CPU; differentiable in the rotations alone.
+
+    Not where they hardly do: on a closed surface those lie just past the horizon and show at the silhouette, where
+    turning them would point the blend anywhere. normals.cpp has the angle.
+    """
+    return _Facing.apply(rotations, positions.detach(), camera)

@@ -1,0 +1,57 @@
+"""Facing normals against torch in float64."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from refgs.kernels import load, reference
+from refgs.render.facing import facing_normals
+from tests.kernels import scenes
+
+
+def surfels(count: int = 1000) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    lengths = 10 ** (2 * torch.rand(count, 1, generator=generator) - 1)
+    return torch.randn(count, 4, generator=generator) * lengths, torch.randn(count, 3, generator=generator)
+
+
+def expected(rotations: Tensor, positions: Tensor, camera) -> tuple[Tensor, Tensor]:
+    """And the cosines."""
+    normals = reference.rotation_matrices(rotations)[..., 2]
+    towards = reference.unit(torch.from_numpy(camera.position) - positions.double())
+    cosine = (normals.detach() * towards).sum(dim=-1, keepdim=True)
+    return torch.where(cosine < -0.3, -normals, normals), cosine
+
+
+@pytest.mark.parametrize("isa", load.supported())
+def test_matches_float64(isa, monkeypatch):
+    monkeypatch.setenv("REFGS_ISA", isa)
+    rotations, positions = surfels()
+    camera, exact, leaf = scenes.camera(40, 30), rotations.double().requires_grad_(), rotations.requires_grad_()
+    reference_normals, cosine = expected(exact, positions, camera)
+    normals = facing_normals(leaf, positions, camera)
+    assert ((cosine + 0.3).abs() > 1e-6).all() and 0.2 < float((cosine < -0.3).float().mean()) < 0.5
+    assert (normals - reference_normals).abs().max() <= 1e-5
+    upstream = torch.randn(normals.shape, generator=torch.Generator().manual_seed(1))
+    (by,), (exact_by,) = (
+        torch.autograd.grad(n, v, upstream.to(n.dtype)) for n, v in ((normals, leaf), (reference_normals, exact))
+    )
+    assert ((by - exact_by).norm(dim=1) <= 1e-4 * (upstream.norm(dim=1) / rotations.norm(dim=1))).all()
+
+
+def test_a_rotation_that_says_nothing():
+    leaf = torch.zeros(1, 4, requires_grad=True)
+    normals = facing_normals(leaf, torch.zeros(1, 3), scenes.camera(40, 30))
+    (by,) = torch.autograd.grad(normals.sum(), leaf)
+    assert normals.isfinite().all() and by.isfinite().all()
+
+
+def test_same_bits_for_any_number_of_threads():
+    rotations, positions = surfels(5000)
+
+    def all_of_it() -> list[Tensor]:
+        leaf = rotations.clone().requires_grad_()
+        normals = facing_normals(leaf, positions, scenes.camera(40, 30))
+        return [normals.detach(), *torch.autograd.grad((normals * positions).sum(), leaf)]
+
+    scenes.check_same_bits_for_any_number_of_threads(all_of_it)
