@@ -19,7 +19,10 @@ from scipy.spatial import cKDTree
 
 from refgs.camera import Camera
 from refgs.kernels import load
+from refgs.model.environment import Environment
+from refgs.model.prefilter import prefilter
 from refgs.render.rasterize import _project_and_bin, _Work, rasterize
+from refgs.render.shade import shade
 from refgs.render.ssim import dssim
 
 SPLATS, SIDE, CHANNELS, ROUNDS = 20_000, 400, 16, 30
@@ -79,31 +82,56 @@ def measure() -> dict[str, list[float]]:
 
     times = dict(zip(("forward", "backward"), _time(forward, backward), strict=True))
     times["both"] = [a + b for a, b in zip(times["forward"], times["backward"], strict=True)]
-    return times | {"binning": _time(binning)[0], "ssim": _time(ssim)[0]}
+    times |= {"binning": _time(binning)[0], "ssim": _time(ssim)[0], "shading": _time(_shading())[0]}
+    return times | {f"prefilter {side}": _time(_prefilter(side))[0] for side in (64, 128)}
+
+
+def _shading() -> Callable[[], None]:
+    """The ball as a rough metal under a light of noise, both ways."""
+    (positions, *geometry, _), camera = ball()
+    material = torch.tensor([0.9, 0.7, 0.5, 1.0, 0.3]).expand(SPLATS, 5)
+    raster = rasterize(positions, *geometry, torch.cat([positions, material, positions], dim=1), camera, near=0.1)
+    light = Environment(torch.rand(6 * 64**2, 3))
+    leaves = [v.requires_grad_() for v in (raster.features, raster.alpha, light.levels, light.irradiance)]
+    upstream = [torch.rand(SIDE, SIDE, n) for n in (3, 3, 5)]
+
+    def step() -> None:
+        shaded = shade(raster.features, raster.alpha, light, camera, torch.ones(3))
+        torch.autograd.grad((shaded.color, shaded.normal, shaded.material), leaves, upstream)
+
+    return step
+
+
+def _prefilter(side: int) -> Callable[[], None]:
+    """Of a cubemap of 6·side² texels, both ways."""
+    radiance = torch.rand(6 * side**2, 3, requires_grad=True)
+    upstream = torch.rand_like(prefilter(radiance, side))
+    return lambda: torch.autograd.grad(prefilter(radiance, side), radiance, upstream)
 
 
 def run(threads: int = 2) -> dict[str, dict[str, list[float]]]:
-    """Print a table, one row an instruction set; returns {set: {step: milliseconds of each round}}."""
+    """Print a table, one column an instruction set; returns {set: {step: milliseconds of each round}}."""
     table = Table(
-        title=f"{SPLATS:,} surfels, {SIDE}×{SIDE}, {CHANNELS} channels, {threads} threads: ms, least (median)"
+        "", title=f"{SPLATS:,} surfels, {SIDE}×{SIDE}, {CHANNELS} channels, {threads} threads: ms, least (median)"
     )
-    table.add_column("instructions")
-    steps = {"binning": "binning¹", "forward": "forward", "backward": "backward", "both": "forward + backward"}
-    steps["ssim"] = "D-SSIM, both ways"
-    for title in steps.values():
-        table.add_column(title, justify="right")
+    steps = {"binning": "binning¹", "forward": "raster forward", "backward": "backward", "both": "both ways"}
+    steps |= {"ssim": "D-SSIM, both ways", "shading": "deferred shading, both ways"}
+    steps |= {f"prefilter {side}": f"prefilter of 6×{side}², both ways" for side in (64, 128)}
     results, before, chosen = {}, torch.get_num_threads(), os.environ.get("REFGS_ISA")
     torch.set_num_threads(threads)
     try:
         for isa in load.supported():
             os.environ["REFGS_ISA"] = isa
             results[isa] = measure()
-            table.add_row(isa, *(f"{min(t):.1f} ({statistics.median(t):.1f})" for t in map(results[isa].get, steps)))
+            table.add_column(isa, justify="right")
     finally:
         torch.set_num_threads(before)
         os.environ.pop("REFGS_ISA")
         if chosen:
             os.environ["REFGS_ISA"] = chosen
+    for step, title in steps.items():
+        taken = (times[step] for times in results.values())
+        table.add_row(title, *(f"{min(t):.1f} ({statistics.median(t):.1f})" for t in taken))
     console = Console()
     console.print(table)
     console.print(f"¹ projection, depth sort and tiles; part of forward. {platform.processor() or platform.machine()}")

@@ -4,6 +4,7 @@ import torch
 from refgs.camera import Camera
 from refgs.model.surfels import activate, initial_parameters
 from refgs.settings import load_settings
+from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify
 
 SETTINGS = load_settings("quick").densify
@@ -19,7 +20,7 @@ def make(count=20):
     )  # fmt: skip
     groups = [{"params": [value], "name": name} for name, value in parameters.items()]
     groups.append({"params": [torch.zeros(6, 3, requires_grad=True)], "name": "environment"})
-    optimizer = torch.optim.Adam(groups, lr=0.0)
+    optimizer = Adam(groups)
     sum((value**2).sum() for value in parameters.values()).backward()
     optimizer.step()
     return parameters, optimizer

@@ -17,7 +17,7 @@ from tests.kernels import scenes, test_ssim
 
 ALL = LossSettings(dssim=0.2, normal=0.3, smooth=0.4, alpha=0.5, metallic=0.6, light=0.0)
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
-MAPS = ("color", "normal", "depth", "alpha", "material")
+MAPS = ("color", "normal", "blended_depth", "alpha", "material")
 
 
 def reference(rendering: Rendering, view: LoadedView, weights: LossSettings, progress: float) -> dict[str, Tensor]:
@@ -67,7 +67,7 @@ def pictures(width: int, height: int, masked: bool, material: bool) -> tuple[Ren
     depth = 2.5 + 0.3 * torch.sin(x) * torch.cos(y) + 0.01 * random(*size)
     normal = torch.tensor(camera.world_to_camera[2, :3] * -1).float() + 0.6 * (random(*size, 3) - 0.5)
     alpha = (random(*size) + 0.4).clamp_max(1) - 0.003 * random(*size)
-    maps = [1.2 * random(*size, 3), alpha, depth, normal, random(*size, 5) if material else None]
+    maps = [1.2 * random(*size, 3), alpha, depth * alpha, normal, random(*size, 5) if material else None]
     photo = (300 * rng.uniform(size=(*size, 3))).clip(0, 255).astype(np.uint8)
     mask = (300 * rng.uniform(size=size)).clip(0, 255).astype(np.uint8) if masked else None
     return Rendering(*maps), LoadedView(photo, mask, camera)

@@ -13,6 +13,7 @@ from refgs.errors import InputError
 
 HERE = Path(__file__).parent
 SOURCES = (
+    "adam.cpp",
     "blend.cpp",
     "harmonics.cpp",
     "losses.cpp",

@@ -9,7 +9,7 @@ namespace {
 
 struct Losses {
   int64_t width, height;
-  const float *color, *normal, *depth, *alpha, *material;  // (H, W, 3), (H, W, 3), (H, W), (H, W), (H, W, 5) or null
+  const float *color, *normal, *depth, *alpha, *material;  // (H, W, 3), (H, W, 3), (H, W) times alpha, (H, W), (H, W, 5) or null
   const uint8_t *image, *mask;                             // (H, W, 3), (H, W) or null: as on disk, 255 is 1
   float background[3];
   double rotation[9], fx, fy, cx, cy;  // world to camera
@@ -88,6 +88,8 @@ struct Row {
     return {p.get(row, 3), p.get(row + 1, 3), p.get(row + 2, 3)};
   }
   MEMBER Vector get(const float* map, int64_t dx = 0, int64_t dy = 0) const { return at.beside(dx).get(of(map, 1, dy), 1); }
+  MEMBER Vector inverse_alpha(int64_t dx = 0, int64_t dy = 0) const { return reciprocal(larger(get(l.alpha, dx, dy), Vector() + SURFACE)); }
+  MEMBER Vector mean_depth(int64_t dx = 0, int64_t dy = 0) const { return get(l.depth, dx, dy) * inverse_alpha(dx, dy); }
   MEMBER void put(float* map, Vector v) const { at.put(of(map, 1), 1, v); }
   MEMBER void put3(float* map, Vector3 v) const {
     float* row = of(map, 3);
@@ -143,7 +145,7 @@ INLINE void normal_term(const Row& r, Sum& loss) {
   float dX = (float)(1 / l.fx), dY = (float)(1 / l.fy), Y = (float)((r.y + 0.5 - l.cy) / l.fy);
   Vector X;
   for (int lane = 0; lane < LANES; lane++) X[lane] = (float)((r.at.x + lane + 0.5 - l.cx) / l.fx);
-  Vector right = r.get(l.depth, 1), left = r.get(l.depth, -1), below = r.get(l.depth, 0, 1), above = r.get(l.depth, 0, -1);
+  Vector right = r.mean_depth(1), left = r.mean_depth(-1), below = r.mean_depth(0, 1), above = r.mean_depth(0, -1);
   Vector p = right - left, q = (right + left) * dX, t = below - above, s = (below + above) * dY;
   Vector3 N = {p * s, q * t, -(q * s + X * p * s + Y * q * t)};
   float R[9];
@@ -212,7 +214,9 @@ EXPORT void refgs_losses_second(Losses* l) {
     Vector by_depth = r.get(l.slopes, -1) + r.get(l.slopes + size, 1);
     if (r.y > 0) by_depth += r.get(l.slopes + 2 * size, 0, -1);
     if (r.y + 1 < l.height) by_depth += r.get(l.slopes + 3 * size, 0, 1);
-    r.put(l.by_depth, by_depth);
+    Vector inverse = r.inverse_alpha(), alpha = r.get(l.alpha);
+    r.put(l.by_depth, by_depth * inverse);
+    r.put(l.by_alpha, r.get(l.by_alpha) - select(alpha >= SURFACE, by_depth * r.mean_depth() * inverse, Vector()));
 
     Vector3 color = r.get3(l.color), clipped = r.get3(l.clipped), by = r.get3(l.by_color), share = r.get3(l.by_clipped);
     auto open = [](Vector color, Vector clipped, Vector share) { return select(color == clipped, share, Vector()); };

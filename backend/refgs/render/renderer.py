@@ -24,17 +24,22 @@ COVERED = 1 / 255  # pixels with less alpha than this are background
 class Rendering:
     """What a camera sees. `color` (H, W, 3) is sRGB-encoded, over the background. The maps are alpha-weighted means over
     the splats of a pixel, linear, zero where nothing is: `normal` (H, W, 3) in world space, not normalised, towards the
-    camera; `depth` (H, W) along the camera's axis. Deferred shading has two more: `material` (H, W, 5) is albedo,
-    metallic, roughness; `radiance` (H, W, 3) is before the background. With inter-reflection, `visibility` (H, W) is 0
-    where the object itself stands in the mirror direction, else 1."""
+    camera; `depth` (H, W) along the camera's axis, of which `blended_depth` is the sum that is divided by alpha. Deferred
+    shading has two more: `material` (H, W, 5) is albedo, metallic, roughness; `radiance` (H, W, 3) is before the
+    background. With inter-reflection, `visibility` (H, W) is 0 where the object itself stands in the mirror direction,
+    else 1."""
 
     color: Tensor
     alpha: Tensor
-    depth: Tensor
+    blended_depth: Tensor
     normal: Tensor
     material: Tensor | None = None
     radiance: Tensor | None = None
     visibility: Tensor | None = None
+
+    @property
+    def depth(self) -> Tensor:
+        return self.blended_depth / self.alpha.clamp_min(COVERED)
 
     @property
     def albedo(self) -> Tensor:
@@ -65,7 +70,8 @@ def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, 
     row, column = np.divmod(covered, camera.width)
     local = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))])
     rays = local.T @ camera.world_to_camera[:3, :3]
-    points = rays * depth.detach().numpy().reshape(-1, 1)[covered] + camera.position
+    mean_depth = (depth / alpha).detach().numpy().reshape(-1, 1)[covered]
+    points = rays * mean_depth + camera.position
     normals = mirrored - _unit(rays)  # half way back to the camera
     visible = torch.ones_like(alpha)
     visible.view(-1)[covered] = torch.from_numpy(occluder.visible(points, _unit(normals), mirrored)).float()
@@ -100,7 +106,6 @@ def render(
         parts.append(surfels.positions)
     geometry = surfels.positions, surfels.rotations, surfels.scales, surfels.opacities
     features, depth, alpha = rasterize(*geometry, torch.cat(parts, dim=1), camera, near=near)
-    depth = depth / alpha.clamp_min(COVERED)
     if deferred:
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
         shaded = shade(features, alpha, environment, camera, background, visibility)

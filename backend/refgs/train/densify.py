@@ -34,7 +34,7 @@ class ScreenGradient:
 @torch.no_grad()
 def densify(
     parameters: Parameters,
-    optimizer: torch.optim.Adam,
+    optimizer: torch.optim.Optimizer,
     gradient: Tensor,
     settings: DensifySettings,
     budget: int,

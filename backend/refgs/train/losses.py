@@ -122,7 +122,7 @@ def objective(
     alone cannot. Not before it is known which is which, hence with the square of the progress.
     """
     material = rendering.material if weights.metallic > 0 else None
-    maps = rendering.color, rendering.normal, rendering.depth, rendering.alpha, material
+    maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material
     loss, psnr = _Maps.apply(*maps, view, background, weights, progress)
     if environment is not None and weights.light > 0:
         loss = loss + weights.light * light_loss(environment)

@@ -22,6 +22,7 @@ from refgs.model.surfels import Surfels, activate
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.settings import Settings
 from refgs.train import checkpoint
+from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify
 from refgs.train.losses import objective
 from refgs.train.start import start_parameters
@@ -79,7 +80,7 @@ class Trainer:
         ]
         if settings.render.shading == "deferred":
             groups.append({"params": [self.light], "name": "environment", "rate": settings.rates.environment})
-        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
+        self.optimizer = Adam(groups)
         self.motion = ScreenGradient(len(self.parameters["position"]))
         self.occluder: Occluder | None = None
 

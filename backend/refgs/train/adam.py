@@ -1,0 +1,67 @@
+"""The optimiser."""
+
+import ctypes
+
+import torch
+from torch import Tensor
+
+from refgs.kernels.load import Shared, Work, kernels, parallel
+
+
+class _Learned(Work):
+    """`struct Learned` of adam.cpp."""
+
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        *((n, ctypes.c_void_p) for n in ("value", "mean", "square", "gradient")),
+        *((n, ctypes.c_double) for n in ("rate", "square_scale")),
+    )
+
+
+class _Work(Work):
+    """`struct Adam` of adam.cpp."""
+
+    _fields_ = (
+        ("tensors", ctypes.c_int64),
+        ("learned", ctypes.c_void_p),
+        *((n, ctypes.c_double) for n in ("beta1", "beta2", "epsilon")),
+        ("scratch", ctypes.c_void_p),
+        ("shared", Shared),
+    )
+
+
+class Adam(torch.optim.Optimizer):
+    """Adam (Kingma and Ba 2015), of float32 tensors on the CPU, all of them in one go: torch's own takes them one by one.
+
+    Groups and state as in `torch.optim.Adam`; a parameter without a gradient is left as it is.
+    """
+
+    BETAS, EPSILON = (0.9, 0.999), 1e-15
+
+    def __init__(self, groups: list[dict]):
+        super().__init__(groups, {"lr": 0.0})
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Move every parameter by its group's rate `lr`."""
+        (beta1, beta2), learned, kept = self.BETAS, [], []
+        for group in self.param_groups:
+            for value in group["params"]:
+                if value.grad is None:
+                    continue
+                state = self.state[value]
+                if not state:
+                    state |= {"step": torch.zeros(()), "exp_avg": torch.zeros_like(value)}
+                    state["exp_avg_sq"] = torch.zeros_like(value)
+                state["step"] += 1
+                t = float(state["step"])
+                work = _Learned(count=value.numel(), rate=group["lr"] / (1 - beta1**t))
+                work.square_scale = (1 - beta2**t) ** -0.5
+                gradient: Tensor = value.grad.contiguous()
+                work.attach(value=value, mean=state["exp_avg"], square=state["exp_avg_sq"], gradient=gradient)
+                learned.append(work)
+                kept.append(gradient)
+        table = (_Learned * len(learned))(*learned)
+        work = _Work(tensors=len(learned), learned=ctypes.addressof(table))
+        work.beta1, work.beta2, work.epsilon = beta1, beta2, self.EPSILON
+        parallel(kernels().refgs_adam_step, work)

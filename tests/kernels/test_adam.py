@@ -1,0 +1,58 @@
+"""The optimiser against torch's in float64."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from refgs.kernels import load
+from refgs.train.adam import Adam
+from tests.kernels import scenes
+
+SHAPES = [(1,), (1000, 3), (20_000,), (777, 4), (5, 2, 3)]
+RATES = [1e-3, 0.0, 3e-2, 1e-4, 1.0]
+
+
+def tensors(steps: int) -> tuple[list[Tensor], list[list[Tensor]]]:
+    """Values, and gradients of each step, from 1e-12 to 1e3 in size; some are zero, one tensor has one only now and then."""
+    generator = torch.Generator().manual_seed(0)
+    sizes = [10.0 ** (15 * torch.rand(s, generator=generator) - 12) for s in SHAPES]
+    values = [torch.randn(s, generator=generator) for s in SHAPES]
+    gradients = [[size * torch.randn(size.shape, generator=generator) for size in sizes] for _ in range(steps)]
+    gradients[0][2][:] = 0
+    gradients[3][1] = None
+    return values, gradients
+
+
+def train(optimizer: torch.optim.Optimizer, values: list[Tensor], gradients: list[list[Tensor]]) -> None:
+    for step in gradients:
+        for value, gradient in zip(values, step, strict=True):
+            value.grad = None if gradient is None else gradient.to(value.dtype)
+        optimizer.step()
+
+
+def groups(values: list[Tensor]) -> list[dict]:
+    return [{"params": [value], "lr": rate} for value, rate in zip(values, RATES, strict=True)]
+
+
+@pytest.mark.parametrize("isa", load.supported())
+def test_matches_float64(isa, monkeypatch):
+    monkeypatch.setenv("REFGS_ISA", isa)
+    start, gradients = tensors(20)
+    exact = [v.double().requires_grad_() for v in start]
+    train(torch.optim.Adam(groups(exact), eps=1e-15), exact, gradients)
+    values = [v.clone().requires_grad_() for v in start]
+    optimizer = Adam(groups(values))
+    train(optimizer, values, gradients)
+    for value, expected, begun, rate in zip(values, exact, start, RATES, strict=True):
+        assert (value - expected).abs().max() <= 2e-7 * begun.abs().max() * 20 + 1e-5 * rate
+    assert [float(optimizer.state[v]["step"]) for v in values] == [20, 19, 20, 20, 20]
+
+
+def test_same_bits_for_any_number_of_threads():
+    def all_of_it() -> list[Tensor]:
+        start, gradients = tensors(5)
+        values = [v.requires_grad_() for v in start]
+        train(Adam(groups(values)), values, gradients)
+        return [v.detach() for v in values]
+
+    scenes.check_same_bits_for_any_number_of_threads(all_of_it)
