@@ -38,7 +38,7 @@ def surfels(kind: str, channels: int, seed: int = 0) -> tuple[Tensor, ...]:
     if kind == "mixed":
         parts = [surfels(k, channels, seed) for k in KINDS if k not in ("mixed", "layers")]
         return tuple(torch.cat(tensors) for tensors in zip(*parts, strict=True))
-    n = 400 if kind == "layers" else 80
+    n = 400 if kind == "layers" else 77
     position = rng.normal(size=(n, 3)) * [0.9, 0.6, 0.6] + [0.3, -0.2, 1.6]
     rotation = rng.normal(size=(n, 4)) * rng.uniform(0.1, 5, (n, 1))
     scale = np.exp(rng.uniform(np.log(0.02), np.log(0.4), (n, 2)))

@@ -120,6 +120,28 @@ def test_a_term_without_weight_is_not_there(term):
         assert (gradient - expected_gradients[name]).abs().max() <= 1e-4 * expected_gradients[name].abs().max()
 
 
+@pytest.mark.parametrize("isa", load.supported())
+def test_far_away_where_hardly_anything_is(isa, monkeypatch):
+    """Depths of 1e11 at pixels that are nearly empty leave the others alone."""
+    monkeypatch.setenv("REFGS_ISA", isa)
+    rendering, view = pictures(30, 20, masked=True, material=True)
+    rendering.alpha[::5, ::4], rendering.blended_depth[::5, ::4] = 0.01, 1e9
+    exact, found = leaves(rendering, torch.float64), leaves(rendering, torch.float32)
+    expected = sum(reference(exact, view, ALL, 0.7).values())
+    loss, _ = objective(found, None, view, BACKGROUND, ALL, 0.7)
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
+    expected_gradients = gradients(expected, exact)
+    for name, gradient in gradients(loss, found).items():
+        assert (gradient - expected_gradients[name]).abs().max() <= 1e-4 * expected_gradients[name].abs().max()
+
+
+def test_a_photo_of_another_size_is_refused():
+    rendering, view = pictures(30, 20, masked=True, material=True)
+    for other in (replace(view, alpha=view.alpha[:10]), replace(view, image=view.image[:, 1:])):
+        with pytest.raises(ValueError, match="size"):
+            objective(leaves(rendering, torch.float32), None, other, BACKGROUND, ALL, 1.0)
+
+
 def test_normals_of_a_plane_agree_with_its_depth():
     camera = scenes.camera(40, 30)
     normal = np.array([0.2, -0.3, -0.9]) / np.linalg.norm([0.2, -0.3, -0.9])

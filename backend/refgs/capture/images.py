@@ -68,6 +68,8 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
     camera = view.camera
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(f"{view.image_path}: the photo changed its size since the capture was read. Start again.")
+    if alpha is not None and alpha.shape != image.shape[:2]:
+        raise InputError(f"{view.mask_path}: the mask changed its size since the capture was read. Start again.")
     fitted = camera.fitted(max_side) if max_side else camera
     if view.lens is None and fitted is camera:
         return LoadedView(image, alpha, camera)

@@ -5,6 +5,8 @@ using refgs::Splat;
 
 namespace {
 
+typedef double Quad __attribute__((vector_size(32)));
+
 // n0, n1, n2 are taken apart where they sum up terms larger than this many times n2: u and v err by 2^-24 of it.
 constexpr double SPLIT = 32;
 constexpr int CHUNK = 64;      // splats of a tile that are treated together
@@ -59,17 +61,17 @@ INLINE Splat localise(const Projected& p, const Tile& t) {
     // Adding 1.5 * 2^52 q rounds to multiples of q, here 2^-22 of the largest sum: its multiples of q / 2 fit in a float.
     Quad round = (most + spread) * (1.5 * (1ll << 30));
     auto part = [&](Quad exact, float* high, float* low) {
-      FloatQuad h = __builtin_convertvector(exact + round - round, FloatQuad);
-      *(FloatQuad*)high = h;
-      *(FloatQuad*)low = __builtin_convertvector(exact - __builtin_convertvector(h, Quad), FloatQuad);
+      Four h = __builtin_convertvector(exact + round - round, Four);
+      *(Four*)high = h;
+      *(Four*)low = __builtin_convertvector(exact - __builtin_convertvector(h, Quad), Four);
     };
     part(value, s.high.value, s.low.value);
     part(slope_x, s.high.slope_x, s.low.slope_x);
     part(slope_y, s.high.slope_y, s.low.slope_y);
   } else {
-    *(FloatQuad*)s.high.value = __builtin_convertvector(value, FloatQuad);
-    *(FloatQuad*)s.high.slope_x = __builtin_convertvector(slope_x, FloatQuad);
-    *(FloatQuad*)s.high.slope_y = __builtin_convertvector(slope_y, FloatQuad);
+    *(Four*)s.high.value = __builtin_convertvector(value, Four);
+    *(Four*)s.high.slope_x = __builtin_convertvector(slope_x, Four);
+    *(Four*)s.high.slope_y = __builtin_convertvector(slope_y, Four);
   }
   s.determinant = p.determinant, s.n2_min = p.n2_min, s.n2_max = p.n2_max;
   s.x = near_zero(p.x - x), s.y = near_zero(p.y - y), s.depth = p.depth;
@@ -142,10 +144,10 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
   const int32_t* members = r.members + r.tile_start[index];
   int64_t count = r.tile_start[index + 1] - r.tile_start[index], reach = 0;
   Splat splats[CHUNK + 1];  // the one after the last covers nothing, and completes an odd list
-  const float* features[CHUNK + 1];
+  const float* features[CHUNK];
   uint8_t lists[BLOCKS][CHUNK + 1];
-  Vector weights[CHUNK + 1];
-  const float* rows[CHUNK + 1];
+  Vector weights[CHUNK];
+  const float* rows[CHUNK];
   for (int64_t start = 0; start < count && live; start += CHUNK) {
     int lengths[BLOCKS] = {};
     int n = (int)(count - start < CHUNK ? count - start : CHUNK);
@@ -159,7 +161,7 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
         lists[b][lengths[b]++] = (uint8_t)k;
       }
     }
-    splats[n] = splats[0], splats[n].rho_max = -1, features[n] = features[0];
+    splats[n] = splats[0], splats[n].rho_max = -1;
     for (uint64_t m = live; m; m &= m - 1) {
       int b = __builtin_ctzll(m), used = 0;
       Vector x = load(CENTRES.x + b * LANES), y = load(CENTRES.y + b * LANES);
@@ -174,7 +176,7 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
           see<true>(s, next, x, y, a, z);
         else
           see<false>(s, next, x, y, a, z);
-        for (int i = 0; i < 2; i++) {
+        for (int i = 0; i < 2 && k[i] < n; i++) {
           Vector w = a[i] * T;
           T = unfinished(T * (1.0f - a[i]));
           Z += w * z[i];

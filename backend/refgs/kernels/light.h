@@ -4,16 +4,6 @@
 
 #include "vector.h"
 
-typedef float Four __attribute__((vector_size(16)));
-
-struct Vectors {
-  Vector x, y, z;
-};
-INLINE Vectors operator+(Vectors a, Vectors b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-INLINE Vectors operator-(Vectors a, Vectors b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-INLINE Vectors operator*(Vector s, Vectors a) { return {s * a.x, s * a.y, s * a.z}; }
-INLINE Vector dot(Vectors a, Vectors b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-
 // Bilinear weights between four neighbours: (0, 0), (1, 0), (0, 1), (1, 1).
 INLINE void bilinear(Vector x, Vector y, Vector (&weight)[4]) {
   weight[0] = (1.0f - x) * (1.0f - y), weight[1] = x * (1.0f - y), weight[2] = (1.0f - x) * y, weight[3] = x * y;

@@ -18,6 +18,7 @@ from refgs.kernels.build import build, target
 MACHINES = {"AMD64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
 # Functions that return how large a buffer must be, and how many integers they take.
 SIZES = {
+    "refgs_tiles": 2,
     "refgs_projected_size": 0,
     "refgs_octagon_size": 0,
     "refgs_row_size": 1,
@@ -93,6 +94,14 @@ def _openmp() -> Callable | None:
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="refgs-kernels")
+
+
+def check(**expected: tuple[torch.Tensor, tuple[int, ...]]) -> None:
+    """What a kernel is about to read: raise ValueError unless each tensor is float32, on the CPU and of its shape."""
+    for name, (tensor, shape) in expected.items():
+        if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+            found = f"{tensor.dtype} {tuple(tensor.shape)} on {tensor.device}"
+            raise ValueError(f"{name}: expected float32 {shape} on the CPU, got {found}")
 
 
 class Shared(ctypes.Structure):

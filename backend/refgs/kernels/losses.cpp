@@ -23,12 +23,10 @@ struct Losses {
   Shared shared;
 };
 
-enum { LOSS, METALLIC, COVERED, SQUARES, SUMS };  // weighted terms but metallic; m (1 - m); pixels with a surface; squared errors
+enum { LOSS, METALLIC, SURFACES, SQUARES, SUMS };  // weighted terms but metallic; m (1 - m); pixels with a surface; squared errors
 constexpr float SATURATED = 0.998f;  // a photo's value above which the true radiance is unknown
-constexpr float SOLID = 0.5f, SURFACE = 1 / 255.0f;  // alphas of an opaque pixel, and of one that is not background
+constexpr float SOLID = 0.5f, COVERED = 1 / 255.0f;  // alphas of an opaque pixel, and of one that is not background
 constexpr int MATERIAL = 5, METAL = 3;               // numbers of a material; which is the metallic
-
-typedef double Sum __attribute__((vector_size(8 * LANES)));
 
 // A vector's worth of pixels of a row.
 struct Pixels {
@@ -60,18 +58,11 @@ struct Pixels {
   }
 };
 
-struct Vector3 {
-  Vector x, y, z;
-};
-INLINE Vector dot(Vector3 a, Vector3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 INLINE Vector magnitude(Vector v) { return v < 0 ? -v : v; }
 INLINE Vector sign(Vector v) { return select(v > 0.0f, Vector() + 1.0f, select(v < 0.0f, Vector() - 1.0f, Vector())); }
-INLINE Vector3 operator+(Vector3 a, Vector3 b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-INLINE Vector3 operator-(Vector3 a, Vector3 b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-INLINE Vector3 operator*(Vector s, Vector3 a) { return {s * a.x, s * a.y, s * a.z}; }
-INLINE Vector inverse_length(Vector3 v) { return reciprocal(root(dot(v, v) + 1e-24f)); }
+INLINE Vector inverse_length(Vectors v) { return reciprocal(root(smaller(dot(v, v) + 1e-24f, Vector() + 1e36f))); }
 // From the derivative by v / |v|, `unit`, to that by v.
-INLINE Vector3 by_length(Vector3 by, Vector3 unit, Vector inverse) { return inverse * (by - dot(by, unit) * unit); }
+INLINE Vectors by_length(Vectors by, Vectors unit, Vector inverse) { return inverse * (by - dot(by, unit) * unit); }
 
 // A row of a pass, `at` being some pixels of it.
 struct Row {
@@ -82,16 +73,16 @@ struct Row {
 
   MEMBER const float* of(const float* map, int64_t numbers, int64_t dy = 0) const { return map + (y + dy) * l.width * numbers; }
   MEMBER float* of(float* map, int64_t numbers, int64_t dy = 0) const { return map + (y + dy) * l.width * numbers; }
-  MEMBER Vector3 get3(const float* map, int64_t dx = 0, int64_t dy = 0) const {
+  MEMBER Vectors get3(const float* map, int64_t dx = 0, int64_t dy = 0) const {
     const float* row = of(map, 3, dy);
     Pixels p = at.beside(dx);
     return {p.get(row, 3), p.get(row + 1, 3), p.get(row + 2, 3)};
   }
   MEMBER Vector get(const float* map, int64_t dx = 0, int64_t dy = 0) const { return at.beside(dx).get(of(map, 1, dy), 1); }
-  MEMBER Vector inverse_alpha(int64_t dx = 0, int64_t dy = 0) const { return reciprocal(larger(get(l.alpha, dx, dy), Vector() + SURFACE)); }
+  MEMBER Vector inverse_alpha(int64_t dx = 0, int64_t dy = 0) const { return reciprocal(larger(get(l.alpha, dx, dy), Vector() + COVERED)); }
   MEMBER Vector mean_depth(int64_t dx = 0, int64_t dy = 0) const { return get(l.depth, dx, dy) * inverse_alpha(dx, dy); }
   MEMBER void put(float* map, Vector v) const { at.put(of(map, 1), 1, v); }
-  MEMBER void put3(float* map, Vector3 v) const {
+  MEMBER void put3(float* map, Vectors v) const {
     float* row = of(map, 3);
     at.put(row, 3, v.x), at.put(row + 1, 3, v.y), at.put(row + 2, 3, v.z);
   }
@@ -123,12 +114,12 @@ INLINE void pixel_terms(const Row& r, Sum (&sums)[SUMS]) {
   if (!l.material) return;
   Vector metallic = r.at.get(r.of(l.material, MATERIAL) + METAL, MATERIAL);
   r.add(sums[METALLIC], metallic * (1.0f - metallic));
-  r.add(sums[COVERED], select(alpha > SURFACE, Vector() + 1.0f, Vector()));
+  r.add(sums[SURFACES], select(alpha > COVERED, Vector() + 1.0f, Vector()));
 }
 
-// The depth's normal at a pixel, by central differences: with X, Y where its ray meets depth 1, p and r the differences of depth along
-// x and y, and q and s the widths there of two pixels, the tangents are (X p + q, Y p, p) and (X r, Y r + s, r), whose product, towards
-// the camera, is N = (p s, q r, -(q s + X p s + Y q r)).
+// The depth's normal at a pixel, by central differences: with X, Y where its ray meets depth 1, p and t the differences of depth along
+// x and y, and q and s the widths there of two pixels, the tangents are (X p + q, Y p, p) and (X t, Y t + s, t), whose product, towards
+// the camera, is N = (p s, q t, -(q s + X p s + Y q t)).
 INLINE void normal_term(const Row& r, Sum& loss) {
   const Losses& l = r.l;
   float* slopes[4];
@@ -141,21 +132,23 @@ INLINE void normal_term(const Row& r, Sum& loss) {
     for (float* slope : slopes) r.put(slope, Vector());
     return r.put3(l.by_normal, {});
   }
-  Vector3 n = r.get3(l.normal);
+  Vectors n = r.get3(l.normal);
   float dX = (float)(1 / l.fx), dY = (float)(1 / l.fy), Y = (float)((r.y + 0.5 - l.cy) / l.fy);
   Vector X;
   for (int lane = 0; lane < LANES; lane++) X[lane] = (float)((r.at.x + lane + 0.5 - l.cx) / l.fx);
-  Vector right = r.mean_depth(1), left = r.mean_depth(-1), below = r.mean_depth(0, 1), above = r.mean_depth(0, -1);
+  // Zero where they are not asked: one outlier there must not become a NaN here.
+  auto depth = [&](int dx, int dy) { return select(solid, r.mean_depth(dx, dy), Vector()); };
+  Vector right = depth(1, 0), left = depth(-1, 0), below = depth(0, 1), above = depth(0, -1);
   Vector p = right - left, q = (right + left) * dX, t = below - above, s = (below + above) * dY;
-  Vector3 N = {p * s, q * t, -(q * s + X * p * s + Y * q * t)};
+  Vectors N = {p * s, q * t, -(q * s + X * p * s + Y * q * t)};
   float R[9];
   for (int i = 0; i < 9; i++) R[i] = (float)l.rotation[i];
-  Vector3 m = {R[0] * n.x + R[1] * n.y + R[2] * n.z, R[3] * n.x + R[4] * n.y + R[5] * n.z, R[6] * n.x + R[7] * n.y + R[8] * n.z};
+  Vectors m = {R[0] * n.x + R[1] * n.y + R[2] * n.z, R[3] * n.x + R[4] * n.y + R[5] * n.z, R[6] * n.x + R[7] * n.y + R[8] * n.z};
   Vector inverse_N = inverse_length(N), inverse_m = inverse_length(m);
-  Vector3 of_depth = inverse_N * N, blended = inverse_m * m;
+  Vectors of_depth = inverse_N * N, blended = inverse_m * m;
   Vector w = select(solid, Vector() + l.normal_weight, Vector());
   r.add(loss, w * (1.0f - dot(of_depth, blended)));
-  Vector3 g = by_length(-w * blended, of_depth, inverse_N), h = by_length(-w * of_depth, blended, inverse_m);
+  Vectors g = by_length(-w * blended, of_depth, inverse_N), h = by_length(-w * of_depth, blended, inverse_m);
   r.put3(l.by_normal, {R[0] * h.x + R[3] * h.y + R[6] * h.z, R[1] * h.x + R[4] * h.y + R[7] * h.z, R[2] * h.x + R[5] * h.y + R[8] * h.z});
   Vector by_p = s * (g.x - X * g.z), by_q = (t * g.y - (s + Y * t) * g.z) * dX;
   Vector by_t = q * (g.y - Y * g.z), by_s = (p * g.x - (q + X * p) * g.z) * dY;
@@ -163,13 +156,13 @@ INLINE void normal_term(const Row& r, Sum& loss) {
 }
 
 // The change of the normal towards a neighbour, and its derivative, which both of them feel; counted once, by the pixel before.
-INLINE Vector3 smooth_term(const Row& r, int dx, int dy, float weight, Sum& loss) {
+INLINE Vectors smooth_term(const Row& r, int dx, int dy, float weight, Sum& loss) {
   const Losses& l = r.l;
   Mask both = r.inside & r.at.beside(dx).inside();
   if (weight == 0 || r.y + dy < 0 || r.y + dy >= l.height) return {};
   both &= (r.get(l.alpha) > SOLID) & (r.get(l.alpha, dx, dy) > SOLID);
   if (!any(both)) return {};
-  Vector3 n = r.get3(l.normal) - r.get3(l.normal, dx, dy), photo = r.get3(l.photo) - r.get3(l.photo, dx, dy);
+  Vectors n = r.get3(l.normal) - r.get3(l.normal, dx, dy), photo = r.get3(l.photo) - r.get3(l.photo, dx, dy);
   Vector edge = magnitude(photo.x) + magnitude(photo.y) + magnitude(photo.z);
   Vector w = select(both, weight * exp2(-1.442695f * edge), Vector());
   if (dx + dy > 0) r.add(loss, w * (magnitude(n.x) + magnitude(n.y) + magnitude(n.z)));
@@ -205,7 +198,7 @@ EXPORT void refgs_losses_first(Losses* l) {
 EXPORT void refgs_losses_second(Losses* l) {
   each(l, [](const Row& r, Sum (&sums)[SUMS]) {
     const Losses& l = r.l;
-    Vector3 by_normal = r.get3(l.by_normal);
+    Vectors by_normal = r.get3(l.by_normal);
     by_normal = by_normal + smooth_term(r, 1, 0, l.smooth_x_weight, sums[LOSS]) + smooth_term(r, -1, 0, l.smooth_x_weight, sums[LOSS]);
     by_normal = by_normal + smooth_term(r, 0, 1, l.smooth_y_weight, sums[LOSS]) + smooth_term(r, 0, -1, l.smooth_y_weight, sums[LOSS]);
     r.put3(l.by_normal, by_normal);
@@ -216,11 +209,11 @@ EXPORT void refgs_losses_second(Losses* l) {
     if (r.y + 1 < l.height) by_depth += r.get(l.slopes + 3 * size, 0, 1);
     Vector inverse = r.inverse_alpha(), alpha = r.get(l.alpha);
     r.put(l.by_depth, by_depth * inverse);
-    r.put(l.by_alpha, r.get(l.by_alpha) - select(alpha >= SURFACE, by_depth * r.mean_depth() * inverse, Vector()));
+    r.put(l.by_alpha, r.get(l.by_alpha) - select(alpha >= COVERED, by_depth * r.mean_depth() * inverse, Vector()));
 
-    Vector3 color = r.get3(l.color), clipped = r.get3(l.clipped), by = r.get3(l.by_color), share = r.get3(l.by_clipped);
+    Vectors color = r.get3(l.color), clipped = r.get3(l.clipped), by = r.get3(l.by_color), share = r.get3(l.by_clipped);
     auto open = [](Vector color, Vector clipped, Vector share) { return select(color == clipped, share, Vector()); };
-    r.put3(l.by_color, by + Vector3{open(color.x, clipped.x, share.x), open(color.y, clipped.y, share.y), open(color.z, clipped.z, share.z)});
+    r.put3(l.by_color, by + Vectors{open(color.x, clipped.x, share.x), open(color.y, clipped.y, share.y), open(color.z, clipped.z, share.z)});
 
     if (!l.material) return;
     float* row = r.of(l.by_material, MATERIAL);

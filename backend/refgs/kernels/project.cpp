@@ -31,7 +31,7 @@ struct Batch {
   }
 };
 
-// Splats in camera space: centre c, axes a = s_u t_u and b = s_v t_v; their homographies (see Splat), n = k (n0, n1, n2).
+// Splats in camera space: centre c, axes a = s_u t_u and b = s_v t_v; their homographies (see Splat) before the factors k and UNIT.
 struct Disc {
   Real q[4], norm;  // unit quaternion; the norm it came with, 0 where it had none and stands for the identity
   Vec3 u, v;        // unit tangents, camera space
@@ -94,7 +94,7 @@ void project(const Raster& r, int64_t first) {
   Real log_opacity;
   for (int lane = 0; lane < BATCH; lane++) log_opacity[lane] = __builtin_log(r.opacities[i[lane]]);
   Real rho_max = log_opacity - __builtin_log(refgs::ALPHA_CUT);
-  Truth visible = (d.c.z >= r.near) & (d.c.z <= refgs::FAR) & (rho_max >= 0), flat = d.k != 0;
+  Truth visible = (d.c.z >= r.near) & (d.c.z <= refgs::FAR) & (rho_max >= 0), proper = d.k != 0;
 
   // The octagon's axes x, y, x + y, x - y, as coefficients of homogeneous coordinates; how far the screen-space filter reaches.
   const double mx[] = {r.fx, 0, r.fx, r.fx}, my[] = {0, r.fy, r.fy, -r.fy}, mz[] = {r.cx, r.cy, r.cx + r.cy, r.cx - r.cy};
@@ -103,7 +103,7 @@ void project(const Raster& r, int64_t first) {
   const double slack = 1e-3;  // pixels: for the rounding of the tiles' float arithmetic
   Real k2 = 2 * rho_max, radius = root(k2 / (double)refgs::LOW_PASS), reach = root(k2);
   Real slope = root(d.a.z * d.a.z + d.b.z * d.b.z);  // of z over the disc, along (d.a.z, d.b.z)
-  Truth whole = d.c.z - reach * slope >= r.near, cut = visible & flat & ~whole;
+  Truth whole = d.c.z - reach * slope >= r.near, cut = visible & proper & ~whole;
   bool some_cut = false;
   for (int lane = 0; lane < BATCH; lane++) some_cut |= cut[lane] != 0;
   Real lows[4], highs[4];
@@ -115,7 +115,7 @@ void project(const Raster& r, int64_t first) {
       high = (where & (b > high)) ? b : high;
     };
     extent(axis(d.a), axis(d.b), axis(d.c), d, k2, a, b);
-    include(flat & whole, a, b);
+    include(proper & whole, a, b);
     if (some_cut) {  // what is left of the disc lies in a rectangle, cut off at the near plane, whose image is convex
       Real eu = d.a.z / slope, ev = d.b.z / slope;
       const Real ts[] = {(r.near - d.c.z) / slope, reach}, ss[] = {-reach, reach};
@@ -138,7 +138,7 @@ void project(const Raster& r, int64_t first) {
     value[j] = rows[j].z - slope_x[j] * r.cx - slope_y[j] * r.cy;
   }
   Real determinant = d.determinant * d.k;
-  Real n2_min = flat ? larger(determinant / refgs::FAR, Real() + 1e-18) : Real() + 1, n2_max = flat ? determinant / r.near : Real() - 1;
+  Real n2_min = proper ? larger(determinant / refgs::FAR, Real() + 1e-18) : Real() + 1, n2_max = proper ? determinant / r.near : Real() - 1;
   Real x = r.fx * d.c.x / d.c.z + r.cx, y = r.fy * d.c.y / d.c.z + r.cy;
   for (int lane = 0; lane < BATCH && first + lane < r.splats; lane++) {
     Octagon& o = r.octagons[first + lane];

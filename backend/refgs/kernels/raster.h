@@ -63,9 +63,6 @@ struct Raster {
   Shared shared;
 };
 
-typedef double Quad __attribute__((vector_size(32)));
-typedef float FloatQuad __attribute__((vector_size(16)));
-
 INLINE int64_t tiles_x(const Raster& r) { return (r.width + TILE_X - 1) / TILE_X; }
 INLINE int64_t tiles_y(const Raster& r) { return (r.height + TILE_Y - 1) / TILE_Y; }
 

@@ -13,7 +13,6 @@ struct Product {
   Shared shared;
 };
 
-typedef float Four __attribute__((vector_size(16)));
 typedef float UnalignedFour __attribute__((vector_size(16), aligned(4)));
 
 }  // namespace

@@ -25,7 +25,7 @@ struct alignas(16) Affine {
   float value[4], slope_x[4], slope_y[4];
 };
 
-// A splat as a pixel (x, y) sees it, x and y in pixels from the middle of its tile. With M = [s_u t_u, s_v t_v, p] in camera
+// A splat as a pixel (x, y) sees it, x and y in pixels from the middle of its tile. With M = [UNIT s_u t_u, UNIT s_v t_v, p] in camera
 // space, Eq. 4 reads M (u, v, 1)^T = z (X, Y, 1)^T, so (n0, n1, n2) = k det(M) M^-1 (X, Y, 1)^T is affine in the pixel,
 // u = n0 / n2, v = n1 / n2, z = k det(M) / n2. The factor k is free. Each is a sum of two: `high` is rounded so
 // that it is computed without error at the half-integers of a tile, `low` is what that left out. For a disc near its edge n2 is a

@@ -63,7 +63,6 @@ void forward_row(const Ssim& s, int64_t y, const Lines& lines) {
     write(lines[0] + i, x, count), write(lines[1] + i, t, count);
     write(lines[2] + i, square, count), write(lines[3] + i, product, count);
   });
-  typedef double Sum __attribute__((vector_size(8 * LANES)));
   Sum sum = {};
   each(n, [&](int64_t i, int64_t count) {
     Vector x = along(lines[0] + i, s.channels), t = along(lines[1] + i, s.channels);

@@ -18,6 +18,9 @@ typedef float UnalignedVector __attribute__((vector_size(4 * LANES), aligned(4))
 #define MEMBER inline __attribute__((always_inline))
 #define INLINE static MEMBER
 
+typedef float Four __attribute__((vector_size(16)));
+typedef double Sum __attribute__((vector_size(8 * LANES)));  // what many vectors are added up in
+
 INLINE Vector select(Mask mask, Vector a, Vector b) { return mask ? a : b; }
 INLINE Vector smaller(Vector a, Vector b) { return a < b ? a : b; }
 INLINE Vector larger(Vector a, Vector b) { return a > b ? a : b; }
@@ -32,6 +35,14 @@ INLINE bool any(Mask mask) { return __builtin_reduce_or(mask) != 0; }
 INLINE Vector load(const float* p) { return *(const UnalignedVector*)p; }
 INLINE void store(float* p, Vector v) { *(UnalignedVector*)p = v; }
 
+struct Vectors {
+  Vector x, y, z;
+};
+INLINE Vectors operator+(Vectors a, Vectors b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+INLINE Vectors operator-(Vectors a, Vectors b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+INLINE Vectors operator*(Vector s, Vectors a) { return {s * a.x, s * a.y, s * a.z}; }
+INLINE Vector dot(Vectors a, Vectors b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
 // 1/x to 1 ulp or so, from 1e-37 to 1e37 in magnitude; beyond, a NaN may stand for an infinity.
 INLINE Vector reciprocal(Vector x) {
 #if LANES == 16  // a division of 16 numbers stops the arithmetic for as long as four steps of this: an estimate to 2^-14, Newton
@@ -43,7 +54,7 @@ INLINE Vector reciprocal(Vector x) {
 #endif
 }
 
-// 2^x for -126 <= x <= 126 to 2 ulp; garbage, but no trap, beyond. 2^x = 2^round(x) 2^f, |f| <= 1/2, the latter by the polynomial
+// 2^x for -126 <= x <= 126 to 2.3 ulp; garbage, but no trap, beyond. 2^x = 2^round(x) 2^f, |f| <= 1/2, the latter by the polynomial
 // of degree 5 that is 1 at 0 and errs least (9e-8).
 INLINE Vector exp2(Vector x) {
   const float ROUND = 12582912.0f;  // 1.5 * 2^23: adding it rounds to an integer, held in the low bits
@@ -58,11 +69,13 @@ INLINE Vector exp2(Vector x) {
   return (Vector)((Mask)p + exponent);
 }
 
-INLINE Mask first(int64_t n) {
+#if LANES == 8
+INLINE Mask first_lanes(int64_t n) {
   Mask lane;
   for (int i = 0; i < LANES; i++) lane[i] = i;
   return lane < (int32_t)n;
 }
+#endif
 
 // Part of a vector: the first n lanes, the others zero.
 INLINE Vector read(const float* p, int64_t n) {
@@ -70,7 +83,7 @@ INLINE Vector read(const float* p, int64_t n) {
 #if LANES == 16
   return __builtin_ia32_loadups512_mask(p, Vector(), (uint16_t)((1 << n) - 1));
 #elif LANES == 8
-  return __builtin_ia32_maskloadps256((const Vector*)p, first(n));
+  return __builtin_ia32_maskloadps256((const Vector*)p, first_lanes(n));
 #else
   Vector v = {};
   for (int i = 0; i < n; i++) v[i] = p[i];
@@ -83,7 +96,7 @@ INLINE void write(float* p, Vector v, int64_t n) {
 #if LANES == 16
   __builtin_ia32_storeups512_mask(p, v, (uint16_t)((1 << n) - 1));
 #elif LANES == 8
-  __builtin_ia32_maskstoreps256((Vector*)p, first(n), v);
+  __builtin_ia32_maskstoreps256((Vector*)p, first_lanes(n), v);
 #else
   for (int i = 0; i < n; i++) p[i] = v[i];
 #endif

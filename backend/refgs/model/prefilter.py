@@ -20,7 +20,7 @@ from scipy import integrate, sparse
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from refgs.kernels.load import Shared, Work, kernels, parallel
+from refgs.kernels.load import Shared, Work, check, kernels, parallel
 from refgs.model import cubemap
 
 ROUGHNESS = (0.0, 0.18, 0.35, 0.6, 1.0)  # of the levels; level 0 is the cubemap itself
@@ -192,4 +192,5 @@ class _Prefilter(torch.autograd.Function):
 
 def prefilter(radiance: Tensor, resolution: int) -> Tensor:
     """All levels of a cubemap (6·R², 3) one after another, (Σ 6·side², 3): linear radiance in, linear radiance out."""
+    check(radiance=(radiance, (6 * resolution**2, 3)))
     return _Prefilter.apply(radiance, resolution)

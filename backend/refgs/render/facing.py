@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
-from refgs.kernels.load import Shared, Work, kernels, parallel
+from refgs.kernels.load import Shared, Work, check, kernels, parallel
 
 
 class _Work(Work):
@@ -50,4 +50,5 @@ def facing_normals(rotations: Tensor, positions: Tensor, camera: Camera) -> Tens
     Not where they hardly do: on a closed surface those lie just past the horizon and show at the silhouette, where
     turning them would point the blend anywhere. normals.cpp has the angle.
     """
+    check(rotations=(rotations, (len(positions), 4)), positions=(positions, (len(positions), 3)))
     return _Facing.apply(rotations, positions.detach(), camera)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
-from refgs.kernels.load import Shared, Work, kernels, parallel
+from refgs.kernels.load import Shared, Work, check, kernels, parallel
 
 
 class Raster(NamedTuple):
@@ -142,16 +142,11 @@ def rasterize(
     transmittance 1e-4, screen-space filter of σ = √2/2 pixels as in 2DGS) are in kernels/splat.h. The result does not depend
     on the number of threads.
     """
-    tensors = (positions, rotations, scales, opacities, features)
-    shapes = {"positions": (3,), "rotations": (4,), "scales": (2,), "opacities": (), "features": features.shape[1:2]}
-    for tensor, (name, shape) in zip(tensors, shapes.items(), strict=True):
-        if tensor.shape != (features.shape[0], *shape) or tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            expected = f"float32 {(features.shape[0], *shape)} on the CPU"
-            raise ValueError(
-                f"{name}: expected {expected}, got {tensor.dtype} {tuple(tensor.shape)} on {tensor.device}"
-            )
+    n, channels = features.shape[0], features.shape[1:2]
+    check(positions=(positions, (n, 3)), rotations=(rotations, (n, 4)), scales=(scales, (n, 2)))
+    check(opacities=(opacities, (n,)), features=(features, (n, *channels)))
     if max(camera.width, camera.height) > 16383:
         raise ValueError(f"images are at most 16,383 pixels wide and high, not {camera.width}×{camera.height}")
     if near <= 0:
         raise ValueError(f"near must be positive, got {near}")
-    return Raster(*_Rasterize.apply(*tensors, camera, near))
+    return Raster(*_Rasterize.apply(positions, rotations, scales, opacities, features, camera, near))

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.capture import LoadedView
-from refgs.kernels.load import Shared, Work, kernels, parallel
+from refgs.kernels.load import Shared, Work, check, kernels, parallel
 from refgs.model.environment import Environment
 from refgs.render.renderer import Rendering
 from refgs.render.ssim import dssim
@@ -48,7 +48,13 @@ class _Maps(torch.autograd.Function):
         inputs = {"color": color, "normal": normal, "depth": depth, "alpha": alpha}
         if material is not None:
             inputs["material"] = material
+        for name, value in inputs.items():
+            numbers = {"color": (3,), "normal": (3,), "material": (5,)}.get(name, ())
+            check(**{name: (value, (height, width, *numbers))})
+        if {view.image.shape[:2], (view.image if view.alpha is None else view.alpha).shape[:2]} != {alpha.shape}:
+            raise ValueError(f"{camera.name}: the photo and its mask must be of the rendering's size, {width}×{height}")
         inputs = {name: value.contiguous() for name, value in inputs.items()}
+        color = inputs["color"]
         gradients = {f"by_{name}": torch.empty_like(value) for name, value in inputs.items()}
         buffers = {"photo": torch.empty_like(color), "clipped": torch.empty_like(color)}
         buffers["slopes"] = torch.empty(4, height, width)
