@@ -77,6 +77,53 @@ INLINE void scatter(float* map, const int64_t* at, int count, const Vector (&v)[
     for (int c = 0; c < N; c++) map[at[k] * N + c] = v[c][k];
 }
 
+typedef float Eight __attribute__((vector_size(32)));
+
+template <class Numbers>
+INLINE Numbers get(const float* p) {  // aligned or not
+  Numbers v;
+  __builtin_memcpy(&v, p, sizeof v);
+  return v;
+}
+
+template <class Numbers>
+INLINE void put(float* p, Numbers v) {
+  __builtin_memcpy(p, &v, sizeof v);
+}
+
+// N numbers of each of LANES pixels, a pixel's side by side: as they lie in a map, and quick to move. Lanes: the other way round.
+template <int N>
+struct Rows {
+  static constexpr int WIDTH = (N + 15) / 16 * 16;
+  alignas(64) float row[LANES][WIDTH];
+
+  MEMBER void to_lanes(float (&lanes)[N][LANES]) const {
+    for (int b = 0; b < N; b += LANES) {
+      Vector v[LANES];
+      for (int k = 0; k < LANES; k++) v[k] = load(row[k] + b);
+      transpose(v);
+      for (int c = 0; c < LANES && b + c < N; c++) store(lanes[b + c], v[c]);
+    }
+  }
+  MEMBER void from_lanes(const float (&lanes)[N][LANES]) {
+    for (int b = 0; b < N; b += LANES) {
+      Vector v[LANES];
+      for (int c = 0; c < LANES; c++) v[c] = b + c < N ? load(lanes[b + c]) : Vector();
+      transpose(v);
+      for (int k = 0; k < LANES; k++) store(row[k] + b, v[k]);
+    }
+  }
+};
+
+// to[c] += weight * row[c] for N numbers.
+template <int N>
+INLINE void add(float* to, const float* row, float weight) {
+  int c = 0;
+  for (; c + 8 <= N; c += 8) put(to + c, get<Eight>(to + c) + weight * get<Eight>(row + c));
+  if (c + 4 <= N) put(to + c, get<Four>(to + c) + weight * get<Four>(row + c)), c += 4;
+  for (; c < N; c++) to[c] += weight * row[c];
+}
+
 // Discs sorted and blended by their centres favour those in front: on a curved surface the blend at a pixel is that of a point
 // nearer to the camera, whose normal leans towards it. The blended position tells which point; the pixel whose blend is *this*
 // pixel's point lies the same way back. C channels, of which all but the position are read there.
@@ -95,10 +142,13 @@ struct Displaced {
   MEMBER Displaced(const Shade& s, const int64_t* at) : at(at) {
     Vector a[1];
     gather<1>(s.alpha, at, a);
-    gather<C>(s.features, at, own);
     alpha = a[0];
     Vector inverse = 1.0f / alpha;
-    for (int c = 0; c < C; c++) own[c] *= inverse;
+    Rows<C> rows;
+    alignas(64) float lanes[C][LANES];
+    for (int k = 0; k < LANES; k++) __builtin_memcpy(rows.row[k], s.features + at[k] * C, C * sizeof(float));
+    rows.to_lanes(lanes);
+    for (int c = 0; c < C; c++) own[c] = load(lanes[c]) * inverse;
 
     const double* m = s.view;
     Vectors p = {own[S], own[S + 1], own[S + 2]};
@@ -126,22 +176,25 @@ struct Displaced {
     alignas(64) float w[4][LANES], along[2][LANES];
     for (int j = 0; j < 4; j++) store(w[j], weight[j]);
     store(along[0], along_x), store(along[1], along_y);
+    Rows<S + 1> at_point, by_x, by_y;  // blended over the four corners, and how that changes along x and y
     for (int k = 0; k < LANES; k++) {
       int64_t first = (int64_t)v0[k] * s.width + (int64_t)u0[k];
       int64_t next = u0[k] < right ? 1 : 0, below = v0[k] < bottom ? s.width : 0;
       corner[0][k] = first, corner[1][k] = first + next, corner[2][k] = first + below, corner[3][k] = first + below + next;
-      float values[4][S + 1];
-      for (int j = 0; j < 4; j++) {
-        for (int c = 0; c < S; c++) values[j][c] = s.features[corner[j][k] * C + c];
-        values[j][S] = s.alpha[corner[j][k]];
-      }
-      for (int c = 0; c <= S; c++) {
-        float top = values[1][c] - values[0][c], low = values[3][c] - values[2][c];
-        sampled[c][k] = w[0][k] * values[0][c] + w[1][k] * values[1][c] + w[2][k] * values[2][c] + w[3][k] * values[3][c];
-        difference_x[c][k] = top + along[1][k] * (low - top);
-        difference_y[c][k] = values[2][c] - values[0][c] + along[0][k] * (low - top);
-      }
+      auto blend = [&](auto type, const float* map, int stride, int c, int to) {
+        typedef decltype(type) Numbers;
+        Numbers value[4];
+        for (int j = 0; j < 4; j++) value[j] = get<Numbers>(map + corner[j][k] * stride + c);
+        Numbers top = value[1] - value[0], low = value[3] - value[2];
+        put<Numbers>(at_point.row[k] + to, w[0][k] * value[0] + w[1][k] * value[1] + w[2][k] * value[2] + w[3][k] * value[3]);
+        put<Numbers>(by_x.row[k] + to, top + along[1][k] * (low - top));
+        put<Numbers>(by_y.row[k] + to, value[2] - value[0] + along[0][k] * (low - top));
+      };
+      blend(Eight(), s.features, C, 0, 0);
+      if (S > 8) blend(Eight(), s.features, C, S - 8, S - 8);  // some once more
+      blend(float(), s.alpha, 1, 0, S);
     }
+    at_point.to_lanes(sampled), by_x.to_lanes(difference_x), by_y.to_lanes(difference_y);
     // At a silhouette the way back leads off the object: there the pixel keeps its own blend.
     there = load(sampled[S]);
     trust = clamp((there - SHIFT_ALPHA) * (1 / SHIFT_ALPHA), 0, 1);
@@ -176,11 +229,14 @@ struct Displaced {
     }
     store(by_own[C], by_alpha);
     for (int j = 0; j < 4; j++) store(w[j], weight[j]);
+    Rows<S + 1> sampled_rows;
+    Rows<C + 1> own_rows;
+    sampled_rows.from_lanes(by_sampled), own_rows.from_lanes(by_own);
     int64_t first = chunk * s.chunk_rows, end = last_row(s, chunk);
     float* halo = s.halo + chunk * 2 * HALO * s.width * (S + 1);
     for (int k = 0; k < count; k++) {
-      for (int c = 0; c < C; c++) s.by_features[at[k] * C + c] += by_own[c][k];
-      s.by_alpha[at[k]] += by_own[C][k];
+      add<C>(s.by_features + at[k] * C, own_rows.row[k], 1);
+      s.by_alpha[at[k]] += own_rows.row[k][C];
       for (int j = 0; j < 4; j++) {
         int64_t to = corner[j][k], y = to / s.width;
         float *features = s.by_features + to * C, *alpha = s.by_alpha + to;
@@ -188,8 +244,8 @@ struct Displaced {
           features = halo + (to - (y < first ? first - HALO : end - HALO) * s.width) * (S + 1);
           alpha = features + S;
         }
-        for (int c = 0; c < S; c++) features[c] += w[j][k] * by_sampled[c][k];
-        *alpha += w[j][k] * by_sampled[S][k];
+        add<S>(features, sampled_rows.row[k], w[j][k]);
+        *alpha += w[j][k] * sampled_rows.row[k][S];
       }
     }
   }
