@@ -291,7 +291,7 @@ def export(
     console.print(f"simplified to {len(mesh.faces):,} triangles; unwrapping")
     if is_crumbs(mesh):
         console.print(
-            "warning: the mesh is in many pieces, none of them half of it: the photos do not agree on a surface; "
+            "warning: the mesh is in pieces, none of them half of it: the photos do not agree on a surface; "
             "give them masks of the object, or take more of them"
         )
     mesh = unwrap(mesh)

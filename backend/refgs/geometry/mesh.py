@@ -81,7 +81,7 @@ def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
     return Mesh(vertices, faces, smooth_normals(vertices, faces))
 
 
-def is_crumbs(mesh: Mesh, many: int = 10) -> bool:
+def is_crumbs(mesh: Mesh, many: int = 5) -> bool:
     """Whether a mesh is hardly a surface: more than so many connected parts, none of which has half of the area."""
     _, areas = _parts(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
     return len(areas) > many and areas.max() < areas.sum() / 2
