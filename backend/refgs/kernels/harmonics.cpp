@@ -49,15 +49,12 @@ constexpr int BATCH = 512;  // surfels at a time
 
 template <class Body>
 void each(Harmonics* h, Body body) {
-  for (int64_t first; (first = take(h->shared.next, BATCH)) < h->count;) {
-    int64_t end = first + BATCH < h->count ? first + BATCH : h->count;
-    for (int64_t i = first; i < end; i++) {
-      float d[3], y[MOST];
-      direction(*h, i, d);
-      basis(d, h->coefficients, y);
-      body(i, y);
-    }
-  }
+  share(h->shared, h->count, BATCH, [&](int64_t i) {
+    float d[3], y[MOST];
+    direction(*h, i, d);
+    basis(d, h->coefficients, y);
+    body(i, y);
+  });
 }
 
 }  // namespace

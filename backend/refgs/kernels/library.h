@@ -15,3 +15,10 @@ struct Shared {
 };
 
 static inline int64_t take(int64_t& next, int64_t n) { return __atomic_fetch_add(&next, n, __ATOMIC_RELAXED); }
+
+// body(i) for each i below n, `batch` of them at a time for whichever thread comes next.
+template <class Body>
+static inline void share(Shared& shared, int64_t n, int64_t batch, Body body) {
+  for (int64_t first; (first = take(shared.next, batch)) < n;)
+    for (int64_t i = first; i < first + batch && i < n; i++) body(i);
+}

@@ -173,13 +173,12 @@ INLINE Vectors smooth_term(const Row& r, int dx, int dy, float weight, Sum& loss
 template <class Body>
 void each(Losses* l, Body body) {
   const int64_t ROWS = 4;
-  for (int64_t first; (first = take(l->shared.next, ROWS)) < l->height;)
-    for (int64_t y = first; y < first + ROWS && y < l->height; y++) {
-      Sum sums[SUMS] = {};
-      for (int64_t x = 0; x < l->width; x += LANES) body(Row{*l, y, {x, l->width}}, sums);
-      for (int i = 0; i < SUMS; i++)
-        for (int lane = 0; lane < LANES; lane++) l->sums[y * SUMS + i] += sums[i][lane];
-    }
+  share(l->shared, l->height, ROWS, [&](int64_t y) {
+    Sum sums[SUMS] = {};
+    for (int64_t x = 0; x < l->width; x += LANES) body(Row{*l, y, {x, l->width}}, sums);
+    for (int i = 0; i < SUMS; i++)
+      for (int lane = 0; lane < LANES; lane++) l->sums[y * SUMS + i] += sums[i][lane];
+  });
 }
 
 }  // namespace

@@ -42,8 +42,7 @@ inline Turned turned(const Normals& s, int64_t i) {
 template <class Body>
 void each(Normals* s, Body body) {
   const int64_t BATCH = 512;
-  for (int64_t first; (first = take(s->shared.next, BATCH)) < s->count;)
-    for (int64_t i = first; i < first + BATCH && i < s->count; i++) body(i, turned(*s, i));
+  share(s->shared, s->count, BATCH, [&](int64_t i) { body(i, turned(*s, i)); });
 }
 
 }  // namespace

@@ -20,14 +20,13 @@ typedef float UnalignedFour __attribute__((vector_size(16), aligned(4)));
 // parallel
 EXPORT void refgs_sparse_product(Product* p) {
   const int64_t BATCH = 64, AT_ONCE = 4;  // sums that do not wait for each other
-  for (int64_t first; (first = take(p->shared.next, BATCH)) < p->rows;)
-    for (int64_t row = first; row < first + BATCH && row < p->rows; row++) {
-      Four sums[AT_ONCE] = {};
-      int32_t k = p->starts[row], end = p->starts[row + 1];
-      for (; k + AT_ONCE <= end; k += AT_ONCE)
-        for (int i = 0; i < AT_ONCE; i++) sums[i] += p->numbers[k + i] * *(const UnalignedFour*)(p->dense + 3 * p->columns[k + i]);
-      for (; k < end; k++) sums[0] += p->numbers[k] * *(const UnalignedFour*)(p->dense + 3 * p->columns[k]);
-      Four sum = (sums[0] + sums[1]) + (sums[2] + sums[3]);
-      for (int c = 0; c < 3; c++) p->out[3 * row + c] = sum[c];
-    }
+  share(p->shared, p->rows, BATCH, [&](int64_t row) {
+    Four sums[AT_ONCE] = {};
+    int32_t k = p->starts[row], end = p->starts[row + 1];
+    for (; k + AT_ONCE <= end; k += AT_ONCE)
+      for (int i = 0; i < AT_ONCE; i++) sums[i] += p->numbers[k + i] * *(const UnalignedFour*)(p->dense + 3 * p->columns[k + i]);
+    for (; k < end; k++) sums[0] += p->numbers[k] * *(const UnalignedFour*)(p->dense + 3 * p->columns[k]);
+    Four sum = (sums[0] + sums[1]) + (sums[2] + sums[3]);
+    for (int c = 0; c < 3; c++) p->out[3 * row + c] = sum[c];
+  });
 }

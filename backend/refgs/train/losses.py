@@ -48,9 +48,8 @@ class _Maps(torch.autograd.Function):
         inputs = {"color": color, "normal": normal, "depth": depth, "alpha": alpha}
         if material is not None:
             inputs["material"] = material
-        for name, value in inputs.items():
-            numbers = {"color": (3,), "normal": (3,), "material": (5,)}.get(name, ())
-            check(**{name: (value, (height, width, *numbers))})
+        numbers = {"color": (3,), "normal": (3,), "material": (5,)}
+        check(**{name: (value, (height, width, *numbers.get(name, ()))) for name, value in inputs.items()})
         if {view.image.shape[:2], (view.image if view.alpha is None else view.alpha).shape[:2]} != {alpha.shape}:
             raise ValueError(f"{camera.name}: the photo and its mask must be of the rendering's size, {width}×{height}")
         inputs = {name: value.contiguous() for name, value in inputs.items()}
