@@ -4,9 +4,24 @@ import os
 import sys
 
 import pytest
-import torch._dynamo  # noqa: F401  its Triton brings an LLVM that crashes when it is loaded after Mesa's, which Eevee draws with
+import torch._dynamo  # its Triton brings an LLVM that crashes when it is loaded after Mesa's, which Eevee draws with
 
 from benchmarks.scenes.analytic import write_ball_capture
+from refgs.kernels import load
+from tests.kernels.emulate import emulate
+
+NO_CARD = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA card here")
+
+
+@pytest.fixture(params=[*load.supported(), "emulated", pytest.param("cuda", marks=NO_CARD)])
+def device(request, monkeypatch) -> torch.device:
+    """Everything that runs kernels, one after another: where a test has to put its tensors. "emulated" are CUDA's kernels
+    on this processor."""
+    if request.param == "emulated":
+        emulate(monkeypatch)
+    elif request.param != "cuda":
+        monkeypatch.setenv("REFGS_ISA", request.param)
+    return torch.device("cuda" if request.param == "cuda" else "cpu")
 
 
 @pytest.fixture(scope="session")

@@ -16,10 +16,10 @@ def light(side: int) -> torch.Tensor:
     return torch.stack([stripes + 5 * sun, stripes + 3 * sun, stripes + sun], dim=-1).float()
 
 
-def test_levels_match_direct_integration():
+def test_levels_match_direct_integration(device):
     """Each level against the sum of the lobe over a cubemap four times as fine."""
     side, fine = 32, 128
-    levels = prefilter.prefilter(light(side), side)
+    levels = prefilter.prefilter(light(side).to(device), side).cpu()
     directions, area = cubemap.texel_directions(fine).numpy(), cubemap.texel_solid_angles(fine).numpy()
     radiance = light(fine).numpy()
     start = 6 * side * side
@@ -39,13 +39,13 @@ def test_constant_light_stays_constant():
     torch.testing.assert_close(levels, torch.full_like(levels, 0.7), atol=1e-5, rtol=0)
 
 
-def test_gradient_is_the_transpose():
+def test_gradient_is_the_transpose(device):
     torch.manual_seed(0)
-    x = torch.rand(6 * 16 * 16, 3, requires_grad=True)
+    x = torch.rand(6 * 16 * 16, 3).to(device).requires_grad_()
     y = prefilter.prefilter(x, 16)
     w = torch.rand_like(y)
     (y * w).sum().backward()
-    other = torch.rand(6 * 16 * 16, 3)
+    other = torch.rand(6 * 16 * 16, 3).to(device)
     with torch.no_grad():
         change = (prefilter.prefilter(other, 16) * w).sum()
     assert float((x.grad * other).sum()) == pytest.approx(float(change), rel=1e-4)

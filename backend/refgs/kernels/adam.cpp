@@ -1,5 +1,4 @@
 // A step of Adam (Kingma and Ba 2015) for several tensors at once.
-#include "library.h"
 #include "vector.h"
 
 namespace {
@@ -11,13 +10,17 @@ struct Learned {
   double rate, square_scale;     // with the corrections of the means' start: α / (1 − β1^t), and 1 / √(1 − β2^t)
 };
 
+constexpr int MOST = 16;  // tensors
+
 struct Adam {
   int64_t tensors;
-  const Learned* learned;
+  Learned learned[MOST];
   double beta1, beta2, epsilon;
   float* scratch;  // none is used
-  Shared shared;
+  mutable Shared shared;
 };
+
+constexpr int BATCH = LANES == 1 ? 1 : 8192;  // numbers of a tensor
 
 INLINE void step(const Adam& a, const Learned& t, int64_t i, int64_t n) {
   Vector g = read(t.gradient + i, n), m = read(t.mean + i, n), v = read(t.square + i, n);
@@ -29,17 +32,14 @@ INLINE void step(const Adam& a, const Learned& t, int64_t i, int64_t n) {
 
 }  // namespace
 
-// parallel
-EXPORT void refgs_adam_step(Adam* a) {
-  const int64_t BATCH = 8192;  // numbers of a tensor
-  int64_t wanted = take(a->shared.next, 1), passed = 0;
-  for (int64_t t = 0; t < a->tensors; t++) {
+KERNEL(refgs_adam_step, Adam, a) {
+  int64_t batches = 0;
+  for (int64_t t = 0; t < a->tensors; t++) batches += (a->learned[t].count + BATCH - 1) / BATCH;
+  share(a->shared, batches, 1, [&](int64_t batch) {
+    int t = 0;
+    for (int64_t n; batch >= (n = (a->learned[t].count + BATCH - 1) / BATCH); t++) batch -= n;
     const Learned& l = a->learned[t];
-    int64_t batches = (l.count + BATCH - 1) / BATCH;
-    for (; wanted < passed + batches; wanted = take(a->shared.next, 1)) {
-      int64_t first = (wanted - passed) * BATCH, end = first + BATCH < l.count ? first + BATCH : l.count;
-      for (int64_t i = first; i < end; i += LANES) step(*a, l, i, end - i);
-    }
-    passed += batches;
-  }
+    int64_t first = batch * BATCH, end = first + BATCH < l.count ? first + BATCH : l.count;
+    for (int64_t i = first; i < end; i += LANES) step(*a, l, i, end - i);
+  });
 }

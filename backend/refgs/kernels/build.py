@@ -9,6 +9,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import platformdirs
+
 from refgs.errors import InputError
 
 HERE = Path(__file__).parent
@@ -23,7 +25,7 @@ SOURCES = (
     "sparse.cpp",
     "ssim.cpp",
 )
-HEADERS = ("library.h", "light.h", "raster.h", "splat.h", "vector.h")
+HEADERS = ("device.h", "lane.h", "library.h", "light.h", "raster.h", "splat.h", "vector.h")
 # -ffp-contract=on: fused within an expression, never across, so that a formula rounds the same wherever it is inlined.
 FLAGS = ["-shared", "-s", "-O3", "-std=c++20", "-fno-exceptions", "-fno-rtti", "-nostdlib", "-fvisibility=hidden"]
 FLAGS += ["-fno-builtin", "-ffp-contract=on", "-fno-math-errno", "-mprefer-vector-width=512"]
@@ -52,6 +54,11 @@ def target(system: str, machine: str, isa: str) -> Target:
     """The target of `sys.platform`, a machine ("x86_64" or "aarch64") and "sse4", "avx2", "avx512" or "neon"."""
     platform, extension, processors = TARGETS[system, machine]
     return Target(platform, processors[isa], extension)
+
+
+def cache_folder() -> Path:
+    """Where compiled kernels are kept: the environment variable REFGS_CACHE, else the user's cache."""
+    return Path(os.environ.get("REFGS_CACHE") or platformdirs.user_cache_dir("refgs", appauthor=False))
 
 
 def _fingerprint(target: Target) -> str:

@@ -1,5 +1,4 @@
 // Colour by direction: real spherical harmonics of each surfel towards a camera, or of the mirrored way (paper Eq. 10), and back.
-#include "library.h"
 #include "vector.h"
 
 namespace {
@@ -15,14 +14,14 @@ struct Harmonics {
   const float* by_color;
   float* by_values;
   float* scratch;  // none is used
-  Shared shared;
+  mutable Shared shared;
 };
 
 // From the camera to a surfel; where there are normals, mirrored there.
 void direction(const Harmonics& h, int64_t i, float (&d)[3]) {
   double towards[3], square = 1e-24;
   for (int a = 0; a < 3; a++) towards[a] = h.camera[a] - h.positions[3 * i + a], square += towards[a] * towards[a];
-  float inverse = (float)(1 / __builtin_sqrt(square)), along = 0;
+  float inverse = (float)(1 / root(square)), along = 0;
   for (int a = 0; a < 3; a++) d[a] = -(float)towards[a] * inverse;
   if (!h.normals) return;
   const float* n = h.normals + 3 * i;
@@ -48,7 +47,7 @@ void basis(const float (&d)[3], int64_t coefficients, float (&y)[MOST]) {
 constexpr int BATCH = 512;  // surfels at a time
 
 template <class Body>
-void each(Harmonics* h, Body body) {
+void each(const Harmonics* h, Body body) {
   share(h->shared, h->count, BATCH, [&](int64_t i) {
     float d[3], y[MOST];
     direction(*h, i, d);
@@ -59,8 +58,7 @@ void each(Harmonics* h, Body body) {
 
 }  // namespace
 
-// parallel
-EXPORT void refgs_harmonics_forward(Harmonics* h) {
+KERNEL(refgs_harmonics_forward, Harmonics, h) {
   each(h, [&](int64_t i, const float* y) {
     const float* v = h->values + 3 * h->coefficients * i;
     float sum[3] = {h->offset, h->offset, h->offset};
@@ -70,8 +68,7 @@ EXPORT void refgs_harmonics_forward(Harmonics* h) {
   });
 }
 
-// parallel
-EXPORT void refgs_harmonics_backward(Harmonics* h) {
+KERNEL(refgs_harmonics_backward, Harmonics, h) {
   each(h, [&](int64_t i, const float* y) {
     float by[3], *to = h->by_values + 3 * h->coefficients * i;
     for (int c = 0; c < 3; c++) by[c] = h->color[3 * i + c] > 0 ? h->by_color[3 * i + c] : 0;

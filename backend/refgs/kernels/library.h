@@ -1,6 +1,9 @@
 // What every exported function needs, without a C library: the result depends on nothing but the processor.
 #pragma once
 
+#ifdef __CUDACC__
+#include "device.h"
+#else
 #include <stdint.h>
 
 #if defined(_WIN32)
@@ -8,6 +11,9 @@
 #else
 #define EXPORT extern "C" __attribute__((visibility("default")))
 #endif
+
+// A function that several threads may enter at once; they share its work.
+#define KERNEL(name, Work, w) EXPORT void name(const Work* w)
 
 // How the threads inside a function share its work.
 struct Shared {
@@ -22,3 +28,4 @@ static inline void share(Shared& shared, int64_t n, int64_t batch, Body body) {
   for (int64_t first; (first = take(shared.next, batch)) < n;)
     for (int64_t i = first; i < first + batch && i < n; i++) body(i);
 }
+#endif

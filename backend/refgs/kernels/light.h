@@ -51,13 +51,13 @@ struct Lookup {
     fraction = (roughness - low) * slope;
 
     for (int i = 0; i < 2; i++) {
-      Vector sides = __builtin_convertvector(side[i], Vector);
+      Vector sides = convert<Vector>(side[i]);
       half[i] = 0.5f * sides;
       Vector column, row;
       x[i] = cell(s, half[i], sides, column), y[i] = cell(t, half[i], sides, row);
       bilinear(x[i], y[i], weight[i]);
       Mask width = side[i] + 2;
-      Mask first = start[i] + (face * width + __builtin_convertvector(row, Mask)) * width + __builtin_convertvector(column, Mask);
+      Mask first = start[i] + (face * width + convert<Mask>(row)) * width + convert<Mask>(column);
       for (int k = 0; k < LANES; k++) {
         const int32_t* at = levels.padded + first[k];
         texel[i][0][k] = at[0], texel[i][1][k] = at[1], texel[i][2][k] = at[width[k]], texel[i][3][k] = at[width[k] + 1];
@@ -113,7 +113,7 @@ struct Lookup {
   // The cell of the padded face, and how far along it.
   static MEMBER Vector cell(Vector s, Vector half, Vector side, Vector& at) {
     Vector x = (s + 1.0f) * half + 0.5f;
-    at = smaller(larger(__builtin_elementwise_floor(x), Vector()), side);
+    at = smaller(larger(round_down(x), Vector()), side);
     return x - at;
   }
 
@@ -161,8 +161,8 @@ struct ReflectanceTable {
     Vector x = n_v * (float)side - 0.5f, y = roughness * (float)side - 0.5f;
     Mask inside_x = (x > 0.0f) & (x < last), inside_y = (y > 0.0f) & (y < last);
     x = clamp(x, 0, last), y = clamp(y, 0, last);
-    Vector column = smaller(__builtin_elementwise_floor(x), Vector() + (last - 1)), row = smaller(__builtin_elementwise_floor(y), Vector() + (last - 1));
-    Mask first = __builtin_convertvector(row, Mask) * (int32_t)side + __builtin_convertvector(column, Mask);
+    Vector column = smaller(round_down(x), Vector() + (last - 1)), row = smaller(round_down(y), Vector() + (last - 1));
+    Mask first = convert<Mask>(row) * (int32_t)side + convert<Mask>(column);
     x -= column, y -= row;
     for (int i = 0; i < 2; i++) {
       alignas(64) float corner[4][LANES];
@@ -183,8 +183,8 @@ INLINE Vector srgb_encode(Vector linear, Vector& derivative) {
   constexpr float LINEAR_END = 0.0031308f;
   Vector x = larger(linear, Vector() + LINEAR_END), square_root = root(x);
   // x^(5/12) = x^(1/4) x^(1/6); y = (x^(1/2))^(-1/3) by Newton from an estimate in the exponent's bits.
-  Vector third = __builtin_convertvector((Mask)square_root, Vector) * (1 / 3.0f);
-  Vector y = (Vector)((Mask() + 0x54a2fa8c) - __builtin_convertvector(third, Mask));
+  Vector third = convert<Vector>(bits(square_root)) * (1 / 3.0f);
+  Vector y = from_bits((Mask() + 0x54a2fa8c) - convert<Mask>(third));
 #pragma unroll
   for (int i = 0; i < 3; i++) y = y * (4 / 3.0f - (1 / 3.0f) * square_root * (y * y * y));
   Vector power = root(square_root) * square_root * (y * y);

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import platformdirs
 import torch
 
 from refgs.errors import InputError
-from refgs.kernels.build import build, target
+from refgs.kernels import cuda
+from refgs.kernels.build import build, cache_folder, target
 
 MACHINES = {"AMD64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
 # Functions that return how large a buffer must be, and how many integers they take.
@@ -35,11 +35,6 @@ def supported() -> list[str]:
         return ["neon"]
     sets = ["avx512", "avx2", "sse4"]
     return sets[{"AVX512": 0, "AVX2": 1}.get(torch.backends.cpu.get_cpu_capability(), 2) :]
-
-
-def cache_folder() -> Path:
-    """Where compiled kernels are kept: the environment variable REFGS_CACHE, else the user's cache."""
-    return Path(os.environ.get("REFGS_CACHE") or platformdirs.user_cache_dir("refgs", appauthor=False))
 
 
 def _keep_memory() -> None:
@@ -96,12 +91,20 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="refgs-kernels")
 
 
+def on_gpu(tensor: torch.Tensor) -> bool:
+    """Whether kernels that work on this tensor run on a CUDA card."""
+    return tensor.device.type == "cuda"
+
+
 def check(**expected: tuple[torch.Tensor, tuple[int, ...]]) -> None:
-    """What a kernel is about to read: raise ValueError unless each tensor is float32, on the CPU and of its shape."""
+    """What a kernel is about to read: raise ValueError unless each tensor is float32, of its shape, and on the first one's
+    device, the CPU or a CUDA card."""
+    home = next(iter(expected.values()))[0].device
     for name, (tensor, shape) in expected.items():
-        if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device.type != "cpu":
+        known = tensor.device == home and home.type in ("cpu", "cuda")
+        if tensor.shape != shape or tensor.dtype != torch.float32 or not known:
             found = f"{tensor.dtype} {tuple(tensor.shape)} on {tensor.device}"
-            raise ValueError(f"{name}: expected float32 {shape} on the CPU, got {found}")
+            raise ValueError(f"{name}: expected float32 {shape} on {home}, the CPU or a CUDA card; got {found}")
 
 
 class Shared(ctypes.Structure):
@@ -135,3 +138,12 @@ def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0) -> No
         openmp(ctypes.cast(function, ctypes.c_void_p), ctypes.addressof(work), threads, 0)
     else:
         list(_pool(threads).map(lambda _: function(ctypes.byref(work)), range(threads)))
+
+
+def run(name: str, work: ctypes.Structure, like: torch.Tensor, items: int, scratch: int = 0) -> None:
+    """Run a kernel that shares `items` out where the tensor `like` is: to torch's threads on the CPU, each with `scratch`
+    floats of its own, or to a thread an item on a card."""
+    if on_gpu(like):
+        cuda.launch(name, work, like.device, max(1, -(-items // cuda.BLOCK)))
+    else:
+        parallel(getattr(kernels(), name), work, scratch)

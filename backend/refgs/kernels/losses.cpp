@@ -2,7 +2,6 @@
 //
 // Colour: |C - C_gt|, C clipped only where the photo is. Normals: 1 - N.n between the depth's normal N and the blended n. Smoothness:
 // |grad n| exp(-|grad C_gt|). Mask: |alpha - mask|. Metallic: m (1 - m), which is zero at both ends. A weight is that of one pixel's term.
-#include "library.h"
 #include "vector.h"
 
 namespace {
@@ -20,7 +19,7 @@ struct Losses {
   float* slopes;            // (4, H, W) derivatives by the depths to the right, to the left, below and above
   double* sums;             // (H, SUMS) of a row
   float* scratch;           // none is used
-  Shared shared;
+  mutable Shared shared;
 };
 
 enum { LOSS, METALLIC, SURFACES, SQUARES, SUMS };  // weighted terms but metallic; m (1 - m); pixels with a surface; squared errors
@@ -86,7 +85,7 @@ struct Row {
     float* row = of(map, 3);
     at.put(row, 3, v.x), at.put(row + 1, 3, v.y), at.put(row + 2, 3, v.z);
   }
-  MEMBER void add(Sum& sum, Vector v) const { sum += __builtin_convertvector(select(inside, v, Vector()), Sum); }
+  MEMBER void add(Sum& sum, Vector v) const { sum += convert<Sum>(select(inside, v, Vector())); }
 };
 
 // The photo over the background; colour, mask and metallic.
@@ -171,7 +170,7 @@ INLINE Vectors smooth_term(const Row& r, int dx, int dy, float weight, Sum& loss
 
 // Body(row) for all the pixels, rows at a time; its sums are added to those of the row.
 template <class Body>
-void each(Losses* l, Body body) {
+void each(const Losses* l, Body body) {
   const int64_t ROWS = 4;
   share(l->shared, l->height, ROWS, [&](int64_t y) {
     Sum sums[SUMS] = {};
@@ -185,16 +184,16 @@ void each(Losses* l, Body body) {
 
 EXPORT int64_t refgs_losses_sums() { return SUMS; }
 
-// parallel: what a pixel says by itself, or by the depths around it
-EXPORT void refgs_losses_first(Losses* l) {
+// what a pixel says by itself, or by the depths around it
+KERNEL(refgs_losses_first, Losses, l) {
   each(l, [](const Row& r, Sum (&sums)[SUMS]) {
     pixel_terms(r, sums);
     normal_term(r, sums[LOSS]);
   });
 }
 
-// parallel: what it says with its neighbours, and what they say of it
-EXPORT void refgs_losses_second(Losses* l) {
+// what it says with its neighbours, and what they say of it
+KERNEL(refgs_losses_second, Losses, l) {
   each(l, [](const Row& r, Sum (&sums)[SUMS]) {
     const Losses& l = r.l;
     Vectors by_normal = r.get3(l.by_normal);

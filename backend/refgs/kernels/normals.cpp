@@ -1,5 +1,5 @@
 // Normals of surfels, turned towards a camera; and back to their rotations.
-#include "library.h"
+#include "vector.h"
 
 namespace {
 
@@ -14,7 +14,7 @@ struct Normals {
   const float* by_normals;
   float* by_rotations;
   float* scratch;                      // none is used
-  Shared shared;
+  mutable Shared shared;
 };
 
 struct Turned {
@@ -25,7 +25,7 @@ struct Turned {
 inline Turned turned(const Normals& s, int64_t i) {
   Turned t;
   const float* q = s.rotations + 4 * i;
-  float norm = __builtin_sqrtf(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+  float norm = root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
   t.inverse = norm < MIN_NORM ? 0 : 1 / norm;  // one that says nothing stands for the identity, as in project.cpp
   for (int k = 0; k < 4; k++) t.q[k] = q[k] * t.inverse;
   float w = t.q[0], x = t.q[1], y = t.q[2], z = t.q[3];
@@ -35,27 +35,25 @@ inline Turned turned(const Normals& s, int64_t i) {
     float towards = (float)(s.camera[k] - s.positions[3 * i + k]);
     along += t.n[k] * towards, square += towards * towards;
   }
-  t.sign = along < PAST_HORIZON * __builtin_sqrtf(square) ? -1 : 1;
+  t.sign = along < PAST_HORIZON * root(square) ? -1 : 1;
   return t;
 }
 
 template <class Body>
-void each(Normals* s, Body body) {
+void each(const Normals* s, Body body) {
   const int64_t BATCH = 512;
   share(s->shared, s->count, BATCH, [&](int64_t i) { body(i, turned(*s, i)); });
 }
 
 }  // namespace
 
-// parallel
-EXPORT void refgs_normals_forward(Normals* s) {
+KERNEL(refgs_normals_forward, Normals, s) {
   each(s, [&](int64_t i, const Turned& t) {
     for (int k = 0; k < 3; k++) s->normals[3 * i + k] = t.sign * t.n[k];
   });
 }
 
-// parallel
-EXPORT void refgs_normals_backward(Normals* s) {
+KERNEL(refgs_normals_backward, Normals, s) {
   each(s, [&](int64_t i, const Turned& t) {
     const float *g = s->by_normals + 3 * i, *q = t.q;
     float by[4] = {q[2] * g[0] - q[1] * g[1], q[3] * g[0] - q[0] * g[1] - 2 * q[1] * g[2],

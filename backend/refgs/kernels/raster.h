@@ -5,7 +5,6 @@
 // once: they share the work through `shared`, which the caller sets to zero. No result depends on who does what.
 #pragma once
 
-#include "library.h"
 #include "vector.h"
 
 #include "splat.h"

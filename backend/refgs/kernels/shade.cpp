@@ -3,7 +3,6 @@
 // Pixels that nothing covers cost nothing: the others are taken LANES at a time, wherever they lie. The picture is worked on in
 // chunks of rows whose size does not depend on the threads, and sums are taken in the chunks' order, so neither does any result.
 #include "light.h"
-#include "library.h"
 
 namespace {
 
@@ -35,7 +34,7 @@ struct Shade {
   float *by_chunk_texels, *by_irradiance;  // (chunks, texels, 4), (chunks, 27)
   float* by_levels;                        // (texels, 3)
   float* scratch;                          // none is used
-  Shared shared;
+  mutable Shared shared;
 };
 
 void zero(float* p, int64_t n) {
@@ -169,7 +168,7 @@ struct Displaced {
     float right = (float)(s.width - 1), bottom = (float)(s.height - 1);
     moves_x &= (u > 0.0f) & (u < right), moves_y &= (v > 0.0f) & (v < bottom);
     u = clamp(u, 0, right), v = clamp(v, 0, bottom);
-    Vector u0 = __builtin_elementwise_floor(u), v0 = __builtin_elementwise_floor(v);
+    Vector u0 = round_down(u), v0 = round_down(v);
     along_x = u - u0, along_y = v - v0;
     bilinear(along_x, along_y, weight);
 
@@ -434,28 +433,24 @@ constexpr int TEXELS = 1024;   // at a time
 
 EXPORT int64_t refgs_shade_halo_size(int64_t width, int64_t channels) { return 2 * HALO * width * (channels - 2); }
 
-// parallel
-EXPORT void refgs_shade_mirrored(Shade* s) {
+KERNEL(refgs_shade_mirrored, Shade, s) {
   auto* rows = s->channels == 14 ? mirrored_rows<14> : mirrored_rows<17>;
   for (int64_t y; (y = take(s->shared.next, ROWS)) < s->height;) rows(*s, y, y + ROWS < s->height ? y + ROWS : s->height);
 }
 
-// parallel
-EXPORT void refgs_shade_forward(Shade* s) {
+KERNEL(refgs_shade_forward, Shade, s) {
   auto* rows = s->visibility ? (s->harmonics ? forward_rows<true, true> : forward_rows<false, true>)
                              : (s->harmonics ? forward_rows<true, false> : forward_rows<false, false>);
   for (int64_t y; (y = take(s->shared.next, ROWS)) < s->height;) rows(*s, y, y + ROWS < s->height ? y + ROWS : s->height);
 }
 
-// parallel
-EXPORT void refgs_shade_backward(Shade* s) {
+KERNEL(refgs_shade_backward, Shade, s) {
   auto* chunk = s->visibility ? (s->harmonics ? backward_chunk<true, true> : backward_chunk<false, true>)
                               : (s->harmonics ? backward_chunk<true, false> : backward_chunk<false, false>);
   for (int64_t k; (k = take(s->shared.next, 1)) < chunks(*s);) chunk(*s, k);
 }
 
-// parallel
-EXPORT void refgs_shade_gather(Shade* s) {
+KERNEL(refgs_shade_gather, Shade, s) {
   int64_t batches = (s->texels + TEXELS - 1) / TEXELS;
   for (int64_t k; (k = take(s->shared.next, 1)) < s->height + batches;) {
     if (k < s->height) {

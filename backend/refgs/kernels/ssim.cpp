@@ -2,7 +2,6 @@
 //
 // Images are (height, width * channels) rows; with the channels interleaved, a neighbour along x is `channels` floats away. Windows
 // are separable: columns first, straight from the image, then rows of what that gave.
-#include "library.h"
 #include "vector.h"
 
 namespace {
@@ -15,7 +14,7 @@ struct Ssim {
   double scale;                             // of the derivative
   float* by_image;
   float* scratch;                           // (threads, refgs_ssim_scratch_size)
-  Shared shared;
+  mutable Shared shared;
 };
 
 constexpr int RADIUS = 5;
@@ -31,7 +30,7 @@ struct Lines {
     margin = (RADIUS * channels + LANES - 1) / LANES * LANES;
     stride = 2 * margin + (width * channels + LANES - 1) / LANES * LANES;
   }
-  explicit Lines(Ssim& s) : Lines(s.width, s.channels) {
+  explicit Lines(const Ssim& s) : Lines(s.width, s.channels) {
     memory = s.scratch + take(s.shared.thread, 1) * 4 * stride;
     clear(memory, 4 * stride);
   }
@@ -72,7 +71,7 @@ void forward_row(const Ssim& s, int64_t y, const Lines& lines) {
     Vector inverse1 = reciprocal(b1), inverse2 = reciprocal(b2), both = inverse1 * inverse2;
     Vector ssim = a1 * a2 * both;
     for (int64_t k = count; k < LANES; k++) ssim[k] = 0;  // beyond the row
-    sum += __builtin_convertvector(ssim, Sum);
+    sum += convert<Sum>(ssim);
     if (!s.by_mean) return;
     write(s.by_mean + y * n + i, 2.0f * (t * (a2 - a1) * both + x * ssim * (inverse2 - inverse1)), count);
     write(s.by_square + y * n + i, -ssim * inverse2, count);
@@ -109,14 +108,12 @@ void backward_row(const Ssim& s, int64_t y, const Lines& lines) {
 
 EXPORT int64_t refgs_ssim_scratch_size(int64_t width, int64_t channels) { return 4 * Lines(width, channels).stride; }
 
-// parallel
-EXPORT void refgs_ssim_forward(Ssim* s) {
+KERNEL(refgs_ssim_forward, Ssim, s) {
   Lines lines(*s);
   for (int64_t y; (y = take(s->shared.next, 1)) < s->height;) forward_row(*s, y, lines);
 }
 
-// parallel
-EXPORT void refgs_ssim_backward(Ssim* s) {
+KERNEL(refgs_ssim_backward, Ssim, s) {
   Lines lines(*s);
   for (int64_t y; (y = take(s->shared.next, 1)) < s->height;) backward_row(*s, y, lines);
 }

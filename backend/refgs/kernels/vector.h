@@ -1,7 +1,11 @@
 // The CPU's number type: LANES floats, in the compilers' vector extensions, so that one source serves every instruction set.
 #pragma once
 
-#include <stdint.h>
+#include "library.h"
+
+#ifdef __CUDACC__
+#include "lane.h"
+#else
 
 #if defined(__AVX512F__)
 #define LANES 16
@@ -24,8 +28,17 @@ typedef double Sum __attribute__((vector_size(8 * LANES)));  // what many vector
 INLINE Vector select(Mask mask, Vector a, Vector b) { return mask ? a : b; }
 INLINE Vector smaller(Vector a, Vector b) { return a < b ? a : b; }
 INLINE Vector larger(Vector a, Vector b) { return a > b ? a : b; }
-INLINE Vector clamp(Vector x, float low, float high) { return larger(smaller(x, Vector() + high), Vector() + low); }
+INLINE Mask select(Mask mask, Mask a, Mask b) { return mask ? a : b; }
 INLINE Vector root(Vector x) { return __builtin_elementwise_sqrt(x); }
+INLINE float root(float x) { return __builtin_sqrtf(x); }
+INLINE double root(double x) { return __builtin_sqrt(x); }
+INLINE Vector round_down(Vector x) { return __builtin_elementwise_floor(x); }
+template <class To, class From>
+INLINE To convert(From v) {
+  return __builtin_convertvector(v, To);
+}
+INLINE Mask bits(Vector v) { return (Mask)v; }
+INLINE Vector from_bits(Mask m) { return (Vector)m; }
 INLINE float total(Vector x) {
   float sum = 0;
   for (int i = 0; i < LANES; i++) sum += x[i];
@@ -34,14 +47,6 @@ INLINE float total(Vector x) {
 INLINE bool any(Mask mask) { return __builtin_reduce_or(mask) != 0; }
 INLINE Vector load(const float* p) { return *(const UnalignedVector*)p; }
 INLINE void store(float* p, Vector v) { *(UnalignedVector*)p = v; }
-
-struct Vectors {
-  Vector x, y, z;
-};
-INLINE Vectors operator+(Vectors a, Vectors b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-INLINE Vectors operator-(Vectors a, Vectors b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-INLINE Vectors operator*(Vector s, Vectors a) { return {s * a.x, s * a.y, s * a.z}; }
-INLINE Vector dot(Vectors a, Vectors b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 
 // 1/x to 1 ulp or so, from 1e-37 to 1e37 in magnitude; beyond, a NaN may stand for an infinity.
 INLINE Vector reciprocal(Vector x) {
@@ -139,3 +144,14 @@ INLINE void transpose(Vector (&v)[LANES]) {  // perfect shuffles, as many as a l
     for (int i = 0; i < LANES; i++) v[i] = w[i];
   }
 }
+#endif
+
+INLINE Vector clamp(Vector x, float low, float high) { return larger(smaller(x, Vector() + high), Vector() + low); }
+
+struct Vectors {
+  Vector x, y, z;
+};
+INLINE Vectors operator+(Vectors a, Vectors b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+INLINE Vectors operator-(Vectors a, Vectors b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+INLINE Vectors operator*(Vector s, Vectors a) { return {s * a.x, s * a.y, s * a.z}; }
+INLINE Vector dot(Vectors a, Vectors b) { return a.x * b.x + a.y * b.y + a.z * b.z; }

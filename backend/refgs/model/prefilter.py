@@ -20,7 +20,7 @@ from scipy import integrate, sparse
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from refgs.kernels.load import Shared, Work, check, kernels, parallel
+from refgs.kernels.load import Shared, Work, check, run
 from refgs.model import cubemap
 
 ROUGHNESS = (0.0, 0.18, 0.35, 0.6, 1.0)  # of the levels; level 0 is the cubemap itself
@@ -105,13 +105,13 @@ class Matrix(NamedTuple):
     numbers: Tensor
 
     @classmethod
-    def of(cls, matrix: sparse.csr_matrix) -> "Matrix":
+    def of(cls, matrix: sparse.csr_matrix, device: torch.device) -> "Matrix":
         parts = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data.astype(np.float32)
-        return cls(*map(torch.from_numpy, parts))
+        return cls(*(torch.from_numpy(part).to(device) for part in parts))
 
 
 @lru_cache(maxsize=4)
-def matrices(resolution: int) -> tuple[Matrix, Matrix]:
+def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
     """The levels above 0 stacked, as a matrix over the pyramid's texels, and its transpose."""
     file = _cache_file(resolution)
     if file.exists():
@@ -129,11 +129,11 @@ def matrices(resolution: int) -> tuple[Matrix, Matrix]:
         temporary = file.with_suffix(f".{os.getpid()}.npz")
         sparse.save_npz(temporary, matrix, compressed=False)
         os.replace(temporary, file)
-    return Matrix.of(matrix), Matrix.of(matrix.T.tocsr())
+    return Matrix.of(matrix, device), Matrix.of(matrix.T.tocsr(), device)
 
 
 @lru_cache(maxsize=4)
-def _pyramid(resolution: int) -> tuple[Matrix, Matrix]:
+def _pyramid(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
     """The cubemap and its pooled mips, means by solid angle, as a matrix over the cubemap's texels; and its transpose."""
     mip = sparse.identity(6 * resolution**2, format="csr")
     mips = [mip]
@@ -146,7 +146,7 @@ def _pyramid(resolution: int) -> tuple[Matrix, Matrix]:
         mip = sparse.csr_matrix((share, (parent, texel)), shape=(len(texel) // 4, len(texel))) @ mip
         mips.append(mip)
     matrix = sparse.vstack(mips, format="csr")
-    return Matrix.of(matrix), Matrix.of(matrix.T.tocsr())
+    return Matrix.of(matrix, device), Matrix.of(matrix.T.tocsr(), device)
 
 
 class _Work(Work):
@@ -163,7 +163,7 @@ def _product(matrix: Matrix, dense: Tensor, out: Tensor) -> Tensor:
     """Into `out`; of `dense`, a float more than its numbers is read."""
     work = _Work(rows=len(matrix.starts) - 1)
     work.attach(**matrix._asdict(), dense=dense, out=out)
-    parallel(kernels().refgs_sparse_product, work)
+    run("refgs_sparse_product", work, out, items=32 * work.rows)
     return out
 
 
@@ -171,10 +171,10 @@ class _Prefilter(torch.autograd.Function):
     @staticmethod
     def forward(ctx, radiance: Tensor, resolution: int) -> Tensor:
         ctx.resolution = resolution
-        pool, lobes = _pyramid(resolution)[0], matrices(resolution)[0]
-        pyramid = torch.empty(len(pool.starts), 3)  # a row more than there are, to be read from
+        pool, lobes = _pyramid(resolution, radiance.device)[0], matrices(resolution, radiance.device)[0]
+        pyramid = radiance.new_empty(len(pool.starts), 3)  # a row more than there are, to be read from
         _product(pool, torch.nn.functional.pad(radiance, (0, 0, 0, 1)), pyramid)
-        levels = torch.empty(len(radiance) + len(lobes.starts) - 1, 3)
+        levels = radiance.new_empty(len(radiance) + len(lobes.starts) - 1, 3)
         levels[: len(radiance)] = radiance
         _product(lobes, pyramid, levels[len(radiance) :])
         return levels
@@ -182,11 +182,11 @@ class _Prefilter(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, by_levels: Tensor):
-        pool, lobes = _pyramid(ctx.resolution)[1], matrices(ctx.resolution)[1]
+        pool, lobes = _pyramid(ctx.resolution, by_levels.device)[1], matrices(ctx.resolution, by_levels.device)[1]
         count = 6 * ctx.resolution**2
-        by_pyramid = torch.empty(len(lobes.starts), 3)
+        by_pyramid = by_levels.new_empty(len(lobes.starts), 3)
         _product(lobes, torch.nn.functional.pad(by_levels[count:], (0, 0, 0, 1)), by_pyramid)
-        by_radiance = _product(pool, by_pyramid, torch.empty(count, 3))
+        by_radiance = _product(pool, by_pyramid, by_levels.new_empty(count, 3))
         return by_radiance.add_(by_levels[:count]), None
 
 

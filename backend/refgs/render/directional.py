@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
-from refgs.kernels.load import Shared, Work, kernels, parallel
+from refgs.kernels.load import Shared, Work, run
 
 
 class _Work(Work):
@@ -30,9 +30,9 @@ class _Directional(torch.autograd.Function):
             inputs["normals"] = normals.contiguous()
         work = _Work(count=coefficients.shape[0], coefficients=coefficients.shape[1], offset=offset)
         work.camera[:] = camera.position.tolist()
-        color = torch.empty(len(positions), 3)
+        color = torch.empty_like(inputs["positions"])
         work.attach(**inputs, color=color)
-        parallel(kernels().refgs_harmonics_forward, work)
+        run("refgs_harmonics_forward", work, color, items=work.count)
         ctx.save_for_backward(*inputs.values(), color)
         ctx.work = work
         return color
@@ -42,7 +42,7 @@ class _Directional(torch.autograd.Function):
     def backward(ctx, by_color):
         by_color, by_values = by_color.contiguous(), torch.empty_like(ctx.saved_tensors[0])
         ctx.work.attach(by_color=by_color, by_values=by_values)
-        parallel(kernels().refgs_harmonics_backward, ctx.work)
+        run("refgs_harmonics_backward", ctx.work, by_color, items=ctx.work.count)
         return by_values, None, None, None, None
 
 
@@ -51,7 +51,7 @@ def directional(
 ) -> Tensor:
     """Colour (N, 3) = max(0, offset + Σ_k c_k Y_k(d)) of surfels at `positions` (N, 3), from `coefficients` (N, K, 3) of
     the harmonics in `refgs.model.harmonics`, K = (degree + 1)². d is the direction from the camera; with unit `normals`
-    (N, 3), it mirrored at the surfel (paper Eq. 10). float32 on the CPU; differentiable in the coefficients alone.
+    (N, 3), it mirrored at the surfel (paper Eq. 10). float32; differentiable in the coefficients alone.
     """
     if coefficients.shape not in [(len(positions), k, 3) for k in (1, 4, 9, 16)]:
         raise ValueError(f"expected harmonics of {len(positions)} surfels, got {tuple(coefficients.shape)}")

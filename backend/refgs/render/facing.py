@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
-from refgs.kernels.load import Shared, Work, check, kernels, parallel
+from refgs.kernels.load import Shared, Work, check, run
 
 
 class _Work(Work):
@@ -26,10 +26,10 @@ class _Facing(torch.autograd.Function):
     @staticmethod
     def forward(ctx, rotations, positions, camera):
         inputs = {"rotations": rotations.contiguous(), "positions": positions.contiguous()}
-        work, normals = _Work(count=len(positions)), torch.empty(len(positions), 3)
+        work, normals = _Work(count=len(positions)), torch.empty_like(positions)
         work.camera[:] = camera.position.tolist()
         work.attach(**inputs, normals=normals)
-        parallel(kernels().refgs_normals_forward, work)
+        run("refgs_normals_forward", work, normals, items=work.count)
         ctx.save_for_backward(*inputs.values())
         ctx.work = work
         return normals
@@ -39,13 +39,13 @@ class _Facing(torch.autograd.Function):
     def backward(ctx, by_normals):
         by_normals, by_rotations = by_normals.contiguous(), torch.empty_like(ctx.saved_tensors[0])
         ctx.work.attach(by_normals=by_normals, by_rotations=by_rotations)
-        parallel(kernels().refgs_normals_backward, ctx.work)
+        run("refgs_normals_backward", ctx.work, by_normals, items=ctx.work.count)
         return by_rotations, None, None
 
 
 def facing_normals(rotations: Tensor, positions: Tensor, camera: Camera) -> Tensor:
     """Unit normals (N, 3), from quaternions wxyz (N, 4) of any length and positions (N, 3), turned towards the camera where
-    they look well away from it. float32 on the CPU; differentiable in the rotations alone.
+    they look well away from it. float32; differentiable in the rotations alone.
 
     Not where they hardly do: on a closed surface those lie just past the horizon and show at the silhouette, where
     turning them would point the blend anywhere. normals.cpp has the angle.

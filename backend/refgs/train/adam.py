@@ -5,7 +5,9 @@ import ctypes
 import torch
 from torch import Tensor
 
-from refgs.kernels.load import Shared, Work, kernels, parallel
+from refgs.kernels.load import Shared, Work, run
+
+MOST = 16  # tensors
 
 
 class _Learned(Work):
@@ -23,7 +25,7 @@ class _Work(Work):
 
     _fields_ = (
         ("tensors", ctypes.c_int64),
-        ("learned", ctypes.c_void_p),
+        ("learned", _Learned * MOST),
         *((n, ctypes.c_double) for n in ("beta1", "beta2", "epsilon")),
         ("scratch", ctypes.c_void_p),
         ("shared", Shared),
@@ -31,7 +33,7 @@ class _Work(Work):
 
 
 class Adam(torch.optim.Optimizer):
-    """Adam (Kingma and Ba 2015), of float32 tensors on the CPU, all of them in one go: torch's own takes them one by one.
+    """Adam (Kingma and Ba 2015), of float32 tensors on one device, all of them in one go: torch's own takes them one by one.
 
     Groups and state as in `torch.optim.Adam`; a parameter without a gradient is left as it is.
     """
@@ -61,7 +63,9 @@ class Adam(torch.optim.Optimizer):
                 work.attach(value=value, mean=state["exp_avg"], square=state["exp_avg_sq"], gradient=gradient)
                 learned.append(work)
                 kept.append(gradient)
-        table = (_Learned * len(learned))(*learned)
-        work = _Work(tensors=len(learned), learned=ctypes.addressof(table))
+        if not learned:
+            return
+        work = _Work(tensors=len(learned))
+        work.learned[: len(learned)] = learned
         work.beta1, work.beta2, work.epsilon = beta1, beta2, self.EPSILON
-        parallel(kernels().refgs_adam_step, work)
+        run("refgs_adam_step", work, kept[0], items=sum(gradient.numel() for gradient in kept))

@@ -1,0 +1,107 @@
+"""Compile the kernels for CUDA cards, and launch them.
+
+NVRTC, NVIDIA's compiler as a library, comes with torch: no toolkit and no host compiler is needed, nor a card to compile.
+"""
+
+import ctypes
+import functools
+import hashlib
+import os
+import re
+from pathlib import Path
+
+import torch
+
+from refgs.kernels.build import HERE, cache_folder
+
+# Those of the sources that a card runs; HEADERS are what they include.
+SOURCES = ("adam.cpp", "harmonics.cpp", "normals.cpp", "sparse.cpp")
+HEADERS = ("device.h", "lane.h", "library.h", "light.h", "splat.h", "vector.h")
+# A product and a sum fuse as the CPU's do; nothing else is rounded other than IEEE 754 has it.
+OPTIONS = (
+    "--std=c++17",
+    "--device-as-default-execution-space",
+    "--extra-device-vectorization",
+    "--fmad=true",
+    "--diag-suppress=177",
+)
+OLDEST = (7, 5)  # the compute capability from which on NVRTC 13 compiles
+BLOCK = 256  # threads, where a kernel does not care
+
+
+@functools.cache
+def kernel_sources() -> dict[str, str]:
+    """The source of each kernel by its name."""
+    return {
+        name: source
+        for source in SOURCES
+        for name in re.findall(r"^KERNEL\((\w+)", (HERE / source).read_text(encoding="utf-8"), re.MULTILINE)
+    }
+
+
+def _check(result: tuple, what: str):
+    """The values of a call of NVIDIA's, without its status."""
+    status, *values = result
+    if int(status):
+        raise RuntimeError(f"{what}: {status.name}")
+    return values[0] if len(values) == 1 else values
+
+
+def compile_source(source: str, architecture: str) -> bytes:
+    """Machine code (cubin) of a source for an architecture such as "sm_86". Needs no card."""
+    from cuda.bindings import nvrtc
+
+    headers = [(HERE / name).read_bytes() for name in HEADERS]
+    names = [name.encode() for name in HEADERS]
+    text = (HERE / source).read_bytes()
+    program = _check(nvrtc.nvrtcCreateProgram(text, source.encode(), len(headers), headers, names), source)
+    options = [o.encode() for o in (*OPTIONS, f"--gpu-architecture={architecture}")]
+    (status,) = nvrtc.nvrtcCompileProgram(program, len(options), options)
+    if int(status):
+        log = b" " * _check(nvrtc.nvrtcGetProgramLogSize(program), source)
+        _check(nvrtc.nvrtcGetProgramLog(program, log), source)
+        raise RuntimeError(f"compiling {source} for {architecture} failed:\n{log.decode(errors='replace')}")
+    code = b" " * _check(nvrtc.nvrtcGetCUBINSize(program), source)
+    _check(nvrtc.nvrtcGetCUBIN(program, code), source)
+    _check(nvrtc.nvrtcDestroyProgram(program), source)
+    return code
+
+
+def cubin(source: str, architecture: str, cache: Path) -> bytes:
+    """The same out of `cache`, where it is kept by what it depends on."""
+    from cuda.bindings import nvrtc
+
+    parts = [(HERE / name).read_bytes() for name in (source, *HEADERS)]
+    digest = hashlib.sha256(repr((OPTIONS, _check(nvrtc.nvrtcVersion(), source), parts)).encode()).hexdigest()[:16]
+    file = cache / f"{Path(source).stem}-{digest}-{architecture}.cubin"
+    if not file.exists():
+        code = compile_source(source, architecture)
+        cache.mkdir(parents=True, exist_ok=True)
+        temporary = file.with_suffix(f".{os.getpid()}")
+        temporary.write_bytes(code)
+        os.replace(temporary, file)
+    return file.read_bytes()
+
+
+@functools.cache
+def _function(name: str, device: int) -> int:
+    """A kernel on a card, loaded into torch's own context."""
+    from cuda.bindings import driver
+
+    major, minor = torch.cuda.get_device_capability(device)
+    torch.cuda.current_stream(device)  # there is a context from here on
+    code = cubin(kernel_sources()[name], f"sm_{major}{minor}", cache_folder())
+    module = _check(driver.cuModuleLoadData(code), name)
+    return _check(driver.cuModuleGetFunction(module, name.encode()), name)
+
+
+def launch(name: str, work: ctypes.Structure, device: torch.device, blocks: int, threads: int = BLOCK) -> None:
+    """Run a kernel on torch's current stream of a device; what the work points at must live until it is done."""
+    from cuda.bindings import driver
+
+    with torch.cuda.device(device):
+        function = _function(name, torch.cuda.current_device())
+        stream = torch.cuda.current_stream().cuda_stream
+        arguments = (ctypes.c_void_p * 1)(ctypes.addressof(work))
+        size = (blocks, 1, 1, threads, 1, 1)
+        _check(driver.cuLaunchKernel(function, *size, 0, stream, ctypes.addressof(arguments), 0), name)

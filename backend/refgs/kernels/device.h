@@ -1,0 +1,36 @@
+// What the sources that serve the CPU and CUDA alike need of CUDA: kernels, and threads that share work by its number.
+// Compiled by NVRTC, with every function for the device (--device-as-default-execution-space).
+#pragma once
+
+#ifdef __CUDACC_RTC__
+typedef unsigned char uint8_t;
+typedef short int16_t;
+typedef unsigned short uint16_t;
+typedef int int32_t;
+typedef unsigned int uint32_t;
+typedef long long int64_t;
+typedef unsigned long long uint64_t;
+#endif
+
+#define EXPORT extern "C"
+
+// A kernel takes its work by value; `w` points at it.
+#ifndef KERNEL
+#define KERNEL(name, Work, w)                                          \
+  static void name##_threads(const Work* w);                           \
+  extern "C" __global__ void name(const __grid_constant__ Work work) { \
+    name##_threads(&work);                                             \
+  }                                                                    \
+  static void name##_threads(const Work* w)
+#endif
+
+struct Shared {
+  int64_t next, thread;
+};
+
+// body(i) for each i below n, each by a thread of its own, or by turns where there are fewer.
+template <class Body>
+inline void share(const Shared&, int64_t n, int64_t, Body body) {
+  int64_t threads = (int64_t)gridDim.x * blockDim.x;
+  for (int64_t i = (int64_t)blockIdx.x * blockDim.x + threadIdx.x; i < n; i += threads) body(i);
+}

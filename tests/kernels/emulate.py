@@ -1,0 +1,54 @@
+"""CUDA kernels on this processor: the sources that a card runs, compiled with CUDA's language emulated (emulator.h)."""
+
+import ctypes
+import functools
+import hashlib
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from refgs.kernels import cuda, load
+from refgs.kernels.build import HERE
+
+EMULATOR = Path(__file__).with_name("emulator.h")
+FLAGS = ["-shared", "-fPIC", "-O2", "-std=c++20", "-ffp-contract=on", "-fno-sanitize=all", "-Wno-everything"]
+
+
+@functools.cache
+def _library(source: str) -> ctypes.CDLL:
+    parts = [(HERE / name).read_bytes() for name in (source, *cuda.HEADERS)] + [EMULATOR.read_bytes()]
+    digest = hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+    file = Path(tempfile.gettempdir()) / "refgs-emulated" / f"{Path(source).stem}-{digest}.so"
+    if not file.exists():
+        file.parent.mkdir(exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=file.parent) as folder:
+            made = Path(folder) / file.name
+            command = [
+                sys.executable,
+                "-m",
+                "ziglang",
+                "c++",
+                *FLAGS,
+                "-include",
+                str(EMULATOR),
+                "-x",
+                "c++",
+                str(HERE / source),
+            ]
+            done = subprocess.run([*command, "-o", str(made)], capture_output=True, text=True)
+            assert done.returncode == 0, done.stderr
+            made.replace(file)
+    return ctypes.CDLL(str(file))
+
+
+def _launch(name: str, work: ctypes.Structure, device, blocks: int, threads: int = cuda.BLOCK) -> None:
+    getattr(_library(cuda.kernel_sources()[name]), name)(ctypes.byref(work), blocks, threads)
+
+
+def emulate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have tensors on the CPU taken for a card's: the kernels for CUDA run on them, and what is around those."""
+    monkeypatch.setattr(load, "on_gpu", lambda tensor: True)
+    monkeypatch.setattr(cuda, "launch", _launch)

@@ -1,0 +1,34 @@
+"""The kernels for CUDA cards: compiling and caching. What they compute is tested beside the CPU's, emulated and on a card."""
+
+import pytest
+
+from refgs.kernels import cuda
+
+ARCHITECTURES = ("sm_75", "sm_80", "sm_86", "sm_89", "sm_90", "sm_120")
+ELF = b"\x7fELF"
+
+
+@pytest.mark.parametrize("architecture", ARCHITECTURES)
+@pytest.mark.parametrize("source", cuda.SOURCES)
+def test_compiles_without_a_card(source, architecture):
+    code = cuda.compile_source(source, architecture)
+    assert code.startswith(ELF)
+    for name, home in cuda.kernel_sources().items():
+        assert (name.encode() in code) == (home == source)
+
+
+def test_is_compiled_once(tmp_path):
+    first = cuda.cubin("sparse.cpp", "sm_86", tmp_path)
+    (file,) = tmp_path.iterdir()
+    made = file.stat().st_mtime_ns
+    assert cuda.cubin("sparse.cpp", "sm_86", tmp_path) == first and file.stat().st_mtime_ns == made
+    cuda.cubin("sparse.cpp", "sm_89", tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_error_says_what_the_compiler_said(monkeypatch, tmp_path):
+    (tmp_path / "wrong.cpp").write_text("nonsense")
+    monkeypatch.setattr(cuda, "HERE", tmp_path)
+    monkeypatch.setattr(cuda, "HEADERS", ())
+    with pytest.raises(RuntimeError, match=r"wrong\.cpp for sm_86 failed:\n[\s\S]*nonsense"):
+        cuda.compile_source("wrong.cpp", "sm_86")
