@@ -23,6 +23,7 @@ from refgs.color import srgb_encode
 from refgs.errors import InputError
 from refgs.export.environment import read_environment, read_exr, write_exr
 from refgs.export.splats import write_splats
+from refgs.kernels import cuda
 from refgs.model.environment import Environment
 from refgs.paths import clone_root
 from refgs.render.renderer import Rendering
@@ -51,13 +52,15 @@ def progress_bar(what: str, total: int):
 
 
 def choose_device(device: str) -> str:
-    """The device to train on. Raises InputError where it cannot be had."""
+    """ "cpu" or "cuda": what to train on. Says so where a card was asked for, or is there, and cannot be used."""
     if device not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device {device}: take auto, cpu or cuda")
-    if device == "cuda":
-        why = "this release trains on the CPU" if torch.cuda.is_available() else "there is no CUDA device here"
-        raise InputError(f"--device cuda: {why}; take --device cpu or auto")
-    return "cpu"
+    if device == "cpu":
+        return "cpu"
+    why = cuda.unusable()
+    if why and (device == "cuda" or torch.cuda.is_available()):
+        console.print(f"warning: training on the CPU: {why}")
+    return "cpu" if why else "cuda"
 
 
 def train(
@@ -66,7 +69,7 @@ def train(
     """Train a capture into a run folder; Ctrl-C leaves a run that `--resume` goes on with."""
     from refgs.train.asset import write_asset
 
-    choose_device(device)
+    device = choose_device(device)
     if resume:
         facts, settings = read_run_facts(out)
         if changes:
@@ -90,12 +93,12 @@ def train(
             else:
                 console.print(facts["what"])
 
-        trainer = Trainer(capture, settings, out, report, minutes)
+        trainer = Trainer(capture, settings, out, report, minutes, device)
         if resume:
             trainer.resume()
             report("stage", {"what": f"going on from iteration {trainer.iteration}"})
         else:
-            create_run(out, capture, settings, preset)
+            create_run(out, capture, settings, preset, device)
         before = signal.signal(signal.SIGINT, lambda *_: stopped.append(True))
         try:
             ended = trainer.run(lambda: bool(stopped))

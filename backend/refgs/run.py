@@ -69,7 +69,7 @@ class Run:
             )
 
 
-def create_run(folder: Path, capture: Capture, settings: Settings, preset: str) -> None:
+def create_run(folder: Path, capture: Capture, settings: Settings, preset: str, device: str) -> None:
     """Make a new run folder with its run.toml and cameras.json. Raises InputError where the folder is taken."""
     check_free(folder)
     try:
@@ -81,7 +81,7 @@ def create_run(folder: Path, capture: Capture, settings: Settings, preset: str) 
             "refgs": __version__,
             "torch": torch.__version__,
             "python": platform.python_version(),
-            "device": "cpu",
+            "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
             "threads": torch.get_num_threads(),
             "preset": preset,
             "capture": str(capture.folder.resolve()),

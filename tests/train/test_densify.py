@@ -81,6 +81,6 @@ def test_screen_gradient_is_by_pixels_of_motion():
     point = position.clone().requires_grad_()
     pixel = point[:, :2] / point[:, 2:].detach() * 150.0
     (pixel * wanted).sum().backward()
-    motion = ScreenGradient(1)
+    motion = ScreenGradient(1, torch.device("cpu"))
     motion.add(position, point.grad, camera)
     torch.testing.assert_close(motion.mean(), wanted.norm()[None] * 100)

@@ -25,7 +25,7 @@ def trained(tmp_path_factory):
     for start in (0.3, 1):
         settings = load_settings("quick", [*SMALL, f"indirect.start={start}"])
         run = Trainer(capture, settings, folder / str(start), lambda *_: None)
-        create_run(run.folder, capture, settings, "quick")
+        create_run(run.folder, capture, settings, "quick", "cpu")
         if start < 1:
             run.run(stop=lambda run=run: run.iteration == 199)
             heard.append(run.test_psnr())

@@ -1,4 +1,5 @@
-// A step of Adam (Kingma and Ba 2015) for several tensors at once.
+// A step of Adam (Kingma and Ba 2015) for several tensors at once. What has no gradient stays as it is, moments and all: surfels
+// that this view does not see. (Adam itself would move them on, by what earlier views said.)
 #include "vector.h"
 
 namespace {
@@ -23,11 +24,15 @@ struct Adam {
 constexpr int BATCH = LANES == 1 ? 1 : 8192;  // numbers of a tensor
 
 INLINE void step(const Adam& a, const Learned& t, int64_t i, int64_t n) {
-  Vector g = read(t.gradient + i, n), m = read(t.mean + i, n), v = read(t.square + i, n);
-  m += (float)(1 - a.beta1) * (g - m);
-  v = (float)a.beta2 * v + (float)(1 - a.beta2) * (g * g);
-  write(t.mean + i, m, n), write(t.square + i, v, n);
-  write(t.value + i, read(t.value + i, n) - (float)t.rate * m / ((float)t.square_scale * root(v) + (float)a.epsilon), n);
+  Vector g = read(t.gradient + i, n);
+  Mask felt = (g < 0.0f) | (g > 0.0f);
+  if (!any(felt)) return;
+  Vector m = read(t.mean + i, n), v = read(t.square + i, n), x = read(t.value + i, n);
+  Vector mean = m + (float)(1 - a.beta1) * (g - m);
+  Vector square = (float)a.beta2 * v + (float)(1 - a.beta2) * (g * g);
+  Vector value = x - (float)t.rate * mean / ((float)t.square_scale * root(square) + (float)a.epsilon);
+  write(t.mean + i, select(felt, mean, m), n), write(t.square + i, select(felt, square, v), n);
+  write(t.value + i, select(felt, value, x), n);
 }
 
 }  // namespace

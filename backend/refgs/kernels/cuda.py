@@ -29,6 +29,22 @@ OLDEST = (7, 5)  # the compute capability from which on NVRTC 13 compiles
 BLOCK = 256  # threads, where a kernel does not care
 
 
+def unusable() -> str | None:
+    """Why no card can be used here; None where one can."""
+    if torch.version.cuda is None:
+        return "this build of torch is without CUDA"
+    if not torch.cuda.is_available():
+        return "no NVIDIA card, or no driver for it, was found"
+    if (capability := torch.cuda.get_device_capability()) < OLDEST:
+        found, least = (".".join(map(str, version)) for version in (capability, OLDEST))
+        return f"{torch.cuda.get_device_name()} is too old: its compute capability is {found}, {least} is the least"
+    try:
+        _function("refgs_adam_step", torch.cuda.current_device())
+    except RuntimeError as error:
+        return f"the card's driver does not take the kernels ({error}): a newer one may"
+    return None
+
+
 @functools.cache
 def kernel_sources() -> dict[str, str]:
     """The source of each kernel by its name."""

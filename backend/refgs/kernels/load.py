@@ -38,10 +38,11 @@ def supported() -> list[str]:
 
 
 def _keep_memory() -> None:
-    """Have GNU's malloc keep what is freed: by default the buffers of an iteration, a few megabytes each, go back to the
-    system at its end, and the next one faults them in again page by page (4 % of the time)."""
+    """Have GNU's malloc keep what is freed: by default the buffers of an iteration go back to the system at its end, and the
+    next one faults them in again page by page (4 % of the time of a small picture's, half of a large one's)."""
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
-        libc.mallopt(-3, 32 << 20)  # M_MMAP_THRESHOLD, at its largest
+        libc.mallopt(-4, 0)  # M_MMAP_MAX: no allocation is the system's own, however large
+        libc.mallopt(-8, 1)  # M_ARENA_MAX: what one thread frees, another may have
         libc.mallopt(-1, 512 << 20)  # M_TRIM_THRESHOLD
 
 

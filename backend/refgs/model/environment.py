@@ -16,10 +16,10 @@ COSINE = (1.0,) + (2 / 3,) * 3 + (1 / 4,) * 5
 
 
 @lru_cache(maxsize=4)
-def _projection(resolution: int) -> Tensor:
+def _projection(resolution: int, device: torch.device) -> Tensor:
     """(9, 6·R²): radiance → the nine coefficients of irradiance / π."""
     y = harmonics.basis(cubemap.texel_directions(resolution), 2) * cubemap.texel_solid_angles(resolution)[:, None]
-    return (y * torch.tensor(COSINE, dtype=torch.float64)).T.float().contiguous()
+    return (y * torch.tensor(COSINE, dtype=torch.float64)).T.float().contiguous().to(device)
 
 
 class Environment:
@@ -30,13 +30,13 @@ class Environment:
         self.resolution = math.isqrt(len(radiance) // 6)
         self.sides = tuple(prefilter.level_sides(self.resolution))
         self.levels = prefilter.prefilter(radiance, self.resolution)
-        self.irradiance = _projection(self.resolution) @ radiance  # (9, 3)
+        self.irradiance = _projection(self.resolution, radiance.device) @ radiance  # (9, 3)
 
     @property
     def harmonics(self) -> Tensor:
         """Coefficients (16, 3) of the radiance, up to degree 3."""
         directions, area = cubemap.texel_directions(self.resolution), cubemap.texel_solid_angles(self.resolution)
-        return (harmonics.basis(directions, 3) * area[:, None]).T.float() @ self.radiance
+        return (harmonics.basis(directions, 3) * area[:, None]).T.float().to(self.radiance.device) @ self.radiance
 
     def diffuse(self, normals: Tensor) -> Tensor:
         """Irradiance / π (P, 3) about unit normals (P, 3): what a white matte surface sends out."""
@@ -46,7 +46,7 @@ class Environment:
         """Equirectangular radiance (height, 2·height, 3) in Blender's orientation."""
         directions = torch.from_numpy(panorama_directions(height, 2 * height)).reshape(-1, 3).float()
         level = torch.zeros(len(directions))
-        colour = cubemap.sample(self.radiance.detach(), (self.resolution,), directions, level)
+        colour = cubemap.sample(self.radiance.detach().cpu(), (self.resolution,), directions, level)
         return colour.reshape(height, 2 * height, 3).numpy()
 
     @classmethod

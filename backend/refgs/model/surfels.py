@@ -105,16 +105,10 @@ def to_splats(surfels: Surfels) -> Splats:
     with torch.no_grad():
         rotations = torch.nn.functional.normalize(surfels.rotations, dim=-1)
         return Splats(
-            positions=surfels.positions.detach().numpy(),
-            normals=surfels.normals().numpy(),
-            sh=surfels.sh.detach().numpy(),
-            opacities=surfels.opacities.detach().numpy(),
-            scales=surfels.scales.detach().numpy(),
-            rotations=rotations.numpy(),
-            albedo=surfels.albedo.detach().numpy(),
-            metallic=surfels.metallic.detach().numpy(),
-            roughness=surfels.roughness.detach().numpy(),
-            indirect=surfels.indirect.detach().numpy(),
+            normals=surfels.normals().numpy(force=True),
+            **{
+                name: value.numpy(force=True) for name, value in surfels._replace(rotations=rotations)._asdict().items()
+            },
         )
 
 

@@ -35,7 +35,9 @@ class _Work(Work):
 class Adam(torch.optim.Optimizer):
     """Adam (Kingma and Ba 2015), of float32 tensors on one device, all of them in one go: torch's own takes them one by one.
 
-    Groups and state as in `torch.optim.Adam`; a parameter without a gradient is left as it is.
+    A number whose gradient is zero, as of a surfel that the view does not see, is left as it is, with its moments: these
+    neither fade nor move it on, as they would in Adam itself. So is a parameter without a gradient. Groups and state as in
+    `torch.optim.Adam`, the step a plain number.
     """
 
     BETAS, EPSILON = (0.9, 0.999), 1e-15
@@ -53,10 +55,9 @@ class Adam(torch.optim.Optimizer):
                     continue
                 state = self.state[value]
                 if not state:
-                    state |= {"step": torch.zeros(()), "exp_avg": torch.zeros_like(value)}
-                    state["exp_avg_sq"] = torch.zeros_like(value)
+                    state |= {"step": 0, "exp_avg": torch.zeros_like(value), "exp_avg_sq": torch.zeros_like(value)}
                 state["step"] += 1
-                t = float(state["step"])
+                t = state["step"]
                 work = _Learned(count=value.numel(), rate=group["lr"] / (1 - beta1**t))
                 work.square_scale = (1 - beta2**t) ** -0.5
                 gradient: Tensor = value.grad.contiguous()

@@ -55,14 +55,14 @@ def _facing_outward(surfels: Surfels, trainer: Trainer) -> tuple[Surfels, int]:
     A surfel's weight in a view is the gradient of the sum of a constant feature.
     """
     count = len(surfels.positions)
-    side, seen = torch.zeros(count), torch.zeros(count)
+    side, seen = torch.zeros(count, device=trainer.device), torch.zeros(count, device=trainer.device)
     normals = surfels.normals()
     for view in trainer.views:
-        feature = torch.ones(count, 1, requires_grad=True)
+        feature = torch.ones(count, 1, device=trainer.device, requires_grad=True)
         raster = rasterize(*surfels[:4], feature, view.camera, near=trainer.near)
         raster.features.sum().backward()
         weight = feature.grad[:, 0]
-        towards = torch.from_numpy(view.camera.position).float() - surfels.positions
+        towards = torch.from_numpy(view.camera.position).float().to(trainer.device) - surfels.positions
         side += weight * torch.sign((normals * towards).sum(dim=-1))
         seen += weight
     w, x, y, z = surfels.rotations.unbind(-1)

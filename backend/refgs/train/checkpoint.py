@@ -24,7 +24,7 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
     data, note = folder / f"{iteration:08d}.safetensors", folder / f"{iteration:08d}.toml"
     temporary = [file.with_name(file.name + ".tmp") for file in (data, note)]
     try:
-        save_file({name: value.detach().contiguous() for name, value in tensors.items()}, str(temporary[0]))
+        save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, str(temporary[0]))
         temporary[1].write_text(tomli_w.dumps({"iteration": iteration, **facts}), encoding="utf-8")
         for file in temporary:
             with open(file, "rb") as handle:

@@ -1,5 +1,8 @@
 """Adding surfels where the picture asks for them, and removing those that nobody sees."""
 
+import math
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -11,14 +14,14 @@ from refgs.settings import DensifySettings
 class ScreenGradient:
     """Mean gradient of the loss by a surfel's motion on the screen, in half image widths (as 3D Gaussian splatting counts it)."""
 
-    def __init__(self, count: int):
-        self.total = torch.zeros(count)
-        self.views = torch.zeros(count)
+    def __init__(self, count: int, device: torch.device):
+        self.total = torch.zeros(count, device=device)
+        self.views = torch.zeros(count, device=device)
 
     @torch.no_grad()
     def add(self, position: Tensor, gradient: Tensor, camera: Camera) -> None:
         """Account for one view's gradient (N, 3) by the world position (N, 3)."""
-        matrix = torch.from_numpy(camera.world_to_camera).float()
+        matrix = torch.from_numpy(camera.world_to_camera).float().to(position.device)
         depth = (position @ matrix[2, :3] + matrix[2, 3]).clamp_min(0)
         across = gradient @ matrix[:2, :3].T  # gradient by motion parallel to the picture plane
         # One pixel at depth z is z / f wide.
@@ -51,7 +54,7 @@ def densify(
     ).all(dim=0)
     if not keep.any():
         keep[opacity.nan_to_num(-1).argmax()] = True
-    chosen = torch.zeros(0, dtype=torch.long)
+    chosen = torch.zeros(0, dtype=torch.long, device=keep.device)
     if divide:
         candidates = torch.where(keep, gradient, -1.0)
         room = max(budget - int(keep.sum()), 0)
@@ -61,7 +64,23 @@ def densify(
     index = torch.cat([kept, chosen])  # each chosen one stands twice
     if len(index) == len(keep) and len(chosen) == 0:
         return 0
-    halves = torch.isin(kept, chosen).nonzero()[:, 0], torch.arange(len(kept), len(index))
+    halves = torch.isin(kept, chosen).nonzero()[:, 0], torch.arange(len(kept), len(index), device=keep.device)
+    _take(parameters, optimizer, index, halves)
+    if len(chosen):
+        _divide(parameters, *halves)
+    return len(chosen)
+
+
+@torch.no_grad()
+def thin(parameters: Parameters, optimizer: torch.optim.Optimizer, count: int) -> None:
+    """Keep this many surfels, the most opaque."""
+    _take(parameters, optimizer, parameters["opacity"].topk(count).indices.sort().values)
+
+
+def _take(
+    parameters: Parameters, optimizer: torch.optim.Optimizer, index: Tensor, fresh: Sequence[Tensor] = ()
+) -> None:
+    """Replace the surfels by those of an index, with their moments; those at `fresh` begin without."""
     for group in optimizer.param_groups:
         if group["name"] not in parameters:  # the light
             continue
@@ -71,23 +90,20 @@ def densify(
         if state:
             for key in ("exp_avg", "exp_avg_sq"):
                 state[key] = state[key][index].clone()
-                for half in halves:
-                    state[key][half] = 0
+                for rows in fresh:
+                    state[key][rows] = 0
         new.requires_grad_()
         group["params"][0] = new
         parameters[group["name"]] = new
         if state:
             optimizer.state[new] = state
-    if len(chosen):
-        _divide(parameters, *halves)
-    return len(chosen)
 
 
 def _divide(parameters: Parameters, first: Tensor, second: Tensor) -> None:
     """Move two copies apart along the longer axis, so that together they cover what the one did."""
     scale = parameters["scale"][first]
     longer = scale.argmax(dim=1)
-    rows = torch.arange(len(first))
+    rows = torch.arange(len(first), device=first.device)
     sigma = scale[rows, longer].exp()
     w, x, y, z = torch.nn.functional.normalize(parameters["rotation"][first], dim=-1).unbind(-1)
     t_u = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
@@ -96,4 +112,4 @@ def _divide(parameters: Parameters, first: Tensor, second: Tensor) -> None:
     # Two Gaussians of 0.8 σ, 0.6 σ either side of the centre: the same variance as the one, 0.8² + 0.6² = 1.
     for half, sign in ((first, 1.0), (second, -1.0)):
         parameters["position"][half] += sign * 0.6 * sigma[:, None] * axis
-        parameters["scale"][half, longer] = scale[rows, longer] + torch.log(torch.tensor(0.8))
+        parameters["scale"][half, longer] = scale[rows, longer] + math.log(0.8)

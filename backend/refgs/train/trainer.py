@@ -23,7 +23,7 @@ from refgs.render.renderer import Rendering, near_plane, render
 from refgs.settings import Settings
 from refgs.train import checkpoint
 from refgs.train.adam import Adam
-from refgs.train.densify import ScreenGradient, densify
+from refgs.train.densify import ScreenGradient, densify, thin
 from refgs.train.losses import objective
 from refgs.train.start import start_parameters
 
@@ -34,9 +34,9 @@ GEOMETRY = ("position", "rotation", "scale", "opacity")
 REPORT_EVERY = 10  # iterations
 HISTORY_EVERY = 100  # iterations
 PLAN_EVERY = 50  # iterations
-TRACED = (
-    24  # views at the least from which the mesh that inter-reflection is traced on is made; all where there are fewer
-)
+TRACED = 24  # views at the least for the mesh that inter-reflection is traced on; all where there are fewer
+FEWER = 0.8  # of the surfels, where there is no memory for all
+LEAST_SURFELS = 1000
 
 
 def composite(view: LoadedView, background: Tensor) -> Tensor:
@@ -57,22 +57,30 @@ class Trainer:
     """A capture being learned. State is on the run folder's disk after every checkpoint."""
 
     def __init__(
-        self, capture: Capture, settings: Settings, folder: Path, report: Report, minutes: float | None = None
+        self,
+        capture: Capture,
+        settings: Settings,
+        folder: Path,
+        report: Report,
+        minutes: float | None = None,
+        device: str = "cpu",
     ):
+        self.device = torch.device(device)
         self.total, self.minutes = settings.train.iterations, minutes
+        self.budget = settings.surfels.budget
         self.capture, self.settings, self.folder, self.report = capture, settings, folder, report
         side = settings.image.max_side
         self.views = [load_view(view, side) for view in capture.train_views]
         self.test = [load_view(view, side) for view in capture.test_views]
-        self.background = torch.tensor(settings.image.background)
+        self.background = torch.tensor(settings.image.background, device=self.device)
         self.near = near_plane(capture.radius)
         self.iteration, self.seconds = 0, 0.0
 
-        self.parameters, source = start_parameters(capture, self.views, settings)
+        start, source = start_parameters(capture, self.views, settings)
+        self.parameters = {name: value.to(self.device).requires_grad_() for name, value in start.items()}
         report("stage", {"what": source})
-        self.light = torch.full(
-            (6 * settings.environment.resolution**2, 3), math.log(math.expm1(settings.environment.radiance))
-        ).requires_grad_()
+        texels, radiance = 6 * settings.environment.resolution**2, settings.environment.radiance
+        self.light = torch.full((texels, 3), math.log(math.expm1(radiance)), device=self.device).requires_grad_()
         self.from_hull = all(view.alpha is not None for view in self.views)
         self._drop_unused()
         groups = [
@@ -81,7 +89,7 @@ class Trainer:
         if settings.render.shading == "deferred":
             groups.append({"params": [self.light], "name": "environment", "rate": settings.rates.environment})
         self.optimizer = Adam(groups)
-        self.motion = ScreenGradient(len(self.parameters["position"]))
+        self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
         self.occluder: Occluder | None = None
 
     def _rate(self, name: str) -> float:
@@ -133,8 +141,8 @@ class Trainer:
             return None
         return float(np.mean([psnr(self.render(v.camera).color, composite(v, self.background)) for v in chosen]))
 
-    def step(self) -> dict[str, float]:
-        """One iteration. Returns its loss and PSNR."""
+    def step(self) -> dict[str, Tensor]:
+        """One iteration. Returns its loss and PSNR, which are still being computed where there is a card."""
         settings = self.settings
         view = self._next_view()
         progress = min(self.iteration / self.total, 1.0)
@@ -158,7 +166,7 @@ class Trainer:
         due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
         if self._reflects() and due and self.iteration < self.total:
             self._trace()
-        return {"loss": float(loss.detach()), "psnr": quality}
+        return {"loss": loss.detach(), "psnr": quality}
 
     def _next_view(self) -> LoadedView:
         """Every view once an epoch, in an order that depends on the seed and the epoch alone, so that a resumed run goes on alike."""
@@ -177,10 +185,10 @@ class Trainer:
             self.optimizer,
             self.motion.mean(),
             settings,
-            self.settings.surfels.budget,
+            self.budget,
             divide=progress < settings.stop,
         )
-        self.motion = ScreenGradient(len(self.parameters["position"]))
+        self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
 
     @torch.no_grad()
     def _trace(self) -> None:
@@ -215,18 +223,18 @@ class Trainer:
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
         """Train to the end, or until `stop` says so; a checkpoint is written either way. True when the end was reached."""
-        loss, quality, started, first = 0.0, 0.0, time.perf_counter(), self.iteration
+        means, started, first = {}, time.perf_counter(), self.iteration
         while self.iteration < self.total and not stop():
             begun = time.perf_counter()
-            figures = self.step()
+            figures = self._step_within_memory()
             self.seconds += time.perf_counter() - begun
             self._plan()
-            if not math.isfinite(figures["loss"]):
-                raise FloatingPointError(f"the loss is {figures['loss']} at iteration {self.iteration}")
-            fresh = 1.0 if self.iteration - first == 1 else 0.05  # running means
-            loss += fresh * (figures["loss"] - loss)
-            quality += fresh * (figures["psnr"] - quality)
+            # Running means, read now and then: a card need not wait. One that is not finite stays so.
+            means = {name: figure + 0.95 * (means.get(name, figure) - figure) for name, figure in figures.items()}
             if self.iteration % REPORT_EVERY == 0 or self.iteration == self.total:
+                loss, quality = float(means["loss"]), float(means["psnr"])
+                if not math.isfinite(loss):
+                    raise FloatingPointError(f"the loss is {loss} at iteration {self.iteration}")
                 pace = (time.perf_counter() - started) / (self.iteration - first)
                 self.report(
                     "progress",
@@ -241,11 +249,30 @@ class Trainer:
                     },
                 )
             if self.iteration % HISTORY_EVERY == 0:
-                self._record(loss, quality)
+                self._record(float(means["loss"]), float(means["psnr"]))
             if self.iteration % self.settings.train.checkpoint_every == 0 and self.iteration < self.total:
                 self.save()
         self.save()
         return self.iteration >= self.total
+
+    def _step_within_memory(self) -> dict[str, Tensor]:
+        """One iteration; where the card's memory does not hold it, with fewer surfels from here on."""
+        while True:
+            try:
+                return self.step()
+            except torch.OutOfMemoryError:
+                self.budget = int(FEWER * len(self.parameters["position"]))
+                if self.budget < LEAST_SURFELS:
+                    raise InputError(
+                        "the card's memory is too small: close what else uses it, or take --device cpu"
+                    ) from None
+            self.optimizer.zero_grad(set_to_none=True)
+            thin(self.parameters, self.optimizer, self.budget)
+            self.motion = ScreenGradient(self.budget, self.device)
+            torch.cuda.empty_cache()
+            self.report(
+                "warning", {"what": f"the card's memory is full: going on with {self.budget:,} surfels at the most"}
+            )
 
     def _plan(self) -> None:
         """Where minutes were given: as many iterations as the pace allows, looked at again now and then."""
@@ -276,7 +303,7 @@ class Trainer:
             tensors |= {"occluder.faces": torch.from_numpy(mesh.faces.astype(np.int32))}
         for group in self.optimizer.param_groups:
             state = self.optimizer.state.get(group["params"][0], {})
-            tensors |= {f"adam.{group['name']}.{key}": value for key, value in state.items()}
+            tensors |= {f"adam.{group['name']}.{key}": torch.as_tensor(value) for key, value in state.items()}
         facts = {"seconds": self.seconds, "total": self.total}
         checkpoint.save(self.folder / "checkpoints", self.iteration, tensors, facts)
 
@@ -286,6 +313,8 @@ class Trainer:
         needed = {f"parameter.{name}" for name in self.parameters} | {f"constant.{name}" for name in self.constant}
         if not needed <= tensors.keys():
             raise InputError(f"{self.folder} was begun by another release of RefGS: train again into a new folder")
+        mesh = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("occluder.")}
+        tensors = {name: value.to(self.device) for name, value in tensors.items()}
         self.iteration, self.seconds = facts["iteration"], facts["seconds"]
         self.total = facts["total"]
         self.motion.total, self.motion.views = tensors["motion.total"], tensors["motion.views"]
@@ -302,11 +331,9 @@ class Trainer:
             prefix = f"adam.{name}."
             state = {key.removeprefix(prefix): t for key, t in tensors.items() if key.startswith(prefix)}
             if state:
-                self.optimizer.state[value] = state
+                self.optimizer.state[value] = state | {"step": int(state["step"])}
         self.constant = {name: tensors[f"constant.{name}"] for name in self.constant}
-        self.occluder = None
-        if "occluder.faces" in tensors:
-            self.occluder = Occluder(Mesh(tensors["occluder.vertices"].numpy(), tensors["occluder.faces"].numpy()))
+        self.occluder = Occluder(Mesh(mesh["occluder.vertices"], mesh["occluder.faces"])) if mesh else None
         self._trim_history()
 
     def _trim_history(self) -> None:

@@ -1,0 +1,93 @@
+"""Which device is trained on, and what is said where it is not the one that was asked for; a card whose memory is full."""
+
+import pytest
+import torch
+
+from refgs import commands
+from refgs.capture import read_capture
+from refgs.errors import InputError
+from refgs.kernels import cuda
+from refgs.settings import load_settings
+from refgs.train.trainer import Trainer
+
+
+@pytest.fixture
+def said(monkeypatch) -> list[str]:
+    lines = []
+    monkeypatch.setattr(commands.console, "print", lines.append)
+    return lines
+
+
+def card(monkeypatch, capability: tuple[int, int], driver: str | None = None) -> None:
+    """Have torch tell of a card."""
+
+    def function(name: str, device: int) -> int:
+        if driver:
+            raise RuntimeError(driver)
+        return 1
+
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "GeForce")
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(cuda, "_function", function)
+
+
+def test_a_card_is_taken(monkeypatch, said):
+    card(monkeypatch, (7, 5))
+    assert [commands.choose_device(d) for d in ("auto", "cuda", "cpu")] == ["cuda", "cuda", "cpu"] and not said
+
+
+def test_no_card(monkeypatch, said):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert commands.choose_device("auto") == "cpu" and not said
+    assert commands.choose_device("cuda") == "cpu"
+    assert len(said) == 1 and "no NVIDIA card, or no driver" in said[0]
+
+
+def test_a_card_that_is_too_old(monkeypatch, said):
+    card(monkeypatch, (6, 1))
+    assert [commands.choose_device(d) for d in ("auto", "cuda")] == ["cpu", "cpu"]
+    assert len(said) == 2 and all("GeForce is too old: its compute capability is 6.1, 7.5" in line for line in said)
+
+
+def test_a_driver_that_refuses(monkeypatch, said):
+    card(monkeypatch, (8, 6), driver="refgs_adam_step: CUDA_ERROR_UNSUPPORTED_PTX_VERSION")
+    assert commands.choose_device("auto") == "cpu"
+    assert len(said) == 1 and "driver does not take the kernels" in said[0]
+
+
+def small_trainer(ball_capture, folder, reports: list, start: int) -> Trainer:
+    changes = [f"surfels.start={start}", "train.iterations=12", "surfels.hull=48"]
+    settings = load_settings("quick", changes)
+    (folder / "checkpoints").mkdir(parents=True)
+    return Trainer(read_capture(ball_capture), settings, folder, lambda *event: reports.append(event))
+
+
+def test_full_memory_lowers_the_budget_and_goes_on(ball_capture, tmp_path, monkeypatch):
+    reports = []
+    trainer = small_trainer(ball_capture, tmp_path, reports, start=2000)
+    whole, step = 1800, trainer.step
+
+    def limited() -> dict:
+        if len(trainer.parameters["position"]) > whole:
+            raise torch.OutOfMemoryError
+        return step()
+
+    faintest = trainer.parameters["opacity"][:400]
+    with torch.no_grad():
+        faintest -= 1
+    monkeypatch.setattr(trainer, "step", limited)
+    assert trainer.run()
+    warnings = [facts["what"] for event, facts in reports if event == "warning"]
+    assert len(warnings) == 1 and "1,600 surfels" in warnings[0]
+    assert trainer.budget == len(trainer.parameters["position"]) == 1600
+    assert trainer.parameters["opacity"].min() > 0
+
+
+def test_memory_that_is_far_too_small(ball_capture, tmp_path, monkeypatch):
+    trainer = small_trainer(ball_capture, tmp_path, [], start=1200)
+    monkeypatch.setattr(trainer, "step", lambda: (_ for _ in ()).throw(torch.OutOfMemoryError()))
+    with pytest.raises(InputError, match="memory is too small"):
+        trainer.run()
