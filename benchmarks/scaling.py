@@ -1,7 +1,8 @@
 """Time and memory of the rasteriser against its size: `refgs bench scaling`.
 
 The ball of `benchmarks.kernels` with 10³ … 10⁶ surfels, drawn 128² … 1024² pixels large, 11 channels as in training. Each size runs
-in a process of its own; what it holds beyond the surfels and the maps' derivatives, which are given, is counted.
+in a process of its own. Memory is set against what the tensors need: the surfels and the maps' derivatives, which are given; the
+maps and the surfels' derivatives, which are returned; the splats' projections and their places, which backward reads again.
 """
 
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
@@ -36,15 +37,16 @@ def _megabytes(name: str) -> float:
 
 
 def measure(splats: int, side: int) -> dict[str, float]:
-    """Least milliseconds forward and backward, pairs of splat and tile, and megabytes: in use at most beyond
-    what is given, and of what is returned, the maps and the derivatives by the surfels."""
+    """Least milliseconds forward and backward, pairs of splat and tile, and megabytes: in use at most, what is given with it,
+    and what the tensors need."""
 
-    def run(inputs: list[torch.Tensor], camera: Camera, upstream: list[torch.Tensor]) -> tuple[float, float, int]:
+    def run(inputs: list[torch.Tensor], camera: Camera, upstream: list[torch.Tensor]) -> tuple[float, float, int, int]:
         at = time.perf_counter()
         raster = rasterize(*inputs, camera, near=0.1)
         middle = time.perf_counter()
         torch.autograd.grad(raster, inputs, upstream)
-        return middle - at, time.perf_counter() - middle, raster.features.grad_fn.work.pairs
+        kept = sum(v.nbytes for v in raster.features.grad_fn.bins.values())
+        return middle - at, time.perf_counter() - middle, raster.features.grad_fn.work.pairs, kept
 
     def scene(splats: int, side: int) -> tuple:
         surfels, camera = ball(splats, side, CHANNELS)
@@ -57,18 +59,16 @@ def measure(splats: int, side: int) -> dict[str, float]:
     before, started, times = _megabytes("VmRSS"), time.perf_counter(), []
     while time.perf_counter() - started < SECONDS or len(times) < 4:
         times.append(run(inputs, camera, upstream))
-    forward, backward, pairs = np.array(times[1:]).min(axis=0).tolist()
-    floats = sum(v.numel() for v in inputs) + sum(
-        v.numel() for v in upstream
-    )  # derivatives by the ones, maps like the others
+    forward, backward, pairs, kept = np.array(times[1:]).min(axis=0).tolist()
+    given = sum(v.nbytes for v in (*inputs, *upstream))  # as much is returned: a derivative of each, a map for each
     return {
         "splats": splats,
         "pixels": side * side,
         "pairs": int(pairs),
         "forward": 1e3 * forward,
         "backward": 1e3 * backward,
-        "megabytes": _megabytes("VmHWM") - before,
-        "returned": floats * 4 / 2**20,
+        "megabytes": _megabytes("VmHWM") - before + given / 2**20,
+        "needed": (2 * given + kept) / 2**20,
     }
 
 
@@ -80,8 +80,8 @@ def main() -> None:
     for size in track(sizes, "measuring"):
         done = subprocess.run([*command, *map(str, size)], stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT)
         rows.append(json.loads(done.stdout))
-    columns = ("splats", "pixels", "pairs", "forward", "backward", "megabytes", "returned")
-    table = Table(*columns, title="milliseconds, the least; megabytes in use, and returned")
+    columns = ("splats", "pixels", "pairs", "forward", "backward", "megabytes", "needed")
+    table = Table(*columns, title="milliseconds, the least; megabytes in use, and needed")
     for row in rows:
         table.add_row(*(f"{row[c]:,.1f}" if isinstance(row[c], float) else f"{row[c]:,}" for c in columns))
     console = Console()

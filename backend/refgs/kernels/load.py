@@ -5,6 +5,7 @@ import functools
 import os
 import platform
 import sys
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -124,13 +125,26 @@ class Work(ctypes.Structure):
             setattr(self, name, tensor.data_ptr())
 
 
+_kept = threading.local()
+
+
+def borrow(name: str, count: int) -> torch.Tensor:
+    """Memory for `count` 32-bit numbers, until the same name is asked for again: one that is used in passing, and whose
+    size differs from view to view, would leave gaps in malloc's memory each time."""
+    memory = _kept.__dict__.get(name)
+    if memory is None or len(memory) < count:
+        _kept.__dict__[name] = None  # so that both are not there at once
+        memory = _kept.__dict__[name] = torch.empty(count + count // 8, dtype=torch.int32)
+    return memory
+
+
 def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0) -> None:
     """Call `function(&work)` on torch.get_num_threads() threads at once; they share the work through `work.shared`.
 
     Each thread gets `scratch` floats of `work.scratch`.
     """
     threads = torch.get_num_threads()
-    memory = torch.empty(threads * scratch)
+    memory = borrow("scratch", threads * scratch)
     work.scratch = memory.data_ptr()
     work.shared = Shared()
     if threads == 1:

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
-from refgs.kernels.load import Shared, Work, check, kernels, parallel
+from refgs.kernels.load import Shared, Work, borrow, check, kernels, parallel
 
 
 class Raster(NamedTuple):
@@ -57,8 +57,7 @@ def _project_and_bin(work: _Work, camera: Camera, near: float) -> dict[str, Tens
         "tile_start": torch.empty(tiles + 1, dtype=torch.int64),
         "reach": torch.empty(tiles, dtype=torch.int32),
     }
-    keys = torch.empty(4 * n, dtype=torch.int32)
-    work.attach(**bins, keys=keys)
+    work.attach(**bins, keys=borrow("keys", 4 * n))
     parallel(library.refgs_project, work)
     library.refgs_sort(ctypes.byref(work))
     bins |= {
@@ -107,7 +106,7 @@ class _Rasterize(torch.autograd.Function):
             "by_features": by_features.contiguous(),
             "by_depth": by_depth.contiguous(),
             "by_alpha": by_alpha.contiguous(),
-            "rows": torch.empty(work.row_count * library.refgs_row_size(work.channels)),
+            "rows": borrow("rows", work.row_count * library.refgs_row_size(work.channels)),
         }
         gradients = {
             "by_positions": torch.empty_like(saved[0]),
