@@ -23,16 +23,20 @@ from refgs.train.trainer import Trainer
 SIZE, SURFELS, REPEATS = 256, 20_000, 30
 
 
+def make_trainer(folder: Path) -> Trainer:
+    """In the middle of a training."""
+    write_ball_capture(folder / "ball", SIZE, samples=2)
+    changes = [f"surfels.start={SURFELS}", f"surfels.budget={SURFELS}", "train.light_first=0"]
+    trainer = Trainer(read_capture(folder / "ball"), load_settings("quick", changes), folder, lambda *_: None)
+    for _ in range(5):
+        trainer.step()
+    return trainer
+
+
 def main() -> None:
     """Print milliseconds: the least and the median of the repeats."""
     with tempfile.TemporaryDirectory() as folder:
-        capture_folder = Path(folder) / "ball"
-        write_ball_capture(capture_folder, SIZE, samples=2)
-        changes = [f"surfels.start={SURFELS}", f"surfels.budget={SURFELS}", "train.light_first=0"]
-        settings = load_settings("quick", changes)
-        trainer = Trainer(read_capture(capture_folder), settings, Path(folder), lambda *_: None)
-        for _ in range(5):
-            trainer.step()
+        trainer = make_trainer(Path(folder))
         rows: dict[str, list[float]] = {}
         for _ in range(REPEATS):
             _one(trainer, rows)

@@ -15,15 +15,19 @@ from refgs.errors import InputError
 
 HERE = Path(__file__).parent
 SOURCES = (
+    "activate.cpp",
     "adam.cpp",
     "blend.cpp",
     "harmonics.cpp",
     "losses.cpp",
+    "motion.cpp",
     "normals.cpp",
+    "peak.cpp",
     "project.cpp",
     "shade.cpp",
     "sparse.cpp",
     "ssim.cpp",
+    "stack.cpp",
 )
 HEADERS = ("device.h", "lane.h", "library.h", "light.h", "raster.h", "splat.h", "vector.h")
 # -ffp-contract=on: fused within an expression, never across, so that a formula rounds the same wherever it is inlined.

@@ -27,6 +27,7 @@ SIZES = {
     "refgs_ssim_scratch_size": 2,
     "refgs_shade_halo_size": 2,
     "refgs_losses_sums": 0,
+    "refgs_peak_round": 0,
 }
 
 
@@ -138,12 +139,18 @@ def borrow(name: str, count: int) -> torch.Tensor:
     return memory
 
 
-def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0) -> None:
-    """Call `function(&work)` on torch.get_num_threads() threads at once; they share the work through `work.shared`.
+@functools.cache
+def cores() -> int:
+    """How many threads can run at once here."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
-    Each thread gets `scratch` floats of `work.scratch`.
+
+def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0) -> None:
+    """Call `function(&work)` on as many threads at once as torch has, but no more than there are cores.
+
+    They share the work through `work.shared`. Each thread gets `scratch` floats of `work.scratch`.
     """
-    threads = torch.get_num_threads()
+    threads = min(torch.get_num_threads(), cores())
     memory = borrow("scratch", threads * scratch)
     work.scratch = memory.data_ptr()
     work.shared = Shared()

@@ -1,12 +1,15 @@
 """The surfels: raw parameters as they are learned, and their activated values as they are rendered."""
 
+import ctypes
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from refgs.export.splats import Splats
+from refgs.kernels.load import Shared, Work, run
 from refgs.model import harmonics
 
 Parameters = dict[str, Tensor]
@@ -37,17 +40,68 @@ class Surfels(NamedTuple):
         return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
 
 
+class _Activation(ctypes.Structure):
+    """`struct Activation` of activate.cpp."""
+
+    _fields_ = (
+        *((n, ctypes.c_int64) for n in ("count", "kind")),
+        *((n, ctypes.c_void_p) for n in ("raw", "value", "by_value", "by_raw")),
+    )
+
+
+class _Work(Work):
+    """`struct Activate` of activate.cpp."""
+
+    _fields_ = (
+        ("tensors", ctypes.c_int64),
+        ("activations", _Activation * 8),
+        ("scratch", ctypes.c_void_p),
+        ("shared", Shared),
+    )
+
+
+class _Activate(torch.autograd.Function):
+    """exp of the first tensor, the logistic function of the others."""
+
+    @staticmethod
+    def forward(ctx, *raw):
+        raw = [tensor.contiguous() for tensor in raw]
+        values, work = [torch.empty_like(tensor) for tensor in raw], _Work(tensors=len(raw))
+        for i, (tensor, value) in enumerate(zip(raw, values, strict=True)):
+            work.activations[i] = _Activation(tensor.numel(), i > 0, tensor.data_ptr(), value.data_ptr())
+        run("refgs_activate_forward", work, raw[0], items=sum(tensor.numel() for tensor in raw))
+        ctx.save_for_backward(*values)
+        ctx.mark_non_differentiable(*(v for v, needed in zip(values, ctx.needs_input_grad, strict=True) if not needed))
+        return tuple(values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *by_values):
+        values, work, by_raw = ctx.saved_tensors, _Work(), [None] * len(by_values)
+        by_values = [by.contiguous() for by in by_values]
+        for i, (value, by) in enumerate(zip(values, by_values, strict=True)):
+            if ctx.needs_input_grad[i]:
+                by_raw[i] = torch.empty_like(value)
+                slot = _Activation(value.numel(), i > 0, None, value.data_ptr(), by.data_ptr(), by_raw[i].data_ptr())
+                work.activations[work.tensors] = slot
+                work.tensors += 1
+        run("refgs_activate_backward", work, values[0], items=sum(value.numel() for value in values))
+        return tuple(by_raw)
+
+
 def activate(p: Parameters) -> Surfels:
     """Raw parameters → values."""
+    names = ("scale", "opacity", "albedo", "metallic", "roughness")
+    scales, opacities, albedo, metallic, roughness = _Activate.apply(*(p[name] for name in names))
     return Surfels(
         positions=p["position"],
         rotations=p["rotation"],
-        scales=p["scale"].exp(),
-        opacities=p["opacity"].sigmoid(),
+        scales=scales,
+        opacities=opacities,
         sh=torch.cat([p["sh_dc"], p["sh_rest"]], dim=1),
-        albedo=p["albedo"].sigmoid(),
-        metallic=p["metallic"].sigmoid(),
-        roughness=p["roughness"].sigmoid(),
+        albedo=albedo,
+        metallic=metallic,
+        roughness=roughness,
         indirect=torch.cat([p["indirect_dc"], p["indirect_rest"]], dim=1),
     )
 

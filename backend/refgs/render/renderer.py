@@ -14,6 +14,7 @@ from refgs.render.directional import directional
 from refgs.render.facing import facing_normals
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import mirror_directions, shade
+from refgs.render.stack import stack
 from refgs.settings import RenderSettings
 
 NEAR = 0.01  # the nearest depth that is drawn, in scene radii
@@ -97,7 +98,7 @@ def render(
     normals = facing_normals(surfels.rotations, surfels.positions, camera)
     parts = [normals]
     if deferred:
-        parts += [surfels.albedo, surfels.metallic[:, None], surfels.roughness[:, None]]
+        parts += [surfels.albedo, surfels.metallic, surfels.roughness]
     if not deferred or settings.diffuse == "sh":
         parts.append(directional(surfels.sh, 0.5, surfels.positions, camera))
     if deferred and occluder is not None:
@@ -105,7 +106,7 @@ def render(
     if deferred:
         parts.append(surfels.positions)
     geometry = surfels.positions, surfels.rotations, surfels.scales, surfels.opacities
-    features, depth, alpha = rasterize(*geometry, torch.cat(parts, dim=1), camera, near=near)
+    features, depth, alpha = rasterize(*geometry, stack(parts), camera, near=near)
     if deferred:
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
         shaded = shade(features, alpha, environment, camera, background, visibility)

@@ -1,5 +1,6 @@
 """Adding surfels where the picture asks for them, and removing those that nobody sees."""
 
+import ctypes
 import math
 from collections.abc import Sequence
 
@@ -7,8 +8,22 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
+from refgs.kernels.load import Shared, Work, check, run
 from refgs.model.surfels import Parameters
 from refgs.settings import DensifySettings
+
+
+class _Work(Work):
+    """`struct Motion` of motion.cpp."""
+
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        *((n, ctypes.c_void_p) for n in ("positions", "gradients")),
+        ("view", ctypes.c_double * 12),
+        ("scale", ctypes.c_double),
+        *((n, ctypes.c_void_p) for n in ("total", "views", "scratch")),
+        ("shared", Shared),
+    )
 
 
 class ScreenGradient:
@@ -21,13 +36,12 @@ class ScreenGradient:
     @torch.no_grad()
     def add(self, position: Tensor, gradient: Tensor, camera: Camera) -> None:
         """Account for one view's gradient (N, 3) by the world position (N, 3)."""
-        matrix = torch.from_numpy(camera.world_to_camera).float().to(position.device)
-        depth = (position @ matrix[2, :3] + matrix[2, 3]).clamp_min(0)
-        across = gradient @ matrix[:2, :3].T  # gradient by motion parallel to the picture plane
-        # One pixel at depth z is z / f wide.
-        length = across.norm(dim=-1)
-        self.total += length * depth * (camera.width / 2 / camera.fx)
-        self.views += length > 0
+        surfels = len(self.total)
+        check(total=(self.total, (surfels,)), position=(position, (surfels, 3)), gradient=(gradient, (surfels, 3)))
+        position, gradient, work = position.contiguous(), gradient.contiguous(), _Work(count=len(position))
+        work.view[:], work.scale = camera.world_to_camera[:3].reshape(-1).tolist(), camera.width / 2 / camera.fx
+        work.attach(positions=position, gradients=gradient, total=self.total, views=self.views)
+        run("refgs_motion", work, position, items=work.count)
 
     def mean(self) -> Tensor:
         """(N,), zero where a surfel was never seen."""

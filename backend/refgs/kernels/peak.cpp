@@ -1,0 +1,31 @@
+// Nothing but arithmetic: what this processor can do at the most, which benchmarks set the other kernels beside.
+#include "vector.h"
+
+namespace {
+
+struct Peak {
+  int64_t rounds;
+  float* scratch;  // (threads, 1), so that nothing is left out
+  mutable Shared shared;
+};
+
+constexpr int CHAINS = 12;  // products and sums that do not wait for each other
+
+}  // namespace
+
+// A round is CHAINS LANES products and as many sums, of a thousand.
+KERNEL(refgs_peak, Peak, p) {
+  Vector chains[CHAINS];
+  for (int i = 0; i < CHAINS; i++) chains[i] = Vector() + (float)i;
+  Vector factor = Vector() + 0.999f, term = Vector() + 1e-3f;
+  share(p->shared, p->rounds, 1, [&](int64_t) {
+    for (int k = 0; k < 1000; k++)
+#pragma unroll
+      for (int i = 0; i < CHAINS; i++) chains[i] = chains[i] * factor + term;
+  });
+  Vector sum = {};
+  for (int i = 0; i < CHAINS; i++) sum += chains[i];
+  p->scratch[take(p->shared.thread, 1)] = total(sum);
+}
+
+EXPORT int64_t refgs_peak_round() { return 1000ll * CHAINS * LANES * 2; }

@@ -1,0 +1,62 @@
+"""Features of surfels, side by side."""
+
+import ctypes
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from refgs.kernels.load import Shared, Work, check, run
+
+MOST = 8  # parts
+
+
+class _Part(ctypes.Structure):
+    """`struct Part` of stack.cpp."""
+
+    _fields_ = (("width", ctypes.c_int64), ("numbers", ctypes.c_void_p))
+
+
+class _Work(Work):
+    """`struct Stack` of stack.cpp."""
+
+    _fields_ = (
+        *((n, ctypes.c_int64) for n in ("rows", "parts", "width")),
+        ("part", _Part * MOST),
+        *((n, ctypes.c_void_p) for n in ("stacked", "scratch")),
+        ("shared", Shared),
+    )
+
+    @classmethod
+    def of(cls, stacked: Tensor, widths: Sequence[int], parts: Sequence[Tensor | None]) -> "_Work":
+        work = cls(rows=len(stacked), parts=len(widths), width=stacked.shape[1])
+        work.attach(stacked=stacked)
+        for slot, width, part in zip(work.part, widths, parts, strict=False):
+            slot.width, slot.numbers = width, None if part is None else part.data_ptr()
+        return work
+
+
+class _Stack(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, *parts):
+        ctx.widths = [part.numel() // max(len(part), 1) for part in parts]
+        parts = [part.contiguous() for part in parts]
+        stacked = parts[0].new_empty(len(parts[0]), sum(ctx.widths))
+        run("refgs_stack", _Work.of(stacked, ctx.widths, parts), stacked, items=len(stacked))
+        ctx.shapes = [part.shape for part in parts]
+        return stacked
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, by_stacked):
+        by_stacked, wanted = by_stacked.contiguous(), zip(ctx.needs_input_grad, ctx.shapes, strict=True)
+        parts = [by_stacked.new_empty(shape) if needed else None for needed, shape in wanted]
+        run("refgs_unstack", _Work.of(by_stacked, ctx.widths, parts), by_stacked, items=len(by_stacked))
+        return tuple(parts)
+
+
+def stack(parts: Sequence[Tensor]) -> Tensor:
+    """Up to eight float32 tensors of N rows, (N,) or (N, C), side by side: (N, ΣC). Differentiable."""
+    check(**{f"part {i}": (part, (len(parts[0]), *part.shape[1:2])) for i, part in enumerate(parts)})
+    return _Stack.apply(*parts)

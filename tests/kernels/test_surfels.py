@@ -1,0 +1,82 @@
+"""What is done to each surfel's numbers before and after the rasteriser, against torch in float64."""
+
+import pytest
+import torch
+
+from refgs.model.surfels import activate
+from refgs.render.stack import stack
+from refgs.train.densify import ScreenGradient
+from tests.kernels import scenes
+
+COUNT = 5003
+ACTIVATED = {"scale": (2,), "opacity": (), "albedo": (3,), "metallic": (), "roughness": ()}
+
+
+def raw() -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    values = {name: 6 * torch.randn(COUNT, *shape, generator=generator) for name, shape in ACTIVATED.items()}
+    values["opacity"][:4] = torch.tensor([-90, 90, -1e4, 1e4])
+    rest = {
+        "position": (3,),
+        "rotation": (4,),
+        "sh_dc": (1, 3),
+        "sh_rest": (0, 3),
+        "indirect_dc": (1, 3),
+        "indirect_rest": (0, 3),
+    }
+    return values | {name: torch.zeros(COUNT, *shape) for name, shape in rest.items()}
+
+
+def values(surfels) -> list[torch.Tensor]:
+    return [surfels.scales, surfels.opacities, surfels.albedo, surfels.metallic, surfels.roughness]
+
+
+@pytest.mark.parametrize("constant", [None, "metallic"])
+def test_activations(device, constant):
+    exact = {name: value.double().requires_grad_(name != constant) for name, value in raw().items()}
+    expected = [exact["scale"].exp(), *(exact[name].sigmoid() for name in list(ACTIVATED)[1:])]
+    leaves = {name: value.to(device).requires_grad_(name != constant) for name, value in raw().items()}
+    got = values(activate(leaves))
+    for value, reference in zip(got, expected, strict=True):
+        assert ((value.cpu() - reference).abs() <= 3e-7 * reference + 1e-30).all()
+    learned = [name for name in ACTIVATED if name != constant]
+    upstream = [torch.randn(v.shape, generator=torch.Generator().manual_seed(i)) for i, v in enumerate(got)]
+    moving = [i for i, name in enumerate(ACTIVATED) if name != constant]
+    assert [v.requires_grad for v in got] == [i in moving for i in range(len(got))]
+    by = torch.autograd.grad(
+        [got[i] for i in moving], [leaves[n] for n in learned], [upstream[i].to(device) for i in moving]
+    )
+    exact_by = torch.autograd.grad(
+        [expected[i] for i in moving], [exact[n] for n in learned], [upstream[i].double() for i in moving]
+    )
+    for g, reference in zip(by, exact_by, strict=True):
+        assert ((g.cpu() - reference).abs() <= 1e-6 * reference.abs() + 1e-6).all()
+
+
+def test_side_by_side_and_apart(device):
+    generator = torch.Generator().manual_seed(0)
+    shapes = [(3,), (), (1,), (2,), ()]
+    parts = [torch.randn(COUNT, *shape, generator=generator).to(device).requires_grad_() for shape in shapes]
+    parts[3].requires_grad_(False)
+    stacked = stack(parts)
+    assert stacked.equal(torch.cat([part.reshape(COUNT, -1) for part in parts], dim=1))
+    upstream = torch.randn(stacked.shape, generator=generator).to(device)
+    learned = [part for part in parts if part.requires_grad]
+    by = torch.autograd.grad(stacked, learned, upstream)
+    columns = upstream.split([3, 1, 1, 2, 1], dim=1)
+    assert all(g.equal(c.reshape(g.shape)) for g, c in zip(by, [columns[i] for i in (0, 1, 2, 4)], strict=True))
+
+
+def test_motion_on_the_screen(device):
+    generator = torch.Generator().manual_seed(0)
+    positions, gradients = torch.randn(2, COUNT, 3, generator=generator)
+    gradients[::3] = 0
+    camera, motion = scenes.camera(), ScreenGradient(COUNT, device)
+    matrix = torch.from_numpy(camera.world_to_camera)
+    depth = (positions.double() @ matrix[2, :3] + matrix[2, 3]).clamp_min(0)
+    length = (gradients.double() @ matrix[:2, :3].T).norm(dim=1)
+    for _ in range(2):
+        motion.add(positions.to(device), gradients.to(device), camera)
+    expected = length * depth * camera.width / 2 / camera.fx
+    torch.testing.assert_close(motion.total.cpu().double(), 2 * expected, rtol=1e-5, atol=1e-5)
+    assert motion.views.cpu().equal(2.0 * (length > 0))
