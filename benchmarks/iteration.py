@@ -23,11 +23,12 @@ from refgs.train.trainer import Trainer
 SIZE, SURFELS, REPEATS = 256, 20_000, 30
 
 
-def make_trainer(folder: Path) -> Trainer:
+def make_trainer(folder: Path, device: str = "cpu") -> Trainer:
     """In the middle of a training."""
     write_ball_capture(folder / "ball", SIZE, samples=2)
     changes = [f"surfels.start={SURFELS}", f"surfels.budget={SURFELS}", "train.light_first=0"]
-    trainer = Trainer(read_capture(folder / "ball"), load_settings("quick", changes), folder, lambda *_: None)
+    settings = load_settings("quick", changes)
+    trainer = Trainer(read_capture(folder / "ball"), settings, folder, lambda *_: None, device=device)
     for _ in range(5):
         trainer.step()
     return trainer

@@ -5,31 +5,42 @@ import time
 
 import torch
 
-from refgs.kernels.load import Shared, Work, kernels, parallel
+from refgs.kernels.load import Shared, Work, kernels, run
+
+CPU = torch.device("cpu")
+CHAINS = 12  # of peak.cpp
 
 
 class _Peak(Work):
     """`struct Peak` of peak.cpp."""
 
-    _fields_ = (("rounds", ctypes.c_int64), ("scratch", ctypes.c_void_p), ("shared", Shared))
+    _fields_ = (("rounds", ctypes.c_int64), ("out", ctypes.c_void_p), ("scratch", ctypes.c_void_p), ("shared", Shared))
 
 
-def arithmetic(seconds: float = 0.5) -> float:
-    """Floating-point operations a second, a product and a sum being two, on torch's threads; the best of many short runs."""
-    library, rounds, best, started = kernels(), 1000, 0.0, time.perf_counter()
+def arithmetic(seconds: float = 0.5, device: torch.device = CPU) -> float:
+    """Floating-point operations a second, a product and a sum being two, on torch's threads or a card; the best of many runs."""
+    on_card = device.type == "cuda"
+    rounds, one = (1 << 20, 2 * 1000 * CHAINS) if on_card else (1000, kernels().refgs_peak_round())
+    work, out = _Peak(rounds=rounds), torch.zeros(1, device=device)
+    work.attach(out=out)
+    best, started = 0.0, time.perf_counter()
     while time.perf_counter() - started < seconds:
         at = time.perf_counter()
-        parallel(library.refgs_peak, _Peak(rounds=rounds), scratch=1)
-        best = max(best, rounds * library.refgs_peak_round() / (time.perf_counter() - at))
+        run("refgs_peak", work, out, items=rounds)
+        if on_card:
+            torch.cuda.synchronize(device)
+        best = max(best, rounds * one / (time.perf_counter() - at))
     return best
 
 
-def bandwidth(seconds: float = 0.5) -> float:
-    """Bytes a second of memory, read and written, by copying more than the caches hold, on torch's threads; the best run."""
-    source = torch.ones(64 << 20)
-    target, best, started = torch.empty_like(source), 0.0, time.perf_counter()
+def bandwidth(seconds: float = 0.5, device: torch.device = CPU) -> float:
+    """Bytes a second of memory, read and written, by copying more than the caches hold, on torch's threads or a card."""
+    source = torch.ones(64 << 20, device=device)
+    target, best, started = source.clone(), 0.0, time.perf_counter()
     while time.perf_counter() - started < seconds:
         at = time.perf_counter()
         target.copy_(source)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
         best = max(best, 2 * source.nbytes / (time.perf_counter() - at))
     return best

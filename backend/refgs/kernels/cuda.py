@@ -15,7 +15,16 @@ import torch
 from refgs.kernels.build import HERE, cache_folder
 
 # Those of the sources that a card runs; HEADERS are what they include.
-SOURCES = ("activate.cpp", "adam.cpp", "harmonics.cpp", "motion.cpp", "normals.cpp", "sparse.cpp", "stack.cpp")
+SOURCES = (
+    "activate.cpp",
+    "adam.cpp",
+    "harmonics.cpp",
+    "motion.cpp",
+    "normals.cpp",
+    "peak.cpp",
+    "sparse.cpp",
+    "stack.cpp",
+)
 HEADERS = ("device.h", "lane.h", "library.h", "light.h", "splat.h", "vector.h")
 # A product and a sum fuse as the CPU's do; nothing else is rounded other than IEEE 754 has it.
 OPTIONS = (

@@ -5,7 +5,7 @@ namespace {
 
 struct Peak {
   int64_t rounds;
-  float* scratch;  // (threads, 1), so that nothing is left out
+  float *out, *scratch;  // (1): never written to, but no compiler knows; none is used
   mutable Shared shared;
 };
 
@@ -25,7 +25,7 @@ KERNEL(refgs_peak, Peak, p) {
   });
   Vector sum = {};
   for (int i = 0; i < CHAINS; i++) sum += chains[i];
-  p->scratch[take(p->shared.thread, 1)] = total(sum);
+  if (total(sum) < 0) *p->out = total(sum);
 }
 
 EXPORT int64_t refgs_peak_round() { return 1000ll * CHAINS * LANES * 2; }
