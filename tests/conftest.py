@@ -13,7 +13,18 @@ from tests.kernels.emulate import emulate
 NO_CARD = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA card here")
 
 
-@pytest.fixture(params=[*load.supported(), "emulated", pytest.param("cuda", marks=NO_CARD)])
+CARDS = ["emulated", pytest.param("cuda", marks=NO_CARD)]
+
+
+@pytest.fixture(params=CARDS)
+def card(request, monkeypatch) -> torch.device:
+    """A CUDA card, emulated and real: for what the CPU does otherwise."""
+    if request.param == "emulated":
+        emulate(monkeypatch)
+    return torch.device("cuda" if request.param == "cuda" else "cpu")
+
+
+@pytest.fixture(params=[*load.supported(), *CARDS])
 def device(request, monkeypatch) -> torch.device:
     """Everything that runs kernels, one after another: where a test has to put its tensors. "emulated" are CUDA's kernels
     on this processor."""

@@ -1,9 +1,11 @@
 """Which ways are free of the object itself: rays traced against a mesh of it (paper §3.2)."""
 
 import numpy as np
+import torch
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
+from refgs.geometry.bvh import Tree
 from refgs.geometry.mesh import Mesh
 
 _LIFT = 1.0  # of the mesh's mean edge: how far a ray starts above its surface, which the mesh only comes near to
@@ -22,8 +24,15 @@ class Occluder:
 
         corners = mesh.vertices[mesh.faces]
         self.lift = _LIFT * float(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1).mean())
+        self._tree: Tree | None = None
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, ((corners - self._centre) / self._size).astype(np.float32))
+
+    def tree(self, device: torch.device) -> Tree:
+        """What a card traces rays against in place of Embree."""
+        if self._tree is None:
+            self._tree = Tree(self.mesh, self._centre, self._size, self.lift / self._size, device)
+        return self._tree
 
     def visible(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Whether nothing is in the way (P,) of rays from `points` (P, 3) of the surface, in the mesh's own frame, in

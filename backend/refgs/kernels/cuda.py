@@ -24,6 +24,7 @@ SOURCES = (
     "peak.cpp",
     "sparse.cpp",
     "stack.cpp",
+    "trace.cu",
 )
 HEADERS = ("device.h", "lane.h", "library.h", "light.h", "splat.h", "vector.h")
 # A product and a sum fuse as the CPU's do; nothing else is rounded other than IEEE 754 has it.

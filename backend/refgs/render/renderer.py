@@ -8,6 +8,7 @@ from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.geometry.visibility import Occluder
+from refgs.kernels import load
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.directional import directional
@@ -65,18 +66,21 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, occluder: Occluder) -> Tensor:
-    """1 where the mirror direction of a pixel is free of the object (H, W), else 0. Rays are traced on the CPU: a card waits."""
-    covered = np.flatnonzero(alpha.numpy(force=True) > COVERED)
-    mirrored = mirror_directions(features, alpha, camera).numpy(force=True).reshape(-1, 3)[covered]
+    """1 where the mirror direction of a pixel is free of the object (H, W), else 0."""
+    directions = mirror_directions(features, alpha, camera)
+    if load.on_gpu(alpha):
+        return occluder.tree(alpha.device).visible(directions, alpha, depth, camera)
+    covered = np.flatnonzero(alpha.detach().numpy() > COVERED)
+    mirrored = directions.numpy().reshape(-1, 3)[covered]
     row, column = np.divmod(covered, camera.width)
     local = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))])
     rays = local.T @ camera.world_to_camera[:3, :3]
-    mean_depth = (depth / alpha).numpy(force=True).reshape(-1, 1)[covered]
+    mean_depth = (depth / alpha).detach().numpy().reshape(-1, 1)[covered]
     points = rays * mean_depth + camera.position
     normals = mirrored - _unit(rays)  # half way back to the camera
     visible = np.ones(alpha.shape, np.float32)
     visible.reshape(-1)[covered] = occluder.visible(points, _unit(normals), mirrored)
-    return torch.from_numpy(visible).to(alpha.device)
+    return torch.from_numpy(visible)
 
 
 def render(

@@ -1,0 +1,76 @@
+"""Rays against a mesh on a CUDA card."""
+
+import ctypes
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refgs.camera import Camera
+from refgs.geometry.mesh import Mesh
+from refgs.kernels.load import Shared, Work, run
+
+LEAF = 4  # triangles, as in trace.cu
+BITS = 10  # of a Morton code's coordinate
+
+
+class _Work(Work):
+    """`struct Trace` of trace.cu."""
+
+    _fields_ = (
+        *((n, ctypes.c_int64) for n in ("width", "height")),
+        ("view", ctypes.c_double * 12),
+        ("camera", ctypes.c_double * 3),
+        *((n, ctypes.c_double) for n in ("fx", "fy", "cx", "cy")),
+        ("centre", ctypes.c_double * 3),
+        *((n, ctypes.c_double) for n in ("size", "lift")),
+        *((n, ctypes.c_void_p) for n in ("mirrored", "depth", "alpha")),
+        ("leaves", ctypes.c_int64),
+        *((n, ctypes.c_void_p) for n in ("boxes", "triangles", "visible", "scratch")),
+        ("shared", Shared),
+    )
+
+
+def _spread(v: Tensor) -> Tensor:
+    """The bits of integers below 2^10, two zeros between any two."""
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        v = (v | v << shift) & mask
+    return v
+
+
+class Tree:
+    """A complete binary tree of boxes over a mesh's triangles, in the order of their middles' Morton codes (Lauterbach et al.
+    2009); every box is that of its two children. The mesh is taken to its `centre` and `size`, in which `lift` is too."""
+
+    def __init__(self, mesh: Mesh, centre: np.ndarray, size: float, lift: float, device: torch.device):
+        self.centre, self.size, self.lift = centre, size, lift
+        corners = torch.from_numpy(((mesh.vertices[mesh.faces] - centre) / size).astype(np.float32)).to(device)
+        cell = ((corners.mean(dim=1) + 1) / 2 * 2**BITS).long().clamp(0, 2**BITS - 1)
+        x, y, z = (_spread(v) for v in cell.unbind(-1))
+        corners = corners[torch.argsort(x | y << 1 | z << 2)]
+        self.leaves = 1 << max(0, (-(-len(corners) // LEAF) - 1).bit_length())
+        empty = corners.new_full((self.leaves * LEAF - len(corners), 3, 3), torch.nan)
+        corners = torch.cat([corners, empty])
+        low = corners.nan_to_num(torch.inf).reshape(self.leaves, -1, 3).amin(dim=1)
+        high = corners.nan_to_num(-torch.inf).reshape(self.leaves, -1, 3).amax(dim=1)
+        levels = [torch.cat([low, high], dim=1)]
+        while len(levels[0]) > 1:
+            low, high = levels[0].split(3, dim=1)
+            pairs = low.reshape(-1, 2, 3).amin(dim=1), high.reshape(-1, 2, 3).amax(dim=1)
+            levels.insert(0, torch.cat(pairs, dim=1))
+        self._boxes = torch.cat([levels[0], *levels]).contiguous()  # what comes before the root is not used
+        edges = corners[:, 1:] - corners[:, :1]
+        self._triangles = torch.cat([corners[:, :1], edges], dim=1).contiguous()
+
+    def visible(self, mirrored: Tensor, alpha: Tensor, depth: Tensor, camera: Camera) -> Tensor:
+        """1 where the way `mirrored` (H, W, 3), a unit vector, is free at what a pixel shows (H, W), else 0; 1 where
+        `alpha` (H, W) says that it shows nothing. `depth` (H, W) is blended with it."""
+        mirrored, alpha, depth = (v.detach().contiguous() for v in (mirrored, alpha, depth))
+        visible, work = torch.empty_like(alpha), _Work(width=camera.width, height=camera.height, leaves=self.leaves)
+        work.view[:], work.camera[:] = camera.world_to_camera[:3].reshape(-1).tolist(), camera.position.tolist()
+        work.fx, work.fy, work.cx, work.cy = camera.fx, camera.fy, camera.cx, camera.cy
+        work.centre[:], work.size, work.lift = self.centre.tolist(), self.size, self.lift
+        work.attach(mirrored=mirrored, alpha=alpha, depth=depth, visible=visible)
+        work.attach(boxes=self._boxes, triangles=self._triangles)
+        run("refgs_trace", work, alpha, items=alpha.numel())
+        return visible

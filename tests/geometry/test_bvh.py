@@ -1,0 +1,55 @@
+"""The card's rays against Embree's, on meshes with back faces, holes and few triangles."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from refgs.geometry.mesh import Mesh
+from refgs.geometry.visibility import Occluder
+from refgs.render import renderer
+from tests.kernels import scenes
+
+
+def rings() -> trimesh.Trimesh:
+    turned = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
+    one, other = trimesh.creation.torus(0.7, 0.2), trimesh.creation.torus(0.7, 0.2, transform=turned)
+    other.apply_translation([0.7, 0, 0])
+    return trimesh.util.concatenate(one, other)
+
+
+def half_open() -> trimesh.Trimesh:
+    ball = trimesh.creation.icosphere(4)
+    return trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0.3][:, ::-1], process=False)
+
+
+SHAPES = {"rings": rings, "half open": half_open, "five faces": lambda: trimesh.creation.cone(0.5, 1, sections=3)}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(("scale", "moved"), [(1.0, 0.0), (1e3, 2e4)])
+def test_as_embree(shape, scale, moved, card, monkeypatch):
+    """What the pixels of a camera before the shape mirror, the normals being any."""
+    mesh = SHAPES[shape]()
+    occluder = Occluder(Mesh(mesh.vertices * scale + moved, np.asarray(mesh.faces)))
+    camera = scenes.camera(60, 50)
+    matrix = camera.world_to_camera.copy()
+    matrix[:3, 3] = [0, 0, 3.0 * scale] - matrix[:3, :3] @ np.full(3, moved)
+    camera = type(camera)(camera.name, 60, 50, 60.0, 60.0, 30.0, 25.0, matrix)
+    rng = np.random.default_rng(0)
+    alpha = torch.from_numpy(rng.uniform(-0.5, 1, (50, 60)).clip(0)).float()
+    # Points of the shape and around it; ways that leave towards the camera's side of some surface.
+    depth = alpha * torch.from_numpy(rng.uniform(2, 4, (50, 60)) * scale).float()
+    rays = torch.nn.functional.normalize(scenes.camera_rays(camera), dim=-1)
+    normals = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(50, 60, 3))).float(), dim=-1)
+    mirrored = rays - 2 * (rays * normals).sum(dim=-1, keepdim=True) * normals
+    mirrored[alpha <= renderer.COVERED] = 0
+    got = occluder.tree(card).visible(mirrored.to(card), alpha.to(card), depth.to(card), camera).cpu()
+
+    monkeypatch.setattr(renderer.load, "on_gpu", lambda tensor: False)
+    monkeypatch.setattr(renderer, "mirror_directions", lambda *_: mirrored)
+    expected = renderer._visibility(None, alpha, depth, camera, occluder)
+    covered = alpha > renderer.COVERED
+    assert 0.01 < float((expected[covered] == 0).float().mean()) < 0.95
+    assert (got[~covered] == 1).all()
+    assert float((got != expected).float().mean()) < 2e-3  # rays along an edge, or within rounding of one
