@@ -24,7 +24,7 @@ from refgs.settings import Settings
 from refgs.train import checkpoint
 from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify
-from refgs.train.losses import objective
+from refgs.train.losses import Photo, objective
 from refgs.train.start import start_parameters
 
 Report = Callable[[str, dict[str, Any]], None]
@@ -65,6 +65,7 @@ class Trainer:
         self.views = [load_view(view, side) for view in capture.train_views]
         self.test = [load_view(view, side) for view in capture.test_views]
         self.background = torch.tensor(settings.image.background)
+        self.photos = [Photo.of(view, self.background.device) for view in self.views]
         self.near = near_plane(capture.radius)
         self.iteration, self.seconds = 0, 0.0
 
@@ -136,7 +137,7 @@ class Trainer:
     def step(self) -> dict[str, float]:
         """One iteration. Returns its loss and PSNR."""
         settings = self.settings
-        view = self._next_view()
+        photo = self._next_photo()
         progress = min(self.iteration / self.total, 1.0)
         decay = settings.rates.decay**progress
         frozen = (
@@ -146,11 +147,11 @@ class Trainer:
             group["lr"] = 0.0 if frozen and group["name"] in GEOMETRY else group["rate"] * decay
 
         surfels, environment = self.surfels(), self.environment()
-        rendering = self._render(surfels, environment, view.camera)
-        loss, quality = objective(rendering, environment, view, self.background, settings.loss, progress)
+        rendering = self._render(surfels, environment, photo.camera)
+        loss, quality = objective(rendering, environment, photo, self.background, settings.loss, progress)
         loss.backward()
         position = self.parameters["position"]
-        self.motion.add(position.detach(), position.grad, view.camera)
+        self.motion.add(position.detach(), position.grad, photo.camera)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.iteration += 1
@@ -158,15 +159,15 @@ class Trainer:
         due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
         if self._reflects() and due and self.iteration < self.total:
             self._trace()
-        return {"loss": float(loss.detach()), "psnr": quality}
+        return {"loss": float(loss.detach()), "psnr": float(quality)}
 
-    def _next_view(self) -> LoadedView:
+    def _next_photo(self) -> Photo:
         """Every view once an epoch, in an order that depends on the seed and the epoch alone, so that a resumed run goes on alike."""
         epoch, place = divmod(self.iteration, len(self.views))
         order = torch.randperm(
             len(self.views), generator=torch.Generator().manual_seed(self.settings.train.seed * 1_000_003 + epoch)
         )
-        return self.views[int(order[place])]
+        return self.photos[int(order[place])]
 
     def _densify(self, progress: float) -> None:
         settings = self.settings.densify
