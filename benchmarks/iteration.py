@@ -49,7 +49,7 @@ def main() -> None:
 
 def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
     """An iteration in pieces, then a whole one."""
-    view, settings, clock = trainer.views[0], trainer.settings, time.perf_counter
+    photo, settings, clock = trainer.photos[0], trainer.settings, time.perf_counter
 
     def record(name: str, since: float) -> float:
         rows.setdefault(name, []).append(clock() - since)
@@ -58,9 +58,9 @@ def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
     at = clock()
     surfels, environment = trainer.surfels(), trainer.environment()
     at = record("activations and light's prefilter", at)
-    rendering = render(surfels, environment, view.camera, trainer.background, settings.render, trainer.near)
+    rendering = render(surfels, environment, photo.camera, trainer.background, settings.render, trainer.near)
     at = record("raster and shading", at)
-    loss, _ = objective(rendering, environment, view, trainer.background, settings.loss, 0.5)
+    loss, _ = objective(rendering, environment, photo, trainer.background, settings.loss, 0.5)
     at = record("losses", at)
     loss.backward()
     record("backward of all", at)

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from analytic import around, box, depth, gradient, look_at, sphere, torus
 
@@ -10,11 +11,15 @@ from refgs.geometry.tsdf import fuse
 VIEWS = around(24, 128)
 
 
-def fused(sdf, resolution, views=VIEWS, noise=0.0, radius=1.3):
+def tensors(maps, device="cpu"):
+    return [torch.tensor(map, device=device) for map in maps]
+
+
+def fused(sdf, resolution, views=VIEWS, noise=0.0, radius=1.3, device="cpu"):
     pictures = [depth(view, sdf) for view in views]
     rng = np.random.default_rng(0)
-    depths = [d + noise * rng.normal(size=d.shape).astype(np.float32) for d, _ in pictures]
-    mesh = fuse(depths, [a for _, a in pictures], views, (0.05, 0, 0), radius, resolution)
+    depths = tensors([d + noise * rng.normal(size=d.shape).astype(np.float32) for d, _ in pictures], device)
+    mesh = fuse(depths, tensors([a for _, a in pictures], device), views, (0.05, 0, 0), radius, resolution)
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
@@ -55,7 +60,7 @@ def test_a_room_seen_from_inside_faces_the_cameras():
         return -sphere(p)
 
     inner = [replace(look_at(-0.1 * view.position, 128), fx=60.0, fy=60.0) for view in VIEWS]
-    mesh = fused(room, 48, views=inner, radius=1.2)
+    mesh = fused(room, 50, views=inner, radius=1.2)
     assert np.abs(room(mesh.vertices)).max() < 0.01
     assert outward(mesh, room).all()
 
@@ -64,14 +69,21 @@ def test_one_wrong_depth_map_is_outvoted():
     pictures = [depth(view, sphere) for view in VIEWS]
     depths = [d for d, _ in pictures]
     depths[5] = np.where(depths[5] > 0, depths[5] - 0.3, 0)
-    mesh = fuse(depths, [a for _, a in pictures], VIEWS, (0, 0, 0), 1.4, 64)
+    mesh = fuse(tensors(depths), tensors([a for _, a in pictures]), VIEWS, (0, 0, 0), 1.4, 64)
     parts = trimesh.Trimesh(mesh.vertices, mesh.faces).split(only_watertight=False)
     largest = max(parts, key=lambda part: part.area)
     assert np.abs(sphere(largest.vertices)).max() < 0.05
 
 
 def test_nothing_to_see():
-    blank = [np.zeros((128, 128), np.float32)] * len(VIEWS)
+    blank = [torch.zeros(128, 128)] * len(VIEWS)
     assert len(fuse(blank, blank, VIEWS, (0, 0, 0), 1.0, 32).faces) == 0
-    behind = [np.full((128, 128), np.nan, np.float32)] * len(VIEWS)
-    assert len(fuse(behind, [np.ones((128, 128))] * len(VIEWS), VIEWS, (0, 0, 0), 1.0, 32).faces) == 0
+    behind, opaque = [torch.full((128, 128), torch.nan)] * len(VIEWS), [torch.ones(128, 128)] * len(VIEWS)
+    assert len(fuse(behind, opaque, VIEWS, (0, 0, 0), 1.0, 32).faces) == 0
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA card here")
+def test_a_card_makes_the_same_mesh():
+    there, here = fused(box, 50, device="cuda"), fused(box, 50)
+    assert np.abs(box(there.vertices)).mean() == pytest.approx(np.abs(box(here.vertices)).mean(), rel=0.01)
+    assert len(there.vertices) == pytest.approx(len(here.vertices), rel=0.01)

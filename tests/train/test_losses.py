@@ -7,23 +7,22 @@ import pytest
 import torch
 from torch import Tensor
 
-from refgs.capture import LoadedView
-from refgs.kernels import load
 from refgs.kernels.reference import unit
 from refgs.render.renderer import COVERED, Rendering
 from refgs.settings import LossSettings
-from refgs.train.losses import objective
+from refgs.train.losses import Photo, objective
 from tests.kernels import scenes, test_ssim
+from tests.kernels.emulate import emulate
 
 ALL = LossSettings(dssim=0.2, normal=0.3, smooth=0.4, alpha=0.5, metallic=0.6, light=0.0)
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
 MAPS = ("color", "normal", "blended_depth", "alpha", "material")
 
 
-def reference(rendering: Rendering, view: LoadedView, weights: LossSettings, progress: float) -> dict[str, Tensor]:
+def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress: float) -> dict[str, Tensor]:
     """The terms, weighted."""
-    photo = torch.from_numpy(view.image).double() / 255
-    mask = None if view.alpha is None else torch.from_numpy(view.alpha).double() / 255
+    photo = view.image.double() / 255
+    mask = None if view.mask is None else view.mask.double() / 255
     if mask is not None:
         photo = photo * mask[..., None] + BACKGROUND.double() * (1 - mask[..., None])
     color = torch.where(photo >= 0.998, rendering.color.clamp_max(1), rendering.color)
@@ -55,7 +54,7 @@ def reference(rendering: Rendering, view: LoadedView, weights: LossSettings, pro
     return terms
 
 
-def pictures(width: int, height: int, masked: bool, material: bool) -> tuple[Rendering, LoadedView]:
+def pictures(width: int, height: int, masked: bool, material: bool) -> tuple[Rendering, Photo]:
     """A bumpy surface seen by a turned camera: half opaque, some pixels beyond 1; a photo that is like it, partly saturated."""
     rng, camera = np.random.default_rng([width, height]), scenes.camera(width, height)
 
@@ -68,14 +67,19 @@ def pictures(width: int, height: int, masked: bool, material: bool) -> tuple[Ren
     normal = torch.tensor(camera.world_to_camera[2, :3] * -1).float() + 0.6 * (random(*size, 3) - 0.5)
     alpha = (random(*size) + 0.4).clamp_max(1) - 0.003 * random(*size)
     maps = [1.2 * random(*size, 3), alpha, depth * alpha, normal, random(*size, 5) if material else None]
-    photo = (300 * rng.uniform(size=(*size, 3))).clip(0, 255).astype(np.uint8)
-    mask = (300 * rng.uniform(size=size)).clip(0, 255).astype(np.uint8) if masked else None
-    return Rendering(*maps), LoadedView(photo, mask, camera)
+    photo, mask = (torch.tensor((300 * rng.uniform(size=s)).clip(0, 255)).byte() for s in ((*size, 3), size))
+    return Rendering(*maps), Photo(photo, mask if masked else None, camera)
 
 
-def leaves(rendering: Rendering, dtype: torch.dtype) -> Rendering:
+def moved(view: Photo, device: torch.device) -> Photo:
+    return view._replace(image=view.image.to(device), mask=None if view.mask is None else view.mask.to(device))
+
+
+def leaves(rendering: Rendering, dtype: torch.dtype, device: torch.device | None = None) -> Rendering:
     maps = {name: getattr(rendering, name) for name in MAPS}
-    return Rendering(**{n: None if m is None else m.detach().to(dtype).requires_grad_() for n, m in maps.items()})
+    return Rendering(
+        **{n: None if m is None else m.detach().to(device, dtype).requires_grad_() for n, m in maps.items()}
+    )
 
 
 def gradients(loss: Tensor, rendering: Rendering) -> dict[str, Tensor]:
@@ -83,63 +87,68 @@ def gradients(loss: Tensor, rendering: Rendering) -> dict[str, Tensor]:
     return dict(zip(maps, torch.autograd.grad(loss, list(maps.values()), materialize_grads=True), strict=True))
 
 
-@pytest.mark.parametrize("isa", load.supported())
+def check(rendering: Rendering, view: Photo, weights: LossSettings, progress: float, scale: float, device) -> Tensor:
+    """The loss and its gradients, `scale` times, against the reference's; returns the PSNR."""
+    exact, found = leaves(rendering, torch.float64), leaves(rendering, torch.float32, device)
+    expected = sum(reference(exact, view, weights, progress).values())
+    loss, psnr = objective(found, None, moved(view, device), BACKGROUND.to(device), weights, progress)
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
+    expected_gradients = gradients(scale * expected, exact)
+    for name, gradient in gradients(scale * loss, found).items():
+        worst = (gradient.cpu() - expected_gradients[name]).abs().max()
+        assert worst <= 1e-4 * expected_gradients[name].abs().max(), name
+    return psnr
+
+
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("material", [False, True])
 @pytest.mark.parametrize("size", [(61, 40), (16, 16), (3, 5), (2, 2), (1, 1), (1, 30)])
-def test_matches_float64(size, material, masked, isa, monkeypatch):
-    monkeypatch.setenv("REFGS_ISA", isa)
+def test_matches_float64(size, material, masked, device):
     rendering, view = pictures(*size, masked, material)
-    exact, found = leaves(rendering, torch.float64), leaves(rendering, torch.float32)
-    expected = sum(reference(exact, view, ALL, 0.7).values())
-    loss, psnr = objective(found, None, view, BACKGROUND, ALL, 0.7)
-    assert abs(float(loss.detach()) - float(expected.detach())) <= 1e-5 * float(expected.detach())
-    expected_gradients = gradients(3 * expected, exact)
-    for name, gradient in gradients(3 * loss, found).items():
-        worst = (gradient - expected_gradients[name]).abs().max()
-        assert worst <= 1e-4 * expected_gradients[name].abs().max(), name
-    photo = torch.from_numpy(view.image).double() / 255
+    psnr = check(rendering, view, ALL, 0.7, 3, device)
+    photo = view.image.double() / 255
     if masked:
-        mask = torch.from_numpy(view.alpha).double()[..., None] / 255
+        mask = view.mask.double()[..., None] / 255
         photo = photo * mask + BACKGROUND.double() * (1 - mask)
     error = ((rendering.color.clamp(0, 1) - photo) ** 2).mean()
-    assert abs(psnr + 10 * float(torch.log10(error))) < 1e-3
+    assert abs(float(psnr) + 10 * float(torch.log10(error))) < 1e-3
 
 
 @pytest.mark.parametrize("term", ["dssim", "normal", "smooth", "alpha", "metallic"])
-def test_a_term_without_weight_is_not_there(term):
-    rendering, view = pictures(30, 20, masked=True, material=True)
-    exact = leaves(rendering, torch.float64)
-    weights = ALL.model_copy(update={term: 0.0})
-    found = leaves(rendering, torch.float32)
-    loss, _ = objective(found, None, view, BACKGROUND, weights, 1.0)
-    expected = sum(reference(exact, view, weights, 1.0).values())
-    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
-    expected_gradients = gradients(expected, exact)
-    for name, gradient in gradients(loss, found).items():
-        assert (gradient - expected_gradients[name]).abs().max() <= 1e-4 * expected_gradients[name].abs().max()
+def test_a_term_without_weight_is_not_there(term, device):
+    check(*pictures(30, 20, masked=True, material=True), ALL.model_copy(update={term: 0.0}), 1.0, 1, device)
 
 
-@pytest.mark.parametrize("isa", load.supported())
-def test_far_away_where_hardly_anything_is(isa, monkeypatch):
+def test_far_away_where_hardly_anything_is(device):
     """Depths of 1e11 at pixels that are nearly empty leave the others alone."""
-    monkeypatch.setenv("REFGS_ISA", isa)
     rendering, view = pictures(30, 20, masked=True, material=True)
     rendering.alpha[::5, ::4], rendering.blended_depth[::5, ::4] = 0.01, 1e9
-    exact, found = leaves(rendering, torch.float64), leaves(rendering, torch.float32)
-    expected = sum(reference(exact, view, ALL, 0.7).values())
-    loss, _ = objective(found, None, view, BACKGROUND, ALL, 0.7)
-    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
-    expected_gradients = gradients(expected, exact)
-    for name, gradient in gradients(loss, found).items():
-        assert (gradient - expected_gradients[name]).abs().max() <= 1e-4 * expected_gradients[name].abs().max()
+    check(rendering, view, ALL, 0.7, 1, device)
 
 
-def test_a_photo_of_another_size_is_refused():
+def test_nothing_waits_for_a_card(monkeypatch):
+    """Neither way is a tensor's value looked at."""
+    emulate(monkeypatch)
     rendering, view = pictures(30, 20, masked=True, material=True)
-    for other in (replace(view, alpha=view.alpha[:10]), replace(view, image=view.image[:, 1:])):
-        with pytest.raises(ValueError, match="size"):
-            objective(leaves(rendering, torch.float32), None, other, BACKGROUND, ALL, 1.0)
+    found = leaves(rendering, torch.float32)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the host waits for the card")
+
+    for name in ("__bool__", "__float__", "__int__", "cpu", "item", "numpy", "tolist"):
+        monkeypatch.setattr(Tensor, name, refuse)
+    loss, _ = objective(found, None, view, BACKGROUND, ALL, 0.7)
+    loss.backward()
+
+
+def test_other_photos_are_refused():
+    rendering, view = pictures(30, 20, masked=True, material=True)
+    wrong = {"image": view.image[:, 1:]}, {"mask": view.mask[:10]}, {"mask": view.mask.float()}
+    for other in wrong:
+        with pytest.raises(
+            ValueError, match="test: the photo and its mask must be uint8 on cpu, of the rendering's size"
+        ):
+            objective(leaves(rendering, torch.float32), None, view._replace(**other), BACKGROUND, ALL, 1.0)
 
 
 def test_normals_of_a_plane_agree_with_its_depth():
@@ -147,7 +156,7 @@ def test_normals_of_a_plane_agree_with_its_depth():
     normal = np.array([0.2, -0.3, -0.9]) / np.linalg.norm([0.2, -0.3, -0.9])
     rays = scenes.camera_rays(camera).numpy().astype(float)
     depth = (-3 - normal @ camera.position) / (rays @ normal)
-    one, view = torch.ones(30, 40), LoadedView(np.zeros((30, 40, 3), np.uint8), None, camera)
+    one, view = torch.ones(30, 40), Photo(torch.zeros(30, 40, 3, dtype=torch.uint8), None, camera)
     flat = Rendering(
         torch.zeros(30, 40, 3), one, torch.tensor(depth).float(), torch.tensor(normal).float().expand(30, 40, 3)
     )

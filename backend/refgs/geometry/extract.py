@@ -22,6 +22,6 @@ def extract(
     depths, alphas = [], []
     for camera in cameras:  # a rendering is nine times as large as what is kept of it
         rendering = render(camera)
-        depths.append(rendering.depth.numpy())
-        alphas.append(rendering.alpha.numpy())
+        depths.append(rendering.depth)
+        alphas.append(rendering.alpha)
     return fuse(depths, alphas, cameras, centre, radius, resolution)

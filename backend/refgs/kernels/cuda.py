@@ -19,10 +19,12 @@ SOURCES = (
     "activate.cpp",
     "adam.cpp",
     "harmonics.cpp",
+    "losses.cpp",
     "motion.cpp",
     "normals.cpp",
     "peak.cpp",
     "sparse.cpp",
+    "ssim.cpp",
     "stack.cpp",
     "trace.cu",
 )

@@ -34,3 +34,19 @@ inline void share(const Shared&, int64_t n, int64_t, Body body) {
   int64_t threads = (int64_t)gridDim.x * blockDim.x;
   for (int64_t i = (int64_t)blockIdx.x * blockDim.x + threadIdx.x; i < n; i += threads) body(i);
 }
+
+// The sums of N numbers over the threads of a block, whole warps, always added in the same order: in float within a warp, then in
+// double. Once in a kernel.
+template <int N>
+inline void sum_over_block(float (&numbers)[N], double* sums) {
+  __shared__ float of_warps[N][32];
+  for (int i = 0; i < N; i++) {
+    for (int apart = 16; apart; apart /= 2) numbers[i] += __shfl_xor_sync(~0u, numbers[i], apart);
+    if (threadIdx.x % 32 == 0) of_warps[i][threadIdx.x / 32] = numbers[i];
+  }
+  __syncthreads();
+  if (threadIdx.x >= N) return;
+  double sum = 0;
+  for (int warp = 0; warp < blockDim.x / 32; warp++) sum += of_warps[threadIdx.x][warp];
+  sums[threadIdx.x] = sum;
+}

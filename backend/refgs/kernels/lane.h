@@ -35,7 +35,7 @@ struct Lane {
 
 typedef Lane<float> Vector;
 typedef Lane<int32_t> Mask;  // -1 or 0, or an integer
-typedef Lane<double> Sum;
+typedef Lane<float> Sum;     // a thread adds up few; many threads do in double: sum_over_block
 
 struct alignas(16) Four {
   float value[4] = {};

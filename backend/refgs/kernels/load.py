@@ -24,9 +24,8 @@ SIZES = {
     "refgs_octagon_size": 0,
     "refgs_row_size": 1,
     "refgs_scratch_size": 1,
-    "refgs_ssim_scratch_size": 2,
+    "refgs_ssim_scratch_size": 1,
     "refgs_shade_halo_size": 2,
-    "refgs_losses_sums": 0,
     "refgs_peak_round": 0,
 }
 

@@ -10,19 +10,20 @@ struct Losses {
   int64_t width, height;
   const float *color, *normal, *depth, *alpha, *material;  // (H, W, 3), (H, W, 3), (H, W) times alpha, (H, W), (H, W, 5) or null
   const uint8_t *image, *mask;                             // (H, W, 3), (H, W) or null: as on disk, 255 is 1
-  float background[3];
-  double rotation[9], fx, fy, cx, cy;  // world to camera
+  const float* background;                                 // (3)
+  float rotation[9], across, down, left, top;              // world to camera; at depth 1 a pixel's size, and where the first one is
   float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, alpha_weight, metallic_weight;
   float *photo, *clipped;   // (H, W, 3) the photo over the background; C as above, for D-SSIM
   const float* by_clipped;  // (H, W, 3) D-SSIM's share
   float *by_color, *by_normal, *by_depth, *by_alpha, *by_material;
   float* slopes;            // (4, H, W) derivatives by the depths to the right, to the left, below and above
-  double* sums;             // (H, SUMS) of a row
+  const double* totals;     // (SUMS) of the first pass
+  double* sums;             // (SUMS) of each row, or of each block's pixels
   float* scratch;           // none is used
   mutable Shared shared;
 };
 
-enum { LOSS, METALLIC, SURFACES, SQUARES, SUMS };  // weighted terms but metallic; m (1 - m); pixels with a surface; squared errors
+enum { LOSS, SURFACES, SQUARES, SUMS };  // weighted terms; pixels with a surface; squared errors
 constexpr float SATURATED = 0.998f;  // a photo's value above which the true radiance is unknown
 constexpr float SOLID = 0.5f, COVERED = 1 / 255.0f;  // alphas of an opaque pixel, and of one that is not background
 constexpr int MATERIAL = 5, METAL = 3;               // numbers of a material; which is the metallic
@@ -57,7 +58,7 @@ struct Pixels {
   }
 };
 
-INLINE Vector magnitude(Vector v) { return v < 0 ? -v : v; }
+INLINE Vector magnitude(Vector v) { return select(v < 0.0f, -v, v); }
 INLINE Vector sign(Vector v) { return select(v > 0.0f, Vector() + 1.0f, select(v < 0.0f, Vector() - 1.0f, Vector())); }
 INLINE Vector inverse_length(Vectors v) { return reciprocal(root(smaller(dot(v, v) + 1e-24f, Vector() + 1e36f))); }
 // From the derivative by v / |v|, `unit`, to that by v.
@@ -88,31 +89,29 @@ struct Row {
   MEMBER void add(Sum& sum, Vector v) const { sum += convert<Sum>(select(inside, v, Vector())); }
 };
 
-// The photo over the background; colour, mask and metallic.
+// The photo over the background; colour and mask.
 INLINE void pixel_terms(const Row& r, Sum (&sums)[SUMS]) {
   const Losses& l = r.l;
-  Vector opaque = Vector() + 1.0f;
+  Vector opaque = Vector() + 1.0f, photo[3], color[3], loss = {}, squares = {};
   if (l.mask) opaque = r.at.get(l.mask + r.y * l.width, 1) / 255.0f;
-  Vector loss = {}, squares = {};
   for (int c = 0; c < 3; c++) {
-    Vector photo = r.at.get(l.image + r.y * l.width * 3 + c, 3) / 255.0f;
-    photo = photo * opaque + (1.0f - opaque) * l.background[c];
-    Vector color = r.at.get(r.of(l.color, 3) + c, 3), seen = clamp(color, 0, 1) - photo;
-    Mask open = (photo < SATURATED) | (color <= 1.0f);
-    Vector clipped = select(open, color, Vector() + 1.0f), error = clipped - photo;
+    photo[c] = r.at.get(l.image + r.y * l.width * 3 + c, 3) / 255.0f * opaque + (1.0f - opaque) * l.background[c];
+    color[c] = r.at.get(r.of(l.color, 3) + c, 3);
+  }
+  Vector alpha = r.get(l.alpha), by_alpha = {};
+  for (int c = 0; c < 3; c++) {
+    Vector seen = clamp(color[c], 0, 1) - photo[c];
+    Mask open = (photo[c] < SATURATED) | (color[c] <= 1.0f);
+    Vector clipped = select(open, color[c], Vector() + 1.0f), error = clipped - photo[c];
     squares += seen * seen;
     loss += l.color_weight * magnitude(error);
-    r.at.put(r.of(l.photo, 3) + c, 3, photo);
+    r.at.put(r.of(l.photo, 3) + c, 3, photo[c]);
     r.at.put(r.of(l.clipped, 3) + c, 3, clipped);
     r.at.put(r.of(l.by_color, 3) + c, 3, select(open, l.color_weight * sign(error), Vector()));
   }
-  Vector alpha = r.get(l.alpha), by_alpha = {};
   if (l.mask) loss += l.alpha_weight * magnitude(alpha - opaque), by_alpha = l.alpha_weight * sign(alpha - opaque);
   r.put(l.by_alpha, by_alpha);
   r.add(sums[LOSS], loss), r.add(sums[SQUARES], squares);
-  if (!l.material) return;
-  Vector metallic = r.at.get(r.of(l.material, MATERIAL) + METAL, MATERIAL);
-  r.add(sums[METALLIC], metallic * (1.0f - metallic));
   r.add(sums[SURFACES], select(alpha > COVERED, Vector() + 1.0f, Vector()));
 }
 
@@ -132,16 +131,15 @@ INLINE void normal_term(const Row& r, Sum& loss) {
     return r.put3(l.by_normal, {});
   }
   Vectors n = r.get3(l.normal);
-  float dX = (float)(1 / l.fx), dY = (float)(1 / l.fy), Y = (float)((r.y + 0.5 - l.cy) / l.fy);
+  float Y = (float)(int32_t)r.y * l.down + l.top;
   Vector X;
-  for (int lane = 0; lane < LANES; lane++) X[lane] = (float)((r.at.x + lane + 0.5 - l.cx) / l.fx);
+  for (int lane = 0; lane < LANES; lane++) X[lane] = (float)(int32_t)(r.at.x + lane) * l.across + l.left;
   // Zero where they are not asked: one outlier there must not become a NaN here.
   auto depth = [&](int dx, int dy) { return select(solid, r.mean_depth(dx, dy), Vector()); };
   Vector right = depth(1, 0), left = depth(-1, 0), below = depth(0, 1), above = depth(0, -1);
-  Vector p = right - left, q = (right + left) * dX, t = below - above, s = (below + above) * dY;
+  Vector p = right - left, q = (right + left) * l.across, t = below - above, s = (below + above) * l.down;
   Vectors N = {p * s, q * t, -(q * s + X * p * s + Y * q * t)};
-  float R[9];
-  for (int i = 0; i < 9; i++) R[i] = (float)l.rotation[i];
+  const float* R = l.rotation;
   Vectors m = {R[0] * n.x + R[1] * n.y + R[2] * n.z, R[3] * n.x + R[4] * n.y + R[5] * n.z, R[6] * n.x + R[7] * n.y + R[8] * n.z};
   Vector inverse_N = inverse_length(N), inverse_m = inverse_length(m);
   Vectors of_depth = inverse_N * N, blended = inverse_m * m;
@@ -149,8 +147,8 @@ INLINE void normal_term(const Row& r, Sum& loss) {
   r.add(loss, w * (1.0f - dot(of_depth, blended)));
   Vectors g = by_length(-w * blended, of_depth, inverse_N), h = by_length(-w * of_depth, blended, inverse_m);
   r.put3(l.by_normal, {R[0] * h.x + R[3] * h.y + R[6] * h.z, R[1] * h.x + R[4] * h.y + R[7] * h.z, R[2] * h.x + R[5] * h.y + R[8] * h.z});
-  Vector by_p = s * (g.x - X * g.z), by_q = (t * g.y - (s + Y * t) * g.z) * dX;
-  Vector by_t = q * (g.y - Y * g.z), by_s = (p * g.x - (q + X * p) * g.z) * dY;
+  Vector by_p = s * (g.x - X * g.z), by_q = (t * g.y - (s + Y * t) * g.z) * l.across;
+  Vector by_t = q * (g.y - Y * g.z), by_s = (p * g.x - (q + X * p) * g.z) * l.down;
   r.put(slopes[0], by_q + by_p), r.put(slopes[1], by_q - by_p), r.put(slopes[2], by_s + by_t), r.put(slopes[3], by_s - by_t);
 }
 
@@ -168,21 +166,31 @@ INLINE Vectors smooth_term(const Row& r, int dx, int dy, float weight, Sum& loss
   return {w * sign(n.x), w * sign(n.y), w * sign(n.z)};
 }
 
-// Body(row) for all the pixels, rows at a time; its sums are added to those of the row.
+// Body(row) for all the pixels; its sums are those of a row, or on CUDA of a block, which has a tile of 32 x 8 pixels.
 template <class Body>
 void each(const Losses* l, Body body) {
+#ifdef __CUDACC__
+  int block = blockIdx.x, thread = threadIdx.x, tiles = (int)((l->width + 31) / 32);
+  int64_t x = block % tiles * 32 + thread % 32, y = block / tiles * 8 + thread / 32;
+  Sum sums[SUMS];
+  if (x < l->width && y < l->height) body(Row{*l, y, {x, l->width}}, sums);
+  float numbers[SUMS];
+  for (int i = 0; i < SUMS; i++) numbers[i] = sums[i][0];
+  sum_over_block(numbers, l->sums + blockIdx.x * SUMS);
+#else
   const int64_t ROWS = 4;
   share(l->shared, l->height, ROWS, [&](int64_t y) {
     Sum sums[SUMS] = {};
     for (int64_t x = 0; x < l->width; x += LANES) body(Row{*l, y, {x, l->width}}, sums);
-    for (int i = 0; i < SUMS; i++)
+    for (int i = 0; i < SUMS; i++) {
+      l->sums[y * SUMS + i] = 0;
       for (int lane = 0; lane < LANES; lane++) l->sums[y * SUMS + i] += sums[i][lane];
+    }
   });
+#endif
 }
 
 }  // namespace
-
-EXPORT int64_t refgs_losses_sums() { return SUMS; }
 
 // what a pixel says by itself, or by the depths around it
 KERNEL(refgs_losses_first, Losses, l) {
@@ -199,24 +207,24 @@ KERNEL(refgs_losses_second, Losses, l) {
     Vectors by_normal = r.get3(l.by_normal);
     by_normal = by_normal + smooth_term(r, 1, 0, l.smooth_x_weight, sums[LOSS]) + smooth_term(r, -1, 0, l.smooth_x_weight, sums[LOSS]);
     by_normal = by_normal + smooth_term(r, 0, 1, l.smooth_y_weight, sums[LOSS]) + smooth_term(r, 0, -1, l.smooth_y_weight, sums[LOSS]);
-    r.put3(l.by_normal, by_normal);
 
     int64_t size = l.width * l.height;
     Vector by_depth = r.get(l.slopes, -1) + r.get(l.slopes + size, 1);
     if (r.y > 0) by_depth += r.get(l.slopes + 2 * size, 0, -1);
     if (r.y + 1 < l.height) by_depth += r.get(l.slopes + 3 * size, 0, 1);
     Vector inverse = r.inverse_alpha(), alpha = r.get(l.alpha);
-    r.put(l.by_depth, by_depth * inverse);
-    r.put(l.by_alpha, r.get(l.by_alpha) - select(alpha >= COVERED, by_depth * r.mean_depth() * inverse, Vector()));
+    Vector by_alpha = r.get(l.by_alpha) - select(alpha >= COVERED, by_depth * r.mean_depth() * inverse, Vector());
 
     Vectors color = r.get3(l.color), clipped = r.get3(l.clipped), by = r.get3(l.by_color), share = r.get3(l.by_clipped);
     auto open = [](Vector color, Vector clipped, Vector share) { return select(color == clipped, share, Vector()); };
+    r.put3(l.by_normal, by_normal), r.put(l.by_depth, by_depth * inverse), r.put(l.by_alpha, by_alpha);
     r.put3(l.by_color, by + Vectors{open(color.x, clipped.x, share.x), open(color.y, clipped.y, share.y), open(color.z, clipped.z, share.z)});
 
     if (!l.material) return;
-    float* row = r.of(l.by_material, MATERIAL);
-    for (int i = 0; i < MATERIAL; i++) r.at.put(row + i, MATERIAL, Vector());
     Vector metallic = r.at.get(r.of(l.material, MATERIAL) + METAL, MATERIAL);
-    r.at.put(row + METAL, MATERIAL, l.metallic_weight * (1.0f - 2.0f * metallic));
+    float surfaces = (float)l.totals[SURFACES], weight = l.metallic_weight / (surfaces > 1 ? surfaces : 1);
+    r.add(sums[LOSS], weight * metallic * (1.0f - metallic));
+    float* row = r.of(l.by_material, MATERIAL);
+    for (int i = 0; i < MATERIAL; i++) r.at.put(row + i, MATERIAL, i == METAL ? weight * (1.0f - 2.0f * metallic) : Vector());
   });
 }

@@ -1,41 +1,62 @@
 """The objective (paper §3.3): colour, normal consistency, edge-aware smoothness; and the mask."""
 
 import ctypes
-import math
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from refgs.camera import Camera
 from refgs.capture import LoadedView
-from refgs.kernels.load import Shared, Work, check, kernels, parallel
+from refgs.kernels import cuda, load
+from refgs.kernels.load import Shared, Work, check, run
 from refgs.model.environment import Environment
 from refgs.render.renderer import Rendering
 from refgs.render.ssim import dssim
 from refgs.settings import LossSettings
+
+TILE = 32, 8  # pixels of a row, and rows, that a block of losses.cpp has on CUDA
+SUMS = 3  # of a row or a block: of the loss, of the pixels with a surface, of squared errors
+
+
+class Photo(NamedTuple):
+    """What a view's rendering should look like: `image` (H, W, 3) uint8, sRGB-encoded, and its `mask` (H, W) uint8, or None,
+    where training is."""
+
+    image: Tensor
+    mask: Tensor | None
+    camera: Camera
+
+    @classmethod
+    def of(cls, view: LoadedView, device: torch.device | str = "cpu") -> "Photo":
+        mask = None if view.alpha is None else torch.from_numpy(view.alpha).to(device)
+        return cls(torch.from_numpy(view.image).to(device), mask, view.camera)
 
 
 class Objective(NamedTuple):
     """The training loss of a view, a differentiable scalar, and its peak signal-to-noise ratio in dB, clipped to 0..1."""
 
     loss: Tensor
-    psnr: float
+    psnr: Tensor
 
 
 class _Work(Work):
     """`struct Losses` of losses.cpp."""
 
     _fields_ = (
-        [(n, ctypes.c_int64) for n in ("width", "height")]
-        + [(n, ctypes.c_void_p) for n in ("color", "normal", "depth", "alpha", "material", "image", "mask")]
-        + [("background", ctypes.c_float * 3), ("rotation", ctypes.c_double * 9)]
-        + [(n, ctypes.c_double) for n in ("fx", "fy", "cx", "cy")]
-        + [(f"{n}_weight", ctypes.c_float) for n in ("color", "normal", "smooth_x", "smooth_y", "alpha", "metallic")]
-        + [(n, ctypes.c_void_p) for n in ("photo", "clipped", "by_clipped")]
-        + [(n, ctypes.c_void_p) for n in ("by_color", "by_normal", "by_depth", "by_alpha", "by_material", "slopes")]
-        + [(n, ctypes.c_void_p) for n in ("sums", "scratch")]
-        + [("shared", Shared)]
+        *((n, ctypes.c_int64) for n in ("width", "height")),
+        *(
+            (n, ctypes.c_void_p)
+            for n in ("color", "normal", "depth", "alpha", "material", "image", "mask", "background")
+        ),
+        ("rotation", ctypes.c_float * 9),
+        *((n, ctypes.c_float) for n in ("across", "down", "left", "top")),
+        *((f"{n}_weight", ctypes.c_float) for n in ("color", "normal", "smooth_x", "smooth_y", "alpha", "metallic")),
+        *((n, ctypes.c_void_p) for n in ("photo", "clipped", "by_clipped")),
+        *((f"by_{n}", ctypes.c_void_p) for n in ("color", "normal", "depth", "alpha", "material")),
+        *((n, ctypes.c_void_p) for n in ("slopes", "totals", "sums", "scratch")),
+        ("shared", Shared),
     )
 
 
@@ -43,57 +64,60 @@ class _Maps(torch.autograd.Function):
     """The terms that a rendering's maps say, but the light's; the derivatives are had with the value."""
 
     @staticmethod
-    def forward(ctx, color, normal, depth, alpha, material, view, background, weights, progress):
-        library, camera, (height, width) = kernels(), view.camera, alpha.shape
+    def forward(ctx, color, normal, depth, alpha, material, photo, background, weights, progress):
+        camera, (height, width) = photo.camera, alpha.shape
         inputs = {"color": color, "normal": normal, "depth": depth, "alpha": alpha}
         if material is not None:
             inputs["material"] = material
         numbers = {"color": (3,), "normal": (3,), "material": (5,)}
-        check(**{name: (value, (height, width, *numbers.get(name, ()))) for name, value in inputs.items()})
-        if {view.image.shape[:2], (view.image if view.alpha is None else view.alpha).shape[:2]} != {alpha.shape}:
-            raise ValueError(f"{camera.name}: the photo and its mask must be of the rendering's size, {width}×{height}")
+        shapes = {name: (value, (height, width, *numbers.get(name, ()))) for name, value in inputs.items()}
+        check(**shapes, background=(background, (3,)))
         inputs = {name: value.contiguous() for name, value in inputs.items()}
         color = inputs["color"]
+        codes = {"image": photo.image} | ({} if photo.mask is None else {"mask": photo.mask})
+        for value in codes.values():
+            if value.shape[:2] != alpha.shape or value.dtype != torch.uint8 or value.device != color.device:
+                raise ValueError(
+                    f"{camera.name}: the photo and its mask must be uint8 on {color.device}, of the rendering's size, "
+                    f"{width}×{height}; got {value.dtype} {tuple(value.shape)} on {value.device}"
+                )
         gradients = {f"by_{name}": torch.empty_like(value) for name, value in inputs.items()}
         buffers = {"photo": torch.empty_like(color), "clipped": torch.empty_like(color)}
-        buffers["slopes"] = torch.empty(4, height, width)
-        buffers["sums"] = sums = torch.zeros(height, library.refgs_losses_sums(), dtype=torch.float64)
-        buffers["image"] = torch.from_numpy(view.image)
-        if view.alpha is not None:
-            buffers["mask"] = torch.from_numpy(view.alpha)
+        buffers["slopes"] = color.new_empty(4, height, width)
+        blocks = -(-width // TILE[0]) * -(-height // TILE[1])
+        sums = color.new_empty(2, blocks if load.on_gpu(color) else height, SUMS, dtype=torch.float64)
 
-        work = _Work(width=width, height=height, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
-        work.background[:] = background.tolist()
+        work = _Work(width=width, height=height)
         work.rotation[:] = camera.world_to_camera[:3, :3].reshape(-1).tolist()
+        work.across, work.left = 1 / camera.fx, (0.5 - camera.cx) / camera.fx
+        work.down, work.top = 1 / camera.fy, (0.5 - camera.cy) / camera.fy
         work.color_weight = (1 - weights.dssim) / color.numel()
         work.normal_weight = weights.normal / max((height - 2) * (width - 2), 1)
         work.smooth_x_weight = weights.smooth / max(height * (width - 1), 1)
         work.smooth_y_weight = weights.smooth / max((height - 1) * width, 1)
         work.alpha_weight = weights.alpha / alpha.numel()
-        work.attach(**inputs, **gradients, **buffers)
-        parallel(library.refgs_losses_first, work)
+        work.metallic_weight = weights.metallic * progress**2
+        work.attach(**inputs, **codes, background=background, **gradients, **buffers, sums=sums[0])
+        run("refgs_losses_first", work, color, items=blocks * cuda.BLOCK)
 
-        structure = torch.zeros(())
+        totals = sums[0].sum(dim=0)
         if weights.dssim > 0:
-            with torch.enable_grad():
-                clipped = buffers["clipped"].requires_grad_()
-                structure = dssim(clipped, buffers["photo"])
-                (by_clipped,) = torch.autograd.grad(structure, clipped, torch.tensor(weights.dssim))
+            structure, by_clipped = dssim(buffers["clipped"], buffers["photo"], weights.dssim)
         else:
-            by_clipped = torch.zeros_like(color)
-        metallic, covered, squares = sums[:, 1:].sum(dim=0).tolist()
-        work.metallic_weight = weights.metallic * progress**2 / max(covered, 1)
-        work.attach(by_clipped=by_clipped)
-        parallel(library.refgs_losses_second, work)
+            structure, by_clipped = 0.0, torch.zeros_like(color)
+        work.attach(by_clipped=by_clipped, totals=totals, sums=sums[1])
+        run("refgs_losses_second", work, color, items=blocks * cuda.BLOCK)
+        loss, _, squares = totals + sums[1].sum(dim=0)
+        psnr = -10 * torch.log10((squares / color.numel()).clamp_min(1e-10))
         ctx.gradients = list(gradients.values()) + [None] * (material is None)
-        psnr = -10 * math.log10(max(squares / color.numel(), 1e-10))
-        value = float(sums[:, 0].sum()) + work.metallic_weight * metallic + weights.dssim * float(structure)
-        return torch.tensor(value), psnr
+        ctx.mark_non_differentiable(psnr)
+        return (loss + weights.dssim * structure).float(), psnr
 
     @staticmethod
     @once_differentiable
     def backward(ctx, by_loss, _):
-        scaled = ctx.gradients if by_loss == 1 else [None if g is None else by_loss * g for g in ctx.gradients]
+        one = not load.on_gpu(by_loss) and by_loss == 1  # nearly always, but a card would have to wait to know
+        scaled = ctx.gradients if one else [None if g is None else by_loss * g for g in ctx.gradients]
         return *scaled, None, None, None, None
 
 
@@ -110,7 +134,7 @@ def light_loss(environment: Environment) -> Tensor:
 def objective(
     rendering: Rendering,
     environment: Environment | None,
-    view: LoadedView,
+    photo: Photo,
     background: Tensor,
     weights: LossSettings,
     progress: float,
@@ -128,7 +152,7 @@ def objective(
     """
     material = rendering.material if weights.metallic > 0 else None
     maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material
-    loss, psnr = _Maps.apply(*maps, view, background, weights, progress)
+    loss, psnr = _Maps.apply(*maps, photo, background, weights, progress)
     if environment is not None and weights.light > 0:
         loss = loss + weights.light * light_loss(environment)
     return Objective(loss, psnr)

@@ -24,7 +24,7 @@ from refgs.settings import Settings
 from refgs.train import checkpoint
 from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify, thin
-from refgs.train.losses import objective
+from refgs.train.losses import Photo, objective
 from refgs.train.start import start_parameters
 
 Report = Callable[[str, dict[str, Any]], None]
@@ -41,10 +41,10 @@ LEAST_SURFELS = 1000
 
 def composite(view: LoadedView, background: Tensor) -> Tensor:
     """The photo over the background, sRGB-encoded float (H, W, 3) in 0..1."""
-    image = torch.from_numpy(view.image).float() / 255
+    image = torch.from_numpy(view.image).to(background.device).float() / 255
     if view.alpha is None:
         return image
-    alpha = torch.from_numpy(view.alpha).float()[..., None] / 255
+    alpha = torch.from_numpy(view.alpha).to(background.device).float()[..., None] / 255
     return image * alpha + background * (1 - alpha)
 
 
@@ -73,6 +73,7 @@ class Trainer:
         self.views = [load_view(view, side) for view in capture.train_views]
         self.test = [load_view(view, side) for view in capture.test_views]
         self.background = torch.tensor(settings.image.background, device=self.device)
+        self.photos = [Photo.of(view, self.device) for view in self.views]
         self.near = near_plane(capture.radius)
         self.iteration, self.seconds = 0, 0.0
 
@@ -144,7 +145,7 @@ class Trainer:
     def step(self) -> dict[str, Tensor]:
         """One iteration. Returns its loss and PSNR, which are still being computed where there is a card."""
         settings = self.settings
-        view = self._next_view()
+        photo = self._next_photo()
         progress = min(self.iteration / self.total, 1.0)
         decay = settings.rates.decay**progress
         frozen = (
@@ -154,11 +155,11 @@ class Trainer:
             group["lr"] = 0.0 if frozen and group["name"] in GEOMETRY else group["rate"] * decay
 
         surfels, environment = self.surfels(), self.environment()
-        rendering = self._render(surfels, environment, view.camera)
-        loss, quality = objective(rendering, environment, view, self.background, settings.loss, progress)
+        rendering = self._render(surfels, environment, photo.camera)
+        loss, quality = objective(rendering, environment, photo, self.background, settings.loss, progress)
         loss.backward()
         position = self.parameters["position"]
-        self.motion.add(position.detach(), position.grad, view.camera)
+        self.motion.add(position.detach(), position.grad, photo.camera)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.iteration += 1
@@ -168,13 +169,13 @@ class Trainer:
             self._trace()
         return {"loss": loss.detach(), "psnr": quality}
 
-    def _next_view(self) -> LoadedView:
+    def _next_photo(self) -> Photo:
         """Every view once an epoch, in an order that depends on the seed and the epoch alone, so that a resumed run goes on alike."""
         epoch, place = divmod(self.iteration, len(self.views))
         order = torch.randperm(
             len(self.views), generator=torch.Generator().manual_seed(self.settings.train.seed * 1_000_003 + epoch)
         )
-        return self.views[int(order[place])]
+        return self.photos[int(order[place])]
 
     def _densify(self, progress: float) -> None:
         settings = self.settings.densify
