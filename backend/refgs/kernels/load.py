@@ -12,6 +12,7 @@ from pathlib import Path
 
 import torch
 
+from refgs import CORES
 from refgs.errors import InputError
 from refgs.kernels import cuda
 from refgs.kernels.build import build, cache_folder, target
@@ -138,18 +139,12 @@ def borrow(name: str, count: int) -> torch.Tensor:
     return memory
 
 
-@functools.cache
-def cores() -> int:
-    """How many threads can run at once here."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0) -> None:
     """Call `function(&work)` on as many threads at once as torch has, but no more than there are cores.
 
     They share the work through `work.shared`. Each thread gets `scratch` floats of `work.scratch`.
     """
-    threads = min(torch.get_num_threads(), cores())
+    threads = min(torch.get_num_threads(), CORES)
     memory = borrow("scratch", threads * scratch)
     work.scratch = memory.data_ptr()
     work.shared = Shared()
