@@ -169,10 +169,9 @@ def frame_table(device: torch.device, splats: int = FRAMES[0], side: int = FRAME
     """Print frames a second of the whole renderer, deferred shading and all."""
     (positions, rotations, scales, opacities, _), camera = make_ball(splats, side, side, device)
     one = torch.ones(splats, device=device)
-    none = torch.zeros(splats, 1, 3, device=device)
-    surfels = Surfels(
-        positions, rotations, scales, opacities, none, 0.7 * one[:, None].expand(-1, 3), one, 0.3 * one, none
-    )
+    none = [torch.zeros(splats, count, 3, device=device) for count in (1, 0)]
+    materials = 0.7 * one[:, None].expand(-1, 3), one, 0.3 * one
+    surfels = Surfels(positions, rotations, scales, opacities, *none, *materials, *none)
     background, settings = torch.ones(3, device=device), load_settings("standard").render
     with torch.no_grad():
         light = Environment(torch.rand(6 * 128**2, 3, device=device))

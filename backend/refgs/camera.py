@@ -1,6 +1,7 @@
 """A pinhole camera, in OpenCV's convention."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -22,7 +23,7 @@ class Camera:
     cy: float
     world_to_camera: np.ndarray
 
-    @property
+    @cached_property
     def camera_to_world(self) -> np.ndarray:
         """4×4 rigid matrix; its columns are the camera's right, down and forward axes and its position."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
@@ -31,7 +32,7 @@ class Camera:
         matrix[:3, 3] = -rotation.T @ translation
         return matrix
 
-    @property
+    @cached_property
     def position(self) -> np.ndarray:
         """The camera's centre in the world, (3,)."""
         return self.camera_to_world[:3, 3]

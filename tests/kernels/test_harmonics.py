@@ -33,12 +33,12 @@ def test_matches_reference(mirrored, coefficients, device):
     values, positions, normals = surfels(coefficients)
     camera, normals = scenes.camera(40, 30), normals if mirrored else None
     exact, basis = expected(values, 0.5, positions, camera, normals)
-    values = values.to(device).requires_grad_()
+    constant, rest = (v.to(device).contiguous().requires_grad_() for v in values.split([1, coefficients - 1], dim=1))
     placed = None if normals is None else normals.to(device)
-    color = directional(values, 0.5, positions.to(device), camera, placed)
+    color = directional(constant, rest, 0.5, positions.to(device), camera, placed)
     assert (color.cpu() - exact.clamp_min(0)).abs().max() / exact.abs().max() <= 1e-5
     upstream = torch.randn(color.shape, generator=torch.Generator().manual_seed(1))
-    (by,) = torch.autograd.grad(color, values, upstream.to(device))
+    by = torch.cat(torch.autograd.grad(color, [constant, rest], upstream.to(device)), dim=1)
     exact_by = basis[..., None] * (upstream * (exact > 0))[:, None]
     assert (by.cpu() - exact_by).abs().max() / exact_by.abs().max() <= 1e-4
 
@@ -48,8 +48,8 @@ def test_same_bits_for_any_number_of_threads():
     camera = scenes.camera(40, 30)
 
     def all_of_it():
-        leaf = values.clone().requires_grad_()
-        color = directional(leaf, 0.0, positions, camera, normals)
+        leaf = [v.clone().requires_grad_() for v in (values[:, :1], values[:, 1:])]
+        color = directional(*leaf, 0.0, positions, camera, normals)
         return [color.detach(), *torch.autograd.grad(color.sum(), leaf)]
 
     scenes.check_same_bits_for_any_number_of_threads(all_of_it)
@@ -65,6 +65,8 @@ def test_light_from_the_object_turns_with_it():
     x, y, z = torch.einsum("ab,nbc->nac", turn, vector).unbind(dim=1)
     turned = torch.stack([values[:, 0], -y, z, -x], dim=1)
     middle = torch.from_numpy(camera.position).float()  # about the camera, which then need not turn
-    before = directional(values, 0.5, positions, camera, normals)
-    after = directional(turned, 0.5, (positions - middle) @ turn.T + middle, camera, normals @ turn.T)
+    before = directional(values[:, :1], values[:, 1:], 0.5, positions, camera, normals)
+    after = directional(
+        turned[:, :1], turned[:, 1:], 0.5, (positions - middle) @ turn.T + middle, camera, normals @ turn.T
+    )
     torch.testing.assert_close(before, after, atol=1e-5, rtol=0)

@@ -7,12 +7,13 @@ constexpr int MOST = 16;  // coefficients a colour, at degree 3
 
 struct Harmonics {
   int64_t count, coefficients;
-  const float *values, *positions, *normals;  // (count, coefficients, 3), (count, 3), (count, 3) or null
+  const float *constant, *rest;               // (count, 1, 3), (count, coefficients - 1, 3)
+  const float *positions, *normals;           // (count, 3), (count, 3) or null
   double camera[3];
   float offset;
   float* color;  // (count, 3)
   const float* by_color;
-  float* by_values;
+  float *by_constant, *by_rest;
   float* scratch;  // none is used
   mutable Shared shared;
 };
@@ -60,19 +61,21 @@ void each(const Harmonics* h, Body body) {
 
 KERNEL(refgs_harmonics_forward, Harmonics, h) {
   each(h, [&](int64_t i, const float* y) {
-    const float* v = h->values + 3 * h->coefficients * i;
-    float sum[3] = {h->offset, h->offset, h->offset};
-    for (int64_t k = 0; k < h->coefficients; k++)
-      for (int c = 0; c < 3; c++) sum[c] += y[k] * v[3 * k + c];
+    const float *v = h->constant + 3 * i, *rest = h->rest + 3 * (h->coefficients - 1) * i;
+    float sum[3];
+    for (int c = 0; c < 3; c++) sum[c] = h->offset + y[0] * v[c];
+    for (int64_t k = 1; k < h->coefficients; k++)
+      for (int c = 0; c < 3; c++) sum[c] += y[k] * rest[3 * (k - 1) + c];
     for (int c = 0; c < 3; c++) h->color[3 * i + c] = sum[c] > 0 ? sum[c] : 0;
   });
 }
 
 KERNEL(refgs_harmonics_backward, Harmonics, h) {
   each(h, [&](int64_t i, const float* y) {
-    float by[3], *to = h->by_values + 3 * h->coefficients * i;
+    float by[3], *rest = h->by_rest + 3 * (h->coefficients - 1) * i;
     for (int c = 0; c < 3; c++) by[c] = h->color[3 * i + c] > 0 ? h->by_color[3 * i + c] : 0;
-    for (int64_t k = 0; k < h->coefficients; k++)
-      for (int c = 0; c < 3; c++) to[3 * k + c] = y[k] * by[c];
+    for (int c = 0; c < 3; c++) h->by_constant[3 * i + c] = y[0] * by[c];
+    for (int64_t k = 1; k < h->coefficients; k++)
+      for (int c = 0; c < 3; c++) rest[3 * (k - 1) + c] = y[k] * by[c];
   });
 }

@@ -21,18 +21,21 @@ indirect_rest as the SH."""
 class Surfels(NamedTuple):
     """Activated values of N surfels: world units, linear Rec.709 albedo, materials in 0..1, SH with colour = 0.5 + SH.
 
-    `indirect` (N, K, 3) are harmonics of the linear radiance that reaches a surfel from the object itself (paper Eq. 10).
+    SH are taken apart into their constant (N, 1, 3) and the rest (N, K − 1, 3), as they are learned. `indirect` are those of
+    the linear radiance that reaches a surfel from the object itself (paper Eq. 10).
     """
 
     positions: Tensor
     rotations: Tensor
     scales: Tensor
     opacities: Tensor
-    sh: Tensor
+    sh_dc: Tensor
+    sh_rest: Tensor
     albedo: Tensor
     metallic: Tensor
     roughness: Tensor
-    indirect: Tensor
+    indirect_dc: Tensor
+    indirect_rest: Tensor
 
     def normals(self) -> Tensor:
         """Unit normals t_u × t_v (N, 3): the third column of each rotation."""
@@ -98,11 +101,13 @@ def activate(p: Parameters) -> Surfels:
         rotations=p["rotation"],
         scales=scales,
         opacities=opacities,
-        sh=torch.cat([p["sh_dc"], p["sh_rest"]], dim=1),
+        sh_dc=p["sh_dc"],
+        sh_rest=p["sh_rest"],
         albedo=albedo,
         metallic=metallic,
         roughness=roughness,
-        indirect=torch.cat([p["indirect_dc"], p["indirect_rest"]], dim=1),
+        indirect_dc=p["indirect_dc"],
+        indirect_rest=p["indirect_rest"],
     )
 
 
@@ -157,15 +162,17 @@ def initial_parameters(
 def to_splats(surfels: Surfels) -> Splats:
     """The asset's table, as `splats.ply` stores it."""
     with torch.no_grad():
-        rotations = torch.nn.functional.normalize(surfels.rotations, dim=-1)
-        return Splats(
-            normals=surfels.normals().numpy(force=True),
-            **{
-                name: value.numpy(force=True) for name, value in surfels._replace(rotations=rotations)._asdict().items()
-            },
-        )
+        values = surfels._asdict() | {"normals": surfels.normals()}
+        values["rotations"] = torch.nn.functional.normalize(surfels.rotations, dim=-1)
+        for name in ("sh", "indirect"):
+            values[name] = torch.cat([values.pop(f"{name}_dc"), values.pop(f"{name}_rest")], dim=1)
+        return Splats(**{name: value.numpy(force=True) for name, value in values.items()})
 
 
 def from_splats(splats: Splats) -> Surfels:
     """The values to render, from the asset's table."""
-    return Surfels(*(torch.from_numpy(np.ascontiguousarray(getattr(splats, name))) for name in Surfels._fields))
+    values = {name: getattr(splats, name) for name in Surfels._fields if hasattr(splats, name)}
+    for name in ("sh", "indirect"):
+        coefficients = getattr(splats, name)
+        values |= {f"{name}_dc": coefficients[:, :1], f"{name}_rest": coefficients[:, 1:]}
+    return Surfels(**{name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in values.items()})

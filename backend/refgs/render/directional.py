@@ -15,20 +15,20 @@ class _Work(Work):
 
     _fields_ = (
         [(n, ctypes.c_int64) for n in ("count", "coefficients")]
-        + [(n, ctypes.c_void_p) for n in ("values", "positions", "normals")]
+        + [(n, ctypes.c_void_p) for n in ("constant", "rest", "positions", "normals")]
         + [("camera", ctypes.c_double * 3), ("offset", ctypes.c_float)]
-        + [(n, ctypes.c_void_p) for n in ("color", "by_color", "by_values", "scratch")]
+        + [(n, ctypes.c_void_p) for n in ("color", "by_color", "by_constant", "by_rest", "scratch")]
         + [("shared", Shared)]
     )
 
 
 class _Directional(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, coefficients, offset, positions, normals, camera):
-        inputs = {"values": coefficients.contiguous(), "positions": positions.contiguous()}
+    def forward(ctx, constant, rest, offset, positions, normals, camera):
+        inputs = {"constant": constant.contiguous(), "rest": rest.contiguous(), "positions": positions.contiguous()}
         if normals is not None:
             inputs["normals"] = normals.contiguous()
-        work = _Work(count=coefficients.shape[0], coefficients=coefficients.shape[1], offset=offset)
+        work = _Work(count=len(positions), coefficients=1 + rest.shape[1], offset=offset)
         work.camera[:] = camera.position.tolist()
         color = torch.empty_like(inputs["positions"])
         work.attach(**inputs, color=color)
@@ -40,21 +40,25 @@ class _Directional(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, by_color):
-        by_color, by_values = by_color.contiguous(), torch.empty_like(ctx.saved_tensors[0])
-        ctx.work.attach(by_color=by_color, by_values=by_values)
+        by_color, (constant, rest, *_) = by_color.contiguous(), ctx.saved_tensors
+        by_constant, by_rest = torch.empty_like(constant), torch.empty_like(rest)
+        ctx.work.attach(by_color=by_color, by_constant=by_constant, by_rest=by_rest)
         run("refgs_harmonics_backward", ctx.work, by_color, items=ctx.work.count)
-        return by_values, None, None, None, None
+        return by_constant, by_rest, None, None, None, None
 
 
 def directional(
-    coefficients: Tensor, offset: float, positions: Tensor, camera: Camera, normals: Tensor | None = None
+    constant: Tensor, rest: Tensor, offset: float, positions: Tensor, camera: Camera, normals: Tensor | None = None
 ) -> Tensor:
-    """Colour (N, 3) = max(0, offset + Σ_k c_k Y_k(d)) of surfels at `positions` (N, 3), from `coefficients` (N, K, 3) of
-    the harmonics in `refgs.model.harmonics`, K = (degree + 1)². d is the direction from the camera; with unit `normals`
-    (N, 3), it mirrored at the surfel (paper Eq. 10). float32; differentiable in the coefficients alone.
+    """Colour (N, 3) = max(0, offset + Σ_k c_k Y_k(d)) of surfels at `positions` (N, 3). The coefficients of the harmonics in
+    `refgs.model.harmonics` are the `constant` (N, 1, 3) and the `rest` (N, K − 1, 3), K = (degree + 1)². d is the direction
+    from the camera; with unit `normals` (N, 3), it mirrored at the surfel (paper Eq. 10). float32; differentiable in the
+    coefficients alone.
     """
-    if coefficients.shape not in [(len(positions), k, 3) for k in (1, 4, 9, 16)]:
-        raise ValueError(f"expected harmonics of {len(positions)} surfels, got {tuple(coefficients.shape)}")
+    count = len(positions)
+    if constant.shape != (count, 1, 3) or rest.shape not in [(count, k - 1, 3) for k in (1, 4, 9, 16)]:
+        found = f"{tuple(constant.shape)} and {tuple(rest.shape)}"
+        raise ValueError(f"expected harmonics of {count} surfels, got {found}")
     return _Directional.apply(
-        coefficients, offset, positions.detach(), None if normals is None else normals.detach(), camera
+        constant, rest, offset, positions.detach(), None if normals is None else normals.detach(), camera
     )

@@ -104,9 +104,10 @@ def render(
     if deferred:
         parts += [surfels.albedo, surfels.metallic, surfels.roughness]
     if not deferred or settings.diffuse == "sh":
-        parts.append(directional(surfels.sh, 0.5, surfels.positions, camera))
+        parts.append(directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera))
     if deferred and occluder is not None:
-        parts.append(directional(surfels.indirect, 0.0, surfels.positions, camera, normals))
+        indirect = surfels.indirect_dc, surfels.indirect_rest
+        parts.append(directional(*indirect, 0.0, surfels.positions, camera, normals))
     if deferred:
         parts.append(surfels.positions)
     geometry = surfels.positions, surfels.rotations, surfels.scales, surfels.opacities

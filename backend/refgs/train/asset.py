@@ -27,7 +27,7 @@ def write_asset(trainer: Trainer) -> None:
     if trainer.occluder is not None:
         write_mesh(folder / OCCLUDER, trainer.occluder.mesh)
     else:
-        surfels = surfels._replace(indirect=surfels.indirect[:, :0])
+        surfels = surfels._replace(indirect_dc=surfels.indirect_dc[:, :0], indirect_rest=surfels.indirect_rest[:, :0])
     surfels, unseen = _facing_outward(surfels, trainer)
     write_splats(folder / "splats.ply", to_splats(surfels))
     write_text(folder / "needs.json", json.dumps(_left_out(trainer, unseen), indent=1))
@@ -42,11 +42,11 @@ def _with_relightable_albedo(surfels: Surfels, environment: Environment, diffuse
     received = environment.diffuse(surfels.normals()).clamp_min(1e-6)
     metallic = surfels.metallic[:, None]
     if diffuse == "sh":
-        sent = (0.5 + harmonics.DC * surfels.sh[:, 0]).clamp_min(0)  # the mean over all directions
+        sent = (0.5 + harmonics.DC * surfels.sh_dc[:, 0]).clamp_min(0)  # the mean over all directions
         albedo = metallic * surfels.albedo + (1 - metallic) * (sent / received).clamp(0, 1)
         return surfels._replace(albedo=albedo)
     look = srgb_encode((surfels.albedo * received).clamp(0, 1))
-    return surfels._replace(sh=((look - 0.5) / harmonics.DC)[:, None])
+    return surfels._replace(sh_dc=((look - 0.5) / harmonics.DC)[:, None], sh_rest=surfels.sh_rest[:, :0])
 
 
 def _facing_outward(surfels: Surfels, trainer: Trainer) -> tuple[Surfels, int]:

@@ -76,6 +76,7 @@ class Trainer:
         self.photos = [Photo.of(view, self.device) for view in self.views]
         self.near = near_plane(capture.radius)
         self.iteration, self.seconds = 0, 0.0
+        self._order: tuple[int, list[int]] = (-1, [])
 
         start, source = start_parameters(capture, self.views, settings)
         self.parameters = {name: value.to(self.device).requires_grad_() for name, value in start.items()}
@@ -117,7 +118,7 @@ class Trainer:
         """The activated surfels, with what does not learn filled in."""
         count = len(self.parameters["position"])
         values = activate({**self.parameters, **self.constant})
-        return Surfels(*(value.expand(count, *value.shape[1:]) for value in values))
+        return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
 
     def environment(self) -> Environment | None:
         """The light as it is now; none where nothing is lit."""
@@ -161,7 +162,7 @@ class Trainer:
         position = self.parameters["position"]
         self.motion.add(position.detach(), position.grad, photo.camera)
         self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
+        self._forget_gradients()
         self.iteration += 1
         self._densify(progress)
         due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
@@ -169,13 +170,17 @@ class Trainer:
             self._trace()
         return {"loss": loss.detach(), "psnr": quality}
 
+    def _forget_gradients(self) -> None:
+        for group in self.optimizer.param_groups:
+            group["params"][0].grad = None
+
     def _next_photo(self) -> Photo:
         """Every view once an epoch, in an order that depends on the seed and the epoch alone, so that a resumed run goes on alike."""
         epoch, place = divmod(self.iteration, len(self.views))
-        order = torch.randperm(
-            len(self.views), generator=torch.Generator().manual_seed(self.settings.train.seed * 1_000_003 + epoch)
-        )
-        return self.photos[int(order[place])]
+        if self._order[0] != epoch:
+            generator = torch.Generator().manual_seed(self.settings.train.seed * 1_000_003 + epoch)
+            self._order = epoch, torch.randperm(len(self.views), generator=generator).tolist()
+        return self.photos[self._order[1][place]]
 
     def _densify(self, progress: float) -> None:
         settings = self.settings.densify
@@ -267,7 +272,7 @@ class Trainer:
                     raise InputError(
                         "the card's memory is too small: close what else uses it, or take --device cpu"
                     ) from None
-            self.optimizer.zero_grad(set_to_none=True)
+            self._forget_gradients()
             thin(self.parameters, self.optimizer, self.budget)
             self.motion = ScreenGradient(self.budget, self.device)
             torch.cuda.empty_cache()
