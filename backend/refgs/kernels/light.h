@@ -69,12 +69,7 @@ struct Lookup {
       Mask across = side[i] + 2, down = face * across + convert<Mask>(row);
       store(cell[i], start[i] + down * across + convert<Mask>(column)), store(width[i], across), store(line[i], first_line[i] + down);
       Vector top[8], bottom[8], share = i ? fraction : 1.0f - fraction;  // two cells each
-      auto cells = [&](int lines) {
-        return [&levels, this, i, lines](int k, int b) {
-          return Blocks<8>::get(levels.cells + 4 * ((int64_t)cell[i][k] + lines * width[i][k]) + Blocks<8>::at(b));
-        };
-      };
-      to_lanes<8>(cells(0), top), to_lanes<8>(cells(1), bottom);
+      two_cells(levels, i, 0, top), two_cells(levels, i, 1, bottom);
       for (int c = 0; c < 3; c++) {
         Vector across_top = top[4 + c] - top[c], across_bottom = bottom[4 + c] - bottom[c];
         Vector above = top[c] + x[i] * across_top, down = bottom[c] + x[i] * across_bottom - above;
@@ -112,6 +107,17 @@ struct Lookup {
 
  private:
   MEMBER Vector choose(Vector if_x, Vector if_y, Vector if_z) const { return select(on_x, if_x, select(on_y, if_y, if_z)); }
+
+  // Of those of level i, in the first line or in the second.
+  MEMBER void two_cells(const Levels& levels, int i, int second, Vector (&v)[8]) const {
+    auto at = [&](int k) { return levels.cells + 4 * ((int64_t)cell[i][k] + second * width[i][k]); };
+#ifdef __CUDACC__
+    Four one = ((const Four*)at(0))[0], other = ((const Four*)at(0))[1];
+    for (int c = 0; c < 4; c++) v[c] = one[c], v[4 + c] = other[c];
+#else
+    to_lanes<8>([&](int k, int b) { return Blocks<8>::get(at(k) + Blocks<8>::at(b)); }, v);
+#endif
+  }
 
   // The cell of the padded face, and how far along it.
   static MEMBER Vector along(Vector s, Vector half, Vector side, Vector& at) {
@@ -165,8 +171,8 @@ struct ReflectanceTable {
     store(first, convert<Mask>(row) * (int32_t)side + convert<Mask>(column));
     x -= column, y -= row;
     Vector top[4], bottom[4];  // two cells each
-    to_lanes<4>([&](int k, int b) { return Blocks<4>::get(table + 2 * first[k] + b); }, top);
-    to_lanes<4>([&](int k, int b) { return Blocks<4>::get(table + 2 * (first[k] + side) + b); }, bottom);
+    to_lanes<4>([&](int k, int b) { return Blocks<4>::get(table + 2 * first[k] + Blocks<4>::at(b)); }, top);
+    to_lanes<4>([&](int k, int b) { return Blocks<4>::get(table + 2 * (first[k] + side) + Blocks<4>::at(b)); }, bottom);
     for (int i = 0; i < 2; i++) {
       Vector across_top = top[2 + i] - top[i], across_bottom = bottom[2 + i] - bottom[i];
       Vector above = top[i] + x * across_top, down = bottom[i] + x * across_bottom - above;

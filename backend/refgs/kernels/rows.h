@@ -31,19 +31,21 @@ struct Blocks {
   static constexpr int at(int block) { return block * WIDTH + WIDTH <= N || N < WIDTH ? block * WIDTH : N - WIDTH; }
 
   static MEMBER Numbers get(const float* p) {
-#ifndef __CUDACC__
-    if constexpr (N < WIDTH && WIDTH == LANES) return read(p, N);
-#endif
+#ifdef __CUDACC__
+    return *p;
+#else
+    if constexpr (N < WIDTH) return read(p, N);
     Numbers v;
     __builtin_memcpy(&v, p, sizeof v);
     return v;
-  }
-  static MEMBER void put(float* p, Numbers v) {
-#ifndef __CUDACC__
-    if constexpr (N < WIDTH && WIDTH == LANES) return write(p, v, N);
 #endif
+  }
+#ifndef __CUDACC__
+  static MEMBER void put(float* p, Numbers v) {
+    if constexpr (N < WIDTH) return write(p, v, N);
     __builtin_memcpy(p, &v, sizeof v);
   }
+#endif
 };
 
 #ifndef __CUDACC__
@@ -134,6 +136,7 @@ struct Rows {
   MEMBER Numbers get(int k, int b) const { return *(const Numbers*)row[b][k]; }
   MEMBER void set(int k, int b, Numbers v) { *(Numbers*)row[b][k] = v; }
 
+#ifndef __CUDACC__
   // to[c] += weight * number c of pixel k.
   MEMBER void add(int k, float weight, float* to) const {
 #pragma unroll
@@ -142,4 +145,5 @@ struct Rows {
       Blocks<N>::put(p, Blocks<N>::get(p) + weight * get(k, b));
     }
   }
+#endif
 };

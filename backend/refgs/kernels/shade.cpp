@@ -2,6 +2,7 @@
 //
 // Pixels that nothing covers cost nothing: the others are taken LANES at a time, wherever they lie. The CPU works on the picture in
 // chunks of rows whose size does not depend on the threads, and sums are taken in the chunks' order, so neither does any result.
+// With CUDA, where a thread has a pixel, what many add to is summed up in integers: in whatever order, the sum is the same.
 #include "light.h"
 
 namespace {
@@ -16,7 +17,8 @@ constexpr int NORMAL = 0, ALBEDO = 3, METALLIC = 6, ROUGHNESS = 7;  // channels;
 struct Shade {
   int64_t width, height, channels, chunk_rows;
   float view[12];  // world to camera, 3x4, row-major
-  float fx, fy, cx, cy, background[3];
+  float fx, fy, cx, cy;
+  const float* background;        // (3)
   int64_t harmonics;              // whether there are channels of colour by direction
   const float *features, *alpha;  // (height, width, channels), (height, width): sums over a pixel's splats
   const float* visibility;        // (height, width): 0 where the object itself stands in the mirror direction; or null
@@ -33,10 +35,13 @@ struct Shade {
   float *color, *normal, *material, *radiance;            // (height, width, 3 | 3 | 5 | 3)
   const float *by_color, *by_normal, *by_material;
   float *by_features, *by_alpha;
-  float *by_light, *by_irradiance;  // (texels, 3), (chunks, 27)
+  float *by_light, *by_irradiance;  // (texels, 3), (chunks or, with CUDA, blocks, 27)
   float *halo, *halo_alpha;         // (chunks, 2 HALO, width, channels), (chunks, 2 HALO, width): for rows above and below a chunk
   float* by_cells;                  // (chunks + 1, cells, 4): the last, their sum
   uint8_t* touched;                 // (chunks, 2 HALO + lines): the rows of those that a chunk has written
+  // With CUDA in place of those four, zero at first:
+  int64_t *map_sums, *cell_sums;    // (channels - 2, height, width), (cells, 3)
+  int32_t* largest;                 // (2): of the numbers that are added to each
   float* scratch;                   // none is used
   mutable Shared shared;
 };
@@ -58,7 +63,7 @@ struct Pixels {
 template <class Body>
 INLINE void each_covered(const Shade& s, int64_t i, int64_t end, Body body) {
   Pixels p;
-  int64_t y = i / s.width, x = i % s.width;
+  int64_t y = (int32_t)i / (int32_t)s.width, x = i - y * s.width;
   for (;;) {
     int n = 0;
     for (; i < end && n < LANES; i++) {
@@ -101,7 +106,86 @@ struct Corners {
   }
 };
 
-#ifndef __CUDACC__
+#ifdef __CUDACC__
+// What fixed-point numbers count, such that neither they nor their sums overflow: a power of two.
+struct Unit {
+  float per, size;  // how many make one; one of them
+
+  // For sums of up to 2^count numbers up to `largest`, the bits of a float. Where that is not finite no sum is a number.
+  Unit(int32_t largest, int count) {
+    int exponent = (largest >> 23) - 127;  // largest < 2^(exponent + 1)
+    int bits = 60 - count - exponent;
+    bits = bits < 126 ? bits : 126;
+    per = __int_as_float((127 + bits) << 23);
+    size = __int_as_float(exponent < 128 ? (127 - bits) << 23 : 0x7fc00000);
+  }
+};
+
+constexpr int SOURCES = 9;  // 2^9 > (2 HALO + 1)^2: the pixels that can add to one, each with weights of up to 1 in all
+
+// Of cells: all pixels may add to one, eight numbers each.
+int adders(const Shade& s) { return 3 + 64 - __clzll(s.width * s.height); }
+
+// The derivatives by the maps and by the light of a pixel: what it adds to others. A first pass takes the LARGEST of that in
+// magnitude, a second adds it.
+template <bool LARGEST>
+struct Contributions {
+  const Shade& s;
+  float map_scale, cell_scale;
+  int32_t largest_map = 0, largest_cell = 0;
+
+  Contributions(const Shade& s) : s(s) {
+    if (!LARGEST) map_scale = Unit(s.largest[0], SOURCES).per, cell_scale = Unit(s.largest[1], adders(s)).per;
+  }
+
+  template <int S>
+  void add_own(const Pixels& p, bool, const Vector (&by_own)[S], const Vector (&by_position)[3], Vector by_alpha) {
+    if (LARGEST) return;
+    float* to = s.by_features + (int64_t)p.at[0] * (S + 3);
+    for (int c = 0; c < S; c++) to[c] = by_own[c].value;
+    for (int i = 0; i < 3; i++) to[S + i] = by_position[i].value;
+    s.by_alpha[p.at[0]] = by_alpha.value;
+  }
+
+  template <int S>
+  void add_sampled(const Corners& c, int, const Vector (&by_sampled)[S], Vector by_there) {
+    Vector weight[4];
+    c.weights(weight);
+    for (int i = 0; i <= S; i++) {
+      float by = (i < S ? by_sampled[i] : by_there).value;
+      if (LARGEST) {
+        raise(largest_map, by);
+      } else {
+        int64_t* sums = s.map_sums + i * s.width * s.height;
+        for (int j = 0; j < 4; j++) add(sums + c.at(0, j), by * weight[j].value * map_scale);
+      }
+    }
+  }
+
+  void add_light(const Lookup<true>& l, int, const Vector (&by_light)[3]) {
+    Vector weight[2][4];
+    l.weights(weight);
+    for (int i = 0; i < 2; i++)
+      for (int j = 0; j < 4; j++)
+        for (int c = 0; c < 3; c++) {
+          float by = by_light[c].value * weight[i][j].value;
+          if (LARGEST)
+            raise(largest_cell, by);
+          else
+            add(s.cell_sums + 3 * (int64_t)(l.cell[i][0] + (j & 1) + (j & 2 ? l.width[i][0] : 0)) + c, by * cell_scale);
+        }
+  }
+
+ private:
+  static void raise(int32_t& largest, float v) {
+    int32_t bits = __float_as_int(v) & 0x7fffffff;  // in the order of the magnitudes, a NaN beyond all
+    largest = bits > largest ? bits : largest;
+  }
+  static void add(int64_t* to, float v) {
+    if (v != 0) atomicAdd((unsigned long long*)to, (unsigned long long)(int64_t)v);
+  }
+};
+#else
 typedef Wide<8>::type Eight;
 
 void zero(float* p, int64_t n) {
@@ -442,12 +526,32 @@ void mirrored_pixels(const Shade& s, int64_t first, int64_t end) {
 }
 
 template <bool HARMONICS, bool INDIRECT>
-void forward_pixels(const Shade& s, int64_t first, int64_t end) {
-  for (int64_t i = first; i < end; i++) {
-    for (int c = 0; c < 3; c++) s.color[3 * i + c] = s.background[c], s.normal[3 * i + c] = s.radiance[3 * i + c] = 0;
-    for (int c = 0; c < 5; c++) s.material[5 * i + c] = 0;
+struct Kind {
+  static void forward(const Shade& s, int64_t first, int64_t end) {
+    const float background[3] = {s.background[0], s.background[1], s.background[2]};
+    for (int64_t i = first; i < end; i++) {
+      for (int c = 0; c < 3; c++) s.color[3 * i + c] = background[c], s.normal[3 * i + c] = s.radiance[3 * i + c] = 0;
+      for (int c = 0; c < 5; c++) s.material[5 * i + c] = 0;
+    }
+    each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, false>(s, pixels).write(s); });
   }
-  each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, false>(s, pixels).write(s); });
+
+  // Into `sums`, and into by_irradiance, a sum a lane.
+  template <class Sums>
+  static void backward(const Shade& s, int64_t first, int64_t end, Sums& sums, Vector (&by_irradiance)[27]) {
+    each_covered(s, first, end, [&](const Pixels& pixels) {
+      Shaded<HARMONICS, INDIRECT, true>(s, pixels).backward(s, sums, by_irradiance);
+    });
+  }
+};
+
+// body(kind) of what the pixels are.
+template <class Body>
+void by_kind(const Shade& s, Body body) {
+  if (s.visibility)
+    s.harmonics ? body(Kind<true, true>()) : body(Kind<false, true>());
+  else
+    s.harmonics ? body(Kind<true, false>()) : body(Kind<false, false>());
 }
 
 // body(first, end) for all pixels, some at a time.
@@ -461,13 +565,50 @@ void share_pixels(const Shade& s, Body body) {
   });
 }
 
-template <bool HARMONICS, bool INDIRECT>
+#ifdef __CUDACC__
+// A thread a pixel.
+template <bool LARGEST>
+void backward_block(const Shade& s) {
+  int64_t pixels = s.width * s.height, i = (int64_t)blockIdx.x * blockDim.x + threadIdx.x;
+  Contributions<LARGEST> sums(s);
+  Vector by_irradiance[27] = {};
+  bool covered = i < pixels && s.alpha[i] > COVERED;
+  if (covered) by_kind(s, [&](auto kind) { kind.backward(s, i, i + 1, sums, by_irradiance); });
+  int lane = threadIdx.x % 32, warp = threadIdx.x / 32, warps = (blockDim.x + 31) / 32;
+  if (LARGEST) {
+    for (int step = 16; step; step /= 2) {
+      int32_t map = __shfl_xor_sync(~0u, sums.largest_map, step), cell = __shfl_xor_sync(~0u, sums.largest_cell, step);
+      sums.largest_map = map > sums.largest_map ? map : sums.largest_map;
+      sums.largest_cell = cell > sums.largest_cell ? cell : sums.largest_cell;
+    }
+    if (lane == 0 && sums.largest_map) atomicMax(s.largest, sums.largest_map);
+    if (lane == 0 && sums.largest_cell) atomicMax(s.largest + 1, sums.largest_cell);
+    return;
+  }
+  if (i < pixels && !covered) {
+    for (int64_t c = 0; c < s.channels; c++) s.by_features[i * s.channels + c] = 0;
+    s.by_alpha[i] = 0;
+  }
+  __shared__ float by_warp[32][27];
+  bool any = __any_sync(~0u, covered && !s.harmonics);
+  for (int k = 0; k < 27; k++) {
+    float sum = by_irradiance[k].value;
+    if (any)
+      for (int step = 16; step; step /= 2) sum += __shfl_xor_sync(~0u, sum, step);
+    if (lane == 0) by_warp[warp][k] = sum;
+  }
+  __syncthreads();
+  if (threadIdx.x < 27) {
+    float sum = 0;
+    for (int w = 0; w < warps; w++) sum += by_warp[w][threadIdx.x];
+    s.by_irradiance[(int64_t)blockIdx.x * 27 + threadIdx.x] = sum;
+  }
+}
+#else
 void backward_chunk(const Shade& s, int64_t index) {
   Chunk chunk(s, index);
   Vector by_irradiance[27] = {};
-  each_covered(s, chunk.first, chunk.end, [&](const Pixels& pixels) {
-    Shaded<HARMONICS, INDIRECT, true>(s, pixels).backward(s, chunk, by_irradiance);
-  });
+  by_kind(s, [&](auto kind) { kind.backward(s, chunk.first, chunk.end, chunk, by_irradiance); });
   for (int i = 0; i < 27; i++) s.by_irradiance[index * 27 + i] = total(by_irradiance[i]);
 }
 
@@ -496,15 +637,60 @@ void add_line(const Shade& s, int32_t line) {
   }
 }
 
+#endif
+
 constexpr int BATCH = 1024;  // cells or texels
 
 }  // namespace
 
-// The light's cells from its texels, and back.
+// The light's cells from its texels.
 KERNEL(refgs_shade_pad, Shade, s) {
   share(s->shared, s->cells, BATCH, [light = s->light, texel = s->texel, padded = s->padded](int64_t i) {
     const float* from = light + 3 * texel[i];
     *(Four*)(padded + 4 * i) = Four{from[0], from[1], from[2], 0};
+  });
+}
+
+KERNEL(refgs_shade_mirrored, Shade, s) {
+  share_pixels(*s, [&](int64_t first, int64_t end) {
+    s->channels == 14 ? mirrored_pixels<14>(*s, first, end) : mirrored_pixels<17>(*s, first, end);
+  });
+}
+
+KERNEL(refgs_shade_forward, Shade, s) {
+  share_pixels(*s, [&](int64_t first, int64_t end) { by_kind(*s, [&](auto kind) { kind.forward(*s, first, end); }); });
+}
+
+#ifdef __CUDACC__
+KERNEL(refgs_shade_largest, Shade, s) { backward_block<true>(*s); }
+KERNEL(refgs_shade_backward, Shade, s) { backward_block<false>(*s); }
+
+KERNEL(refgs_shade_gather, Shade, s) {
+  int64_t pixels = s->width * s->height, S = s->channels - 3;
+  float unit = Unit(s->largest[0], SOURCES).size;
+  share(s->shared, pixels, 1, [&](int64_t i) {
+    for (int64_t c = 0; c < S; c++) s->by_features[i * s->channels + c] += unit * (float)s->map_sums[c * pixels + i];
+    s->by_alpha[i] += unit * (float)s->map_sums[S * pixels + i];
+  });
+}
+
+KERNEL(refgs_shade_unpad, Shade, s) {
+  float unit = Unit(s->largest[1], adders(*s)).size;
+  share(s->shared, s->texels, BATCH, [&](int64_t i) {
+    int64_t sum[3] = {};
+    for (int32_t k = s->starts[i]; k < s->starts[i + 1]; k++)
+      for (int c = 0; c < 3; c++) sum[c] += s->cell_sums[3 * (int64_t)s->cell[k] + c];
+    for (int c = 0; c < 3; c++) s->by_light[3 * i + c] = unit * (float)sum[c];
+  });
+}
+#else
+KERNEL(refgs_shade_backward, Shade, s) {
+  share(s->shared, chunks(*s), 1, [&](int64_t k) { backward_chunk(*s, k); });
+}
+
+KERNEL(refgs_shade_gather, Shade, s) {
+  share(s->shared, s->height + s->lines, 8, [&](int64_t k) {
+    k < s->height ? add_halo(*s, k) : add_line(*s, (int32_t)(k - s->height));
   });
 }
 
@@ -517,27 +703,5 @@ KERNEL(refgs_shade_unpad, Shade, s) {
   });
 }
 
-KERNEL(refgs_shade_mirrored, Shade, s) {
-  auto* pixels = s->channels == 14 ? mirrored_pixels<14> : mirrored_pixels<17>;
-  share_pixels(*s, [&](int64_t first, int64_t end) { pixels(*s, first, end); });
-}
-
-KERNEL(refgs_shade_forward, Shade, s) {
-  auto* pixels = s->visibility ? (s->harmonics ? forward_pixels<true, true> : forward_pixels<false, true>)
-                               : (s->harmonics ? forward_pixels<true, false> : forward_pixels<false, false>);
-  share_pixels(*s, [&](int64_t first, int64_t end) { pixels(*s, first, end); });
-}
-
-KERNEL(refgs_shade_backward, Shade, s) {
-  auto* chunk = s->visibility ? (s->harmonics ? backward_chunk<true, true> : backward_chunk<false, true>)
-                              : (s->harmonics ? backward_chunk<true, false> : backward_chunk<false, false>);
-  share(s->shared, chunks(*s), 1, [&](int64_t k) { chunk(*s, k); });
-}
-
-KERNEL(refgs_shade_gather, Shade, s) {
-  share(s->shared, s->height + s->lines, 8, [&](int64_t k) {
-    k < s->height ? add_halo(*s, k) : add_line(*s, (int32_t)(k - s->height));
-  });
-}
-
 EXPORT int64_t refgs_shade_halo() { return 2 * HALO; }
+#endif

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
-from refgs.kernels import load
+from refgs.kernels import cuda, load
 from refgs.kernels.load import Shared, Work
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
@@ -49,7 +49,7 @@ class _Work(Work):
         [(n, ctypes.c_int64) for n in ("width", "height", "channels", "chunk_rows")]
         + [("view", ctypes.c_float * 12)]
         + [(n, ctypes.c_float) for n in ("fx", "fy", "cx", "cy")]
-        + [("background", ctypes.c_float * 3), ("harmonics", ctypes.c_int64)]
+        + [("background", ctypes.c_void_p), ("harmonics", ctypes.c_int64)]
         + [(n, ctypes.c_void_p) for n in ("features", "alpha", "visibility")]
         + [("levels", _Levels)]
         + [(n, ctypes.c_int64) for n in ("texels", "cells", "lines")]
@@ -58,6 +58,7 @@ class _Work(Work):
         + [(n, ctypes.c_void_p) for n in ("mirrored", "color", "normal", "material", "radiance")]
         + [(n, ctypes.c_void_p) for n in ("by_color", "by_normal", "by_material", "by_features", "by_alpha")]
         + [(n, ctypes.c_void_p) for n in ("by_light", "by_irradiance", "halo", "halo_alpha", "by_cells", "touched")]
+        + [(n, ctypes.c_void_p) for n in ("map_sums", "cell_sums", "largest")]
         + [("scratch", ctypes.c_void_p), ("shared", Shared)]
     )
 
@@ -111,8 +112,8 @@ class _Shade(torch.autograd.Function):
         light, cells = levels.contiguous(), len(padding.texel)
         padded = features.new_empty(cells, 4)
         work = _Work.of(features, alpha, camera)
-        work.background[:] = background.tolist()
-        work.attach(irradiance=irradiance, fg=table, light=light, padded=padded)
+        background = background.to(features)
+        work.attach(background=background, irradiance=irradiance, fg=table, light=light, padded=padded)
         work.attach(texel=padding.texel, starts=padding.starts, cell=padding.cell)
         if visibility is not None:
             work.attach(visibility=visibility)
@@ -128,7 +129,7 @@ class _Shade(torch.autograd.Function):
         load.run("refgs_shade_pad", work, features, items=cells)
         load.run("refgs_shade_forward", work, features, items=alpha.numel())
         ctx.save_for_backward(features, alpha, irradiance)
-        ctx.work, ctx.kept = work, (padded, visibility, table, padding)
+        ctx.work, ctx.kept = work, (padded, background, visibility, table, padding)
         ctx.mark_non_differentiable(shaded.radiance)
         ctx.set_materialize_grads(False)
         return tuple(shaded)
@@ -141,17 +142,25 @@ class _Shade(torch.autograd.Function):
         upstream = {"by_color": (by_color, 3), "by_normal": (by_normal, 3), "by_material": (by_material, 5)}
         given = {n: new(*alpha.shape, c).zero_() if v is None else v.contiguous() for n, (v, c) in upstream.items()}
         by_features, by_alpha, by_light = torch.empty_like(features), torch.empty_like(alpha), new(work.texels, 3)
-        by_irradiance = new(work.chunks, *irradiance.shape)
-        work.attach(**given, by_features=by_features, by_alpha=by_alpha, by_light=by_light, by_irradiance=by_irradiance)
-        halo = load.kernels().refgs_shade_halo()
-        buffers = {
-            "halo": new(work.chunks, halo, work.width, work.channels),
-            "halo_alpha": new(work.chunks, halo, work.width),
-            "by_cells": new(work.chunks + 1, work.cells, 4),
-            "touched": new(work.chunks, halo + work.lines, dtype=torch.uint8),
-        }
-        work.attach(**buffers)
-        load.run("refgs_shade_backward", work, features, items=alpha.numel())
+        work.attach(**given, by_features=by_features, by_alpha=by_alpha, by_light=by_light)
+        if load.on_gpu(features):
+            blocks = -(-alpha.numel() // cuda.BLOCK)
+            by_irradiance = new(blocks, *irradiance.shape)
+            sizes = (work.channels - 2) * alpha.numel(), 3 * work.cells, 1
+            map_sums, cell_sums, largest = new(sum(sizes), dtype=torch.int64).zero_().split(sizes)
+            work.attach(by_irradiance=by_irradiance, map_sums=map_sums, cell_sums=cell_sums, largest=largest)
+            cuda.launch("refgs_shade_largest", work, features.device, blocks)
+            cuda.launch("refgs_shade_backward", work, features.device, blocks)
+        else:
+            by_irradiance, halo = new(work.chunks, *irradiance.shape), load.kernels().refgs_shade_halo()
+            buffers = {
+                "halo": new(work.chunks, halo, work.width, work.channels),
+                "halo_alpha": new(work.chunks, halo, work.width),
+                "by_cells": new(work.chunks + 1, work.cells, 4),
+                "touched": new(work.chunks, halo + work.lines, dtype=torch.uint8),
+            }
+            work.attach(by_irradiance=by_irradiance, **buffers)
+            load.parallel(load.kernels().refgs_shade_backward, work)
         load.run("refgs_shade_gather", work, features, items=alpha.numel())
         load.run("refgs_shade_unpad", work, features, items=work.texels)
         return by_features, by_alpha, by_light, by_irradiance.sum(dim=0), None, None, None, None
@@ -182,13 +191,18 @@ def shade(
     `features` (H, W, C) are sums over a pixel's splats of, in this order: normal in world space, albedo, metallic,
     roughness; three of colour by direction, where that takes the place of integrated diffuse light (the paper's
     substitute); three of radiance from the object itself, where there is a `visibility` (H, W) in 0..1, by which that
-    gives way to the environment's (Eq. 9); position. `alpha` (H, W). float32 on the CPU, differentiable in features,
+    gives way to the environment's (Eq. 9); position. `alpha` (H, W). float32, all on the CPU or on one card, differentiable in features,
     alpha and the light. What the blend's mean position says of its bias towards the camera is undone first: shade.cpp
-    has how. The result does not depend on the number of threads.
+    has how. The result does not depend on the number of threads, nor, on a card, does it differ from one call to
+    the next. Where a derivative to hand back is not finite, on a card none is a number.
     """
     least = CHANNELS + 3 * (visibility is not None)
     if features.shape not in ((*alpha.shape, least), (*alpha.shape, least + 3)):
         size = f"{alpha.shape[1]}×{alpha.shape[0]}"
         raise ValueError(f"expected {least} or {least + 3} features a pixel of {size}, got {tuple(features.shape)}")
     light = environment.levels, environment.irradiance, environment.sides
+    texels = sum(6 * side * side for side in environment.sides)
+    given = {"features": (features, features.shape), "alpha": (alpha, alpha.shape)}
+    given |= {"levels": (environment.levels, (texels, 3)), "irradiance": (environment.irradiance, (9, 3))}
+    load.check(**given, **({} if visibility is None else {"visibility": (visibility, alpha.shape)}))
     return Shaded(*_Shade.apply(features, alpha, *light, camera, background, visibility))
