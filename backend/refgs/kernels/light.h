@@ -147,9 +147,8 @@ struct Irradiance {
     return larger(sum, Vector());
   }
 
-  // Adds to by_coefficients (9, 3), a sum a lane, and to by_normal. `by` is zero where the value was cut off.
-  MEMBER void backward(const float* coefficients, int c, Vector by, Vector* by_coefficients, Vectors& by_normal) const {
-    for (int k = 0; k < 9; k++) by_coefficients[3 * k + c] += by * basis[k];
+  // Adds to by_normal; `by` is zero where the value was cut off. By a coefficient it is `by` times its basis.
+  MEMBER void backward(const float* coefficients, int c, Vector by, Vectors& by_normal) const {
     const float* i = coefficients + c;
     by_normal.x += by * (-Y1 * i[9] + XY * i[12] * n.y - XY * i[21] * n.z + 2.0f * XX * i[24] * n.x);
     by_normal.y += by * (-Y1 * i[3] + XY * i[12] * n.x - XY * i[15] * n.z - 2.0f * XX * i[24] * n.y);

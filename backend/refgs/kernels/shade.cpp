@@ -64,6 +64,10 @@ template <class Body>
 INLINE void each_covered(const Shade& s, int64_t i, int64_t end, Body body) {
   Pixels p;
   int64_t y = (int32_t)i / (int32_t)s.width, x = i - y * s.width;
+  if constexpr (LANES == 1) {  // of one pixel
+    if (s.alpha[i] > COVERED) p.count = 1, p.set(0, i, x, y, s.alpha[i]), body(p);
+    return;
+  }
   for (;;) {
     int n = 0;
     for (; i < end && n < LANES; i++) {
@@ -133,6 +137,8 @@ struct Contributions {
   const Shade& s;
   float map_scale, cell_scale;
   int32_t largest_map = 0, largest_cell = 0;
+  Vectors normal = {};
+  float by_irradiance[3] = {};
 
   Contributions(const Shade& s) : s(s) {
     if (!LARGEST) map_scale = Unit(s.largest[0], SOURCES).per, cell_scale = Unit(s.largest[1], adders(s)).per;
@@ -160,6 +166,11 @@ struct Contributions {
         for (int j = 0; j < 4; j++) add(sums + c.at(0, j), by * weight[j].value * map_scale);
       }
     }
+  }
+
+  void add_irradiance(const Irradiance& irradiance, const Vector (&by)[3]) {
+    normal = irradiance.n;
+    for (int c = 0; c < 3; c++) by_irradiance[c] = by[c].value;
   }
 
   void add_light(const Lookup<true>& l, int, const Vector (&by_light)[3]) {
@@ -198,6 +209,7 @@ struct Chunk {
   int64_t index, first, end;  // pixels
   float* cells;
   uint8_t *halo, *lines;      // touched
+  Vector by_irradiance[27] = {};
 
   Chunk(const Shade& s, int64_t index) : s(s), index(index), first(index * s.chunk_rows * s.width) {
     int64_t rows = s.height - index * s.chunk_rows;
@@ -241,6 +253,11 @@ struct Chunk {
         rows.add(k, w[j][k], features), rows.add(k, w[j + 1][k], features + c.next * (S + 3));
         alpha[0] += there[j][k], alpha[c.next] += there[j + 1][k];
       }
+  }
+
+  MEMBER void add_irradiance(const Irradiance& irradiance, const Vector (&by)[3]) {
+    for (int k = 0; k < 9; k++)
+      for (int c = 0; c < 3; c++) by_irradiance[3 * k + c] += by[c] * irradiance.basis[k];
   }
 
   // To the cells that were looked up.
@@ -439,6 +456,7 @@ struct Shaded {
       for (int c = 0; c < 3; c++) light[c] = lookup.light[c];
     }
     coat = 1.0f - DIELECTRIC_F0 * fg.value[0] - fg.value[1];
+#pragma unroll
     for (int c = 0; c < 3; c++) {
       received[c] = HARMONICS ? v[APPEARANCE + c] : irradiance.value(s.irradiance, c);
       Vector diffuse = (1.0f - metallic) * received[c];
@@ -458,17 +476,17 @@ struct Shaded {
     scatter<3>(s.radiance, map.pixels, radiance);
   }
 
-  // Into `sums`, and into by_irradiance, a sum a lane.
   template <class Sums>
-  MEMBER void backward(const Shade& s, Sums& sums, Vector (&by_irradiance)[27]) const {
+  MEMBER void backward(const Shade& s, Sums& sums) const {
     Vector by_color[3], by_normal[3], by_material[5], by_alpha = {};
     gather<3>(s.by_color, map.pixels, by_color), gather<3>(s.by_normal, map.pixels, by_normal);
     gather<5>(s.by_material, map.pixels, by_material);
 
     const Vector(&v)[S] = map.value;
-    Vector metallic = v[METALLIC], by[S] = {}, by_light[3], by_fg[2] = {}, by_coat = {};
+    Vector metallic = v[METALLIC], by[S] = {}, by_light[3], by_fg[2] = {}, by_coat = {}, by_received[3];
     by[METALLIC] = by_material[3], by[ROUGHNESS] = by_material[4];
     Vectors by_n = {};
+#pragma unroll
     for (int c = 0; c < 3; c++) {
       by_alpha += by_color[c] * (encoded[c] - s.background[c]);
       Vector by_radiance = by_color[c] * map.alpha * slope[c];
@@ -489,10 +507,11 @@ struct Shaded {
         by[ALBEDO + c] += by_diffuse * base;
         by[METALLIC] -= by_diffuse * v[ALBEDO + c] * coat;
         by_coat += by_diffuse * v[ALBEDO + c] * (1.0f - metallic);
-        Vector by_received = select(received[c] > 0.0f, by_radiance * base * v[ALBEDO + c], Vector());
-        irradiance.backward(s.irradiance, c, by_received, by_irradiance, by_n);
+        by_received[c] = select(received[c] > 0.0f, by_radiance * base * v[ALBEDO + c], Vector());
+        irradiance.backward(s.irradiance, c, by_received[c], by_n);
       }
     }
+    if (!HARMONICS) sums.add_irradiance(irradiance, by_received);
     by_fg[0] -= DIELECTRIC_F0 * by_coat, by_fg[1] -= by_coat;
     by[ROUGHNESS] += by_fg[0] * fg.by_roughness[0] + by_fg[1] * fg.by_roughness[1];
     Vector by_n_v = by_fg[0] * fg.by_n_v[0] + by_fg[1] * fg.by_n_v[1];
@@ -536,12 +555,9 @@ struct Kind {
     each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, false>(s, pixels).write(s); });
   }
 
-  // Into `sums`, and into by_irradiance, a sum a lane.
   template <class Sums>
-  static void backward(const Shade& s, int64_t first, int64_t end, Sums& sums, Vector (&by_irradiance)[27]) {
-    each_covered(s, first, end, [&](const Pixels& pixels) {
-      Shaded<HARMONICS, INDIRECT, true>(s, pixels).backward(s, sums, by_irradiance);
-    });
+  static void backward(const Shade& s, int64_t first, int64_t end, Sums& sums) {
+    each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, true>(s, pixels).backward(s, sums); });
   }
 };
 
@@ -571,9 +587,8 @@ template <bool LARGEST>
 void backward_block(const Shade& s) {
   int64_t pixels = s.width * s.height, i = (int64_t)blockIdx.x * blockDim.x + threadIdx.x;
   Contributions<LARGEST> sums(s);
-  Vector by_irradiance[27] = {};
   bool covered = i < pixels && s.alpha[i] > COVERED;
-  if (covered) by_kind(s, [&](auto kind) { kind.backward(s, i, i + 1, sums, by_irradiance); });
+  if (covered) by_kind(s, [&](auto kind) { kind.backward(s, i, i + 1, sums); });
   int lane = threadIdx.x % 32, warp = threadIdx.x / 32, warps = (blockDim.x + 31) / 32;
   if (LARGEST) {
     for (int step = 16; step; step /= 2) {
@@ -591,8 +606,10 @@ void backward_block(const Shade& s) {
   }
   __shared__ float by_warp[32][27];
   bool any = __any_sync(~0u, covered && !s.harmonics);
+  Irradiance irradiance(sums.normal);
+#pragma unroll
   for (int k = 0; k < 27; k++) {
-    float sum = by_irradiance[k].value;
+    float sum = sums.by_irradiance[k % 3] * irradiance.basis[k / 3].value;
     if (any)
       for (int step = 16; step; step /= 2) sum += __shfl_xor_sync(~0u, sum, step);
     if (lane == 0) by_warp[warp][k] = sum;
@@ -607,9 +624,8 @@ void backward_block(const Shade& s) {
 #else
 void backward_chunk(const Shade& s, int64_t index) {
   Chunk chunk(s, index);
-  Vector by_irradiance[27] = {};
-  by_kind(s, [&](auto kind) { kind.backward(s, chunk.first, chunk.end, chunk, by_irradiance); });
-  for (int i = 0; i < 27; i++) s.by_irradiance[index * 27 + i] = total(by_irradiance[i]);
+  by_kind(s, [&](auto kind) { kind.backward(s, chunk.first, chunk.end, chunk); });
+  for (int i = 0; i < 27; i++) s.by_irradiance[index * 27 + i] = total(chunk.by_irradiance[i]);
 }
 
 // What the chunks above and below added to a row.
