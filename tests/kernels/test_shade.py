@@ -139,6 +139,12 @@ def test_same_bits_for_any_number_of_threads():
     scenes.check_same_bits_for_any_number_of_threads(all_of_it)
 
 
+def test_same_bits_from_call_to_call(device):
+    camera, inputs, visibility, _, _, upstream, _ = case(False, True, (37, 70))
+    (maps, by), (maps_again, by_again) = (run(camera, inputs, visibility, upstream, device) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip([*maps, *by], [*maps_again, *by_again], strict=True))
+
+
 @pytest.mark.parametrize("scale", [1e-30, 1e-10, 1e10, 1e30])
 def test_gradients_of_any_size(scale, device):
     """What is summed up in integers has room for them, and for those that are small beside others."""

@@ -27,6 +27,7 @@ struct Wide {
 template <int N>
 struct Blocks {
   static constexpr int WIDTH = N >= LANES ? LANES : N > 8 ? 16 : N > 4 ? 8 : 4, COUNT = (N + WIDTH - 1) / WIDTH;
+  static_assert(N >= WIDTH || WIDTH == LANES, "only whole vectors are read and written in part");
   typedef typename Wide<WIDTH>::type Numbers;
   static constexpr int at(int block) { return block * WIDTH + WIDTH <= N || N < WIDTH ? block * WIDTH : N - WIDTH; }
 
