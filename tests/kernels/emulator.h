@@ -203,6 +203,7 @@ inline int __syncthreads_count(int vote) {
 inline int __popc(unsigned v) { return __builtin_popcount(v); }
 inline int __ffs(int v) { return __builtin_ffs(v); }
 inline int __clz(int v) { return v ? __builtin_clz(v) : 32; }
+inline int __clzll(long long v) { return v ? __builtin_clzll(v) : 64; }
 
 template <class T>
 T atomicAdd(T* to, T v) {

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
-from refgs.kernels import load, reference
+from refgs.kernels import reference
 from refgs.model.environment import Environment
 from refgs.render.shade import mirror_directions, shade
 from tests.kernels import scenes
@@ -22,12 +22,13 @@ BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
 class Light:
     """What `shade` reads of an Environment, as leaves."""
 
-    def __init__(self, dtype: torch.dtype, resolution: int = 16):
+    def __init__(self, dtype: torch.dtype, device: torch.device | str = "cpu", resolution: int = 16):
         generator = torch.Generator().manual_seed(2)
         exact = Environment(torch.exp(0.5 * torch.randn(6 * resolution**2, 3, generator=generator)))
         self.sides = exact.sides
-        self.levels = exact.levels.to(dtype).requires_grad_()
-        self.irradiance = (exact.irradiance + 0.3 * torch.randn(9, 3, generator=generator)).to(dtype).requires_grad_()
+        self.levels = exact.levels.to(device, dtype).requires_grad_()
+        irradiance = exact.irradiance + 0.3 * torch.randn(9, 3, generator=generator)
+        self.irradiance = irradiance.to(device, dtype).requires_grad_()
 
 
 def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
@@ -90,24 +91,25 @@ def run(
     inputs: tuple[Tensor, ...],
     visibility: Tensor | None,
     upstream: list[Tensor],
+    device: torch.device,
     count: int = 4,
-) -> tuple[list[Tensor], tuple]:
-    light = Light(torch.float32)
-    leaves = [*(v.clone().requires_grad_() for v in inputs), light.levels, light.irradiance]
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Maps and gradients, on the CPU."""
+    light = Light(torch.float32, device)
+    leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels, light.irradiance]
+    visibility = None if visibility is None else visibility.to(device)
     shaded = shade(*leaves[:2], light, camera, BACKGROUND, visibility)
-    gradients = torch.autograd.grad(shaded[:3], leaves[:count], upstream)
-    return [s.detach() for s in shaded], gradients
+    gradients = torch.autograd.grad(shaded[:3], leaves[:count], [u.to(device) for u in upstream])
+    return [s.detach().cpu() for s in shaded], [g.cpu() for g in gradients]
 
 
-@pytest.mark.parametrize("isa", load.supported())
 @pytest.mark.parametrize("size", [(45, 30), (37, 70), (9, 4)])
 @pytest.mark.parametrize("appearance", [False, True])
 @pytest.mark.parametrize("indirect", [False, True])
-def test_matches_reference(indirect, appearance, size, isa, monkeypatch):
-    monkeypatch.setenv("REFGS_ISA", isa)
+def test_matches_reference(indirect, appearance, size, device):
     camera, inputs, visibility, maps, safe, upstream, gradients = case(appearance, indirect, size)
     assert safe.float().mean() > 0.9
-    found, by = run(camera, inputs, visibility, upstream, len(gradients))
+    found, by = run(camera, inputs, visibility, upstream, device, len(gradients))
     for value, expected in zip(found, maps, strict=True):
         error = (value - expected)[safe].abs().max() / expected.abs().max()
         assert error <= FORWARD
@@ -116,15 +118,13 @@ def test_matches_reference(indirect, appearance, size, isa, monkeypatch):
         assert error <= GRADIENT, (name, error.item())
 
 
-@pytest.mark.parametrize("isa", load.supported())
-def test_mirror_directions(isa, monkeypatch):
+def test_mirror_directions(device):
     """Of the reference's blended normals."""
-    monkeypatch.setenv("REFGS_ISA", isa)
     camera, (features, alpha), _, maps, _, _, _ = case(False, True, (37, 70))
     covered = alpha > reference.COVERED
     normal, ray = reference.unit(maps[1][covered]), reference.unit(scenes.camera_rays(camera)[covered].double())
     expected = ray - 2 * (ray * normal).sum(dim=-1, keepdim=True) * normal
-    found = mirror_directions(features, alpha, camera)
+    found = mirror_directions(features.to(device), alpha.to(device), camera).cpu()
     assert (found[covered] - expected).abs().max() <= FORWARD
     assert found[~covered].eq(0).all()
 
@@ -133,19 +133,63 @@ def test_same_bits_for_any_number_of_threads():
     camera, inputs, visibility, _, _, upstream, _ = case(False, True, (37, 70))
 
     def all_of_it() -> list[Tensor]:
-        maps, gradients = run(camera, inputs, visibility, upstream)
+        maps, gradients = run(camera, inputs, visibility, upstream, torch.device("cpu"))
         return [*maps, *gradients]
 
     scenes.check_same_bits_for_any_number_of_threads(all_of_it)
 
 
-def test_nothing_there():
+def test_same_bits_from_call_to_call(device):
+    camera, inputs, visibility, _, _, upstream, _ = case(False, True, (37, 70))
+    (maps, by), (maps_again, by_again) = (run(camera, inputs, visibility, upstream, device) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip([*maps, *by], [*maps_again, *by_again], strict=True))
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-10, 1e10, 1e30])
+def test_gradients_of_any_size(scale, device):
+    """What is summed up in integers has room for them, and for those that are small beside others."""
+    camera, inputs, visibility, _, _, upstream, gradients = case(False, False, (37, 70))
+    _, by = run(camera, inputs, visibility, [u * scale for u in upstream], device)
+    for value, expected in zip(by, gradients, strict=True):
+        assert (value / scale - expected).abs().max() <= GRADIENT * expected.abs().max()
+    mixed = [u.clone() for u in upstream]
+    for u in mixed:
+        u[:35] *= 1e-6
+    small, large = (b for b in (run(camera, inputs, visibility, u, device)[1][0] for u in (mixed, upstream)))
+    reach = slice(0, 35 - 10)  # rows that nothing below adds to
+    assert (1e6 * small[reach] - large[reach]).abs().max() <= GRADIENT * large[reach].abs().max()
+
+
+def test_upstream_that_is_no_number(device):
+    """Says so in the gradients, and nowhere in the maps."""
+    camera, inputs, visibility, _, _, upstream, _ = case(False, False, (45, 30))
+    for wrong in (float("nan"), float("inf")):
+        for u in (given := [u.clone() for u in upstream]):
+            u[10:20] = wrong
+        maps, by = run(camera, inputs, visibility, given, device)
+        assert all(m.isfinite().all() for m in maps) and not any(b.isfinite().all() for b in by)
+
+
+def test_nothing_there(device):
     camera = scenes.camera(20, 10)
-    leaves = torch.zeros(10, 20, 11, requires_grad=True), torch.zeros(10, 20, requires_grad=True)
-    shaded = shade(*leaves, Light(torch.float32), camera, BACKGROUND)
-    assert torch.equal(shaded.color, BACKGROUND.expand(10, 20, 3)) and shaded.normal.eq(0).all()
+    leaves = [torch.zeros(*size, device=device, requires_grad=True) for size in ((10, 20, 11), (10, 20))]
+    shaded = shade(*leaves, Light(torch.float32, device), camera, BACKGROUND)
+    assert torch.equal(shaded.color.cpu(), BACKGROUND.expand(10, 20, 3)) and shaded.normal.eq(0).all()
     by = torch.autograd.grad(shaded.color.sum(), leaves)
     assert all(b.eq(0).all() for b in by)
+
+
+def test_one_pixel(device):
+    """A row, a column: no neighbours to look between."""
+    light, mean = Light(torch.float32, device), torch.tensor([0, 0, -1, 0.5, 0.5, 0.5, 0, 0.5, 0, 0, 3.0])
+    for size in ((1, 1), (1, 5), (5, 1)):
+        camera = Camera("small", *size, 50, 50, size[0] / 2, size[1] / 2, torch.eye(4, dtype=torch.float64).numpy())
+        features = mean.to(device).expand(size[1], size[0], 11).clone().requires_grad_()
+        alpha = torch.ones(size[1], size[0], device=device)
+        shaded = shade(features, alpha, light, camera, BACKGROUND)
+        assert (shaded.material - mean.to(device)[3:8]).abs().max() <= FORWARD
+        (by,) = torch.autograd.grad(shaded.normal.sum(), features)
+        assert (by[..., :3].sum(dim=(0, 1)) - size[0] * size[1]).abs().max() <= 1e-4
 
 
 def white_ball(metallic: float, roughness: float, side: int = 64) -> Tensor:

@@ -23,12 +23,13 @@ SOURCES = (
     "motion.cpp",
     "normals.cpp",
     "peak.cpp",
+    "shade.cpp",
     "sparse.cpp",
     "ssim.cpp",
     "stack.cpp",
     "trace.cu",
 )
-HEADERS = ("device.h", "lane.h", "library.h", "light.h", "splat.h", "vector.h")
+HEADERS = ("device.h", "lane.h", "library.h", "light.h", "rows.h", "splat.h", "vector.h")
 # A product and a sum fuse as the CPU's do; nothing else is rounded other than IEEE 754 has it.
 OPTIONS = (
     "--std=c++17",

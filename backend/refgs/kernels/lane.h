@@ -72,10 +72,12 @@ INLINE float root(float x) { return sqrtf(x); }
 INLINE double root(double x) { return sqrt(x); }
 INLINE Vector round_down(Vector x) { return floorf(x.value); }
 INLINE Vector reciprocal(Vector x) { return 1.0f / x.value; }
+INLINE Vector inverse_root(Vector x) { return 1.0f / sqrtf(x.value); }
 INLINE Vector exp2(Vector x) { return exp2f(x.value); }
 INLINE float total(Vector x) { return x.value; }
 INLINE bool any(Mask mask) { return mask.value != 0; }
 INLINE Vector load(const float* p) { return *p; }
 INLINE void store(float* p, Vector v) { *p = v.value; }
+INLINE void store(int32_t* p, Mask v) { *p = v.value; }
 INLINE Vector read(const float* p, int64_t) { return *p; }
 INLINE void write(float* p, Vector v, int64_t) { *p = v.value; }

@@ -26,7 +26,7 @@ SIZES = {
     "refgs_row_size": 1,
     "refgs_scratch_size": 1,
     "refgs_ssim_scratch_size": 1,
-    "refgs_shade_halo_size": 2,
+    "refgs_shade_halo": 0,
     "refgs_peak_round": 0,
 }
 

@@ -1,7 +1,8 @@
 // Maps to a picture and back: deferred shading of what the rasteriser blended (paper Eq. 5-10).
 //
-// Pixels that nothing covers cost nothing: the others are taken LANES at a time, wherever they lie. The picture is worked on in
+// Pixels that nothing covers cost nothing: the others are taken LANES at a time, wherever they lie. The CPU works on the picture in
 // chunks of rows whose size does not depend on the threads, and sums are taken in the chunks' order, so neither does any result.
+// With CUDA, where a thread has a pixel, what many add to is summed up in integers: in whatever order, the sum is the same.
 #include "light.h"
 
 namespace {
@@ -15,151 +16,325 @@ constexpr int NORMAL = 0, ALBEDO = 3, METALLIC = 6, ROUGHNESS = 7;  // channels;
 
 struct Shade {
   int64_t width, height, channels, chunk_rows;
-  double view[12];  // world to camera, 3x4, row-major
-  double fx, fy, cx, cy;
-  float background[3];
+  float view[12];  // world to camera, 3x4, row-major
+  float fx, fy, cx, cy;
+  const float* background;        // (3)
   int64_t harmonics;              // whether there are channels of colour by direction
   const float *features, *alpha;  // (height, width, channels), (height, width): sums over a pixel's splats
   const float* visibility;        // (height, width): 0 where the object itself stands in the mirror direction; or null
   Levels levels;
-  int64_t texels;
-  const float* irradiance;  // (9, 3)
-  const float* fg;          // (2, fg_side, fg_side)
+  int64_t texels, cells, lines;
+  const float* light;             // (texels, 3)
+  const int32_t* texel;           // (cells): under each cell of the padded faces
+  float* padded;                  // (cells, 4): for levels.cells
+  const int32_t *starts, *cell;   // the cells of texel i: `cell` from starts[i] to starts[i + 1]
+  const float* irradiance;        // (9, 3)
+  const float* fg;                // (fg_side, fg_side, 2)
   int64_t fg_side;
   float *mirrored;                                        // (height, width, 3)
   float *color, *normal, *material, *radiance;            // (height, width, 3 | 3 | 5 | 3)
   const float *by_color, *by_normal, *by_material;
   float *by_features, *by_alpha;
-  float* halo;                             // (chunks, 2 HALO, width, channels - 2): what a chunk adds to the rows above and below
-  float *by_chunk_texels, *by_irradiance;  // (chunks, texels, 4), (chunks, 27)
-  float* by_levels;                        // (texels, 3)
-  float* scratch;                          // none is used
+  float *by_light, *by_irradiance;  // (texels, 3), (chunks or, with CUDA, blocks, 27)
+  float *halo, *halo_alpha;         // (chunks, 2 HALO, width, channels), (chunks, 2 HALO, width): for rows above and below a chunk
+  float* by_cells;                  // (chunks + 1, cells, 4): the last, their sum
+  uint8_t* touched;                 // (chunks, 2 HALO + lines): the rows of those that a chunk has written
+  // With CUDA in place of those four, zero at first:
+  int64_t *map_sums, *cell_sums;    // (channels - 2, height, width), (cells, 3)
+  int32_t* largest;                 // (2): of the numbers that are added to each
+  float* scratch;                   // none is used
   mutable Shared shared;
 };
+
+int64_t chunks(const Shade& s) { return (s.height + s.chunk_rows - 1) / s.chunk_rows; }
+
+// LANES covered pixels, the last one repeated where there are fewer.
+struct Pixels {
+  int count;
+  int32_t at[LANES];
+  alignas(64) float column[LANES], row[LANES], alpha[LANES];
+
+  MEMBER void set(int k, int64_t i, int64_t x, int64_t y, float a) {
+    at[k] = (int32_t)i, column[k] = (float)x, row[k] = (float)y, alpha[k] = a;
+  }
+};
+
+// body(pixels) for all covered ones from pixel i on.
+template <class Body>
+INLINE void each_covered(const Shade& s, int64_t i, int64_t end, Body body) {
+  Pixels p;
+  int64_t y = (int32_t)i / (int32_t)s.width, x = i - y * s.width;
+  if constexpr (LANES == 1) {  // of one pixel
+    if (s.alpha[i] > COVERED) p.count = 1, p.set(0, i, x, y, s.alpha[i]), body(p);
+    return;
+  }
+  for (;;) {
+    int n = 0;
+    for (; i < end && n < LANES; i++) {
+      if (s.alpha[i] > COVERED) p.set(n++, i, x, y, s.alpha[i]);
+      if (++x == s.width) x = 0, y++;
+    }
+    if (!n) return;
+    p.count = n;
+    for (; n < LANES; n++) p.at[n] = p.at[n - 1], p.column[n] = p.column[n - 1], p.row[n] = p.row[n - 1], p.alpha[n] = p.alpha[n - 1];
+    body(p);
+  }
+}
+
+// Zero for those that are repeated.
+template <int N>
+INLINE void gather(const float* map, const Pixels& p, Vector (&v)[N]) {
+  alignas(64) float lanes[N][LANES] = {};
+  for (int k = 0; k < p.count; k++)
+    for (int c = 0; c < N; c++) lanes[c][k] = map[(int64_t)p.at[k] * N + c];
+  for (int c = 0; c < N; c++) v[c] = load(lanes[c]);
+}
+
+template <int N>
+INLINE void scatter(float* map, const Pixels& p, const Vector (&v)[N]) {
+  alignas(64) float lanes[N][LANES];
+  for (int c = 0; c < N; c++) store(lanes[c], v[c]);
+  for (int k = 0; k < p.count; k++)
+    for (int c = 0; c < N; c++) map[(int64_t)p.at[k] * N + c] = lanes[c][k];
+}
+
+// The four pixels about each of LANES points: the first, and how far it is to the one beside it and to the one below.
+struct Corners {
+  int32_t first[LANES];
+  int64_t next, below;
+  Vector x, y;  // how far the point is along
+
+  MEMBER int64_t at(int k, int j) const { return first[k] + (j & 1 ? next : 0) + (j & 2 ? below : 0); }
+  MEMBER void weights(Vector (&w)[4]) const {
+    w[0] = (1.0f - x) * (1.0f - y), w[1] = x * (1.0f - y), w[2] = (1.0f - x) * y, w[3] = x * y;
+  }
+};
+
+#ifdef __CUDACC__
+// What fixed-point numbers count, such that neither they nor their sums overflow: a power of two.
+struct Unit {
+  float per, size;  // how many make one; one of them
+
+  // For sums of up to 2^count numbers up to `largest`, the bits of a float. Where that is not finite no sum is a number.
+  Unit(int32_t largest, int count) {
+    int exponent = (largest >> 23) - 127;  // largest < 2^(exponent + 1)
+    int bits = 60 - count - exponent;
+    bits = bits < 126 ? bits : 126;
+    per = __int_as_float((127 + bits) << 23);
+    size = __int_as_float(exponent < 128 ? (127 - bits) << 23 : 0x7fc00000);
+  }
+};
+
+constexpr int SOURCES = 9;  // 2^9 > (2 HALO + 1)^2: the pixels that can add to one, each with weights of up to 1 in all
+
+// Of cells: all pixels may add to one, eight numbers each.
+int adders(const Shade& s) { return 3 + 64 - __clzll(s.width * s.height); }
+
+// The derivatives by the maps and by the light of a pixel: what it adds to others. A first pass takes the LARGEST of that in
+// magnitude, a second adds it.
+template <bool LARGEST>
+struct Contributions {
+  const Shade& s;
+  float map_scale, cell_scale;
+  int32_t largest_map = 0, largest_cell = 0;
+  Vectors normal = {};
+  float by_irradiance[3] = {};
+
+  Contributions(const Shade& s) : s(s) {
+    if (!LARGEST) map_scale = Unit(s.largest[0], SOURCES).per, cell_scale = Unit(s.largest[1], adders(s)).per;
+  }
+
+  template <int S>
+  void add_own(const Pixels& p, bool, const Vector (&by_own)[S], const Vector (&by_position)[3], Vector by_alpha) {
+    if (LARGEST) return;
+    float* to = s.by_features + (int64_t)p.at[0] * (S + 3);
+    for (int c = 0; c < S; c++) to[c] = by_own[c].value;
+    for (int i = 0; i < 3; i++) to[S + i] = by_position[i].value;
+    s.by_alpha[p.at[0]] = by_alpha.value;
+  }
+
+  template <int S>
+  void add_sampled(const Corners& c, int, const Vector (&by_sampled)[S], Vector by_there) {
+    Vector weight[4];
+    c.weights(weight);
+    for (int i = 0; i <= S; i++) {
+      float by = (i < S ? by_sampled[i] : by_there).value;
+      if (LARGEST) {
+        raise(largest_map, by);
+      } else {
+        int64_t* sums = s.map_sums + i * s.width * s.height;
+        for (int j = 0; j < 4; j++) add(sums + c.at(0, j), by * weight[j].value * map_scale);
+      }
+    }
+  }
+
+  void add_irradiance(const Irradiance& irradiance, const Vector (&by)[3]) {
+    normal = irradiance.n;
+    for (int c = 0; c < 3; c++) by_irradiance[c] = by[c].value;
+  }
+
+  void add_light(const Lookup<true>& l, int, const Vector (&by_light)[3]) {
+    Vector weight[2][4];
+    l.weights(weight);
+    for (int i = 0; i < 2; i++)
+      for (int j = 0; j < 4; j++)
+        for (int c = 0; c < 3; c++) {
+          float by = by_light[c].value * weight[i][j].value;
+          if (LARGEST)
+            raise(largest_cell, by);
+          else
+            add(s.cell_sums + 3 * (int64_t)(l.cell[i][0] + (j & 1) + (j & 2 ? l.width[i][0] : 0)) + c, by * cell_scale);
+        }
+  }
+
+ private:
+  static void raise(int32_t& largest, float v) {
+    int32_t bits = __float_as_int(v) & 0x7fffffff;  // in the order of the magnitudes, a NaN beyond all
+    largest = bits > largest ? bits : largest;
+  }
+  static void add(int64_t* to, float v) {
+    if (v != 0) atomicAdd((unsigned long long*)to, (unsigned long long)(int64_t)v);
+  }
+};
+#else
+typedef Wide<8>::type Eight;
 
 void zero(float* p, int64_t n) {
   for (int64_t i = 0; i < n; i++) p[i] = 0;
 }
 
-int64_t chunks(const Shade& s) { return (s.height + s.chunk_rows - 1) / s.chunk_rows; }
-int64_t last_row(const Shade& s, int64_t chunk) {
-  int64_t end = (chunk + 1) * s.chunk_rows;
-  return end < s.height ? end : s.height;
-}
+// The derivatives by the maps and by the light of a chunk of rows.
+struct Chunk {
+  const Shade& s;
+  int64_t index, first, end;  // pixels
+  float* cells;
+  uint8_t *halo, *lines;      // touched
+  Vector by_irradiance[27] = {};
 
-// The covered pixels of some rows, LANES at a time: body(pixels, count), the last one repeated where there are fewer.
-template <class Body>
-INLINE void each_covered(const Shade& s, int64_t first, int64_t end, Body body) {
-  int64_t at[LANES];
-  int count = 0;
-  for (int64_t i = first * s.width; i < end * s.width; i++) {
-    if (!(s.alpha[i] > COVERED)) continue;
-    at[count++] = i;
-    if (count == LANES) body(at, count), count = 0;
+  Chunk(const Shade& s, int64_t index) : s(s), index(index), first(index * s.chunk_rows * s.width) {
+    int64_t rows = s.height - index * s.chunk_rows;
+    end = first + (rows < s.chunk_rows ? rows : s.chunk_rows) * s.width;
+    cells = s.by_cells + index * 4 * s.cells;
+    halo = s.touched + index * (2 * HALO + s.lines), lines = halo + 2 * HALO;
+    zero(s.by_features + first * s.channels, (end - first) * s.channels);
+    zero(s.by_alpha + first, end - first);
+    for (int64_t i = 0; i < 2 * HALO + s.lines; i++) halo[i] = 0;
   }
-  if (!count) return;
-  for (int k = count; k < LANES; k++) at[k] = at[count - 1];
-  body(at, count);
-}
 
-template <int N>
-INLINE void gather(const float* map, const int64_t* at, Vector (&v)[N]) {
-  alignas(64) float lanes[N][LANES];
-  for (int k = 0; k < LANES; k++)
-    for (int c = 0; c < N; c++) lanes[c][k] = map[at[k] * N + c];
-  for (int c = 0; c < N; c++) v[c] = load(lanes[c]);
-}
-
-template <int N>
-INLINE void scatter(float* map, const int64_t* at, int count, const Vector (&v)[N]) {
-  for (int k = 0; k < count; k++)
-    for (int c = 0; c < N; c++) map[at[k] * N + c] = v[c][k];
-}
-
-typedef float Eight __attribute__((vector_size(32)));
-
-template <class Numbers>
-INLINE Numbers get(const float* p) {  // aligned or not
-  Numbers v;
-  __builtin_memcpy(&v, p, sizeof v);
-  return v;
-}
-
-template <class Numbers>
-INLINE void put(float* p, Numbers v) {
-  __builtin_memcpy(p, &v, sizeof v);
-}
-
-// N numbers of each of LANES pixels, a pixel's side by side: as they lie in a map, and quick to move. Lanes: the other way round.
-template <int N>
-struct Rows {
-  static constexpr int WIDTH = (N + 15) / 16 * 16;
-  alignas(64) float row[LANES][WIDTH];
-
-  MEMBER void to_lanes(float (&lanes)[N][LANES]) const {
-    for (int b = 0; b < N; b += LANES) {
-      Vector v[LANES];
-      for (int k = 0; k < LANES; k++) v[k] = load(row[k] + b);
-      transpose(v);
-      for (int c = 0; c < LANES && b + c < N; c++) store(lanes[b + c], v[c]);
+  // To the pixels themselves: all channels but the position, if any are not zero; those of the position.
+  template <int S>
+  MEMBER void add_own(const Pixels& p, bool any, const Vector (&by_own)[S], const Vector (&by_position)[3], Vector by_alpha) {
+    constexpr int C = S + 3;
+    if (any) {
+      Rows<S> rows(by_own);
+      for (int k = 0; k < p.count; k++) rows.add(k, 1, s.by_features + (int64_t)p.at[k] * C);
+    }
+    alignas(64) float lanes[4][LANES];
+    for (int i = 0; i < 3; i++) store(lanes[i], by_position[i]);
+    store(lanes[3], by_alpha);
+    for (int k = 0; k < p.count; k++) {
+      for (int i = 0; i < 3; i++) s.by_features[(int64_t)p.at[k] * C + S + i] = lanes[i][k];
+      s.by_alpha[p.at[k]] += lanes[3][k];
     }
   }
-  MEMBER void from_lanes(const float (&lanes)[N][LANES]) {
-    for (int b = 0; b < N; b += LANES) {
-      Vector v[LANES];
-      for (int c = 0; c < LANES; c++) v[c] = b + c < N ? load(lanes[b + c]) : Vector();
-      transpose(v);
-      for (int k = 0; k < LANES; k++) store(row[k] + b, v[k]);
+
+  // To the corners, by their weights.
+  template <int S>
+  MEMBER void add_sampled(const Corners& c, int count, const Vector (&by_sampled)[S], Vector by_there) {
+    alignas(64) float w[4][LANES], there[4][LANES];
+    Vector weight[4];
+    c.weights(weight);
+    for (int j = 0; j < 4; j++) store(w[j], weight[j]), store(there[j], weight[j] * by_there);
+    Rows<S> rows(by_sampled);
+    for (int k = 0; k < count; k++)
+      for (int j = 0; j < 4; j += 2) {
+        float *features, *alpha;
+        place(c.at(k, j), features, alpha);
+        rows.add(k, w[j][k], features), rows.add(k, w[j + 1][k], features + c.next * (S + 3));
+        alpha[0] += there[j][k], alpha[c.next] += there[j + 1][k];
+      }
+  }
+
+  MEMBER void add_irradiance(const Irradiance& irradiance, const Vector (&by)[3]) {
+    for (int k = 0; k < 9; k++)
+      for (int c = 0; c < 3; c++) by_irradiance[3 * k + c] += by[c] * irradiance.basis[k];
+  }
+
+  // To the cells that were looked up.
+  MEMBER void add_light(const Lookup<true>& l, int count, const Vector (&by_light)[3]) {
+    Vector weight[2][4];
+    l.weights(weight);
+    Rows<4> w[2] = {Rows<4>(weight[0]), Rows<4>(weight[1])}, by({by_light[0], by_light[1], by_light[2], Vector()});
+    for (int k = 0; k < count; k++) {
+      Four light = by.get(k, 0);
+      Eight twice = __builtin_shufflevector(light, light, 0, 1, 2, 3, 0, 1, 2, 3);
+      for (int i = 0; i < 2; i++) {
+        Four four = w[i].get(k, 0);
+        int32_t line = l.line[i][k];
+        if (!(lines[line] & lines[line + 1])) touch(line), touch(line + 1);
+        float *above = cells + 4 * (int64_t)l.cell[i][k], *below = above + 4 * (int64_t)l.width[i][k];
+        auto add = [](float* to, Eight v) {
+          Eight was;
+          __builtin_memcpy(&was, to, sizeof was);
+          was += v;
+          __builtin_memcpy(to, &was, sizeof was);
+        };
+        add(above, __builtin_shufflevector(four, four, 0, 0, 0, 0, 1, 1, 1, 1) * twice);
+        add(below, __builtin_shufflevector(four, four, 2, 2, 2, 2, 3, 3, 3, 3) * twice);
+      }
     }
+  }
+
+ private:
+  // Where to add what is added to a pixel; those of its row lie beside it.
+  MEMBER void place(int64_t at, float*& features, float*& alpha) {
+    if (at >= first && at < end)
+      features = s.by_features + at * s.channels, alpha = s.by_alpha + at;
+    else
+      place_in_halo(at, features, alpha);
+  }
+  __attribute__((noinline)) void place_in_halo(int64_t at, float*& features, float*& alpha) {
+    int64_t row = HALO + (at < first ? at / s.width - first / s.width : (at - end) / s.width);
+    int64_t start = (index * 2 * HALO + row) * s.width, x = at % s.width;
+    if (!halo[row]) zero(s.halo + start * s.channels, s.width * s.channels), zero(s.halo_alpha + start, s.width);
+    halo[row] = 1;
+    features = s.halo + (start + x) * s.channels, alpha = s.halo_alpha + start + x;
+  }
+  __attribute__((noinline)) void touch(int32_t line) {
+    if (lines[line]) return;
+    lines[line] = 1;
+    zero(cells + 4 * s.levels.first_cell(line), 4 * s.levels.width(line));
   }
 };
-
-// to[c] += weight * row[c] for N numbers.
-template <int N>
-INLINE void add(float* to, const float* row, float weight) {
-  int c = 0;
-  for (; c + 8 <= N; c += 8) put(to + c, get<Eight>(to + c) + weight * get<Eight>(row + c));
-  if (c + 4 <= N) put(to + c, get<Four>(to + c) + weight * get<Four>(row + c)), c += 4;
-  for (; c < N; c++) to[c] += weight * row[c];
-}
+#endif
 
 // Discs sorted and blended by their centres favour those in front: on a curved surface the blend at a pixel is that of a point
 // nearer to the camera, whose normal leans towards it. The blended position tells which point; the pixel whose blend is *this*
 // pixel's point lies the same way back. C channels, of which all but the position are read there.
-template <int C>
+template <int C, bool DERIVATIVES>
 struct Displaced {
   static constexpr int S = C - 3;
-  const int64_t* at;
-  Vector alpha, own[C], value[S];
+  const Pixels& pixels;
+  Vector alpha, inverse, own[C], value[S];
   Vector x, y, inverse_z, px, py;  // the blended point in camera space; where it projects
   Mask moves_x, moves_y;           // the derivative passes the limits
-  Vector along_x, along_y, weight[4];
-  int64_t corner[4][LANES];
+  Corners corners;
   Vector there, trust, scale, inverse_there;
-  alignas(64) float sampled[S + 1][LANES], difference_x[S + 1][LANES], difference_y[S + 1][LANES];
+  Vector sampled[S], by_x[S], by_y[S], there_by_x, there_by_y;  // blended over the four corners, and how that changes along x and y
 
-  MEMBER Displaced(const Shade& s, const int64_t* at) : at(at) {
-    Vector a[1];
-    gather<1>(s.alpha, at, a);
-    alpha = a[0];
-    Vector inverse = 1.0f / alpha;
-    Rows<C> rows;
-    alignas(64) float lanes[C][LANES];
-    for (int k = 0; k < LANES; k++) __builtin_memcpy(rows.row[k], s.features + at[k] * C, C * sizeof(float));
-    rows.to_lanes(lanes);
-    for (int c = 0; c < C; c++) own[c] = load(lanes[c]) * inverse;
+  MEMBER Displaced(const Shade& s, const Pixels& p) : pixels(p), alpha(load(p.alpha)), inverse(reciprocal(alpha)) {
+    to_lanes<C>([&](int k, int b) { return Blocks<C>::get(s.features + (int64_t)p.at[k] * C + Blocks<C>::at(b)); }, own);
+    for (int c = 0; c < C; c++) own[c] *= inverse;
 
-    const double* m = s.view;
-    Vectors p = {own[S], own[S + 1], own[S + 2]};
-    auto row = [&](int i) { return (float)m[i] * p.x + (float)m[i + 1] * p.y + (float)m[i + 2] * p.z + (float)m[i + 3]; };
+    const float* m = s.view;
+    auto row = [&](int i) { return m[i] * own[S] + m[i + 1] * own[S + 1] + m[i + 2] * own[S + 2] + m[i + 3]; };
     x = row(0), y = row(4);
     Vector z = row(8);
     Mask ahead = z > 1e-12f;
     inverse_z = 1.0f / select(ahead, z, Vector() + 1e-12f);
-    px = (float)s.fx * x * inverse_z, py = (float)s.fy * y * inverse_z;
-    Vector column, line;
-    for (int k = 0; k < LANES; k++) column[k] = (float)(at[k] % s.width), line[k] = (float)(at[k] / s.width);
-    Vector shift_x = px + (float)s.cx - (column + 0.5f), shift_y = py + (float)s.cy - (line + 0.5f);
+    px = s.fx * x * inverse_z, py = s.fy * y * inverse_z;
+    Vector column = load(p.column), line = load(p.row);
+    Vector shift_x = px + s.cx - (column + 0.5f), shift_y = py + s.cy - (line + 0.5f);
     Mask solid = (alpha > SHIFT_ALPHA) & ahead;
     moves_x = solid & (shift_x > -SHIFT_LIMIT) & (shift_x < SHIFT_LIMIT);
     moves_y = solid & (shift_y > -SHIFT_LIMIT) & (shift_y < SHIFT_LIMIT);
@@ -168,97 +343,76 @@ struct Displaced {
     float right = (float)(s.width - 1), bottom = (float)(s.height - 1);
     moves_x &= (u > 0.0f) & (u < right), moves_y &= (v > 0.0f) & (v < bottom);
     u = clamp(u, 0, right), v = clamp(v, 0, bottom);
-    Vector u0 = round_down(u), v0 = round_down(v);
-    along_x = u - u0, along_y = v - v0;
-    bilinear(along_x, along_y, weight);
+    // At the right and at the bottom the last two, unless there is but one.
+    corners.next = s.width > 1, corners.below = s.height > 1 ? s.width : 0;
+    Vector u0 = smaller(round_down(u), Vector() + (right - (float)corners.next));
+    Vector v0 = smaller(round_down(v), Vector() + (s.height > 1 ? bottom - 1 : 0));
+    store(corners.first, convert<Mask>(v0) * (int32_t)s.width + convert<Mask>(u0));
+    corners.x = u - u0, corners.y = v - v0;
 
-    alignas(64) float w[4][LANES], along[2][LANES];
-    for (int j = 0; j < 4; j++) store(w[j], weight[j]);
-    store(along[0], along_x), store(along[1], along_y);
-    Rows<S + 1> at_point, by_x, by_y;  // blended over the four corners, and how that changes along x and y
-    for (int k = 0; k < LANES; k++) {
-      int64_t first = (int64_t)v0[k] * s.width + (int64_t)u0[k];
-      int64_t next = u0[k] < right ? 1 : 0, below = v0[k] < bottom ? s.width : 0;
-      corner[0][k] = first, corner[1][k] = first + next, corner[2][k] = first + below, corner[3][k] = first + below + next;
-      auto blend = [&](auto type, const float* map, int stride, int c, int to) {
-        typedef decltype(type) Numbers;
-        Numbers value[4];
-        for (int j = 0; j < 4; j++) value[j] = get<Numbers>(map + corner[j][k] * stride + c);
-        Numbers top = value[1] - value[0], low = value[3] - value[2];
-        put<Numbers>(at_point.row[k] + to, w[0][k] * value[0] + w[1][k] * value[1] + w[2][k] * value[2] + w[3][k] * value[3]);
-        put<Numbers>(by_x.row[k] + to, top + along[1][k] * (low - top));
-        put<Numbers>(by_y.row[k] + to, value[2] - value[0] + along[0][k] * (low - top));
-      };
-      blend(Eight(), s.features, C, 0, 0);
-      if (S > 8) blend(Eight(), s.features, C, S - 8, S - 8);  // some once more
-      blend(float(), s.alpha, 1, 0, S);
+    alignas(64) float along_x[LANES], along_y[LANES];
+    store(along_x, corners.x), store(along_y, corners.y);
+    typedef typename Blocks<S>::Numbers Numbers;
+    Rows<S> rows_by_x, rows_by_y;
+    to_lanes<S>(
+        [&](int k, int b) {
+          auto corner = [&](int j) { return Blocks<S>::get(s.features + corners.at(k, j) * C + Blocks<S>::at(b)); };
+          Numbers first = corner(0), second = corner(2), across = corner(1) - first, across_below = corner(3) - second;
+          Numbers above = first + along_x[k] * across, down = second + along_x[k] * across_below - above;
+          if (DERIVATIVES) rows_by_x.set(k, b, across + along_y[k] * (across_below - across)), rows_by_y.set(k, b, down);
+          return above + along_y[k] * down;
+        },
+        sampled);
+    if (DERIVATIVES) {
+      to_lanes<S>([&](int k, int b) { return rows_by_x.get(k, b); }, by_x);
+      to_lanes<S>([&](int k, int b) { return rows_by_y.get(k, b); }, by_y);
     }
-    at_point.to_lanes(sampled), by_x.to_lanes(difference_x), by_y.to_lanes(difference_y);
+    alignas(64) float a[4][LANES];
+    for (int k = 0; k < LANES; k++)
+      for (int j = 0; j < 4; j++) a[j][k] = s.alpha[corners.at(k, j)];
+    Vector across = load(a[1]) - load(a[0]), across_below = load(a[3]) - load(a[2]);
+    Vector above = load(a[0]) + corners.x * across;
+    there_by_x = across + corners.y * (across_below - across), there_by_y = load(a[2]) + corners.x * across_below - above;
+    there = above + corners.y * there_by_y;
     // At a silhouette the way back leads off the object: there the pixel keeps its own blend.
-    there = load(sampled[S]);
     trust = clamp((there - SHIFT_ALPHA) * (1 / SHIFT_ALPHA), 0, 1);
-    inverse_there = 1.0f / larger(there, Vector() + SHIFT_ALPHA);
+    inverse_there = reciprocal(larger(there, Vector() + SHIFT_ALPHA));
     scale = trust * inverse_there;
-    for (int c = 0; c < S; c++) value[c] = scale * load(sampled[c]) + (1.0f - trust) * own[c];
+    for (int c = 0; c < S; c++) value[c] = scale * sampled[c] + (1.0f - trust) * own[c];
   }
 
   // From the derivatives by `value` and by the pixel's own alpha.
-  MEMBER void backward(const Shade& s, const Vector (&by_value)[S], Vector by_alpha, int64_t chunk, int count) const {
-    alignas(64) float by_sampled[S + 1][LANES], by_own[C + 1][LANES], w[4][LANES];
-    Vector by_there = {}, by_u = {}, by_v = {}, inverse = 1.0f / alpha;
+  template <class Sums>
+  MEMBER void backward(const Shade& s, const Vector (&by_value)[S], Vector by_alpha, Sums& sums) const {
+    Vector by_sampled[S], by_own[S], by_there = {}, by_u = {}, by_v = {};
     for (int c = 0; c < S; c++) {
-      Vector by = scale * by_value[c];
-      store(by_sampled[c], by);
-      by_there -= by * load(sampled[c]) * inverse_there;
-      by_u += by * load(difference_x[c]), by_v += by * load(difference_y[c]);
-      Vector to_own = (1.0f - trust) * by_value[c];
-      by_alpha -= to_own * own[c] * inverse;
-      store(by_own[c], to_own * inverse);
+      by_sampled[c] = scale * by_value[c];
+      by_there -= by_sampled[c] * sampled[c];
+      by_u += by_sampled[c] * by_x[c], by_v += by_sampled[c] * by_y[c];
+      by_own[c] = (1.0f - trust) * by_value[c] * inverse;
+      by_alpha -= by_own[c] * own[c];
     }
-    by_there = select(there > SHIFT_ALPHA, by_there, Vector());
-    store(by_sampled[S], by_there);
-    by_u += by_there * load(difference_x[S]), by_v += by_there * load(difference_y[S]);
+    by_there = select(there > SHIFT_ALPHA, by_there * inverse_there, Vector());
+    by_u += by_there * there_by_x, by_v += by_there * there_by_y;
     Vector by_px = select(moves_x, -by_u, Vector()), by_py = select(moves_y, -by_v, Vector());
-    Vector by_x = (float)s.fx * inverse_z * by_px, by_y = (float)s.fy * inverse_z * by_py;
-    Vector by_z = -inverse_z * (px * by_px + py * by_py);
+    Vector by_camera_x = s.fx * inverse_z * by_px, by_camera_y = s.fy * inverse_z * by_py;
+    Vector by_z = -inverse_z * (px * by_px + py * by_py), by_position[3];
     for (int i = 0; i < 3; i++) {
-      Vector by = (float)s.view[i] * by_x + (float)s.view[4 + i] * by_y + (float)s.view[8 + i] * by_z;
-      by_alpha -= by * own[S + i] * inverse;
-      store(by_own[S + i], by * inverse);
+      Vector by = s.view[i] * by_camera_x + s.view[4 + i] * by_camera_y + s.view[8 + i] * by_z;
+      by_position[i] = by * inverse;
+      by_alpha -= by_position[i] * own[S + i];
     }
-    store(by_own[C], by_alpha);
-    for (int j = 0; j < 4; j++) store(w[j], weight[j]);
-    Rows<S + 1> sampled_rows;
-    Rows<C + 1> own_rows;
-    sampled_rows.from_lanes(by_sampled), own_rows.from_lanes(by_own);
-    int64_t first = chunk * s.chunk_rows, end = last_row(s, chunk);
-    float* halo = s.halo + chunk * 2 * HALO * s.width * (S + 1);
-    for (int k = 0; k < count; k++) {
-      add<C>(s.by_features + at[k] * C, own_rows.row[k], 1);
-      s.by_alpha[at[k]] += own_rows.row[k][C];
-      for (int j = 0; j < 4; j++) {
-        int64_t to = corner[j][k], y = to / s.width;
-        float *features = s.by_features + to * C, *alpha = s.by_alpha + to;
-        if (y < first || y >= end) {
-          features = halo + (to - (y < first ? first - HALO : end - HALO) * s.width) * (S + 1);
-          alpha = features + S;
-        }
-        add<S>(features, sampled_rows.row[k], w[j][k]);
-        *alpha += w[j][k] * sampled_rows.row[k][S];
-      }
-    }
+    sums.template add_own<S>(pixels, any(trust < 1.0f), by_own, by_position, by_alpha);
+    sums.template add_sampled<S>(corners, pixels.count, by_sampled, by_there);
   }
 };
 
-INLINE Vector inverse_norm(Vectors n) { return 1.0f / root(dot(n, n) + 1e-24f); }
+INLINE Vector inverse_norm(Vectors n) { return inverse_root(dot(n, n) + 1e-24f); }
 
-INLINE Vectors towards_camera(const Shade& s, const int64_t* at) {
-  const double* m = s.view;
-  Vector x, y;
-  for (int k = 0; k < LANES; k++) {
-    x[k] = (float)((s.cx - 0.5 - (double)(at[k] % s.width)) / s.fx), y[k] = (float)((s.cy - 0.5 - (double)(at[k] / s.width)) / s.fy);
-  }
-  auto along = [&](int i) { return x * (float)m[i] + y * (float)m[4 + i] - (float)m[8 + i]; };
+INLINE Vectors towards_camera(const Shade& s, const Pixels& p) {
+  const float* m = s.view;
+  Vector x = ((s.cx - 0.5f) - load(p.column)) * (1 / s.fx), y = ((s.cy - 0.5f) - load(p.row)) * (1 / s.fy);
+  auto along = [&](int i) { return x * m[i] + y * m[4 + i] - m[8 + i]; };
   Vectors v = {along(0), along(1), along(2)};
   return inverse_norm(v) * v;
 }
@@ -270,38 +424,39 @@ INLINE Vectors mirror(Vectors normal, Vectors view, Vector& n_dot_v) {
 
 // The split sum over a metallic-roughness material, of LANES pixels. HARMONICS: colour by direction in place of the reflected
 // irradiance. INDIRECT: light from the object itself where it stands in the mirror direction (Eq. 9).
-template <bool HARMONICS, bool INDIRECT>
+template <bool HARMONICS, bool INDIRECT, bool DERIVATIVES>
 struct Shaded {
   static constexpr int APPEARANCE = HARMONICS ? 8 : 0, FROM_OBJECT = INDIRECT ? 8 + 3 * HARMONICS : 0;  // channels
   static constexpr int C = 11 + 3 * HARMONICS + 3 * INDIRECT, S = C - 3;
-  Displaced<C> map;
+  Displaced<C, DERIVATIVES> map;
   Vector inverse_length, n_dot_v, coat, visibility;
   Vectors normal, view;
-  Lookup lookup;
+  Lookup<DERIVATIVES> lookup;
   Irradiance irradiance;
   ReflectanceTable fg;
   Vector light[3], received[3], radiance[3], encoded[3], slope[3];
 
-  MEMBER Shaded(const Shade& s, const int64_t* at)
-      : map(s, at),
+  MEMBER Shaded(const Shade& s, const Pixels& pixels)
+      : map(s, pixels),
         inverse_length(inverse_norm({map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
         normal(inverse_length * Vectors{map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]}),
-        view(towards_camera(s, at)),
+        view(towards_camera(s, pixels)),
         lookup(s.levels, mirrored(), map.value[ROUGHNESS]),
         irradiance(normal),
         fg(s.fg, s.fg_side, clamp(n_dot_v, 1e-4f, 1), map.value[ROUGHNESS]) {
     const Vector(&v)[S] = map.value;
     Vector metallic = v[METALLIC];
-    Vectors l = lookup.light(s.levels);
-    light[0] = l.x, light[1] = l.y, light[2] = l.z;
     visibility = Vector() + 1.0f;
     if (INDIRECT) {
       Vector free[1];
-      gather<1>(s.visibility, at, free);
+      gather<1>(s.visibility, pixels, free);
       visibility = free[0];
-      for (int c = 0; c < 3; c++) light[c] = visibility * light[c] + (1.0f - visibility) * v[FROM_OBJECT + c];
+      for (int c = 0; c < 3; c++) light[c] = visibility * lookup.light[c] + (1.0f - visibility) * v[FROM_OBJECT + c];
+    } else {
+      for (int c = 0; c < 3; c++) light[c] = lookup.light[c];
     }
     coat = 1.0f - DIELECTRIC_F0 * fg.value[0] - fg.value[1];
+#pragma unroll
     for (int c = 0; c < 3; c++) {
       received[c] = HARMONICS ? v[APPEARANCE + c] : irradiance.value(s.irradiance, c);
       Vector diffuse = (1.0f - metallic) * received[c];
@@ -311,30 +466,30 @@ struct Shaded {
     }
   }
 
-  MEMBER void write(const Shade& s, int count) const {
+  MEMBER void write(const Shade& s) const {
     const Vector(&v)[S] = map.value;
     Vector color[3];
     for (int c = 0; c < 3; c++) color[c] = encoded[c] * map.alpha + (1.0f - map.alpha) * s.background[c];
-    scatter<3>(s.color, map.at, count, color);
-    scatter<3>(s.normal, map.at, count, {v[NORMAL], v[NORMAL + 1], v[NORMAL + 2]});
-    scatter<5>(s.material, map.at, count, {v[ALBEDO], v[ALBEDO + 1], v[ALBEDO + 2], v[METALLIC], v[ROUGHNESS]});
-    scatter<3>(s.radiance, map.at, count, radiance);
+    scatter<3>(s.color, map.pixels, color);
+    scatter<3>(s.normal, map.pixels, {v[NORMAL], v[NORMAL + 1], v[NORMAL + 2]});
+    scatter<5>(s.material, map.pixels, {v[ALBEDO], v[ALBEDO + 1], v[ALBEDO + 2], v[METALLIC], v[ROUGHNESS]});
+    scatter<3>(s.radiance, map.pixels, radiance);
   }
 
-  MEMBER void backward(const Shade& s, int64_t chunk, int count, Vector* by_irradiance) const {
+  template <class Sums>
+  MEMBER void backward(const Shade& s, Sums& sums) const {
     Vector by_color[3], by_normal[3], by_material[5], by_alpha = {};
-    gather<3>(s.by_color, map.at, by_color), gather<3>(s.by_normal, map.at, by_normal), gather<5>(s.by_material, map.at, by_material);
-    Mask counted;
-    for (int k = 0; k < LANES; k++) counted[k] = k < count ? -1 : 0;
+    gather<3>(s.by_color, map.pixels, by_color), gather<3>(s.by_normal, map.pixels, by_normal);
+    gather<5>(s.by_material, map.pixels, by_material);
 
     const Vector(&v)[S] = map.value;
-    Vector metallic = v[METALLIC], by[S] = {}, by_light[3], by_fg[2] = {}, by_coat = {};
+    Vector metallic = v[METALLIC], by[S] = {}, by_light[3], by_fg[2] = {}, by_coat = {}, by_received[3];
     by[METALLIC] = by_material[3], by[ROUGHNESS] = by_material[4];
     Vectors by_n = {};
+#pragma unroll
     for (int c = 0; c < 3; c++) {
-      Vector by_c = select(counted, by_color[c], Vector());
-      by_alpha += by_c * (encoded[c] - s.background[c]);
-      Vector by_radiance = by_c * map.alpha * slope[c];
+      by_alpha += by_color[c] * (encoded[c] - s.background[c]);
+      Vector by_radiance = by_color[c] * map.alpha * slope[c];
       by_light[c] = by_radiance * (f0(c) * fg.value[0] + fg.value[1]);
       if (INDIRECT) {
         by[FROM_OBJECT + c] = (1.0f - visibility) * by_light[c];
@@ -352,22 +507,23 @@ struct Shaded {
         by[ALBEDO + c] += by_diffuse * base;
         by[METALLIC] -= by_diffuse * v[ALBEDO + c] * coat;
         by_coat += by_diffuse * v[ALBEDO + c] * (1.0f - metallic);
-        Vector by_received = select(received[c] > 0.0f, by_radiance * base * v[ALBEDO + c], Vector());
-        irradiance.backward(s.irradiance, c, by_received, by_irradiance, by_n);
+        by_received[c] = select(received[c] > 0.0f, by_radiance * base * v[ALBEDO + c], Vector());
+        irradiance.backward(s.irradiance, c, by_received[c], by_n);
       }
     }
+    if (!HARMONICS) sums.add_irradiance(irradiance, by_received);
     by_fg[0] -= DIELECTRIC_F0 * by_coat, by_fg[1] -= by_coat;
     by[ROUGHNESS] += by_fg[0] * fg.by_roughness[0] + by_fg[1] * fg.by_roughness[1];
     Vector by_n_v = by_fg[0] * fg.by_n_v[0] + by_fg[1] * fg.by_n_v[1];
     by_n_v = select((n_dot_v > 1e-4f) & (n_dot_v < 1.0f), by_n_v, Vector());
     Vector by_roughness;
-    Vectors by_mirrored = lookup.backward(s.levels, {by_light[0], by_light[1], by_light[2]}, count,
-                                          s.by_chunk_texels + chunk * 4 * s.texels, by_roughness);
+    Vectors by_mirrored = lookup.backward(by_light, by_roughness);
+    sums.add_light(lookup, map.pixels.count, by_light);
     by[ROUGHNESS] += by_roughness;
     by_n = by_n + 2.0f * n_dot_v * by_mirrored + (2.0f * dot(by_mirrored, normal) + by_n_v) * view;
     by_n = inverse_length * (by_n - dot(by_n, normal) * normal);
     by[NORMAL] = by_n.x + by_normal[0], by[NORMAL + 1] = by_n.y + by_normal[1], by[NORMAL + 2] = by_n.z + by_normal[2];
-    map.backward(s, by, by_alpha, chunk, count);
+    map.backward(s, by, by_alpha, sums);
   }
 
  private:
@@ -377,91 +533,191 @@ struct Shaded {
 };
 
 template <int C>
-void mirrored_rows(const Shade& s, int64_t first, int64_t end) {
-  zero(s.mirrored + 3 * first * s.width, 3 * (end - first) * s.width);
-  each_covered(s, first, end, [&](const int64_t* at, int count) {
-    Displaced<C> map(s, at);
-    Vectors normal = {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]}, view = towards_camera(s, at);
+void mirrored_pixels(const Shade& s, int64_t first, int64_t end) {
+  for (int64_t i = 3 * first; i < 3 * end; i++) s.mirrored[i] = 0;
+  each_covered(s, first, end, [&](const Pixels& pixels) {
+    Displaced<C, false> map(s, pixels);
+    Vectors normal = {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]}, view = towards_camera(s, pixels);
     Vector n_dot_v;
     Vectors m = mirror(inverse_norm(normal) * normal, view, n_dot_v);
-    scatter<3>(s.mirrored, at, count, {m.x, m.y, m.z});
+    scatter<3>(s.mirrored, pixels, {m.x, m.y, m.z});
   });
 }
 
 template <bool HARMONICS, bool INDIRECT>
-void forward_rows(const Shade& s, int64_t first, int64_t end) {
-  for (int64_t i = first * s.width; i < end * s.width; i++) {
-    for (int c = 0; c < 3; c++) s.color[3 * i + c] = s.background[c], s.normal[3 * i + c] = s.radiance[3 * i + c] = 0;
-    for (int c = 0; c < 5; c++) s.material[5 * i + c] = 0;
+struct Kind {
+  static void forward(const Shade& s, int64_t first, int64_t end) {
+    const float background[3] = {s.background[0], s.background[1], s.background[2]};
+    for (int64_t i = first; i < end; i++) {
+      for (int c = 0; c < 3; c++) s.color[3 * i + c] = background[c], s.normal[3 * i + c] = s.radiance[3 * i + c] = 0;
+      for (int c = 0; c < 5; c++) s.material[5 * i + c] = 0;
+    }
+    each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, false>(s, pixels).write(s); });
   }
-  each_covered(s, first, end, [&](const int64_t* at, int count) { Shaded<HARMONICS, INDIRECT>(s, at).write(s, count); });
+
+  template <class Sums>
+  static void backward(const Shade& s, int64_t first, int64_t end, Sums& sums) {
+    each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, true>(s, pixels).backward(s, sums); });
+  }
+};
+
+// body(kind) of what the pixels are.
+template <class Body>
+void by_kind(const Shade& s, Body body) {
+  if (s.visibility)
+    s.harmonics ? body(Kind<true, true>()) : body(Kind<false, true>());
+  else
+    s.harmonics ? body(Kind<true, false>()) : body(Kind<false, false>());
 }
 
-template <bool HARMONICS, bool INDIRECT>
-void backward_chunk(const Shade& s, int64_t chunk) {
-  using Pixels = Shaded<HARMONICS, INDIRECT>;
-  constexpr int C = Pixels::C;
-  int64_t first = chunk * s.chunk_rows, end = last_row(s, chunk);
-  zero(s.by_features + first * s.width * C, (end - first) * s.width * C);
-  zero(s.by_alpha + first * s.width, (end - first) * s.width);
-  zero(s.halo + chunk * 2 * HALO * s.width * (C - 2), 2 * HALO * s.width * (C - 2));
-  zero(s.by_chunk_texels + chunk * 4 * s.texels, 4 * s.texels);
-  Vector by_irradiance[27] = {};
-  each_covered(s, first, end, [&](const int64_t* at, int count) { Pixels(s, at).backward(s, chunk, count, by_irradiance); });
-  for (int i = 0; i < 27; i++) s.by_irradiance[chunk * 27 + i] = total(by_irradiance[i]);
+// body(first, end) for all pixels, some at a time.
+template <class Body>
+void share_pixels(const Shade& s, Body body) {
+  const int64_t STRIP = LANES == 1 ? 1 : 8 * s.width;
+  int64_t pixels = s.width * s.height;
+  share(s.shared, (pixels + STRIP - 1) / STRIP, 1, [&](int64_t i) {
+    int64_t first = i * STRIP;
+    body(first, first + STRIP < pixels ? first + STRIP : pixels);
+  });
+}
+
+#ifdef __CUDACC__
+// A thread a pixel.
+template <bool LARGEST>
+void backward_block(const Shade& s) {
+  int64_t pixels = s.width * s.height, i = (int64_t)blockIdx.x * blockDim.x + threadIdx.x;
+  Contributions<LARGEST> sums(s);
+  bool covered = i < pixels && s.alpha[i] > COVERED;
+  if (covered) by_kind(s, [&](auto kind) { kind.backward(s, i, i + 1, sums); });
+  int lane = threadIdx.x % 32, warp = threadIdx.x / 32, warps = (blockDim.x + 31) / 32;
+  if (LARGEST) {
+    for (int step = 16; step; step /= 2) {
+      int32_t map = __shfl_xor_sync(~0u, sums.largest_map, step), cell = __shfl_xor_sync(~0u, sums.largest_cell, step);
+      sums.largest_map = map > sums.largest_map ? map : sums.largest_map;
+      sums.largest_cell = cell > sums.largest_cell ? cell : sums.largest_cell;
+    }
+    if (lane == 0 && sums.largest_map) atomicMax(s.largest, sums.largest_map);
+    if (lane == 0 && sums.largest_cell) atomicMax(s.largest + 1, sums.largest_cell);
+    return;
+  }
+  if (i < pixels && !covered) {
+    for (int64_t c = 0; c < s.channels; c++) s.by_features[i * s.channels + c] = 0;
+    s.by_alpha[i] = 0;
+  }
+  __shared__ float by_warp[32][27];
+  bool any = __any_sync(~0u, covered && !s.harmonics);
+  Irradiance irradiance(sums.normal);
+#pragma unroll
+  for (int k = 0; k < 27; k++) {
+    float sum = sums.by_irradiance[k % 3] * irradiance.basis[k / 3].value;
+    if (any)
+      for (int step = 16; step; step /= 2) sum += __shfl_xor_sync(~0u, sum, step);
+    if (lane == 0) by_warp[warp][k] = sum;
+  }
+  __syncthreads();
+  if (threadIdx.x < 27) {
+    float sum = 0;
+    for (int w = 0; w < warps; w++) sum += by_warp[w][threadIdx.x];
+    s.by_irradiance[(int64_t)blockIdx.x * 27 + threadIdx.x] = sum;
+  }
+}
+#else
+void backward_chunk(const Shade& s, int64_t index) {
+  Chunk chunk(s, index);
+  by_kind(s, [&](auto kind) { kind.backward(s, chunk.first, chunk.end, chunk); });
+  for (int i = 0; i < 27; i++) s.by_irradiance[index * 27 + i] = total(chunk.by_irradiance[i]);
 }
 
 // What the chunks above and below added to a row.
 void add_halo(const Shade& s, int64_t y) {
-  int64_t chunk = y / s.chunk_rows, first = chunk * s.chunk_rows, end = last_row(s, chunk), S = s.channels - 3;
+  int64_t chunk = y / s.chunk_rows, first = chunk * s.chunk_rows, end = first + s.chunk_rows;
   for (int64_t from = chunk - 1; from <= chunk + 1; from += 2) {
-    int64_t row = from < chunk ? HALO + y - first : y - (end - HALO);
+    int64_t row = HALO + y - (from < chunk ? first : end);
     if (from < 0 || from >= chunks(s) || row < 0 || row >= 2 * HALO) continue;
-    const float* halo = s.halo + (from * 2 * HALO + row) * s.width * (S + 1);
-    for (int64_t x = 0; x < s.width; x++, halo += S + 1) {
-      float* features = s.by_features + (y * s.width + x) * s.channels;
-      for (int64_t c = 0; c < S; c++) features[c] += halo[c];
-      s.by_alpha[y * s.width + x] += halo[S];
-    }
+    if (!s.touched[from * (2 * HALO + s.lines) + row]) continue;
+    int64_t start = (from * 2 * HALO + row) * s.width, n = s.width * s.channels;
+    for (int64_t i = 0; i < n; i++) s.by_features[y * n + i] += s.halo[start * s.channels + i];
+    for (int64_t x = 0; x < s.width; x++) s.by_alpha[y * s.width + x] += s.halo_alpha[start + x];
   }
 }
 
-constexpr int ROWS = 8;        // at a time, forward
-constexpr int TEXELS = 1024;   // at a time
+// What the chunks added to a line of cells.
+void add_line(const Shade& s, int32_t line) {
+  int64_t first = 4 * s.levels.first_cell(line), n = 4 * s.levels.width(line);
+  float* sum = s.by_cells + chunks(s) * 4 * s.cells + first;
+  zero(sum, n);
+  for (int64_t k = 0; k < chunks(s); k++) {
+    if (!s.touched[k * (2 * HALO + s.lines) + 2 * HALO + line]) continue;
+    const float* from = s.by_cells + k * 4 * s.cells + first;
+    for (int64_t i = 0; i < n; i++) sum[i] += from[i];
+  }
+}
+
+#endif
+
+constexpr int BATCH = 1024;  // cells or texels
 
 }  // namespace
 
-EXPORT int64_t refgs_shade_halo_size(int64_t width, int64_t channels) { return 2 * HALO * width * (channels - 2); }
+// The light's cells from its texels.
+KERNEL(refgs_shade_pad, Shade, s) {
+  share(s->shared, s->cells, BATCH, [light = s->light, texel = s->texel, padded = s->padded](int64_t i) {
+    const float* from = light + 3 * texel[i];
+    *(Four*)(padded + 4 * i) = Four{from[0], from[1], from[2], 0};
+  });
+}
 
 KERNEL(refgs_shade_mirrored, Shade, s) {
-  auto* rows = s->channels == 14 ? mirrored_rows<14> : mirrored_rows<17>;
-  for (int64_t y; (y = take(s->shared.next, ROWS)) < s->height;) rows(*s, y, y + ROWS < s->height ? y + ROWS : s->height);
+  share_pixels(*s, [&](int64_t first, int64_t end) {
+    s->channels == 14 ? mirrored_pixels<14>(*s, first, end) : mirrored_pixels<17>(*s, first, end);
+  });
 }
 
 KERNEL(refgs_shade_forward, Shade, s) {
-  auto* rows = s->visibility ? (s->harmonics ? forward_rows<true, true> : forward_rows<false, true>)
-                             : (s->harmonics ? forward_rows<true, false> : forward_rows<false, false>);
-  for (int64_t y; (y = take(s->shared.next, ROWS)) < s->height;) rows(*s, y, y + ROWS < s->height ? y + ROWS : s->height);
+  share_pixels(*s, [&](int64_t first, int64_t end) { by_kind(*s, [&](auto kind) { kind.forward(*s, first, end); }); });
 }
 
+#ifdef __CUDACC__
+KERNEL(refgs_shade_largest, Shade, s) { backward_block<true>(*s); }
+KERNEL(refgs_shade_backward, Shade, s) { backward_block<false>(*s); }
+
+KERNEL(refgs_shade_gather, Shade, s) {
+  int64_t pixels = s->width * s->height, S = s->channels - 3;
+  float unit = Unit(s->largest[0], SOURCES).size;
+  share(s->shared, pixels, 1, [&](int64_t i) {
+    for (int64_t c = 0; c < S; c++) s->by_features[i * s->channels + c] += unit * (float)s->map_sums[c * pixels + i];
+    s->by_alpha[i] += unit * (float)s->map_sums[S * pixels + i];
+  });
+}
+
+KERNEL(refgs_shade_unpad, Shade, s) {
+  float unit = Unit(s->largest[1], adders(*s)).size;
+  share(s->shared, s->texels, BATCH, [&](int64_t i) {
+    int64_t sum[3] = {};
+    for (int32_t k = s->starts[i]; k < s->starts[i + 1]; k++)
+      for (int c = 0; c < 3; c++) sum[c] += s->cell_sums[3 * (int64_t)s->cell[k] + c];
+    for (int c = 0; c < 3; c++) s->by_light[3 * i + c] = unit * (float)sum[c];
+  });
+}
+#else
 KERNEL(refgs_shade_backward, Shade, s) {
-  auto* chunk = s->visibility ? (s->harmonics ? backward_chunk<true, true> : backward_chunk<false, true>)
-                              : (s->harmonics ? backward_chunk<true, false> : backward_chunk<false, false>);
-  for (int64_t k; (k = take(s->shared.next, 1)) < chunks(*s);) chunk(*s, k);
+  share(s->shared, chunks(*s), 1, [&](int64_t k) { backward_chunk(*s, k); });
 }
 
 KERNEL(refgs_shade_gather, Shade, s) {
-  int64_t batches = (s->texels + TEXELS - 1) / TEXELS;
-  for (int64_t k; (k = take(s->shared.next, 1)) < s->height + batches;) {
-    if (k < s->height) {
-      add_halo(*s, k);
-      continue;
-    }
-    int64_t first = (k - s->height) * TEXELS, end = first + TEXELS < s->texels ? first + TEXELS : s->texels;
-    for (int64_t i = first; i < end; i++) {
-      Four sum = {};
-      for (int64_t c = 0; c < chunks(*s); c++) sum += *(const Four*)(s->by_chunk_texels + 4 * (c * s->texels + i));
-      for (int j = 0; j < 3; j++) s->by_levels[3 * i + j] = sum[j];
-    }
-  }
+  share(s->shared, s->height + s->lines, 8, [&](int64_t k) {
+    k < s->height ? add_halo(*s, k) : add_line(*s, (int32_t)(k - s->height));
+  });
 }
+
+KERNEL(refgs_shade_unpad, Shade, s) {
+  const float* sums = s->by_cells + chunks(*s) * 4 * s->cells;
+  share(s->shared, s->texels, BATCH, [&](int64_t i) {
+    Four sum = {};
+    for (int32_t k = s->starts[i]; k < s->starts[i + 1]; k++) sum += *(const Four*)(sums + 4 * (int64_t)s->cell[k]);
+    for (int c = 0; c < 3; c++) s->by_light[3 * i + c] = sum[c];
+  });
+}
+
+EXPORT int64_t refgs_shade_halo() { return 2 * HALO; }
+#endif

@@ -47,6 +47,7 @@ INLINE float total(Vector x) {
 INLINE bool any(Mask mask) { return __builtin_reduce_or(mask) != 0; }
 INLINE Vector load(const float* p) { return *(const UnalignedVector*)p; }
 INLINE void store(float* p, Vector v) { *(UnalignedVector*)p = v; }
+INLINE void store(int32_t* p, Mask v) { __builtin_memcpy(p, &v, sizeof v); }
 
 // 1/x to 1 ulp or so, from 1e-37 to 1e37 in magnitude; beyond, a NaN may stand for an infinity.
 INLINE Vector reciprocal(Vector x) {
@@ -56,6 +57,16 @@ INLINE Vector reciprocal(Vector x) {
   return r + r * error;
 #else
   return 1.0f / x;
+#endif
+}
+
+// 1/sqrt(x) to 2 ulp or so, for x from 1e-37 to 1e37.
+INLINE Vector inverse_root(Vector x) {
+#if LANES == 16  // as above
+  Vector r = (Vector)__builtin_ia32_rsqrt14ps512_mask(x, Vector(), 0xffff);
+  return r + r * (0.5f - 0.5f * x * r * r);
+#else
+  return 1.0f / root(x);
 #endif
 }
 

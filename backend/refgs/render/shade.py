@@ -9,7 +9,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
-from refgs.kernels.load import Shared, Work, kernels, parallel
+from refgs.kernels import cuda, load
+from refgs.kernels.load import Shared, Work
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
 from refgs.render.brdf import fg_table
@@ -35,9 +36,9 @@ class _Levels(ctypes.Structure):
         ("count", ctypes.c_int64),
         ("side", ctypes.c_int32 * 8),
         ("start", ctypes.c_int32 * 8),
+        ("line", ctypes.c_int32 * 8),
         ("roughness", ctypes.c_float * 8),
-        ("texels", ctypes.c_void_p),
-        ("padded", ctypes.c_void_p),
+        ("cells", ctypes.c_void_p),
     )
 
 
@@ -46,15 +47,18 @@ class _Work(Work):
 
     _fields_ = (
         [(n, ctypes.c_int64) for n in ("width", "height", "channels", "chunk_rows")]
-        + [("view", ctypes.c_double * 12)]
-        + [(n, ctypes.c_double) for n in ("fx", "fy", "cx", "cy")]
-        + [("background", ctypes.c_float * 3), ("harmonics", ctypes.c_int64)]
+        + [("view", ctypes.c_float * 12)]
+        + [(n, ctypes.c_float) for n in ("fx", "fy", "cx", "cy")]
+        + [("background", ctypes.c_void_p), ("harmonics", ctypes.c_int64)]
         + [(n, ctypes.c_void_p) for n in ("features", "alpha", "visibility")]
-        + [("levels", _Levels), ("texels", ctypes.c_int64), ("irradiance", ctypes.c_void_p)]
-        + [("fg", ctypes.c_void_p), ("fg_side", ctypes.c_int64)]
+        + [("levels", _Levels)]
+        + [(n, ctypes.c_int64) for n in ("texels", "cells", "lines")]
+        + [(n, ctypes.c_void_p) for n in ("light", "texel", "padded", "starts", "cell", "irradiance", "fg")]
+        + [("fg_side", ctypes.c_int64)]
         + [(n, ctypes.c_void_p) for n in ("mirrored", "color", "normal", "material", "radiance")]
         + [(n, ctypes.c_void_p) for n in ("by_color", "by_normal", "by_material", "by_features", "by_alpha")]
-        + [(n, ctypes.c_void_p) for n in ("halo", "by_chunk_texels", "by_irradiance", "by_levels")]
+        + [(n, ctypes.c_void_p) for n in ("by_light", "by_irradiance", "halo", "halo_alpha", "by_cells", "touched")]
+        + [(n, ctypes.c_void_p) for n in ("map_sums", "cell_sums", "largest")]
         + [("scratch", ctypes.c_void_p), ("shared", Shared)]
     )
 
@@ -68,57 +72,98 @@ class _Work(Work):
         work.attach(features=features, alpha=alpha)
         return work
 
+    @property
+    def chunks(self) -> int:
+        return -(-self.height // self.chunk_rows)
+
+
+class _Padding(NamedTuple):
+    """Of cubemaps one after another, their faces padded by one: the texel under each cell, and the cells of each texel, int32:
+    `cell` from starts[i] to starts[i + 1]. Where each level starts, in cells and in rows of cells, and how many rows there are."""
+
+    texel: Tensor
+    starts: Tensor
+    cell: Tensor
+    first_cells: list[int]
+    first_lines: list[int]
+    lines: int
+
+    @classmethod
+    @lru_cache(maxsize=4)
+    def of(cls, sides: tuple[int, ...], device: torch.device) -> "_Padding":
+        texel, first_cells, _ = cubemap.padded(sides)
+        lines = [6 * (side + 2) for side in sides]
+        starts = torch.nn.functional.pad(texel.bincount().cumsum(dim=0), (1, 0))
+        tables = (t.to(device, torch.int32) for t in (texel, starts, texel.argsort(stable=True)))
+        return cls(*tables, first_cells.tolist(), [sum(lines[:k]) for k in range(len(lines))], sum(lines))
+
 
 @lru_cache(maxsize=4)
-def _padded(sides: tuple[int, ...]) -> tuple[Tensor, list[int]]:
-    texels, starts, _ = cubemap.padded(sides)
-    return texels.to(torch.int32), starts.tolist()
+def _fg_table(device: torch.device) -> Tensor:
+    """FG0 and FG1 side by side, (side, side, 2)."""
+    return fg_table().permute(1, 2, 0).contiguous().to(device)
 
 
 class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx, features, alpha, levels, irradiance, sides, camera, background, visibility):
         features, alpha, irradiance = features.contiguous(), alpha.contiguous(), irradiance.contiguous()
-        table, (padded, starts) = fg_table(), _padded(sides)
-        quads = torch.nn.functional.pad(levels, (0, 1))
+        table, padding = _fg_table(features.device), _Padding.of(sides, features.device)
+        light, cells = levels.contiguous(), len(padding.texel)
+        padded = features.new_empty(cells, 4)
         work = _Work.of(features, alpha, camera)
-        work.background[:] = background.tolist()
-        work.attach(irradiance=irradiance, fg=table)
+        background = background.to(features)
+        work.attach(background=background, irradiance=irradiance, fg=table, light=light, padded=padded)
+        work.attach(texel=padding.texel, starts=padding.starts, cell=padding.cell)
         if visibility is not None:
             work.attach(visibility=visibility)
         work.harmonics = work.channels > CHANNELS + 3 * (visibility is not None)
-        work.levels.count, work.texels = len(sides), len(levels)
-        work.levels.side[: len(sides)], work.levels.start[: len(sides)] = sides, starts
+        work.texels, work.cells, work.lines = len(light), cells, padding.lines
+        work.levels.count, work.levels.cells = len(sides), padded.data_ptr()
+        work.levels.side[: len(sides)] = sides
+        work.levels.start[: len(sides)], work.levels.line[: len(sides)] = padding.first_cells, padding.first_lines
         work.levels.roughness[: len(sides)] = prefilter.ROUGHNESS
-        work.levels.texels, work.levels.padded = quads.data_ptr(), padded.data_ptr()
-        work.fg_side = table.shape[-1]
-        shaded = Shaded(*(torch.empty(*alpha.shape, c) for c in (3, 3, 5, 3)))
+        work.fg_side = table.shape[0]
+        shaded = Shaded(*(features.new_empty(*alpha.shape, c) for c in (3, 3, 5, 3)))
         work.attach(**shaded._asdict())
-        parallel(kernels().refgs_shade_forward, work)
+        load.run("refgs_shade_pad", work, features, items=cells)
+        load.run("refgs_shade_forward", work, features, items=alpha.numel())
         ctx.save_for_backward(features, alpha, irradiance)
-        ctx.work, ctx.kept = work, (quads, visibility)
+        ctx.work, ctx.kept = work, (padded, background, visibility, table, padding)
         ctx.mark_non_differentiable(shaded.radiance)
+        ctx.set_materialize_grads(False)
         return tuple(shaded)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, by_color, by_normal, by_material, _):
         features, alpha, irradiance = ctx.saved_tensors
-        library, work = kernels(), ctx.work
-        chunks = -(-work.height // work.chunk_rows)
-        given = {"by_color": by_color.contiguous(), "by_normal": by_normal.contiguous()}
-        given["by_material"] = by_material.contiguous()
-        by_features, by_alpha = torch.empty_like(features), torch.empty_like(alpha)
-        by_levels, by_irradiance = torch.empty(work.texels, 3), torch.empty(chunks, *irradiance.shape)
-        buffers = {
-            "halo": torch.empty(chunks * library.refgs_shade_halo_size(work.width, work.channels)),
-            "by_chunk_texels": torch.empty(chunks, work.texels, 4),
-        }
-        work.attach(**given, **buffers, by_features=by_features, by_alpha=by_alpha)
-        work.attach(by_levels=by_levels, by_irradiance=by_irradiance)
-        parallel(library.refgs_shade_backward, work)
-        parallel(library.refgs_shade_gather, work)
-        return by_features, by_alpha, by_levels, by_irradiance.sum(dim=0), None, None, None, None
+        work, new = ctx.work, features.new_empty
+        upstream = {"by_color": (by_color, 3), "by_normal": (by_normal, 3), "by_material": (by_material, 5)}
+        given = {n: new(*alpha.shape, c).zero_() if v is None else v.contiguous() for n, (v, c) in upstream.items()}
+        by_features, by_alpha, by_light = torch.empty_like(features), torch.empty_like(alpha), new(work.texels, 3)
+        work.attach(**given, by_features=by_features, by_alpha=by_alpha, by_light=by_light)
+        if load.on_gpu(features):
+            blocks = -(-alpha.numel() // cuda.BLOCK)
+            by_irradiance = new(blocks, *irradiance.shape)
+            sizes = (work.channels - 2) * alpha.numel(), 3 * work.cells, 1
+            map_sums, cell_sums, largest = new(sum(sizes), dtype=torch.int64).zero_().split(sizes)
+            work.attach(by_irradiance=by_irradiance, map_sums=map_sums, cell_sums=cell_sums, largest=largest)
+            cuda.launch("refgs_shade_largest", work, features.device, blocks)
+            cuda.launch("refgs_shade_backward", work, features.device, blocks)
+        else:
+            by_irradiance, halo = new(work.chunks, *irradiance.shape), load.kernels().refgs_shade_halo()
+            buffers = {
+                "halo": new(work.chunks, halo, work.width, work.channels),
+                "halo_alpha": new(work.chunks, halo, work.width),
+                "by_cells": new(work.chunks + 1, work.cells, 4),
+                "touched": new(work.chunks, halo + work.lines, dtype=torch.uint8),
+            }
+            work.attach(by_irradiance=by_irradiance, **buffers)
+            load.parallel(load.kernels().refgs_shade_backward, work)
+        load.run("refgs_shade_gather", work, features, items=alpha.numel())
+        load.run("refgs_shade_unpad", work, features, items=work.texels)
+        return by_features, by_alpha, by_light, by_irradiance.sum(dim=0), None, None, None, None
 
 
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
@@ -127,9 +172,9 @@ def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor
     if features.shape not in ((*alpha.shape, CHANNELS + 3), (*alpha.shape, CHANNELS + 6)):
         raise ValueError(f"expected {CHANNELS + 3} or {CHANNELS + 6} features a pixel, got {tuple(features.shape)}")
     features, alpha = features.detach().contiguous(), alpha.detach().contiguous()
-    work, mirrored = _Work.of(features, alpha, camera), torch.empty(*alpha.shape, 3)
+    work, mirrored = _Work.of(features, alpha, camera), features.new_empty(*alpha.shape, 3)
     work.attach(mirrored=mirrored)
-    parallel(kernels().refgs_shade_mirrored, work)
+    load.run("refgs_shade_mirrored", work, features, items=alpha.numel())
     return mirrored
 
 
@@ -146,13 +191,18 @@ def shade(
     `features` (H, W, C) are sums over a pixel's splats of, in this order: normal in world space, albedo, metallic,
     roughness; three of colour by direction, where that takes the place of integrated diffuse light (the paper's
     substitute); three of radiance from the object itself, where there is a `visibility` (H, W) in 0..1, by which that
-    gives way to the environment's (Eq. 9); position. `alpha` (H, W). float32 on the CPU, differentiable in features,
+    gives way to the environment's (Eq. 9); position. `alpha` (H, W). float32, all on the CPU or on one card, differentiable in features,
     alpha and the light. What the blend's mean position says of its bias towards the camera is undone first: shade.cpp
-    has how. The result does not depend on the number of threads.
+    has how. The result does not depend on the number of threads, nor, on a card, does it differ from one call to
+    the next. Where a derivative to hand back is not finite, on a card none is a number.
     """
     least = CHANNELS + 3 * (visibility is not None)
     if features.shape not in ((*alpha.shape, least), (*alpha.shape, least + 3)):
         size = f"{alpha.shape[1]}×{alpha.shape[0]}"
         raise ValueError(f"expected {least} or {least + 3} features a pixel of {size}, got {tuple(features.shape)}")
     light = environment.levels, environment.irradiance, environment.sides
+    texels = sum(6 * side * side for side in environment.sides)
+    given = {"features": (features, features.shape), "alpha": (alpha, alpha.shape)}
+    given |= {"levels": (environment.levels, (texels, 3)), "irradiance": (environment.irradiance, (9, 3))}
+    load.check(**given, **({} if visibility is None else {"visibility": (visibility, alpha.shape)}))
     return Shaded(*_Shade.apply(features, alpha, *light, camera, background, visibility))
