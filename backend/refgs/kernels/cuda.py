@@ -15,8 +15,8 @@ import torch
 from refgs.kernels.build import HERE, cache_folder
 
 # Those of the sources that a card runs; HEADERS are what they include.
-SOURCES = ("adam.cpp", "harmonics.cpp", "normals.cpp", "sparse.cpp")
-HEADERS = ("device.h", "lane.h", "library.h", "light.h", "splat.h", "vector.h")
+SOURCES = ("adam.cpp", "harmonics.cpp", "normals.cpp", "raster.cu", "sparse.cpp")
+HEADERS = ("device.h", "lane.h", "library.h", "light.h", "project.h", "raster.h", "splat.h", "vector.h")
 # A product and a sum fuse as the CPU's do; nothing else is rounded other than IEEE 754 has it.
 OPTIONS = (
     "--std=c++17",
