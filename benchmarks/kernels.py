@@ -21,7 +21,8 @@ from refgs.camera import Camera
 from refgs.kernels import load
 from refgs.model.environment import Environment
 from refgs.model.prefilter import prefilter
-from refgs.render.rasterize import _project_and_bin, _Work, rasterize
+from refgs.render import raster_cpu
+from refgs.render.rasterize import rasterize
 from refgs.render.shade import shade
 from refgs.render.ssim import dssim
 
@@ -67,9 +68,10 @@ def measure() -> dict[str, list[float]]:
     state = {}
 
     def binning() -> None:
-        work = _Work(splats=SPLATS, channels=CHANNELS)
+        work = raster_cpu.Raster(splats=SPLATS, channels=CHANNELS)
         work.attach(**dict(zip(("positions", "rotations", "scales", "opacities", "features"), detached, strict=True)))
-        _project_and_bin(work, camera, 0.1)
+        work.look(camera, 0.1)
+        work.project(detached[0].device)
 
     def forward() -> None:
         state["raster"] = rasterize(*inputs, camera, near=0.1)

@@ -45,7 +45,7 @@ def measure(splats: int, side: int) -> dict[str, float]:
         raster = rasterize(*inputs, camera, near=0.1)
         middle = time.perf_counter()
         torch.autograd.grad(raster, inputs, upstream)
-        kept = sum(v.nbytes for v in raster.features.grad_fn.bins.values())
+        kept = sum(v.nbytes for v in raster.features.grad_fn.work.kept.values())
         return middle - at, time.perf_counter() - middle, raster.features.grad_fn.work.pairs, kept
 
     def scene(splats: int, side: int) -> tuple:

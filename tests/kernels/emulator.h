@@ -153,7 +153,7 @@ inline unsigned ballot(bool vote) {
 #define blockDim (emulator::block_size)
 #define gridDim (emulator::grid_size)
 
-#define KERNEL(name, Work, w)                                                                     \
+#define KERNEL(name, Work, w, ...)                                                                \
   static void name##_threads(const Work* w);                                                      \
   extern "C" void name(const void* work, int blocks, int threads) {                               \
     emulator::launch(blocks, threads, [](const void* w) { name##_threads((const Work*)w); }, work); \
@@ -228,3 +228,5 @@ inline float __int_as_float(int v) {
   memcpy(&number, &v, 4);
   return number;
 }
+
+inline double rsqrt(double x) { return 1 / sqrt(x); }

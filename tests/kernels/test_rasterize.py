@@ -11,8 +11,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from refgs.kernels import load, reference
+from refgs.render import raster_cuda
 from refgs.render.rasterize import Raster, rasterize
 from tests.kernels import scenes
+from tests.kernels.emulate import emulate
 
 NAMES = ("positions", "rotations", "scales", "opacities", "features")
 # A pixel whose value hangs on a comparison (of alpha with its cut, of transmittance with its end …) that float32 may decide
@@ -34,17 +36,19 @@ def case(kind: str, channels: int, size: tuple[int, int] = (45, 30), centre: tup
     return inputs, camera, [m.detach() for m in maps], safe, upstream, gradients
 
 
-def run(inputs: tuple[Tensor, ...], camera, upstream: list[Tensor]) -> tuple[Raster, tuple[Tensor, ...]]:
-    inputs = [v.clone().requires_grad_() for v in inputs]
+def run(device, inputs: tuple[Tensor, ...], camera, upstream: list[Tensor]) -> tuple[Raster, tuple[Tensor, ...]]:
+    """Maps and gradients, on the CPU."""
+    inputs = [v.to(device, copy=True).requires_grad_() for v in inputs]
     raster = rasterize(*inputs, camera, near=scenes.NEAR)
-    return raster, torch.autograd.grad(raster, inputs, upstream)
+    gradients = torch.autograd.grad(raster, inputs, [u.to(device) for u in upstream])
+    return Raster(*(m.detach().cpu() for m in raster)), tuple(g.cpu() for g in gradients)
 
 
-def check(inputs, camera, maps, safe, upstream, gradients) -> None:
+def check(device, inputs, camera, maps, safe, upstream, gradients) -> None:
     """Every error relative to the largest value of the same tensor."""
     assert safe.float().mean() > 0.9
-    raster, found = run(inputs, camera, upstream)
-    for name, value, expected in zip(raster._fields, (m.detach() for m in raster), maps, strict=True):
+    raster, found = run(device, inputs, camera, upstream)
+    for name, value, expected in zip(raster._fields, raster, maps, strict=True):
         assert expected[safe].abs().max() > 0.05
         error = (value - expected)[safe].abs().max() / expected[safe].abs().max()
         assert error <= FORWARD, (name, error.item())
@@ -53,25 +57,34 @@ def check(inputs, camera, maps, safe, upstream, gradients) -> None:
         assert error <= GRADIENT, (name, error.item())
 
 
-@pytest.fixture(params=load.supported())
-def isa(request, monkeypatch) -> str:
-    monkeypatch.setenv("REFGS_ISA", request.param)
-    return request.param
-
-
 @pytest.mark.parametrize("kind", scenes.KINDS)
-def test_matches_reference(kind, isa):
-    check(*case(kind, scenes.CHANNELS[kind]))
+def test_matches_reference(kind, device):
+    check(device, *case(kind, scenes.CHANNELS[kind]))
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 7, 12, 16, 20, 33])
-def test_any_number_of_channels(channels, isa):
-    check(*case("plain", channels))
+def test_any_number_of_channels(channels, device):
+    check(device, *case("plain", channels))
 
 
-@pytest.mark.parametrize(("size", "centre"), [((17, 40), None), ((33, 20), (-25.0, 60.0)), ((1, 1), None)])
-def test_any_image(size, centre):
-    check(*case("mixed", 3, size, centre))
+@pytest.mark.parametrize(
+    ("kind", "size", "centre"),
+    [
+        ("mixed", (17, 40), None),
+        ("mixed", (33, 20), (-25.0, 60.0)),
+        ("mixed", (1, 1), None),
+        ("huge", (140, 130), None),  # each in up to 81 tiles, and CUDA's warps add up more than 64 together
+    ],
+)
+def test_any_image(kind, size, centre, device):
+    check(device, *case(kind, 3, size, centre))
+
+
+def test_more_tiles_than_16_bits_number(monkeypatch):
+    """As with images of more than eight million pixels."""
+    emulate(monkeypatch)
+    monkeypatch.setattr(raster_cuda, "SHORT", 0)
+    check(torch.device("cpu"), *case("mixed", 3, (33, 20), (-25.0, 60.0)))
 
 
 def test_instruction_sets_differ(monkeypatch):
@@ -99,14 +112,14 @@ def test_reference_gradients():
 
 
 @pytest.mark.parametrize("private_pool", [False, True])
-def test_same_bits_for_any_number_of_threads(private_pool, isa, monkeypatch):
+def test_same_bits_for_any_number_of_threads(private_pool, device, monkeypatch):
     if private_pool:
         monkeypatch.setattr(load, "_openmp", lambda: None)
     inputs, camera = scenes.surfels("mixed", 16), scenes.camera(150, 100)
     upstream = [torch.ones(100, 150, 16), torch.ones(100, 150), torch.ones(100, 150)]
 
     def all_of_it() -> list[Tensor]:
-        raster, gradients = run(inputs, camera, upstream)
+        raster, gradients = run(device, inputs, camera, upstream)
         return [*raster, *gradients]
 
     scenes.check_same_bits_for_any_number_of_threads(all_of_it)
@@ -118,17 +131,18 @@ def test_shares_torchs_threads():
     assert load._openmp() is not None
 
 
-def test_ties_are_drawn_in_order():
+def test_ties_are_drawn_in_order(device):
     position = torch.tensor([[0.0, 0, 1]] * 2)
     camera = scenes.camera(9, 9)
     one = (position, torch.tensor([[1.0, 0, 0, 0]] * 2), torch.ones(2, 2), torch.tensor([0.8, 0.8]))
-    raster = rasterize(*one, torch.tensor([[1.0, 0], [0, 1]]), camera, near=0.1)
+    features = torch.tensor([[1.0, 0], [0, 1]])
+    raster = rasterize(*(v.to(device) for v in (*one, features)), camera, near=0.1)
     first, second = raster.features.unbind(-1)
     assert (first > second).all() and (second > 0).all()
 
 
 @pytest.mark.parametrize("where", ["none", "behind", "beside", "transparent"])
-def test_nothing_to_see(where):
+def test_nothing_to_see(where, device):
     inputs = list(scenes.surfels("plain", 3))
     if where == "none":
         inputs = [v[:0] for v in inputs]
@@ -137,12 +151,12 @@ def test_nothing_to_see(where):
         inputs[3] = torch.full_like(inputs[3], 1 / 256)
     camera = scenes.camera()
     upstream = [torch.ones(30, 45, 3), torch.ones(30, 45), torch.ones(30, 45)]
-    raster, gradients = run(tuple(inputs), camera, upstream)
+    raster, gradients = run(device, tuple(inputs), camera, upstream)
     assert all((m == 0).all() for m in raster)
     assert all(g.shape == v.shape and (g == 0).all() for g, v in zip(gradients, inputs, strict=True))
 
 
-def test_absurd_input_stays_finite(isa):
+def test_absurd_input_stays_finite(device):
     torch.manual_seed(0)
     sizes = torch.tensor([0, 1e-45, 1e-38, 1e-20, 1e-6, 1e-2, 1, 1e3, 1e10, 1e20, 3e38])
     n = 4000
@@ -158,23 +172,23 @@ def test_absurd_input_stays_finite(isa):
     for camera in (scenes.camera(), scenes.camera(1, 40)):
         shape = (camera.height, camera.width)
         upstream = [torch.randn(*shape, 3), torch.randn(shape), torch.randn(shape)]
-        raster, gradients = run((position, rotation, scale, opacity, torch.randn(n, 3)), camera, upstream)
+        inputs = position, rotation, scale, opacity, torch.randn(n, 3)
+        raster, gradients = run(device, inputs, camera, upstream)
         assert raster.alpha.max() > 0.5
         for value in (*raster, *gradients):
             assert value.isfinite().all()
         assert raster.alpha.max() <= 1 + 1e-5
 
 
-def test_exactly_edge_on_is_a_dot():
+def test_exactly_edge_on_is_a_dot(device):
     """A disc seen exactly from its side is drawn by the screen-space filter alone, at its centre's depth."""
     camera = scenes.camera(9, 9, (4.5, 4.5))
     centre = torch.tensor(camera.camera_to_world @ [0, 0, 2, 1], dtype=torch.float64)[:3]
     right, down, forward = camera.camera_to_world[:3, :3].T
     matrix = np.stack([right, forward, -down], axis=1)
     rotation = torch.tensor(Rotation.from_matrix(matrix).as_quat(scalar_first=True)).float()
-    raster = rasterize(
-        centre.float()[None], rotation[None], torch.full((1, 2), 0.3), torch.ones(1), torch.ones(1, 1), camera, near=0.1
-    )
+    inputs = centre.float()[None], rotation[None], torch.full((1, 2), 0.3), torch.ones(1), torch.ones(1, 1)
+    raster = Raster(*(m.cpu() for m in rasterize(*(v.to(device) for v in inputs), camera, near=0.1)))
     y, x = torch.meshgrid(torch.arange(9) - 4.0, torch.arange(9) - 4.0, indexing="ij")
     expected = torch.exp(-(x**2 + y**2)).clamp_max(0.99)
     off_the_line = y != 0

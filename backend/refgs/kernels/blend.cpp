@@ -5,25 +5,14 @@ using refgs::Splat;
 
 namespace {
 
-typedef double Quad __attribute__((vector_size(32)));
-
-// n0, n1, n2 are taken apart where they sum up terms larger than this many times n2: u and v err by 2^-24 of it.
-constexpr double SPLIT = 32;
-constexpr int CHUNK = 64;      // splats of a tile that are treated together
+constexpr int CHUNK = 64;  // splats of a tile that are treated together
 
 // A tile's pixels are numbered block by block, and within a block lane by lane.
 constexpr int pixel_x(int i) { return i / LANES % BLOCKS_X * BLOCK_X + i % LANES % BLOCK_X; }
 constexpr int pixel_y(int i) { return i / LANES / BLOCKS_X * BLOCK_Y + i % LANES / BLOCK_X; }
 
-struct Tile {
-  int64_t index, x, y, width, height;  // x, y: its first pixel; width, height: its part inside the image
-  Tile(const Raster& r, int64_t i) : index(i), x(i % tiles_x(r) * TILE_X), y(i / tiles_x(r) * TILE_Y) {
-    width = r.width - x < TILE_X ? r.width - x : TILE_X;
-    height = r.height - y < TILE_Y ? r.height - y : TILE_Y;
-  }
-  bool inside(int i) const { return pixel_x(i) < width && pixel_y(i) < height; }
-  int64_t pixel(const Raster& r, int i) const { return (y + pixel_y(i)) * r.width + x + pixel_x(i); }
-};
+bool contains(const Tile& t, int i) { return pixel_x(i) < t.width && pixel_y(i) < t.height; }
+int64_t pixel(const Raster& r, const Tile& t, int i) { return (t.y + pixel_y(i)) * r.width + t.x + pixel_x(i); }
 
 // Pixel centres of a tile from its middle, block by block.
 struct Centres {
@@ -37,47 +26,8 @@ struct Centres {
 };
 constexpr Centres CENTRES;
 
-float near_zero(double x) { return (float)lesser(larger(x, -1e9), 1e9); }
-
-INLINE Quad load_quad(const double* p) {
-  typedef double Unaligned __attribute__((vector_size(32), aligned(8)));
-  return *(const Unaligned*)p;
-}
-
 // A pixel's transmittance, zero from where it is finished.
 INLINE Vector unfinished(Vector T) { return select(T >= refgs::MIN_TRANSMITTANCE, T, Vector()); }
-
-INLINE Quad magnitude(Quad v) { return v < 0 ? -v : v; }
-
-INLINE Splat localise(const Projected& p, const Tile& t) {
-  double x = t.x + TILE_X / 2, y = t.y + TILE_Y / 2;
-  Splat s;
-  // A fourth lane reads what comes next in `p`, and is not used.
-  Quad slope_x = load_quad(p.slope_x), slope_y = load_quad(p.slope_y), value = load_quad(p.value) + slope_x * x + slope_y * y;
-  Quad spread = (TILE_X / 2) * magnitude(slope_x) + (TILE_Y / 2) * magnitude(slope_y), most = magnitude(value) + spread;
-  double n2_low = value[2] - spread[2], n2_high = value[2] + spread[2];
-  s.plain = larger(larger(most[0], most[1]), most[2]) <= SPLIT * n2_low && n2_low >= p.n2_min && n2_high <= p.n2_max;
-  if (!s.plain) {
-    // Adding 1.5 * 2^52 q rounds to multiples of q, here 2^-22 of the largest sum: its multiples of q / 2 fit in a float.
-    Quad round = (most + spread) * (1.5 * (1ll << 30));
-    auto part = [&](Quad exact, float* high, float* low) {
-      Four h = __builtin_convertvector(exact + round - round, Four);
-      *(Four*)high = h;
-      *(Four*)low = __builtin_convertvector(exact - __builtin_convertvector(h, Quad), Four);
-    };
-    part(value, s.high.value, s.low.value);
-    part(slope_x, s.high.slope_x, s.low.slope_x);
-    part(slope_y, s.high.slope_y, s.low.slope_y);
-  } else {
-    *(Four*)s.high.value = __builtin_convertvector(value, Four);
-    *(Four*)s.high.slope_x = __builtin_convertvector(slope_x, Four);
-    *(Four*)s.high.slope_y = __builtin_convertvector(slope_y, Four);
-  }
-  s.determinant = p.determinant, s.n2_min = p.n2_min, s.n2_max = p.n2_max;
-  s.x = near_zero(p.x - x), s.y = near_zero(p.y - y), s.depth = p.depth;
-  s.log2_opacity = p.log2_opacity, s.rho_max = p.rho_max;
-  return s;
-}
 
 // Start fetching what a tile's member holds: they lie anywhere.
 INLINE void fetch(const Raster& r, const int32_t* members, int64_t k, int64_t count) {
@@ -85,22 +35,6 @@ INLINE void fetch(const Raster& r, const int32_t* members, int64_t k, int64_t co
   __builtin_prefetch(&r.projected[members[k]]);
   __builtin_prefetch((const char*)&r.projected[members[k]] + 64);
   __builtin_prefetch(r.features + members[k] * r.channels);
-}
-
-uint64_t bits(int low, int high) { return (~0ull >> (63 - (high - low))) << low; }
-
-// Blocks of the tile that the splat's octagon meets, one bit each.
-uint64_t blocks(const Octagon& p, const Tile& t) {
-  int32_t tx = (int32_t)t.x, ty = (int32_t)t.y;
-  uint64_t mask = 0;
-  for (int y = larger(p.y0 - ty, 0) / BLOCK_Y; y <= lesser(p.y1 - ty, TILE_Y - 1) / BLOCK_Y; y++) {
-    int32_t top = ty + y * BLOCK_Y, bottom = top + BLOCK_Y - 1;
-    int32_t x0 = larger(larger(p.x0, p.sum0 - bottom), p.difference0 + top) - tx;
-    int32_t x1 = lesser(lesser(p.x1, p.sum1 - top), p.difference1 + bottom) - tx;
-    if (x0 > x1 || x1 < 0 || x0 >= TILE_X) continue;
-    mask |= bits(larger(x0, 0) / BLOCK_X, lesser(x1, TILE_X - 1) / BLOCK_X) << (y * BLOCKS_X);
-  }
-  return mask;
 }
 
 // sums[c] += sum_k weights[k] features[which[k]][c], for N channels of a block.
@@ -134,9 +68,9 @@ INLINE void see(const Splat& s, const Splat& t, Vector x, Vector y, Vector (&alp
 }
 
 void forward_tile(Raster& r, int64_t index, float* sums) {
-  Tile t(r, index);
+  Tile t(r, (int32_t)index);
   alignas(64) float transmittance[PIXELS], depth[PIXELS] = {}, alpha[PIXELS] = {};
-  for (int i = 0; i < PIXELS; i++) transmittance[i] = t.inside(i) ? 1 : 0;
+  for (int i = 0; i < PIXELS; i++) transmittance[i] = contains(t, i) ? 1 : 0;
   clear(sums, r.channels * PIXELS);
 
   uint64_t live = 0;
@@ -197,8 +131,8 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
   }
   r.reach[index] = (int32_t)reach;
   for (int i = 0; i < PIXELS; i++) {
-    if (!t.inside(i)) continue;
-    r.out_depth[t.pixel(r, i)] = depth[i], r.out_alpha[t.pixel(r, i)] = alpha[i];
+    if (!contains(t, i)) continue;
+    r.out_depth[pixel(r, t, i)] = depth[i], r.out_alpha[pixel(r, t, i)] = alpha[i];
   }
   for (int b = 0; b < BLOCKS; b++)
     for (int64_t c = 0; c < r.channels; c += LANES) {
@@ -207,7 +141,7 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
       transpose(v);
       for (int k = 0; k < LANES; k++) {
         int i = b * LANES + k;
-        if (t.inside(i)) write(r.out_features + t.pixel(r, i) * r.channels + c, v[k], r.channels - c);
+        if (contains(t, i)) write(r.out_features + pixel(r, t, i) * r.channels + c, v[k], r.channels - c);
       }
     }
 }
@@ -228,7 +162,7 @@ void gather_features(float* row, const Vector* weights, const float* const* plan
 
 // Front to back again. What lies behind a splat is what is left of the pixel's total, so one scalar a pixel suffices.
 void backward_tile(Raster& r, int64_t index, float* scratch) {
-  Tile t(r, index);
+  Tile t(r, (int32_t)index);
   int64_t channels = r.channels, C = padded(channels);
   float* planes = scratch;  // derivatives by features, (block, channel, lane)
   alignas(64) float transmittance[PIXELS], by_depth[PIXELS] = {}, by_alpha[PIXELS] = {}, rest[PIXELS];
@@ -243,8 +177,8 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
     Vector dots[LANES];
     for (int k = 0; k < LANES; k++) {
       int i = b * LANES + k;
-      int64_t p = t.pixel(r, i);
-      bool inside = t.inside(i);
+      int64_t p = pixel(r, t, i);
+      bool inside = contains(t, i);
       transmittance[i] = inside ? 1 : 0;
       dots[k] = Vector();
       if (inside) by_depth[i] = r.by_depth[p], by_alpha[i] = r.by_alpha[p];
@@ -253,8 +187,8 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
     for (int64_t c = 0; c < C; c += LANES) {
       Vector v[LANES];
       for (int k = 0; k < LANES; k++) {
-        int64_t at = t.pixel(r, b * LANES + k) * channels + c;
-        bool inside = t.inside(b * LANES + k);
+        int64_t at = pixel(r, t, b * LANES + k) * channels + c;
+        bool inside = contains(t, b * LANES + k);
         v[k] = inside ? read(r.by_features + at, channels - c) : Vector();
         if (inside) dots[k] += v[k] * read(r.out_features + at, channels - c);
       }

@@ -29,7 +29,17 @@ SOURCES = (
     "ssim.cpp",
     "stack.cpp",
 )
-HEADERS = ("device.h", "lane.h", "library.h", "light.h", "raster.h", "rows.h", "splat.h", "vector.h")
+HEADERS = (
+    "device.h",
+    "lane.h",
+    "library.h",
+    "light.h",
+    "project.h",
+    "raster.h",
+    "rows.h",
+    "splat.h",
+    "vector.h",
+)
 # -ffp-contract=on: fused within an expression, never across, so that a formula rounds the same wherever it is inlined.
 FLAGS = ["-shared", "-s", "-O3", "-std=c++20", "-fno-exceptions", "-fno-rtti", "-nostdlib", "-fvisibility=hidden"]
 FLAGS += ["-fno-builtin", "-ffp-contract=on", "-fno-math-errno", "-mprefer-vector-width=512"]

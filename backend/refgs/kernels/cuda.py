@@ -12,9 +12,9 @@ from pathlib import Path
 
 import torch
 
-from refgs.kernels.build import HERE, cache_folder
+from refgs.kernels.build import HEADERS, HERE, cache_folder
 
-# Those of the sources that a card runs; HEADERS are what they include.
+# Those of the sources that a card runs.
 SOURCES = (
     "activate.cpp",
     "adam.cpp",
@@ -23,13 +23,13 @@ SOURCES = (
     "motion.cpp",
     "normals.cpp",
     "peak.cpp",
+    "raster.cu",
     "shade.cpp",
     "sparse.cpp",
     "ssim.cpp",
     "stack.cpp",
     "trace.cu",
 )
-HEADERS = ("device.h", "lane.h", "library.h", "light.h", "rows.h", "splat.h", "vector.h")
 # A product and a sum fuse as the CPU's do; nothing else is rounded other than IEEE 754 has it.
 OPTIONS = (
     "--std=c++17",

@@ -71,9 +71,22 @@ INLINE Vector root(Vector x) { return sqrtf(x.value); }
 INLINE float root(float x) { return sqrtf(x); }
 INLINE double root(double x) { return sqrt(x); }
 INLINE Vector round_down(Vector x) { return floorf(x.value); }
-INLINE Vector reciprocal(Vector x) { return 1.0f / x.value; }
 INLINE Vector inverse_root(Vector x) { return 1.0f / sqrtf(x.value); }
+#ifdef __CUDACC_RTC__  // one instruction each, where 1 / x and exp2f are right for denormal numbers, too
+INLINE Vector reciprocal(Vector x) {
+  float y;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x.value));
+  return y;
+}
+INLINE Vector exp2(Vector x) {
+  float y;
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x.value));
+  return y;
+}
+#else
+INLINE Vector reciprocal(Vector x) { return 1.0f / x.value; }
 INLINE Vector exp2(Vector x) { return exp2f(x.value); }
+#endif
 INLINE float total(Vector x) { return x.value; }
 INLINE bool any(Mask mask) { return mask.value != 0; }
 INLINE Vector load(const float* p) { return *p; }

@@ -1,8 +1,6 @@
-// The rasteriser's work: what a caller allocates, and how the picture is divided. Splats are projected, sorted and binned
-// (project.cpp), then blended (blend.cpp), and their derivatives go back the same way.
-//
-// Every function works on one Raster that the caller allocates. The ones marked `parallel` may be entered by several threads at
-// once: they share the work through `shared`, which the caller sets to zero. No result depends on who does what.
+// The rasteriser's work, on the CPU and on CUDA cards: how the picture is divided, and what a tile sees of a splat. Splats are
+// projected (project.h), sorted and binned, then blended, tile by tile, and their derivatives go back the same way: the CPU's part is
+// in project.cpp and blend.cpp, the cards' in raster.cu.
 #pragma once
 
 #include "vector.h"
@@ -11,16 +9,22 @@
 
 INLINE int32_t larger(int32_t a, int32_t b) { return a > b ? a : b; }
 INLINE int32_t lesser(int32_t a, int32_t b) { return a < b ? a : b; }
+INLINE float larger(float a, float b) { return a > b ? a : b; }
 INLINE double larger(double a, double b) { return a > b ? a : b; }  // b where one is NaN
 INLINE double lesser(double a, double b) { return a < b ? a : b; }
 
-constexpr int TILE_X = LANES == 4 ? 16 : 32, TILE_Y = 16;  // pixels; 64 blocks at most
+// In pixels. A block is what is computed at once: a vector of pixels, or a warp's.
+#ifdef __CUDACC__
+constexpr int TILE_X = 16, TILE_Y = 16, BLOCK_X = 8, BLOCK_Y = 4;
+typedef uint32_t Bits;  // one a block
+#else
+constexpr int TILE_X = LANES == 4 ? 16 : 32, TILE_Y = 16, BLOCK_X = LANES == 4 ? 2 : 4, BLOCK_Y = LANES / BLOCK_X;
+typedef uint64_t Bits;
+#endif
 constexpr int PIXELS = TILE_X * TILE_Y;
-constexpr int BLOCK_X = LANES == 4 ? 2 : 4;  // a block is one vector of pixels
-constexpr int BLOCK_Y = LANES / BLOCK_X;
 constexpr int BLOCKS_X = TILE_X / BLOCK_X, BLOCKS_Y = TILE_Y / BLOCK_Y;
-constexpr int BLOCKS = BLOCKS_X * BLOCKS_Y;
-constexpr int AHEAD = 12;     // splats that are fetched before they are needed
+constexpr int BLOCKS = BLOCKS_X * BLOCKS_Y, MOST_BLOCKS = 8 * sizeof(Bits);
+static_assert(BLOCKS <= MOST_BLOCKS);
 constexpr int GEOMETRY = 16;  // floats of a gradient row before its features; 14 are used
 
 // Pixels that a splat can cover, all inclusive: bounds of x, y, x + y and x - y; x1 < x0 where there are none.
@@ -37,13 +41,128 @@ struct alignas(64) Projected {
 
 static_assert(sizeof(Projected) == 128, "two cache lines");
 
-struct Raster {
+// What is drawn, and the pictures; `by_` are derivatives of the loss.
+struct Scene {
   int64_t splats, channels, width, height;
   const float *positions, *rotations, *scales, *opacities, *features;
   double view[12];  // world to camera, 3x4, row-major
   double fx, fy, cx, cy, near;
-  Projected* projected;       // (splats)
-  Octagon* octagons;          // (splats) once more, close together: what binning reads
+  Projected* projected;  // (splats)
+  float *out_features, *out_depth, *out_alpha;
+  const float *by_features, *by_depth, *by_alpha;
+  float *by_positions, *by_rotations, *by_scales, *by_opacities, *by_splat_features;
+};
+
+INLINE int64_t tiles_x(const Scene& r) { return (r.width + TILE_X - 1) / TILE_X; }
+INLINE int64_t tiles_y(const Scene& r) { return (r.height + TILE_Y - 1) / TILE_Y; }
+
+// Columns of pixels where the octagon can meet the rows from `top` to `bottom`; whether there are any.
+INLINE bool columns(const Octagon& p, int32_t top, int32_t bottom, int32_t& x0, int32_t& x1) {
+  x0 = larger(larger(p.x0, p.sum0 - bottom), p.difference0 + top);
+  x1 = lesser(lesser(p.x1, p.sum1 - top), p.difference1 + bottom);
+  return x0 <= x1;
+}
+
+// body(y, x0, x1) for the rows of tiles that the octagon meets: from which to which.
+template <class Body>
+INLINE void each_row(const Octagon& p, Body body) {
+  if (p.x1 < p.x0) return;
+  for (int32_t y = p.y0 / TILE_Y; y <= p.y1 / TILE_Y; y++) {
+    int32_t x0, x1;
+    if (columns(p, y * TILE_Y, y * TILE_Y + TILE_Y - 1, x0, x1)) body(y, x0 / TILE_X, x1 / TILE_X);
+  }
+}
+
+// body(tile, x, y) for those tiles, row by row.
+template <class Body>
+INLINE void each_tile(const Scene& r, const Octagon& p, Body body) {
+  each_row(p, [&](int32_t y, int32_t x0, int32_t x1) {
+    for (int32_t x = x0; x <= x1; x++) body(y * tiles_x(r) + x, x, y);
+  });
+}
+
+struct Tile {
+  int64_t index, x, y, width, height;  // x, y: its first pixel; width, height: its part inside the image
+  MEMBER Tile(const Scene& r, int32_t i) : index(i), x(i % (int32_t)tiles_x(r) * TILE_X), y(i / (int32_t)tiles_x(r) * TILE_Y) {
+    width = r.width - x < TILE_X ? r.width - x : TILE_X;
+    height = r.height - y < TILE_Y ? r.height - y : TILE_Y;
+  }
+};
+
+INLINE Bits bits(int low, int high) { return (~(Bits)0 >> (MOST_BLOCKS - 1 - (high - low))) << low; }
+
+// Blocks of the tile that the splat's octagon meets.
+INLINE Bits blocks(const Octagon& p, const Tile& t) {
+  int32_t tx = (int32_t)t.x, ty = (int32_t)t.y;
+  Bits mask = 0;
+  for (int y = larger(p.y0 - ty, 0) / BLOCK_Y; y <= lesser(p.y1 - ty, TILE_Y - 1) / BLOCK_Y; y++) {
+    int32_t top = ty + y * BLOCK_Y, x0, x1;
+    if (!columns(p, top, top + BLOCK_Y - 1, x0, x1) || x1 < tx || x0 >= tx + TILE_X) continue;
+    mask |= bits(larger(x0 - tx, 0) / BLOCK_X, lesser(x1 - tx, TILE_X - 1) / BLOCK_X) << (y * BLOCKS_X);
+  }
+  return mask;
+}
+
+// Four doubles, of which three count.
+#ifdef __CUDACC__
+struct Quad {
+  double value[4];
+  friend Quad operator+(Quad a, Quad b) { return {a.value[0] + b.value[0], a.value[1] + b.value[1], a.value[2] + b.value[2]}; }
+  friend Quad operator-(Quad a, Quad b) { return {a.value[0] - b.value[0], a.value[1] - b.value[1], a.value[2] - b.value[2]}; }
+  friend Quad operator*(double s, Quad a) { return {s * a.value[0], s * a.value[1], s * a.value[2]}; }
+};
+INLINE Quad load_quad(const double* p) { return {p[0], p[1], p[2]}; }
+INLINE Four narrow(Quad q) { return {(float)q.value[0], (float)q.value[1], (float)q.value[2]}; }
+INLINE Quad widen(Four f) { return {f[0], f[1], f[2]}; }
+INLINE Four magnitude(Four f) { return {fabsf(f[0]), fabsf(f[1]), fabsf(f[2])}; }
+#else
+typedef double Quad __attribute__((vector_size(32)));
+INLINE Quad load_quad(const double* p) {  // a fourth lane reads what comes next
+  typedef double Unaligned __attribute__((vector_size(32), aligned(8)));
+  return *(const Unaligned*)p;
+}
+INLINE Four narrow(Quad q) { return __builtin_convertvector(q, Four); }
+INLINE Quad widen(Four f) { return __builtin_convertvector(f, Quad); }
+INLINE Four magnitude(Four f) { return f < 0 ? -f : f; }
+#endif
+
+INLINE float near_zero(double x) { return (float)lesser(larger(x, -1e9), 1e9); }
+
+// n0, n1, n2 are taken apart where they sum up terms larger than this many times n2: u and v err by 2^-24 of it.
+constexpr float SPLIT = 32;
+
+// The splat as the tile sees it.
+INLINE refgs::Splat localise(const Projected& p, const Tile& t) {
+  double x = t.x + TILE_X / 2, y = t.y + TILE_Y / 2;
+  refgs::Splat s;
+  Quad slope_x = load_quad(p.slope_x), slope_y = load_quad(p.slope_y), value = load_quad(p.value) + x * slope_x + y * slope_y;
+  Four v = narrow(value), along_x = narrow(slope_x), along_y = narrow(slope_y);
+  Four spread = (TILE_X / 2.0f) * magnitude(along_x) + (TILE_Y / 2.0f) * magnitude(along_y), most = magnitude(v) + spread;
+  float n2_low = v[2] - spread[2], n2_high = v[2] + spread[2];
+  s.plain = larger(larger(most[0], most[1]), most[2]) <= SPLIT * n2_low && n2_low >= p.n2_min && n2_high <= p.n2_max;
+  if (!s.plain) {
+    // Adding 1.5 * 2^52 q rounds to multiples of q, here 2^-22 of the largest sum: its multiples of q / 2 fit in a float.
+    Quad round = (1.5 * (1ll << 30)) * widen(most + spread);
+    auto part = [&](Quad exact, Four& high, float* low) {
+      high = narrow(exact + round - round);
+      *(Four*)low = narrow(exact - widen(high));
+    };
+    part(value, v, s.low.value);
+    part(slope_x, along_x, s.low.slope_x);
+    part(slope_y, along_y, s.low.slope_y);
+  }
+  *(Four*)s.high.value = v, *(Four*)s.high.slope_x = along_x, *(Four*)s.high.slope_y = along_y;
+  s.determinant = p.determinant, s.n2_min = p.n2_min, s.n2_max = p.n2_max;
+  s.x = near_zero(p.x - x), s.y = near_zero(p.y - y), s.depth = p.depth;
+  s.log2_opacity = p.log2_opacity, s.rho_max = p.rho_max;
+  return s;
+}
+
+#ifndef __CUDACC__
+// The CPU's work, one object that the caller allocates. The functions marked `parallel` may be entered by several threads at once: they
+// share the work through `shared`, which the caller sets to zero. No result depends on who does what.
+struct Raster : Scene {
+  Octagon* octagons;          // (splats) those of `projected` once more, close together: what binning reads
   uint32_t* keys;             // (4 splats) scratch of the sort; the third quarter begins as the splats' depths
   int32_t* order;             // (visible) splats, front to back
   int64_t visible, pairs;     // pairs: (splat, tile) that meet
@@ -51,30 +170,15 @@ struct Raster {
   int64_t* tile_start;        // (tiles + 1) into `members`
   int32_t* members;           // (pairs) splats of each tile, front to back
   int32_t* places;            // (pairs) of each splat's tiles, row by row: where in the tile's members it is
-  float *out_features, *out_depth, *out_alpha;
   int32_t* reach;             // (tiles) members after which every pixel is finished
-  const float *by_features, *by_depth, *by_alpha;
   int64_t* row_start;         // (tiles + 1) into `rows`
   int64_t row_count;
   float* rows;                // (row_count, GEOMETRY + padded channels) derivatives of a pair
-  float *by_positions, *by_rotations, *by_scales, *by_opacities, *by_splat_features;
   float* scratch;             // (threads, refgs_scratch_size)
   Shared shared;
 };
 
-INLINE int64_t tiles_x(const Raster& r) { return (r.width + TILE_X - 1) / TILE_X; }
-INLINE int64_t tiles_y(const Raster& r) { return (r.height + TILE_Y - 1) / TILE_Y; }
-
-// body(tile) for the tiles that the splat's octagon meets, row by row.
-template <class Body>
-INLINE void each_tile(const Raster& r, const Octagon& p, Body body) {
-  if (p.x1 < p.x0) return;
-  for (int32_t y = p.y0 / TILE_Y; y <= p.y1 / TILE_Y; y++)
-    for (int32_t x = p.x0 / TILE_X; x <= p.x1 / TILE_X; x++) {
-      int32_t sum = x * TILE_X + y * TILE_Y, difference = x * TILE_X - y * TILE_Y;  // of the tile's first pixel
-      if (sum <= p.sum1 && sum + TILE_X + TILE_Y - 2 >= p.sum0 && difference - TILE_Y < p.difference1 && difference + TILE_X > p.difference0)
-        body(y * tiles_x(r) + x, x, y);
-    }
-}
+constexpr int AHEAD = 12;     // splats that are fetched before they are needed
 
 INLINE int64_t padded(int64_t channels) { return (channels + LANES - 1) / LANES * LANES; }
+#endif

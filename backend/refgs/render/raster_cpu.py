@@ -1,0 +1,52 @@
+"""The rasteriser on the CPU."""
+
+import ctypes
+
+import torch
+
+from refgs.kernels.load import Shared, borrow, kernels, parallel
+from refgs.render.raster import Scene
+
+
+class Raster(Scene):
+    """`struct Raster` of raster.h."""
+
+    _fields_ = (
+        [(n, ctypes.c_void_p) for n in ("octagons", "keys", "order")]
+        + [(n, ctypes.c_int64) for n in ("visible", "pairs")]
+        + [(n, ctypes.c_void_p) for n in ("splat_start", "tile_start", "members", "places", "reach", "row_start")]
+        + [("row_count", ctypes.c_int64), ("rows", ctypes.c_void_p), ("scratch", ctypes.c_void_p), ("shared", Shared)]
+    )
+
+    def project(self, device: torch.device) -> None:
+        library, n = kernels(), self.splats
+        tiles = library.refgs_tiles(self.width, self.height)
+        self.keep(
+            projected=torch.empty(n * library.refgs_projected_size(), dtype=torch.uint8),
+            octagons=torch.empty(n * library.refgs_octagon_size(), dtype=torch.uint8),
+            order=torch.empty(n, dtype=torch.int32),
+            splat_start=torch.empty(n + 1, dtype=torch.int64),
+            tile_start=torch.empty(tiles + 1, dtype=torch.int64),
+            reach=torch.empty(tiles, dtype=torch.int32),
+        )
+        self.attach(keys=borrow("keys", 4 * n))
+        parallel(library.refgs_project, self)
+        library.refgs_sort(ctypes.byref(self))
+        self.keep(
+            members=torch.empty(self.pairs, dtype=torch.int32),
+            places=torch.empty(self.pairs, dtype=torch.int32),
+        )
+        library.refgs_bin(ctypes.byref(self))
+
+    def blend(self) -> None:
+        library = kernels()
+        parallel(library.refgs_forward, self, library.refgs_scratch_size(self.channels))
+
+    def differentiate(self) -> None:
+        library = kernels()
+        row_start = torch.empty_like(self.kept["tile_start"])
+        self.attach(row_start=row_start)
+        library.refgs_rows(ctypes.byref(self))
+        self.attach(rows=borrow("rows", self.row_count * library.refgs_row_size(self.channels)))
+        parallel(library.refgs_backward, self, library.refgs_scratch_size(self.channels))
+        parallel(library.refgs_gather, self)

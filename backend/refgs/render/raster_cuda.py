@@ -1,0 +1,72 @@
+"""The rasteriser on CUDA cards."""
+
+import ctypes
+
+import torch
+
+from refgs.kernels import cuda, load
+from refgs.render.raster import Scene
+
+SIZES = (4, 8, 12, 16, 20)  # channels that kernels are compiled for; other numbers are drawn by the next larger one
+MOST = SIZES[-1]
+TILE, THREADS, PHASES = 16, 128, 8  # as in raster.cu
+PROJECTED = 128  # bytes of `struct Projected` of raster.h
+GEOMETRY = 16  # floats of a gradient row before its features, as there
+SHORT = 1 << 15  # tiles that 16 bits can number: they take half as long to sort
+
+
+class Raster(Scene):
+    """`struct Raster` of raster.cu."""
+
+    _fields_ = (
+        [(n, ctypes.c_void_p) for n in ("depths", "counts", "order", "ends", "starts")]
+        + [("pair_count", ctypes.c_int64)]
+        + [(n, ctypes.c_void_p) for n in ("pairs", "sorted", "tile_start", "members", "places", "reach", "last")]
+        + [("size", ctypes.c_int64), ("rows", ctypes.c_void_p), ("scratch", ctypes.c_void_p), ("shared", load.Shared)]
+    )
+
+    def project(self, device: torch.device) -> None:
+        def integers(*shape: int) -> torch.Tensor:
+            return torch.empty(shape, dtype=torch.int32, device=device)
+
+        n = self.splats
+        self.tiles = -(-self.width // TILE) * -(-self.height // TILE)
+        self.keep(
+            projected=torch.empty(n * PROJECTED, dtype=torch.uint8, device=device),
+            counts=integers(n),
+            starts=integers(n),
+            tile_start=integers(self.tiles + 1),
+            reach=integers(self.tiles),
+            last=integers(self.tiles),
+        )
+        counts, depths = self.kept["counts"], integers(n)
+        self.attach(depths=depths)
+        load.run("refgs_raster_project", self, depths, n)
+        order = torch.sort(depths, stable=True).indices
+        ends = counts[order].cumsum(0)
+        self.pair_count = (
+            int(ends[-1]) if n else 0
+        )  # the one thing that the processor waits for: it has to find the memory
+        if self.pair_count >= 1 << 31:
+            raise RuntimeError(f"{self.pair_count:,} pairs of a surfel and a tile are more than 32 bits can number")
+        self.keep(
+            pairs=integers(self.pair_count, 2), members=integers(self.pair_count), places=integers(self.pair_count)
+        )
+        self.attach(order=order, ends=ends)
+        load.run("refgs_raster_list", self, depths, n)
+        tile = self.kept["pairs"][:, 0]
+        sorted = torch.sort(tile.short() if self.tiles <= SHORT else tile, stable=True).indices
+        self.attach(sorted=sorted)
+        load.run("refgs_raster_bin", self, depths, self.pair_count + 1)
+
+    def blend(self) -> None:
+        self.size = next(size for size in SIZES if size >= self.channels)
+        cuda.launch(f"refgs_raster_forward_{self.size}", self, self.kept["reach"].device, self.tiles, THREADS)
+
+    def differentiate(self) -> None:
+        like = self.kept["reach"]
+        rows = torch.empty(self.pair_count * (GEOMETRY + self.size), device=like.device)
+        self.attach(rows=rows)
+        cuda.launch(f"refgs_raster_backward_{self.size}", self, like.device, self.tiles, THREADS)
+        load.run("refgs_raster_gather", self, like, self.splats)
+        load.run("refgs_raster_gather_features", self, like, self.splats * -(-self.channels // 4) * PHASES)
