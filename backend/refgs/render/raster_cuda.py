@@ -15,6 +15,11 @@ GEOMETRY = 16  # floats of a gradient row before its features, as there
 SHORT = 1 << 15  # tiles that 16 bits can number: they take half as long to sort
 
 
+def how_many(ends: torch.Tensor) -> int:
+    """The last of some running sums: the one thing of a picture that the processor waits for, as it has to find the memory."""
+    return int(ends[-1]) if len(ends) else 0
+
+
 class Raster(Scene):
     """`struct Raster` of raster.cu."""
 
@@ -44,9 +49,7 @@ class Raster(Scene):
         load.run("refgs_raster_project", self, depths, n)
         order = torch.sort(depths, stable=True).indices
         ends = counts[order].cumsum(0)
-        self.pair_count = (
-            int(ends[-1]) if n else 0
-        )  # the one thing that the processor waits for: it has to find the memory
+        self.pair_count = how_many(ends)
         if self.pair_count >= 1 << 31:
             raise RuntimeError(f"{self.pair_count:,} pairs of a surfel and a tile are more than 32 bits can number")
         self.keep(
