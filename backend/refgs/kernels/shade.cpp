@@ -315,7 +315,7 @@ template <int C, bool DERIVATIVES>
 struct Displaced {
   static constexpr int S = C - 3;
   const Pixels& pixels;
-  Vector alpha, inverse, own[C], value[S];
+  Vector alpha, inverse, own[C], value[S];  // own: the position, and the others where any is needed
   Vector x, y, inverse_z, px, py;  // the blended point in camera space; where it projects
   Mask moves_x, moves_y;           // the derivative passes the limits
   Corners corners;
@@ -323,8 +323,9 @@ struct Displaced {
   Vector sampled[S], by_x[S], by_y[S], there_by_x, there_by_y;  // blended over the four corners, and how that changes along x and y
 
   MEMBER Displaced(const Shade& s, const Pixels& p) : pixels(p), alpha(load(p.alpha)), inverse(reciprocal(alpha)) {
-    to_lanes<C>([&](int k, int b) { return Blocks<C>::get(s.features + (int64_t)p.at[k] * C + Blocks<C>::at(b)); }, own);
-    for (int c = 0; c < C; c++) own[c] *= inverse;
+    Vector last[4];  // channels: one more than the position's, as four are quick to load
+    to_lanes<4>([&](int k, int b) { return Blocks<4>::get(s.features + (int64_t)p.at[k] * C + S - 1 + Blocks<4>::at(b)); }, last);
+    for (int i = 0; i < 3; i++) own[S + i] = inverse * last[1 + i];
 
     const float* m = s.view;
     auto row = [&](int i) { return m[i] * own[S] + m[i + 1] * own[S + 1] + m[i + 2] * own[S + 2] + m[i + 3]; };
@@ -378,7 +379,12 @@ struct Displaced {
     trust = clamp((there - SHIFT_ALPHA) * (1 / SHIFT_ALPHA), 0, 1);
     inverse_there = reciprocal(larger(there, Vector() + SHIFT_ALPHA));
     scale = trust * inverse_there;
-    for (int c = 0; c < S; c++) value[c] = scale * sampled[c] + (1.0f - trust) * own[c];
+    for (int c = 0; c < S; c++) value[c] = scale * sampled[c], own[c] = Vector();
+    if (any(trust < 1.0f)) {
+      Vector first[S];
+      to_lanes<S>([&](int k, int b) { return Blocks<S>::get(s.features + (int64_t)p.at[k] * C + Blocks<S>::at(b)); }, first);
+      for (int c = 0; c < S; c++) own[c] = inverse * first[c], value[c] += (1.0f - trust) * own[c];
+    }
   }
 
   // From the derivatives by `value` and by the pixel's own alpha.
