@@ -1,0 +1,159 @@
+"""Training on a CUDA card, without one: its kernels emulated, and an iteration's tensors followed from device to device."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake_temporarily
+
+from refgs.capture import read_capture
+from refgs.geometry.mesh import Mesh
+from refgs.geometry.visibility import Occluder
+from refgs.kernels import cuda
+from refgs.model import environment, prefilter
+from refgs.render import raster_cuda, shade
+from refgs.settings import load_settings
+from refgs.train.adam import Adam
+from refgs.train.densify import ScreenGradient
+from refgs.train.losses import Photo
+from refgs.train.trainer import Trainer
+from tests.kernels.emulate import emulate
+
+CARD = torch.device("cuda:0")
+
+
+def make_trainer(capture, folder, *changes: str) -> Trainer:
+    start = [
+        "surfels.start=600",
+        "surfels.budget=800",
+        "surfels.hull=48",
+        "train.light_first=0",
+        "environment.resolution=16",
+    ]
+    settings = load_settings("quick", [*start, *changes])
+    (folder / "checkpoints").mkdir(parents=True)
+    return Trainer(read_capture(capture), settings, folder, lambda *_: None)
+
+
+@pytest.mark.parametrize("changes", [["indirect.start=0"], ["render.shading=sh"]])
+def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
+    """The same steps with the kernels of both, the object in its own way, too."""
+    figures, learned = [], []
+    for name in ("cpu", "card"):
+        trainer = make_trainer(ball_capture, tmp_path / name, *changes)
+        if "indirect.start=0" in changes:
+            ring = trimesh.creation.torus(1.0, 0.3)
+            trainer.occluder = Occluder(Mesh(ring.vertices * trainer.capture.radius, np.asarray(ring.faces)))
+        if name == "card":
+            emulate(monkeypatch)
+        steps = [trainer.step() for _ in range(3)]
+        figures.append([[float(step[name]) for name in ("loss", "psnr")] for step in steps])
+        learned.append({name: value.detach().clone() for name, value in trainer.parameters.items()})
+    np.testing.assert_allclose(figures[0], figures[1], rtol=1e-3)
+    for name, value in learned[0].items():
+        # Adam's first steps are the gradients' signs, which rounding may turn where they are next to nothing.
+        off = (value - learned[1][name]).abs() > 1e-3 * value.abs().max()
+        assert float(off.float().mean()) < 0.01, name
+
+
+def follow_to_the_card(monkeypatch) -> list[str]:
+    """Have tensors be none but shapes on devices, as which a card's need no card; names of the kernels that are launched."""
+
+    def empty(value):
+        if isinstance(value, Tensor):
+            return torch.empty(value.shape, dtype=value.dtype, device=CARD)
+        if isinstance(value, tuple | list):
+            moved = map(empty, value)
+            return type(value)(*moved) if hasattr(value, "_fields") else type(value)(moved)
+        return value
+
+    def computed_on_the_cpu(make):  # what numpy has a hand in
+        def made(*arguments):
+            with unset_fake_temporarily():
+                value = make(*arguments[:-1], torch.device("cpu"))
+            return empty(value)
+
+        return made
+
+    tables = [(prefilter, "matrices"), (prefilter, "_pyramid"), (environment, "_projection")]
+    for home, name in [*tables, (shade, "_fg_table"), (shade._Padding, "of")]:
+        monkeypatch.setattr(home, name, computed_on_the_cpu(getattr(home, name)))
+    launched = []
+    monkeypatch.setattr(cuda, "launch", lambda name, *_: launched.append(name))
+    monkeypatch.setattr(raster_cuda, "how_many", lambda ends: 1000)
+    monkeypatch.setattr(FakeTensor, "data_ptr", lambda tensor: 0, raising=False)
+    monkeypatch.setattr(Tensor, "backward", backward)
+    return launched
+
+
+def backward(loss: Tensor) -> None:
+    """Autograd, whose own engine asks for the card. What a function takes beside tensors comes after those with a derivative."""
+    order: list = []
+
+    def visit(node) -> None:
+        if node is not None and node not in order:
+            for below, _ in node.next_functions:
+                visit(below)
+            order.append(node)
+
+    visit(loss.grad_fn)
+    gradients = {loss.grad_fn: {0: torch.ones_like(loss)}}
+    with torch.no_grad():
+        for node in reversed(order):
+            found = gradients.get(node, {})
+            if hasattr(node, "variable"):
+                node.variable.grad = found[0]
+                continue
+            blank = [torch.zeros(m.shape, dtype=m.dtype, device=m.device) for m in node._input_metadata]
+            passed = getattr(node, "apply", node)(*(found.get(i, zero) for i, zero in enumerate(blank)))
+            passed = passed if isinstance(passed, tuple) else (passed,)
+            for (below, i), value in zip(node.next_functions, passed, strict=False):
+                if below is not None and value is not None:
+                    slot = gradients.setdefault(below, {})
+                    slot[i] = slot[i] + value if i in slot else value
+
+
+@pytest.mark.parametrize("indirect", [False, True])
+def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, indirect):
+    """No operation finds its tensors on two devices, and none waits for a number but the one that is named: reading one, or
+    making a tensor whose size depends on one, is an error here."""
+    trainer = make_trainer(ball_capture, tmp_path / "run", f"indirect.start={0 if indirect else 1}")
+    ball = trimesh.creation.icosphere(2)
+    occluder = Occluder(Mesh(ball.vertices * trainer.capture.radius, np.asarray(ball.faces)))
+    tree = occluder.tree(torch.device("cpu"))
+    trainer._next_photo()  # the views' order is drawn on the CPU
+    launched = follow_to_the_card(monkeypatch)
+    with FakeTensorMode(allow_non_fake_inputs=True):
+
+        def to_card(value: Tensor) -> Tensor:
+            return torch.empty(value.shape, dtype=value.dtype, device=CARD)
+
+        trainer.device, trainer.background, trainer.light = CARD, to_card(trainer.background), to_card(trainer.light)
+        trainer.light.requires_grad_()
+        trainer.parameters = {name: to_card(value).requires_grad_() for name, value in trainer.parameters.items()}
+        trainer.constant = {name: to_card(value) for name, value in trainer.constant.items()}
+        trainer.photos = [Photo(to_card(p.image), to_card(p.mask), p.camera) for p in trainer.photos]
+        for group in trainer.optimizer.param_groups:
+            group["params"] = [trainer.parameters.get(group["name"], trainer.light)]
+        trainer.optimizer = Adam(trainer.optimizer.param_groups)
+        trainer.motion = ScreenGradient(len(trainer.parameters["position"]), CARD)
+        if indirect:
+            tree._boxes, tree._triangles = to_card(tree._boxes), to_card(tree._triangles)
+            trainer.occluder = occluder
+        figures = trainer.step()
+        assert all(figure.device == CARD for figure in figures.values())
+        assert all(value.grad is None and value.device == CARD for value in trainer.parameters.values())
+    stages = [
+        "activate",
+        "sparse",
+        "raster_project",
+        "raster_forward",
+        "shade_forward",
+        "losses",
+        "ssim",
+        "raster_backward",
+        "adam",
+    ]
+    for stage in stages + ["trace", "harmonics"] * indirect:
+        assert any(stage in name for name in launched), stage
