@@ -12,6 +12,18 @@ def test_solid_angles_cover_the_sphere(side):
     assert cubemap.texel_solid_angles(side).sum() == pytest.approx(4 * math.pi, rel=1e-12)
 
 
+def test_symmetries_take_orbits_to_themselves():
+    side = 8
+    orbits, directions = cubemap.orbits(side), cubemap.texel_directions(side)
+    assert orbits.flatten().sort().values.equal(torch.arange(6 * side * side))
+    for symmetry in range(cubemap.SYMMETRIES):
+        signs = torch.tensor([-1.0 if symmetry & bit else 1.0 for bit in (1, 2, 4)])
+        expected = (directions[orbits] * signs).roll(symmetry // 8, dims=-1)
+        torch.testing.assert_close(
+            directions[orbits[:, cubemap.compositions()[:, symmetry]]], expected, check_dtype=False
+        )
+
+
 def test_a_texels_own_direction_reads_that_texel():
     side = 8
     table = torch.rand(6 * side * side, 3, dtype=torch.float64)

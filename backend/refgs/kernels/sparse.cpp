@@ -1,25 +1,33 @@
-// A sparse matrix times a dense one of three columns: the light's prefilter.
+// A sparse matrix times a dense one of three columns: the light's prefilter. Both are over texels of cubemaps in the order of
+// their orbits, and the cube's 24 symmetries leave the matrix as it is (cubemap.py).
 #include "vector.h"
 
 namespace {
 
+const int SYMMETRIES = 24, WIDTH = 3 * SYMMETRIES;
+
 struct Product {
-  int64_t rows;
-  const int32_t *starts, *columns;  // (rows + 1), of the numbers of each row; their columns
-  const float *numbers, *dense;     // (columns, 3), and one float more that may be read
-  float* out;                       // (rows, 3)
-  float* scratch;                   // none is used
+  int64_t orbits;                   // of rows
+  const int32_t *starts, *columns;  // (orbits + 1), of the numbers of each one's first row; their columns, by symmetry
+  const float* numbers;
+  const int32_t* compositions;  // (24, 24): the symmetry that is the row's, then the column's
+  const float* dense;           // (columns, 3), and LANES - 1 floats more that may be read
+  float* out;                   // (24 orbits, 3)
+  float* scratch;               // none is used
   mutable Shared shared;
 };
 
 #ifdef __CUDACC__
 // A warp a row: its threads take numbers by turns, then add up what they have.
 INLINE void product(const Product& p) {
-  share(p.shared, 32 * p.rows, 32, [&](int64_t i) {
-    int64_t row = i / 32;
+  share(p.shared, 32 * SYMMETRIES * p.orbits, 32, [&](int64_t i) {
+    int32_t row = i / 32, orbit = row / SYMMETRIES;
     float sum[3] = {};
-    for (int32_t k = p.starts[row] + i % 32; k < p.starts[row + 1]; k += 32)
-      for (int c = 0; c < 3; c++) sum[c] += p.numbers[k] * p.dense[3 * p.columns[k] + c];
+    for (int32_t k = p.starts[orbit] + i % 32; k < p.starts[orbit + 1]; k += 32) {
+      int32_t symmetry = p.columns[k] % SYMMETRIES;
+      int32_t column = p.columns[k] - symmetry + p.compositions[SYMMETRIES * symmetry + row % SYMMETRIES];
+      for (int c = 0; c < 3; c++) sum[c] += p.numbers[k] * p.dense[3 * column + c];
+    }
     for (int c = 0; c < 3; c++) {
       for (int apart = 16; apart; apart /= 2) sum[c] += __shfl_xor_sync(~0u, sum[c], apart);
       if (i % 32 == c) p.out[3 * row + c] = sum[c];
@@ -29,16 +37,25 @@ INLINE void product(const Product& p) {
 #else
 typedef float UnalignedFour __attribute__((vector_size(16), aligned(4)));
 
+// An orbit's rows at once: what the first reads of another orbit the others read too, each another image of it.
 INLINE void product(const Product& p) {
-  const int64_t BATCH = 64, AT_ONCE = 4;  // sums that do not wait for each other
-  share(p.shared, p.rows, BATCH, [&](int64_t row) {
-    Four sums[AT_ONCE] = {};
-    int32_t k = p.starts[row], end = p.starts[row + 1];
-    for (; k + AT_ONCE <= end; k += AT_ONCE)
-      for (int i = 0; i < AT_ONCE; i++) sums[i] += p.numbers[k + i] * *(const UnalignedFour*)(p.dense + 3 * p.columns[k + i]);
-    for (; k < end; k++) sums[0] += p.numbers[k] * *(const UnalignedFour*)(p.dense + 3 * p.columns[k]);
-    Four sum = (sums[0] + sums[1]) + (sums[2] + sums[3]);
-    for (int c = 0; c < 3; c++) p.out[3 * row + c] = sum[c];
+  const int64_t BATCH = 16, VECTORS = (WIDTH + LANES - 1) / LANES;
+  share(p.shared, p.orbits, BATCH, [&](int64_t i) {
+    int64_t orbit = p.orbits - 1 - i;  // the last have most numbers
+    Four sums[SYMMETRIES] = {};
+    for (int32_t k = p.starts[orbit], end = p.starts[orbit + 1]; k < end;) {
+      int32_t symmetry = p.columns[k] % SYMMETRIES;
+      Vector run[VECTORS] = {};
+      for (; k < end && p.columns[k] % SYMMETRIES == symmetry; k++)
+        for (int v = 0; v < VECTORS; v++)
+          run[v] += p.numbers[k] * *(const UnalignedVector*)(p.dense + 3 * (p.columns[k] - symmetry) + v * LANES);
+      float images[VECTORS * LANES + 1];
+      for (int v = 0; v < VECTORS; v++) *(UnalignedVector*)(images + v * LANES) = run[v];
+      for (int s = 0; s < SYMMETRIES; s++)
+        sums[s] += *(const UnalignedFour*)(images + 3 * p.compositions[SYMMETRIES * symmetry + s]);
+    }
+    for (int s = 0; s < SYMMETRIES; s++)
+      for (int c = 0; c < 3; c++) p.out[WIDTH * orbit + 3 * s + c] = sums[s][c];
   });
 }
 #endif

@@ -10,6 +10,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+SYMMETRIES = 24  # of the cube: every change of the axes' signs and every cyclic order of them
+
 
 def _face_direction(face: Tensor, s: Tensor, t: Tensor) -> Tensor:
     """Unnormalised direction of (s, t) on a face (see the module's text)."""
@@ -55,6 +57,30 @@ def texel_solid_angles(resolution: int) -> Tensor:
     corner = torch.atan2(s * t, torch.sqrt(s * s + t * t + 1))  # area of the rectangle from the face's centre to (s, t)
     face = corner[1:, 1:] - corner[:-1, 1:] - corner[1:, :-1] + corner[:-1, :-1]
     return face.flatten().repeat(6)
+
+
+@lru_cache(maxsize=32)
+def orbits(resolution: int) -> Tensor:
+    """Texels (R²/4, 24), R even: those of the quarter s, t > 0 of face +x by row and column, each with its images by symmetry.
+
+    Symmetry 8·turn + signs is P^turn D: D changes the signs of x, y, z where `signs` has the bits 1, 2, 4, then P takes +x to
+    +y, +y to +z, +z to +x. None but the first leaves any texel where it is, so each texel is there once.
+    """
+    texel = torch.arange(6 * resolution**2).reshape(3, 2, resolution, resolution)  # axis, its sign, t, s
+    for dim in (2, 4):  # each half from the face's middle outwards, the signs before it
+        less, more = texel.chunk(2, dim=dim)
+        texel = torch.stack([more, less.flip(dim)], dim=dim)
+    axis, x, z, t, y, s = range(6)
+    return texel.permute(t, s, axis, z, y, x).reshape(-1, SYMMETRIES)
+
+
+@lru_cache(maxsize=1)
+def compositions() -> Tensor:
+    """(24, 24): which symmetry it is to apply the row's, then the column's."""
+    first, then = torch.arange(SYMMETRIES)[:, None], torch.arange(SYMMETRIES)
+    turn, signs = first // 8, then % 8
+    signs = signs >> turn | signs << 3 - turn  # D P^turn = P^turn D', of the axes that P^turn takes to D's
+    return (turn + then // 8) % 3 * 8 + ((signs ^ first) & 7)
 
 
 @lru_cache(maxsize=32)

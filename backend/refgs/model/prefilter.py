@@ -3,18 +3,15 @@
 With N = V = R (Karis, "Real Shading in Unreal Engine 4", 2013) the filtered radiance is Σ L(l) K(θ) / Σ K(θ),
 K(θ) = D(cos θ/2) cos θ, θ the angle between l and the lobe's axis. K depends on θ and roughness alone, so each level is
 one fixed sparse matrix over the texels of the cubemap and of its pooled mips: fine texels at the lobe's core,
-coarse ones in its tail.
+coarse ones in its tail. A matrix is as symmetric as the cube, so a 24th of it is made and kept; that takes 0.05 s for a
+cubemap of 6×64² texels and 0.25 s for 6×128², too little to want a file.
 """
 
 import ctypes
-import hashlib
-import os
 from functools import lru_cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import platformdirs
 import torch
 from scipy import integrate, sparse
 from torch import Tensor
@@ -22,12 +19,14 @@ from torch.autograd.function import once_differentiable
 
 from refgs.kernels.load import Shared, Work, check, run
 from refgs.model import cubemap
+from refgs.model.cubemap import SYMMETRIES
 
 ROUGHNESS = (0.0, 0.18, 0.35, 0.6, 1.0)  # of the levels; level 0 is the cubemap itself
 DIVISOR = (1, 2, 4, 8, 8)  # a level's side is the cubemap's divided by this
-CELLS = (0, 64, 128, 256, 256)  # a texel of the pyramid is split while it holds more than 1/CELLS of the lobe
+CELLS = 256  # a texel of the pyramid is split while it holds more than 1/CELLS of the lobe
 COARSEST = 4  # side of the last pooled mip
 SAMPLES = 3  # sub-samples of the lobe along each side of a texel
+PAST = 3  # texels past the last one that the product may read
 
 
 def level_sides(resolution: int) -> list[int]:
@@ -49,145 +48,149 @@ def ggx_lobe(cosine: np.ndarray, roughness: float) -> np.ndarray:
     return np.maximum(cosine, 0) / (half * (a2 - 1) + 1) ** 2
 
 
-def _level_matrix(
-    resolution: int, side: int, roughness: float, cells: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One level's rows as (row, pyramid texel, weight), rows summing to one."""
-    axes = cubemap.texel_directions(side).numpy()
+def _level(resolution: int, side: int, roughness: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the pyramid's texels of the quarter s, t > 0 of face +x give to a level's, and by symmetry the others to the others:
+    (which of them, the level's texel in the order of orbits, weight). All that a level's texel is given sums to one."""
+    axes = cubemap.texel_directions(side)[cubemap.orbits(side).flatten()].numpy()
     sides = _pyramid_sides(resolution)
-    offsets = np.concatenate([[0], np.cumsum([6 * s * s for s in sides])])
+    starts = np.cumsum([0] + [n * n // 4 for n in sides])
     cosine = 1 - np.linspace(0, 1, 100_001) ** 4  # dense where a narrow lobe is
     whole = -2 * np.pi * integrate.trapezoid(ggx_lobe(cosine, roughness), cosine)
-    rows, columns, weights = [], [], []
-    row = np.repeat(np.arange(len(axes)), 6 * COARSEST**2)
-    texel = np.tile(np.arange(6 * COARSEST**2), len(axes))
-    for mip in reversed(range(len(sides))):
-        n = sides[mip]
-        area = cubemap.texel_solid_angles(n).numpy()[texel]
-        share = _lobe_over_texels(axes[row], texel, n, roughness) * area / whole
-        seen = share > 1e-5
-        row, texel, share = row[seen], texel[seen], share[seen]
-        keep = share < 1 / cells if mip else np.ones(len(share), dtype=bool)
-        rows.append(row[keep])
-        columns.append(texel[keep] + offsets[mip])
-        weights.append(share[keep])
-        split = texel[~keep]
-        face, r, c = split // (n * n), split // n % n, split % n
-        children = [(face * 2 * n + 2 * r + i) * 2 * n + 2 * c + j for i in (0, 1) for j in (0, 1)]
-        row, texel = np.tile(row[~keep], 4), np.concatenate(children)
-    rows, columns, weights = np.concatenate(rows), np.concatenate(columns), np.concatenate(weights)
-    return rows, columns, weights / np.bincount(rows, weights, len(axes))[rows]
+    parts = []
+    axis, row, column = np.indices((len(axes), COARSEST // 2, COARSEST // 2)).reshape(3, -1)
+    for n, start in zip(reversed(sides), reversed(starts[:-1]), strict=True):
+        half = n // 2
+        area = cubemap.texel_solid_angles(n).numpy().reshape(6, n, n)[0, half:, half:]
+        share = _lobe_over_texels(axes[axis], row, column, n, roughness) * area[row, column] / whole
+        split = (share > 1 / CELLS) & (n < resolution)
+        kept = (share > 1e-5) & ~split
+        parts.append((start + row[kept] * half + column[kept], axis[kept], share[kept]))
+        axis = np.repeat(axis[split], 4)
+        row, column = (np.add.outer(2 * a[split], b).ravel() for a, b in ((row, (0, 0, 1, 1)), (column, (0, 1, 0, 1))))
+    orbit, axis, weight = (np.concatenate(p) for p in zip(*parts, strict=True))
+    return orbit, axis, weight / np.bincount(axis // SYMMETRIES, weight)[axis // SYMMETRIES]
 
 
-def _lobe_over_texels(axes: np.ndarray, texel: np.ndarray, side: int, roughness: float) -> np.ndarray:
-    """The lobe about each axis, averaged over its texel: it changes within one."""
-    fine = cubemap.texel_directions(side * SAMPLES).numpy().reshape(6, side, SAMPLES, side, SAMPLES, 3)
-    face, row, column = texel // (side * side), texel // side % side, texel % side
-    value = np.zeros(len(texel))
+def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, side: int, roughness: float) -> np.ndarray:
+    """The lobe about each axis, averaged over a texel, counted from the middle of face +x: it changes within one."""
+    value = np.zeros(len(axes))
+    x, y, z = np.ascontiguousarray(axes.T)
     for i in range(SAMPLES):
         for j in range(SAMPLES):
-            value += ggx_lobe(np.einsum("ij,ij->i", axes, fine[face, row, i, column, j]), roughness)
+            s, t = (2 / side * (place + (k + 0.5) / SAMPLES) for place, k in ((column, j), (row, i)))
+            value += ggx_lobe((x + y * s + z * t) / np.sqrt(1 + s * s + t * t), roughness)
     return value / SAMPLES**2
 
 
-def _cache_file(resolution: int) -> Path:
-    # The source is part of the key: a change of the lobe or of a constant must not read an older file.
-    source = Path(__file__).read_bytes() + Path(cubemap.__file__).read_bytes()
-    key = hashlib.sha256(source).hexdigest()[:16]
-    return Path(platformdirs.user_cache_dir("refgs")) / f"prefilter-{resolution}-{key}.npz"
-
-
 class Matrix(NamedTuple):
-    """A sparse matrix by rows: where each row's numbers start (rows + 1), int32; the numbers' columns, int32; float32."""
+    """A sparse matrix over texels in the order of cubemap.orbits, that the cube's symmetries leave as it is.
 
-    starts: Tensor
-    columns: Tensor
-    numbers: Tensor
+    Of an orbit's 24 rows the first is kept: the others have the same numbers, at the images of its columns.
+    """
+
+    starts: Tensor  # (orbits + 1), int32: where each row's numbers start
+    columns: Tensor  # int32, the numbers'; those that are images by one symmetry follow each other
+    numbers: Tensor  # float32
+    compositions: Tensor  # int32, cubemap.compositions()
 
     @classmethod
-    def of(cls, matrix: sparse.csr_matrix, device: torch.device) -> "Matrix":
-        parts = matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32), matrix.data.astype(np.float32)
-        return cls(*(torch.from_numpy(part).to(device) for part in parts))
+    def of(
+        cls, orbits: int, orbit: np.ndarray, column: np.ndarray, number: np.ndarray, device: torch.device
+    ) -> "Matrix":
+        by_symmetry = SYMMETRIES * orbit + column % SYMMETRIES
+        shape = SYMMETRIES * orbits, column.max() + 1
+        matrix = sparse.csr_matrix((number.astype(np.float32), (by_symmetry, column)), shape)
+        indices = matrix.indptr[::SYMMETRIES], matrix.indices, cubemap.compositions().numpy()
+        starts, columns, compositions = (torch.from_numpy(part.astype(np.int32)).to(device) for part in indices)
+        return cls(starts, columns, torch.from_numpy(matrix.data).to(device), compositions)
+
+
+def _pair(
+    shape: tuple[int, int], orbit: np.ndarray, column: np.ndarray, number: np.ndarray, device: torch.device
+) -> tuple[Matrix, Matrix]:
+    """The matrix of these numbers in the first rows of orbits, and its transpose; `shape` in orbits."""
+    # A number at row 24 i, column 24 j + h is also at row 24 i + g, column 24 j, g being the inverse of h.
+    inverse = (cubemap.compositions() == 0).int().argmax(dim=1).numpy()
+    transpose = column // SYMMETRIES, SYMMETRIES * orbit + inverse[column % SYMMETRIES], number
+    return Matrix.of(shape[0], orbit, column, number, device), Matrix.of(shape[1], *transpose, device)
 
 
 @lru_cache(maxsize=4)
 def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
     """The levels above 0 stacked, as a matrix over the pyramid's texels, and its transpose."""
-    file = _cache_file(resolution)
-    if file.exists():
-        matrix = sparse.load_npz(file)
-    else:
-        parts, offset = [], 0
-        for side, roughness, cells in zip(level_sides(resolution)[1:], ROUGHNESS[1:], CELLS[1:], strict=True):
-            row, column, weight = _level_matrix(resolution, side, roughness, cells)
-            parts.append((row + offset, column, weight))
-            offset += 6 * side * side
-        row, column, weight = (np.concatenate(p) for p in zip(*parts, strict=True))
-        width = sum(6 * s * s for s in _pyramid_sides(resolution))
-        matrix = sparse.csr_matrix((weight.astype(np.float32), (row, column)), shape=(offset, width))
-        file.parent.mkdir(parents=True, exist_ok=True)
-        temporary = file.with_suffix(f".{os.getpid()}.npz")
-        sparse.save_npz(temporary, matrix, compressed=False)
-        os.replace(temporary, file)
-    return Matrix.of(matrix, device), Matrix.of(matrix.T.tocsr(), device)
+    parts, start = [], 0
+    for side, roughness in zip(level_sides(resolution)[1:], ROUGHNESS[1:], strict=True):
+        orbit, texel, weight = _level(resolution, side, roughness)
+        parts.append((orbit, start + texel, weight))
+        start += 6 * side * side
+    shape = sum(n * n // 4 for n in _pyramid_sides(resolution)), start // SYMMETRIES
+    transpose, matrix = _pair(shape, *(np.concatenate(p) for p in zip(*parts, strict=True)), device)
+    return matrix, transpose
 
 
 @lru_cache(maxsize=4)
 def _pyramid(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
     """The cubemap and its pooled mips, means by solid angle, as a matrix over the cubemap's texels; and its transpose."""
-    mip = sparse.identity(6 * resolution**2, format="csr")
+    mip = sparse.identity(resolution**2 // 4, format="csr")
     mips = [mip]
     for side in _pyramid_sides(resolution)[:-1]:
-        area = cubemap.texel_solid_angles(side).reshape(6, side // 2, 2, side // 2, 2)
-        share = (area / area.sum(dim=(2, 4), keepdim=True)).reshape(-1).numpy()
-        texel = np.arange(6 * side * side)
-        face, row, column = texel // (side * side), texel // side % side, texel % side
-        parent = (face * (side // 2) + row // 2) * (side // 2) + column // 2
-        mip = sparse.csr_matrix((share, (parent, texel)), shape=(len(texel) // 4, len(texel))) @ mip
+        half, quarter = side // 2, side // 4
+        area = cubemap.texel_solid_angles(side)[cubemap.orbits(side)[:, 0]].reshape(quarter, 2, quarter, 2)
+        share = (area / area.sum(dim=(1, 3), keepdim=True)).flatten().numpy()
+        texel = np.arange(half * half)
+        parent = texel // half // 2 * quarter + texel % half // 2
+        mip = sparse.csr_matrix((share, (parent, texel))) @ mip
         mips.append(mip)
-    matrix = sparse.vstack(mips, format="csr")
-    return Matrix.of(matrix, device), Matrix.of(matrix.T.tocsr(), device)
+    matrix = sparse.vstack(mips, format="coo")
+    return _pair(matrix.shape, matrix.row, SYMMETRIES * matrix.col, matrix.data, device)
+
+
+@lru_cache(maxsize=8)
+def _orders(sides: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Of cubemaps one after another: their texels in the order of orbits, and PAST more; where each texel is in that order."""
+    starts = np.cumsum([0] + [6 * side * side for side in sides])
+    order = torch.cat([cubemap.orbits(side).flatten() + start for side, start in zip(sides, starts[:-1], strict=True)])
+    return torch.nn.functional.pad(order, (0, PAST)).to(device), order.argsort().to(device)
 
 
 class _Work(Work):
     """`struct Product` of sparse.cpp."""
 
     _fields_ = (
-        ("rows", ctypes.c_int64),
-        *((n, ctypes.c_void_p) for n in ("starts", "columns", "numbers", "dense", "out", "scratch")),
+        ("orbits", ctypes.c_int64),
+        *((n, ctypes.c_void_p) for n in ("starts", "columns", "numbers", "compositions", "dense", "out", "scratch")),
         ("shared", Shared),
     )
 
 
-def _product(matrix: Matrix, dense: Tensor, out: Tensor) -> Tensor:
-    """Into `out`; of `dense`, a float more than its numbers is read."""
-    work = _Work(rows=len(matrix.starts) - 1)
+def _product(matrix: Matrix, dense: Tensor) -> Tensor:
+    """What goes in and what comes out are in the order of orbits, with PAST texels more."""
+    work = _Work(orbits=len(matrix.starts) - 1)
+    out = dense.new_empty(SYMMETRIES * work.orbits + PAST, 3)
     work.attach(**matrix._asdict(), dense=dense, out=out)
-    run("refgs_sparse_product", work, out, items=32 * work.rows)
+    run("refgs_sparse_product", work, out, items=32 * SYMMETRIES * work.orbits)
     return out
 
 
 class _Prefilter(torch.autograd.Function):
     @staticmethod
     def forward(ctx, radiance: Tensor, resolution: int) -> Tensor:
-        ctx.resolution = resolution
-        pool, lobes = _pyramid(resolution, radiance.device)[0], matrices(resolution, radiance.device)[0]
-        pyramid = radiance.new_empty(len(pool.starts), 3)  # a row more than there are, to be read from
-        _product(pool, torch.nn.functional.pad(radiance, (0, 0, 0, 1)), pyramid)
-        levels = radiance.new_empty(len(radiance) + len(lobes.starts) - 1, 3)
-        levels[: len(radiance)] = radiance
-        _product(lobes, pyramid, levels[len(radiance) :])
-        return levels
+        ctx.resolution, device = resolution, radiance.device
+        order, _ = _orders((resolution,), device)
+        _, back = _orders(tuple(level_sides(resolution)[1:]), device)
+        pyramid = _product(_pyramid(resolution, device)[0], radiance.index_select(0, order))
+        levels = _product(matrices(resolution, device)[0], pyramid)
+        return torch.cat([radiance, levels.index_select(0, back)])
 
     @staticmethod
     @once_differentiable
     def backward(ctx, by_levels: Tensor):
-        pool, lobes = _pyramid(ctx.resolution, by_levels.device)[1], matrices(ctx.resolution, by_levels.device)[1]
-        count = 6 * ctx.resolution**2
-        by_pyramid = by_levels.new_empty(len(lobes.starts), 3)
-        _product(lobes, torch.nn.functional.pad(by_levels[count:], (0, 0, 0, 1)), by_pyramid)
-        by_radiance = _product(pool, by_pyramid, by_levels.new_empty(count, 3))
-        return by_radiance.add_(by_levels[:count]), None
+        resolution, device, count = ctx.resolution, by_levels.device, 6 * ctx.resolution**2
+        order, _ = _orders(tuple(level_sides(resolution)[1:]), device)
+        _, back = _orders((resolution,), device)
+        by_pyramid = _product(matrices(resolution, device)[1], by_levels[count:].index_select(0, order))
+        by_radiance = _product(_pyramid(resolution, device)[1], by_pyramid)
+        return by_radiance.index_select(0, back).add_(by_levels[:count]), None
 
 
 def prefilter(radiance: Tensor, resolution: int) -> Tensor:
