@@ -8,7 +8,6 @@ card's work being done.
 
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
 
-import math
 import platform
 import re
 import statistics
@@ -19,8 +18,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
+from benchmarks.floors import Machine, raster
 from benchmarks.kernels import ball
-from benchmarks.machine import arithmetic, bandwidth
 from rich.console import Console
 from rich.table import Table
 
@@ -38,10 +37,6 @@ SIZES = ((20_000, 400, 400), (200_000, 800, 800), (1_000_000, 1600, 1060))  # su
 CHANNELS, WARM, ROUNDS = 16, 3, 20
 FRAMES = (200_000, 800)
 SCENE = ("jar", 800, 100)  # of benchmarks.scenes; pixels; training views
-# Operations of one surfel at one pixel: three affine functions, a division, two squared distances, an exponential, blending;
-# backward those of forward, the suffix, and the derivatives of all of them.
-FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 45, 110
-CHANNEL_OPERATIONS = (2, 4)  # a channel: forward, backward
 console = Console()
 
 
@@ -76,24 +71,6 @@ def make_ball(splats: int, width: int, height: int, device: torch.device) -> tup
     return [v.to(device) for v in surfels], camera
 
 
-def covered_pairs(surfels: list[torch.Tensor], camera: Camera) -> float:
-    """How many pairs of surfel and pixel there are, about: the ellipses' areas, of the surfels that face the camera."""
-    positions, _, scales, opacities, _ = (v.double() for v in surfels)
-    towards = torch.from_numpy(camera.position).to(positions) - positions
-    cosine = torch.nn.functional.cosine_similarity(positions, towards).clamp_min(0)  # a ball: positions are normals
-    reach = 2 * torch.log(255 * opacities).clamp_min(0)  # squared, in standard deviations
-    depth = towards.norm(dim=1)
-    return float((math.pi * reach * scales.prod(dim=1) * cosine * camera.fx * camera.fy / depth**2).sum())
-
-
-def floors(surfels: list[torch.Tensor], camera: Camera, peak: float, speed: float) -> tuple[float, float]:
-    """Milliseconds both ways at the least, by bytes (what is given and returned, once) and by operations."""
-    pixels, channels = camera.width * camera.height, surfels[-1].shape[1]
-    given = sum(v.nbytes for v in surfels) + 4 * pixels * (channels + 2)
-    operations = FORWARD_OPERATIONS + BACKWARD_OPERATIONS + channels * sum(CHANNEL_OPERATIONS)
-    return 1e3 * 3 * given / speed, 1e3 * covered_pairs(surfels, camera) * operations / peak
-
-
 def gsplat_step(
     surfels: list[torch.Tensor], camera: Camera, upstream: list[torch.Tensor]
 ) -> Callable[[], object] | None:
@@ -119,8 +96,9 @@ def gsplat_step(
 
 def raster_table(device: torch.device, sizes: Sequence[tuple[int, int, int]] = SIZES, rounds: int = ROUNDS) -> None:
     """Print the rasteriser at each size, its floors, and gsplat."""
-    peak, speed = arithmetic(device=device), bandwidth(device=device)
-    title = f"rasteriser, {CHANNELS} channels: ms, least (median); {peak / 1e12:.1f} TFLOP/s, {speed / 1e9:.0f} GB/s measured"
+    machine = Machine.measured(device)
+    measured = f"{machine.operations / 1e12:.1f} TFLOP/s, {machine.bytes / 1e9:.0f} GB/s measured"
+    title = f"rasteriser, {CHANNELS} channels: ms, least (median); {measured}"
     table = Table(
         "surfels",
         "picture",
@@ -152,7 +130,9 @@ def raster_table(device: torch.device, sizes: Sequence[tuple[int, int, int]] = S
         rows = [milliseconds(step, device, rounds) for step in (forward, backward, both)]
         peer = gsplat_step(inputs, camera, upstream)
         theirs = milliseconds(peer, device, rounds) if peer else None
-        by_bytes, by_operations = floors([v.detach() for v in inputs], camera, peak, speed)
+        needs = raster(inputs, camera)
+        by_bytes = 1e3 * sum(need.bytes for need in needs) / machine.bytes
+        by_operations = 1e3 * sum(need.operations for need in needs) / machine.operations
         table.add_row(
             f"{splats:,}",
             f"{width}×{height}",

@@ -5,6 +5,7 @@ mean distance to its three nearest neighbours and opacity 0.73 — how training 
 away and are mostly hidden.
 """
 
+import math
 import os
 import platform
 import statistics
@@ -17,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
+from benchmarks import floors
 from refgs.camera import Camera
 from refgs.kernels import load
 from refgs.model.environment import Environment
@@ -112,20 +114,34 @@ def _prefilter(side: int) -> Callable[[], None]:
     return lambda: torch.autograd.grad(prefilter(radiance, side), radiance, upstream)
 
 
+def _needs() -> dict[str, floors.Need]:
+    """What the steps have to do."""
+    surfels, camera = ball()
+    forward, backward = floors.raster(surfels, camera)
+    covered = int((rasterize(*surfels, camera, near=0.1).alpha > 1 / 255).sum())
+    needs = {"forward": forward, "backward": backward, "ssim": floors.ssim(SIDE * SIDE)}
+    needs["both"] = floors.Need(*(a + b for a, b in zip(forward, backward, strict=True)))
+    needs["shading"] = floors.shading(covered, SIDE * SIDE)
+    return needs | {f"prefilter {side}": floors.prefiltering(side) for side in (64, 128)}
+
+
 def run(threads: int = 2) -> dict[str, dict[str, list[float]]]:
     """Print a table, one column an instruction set; returns {set: {step: milliseconds of each round}}."""
-    table = Table(
-        "", title=f"{SPLATS:,} surfels, {SIDE}×{SIDE}, {CHANNELS} channels, {threads} threads: ms, least (median)"
+    title = (
+        f"{SPLATS:,} surfels, {SIDE}×{SIDE}, {CHANNELS} channels, {threads} threads: ms, least (median), floor, before²"
     )
+    table, release, kept = Table("", title=title), "", {}
     steps = {"binning": "binning¹", "forward": "raster forward", "backward": "backward", "both": "both ways"}
     steps |= {"ssim": "D-SSIM, both ways", "shading": "deferred shading, both ways"}
     steps |= {f"prefilter {side}": f"prefilter of 6×{side}², both ways" for side in (64, 128)}
-    results, before, chosen = {}, torch.get_num_threads(), os.environ.get("REFGS_ISA")
+    results, floor, before, chosen = {}, {}, torch.get_num_threads(), os.environ.get("REFGS_ISA")
     torch.set_num_threads(threads)
     try:
         for isa in load.supported():
             os.environ["REFGS_ISA"] = isa
-            results[isa] = measure()
+            results[isa], machine = measure(), floors.Machine.measured()
+            floor[isa] = {step: machine.floor(need) for step, need in _needs().items()}
+            release, kept[isa] = floors.previous("kernels", isa)
             table.add_column(isa, justify="right")
     finally:
         torch.set_num_threads(before)
@@ -133,11 +149,19 @@ def run(threads: int = 2) -> dict[str, dict[str, list[float]]]:
         if chosen:
             os.environ["REFGS_ISA"] = chosen
     for step, title in steps.items():
-        taken = (times[step] for times in results.values())
-        table.add_row(title, *(f"{min(t):.1f} ({statistics.median(t):.1f})" for t in taken))
+        cells = []
+        for isa, times in results.items():
+            least, middle = min(times[step]), statistics.median(times[step])
+            cells.append(
+                f"{least:.1f} ({middle:.1f}), {floor[isa].get(step, math.nan):.1f}, {kept[isa].get(step, math.nan):.1f}"
+            )
+        table.add_row(title, *cells)
     console = Console()
     console.print(table)
     console.print(f"¹ projection, depth sort and tiles; part of forward. {platform.processor() or platform.machine()}")
+    console.print(
+        f"² least of release {release}, on the machine of docs/benchmarks.toml" if release else "² nothing is kept"
+    )
     return results
 
 

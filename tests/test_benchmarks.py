@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from benchmarks import gpu, machine
+from benchmarks import floors, gpu, machine
 
 CPU = torch.device("cpu")
 
@@ -27,7 +27,7 @@ def test_covered_pairs_are_about_those_that_are_blended():
     """A ball of faint surfels hides nothing: its pixels' alphas add up to what the areas say."""
     (positions, rotations, scales, _, _), camera = gpu.make_ball(2000, 200, 150, CPU)
     opacities = torch.full((2000,), 0.02)
-    pairs = gpu.covered_pairs([positions, rotations, scales, opacities, torch.zeros(2000, 1)], camera)
+    pairs = floors.covered_pairs([positions, rotations, scales, opacities, torch.zeros(2000, 1)], camera)
     raster = gpu.rasterize(positions, rotations, scales, opacities, torch.ones(2000, 1), camera, near=0.1)
     # The mean alpha over a covered ellipse, where alpha falls from o to c: (o - c) / ln(o / c). Both halves of the ball count.
     mean = (0.02 - 1 / 255) / torch.log(torch.tensor(0.02 * 255))

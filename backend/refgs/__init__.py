@@ -1,6 +1,6 @@
 """RefGS: photographs of shiny objects into relightable surfels, textured meshes and light."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 import os
 
