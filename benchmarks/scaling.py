@@ -2,7 +2,8 @@
 
 The ball of `benchmarks.kernels` with 10³ … 10⁶ surfels, drawn 128² … 1024² pixels large, 11 channels as in training. Each size runs
 in a process of its own. Memory is set against what the tensors need: the surfels and the maps' derivatives, which are given; the
-maps and the surfels' derivatives, which are returned; the splats' projections and their places, which backward reads again.
+maps and the surfels' derivatives, which are returned; the splats' projections and places, which backward reads again, and its
+row of derivatives for each pair of splat and tile.
 """
 
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
@@ -23,6 +24,7 @@ from rich.table import Table
 from scipy.optimize import nnls
 
 from refgs.camera import Camera
+from refgs.kernels.load import kernels
 from refgs.render.rasterize import rasterize
 
 SPLATS, SIDES, CHANNELS = (1_000, 10_000, 100_000, 1_000_000), (128, 256, 512, 1024), 11
@@ -45,8 +47,9 @@ def measure(splats: int, side: int) -> dict[str, float]:
         raster = rasterize(*inputs, camera, near=0.1)
         middle = time.perf_counter()
         torch.autograd.grad(raster, inputs, upstream)
-        kept = sum(v.nbytes for v in raster.features.grad_fn.work.kept.values())
-        return middle - at, time.perf_counter() - middle, raster.features.grad_fn.work.pairs, kept
+        ended, work = time.perf_counter(), raster.features.grad_fn.work
+        rows = 4 * work.row_count * kernels().refgs_row_size(CHANNELS)
+        return middle - at, ended - middle, work.pairs, rows + sum(v.nbytes for v in work.kept.values())
 
     def scene(splats: int, side: int) -> tuple:
         surfels, camera = ball(splats, side, CHANNELS)
