@@ -14,16 +14,13 @@ from refgs.kernels import cuda
 from refgs.model import environment, prefilter
 from refgs.render import raster_cuda, shade
 from refgs.settings import load_settings
-from refgs.train.adam import Adam
-from refgs.train.densify import ScreenGradient
-from refgs.train.losses import Photo
 from refgs.train.trainer import Trainer
 from tests.kernels.emulate import emulate
 
 CARD = torch.device("cuda:0")
 
 
-def make_trainer(capture, folder, *changes: str) -> Trainer:
+def make_trainer(capture, folder, *changes: str, device: str = "cpu") -> Trainer:
     start = [
         "surfels.start=600",
         "surfels.budget=800",
@@ -33,7 +30,7 @@ def make_trainer(capture, folder, *changes: str) -> Trainer:
     ]
     settings = load_settings("quick", [*start, *changes])
     (folder / "checkpoints").mkdir(parents=True)
-    return Trainer(read_capture(capture), settings, folder, lambda *_: None)
+    return Trainer(read_capture(capture), settings, folder, lambda *_: None, device=device)
 
 
 @pytest.mark.parametrize("changes", [["indirect.start=0"], ["render.shading=sh"]])
@@ -118,28 +115,16 @@ def backward(loss: Tensor) -> None:
 def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, indirect):
     """No operation finds its tensors on two devices, and none waits for a number but the one that is named: reading one, or
     making a tensor whose size depends on one, is an error here."""
-    trainer = make_trainer(ball_capture, tmp_path / "run", f"indirect.start={0 if indirect else 1}")
     ball = trimesh.creation.icosphere(2)
-    occluder = Occluder(Mesh(ball.vertices * trainer.capture.radius, np.asarray(ball.faces)))
+    occluder = Occluder(Mesh(ball.vertices, np.asarray(ball.faces)))
     tree = occluder.tree(torch.device("cpu"))
-    trainer._next_photo()  # the views' order is drawn on the CPU
     launched = follow_to_the_card(monkeypatch)
     with FakeTensorMode(allow_non_fake_inputs=True):
-
-        def to_card(value: Tensor) -> Tensor:
-            return torch.empty(value.shape, dtype=value.dtype, device=CARD)
-
-        trainer.device, trainer.background, trainer.light = CARD, to_card(trainer.background), to_card(trainer.light)
-        trainer.light.requires_grad_()
-        trainer.parameters = {name: to_card(value).requires_grad_() for name, value in trainer.parameters.items()}
-        trainer.constant = {name: to_card(value) for name, value in trainer.constant.items()}
-        trainer.photos = [Photo(to_card(p.image), to_card(p.mask), p.camera) for p in trainer.photos]
-        for group in trainer.optimizer.param_groups:
-            group["params"] = [trainer.parameters.get(group["name"], trainer.light)]
-        trainer.optimizer = Adam(trainer.optimizer.param_groups)
-        trainer.motion = ScreenGradient(len(trainer.parameters["position"]), CARD)
+        trainer = make_trainer(ball_capture, tmp_path / "run", f"indirect.start={0 if indirect else 1}", device="cuda")
+        with unset_fake_temporarily():
+            trainer._next_photo()  # the views' order is drawn on the CPU
         if indirect:
-            tree._boxes, tree._triangles = to_card(tree._boxes), to_card(tree._triangles)
+            tree._boxes, tree._triangles = (torch.empty(v.shape, device=CARD) for v in (tree._boxes, tree._triangles))
             trainer.occluder = occluder
         figures = trainer.step()
         assert all(figure.device == CARD for figure in figures.values())

@@ -79,7 +79,7 @@ class Trainer:
         self._order: tuple[int, list[int]] = (-1, [])
 
         start, source = start_parameters(capture, self.views, settings)
-        self.parameters = {name: value.to(self.device).requires_grad_() for name, value in start.items()}
+        self.parameters = {name: value.detach().to(self.device).requires_grad_() for name, value in start.items()}
         report("stage", {"what": source})
         texels, radiance = 6 * settings.environment.resolution**2, settings.environment.radiance
         self.light = torch.full((texels, 3), math.log(math.expm1(radiance)), device=self.device).requires_grad_()
