@@ -130,7 +130,7 @@ INLINE void project(const Scene& r, int64_t first, Each each) {
       px[j] = r.fx * corner.x / corner.z + r.cx, py[j] = r.fy * corner.y / corner.z + r.cy;
     }
   }
-  // The octagon's axes x, y, x + y, x - y: in them the centre, and a and b where the centre has 0; how far the screen-space filter reaches.
+  // Along the octagon's axes x, y, x + y, x - y: the centre, and a and b from there; how far the screen-space filter reaches.
   Real from_x = d.c.x * d.per_z, from_y = d.c.y * d.per_z, x = r.fx * from_x + r.cx, y = r.fy * from_y + r.cy;
   Bound ax = bound(r.fx * (d.a.x - from_x * d.a.z)), ay = bound(r.fy * (d.a.y - from_y * d.a.z)), az = bound(d.a.z);
   Bound bx = bound(r.fx * (d.b.x - from_x * d.b.z)), by = bound(r.fy * (d.b.y - from_y * d.b.z)), bz = bound(d.b.z);
@@ -138,7 +138,6 @@ INLINE void project(const Scene& r, int64_t first, Each each) {
   const Bound centres[] = {bound(x), bound(y), bound(x + y), bound(x - y)};
   const float diagonal[] = {1, 1, (float)refgs::UNIT, (float)refgs::UNIT}, first_pixel[] = {0.5f, 0.5f, 1, 0};  // its centre along the axes
   const float LIMIT = 32767, lowest[] = {0, 0, -LIMIT, -LIMIT}, highest[] = {r.width - 1.0f, r.height - 1.0f, LIMIT, LIMIT};
-  const float SLACK = 1 / 64.0f;  // pixels: for the rounding of what is float
   Bound bound_k2 = bound(k2), radius = root(bound_k2 * (1 / refgs::LOW_PASS)), bound_zz = bound(zz), per_zz = 1 / bound_zz;
   Bound lows[4], highs[4];
 #pragma unroll
@@ -150,13 +149,14 @@ INLINE void project(const Scene& r, int64_t first, Each each) {
     };
     extent(as[j], bs[j], az, bz, bound_k2, bound_zz, per_zz, a, b);
     include(proper & whole, a, b);
+    Bound slack = 1e-6f * (larger(centres[j], -centres[j]) + high - low) + 1 / 64.0f;  // for the rounding of what is float
     low += centres[j], high += centres[j];
     if (some_cut)
       for (int k = 0; k < 4; k++) {
         Bound at = bound(j == 0 ? px[k] : j == 1 ? py[k] : j == 2 ? px[k] + py[k] : px[k] - py[k]);
         include(cut, at, at);
       }
-    low = round_up(low - (first_pixel[j] + SLACK)), high = round_down(high - (first_pixel[j] - SLACK));
+    low = round_up(low - first_pixel[j] - slack), high = round_down(high - first_pixel[j] + slack);
     lows[j] = smaller(larger(low, Bound() + lowest[j]), Bound() + LIMIT);
     highs[j] = smaller(larger(high, Bound() - LIMIT), Bound() + highest[j]);
   }

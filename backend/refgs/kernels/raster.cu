@@ -16,19 +16,17 @@ struct Pair {
 };
 
 struct Raster : Scene {
-  int32_t *depths, *counts;     // (splats) keys to sort by; tiles that the splat meets
-  const int64_t *order, *ends;  // (splats) front to back; how many pairs there are up to and with each of `order`
+  int32_t *depths, *counts;     // (splats) what they are sorted by; how many tiles they meet
+  const int64_t *order, *ends;  // (splats) front to back; how many pairs there are up to each of `order` and with it
   int32_t* starts;              // (splats) where a splat's pairs begin
   int64_t pair_count;
-  Pair* pairs;            // (pair_count) those of a splat together, front to back
-  const int64_t* sorted;  // (pair_count) into `pairs`: tile by tile, each front to back
-  int32_t* tile_start;    // (tiles + 1) into `members` and `places`
-  int32_t *members, *places;  // (pair_count) in the order of `sorted`: splats, and where their pairs are in `pairs`
-  int32_t *reach, *last;      // (tiles) members up to which any is visible, and the place of the last of them, or -1
-  int64_t size;               // channels that the kernels are compiled for, of which `channels` are used
-  float* rows;                // (pair_count, GEOMETRY + size) derivatives of a pair
-  float* scratch;             // none is used
-  mutable Shared shared;
+  Pair* pairs;                  // (pair_count) those of a splat together, front to back
+  const int64_t* sorted;        // (pair_count) into `pairs`: tile by tile, each front to back
+  int32_t* tile_start;          // (tiles + 1) into `members` and `places`
+  int32_t *members, *places;    // (pair_count) in the order of `sorted`: splats, and where their pairs are in `pairs`
+  int32_t *reach, *last;        // (tiles) members up to the last that any pixel sees; its place, or -1
+  int64_t size;                 // channels that the kernels are compiled for, of which `channels` are used
+  float* rows;                  // (pair_count, GEOMETRY + size) derivatives of a pair, where its tile reaches it
 };
 
 INLINE int lane() { return threadIdx.x % WARP; }
@@ -61,10 +59,10 @@ INLINE void add_up(float* to, const float* v) {
   if constexpr (M > V) add_up<M - V>(to + V, v + V);
 }
 
-// A splat in shared memory. Vectors of four: those of Affine, whose last numbers are others.
+// A splat in shared memory, in vectors of four: those of Affine, and in their last lanes what else there is.
 struct alignas(16) Stored {
-  float value[4], slope_x[4], slope_y[4];  // and x, y, depth
-  float rest[4];                           // determinant, log2_opacity, rho_max, plain
+  float value[4], slope_x[4], slope_y[4];              // and x, y, depth
+  float rest[4];                                       // determinant, log2_opacity, rho_max, plain
   float low_value[4], low_slope_x[4], low_slope_y[4];  // and n2_min, n2_max
 };
 
@@ -80,7 +78,7 @@ INLINE void keep(Stored& to, Splat s) {
   to.rest[0] = s.determinant, to.rest[1] = s.log2_opacity, to.rest[2] = s.rho_max, to.rest[3] = s.plain;
 }
 
-// What there is of a plain one.
+// Without what a plain one does not need.
 INLINE Splat plain(const Stored& from) {
   Splat s;
   float rest[4];
@@ -166,7 +164,7 @@ INLINE void forward(const Raster& r) {
   Tile t(r, (int32_t)blockIdx.x);
   Place place;
   Vector x = place.centre_x(), T[HALVES], Z[HALVES], A[HALVES];
-  Four sums[HALVES][N / 4];
+  Four blended[HALVES][N / 4];
   bool live[HALVES];
   for (int h = 0; h < HALVES; h++) T[h] = place.inside(t, h) ? 1 : 0, live[h] = true;
   if (threadIdx.x == 0) reached = 0;
@@ -191,7 +189,7 @@ INLINE void forward(const Raster& r) {
         T[h] = unfinished(T[h] * (1 - a));
         Z[h] += w * hit.z, A[h] += w;
 #pragma unroll
-        for (int c = 0; c < N / 4; c++) sums[h][c] += w.value * *(const Four*)&chunk.features[k][4 * c];
+        for (int c = 0; c < N / 4; c++) blended[h][c] += w.value * *(const Four*)&chunk.features[k][4 * c];
         mine = start + k + 1;
       }
     });
@@ -208,19 +206,20 @@ INLINE void forward(const Raster& r) {
 #pragma unroll
     for (int c = 0; c < N; c += 4)
       if (r.channels == N)
-        *(Four*)(out + c) = sums[h][c / 4];
+        *(Four*)(out + c) = blended[h][c / 4];
       else
 #pragma unroll
         for (int i = 0; i < 4; i++)
-          if (c + i < r.channels) out[c + i] = sums[h][c / 4][i];
+          if (c + i < r.channels) out[c + i] = blended[h][c / 4][i];
   }
 }
 
 template <int QUADS>
 INLINE void read_channels(const Raster& r, const float* from, Four (&v)[QUADS]) {
+  bool whole = r.channels == 4 * QUADS && (int64_t)from % sizeof(Four) == 0;
 #pragma unroll
   for (int c = 0; c < QUADS; c++)
-    if (r.channels == 4 * QUADS)
+    if (whole)
       v[c] = *(const Four*)(from + 4 * c);
     else
 #pragma unroll
@@ -254,7 +253,6 @@ INLINE void backward(const Raster& r) {
   }
   int32_t first = r.tile_start[t.index], count = r.reach[t.index];
   for (int32_t start = 0; start < count; start += SIZE) {
-    __syncthreads();
     int n = lesser(count - start, SIZE);
     fetch(chunk, r, t, r.members + first + start, n);
     __syncthreads();
@@ -340,7 +338,7 @@ INLINE bool add_rows(const Raster& r, int32_t k, int32_t end, int step, double (
 }  // namespace
 
 KERNEL(refgs_raster_project, Raster, r) {
-  share(r->shared, r->splats, 1, [&](int64_t first) {
+  share({}, r->splats, 1, [&](int64_t first) {
     project(*r, first, [&](int64_t i, const Octagon& octagon, float depth) {
       int32_t tiles = 0;
       each_row(octagon, [&](int32_t, int32_t x0, int32_t x1) { tiles += x1 - x0 + 1; });
@@ -351,7 +349,7 @@ KERNEL(refgs_raster_project, Raster, r) {
 }
 
 KERNEL(refgs_raster_list, Raster, r) {
-  share(r->shared, r->splats, 1, [&](int64_t k) {
+  share({}, r->splats, 1, [&](int64_t k) {
     int64_t i = r->order[k];
     int32_t count = r->counts[i], at = (int32_t)(r->ends[k] - count);
     r->starts[i] = at;
@@ -361,7 +359,7 @@ KERNEL(refgs_raster_list, Raster, r) {
 
 KERNEL(refgs_raster_bin, Raster, r) {
   int64_t n = r->pair_count;
-  share(r->shared, n + 1, 1, [&](int64_t at) {
+  share({}, n + 1, 1, [&](int64_t at) {
     int32_t before = at ? r->pairs[r->sorted[at - 1]].tile : -1, here = (int32_t)(tiles_x(*r) * tiles_y(*r));
     if (at < n) {
       int32_t place = (int32_t)r->sorted[at];
@@ -415,9 +413,9 @@ KERNEL(refgs_raster_gather, Raster, r) {
 // Of a splat, four features' rows by eight threads.
 KERNEL(refgs_raster_gather_features, Raster, r) {
   constexpr int PHASES = 8;
-  int64_t i = (int64_t)blockIdx.x * blockDim.x + threadIdx.x, quads = (r->channels + 3) / 4;
-  int phase = i % PHASES, quad = i / PHASES % quads;
-  i /= PHASES * quads;
+  uint32_t thread = blockIdx.x * blockDim.x + threadIdx.x, quads = (uint32_t)(r->channels + 3) / 4;
+  int phase = thread % PHASES, quad = thread / PHASES % quads;
+  int64_t i = thread / PHASES / quads;
   Four sum;
   if (i < r->splats) {
     int32_t end = r->starts[i] + r->counts[i];

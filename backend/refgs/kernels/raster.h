@@ -9,9 +9,8 @@
 
 INLINE int32_t larger(int32_t a, int32_t b) { return a > b ? a : b; }
 INLINE int32_t lesser(int32_t a, int32_t b) { return a < b ? a : b; }
-INLINE float larger(float a, float b) { return a > b ? a : b; }
-INLINE double larger(double a, double b) { return a > b ? a : b; }  // b where one is NaN
-INLINE double lesser(double a, double b) { return a < b ? a : b; }
+INLINE float larger(float a, float b) { return a > b ? a : b; }  // b where one is NaN
+INLINE float lesser(float a, float b) { return a < b ? a : b; }
 
 // In pixels. A block is what is computed at once: a vector of pixels, or a warp's.
 #ifdef __CUDACC__
@@ -126,7 +125,7 @@ INLINE Quad widen(Four f) { return __builtin_convertvector(f, Quad); }
 INLINE Four magnitude(Four f) { return f < 0 ? -f : f; }
 #endif
 
-INLINE float near_zero(double x) { return (float)lesser(larger(x, -1e9), 1e9); }
+INLINE float near_zero(double x) { return lesser(larger((float)x, -1e9f), 1e9f); }
 
 // n0, n1, n2 are taken apart where they sum up terms larger than this many times n2: u and v err by 2^-24 of it.
 constexpr float SPLIT = 32;

@@ -27,15 +27,14 @@ class Raster(Scene):
         [(n, ctypes.c_void_p) for n in ("depths", "counts", "order", "ends", "starts")]
         + [("pair_count", ctypes.c_int64)]
         + [(n, ctypes.c_void_p) for n in ("pairs", "sorted", "tile_start", "members", "places", "reach", "last")]
-        + [("size", ctypes.c_int64), ("rows", ctypes.c_void_p), ("scratch", ctypes.c_void_p), ("shared", load.Shared)]
+        + [("size", ctypes.c_int64), ("rows", ctypes.c_void_p)]
     )
 
     def project(self, device: torch.device) -> None:
         def integers(*shape: int) -> torch.Tensor:
             return torch.empty(shape, dtype=torch.int32, device=device)
 
-        n = self.splats
-        self.tiles = -(-self.width // TILE) * -(-self.height // TILE)
+        n, self.tiles = self.splats, -(-self.width // TILE) * -(-self.height // TILE)
         self.keep(
             projected=torch.empty(n * PROJECTED, dtype=torch.uint8, device=device),
             counts=integers(n),
@@ -49,18 +48,16 @@ class Raster(Scene):
         load.run("refgs_raster_project", self, depths, n)
         order = torch.sort(depths, stable=True).indices
         ends = counts[order].cumsum(0)
-        self.pair_count = how_many(ends)
-        if self.pair_count >= 1 << 31:
-            raise RuntimeError(f"{self.pair_count:,} pairs of a surfel and a tile are more than 32 bits can number")
-        self.keep(
-            pairs=integers(self.pair_count, 2), members=integers(self.pair_count), places=integers(self.pair_count)
-        )
+        self.pair_count = pairs = how_many(ends)
+        if pairs >= 1 << 31:
+            raise RuntimeError(f"{pairs:,} pairs of a surfel and a tile are more than 32 bits can number")
+        self.keep(pairs=integers(pairs, 2), members=integers(pairs), places=integers(pairs))
         self.attach(order=order, ends=ends)
         load.run("refgs_raster_list", self, depths, n)
         tile = self.kept["pairs"][:, 0]
         sorted = torch.sort(tile.short() if self.tiles <= SHORT else tile, stable=True).indices
         self.attach(sorted=sorted)
-        load.run("refgs_raster_bin", self, depths, self.pair_count + 1)
+        load.run("refgs_raster_bin", self, depths, pairs + 1)
 
     def blend(self) -> None:
         self.size = next(size for size in SIZES if size >= self.channels)
