@@ -5,7 +5,6 @@ mean distance to its three nearest neighbours and opacity 0.73 — how training 
 away and are mostly hidden.
 """
 
-import math
 import os
 import platform
 import statistics
@@ -152,9 +151,8 @@ def run(threads: int = 2) -> dict[str, dict[str, list[float]]]:
         cells = []
         for isa, times in results.items():
             least, middle = min(times[step]), statistics.median(times[step])
-            cells.append(
-                f"{least:.1f} ({middle:.1f}), {floor[isa].get(step, math.nan):.1f}, {kept[isa].get(step, math.nan):.1f}"
-            )
+            beside = (f"{figures[step]:.1f}" if step in figures else "–" for figures in (floor[isa], kept[isa]))
+            cells.append(", ".join([f"{least:.1f} ({middle:.1f})", *beside]))
         table.add_row(title, *cells)
     console = Console()
     console.print(table)

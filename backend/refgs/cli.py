@@ -115,7 +115,7 @@ def demo(
 
 
 @app.command()
-def bench(what: Annotated[str, typer.Argument(help="kernels, iteration or scaling")] = "kernels") -> None:
+def bench(what: Annotated[str, typer.Argument(help="kernels, iteration, scaling, threads or gpu")] = "kernels") -> None:
     """Measure the parts in milliseconds."""
     from refgs import commands
 

@@ -30,7 +30,7 @@ from refgs.render.renderer import Rendering
 from refgs.report import metrics
 from refgs.run import check_free, create_run, open_run, read_run_facts, write_text
 from refgs.settings import load_settings
-from refgs.train.trainer import Trainer, composite
+from refgs.train.trainer import Trainer, composite, full_card
 
 console = Console(highlight=False, soft_wrap=True)
 PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha", "visibility")
@@ -58,9 +58,11 @@ def choose_device(device: str) -> str:
     if device == "cpu":
         return "cpu"
     why = cuda.unusable()
-    if why and (device == "cuda" or torch.cuda.is_available()):
-        console.print(f"warning: training on the CPU: {why}")
-    return "cpu" if why else "cuda"
+    if why is None:
+        return "cuda"
+    if why or device == "cuda":
+        console.print(f"warning: training on the CPU: {why or 'no NVIDIA card, or no driver for it, was found'}")
+    return "cpu"
 
 
 def train(
@@ -93,7 +95,10 @@ def train(
             else:
                 console.print(facts["what"])
 
-        trainer = Trainer(capture, settings, out, report, minutes, device)
+        try:
+            trainer = Trainer(capture, settings, out, report, minutes, device)
+        except torch.OutOfMemoryError:
+            raise full_card() from None
         if resume:
             trainer.resume()
             report("stage", {"what": f"going on from iteration {trainer.iteration}"})
@@ -104,6 +109,8 @@ def train(
             ended = trainer.run(lambda: bool(stopped))
         except InputError:
             raise
+        except torch.OutOfMemoryError:
+            raise full_card() from None
         except Exception:
             (out / "log.txt").write_text(traceback.format_exc(), encoding="utf-8")
             raise
@@ -114,8 +121,12 @@ def train(
             f"stopped at iteration {trainer.iteration}; go on with: refgs train {capture_folder} --out {out} --resume"
         )
         raise KeyboardInterrupt
-    write_asset(trainer)
-    quality = trainer.test_psnr(most=len(trainer.test))
+    try:
+        write_asset(trainer)
+        quality = trainer.test_psnr(most=len(trainer.test))
+    except torch.OutOfMemoryError:
+        again = f"refgs train {capture_folder} --out {out} --resume --device cpu"
+        raise InputError(f"the card's memory is full; nothing is lost, go on with: {again}") from None
     held_out = "" if quality is None else f", {quality:.2f} dB on {len(trainer.test)} held-out views"
     console.print(f"trained {trainer.iteration} iterations in {trainer.seconds:.0f} s{held_out}: {out}")
 
@@ -305,7 +316,8 @@ def export(
 
 def bench(what: str) -> None:
     """Run a benchmark of the repository."""
-    names = sorted(file.stem for file in (clone_root() / "benchmarks").glob("*.py") if file.stem != "__init__")
+    files = (clone_root() / "benchmarks").glob("*.py")
+    names = sorted(file.stem for file in files if "__main__" in file.read_text(encoding="utf-8"))
     if what not in names:
         raise InputError(f"no benchmark {what}: take one of {', '.join(names)}")
     sys.path.insert(0, str(clone_root()))

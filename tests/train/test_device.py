@@ -1,5 +1,7 @@
 """Which device is trained on, and what is said where it is not the one that was asked for; a card whose memory is full."""
 
+import warnings
+
 import pytest
 import torch
 
@@ -21,7 +23,7 @@ def said(monkeypatch) -> list[str]:
 def card(monkeypatch, capability: tuple[int, int], driver: str | None = None) -> None:
     """Have torch tell of a card."""
 
-    def function(name: str, device: int) -> int:
+    def module(source: str, device: int) -> int:
         if driver:
             raise RuntimeError(driver)
         return 1
@@ -31,7 +33,7 @@ def card(monkeypatch, capability: tuple[int, int], driver: str | None = None) ->
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: capability)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "GeForce")
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
-    monkeypatch.setattr(cuda, "_function", function)
+    monkeypatch.setattr(cuda, "_module", module)
 
 
 def test_a_card_is_taken(monkeypatch, said):
@@ -46,6 +48,17 @@ def test_no_card(monkeypatch, said):
     assert len(said) == 1 and "no NVIDIA card, or no driver" in said[0]
 
 
+def test_a_driver_that_is_too_old_for_torch(monkeypatch, said):
+    def available() -> bool:
+        warnings.warn("The NVIDIA driver on your system is too old", stacklevel=1)
+        return False
+
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch.cuda, "is_available", available)
+    assert commands.choose_device("auto") == "cpu"
+    assert len(said) == 1 and "driver is too old" in said[0]
+
+
 def test_a_card_that_is_too_old(monkeypatch, said):
     card(monkeypatch, (6, 1))
     assert [commands.choose_device(d) for d in ("auto", "cuda")] == ["cpu", "cpu"]
@@ -53,9 +66,9 @@ def test_a_card_that_is_too_old(monkeypatch, said):
 
 
 def test_a_driver_that_refuses(monkeypatch, said):
-    card(monkeypatch, (8, 6), driver="refgs_adam_step: CUDA_ERROR_UNSUPPORTED_PTX_VERSION")
+    card(monkeypatch, (8, 6), driver="adam.cpp: CUDA_ERROR_INVALID_IMAGE\nand more")
     assert commands.choose_device("auto") == "cpu"
-    assert len(said) == 1 and "driver does not take the kernels" in said[0]
+    assert len(said) == 1 and said[0].endswith("(adam.cpp: CUDA_ERROR_INVALID_IMAGE): a newer driver may do")
 
 
 def small_trainer(ball_capture, folder, reports: list, start: int) -> Trainer:

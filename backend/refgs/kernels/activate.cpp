@@ -9,7 +9,7 @@ struct Activation {
   int64_t count, kind;
   const float* raw;
   float* value;
-  const float* by_value;  // null where nobody asked
+  const float* by_value;
   float* by_raw;
 };
 

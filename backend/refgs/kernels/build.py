@@ -82,6 +82,13 @@ def _fingerprint(target: Target) -> str:
     return digest.hexdigest()[:16]
 
 
+def unwritable(cache: Path, error: OSError) -> InputError:
+    """What to say where compiled kernels cannot be kept."""
+    return InputError(
+        f"cannot write compiled kernels to {cache}: {error.strerror}; set REFGS_CACHE to a folder that can be written"
+    )
+
+
 def build(target: Target, cache: Path) -> Path:
     """The library for a target, compiled into `cache` if it isn't there yet. Safe when several processes want it at once.
 
@@ -94,9 +101,7 @@ def build(target: Target, cache: Path) -> Path:
         cache.mkdir(parents=True, exist_ok=True)
         scratch = tempfile.TemporaryDirectory(prefix="build-", dir=cache)
     except OSError as error:
-        raise InputError(
-            f"cannot write compiled kernels to {cache}: {error.strerror}; set REFGS_CACHE to a folder that can be written"
-        ) from None
+        raise unwritable(cache, error) from None
     with scratch:
         made = Path(scratch.name) / library.name
         command = [

@@ -8,11 +8,12 @@ import functools
 import hashlib
 import os
 import re
+import warnings
 from pathlib import Path
 
 import torch
 
-from refgs.kernels.build import HEADERS, HERE, cache_folder
+from refgs.kernels.build import HEADERS, HERE, cache_folder, unwritable
 
 # Those of the sources that a card runs.
 SOURCES = (
@@ -43,18 +44,22 @@ BLOCK = 256  # threads, where a kernel does not care
 
 
 def unusable() -> str | None:
-    """Why no card can be used here; None where one can."""
+    """Why the card here cannot be used, in a line; an empty one where there is none; None where it can."""
     if torch.version.cuda is None:
-        return "this build of torch is without CUDA"
-    if not torch.cuda.is_available():
-        return "no NVIDIA card, or no driver for it, was found"
+        return ""
+    with warnings.catch_warnings(record=True) as said:  # torch warns of a driver that is too old
+        warnings.simplefilter("always")
+        available = torch.cuda.is_available()
+    if not available:
+        return "the card's driver is too old for CUDA 13: a newer one may do" if said else ""
     if (capability := torch.cuda.get_device_capability()) < OLDEST:
         found, least = (".".join(map(str, version)) for version in (capability, OLDEST))
         return f"{torch.cuda.get_device_name()} is too old: its compute capability is {found}, {least} is the least"
     try:
-        _function("refgs_adam_step", torch.cuda.current_device())
+        for source in SOURCES:  # now, as later the memory may be full
+            _module(source, torch.cuda.current_device())
     except RuntimeError as error:
-        return f"the card's driver does not take the kernels ({error}): a newer one may"
+        return f"the kernels cannot be loaded ({str(error).splitlines()[0]}): a newer driver may do"
     return None
 
 
@@ -71,6 +76,8 @@ def kernel_sources() -> dict[str, str]:
 def _check(result: tuple, what: str):
     """The values of a call of NVIDIA's, without its status."""
     status, *values = result
+    if status.name == "CUDA_ERROR_OUT_OF_MEMORY":
+        raise torch.OutOfMemoryError(what)
     if int(status):
         raise RuntimeError(f"{what}: {status.name}")
     return values[0] if len(values) == 1 else values
@@ -104,33 +111,40 @@ def cubin(source: str, architecture: str, cache: Path) -> bytes:
     digest = hashlib.sha256(repr((OPTIONS, _check(nvrtc.nvrtcVersion(), source), parts)).encode()).hexdigest()[:16]
     file = cache / f"{Path(source).stem}-{digest}-{architecture}.cubin"
     if not file.exists():
-        code = compile_source(source, architecture)
-        cache.mkdir(parents=True, exist_ok=True)
-        temporary = file.with_suffix(f".{os.getpid()}")
-        temporary.write_bytes(code)
-        os.replace(temporary, file)
+        code, temporary = compile_source(source, architecture), file.with_suffix(f".{os.getpid()}")
+        try:
+            cache.mkdir(parents=True, exist_ok=True)
+            temporary.write_bytes(code)
+            os.replace(temporary, file)
+        except OSError as error:
+            raise unwritable(cache, error) from None
     return file.read_bytes()
 
 
 @functools.cache
-def _function(name: str, device: int) -> int:
-    """A kernel on a card, loaded into torch's own context."""
+def _module(source: str, device: int):
+    """A source's kernels on a card, in torch's own context, which the thread must have."""
     from cuda.bindings import driver
 
     major, minor = torch.cuda.get_device_capability(device)
-    torch.cuda.current_stream(device)  # there is a context from here on
-    code = cubin(kernel_sources()[name], f"sm_{major}{minor}", cache_folder())
-    module = _check(driver.cuModuleLoadData(code), name)
-    return _check(driver.cuModuleGetFunction(module, name.encode()), name)
+    torch.cuda.set_device(device)
+    return _check(driver.cuModuleLoadData(cubin(source, f"sm_{major}{minor}", cache_folder())), source)
+
+
+@functools.cache
+def _function(name: str, device: int):
+    from cuda.bindings import driver
+
+    return _check(driver.cuModuleGetFunction(_module(kernel_sources()[name], device), name.encode()), name)
 
 
 def launch(name: str, work: ctypes.Structure, device: torch.device, blocks: int, threads: int = BLOCK) -> None:
     """Run a kernel on torch's current stream of a device; what the work points at must live until it is done."""
     from cuda.bindings import driver
 
-    with torch.cuda.device(device):
-        function = _function(name, torch.cuda.current_device())
-        stream = torch.cuda.current_stream().cuda_stream
-        arguments = (ctypes.c_void_p * 1)(ctypes.addressof(work))
-        size = (blocks, 1, 1, threads, 1, 1)
-        _check(driver.cuLaunchKernel(function, *size, 0, stream, ctypes.addressof(arguments), 0), name)
+    # Autograd's own threads have no context until they ask for one, and torch's `device` asks only where it changes.
+    torch.cuda.set_device(device)
+    function, stream = _function(name, torch.cuda.current_device()), torch.cuda.current_stream().cuda_stream
+    arguments = (ctypes.c_void_p * 1)(ctypes.addressof(work))
+    size = (blocks, 1, 1, threads, 1, 1)
+    _check(driver.cuLaunchKernel(function, *size, 0, stream, ctypes.addressof(arguments), 0), name)

@@ -26,7 +26,7 @@ inline Turned turned(const Normals& s, int64_t i) {
   Turned t;
   const float* q = s.rotations + 4 * i;
   float norm = root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  t.inverse = norm < MIN_NORM ? 0 : 1 / norm;  // one that says nothing stands for the identity, as in project.cpp
+  t.inverse = norm < MIN_NORM ? 0 : 1 / norm;  // one that says nothing stands for the identity, as in project.h
   for (int k = 0; k < 4; k++) t.q[k] = q[k] * t.inverse;
   float w = t.q[0], x = t.q[1], y = t.q[2], z = t.q[3];
   t.n[0] = 2 * (x * z + w * y), t.n[1] = 2 * (y * z - w * x), t.n[2] = 1 - 2 * (x * x + y * y);

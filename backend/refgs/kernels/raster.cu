@@ -81,7 +81,7 @@ INLINE void keep(Stored& to, Splat s) {
 // Without what a plain one does not need.
 INLINE Splat plain(const Stored& from) {
   Splat s;
-  float rest[4];
+  alignas(16) float rest[4];
   copy(s.high.value, from.value), copy(s.high.slope_x, from.slope_x), copy(s.high.slope_y, from.slope_y), copy(rest, from.rest);
   s.x = s.high.value[3], s.y = s.high.slope_x[3], s.depth = s.high.slope_y[3];
   s.determinant = rest[0], s.log2_opacity = rest[1], s.rho_max = rest[2], s.plain = rest[3] != 0;
@@ -259,7 +259,7 @@ INLINE void backward(const Raster& r) {
     uint32_t gave = 0;
     each_met(chunk.met, n, place, live, [&](int k, const bool (&in)[HALVES]) {
       Splat s = plain(chunk.splats[k]);
-      float g[GEOMETRY] = {}, w[HALVES] = {};
+      alignas(16) float g[GEOMETRY] = {}, w[HALVES] = {};
       bool gives = false;
 #pragma unroll
       for (int h = 0; h < HALVES; h++) {
@@ -322,7 +322,7 @@ INLINE bool add_rows(const Raster& r, int32_t k, int32_t end, int step, double (
     int32_t tile = r.pairs[k].tile;
     if (k > r.last[tile]) continue;
     touched = true;
-    float g[GEOMETRY];
+    alignas(16) float g[GEOMETRY];
 #pragma unroll
     for (int i = 0; i < GEOMETRY; i += 4) copy(g + i, r.rows + k * (GEOMETRY + r.size) + i);
 #pragma unroll

@@ -35,6 +35,7 @@ inline void cross(const float* a, const float* b, float* c) {
 
 // How far along the ray it enters a box; FAR where it does not before `nearest`.
 inline float enter(const Ray& r, const float* box, float nearest) {
+  if (!(box[0] <= box[3])) return FAR;  // an empty one
   float first = 0, last = nearest;
   for (int a = 0; a < 3; a++) {
     float t0 = (box[a] - r.origin[a]) * r.inverse[a], t1 = (box[3 + a] - r.origin[a]) * r.inverse[a];

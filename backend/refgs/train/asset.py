@@ -54,6 +54,7 @@ def _facing_outward(surfels: Surfels, trainer: Trainer) -> tuple[Surfels, int]:
 
     A surfel's weight in a view is the gradient of the sum of a constant feature.
     """
+    surfels = Surfels(*(value.detach() for value in surfels))
     count = len(surfels.positions)
     side, seen = torch.zeros(count, device=trainer.device), torch.zeros(count, device=trainer.device)
     normals = surfels.normals()

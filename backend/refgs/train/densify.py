@@ -94,21 +94,21 @@ def thin(parameters: Parameters, optimizer: torch.optim.Optimizer, count: int) -
 def _take(
     parameters: Parameters, optimizer: torch.optim.Optimizer, index: Tensor, fresh: Sequence[Tensor] = ()
 ) -> None:
-    """Replace the surfels by those of an index, with their moments; those at `fresh` begin without."""
-    for group in optimizer.param_groups:
-        if group["name"] not in parameters:  # the light
-            continue
+    """Replace the surfels by those of an index, with their moments; those at `fresh` begin without. All of them or, where there is
+    no memory for that, none."""
+    groups = [group for group in optimizer.param_groups if group["name"] in parameters]  # not the light
+    made = []
+    for group in groups:
         old = group["params"][0]
-        new = old.detach()[index].clone()
-        state = optimizer.state.pop(old, None)
-        if state:
-            for key in ("exp_avg", "exp_avg_sq"):
-                state[key] = state[key][index].clone()
-                for rows in fresh:
-                    state[key][rows] = 0
-        new.requires_grad_()
-        group["params"][0] = new
-        parameters[group["name"]] = new
+        new, state = old.detach()[index].requires_grad_(), dict(optimizer.state.get(old, {}))
+        for key in ("exp_avg", "exp_avg_sq") if state else ():
+            state[key] = state[key][index]
+            for rows in fresh:
+                state[key][rows] = 0
+        made.append((new, state))
+    for group, (new, state) in zip(groups, made, strict=True):
+        optimizer.state.pop(group["params"][0], None)
+        group["params"][0] = parameters[group["name"]] = new
         if state:
             optimizer.state[new] = state
 

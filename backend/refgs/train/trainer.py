@@ -53,6 +53,11 @@ def psnr(image: Tensor, photo: Tensor) -> float:
     return float(-10 * torch.log10(((image.clamp(0, 1) - photo) ** 2).mean().clamp_min(1e-10)))
 
 
+def full_card() -> InputError:
+    """What to say where a card's memory does not do."""
+    return InputError("the card's memory is too small: close what else uses it, or take --device cpu")
+
+
 class Trainer:
     """A capture being learned. State is on the run folder's disk after every checkpoint."""
 
@@ -269,13 +274,11 @@ class Trainer:
             except torch.OutOfMemoryError:
                 self.budget = int(FEWER * len(self.parameters["position"]))
                 if self.budget < LEAST_SURFELS:
-                    raise InputError(
-                        "the card's memory is too small: close what else uses it, or take --device cpu"
-                    ) from None
+                    raise full_card() from None
             self._forget_gradients()
+            torch.cuda.empty_cache()
             thin(self.parameters, self.optimizer, self.budget)
             self.motion = ScreenGradient(self.budget, self.device)
-            torch.cuda.empty_cache()
             self.report(
                 "warning", {"what": f"the card's memory is full: going on with {self.budget:,} surfels at the most"}
             )
@@ -299,7 +302,9 @@ class Trainer:
             file.write(json.dumps(facts) + "\n")
 
     def save(self) -> None:
-        """Write a checkpoint of everything that the next iteration depends on."""
+        """Write a checkpoint of everything that the next iteration depends on. Raises FloatingPointError where that is not finite."""
+        if not all(bool(value.isfinite().all()) for value in (self.parameters["position"], self.light)):
+            raise FloatingPointError(f"surfels or light are not finite at iteration {self.iteration}")
         tensors = {f"parameter.{name}": value for name, value in self.parameters.items()}
         tensors |= {f"constant.{name}": value for name, value in self.constant.items()}
         tensors |= {"environment": self.light, "motion.total": self.motion.total, "motion.views": self.motion.views}
