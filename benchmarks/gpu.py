@@ -219,8 +219,8 @@ def training_table(device: torch.device, folder: Path) -> None:
 
 def main() -> None:
     """Run it all."""
-    if (why := cuda.unusable()) is not None:
-        console.print(f"no figures of a card from here: {why or 'no NVIDIA card, or no driver for it, was found'}")
+    if why := cuda.unusable():
+        console.print(f"no figures of a card from here: {why}")
         raise SystemExit(2)
     device = torch.device("cuda")
     at = time.perf_counter()

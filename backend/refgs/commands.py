@@ -52,7 +52,7 @@ def progress_bar(what: str, total: int):
 
 
 def choose_device(device: str) -> str:
-    """ "cpu" or "cuda": what to train on. Says so where a card was asked for, or is there, and cannot be used."""
+    """What to train on, "cpu" or "cuda". Says so where a card was asked for, or is there, and cannot be used."""
     if device not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device {device}: take auto, cpu or cuda")
     if device == "cpu":
@@ -60,8 +60,8 @@ def choose_device(device: str) -> str:
     why = cuda.unusable()
     if why is None:
         return "cuda"
-    if why or device == "cuda":
-        console.print(f"warning: training on the CPU: {why or 'no NVIDIA card, or no driver for it, was found'}")
+    if device == "cuda" or why != cuda.NO_CARD:
+        console.print(f"warning: training on the CPU: {why}")
     return "cpu"
 
 

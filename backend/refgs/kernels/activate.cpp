@@ -22,7 +22,6 @@ struct Activate {
   mutable Shared shared;
 };
 
-constexpr int BATCH = LANES == 1 ? 1 : 4096;  // numbers of a tensor
 constexpr float LOG2_E = 1.4426950f, LN_2_HIGH = 0.693359375f, LN_2_LOW = -2.1219444e-4f;  // their sum is ln 2; k LN_2_HIGH is exact
 
 // e^x = 2^k e^r, for |x| <= 87; beyond, the values there.
@@ -32,31 +31,17 @@ INLINE Vector exponential(Vector x) {
   return exp2(k) * exp2(r * LOG2_E);
 }
 
-// body(activation, first, numbers) for vectors of all the tensors.
-template <class Body>
-INLINE void each(const Activate& a, Body body) {
-  int64_t batches = 0;
-  for (int64_t t = 0; t < a.tensors; t++) batches += (a.activations[t].count + BATCH - 1) / BATCH;
-  share(a.shared, batches, 1, [&](int64_t batch) {
-    int t = 0;
-    for (int64_t n; batch >= (n = (a.activations[t].count + BATCH - 1) / BATCH); t++) batch -= n;
-    const Activation& v = a.activations[t];
-    int64_t first = batch * BATCH, end = first + BATCH < v.count ? first + BATCH : v.count;
-    for (int64_t i = first; i < end; i += LANES) body(v, i, end - i);
-  });
-}
-
 }  // namespace
 
 KERNEL(refgs_activate_forward, Activate, a) {
-  each(*a, [](const Activation& v, int64_t i, int64_t n) {
+  share_vectors(a->shared, a->activations, a->tensors, [](const Activation& v, int64_t i, int64_t n) {
     Vector raw = read(v.raw + i, n);
     write(v.value + i, v.kind == EXP ? exponential(raw) : 1.0f / (1.0f + exponential(-raw)), n);
   });
 }
 
 KERNEL(refgs_activate_backward, Activate, a) {
-  each(*a, [](const Activation& v, int64_t i, int64_t n) {
+  share_vectors(a->shared, a->activations, a->tensors, [](const Activation& v, int64_t i, int64_t n) {
     Vector value = read(v.value + i, n), slope = v.kind == EXP ? value : value * (1.0f - value);
     write(v.by_raw + i, read(v.by_value + i, n) * slope, n);
   });

@@ -21,8 +21,6 @@ struct Adam {
   mutable Shared shared;
 };
 
-constexpr int BATCH = LANES == 1 ? 1 : 8192;  // numbers of a tensor
-
 INLINE void step(const Adam& a, const Learned& t, int64_t i, int64_t n) {
   Vector g = read(t.gradient + i, n);
   Mask felt = (g < 0.0f) | (g > 0.0f);
@@ -38,13 +36,5 @@ INLINE void step(const Adam& a, const Learned& t, int64_t i, int64_t n) {
 }  // namespace
 
 KERNEL(refgs_adam_step, Adam, a) {
-  int64_t batches = 0;
-  for (int64_t t = 0; t < a->tensors; t++) batches += (a->learned[t].count + BATCH - 1) / BATCH;
-  share(a->shared, batches, 1, [&](int64_t batch) {
-    int t = 0;
-    for (int64_t n; batch >= (n = (a->learned[t].count + BATCH - 1) / BATCH); t++) batch -= n;
-    const Learned& l = a->learned[t];
-    int64_t first = batch * BATCH, end = first + BATCH < l.count ? first + BATCH : l.count;
-    for (int64_t i = first; i < end; i += LANES) step(*a, l, i, end - i);
-  });
+  share_vectors(a->shared, a->learned, a->tensors, [&](const Learned& l, int64_t i, int64_t n) { step(*a, l, i, n); });
 }

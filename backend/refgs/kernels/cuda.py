@@ -31,7 +31,7 @@ SOURCES = (
     "stack.cpp",
     "trace.cu",
 )
-# A product and a sum fuse as the CPU's do; nothing else is rounded other than IEEE 754 has it.
+# A product and a sum fuse as the CPU's do; but for lane.h's reciprocal and exp2, nothing is rounded other than IEEE 754 has it.
 OPTIONS = (
     "--std=c++17",
     "--device-as-default-execution-space",
@@ -41,17 +41,18 @@ OPTIONS = (
 )
 OLDEST = (7, 5)  # the compute capability from which on NVRTC 13 compiles
 BLOCK = 256  # threads, where a kernel does not care
+NO_CARD = "no NVIDIA card, or no driver for it, was found"
 
 
 def unusable() -> str | None:
-    """Why the card here cannot be used, in a line; an empty one where there is none; None where it can."""
+    """Why no card can be used here, in a line, NO_CARD where there is none; None where one can."""
     if torch.version.cuda is None:
-        return ""
+        return NO_CARD
     with warnings.catch_warnings(record=True) as said:  # torch warns of a driver that is too old
         warnings.simplefilter("always")
         available = torch.cuda.is_available()
     if not available:
-        return "the card's driver is too old for CUDA 13: a newer one may do" if said else ""
+        return "the card's driver is too old for CUDA 13: a newer one may do" if said else NO_CARD
     if (capability := torch.cuda.get_device_capability()) < OLDEST:
         found, least = (".".join(map(str, version)) for version in (capability, OLDEST))
         return f"{torch.cuda.get_device_name()} is too old: its compute capability is {found}, {least} is the least"

@@ -166,3 +166,19 @@ INLINE Vectors operator+(Vectors a, Vectors b) { return {a.x + b.x, a.y + b.y, a
 INLINE Vectors operator-(Vectors a, Vectors b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
 INLINE Vectors operator*(Vector s, Vectors a) { return {s * a.x, s * a.y, s * a.z}; }
 INLINE Vector dot(Vectors a, Vectors b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
+// body(tensor, first, numbers) for vectors of several tensors that have a `count`; a thread takes as many numbers of one at a time
+// as are worth its while.
+template <class Tensor, class Body>
+INLINE void share_vectors(Shared& shared, const Tensor* tensors, int64_t n, Body body) {
+  constexpr int64_t BATCH = LANES == 1 ? 1 : 4096;
+  auto batches = [&](int64_t t) { return (tensors[t].count + BATCH - 1) / BATCH; };
+  int64_t all = 0;
+  for (int64_t t = 0; t < n; t++) all += batches(t);
+  share(shared, all, 1, [&](int64_t batch) {
+    int64_t t = 0;
+    for (; batch >= batches(t); t++) batch -= batches(t);
+    int64_t first = batch * BATCH, end = first + BATCH < tensors[t].count ? first + BATCH : tensors[t].count;
+    for (int64_t i = first; i < end; i += LANES) body(tensors[t], i, end - i);
+  });
+}
