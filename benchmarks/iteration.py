@@ -107,8 +107,8 @@ def _watch(times: dict[str, list[float]]) -> None:
 
     library, parallel = load.kernels(), load.parallel
 
-    def watched(function: Callable, work, scratch: int = 0) -> None:
-        timed(function.__name__, parallel, function, work, scratch)
+    def watched(function: Callable, work, *sizes: int) -> None:
+        timed(function.__name__, parallel, function, work, *sizes)
 
     load.parallel = raster_cpu.parallel = watched
     raster_cpu.kernels = Library

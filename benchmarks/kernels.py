@@ -109,7 +109,7 @@ def _shading() -> Callable[[], None]:
 def _prefilter(side: int) -> Callable[[], None]:
     """Of a cubemap of 6·side² texels, both ways."""
     radiance = torch.rand(6 * side**2, 3, requires_grad=True)
-    upstream = torch.rand_like(prefilter(radiance, side))
+    upstream = [torch.rand_like(part) for part in prefilter(radiance, side)]
     return lambda: torch.autograd.grad(prefilter(radiance, side), radiance, upstream)
 
 

@@ -11,7 +11,7 @@ from refgs.capture import read_capture
 from refgs.geometry.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.kernels import cuda
-from refgs.model import environment, prefilter
+from refgs.model import prefilter
 from refgs.render import raster_cuda, shade
 from refgs.settings import load_settings
 from refgs.train.trainer import Trainer
@@ -45,7 +45,7 @@ def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
         if name == "card":
             emulate(monkeypatch)
         steps = [trainer.step() for _ in range(3)]
-        figures.append([[float(step[name]) for name in ("loss", "psnr")] for step in steps])
+        figures.append([[float(step[name]) for name in ("loss", "square")] for step in steps])
         learned.append({name: value.detach().clone() for name, value in trainer.parameters.items()})
     np.testing.assert_allclose(figures[0], figures[1], rtol=1e-3)
     for name, value in learned[0].items():
@@ -73,7 +73,7 @@ def follow_to_the_card(monkeypatch) -> list[str]:
 
         return made
 
-    tables = [(prefilter, "matrices"), (prefilter, "_pyramid"), (environment, "_projection")]
+    tables = [(prefilter, "matrices"), (prefilter, "_pyramid"), (prefilter, "_projection"), (prefilter, "_order")]
     for home, name in [*tables, (shade, "_fg_table"), (shade._Padding, "of")]:
         monkeypatch.setattr(home, name, computed_on_the_cpu(getattr(home, name)))
     launched = []

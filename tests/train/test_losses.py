@@ -1,6 +1,7 @@
 """The objective against plain torch in float64, values and gradients."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -88,16 +89,16 @@ def gradients(loss: Tensor, rendering: Rendering) -> dict[str, Tensor]:
 
 
 def check(rendering: Rendering, view: Photo, weights: LossSettings, progress: float, scale: float, device) -> Tensor:
-    """The loss and its gradients, `scale` times, against the reference's; returns the PSNR."""
+    """The loss and its gradients, `scale` times, against the reference's; returns the mean squared error."""
     exact, found = leaves(rendering, torch.float64), leaves(rendering, torch.float32, device)
     expected = sum(reference(exact, view, weights, progress).values())
-    loss, psnr = objective(found, None, moved(view, device), BACKGROUND.to(device), weights, progress)
+    loss, square = objective(found, None, moved(view, device), BACKGROUND.to(device), weights, progress)
     assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-5)
     expected_gradients = gradients(scale * expected, exact)
     for name, gradient in gradients(scale * loss, found).items():
         worst = (gradient.cpu() - expected_gradients[name]).abs().max()
         assert worst <= 1e-4 * expected_gradients[name].abs().max(), name
-    return psnr
+    return square
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -105,13 +106,35 @@ def check(rendering: Rendering, view: Photo, weights: LossSettings, progress: fl
 @pytest.mark.parametrize("size", [(61, 40), (16, 16), (3, 5), (2, 2), (1, 1), (1, 30)])
 def test_matches_float64(size, material, masked, device):
     rendering, view = pictures(*size, masked, material)
-    psnr = check(rendering, view, ALL, 0.7, 3, device)
+    square = check(rendering, view, ALL, 0.7, 3, device)
     photo = view.image.double() / 255
     if masked:
         mask = view.mask.double()[..., None] / 255
         photo = photo * mask + BACKGROUND.double() * (1 - mask)
     error = ((rendering.color.clamp(0, 1) - photo) ** 2).mean()
-    assert abs(float(psnr) + 10 * float(torch.log10(error))) < 1e-3
+    assert float(square) == pytest.approx(float(error), rel=1e-5)
+
+
+def test_the_light_is_held_to_be_neutral_on_the_whole(device):
+    """Departure of the mean from grey, and its derivative, in float64."""
+    rendering, view = pictures(8, 8, masked=True, material=True)
+    only = LossSettings(dssim=0, normal=0, smooth=0, alpha=0, metallic=0, light=0.5)
+    irradiance = torch.rand(9, 3, generator=torch.Generator().manual_seed(0))
+    for scale in (1e-6, 1, 1e6):
+        exact = (scale * irradiance).double().requires_grad_()
+        expected = 0.5 * ((exact[0] / exact[0].mean() - 1) ** 2).mean()
+        light = SimpleNamespace(irradiance=exact.detach().float().to(device).requires_grad_())
+        found = leaves(rendering, torch.float32, device)
+        without = objective(found, None, moved(view, device), BACKGROUND.to(device), only, 1.0).loss
+        loss = objective(found, light, moved(view, device), BACKGROUND.to(device), only, 1.0).loss
+        assert float((loss - without).detach()) == pytest.approx(float(expected.detach()), rel=1e-4)
+        loss.backward()
+        torch.testing.assert_close(
+            light.irradiance.grad.cpu().double(), *torch.autograd.grad(expected, exact), rtol=1e-4, atol=1e-6 / scale
+        )
+    dark = SimpleNamespace(irradiance=torch.zeros(9, 3, device=device, requires_grad=True))
+    objective(found, dark, moved(view, device), BACKGROUND.to(device), only, 1.0).loss.backward()
+    assert not dark.irradiance.grad.any()
 
 
 @pytest.mark.parametrize("term", ["dssim", "normal", "smooth", "alpha", "metallic"])

@@ -139,12 +139,12 @@ def borrow(name: str, count: int) -> torch.Tensor:
     return memory
 
 
-def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0) -> None:
-    """Call `function(&work)` on as many threads at once as torch has, but no more than there are cores.
+def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most: int = CORES) -> None:
+    """Call `function(&work)` on as many threads at once as torch has, but at `most` so many, and no more than there are cores.
 
     They share the work through `work.shared`. Each thread gets `scratch` floats of `work.scratch`.
     """
-    threads = min(torch.get_num_threads(), CORES)
+    threads = max(1, min(torch.get_num_threads(), CORES, most))
     memory = borrow("scratch", threads * scratch)
     work.scratch = memory.data_ptr()
     work.shared = Shared()
@@ -162,4 +162,4 @@ def run(name: str, work: ctypes.Structure, like: torch.Tensor, items: int, scrat
     if on_gpu(like):
         cuda.launch(name, work, like.device, max(1, -(-items // cuda.BLOCK)))
     else:
-        parallel(getattr(kernels(), name), work, scratch)
+        parallel(getattr(kernels(), name), work, scratch, items)

@@ -17,8 +17,12 @@ struct Losses {
   const float* by_clipped;  // (H, W, 3) D-SSIM's share
   float *by_color, *by_normal, *by_depth, *by_alpha, *by_material;
   float* slopes;            // (4, H, W) derivatives by the depths to the right, to the left, below and above
-  const double* totals;     // (SUMS) of the first pass
   double* sums;             // (SUMS) of each row, or of each block's pixels
+  const double* totals[2];  // (SUMS) of each pass
+  const float* structure;   // D-SSIM, or null
+  const float* irradiance;  // (9, 3) of the light, or null
+  float dssim_weight, light_weight;
+  float *loss, *square, *by_irradiance;  // what comes of it: the loss; the mean squared error; (9, 3)
   float* scratch;           // none is used
   mutable Shared shared;
 };
@@ -222,9 +226,33 @@ KERNEL(refgs_losses_second, Losses, l) {
 
     if (!l.material) return;
     Vector metallic = r.at.get(r.of(l.material, MATERIAL) + METAL, MATERIAL);
-    float surfaces = (float)l.totals[SURFACES], weight = l.metallic_weight / (surfaces > 1 ? surfaces : 1);
+    float surfaces = (float)l.totals[0][SURFACES], weight = l.metallic_weight / (surfaces > 1 ? surfaces : 1);
     r.add(sums[LOSS], weight * metallic * (1.0f - metallic));
     float* row = r.of(l.by_material, MATERIAL);
     for (int i = 0; i < MATERIAL; i++) r.at.put(row + i, MATERIAL, i == METAL ? weight * (1.0f - 2.0f * metallic) : Vector());
+  });
+}
+
+// The whole, with the light's own word: the squared departure from grey of its mean over all directions, the constant harmonic. Of
+// numbers m with mean u that is mean((m / u - 1)^2).
+KERNEL(refgs_losses_total, Losses, l) {
+  share(l->shared, 1, 1, [&](int64_t) {
+    const double *first = l->totals[0], *second = l->totals[1];
+    double loss = first[LOSS] + second[LOSS];
+    if (l->structure) loss += l->dssim_weight * (double)*l->structure;
+    if (l->irradiance) {
+      double mean = 0, square = 0, along = 0, departure[3];  // along: what all three do to the mean
+      for (int c = 0; c < 3; c++) mean += l->irradiance[c] / 3.0;
+      double weight = mean > 1e-9 ? l->light_weight : 0;  // darkness has no colour
+      mean = mean > 1e-9 ? mean : 1;
+      for (int c = 0; c < 3; c++) {
+        departure[c] = l->irradiance[c] / mean - 1;
+        square += departure[c] * departure[c] / 3, along += departure[c] * (departure[c] + 1) / 3;
+      }
+      loss += weight * square;
+      for (int i = 0; i < 27; i++) l->by_irradiance[i] = i < 3 ? (float)(weight * 2 / 3 * (departure[i] - along) / mean) : 0;
+    }
+    *l->loss = (float)loss;
+    *l->square = (float)(first[SQUARES] / (3 * l->width * l->height));
   });
 }

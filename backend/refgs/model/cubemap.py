@@ -5,6 +5,7 @@ face's (s, t) coordinates in [−1, 1] run along the two world axes that follow 
 image convention to respect: cubemaps never leave the program (environment.exr is equirectangular).
 """
 
+import itertools
 from functools import lru_cache
 
 import torch
@@ -72,6 +73,13 @@ def orbits(resolution: int) -> Tensor:
         texel = torch.stack([more, less.flip(dim)], dim=dim)
     axis, x, z, t, y, s = range(6)
     return texel.permute(t, s, axis, z, y, x).reshape(-1, SYMMETRIES)
+
+
+@lru_cache(maxsize=8)
+def orbit_order(sides: tuple[int, ...]) -> Tensor:
+    """The texels of cubemaps one after another, in the order of each one's orbits (Σ 6·side²,)."""
+    starts = itertools.accumulate((6 * side * side for side in sides), initial=0)
+    return torch.cat([orbits(side).flatten() + start for side, start in zip(sides, starts, strict=False)])
 
 
 @lru_cache(maxsize=1)

@@ -1,7 +1,6 @@
 """The light: a cubemap of linear HDR radiance, prefiltered for the split sum, with the irradiance that lights the diffuse part."""
 
 import math
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -11,16 +10,6 @@ from refgs.export.environment import directions as panorama_directions
 from refgs.export.environment import sample as sample_panorama
 from refgs.model import cubemap, harmonics, prefilter
 
-# A clamped cosine's harmonics divided by π, by degree (Ramamoorthi and Hanrahan 2001, eq. 8).
-COSINE = (1.0,) + (2 / 3,) * 3 + (1 / 4,) * 5
-
-
-@lru_cache(maxsize=4)
-def _projection(resolution: int, device: torch.device) -> Tensor:
-    """(9, 6·R²): radiance → the nine coefficients of irradiance / π."""
-    y = harmonics.basis(cubemap.texel_directions(resolution), 2) * cubemap.texel_solid_angles(resolution)[:, None]
-    return (y * torch.tensor(COSINE, dtype=torch.float64)).T.float().contiguous().to(device)
-
 
 class Environment:
     """Light from afar. `radiance` (6·R², 3), linear, in the order of `refgs.model.cubemap`."""
@@ -29,8 +18,7 @@ class Environment:
         self.radiance = radiance
         self.resolution = math.isqrt(len(radiance) // 6)
         self.sides = tuple(prefilter.level_sides(self.resolution))
-        self.levels = prefilter.prefilter(radiance, self.resolution)
-        self.irradiance = _projection(self.resolution, radiance.device) @ radiance  # (9, 3)
+        self.levels, self.irradiance = prefilter.prefilter(radiance, self.resolution)
 
     @property
     def harmonics(self) -> Tensor:

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.kernels.load import Shared, Work, check, run
-from refgs.model import cubemap
+from refgs.model import cubemap, harmonics
 from refgs.model.cubemap import SYMMETRIES
 
 ROUGHNESS = (0.0, 0.18, 0.35, 0.6, 1.0)  # of the levels; level 0 is the cubemap itself
@@ -26,7 +26,8 @@ DIVISOR = (1, 2, 4, 8, 8)  # a level's side is the cubemap's divided by this
 CELLS = 256  # a texel of the pyramid is split while it holds more than 1/CELLS of the lobe
 COARSEST = 4  # side of the last pooled mip
 SAMPLES = 3  # sub-samples of the lobe along each side of a texel
-PAST = 3  # texels past the last one that the product may read
+# A clamped cosine's harmonics divided by π, by degree (Ramamoorthi and Hanrahan 2001, eq. 8).
+COSINE = (1.0,) + (2 / 3,) * 3 + (1 / 4,) * 5
 
 
 def level_sides(resolution: int) -> list[int]:
@@ -117,8 +118,9 @@ def _pair(
 
 @lru_cache(maxsize=4)
 def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
-    """The levels above 0 stacked, as a matrix over the pyramid's texels, and its transpose."""
-    parts, start = [], 0
+    """The levels stacked, as a matrix over the pyramid's texels, and its transpose."""
+    itself = np.arange(resolution**2 // 4)  # level 0
+    parts, start = [(itself, SYMMETRIES * itself, np.ones(len(itself)))], 6 * resolution**2
     for side, roughness in zip(level_sides(resolution)[1:], ROUGHNESS[1:], strict=True):
         orbit, texel, weight = _level(resolution, side, roughness)
         parts.append((orbit, start + texel, weight))
@@ -145,12 +147,21 @@ def _pyramid(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
     return _pair(matrix.shape, matrix.row, SYMMETRIES * matrix.col, matrix.data, device)
 
 
-@lru_cache(maxsize=8)
-def _orders(sides: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Of cubemaps one after another: their texels in the order of orbits, and PAST more; where each texel is in that order."""
-    starts = np.cumsum([0] + [6 * side * side for side in sides])
-    order = torch.cat([cubemap.orbits(side).flatten() + start for side, start in zip(sides, starts[:-1], strict=True)])
-    return torch.nn.functional.pad(order, (0, PAST)).to(device), order.argsort().to(device)
+@lru_cache(maxsize=4)
+def _order(resolution: int, device: torch.device) -> Tensor:
+    return cubemap.orbit_order((resolution,)).int().to(device)
+
+
+@lru_cache(maxsize=4)
+def _projection(resolution: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Radiance → irradiance / π in harmonics, in two steps: (9, orbits), of an orbit's first texel; (9, 9 · 24), from what the
+    first step gives for each symmetry to the sum over all of them, each being the harmonics of the first turned."""
+    orbits = cubemap.orbits(resolution)
+    basis = harmonics.basis(cubemap.texel_directions(resolution), 2)[orbits]  # (orbits, 24, 9)
+    turned = torch.linalg.lstsq(basis[:, 0], basis.flatten(1)).solution.unflatten(1, (SYMMETRIES, 9))
+    turned = turned * torch.tensor(COSINE, dtype=torch.float64)
+    first = (basis[:, 0] * cubemap.texel_solid_angles(resolution)[orbits[:, :1]]).T
+    return tuple(m.float().contiguous().to(device) for m in (first, turned.permute(2, 0, 1).flatten(1)))
 
 
 class _Work(Work):
@@ -158,42 +169,45 @@ class _Work(Work):
 
     _fields_ = (
         ("orbits", ctypes.c_int64),
-        *((n, ctypes.c_void_p) for n in ("starts", "columns", "numbers", "compositions", "dense", "out", "scratch")),
+        *((n, ctypes.c_void_p) for n in ("starts", "columns", "numbers", "compositions", "dense")),
+        *((n, ctypes.c_void_p) for n in ("rows", "out", "scratch")),
         ("shared", Shared),
     )
 
 
-def _product(matrix: Matrix, dense: Tensor) -> Tensor:
-    """What goes in and what comes out are in the order of orbits, with PAST texels more."""
+def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tensor:
+    """What goes in is in the order of orbits; so is what comes out, unless each texel goes to a row."""
     work = _Work(orbits=len(matrix.starts) - 1)
-    out = dense.new_empty(SYMMETRIES * work.orbits + PAST, 3)
-    work.attach(**matrix._asdict(), dense=dense, out=out)
+    out = dense.new_empty(SYMMETRIES * work.orbits, 3)
+    work.attach(**matrix._asdict(), dense=dense, out=out, **({} if rows is None else {"rows": rows}))
     run("refgs_sparse_product", work, out, items=32 * SYMMETRIES * work.orbits)
     return out
 
 
 class _Prefilter(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, radiance: Tensor, resolution: int) -> Tensor:
+    def forward(ctx, radiance: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
         ctx.resolution, device = resolution, radiance.device
-        order, _ = _orders((resolution,), device)
-        _, back = _orders(tuple(level_sides(resolution)[1:]), device)
-        pyramid = _product(_pyramid(resolution, device)[0], radiance.index_select(0, order))
+        ordered = radiance.index_select(0, _order(resolution, device))
+        pyramid = _product(_pyramid(resolution, device)[0], ordered)
         levels = _product(matrices(resolution, device)[0], pyramid)
-        return torch.cat([radiance, levels.index_select(0, back)])
+        first, turned = _projection(resolution, device)
+        irradiance = turned @ (first @ ordered.view(-1, 3 * SYMMETRIES)).view(-1, 3)
+        return levels, irradiance
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, by_levels: Tensor):
+    def backward(ctx, by_levels: Tensor, by_irradiance: Tensor):
         resolution, device, count = ctx.resolution, by_levels.device, 6 * ctx.resolution**2
-        order, _ = _orders(tuple(level_sides(resolution)[1:]), device)
-        _, back = _orders((resolution,), device)
-        by_pyramid = _product(matrices(resolution, device)[1], by_levels[count:].index_select(0, order))
-        by_radiance = _product(_pyramid(resolution, device)[1], by_pyramid)
-        return by_radiance.index_select(0, back).add_(by_levels[:count]), None
+        by_pyramid = _product(matrices(resolution, device)[1], by_levels.contiguous())
+        first, turned = _projection(resolution, device)
+        by_first = (turned.T @ by_irradiance).view(-1, 3 * SYMMETRIES)
+        by_pyramid[:count].view(-1, 3 * SYMMETRIES).addmm_(first.T, by_first)  # it begins with the cubemap itself
+        return _product(_pyramid(resolution, device)[1], by_pyramid, rows=_order(resolution, device)), None
 
 
-def prefilter(radiance: Tensor, resolution: int) -> Tensor:
-    """All levels of a cubemap (6·R², 3) one after another, (Σ 6·side², 3): linear radiance in, linear radiance out."""
+def prefilter(radiance: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
+    """Of a cubemap (6·R², 3) all levels one after another, (Σ 6·side², 3), each in the order of `cubemap.orbits`; and the
+    irradiance / π in harmonics up to degree 2, (9, 3). Linear radiance in, linear radiance out."""
     check(radiance=(radiance, (6 * resolution**2, 3)))
     return _Prefilter.apply(radiance, resolution)

@@ -78,8 +78,9 @@ class _Work(Work):
 
 
 class _Padding(NamedTuple):
-    """Of cubemaps one after another, their faces padded by one: the texel under each cell, and the cells of each texel, int32:
-    `cell` from starts[i] to starts[i + 1]. Where each level starts, in cells and in rows of cells, and how many rows there are."""
+    """Of cubemaps one after another, their faces padded by one: the texel under each cell, as a place in the order of orbits, and
+    the cells of each texel, int32: `cell` from starts[i] to starts[i + 1]. Where each level starts, in cells and in rows of
+    cells, and how many rows there are."""
 
     texel: Tensor
     starts: Tensor
@@ -92,6 +93,7 @@ class _Padding(NamedTuple):
     @lru_cache(maxsize=4)
     def of(cls, sides: tuple[int, ...], device: torch.device) -> "_Padding":
         texel, first_cells, _ = cubemap.padded(sides)
+        texel = cubemap.orbit_order(sides).argsort()[texel]
         lines = [6 * (side + 2) for side in sides]
         starts = torch.nn.functional.pad(texel.bincount().cumsum(dim=0), (1, 0))
         tables = (t.to(device, torch.int32) for t in (texel, starts, texel.argsort(stable=True)))

@@ -35,10 +35,10 @@ class Photo(NamedTuple):
 
 
 class Objective(NamedTuple):
-    """The training loss of a view, a differentiable scalar, and its peak signal-to-noise ratio in dB, clipped to 0..1."""
+    """The training loss of a view, a differentiable scalar; and the mean squared error of the picture, clipped to 0..1."""
 
     loss: Tensor
-    psnr: Tensor
+    square: Tensor
 
 
 class _Work(Work):
@@ -55,23 +55,30 @@ class _Work(Work):
         *((f"{n}_weight", ctypes.c_float) for n in ("color", "normal", "smooth_x", "smooth_y", "alpha", "metallic")),
         *((n, ctypes.c_void_p) for n in ("photo", "clipped", "by_clipped")),
         *((f"by_{n}", ctypes.c_void_p) for n in ("color", "normal", "depth", "alpha", "material")),
-        *((n, ctypes.c_void_p) for n in ("slopes", "totals", "sums", "scratch")),
+        *((n, ctypes.c_void_p) for n in ("slopes", "sums", "first", "second", "structure", "irradiance")),
+        *((n, ctypes.c_float) for n in ("dssim_weight", "light_weight")),
+        *((n, ctypes.c_void_p) for n in ("loss", "square", "by_irradiance", "scratch")),
         ("shared", Shared),
     )
 
 
-class _Maps(torch.autograd.Function):
-    """The terms that a rendering's maps say, but the light's; the derivatives are had with the value."""
+class _Objective(torch.autograd.Function):
+    """The derivatives are had with the value."""
+
+    DIFFERENTIABLE = "color", "normal", "depth", "alpha", "material", "irradiance"
 
     @staticmethod
-    def forward(ctx, color, normal, depth, alpha, material, photo, background, weights, progress):
+    def forward(ctx, color, normal, depth, alpha, material, irradiance, photo, background, weights, progress):
         camera, (height, width) = photo.camera, alpha.shape
         inputs = {"color": color, "normal": normal, "depth": depth, "alpha": alpha}
+        shapes = dict.fromkeys(inputs, (height, width))
+        shapes |= {"color": (height, width, 3), "normal": (height, width, 3), "background": (3,)}
+        inputs["background"] = background
         if material is not None:
-            inputs["material"] = material
-        numbers = {"color": (3,), "normal": (3,), "material": (5,)}
-        shapes = {name: (value, (height, width, *numbers.get(name, ()))) for name, value in inputs.items()}
-        check(**shapes, background=(background, (3,)))
+            inputs["material"], shapes["material"] = material, (height, width, 5)
+        if irradiance is not None:
+            inputs["irradiance"], shapes["irradiance"] = irradiance, (9, 3)
+        check(**{name: (value, shapes[name]) for name, value in inputs.items()})
         inputs = {name: value.contiguous() for name, value in inputs.items()}
         color = inputs["color"]
         codes = {"image": photo.image} | ({} if photo.mask is None else {"mask": photo.mask})
@@ -81,7 +88,7 @@ class _Maps(torch.autograd.Function):
                     f"{camera.name}: the photo and its mask must be uint8 on {color.device}, of the rendering's size, "
                     f"{width}×{height}; got {value.dtype} {tuple(value.shape)} on {value.device}"
                 )
-        gradients = {f"by_{name}": torch.empty_like(value) for name, value in inputs.items()}
+        gradients = {name: torch.empty_like(value) for name, value in inputs.items() if name != "background"}
         buffers = {"photo": torch.empty_like(color), "clipped": torch.empty_like(color)}
         buffers["slopes"] = color.new_empty(4, height, width)
         blocks = -(-width // TILE[0]) * -(-height // TILE[1])
@@ -97,21 +104,28 @@ class _Maps(torch.autograd.Function):
         work.smooth_y_weight = weights.smooth / max((height - 1) * width, 1)
         work.alpha_weight = weights.alpha / alpha.numel()
         work.metallic_weight = weights.metallic * progress**2
-        work.attach(**inputs, **codes, background=background, **gradients, **buffers, sums=sums[0])
+        work.dssim_weight, work.light_weight = weights.dssim, weights.light
+        by = {f"by_{name}": value for name, value in gradients.items()}
+        work.attach(**inputs, **codes, **by, **buffers, sums=sums[0])
         run("refgs_losses_first", work, color, items=blocks * cuda.BLOCK)
 
-        totals = sums[0].sum(dim=0)
+        totals = [sums[0].sum(dim=0)]
         if weights.dssim > 0:
             structure, by_clipped = dssim(buffers["clipped"], buffers["photo"], weights.dssim)
         else:
-            structure, by_clipped = 0.0, torch.zeros_like(color)
-        work.attach(by_clipped=by_clipped, totals=totals, sums=sums[1])
+            structure, by_clipped = None, torch.zeros_like(color)
+        work.attach(by_clipped=by_clipped, first=totals[0], sums=sums[1])
         run("refgs_losses_second", work, color, items=blocks * cuda.BLOCK)
-        loss, _, squares = totals + sums[1].sum(dim=0)
-        psnr = -10 * torch.log10((squares / color.numel()).clamp_min(1e-10))
-        ctx.gradients = list(gradients.values()) + [None] * (material is None)
-        ctx.mark_non_differentiable(psnr)
-        return (loss + weights.dssim * structure).float(), psnr
+
+        totals.append(sums[1].sum(dim=0))
+        loss, square = color.new_empty(()), color.new_empty(())
+        work.attach(second=totals[1], loss=loss, square=square)
+        if structure is not None:
+            work.attach(structure=structure)
+        run("refgs_losses_total", work, color, items=1)
+        ctx.gradients = [gradients.get(name) for name in _Objective.DIFFERENTIABLE]
+        ctx.mark_non_differentiable(square)
+        return loss, square
 
     @staticmethod
     @once_differentiable
@@ -119,16 +133,6 @@ class _Maps(torch.autograd.Function):
         one = not load.on_gpu(by_loss) and by_loss == 1  # nearly always, but a card would have to wait to know
         scaled = ctx.gradients if one else [None if g is None else by_loss * g for g in ctx.gradients]
         return *scaled, None, None, None, None
-
-
-def light_loss(environment: Environment) -> Tensor:
-    """Squared departure from grey of the mean over all directions.
-
-    Warm metal under a neutral light and neutral metal under a warm light look almost alike; without a word for one of
-    them, white balance drifts between the two. Only the mean is held: the light's colours may differ by direction.
-    """
-    mean = environment.irradiance[0]  # the constant harmonic
-    return ((mean / mean.mean().clamp_min(1e-9) - 1) ** 2).mean()
 
 
 def objective(
@@ -146,13 +150,15 @@ def objective(
     differences, where the surface is opaque around the pixel. Smoothness: ‖∇N‖ exp(−‖∇C_gt‖), forward differences, where
     the surface is opaque. The mask: |α − mask|.
 
+    The light: squared departure from grey of its mean over all directions. Warm metal under a neutral light and neutral metal
+    under a warm light look almost alike; without a word for one of them, white balance drifts between the two. Only the
+    mean is held: the light's colours may differ by direction.
+
     And m (1 − m) of the metallic m, over the object: nothing real is half a metal. Where the metallic is decided, the
     highlights of dielectrics, 4 % of the light and without colour, fix the light's scale and white balance, which metals
     alone cannot. Not before it is known which is which, hence with the square of the progress.
     """
     material = rendering.material if weights.metallic > 0 else None
     maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material
-    loss, psnr = _Maps.apply(*maps, photo, background, weights, progress)
-    if environment is not None and weights.light > 0:
-        loss = loss + weights.light * light_loss(environment)
-    return Objective(loss, psnr)
+    irradiance = environment.irradiance if environment is not None and weights.light > 0 else None
+    return Objective(*_Objective.apply(*maps, irradiance, photo, background, weights, progress))

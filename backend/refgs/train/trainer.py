@@ -48,9 +48,14 @@ def composite(view: LoadedView, background: Tensor) -> Tensor:
     return image * alpha + background * (1 - alpha)
 
 
+def decibels(square: float) -> float:
+    """Peak signal-to-noise ratio in dB of a mean squared error."""
+    return -10 * math.log10(max(square, 1e-10))
+
+
 def psnr(image: Tensor, photo: Tensor) -> float:
     """Peak signal-to-noise ratio in dB of a rendering, clipped to 0..1."""
-    return float(-10 * torch.log10(((image.clamp(0, 1) - photo) ** 2).mean().clamp_min(1e-10)))
+    return decibels(float(((image.clamp(0, 1) - photo) ** 2).mean()))
 
 
 def full_card() -> InputError:
@@ -149,7 +154,7 @@ class Trainer:
         return float(np.mean([psnr(self.render(v.camera).color, composite(v, self.background)) for v in chosen]))
 
     def step(self) -> dict[str, Tensor]:
-        """One iteration. Returns its loss and PSNR, which are still being computed where there is a card."""
+        """One iteration. Returns its loss and mean squared error, which are still being computed where there is a card."""
         settings = self.settings
         photo = self._next_photo()
         progress = min(self.iteration / self.total, 1.0)
@@ -162,7 +167,7 @@ class Trainer:
 
         surfels, environment = self.surfels(), self.environment()
         rendering = self._render(surfels, environment, photo.camera)
-        loss, quality = objective(rendering, environment, photo, self.background, settings.loss, progress)
+        loss, square = objective(rendering, environment, photo, self.background, settings.loss, progress)
         loss.backward()
         position = self.parameters["position"]
         self.motion.add(position.detach(), position.grad, photo.camera)
@@ -173,7 +178,7 @@ class Trainer:
         due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
         if self._reflects() and due and self.iteration < self.total:
             self._trace()
-        return {"loss": loss.detach(), "psnr": quality}
+        return {"loss": loss.detach(), "square": square}
 
     def _forget_gradients(self) -> None:
         for group in self.optimizer.param_groups:
@@ -243,7 +248,7 @@ class Trainer:
             # Running means, read now and then: a card need not wait. One that is not finite stays so.
             means = {name: figure + 0.95 * (means.get(name, figure) - figure) for name, figure in figures.items()}
             if self.iteration % REPORT_EVERY == 0 or self.iteration == self.total:
-                loss, quality = float(means["loss"]), float(means["psnr"])
+                loss, quality = float(means["loss"]), decibels(float(means["square"]))
                 if not math.isfinite(loss):
                     raise FloatingPointError(f"the loss is {loss} at iteration {self.iteration}")
                 pace = (time.perf_counter() - started) / (self.iteration - first)
@@ -260,7 +265,7 @@ class Trainer:
                     },
                 )
             if self.iteration % HISTORY_EVERY == 0:
-                self._record(float(means["loss"]), float(means["psnr"]))
+                self._record(float(means["loss"]), decibels(float(means["square"])))
             if self.iteration % self.settings.train.checkpoint_every == 0 and self.iteration < self.total:
                 self.save()
         self.save()
