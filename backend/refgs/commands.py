@@ -24,7 +24,6 @@ from refgs.errors import InputError
 from refgs.export.environment import read_environment, read_exr, write_exr
 from refgs.export.splats import write_splats
 from refgs.kernels import cuda
-from refgs.model.environment import Environment
 from refgs.paths import clone_root
 from refgs.render.renderer import Rendering
 from refgs.report import metrics
@@ -194,7 +193,7 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
     if hdri is not None:
         if run.environment is None:
             raise InputError("--hdri: a run with shading = sh has no materials to relight")
-        light = Environment.from_panorama(read_environment(hdri), run.settings.environment.resolution)
+        light = run.light(read_environment(hdri))
     to_run = np.linalg.inv(run.to_capture)
     views = [in_frame(camera, to_run) for camera in read_cameras(cameras)]
     background = np.array(run.settings.image.background)

@@ -96,6 +96,7 @@ def shade(
     camera: Camera,
     background: Tensor,
     visibility: Tensor | None = None,
+    display: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """As refgs.render.shade.shade, for float64 tensors; and how far each pixel (H, W) is from a kink of the derivatives,
     in the units of what has the kink. Bilinear look-ups have one at every texel."""
@@ -103,29 +104,17 @@ def shade(
     here, margins = alpha[pixels], []
     own = features[pixels] / here[:, None]
     maps = _displaced(features, alpha, own, pixels, camera, margins)
-    normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
 
     row, column = (index + 0.5 for index in pixels)
     ray = torch.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, torch.ones_like(here)], dim=-1)
     towards = -unit(ray @ view[:3, :3])
-    dot = (normal * towards).sum(dim=-1)
-    n_v = dot.clamp(1e-4, 1)
-    light = specular(levels, sides, 2 * dot[:, None] * normal - towards, roughness, margins)
-    if visibility is not None:  # Eq. 9
-        free = visibility[pixels][:, None]
-        light = free * light + (1 - free) * maps[:, -3:]
-    fg0, fg1 = (f[:, None] for f in fg(n_v, roughness, margins))
-    metal = metallic[:, None]
-    f0 = DIELECTRIC_F0 * (1 - metal) + albedo * metal
-    if features.shape[-1] > 11 + 3 * (visibility is not None):
-        diffuse = (1 - metal) * maps[:, 8:11]
-    else:
-        received = harmonics.basis(normal, 2) @ irradiance
-        margins += [(dot - 1e-4).abs(), received.abs().amin(dim=-1)]
-        diffuse = (1 - metal) * (1 - DIELECTRIC_F0 * fg0 - fg1) * albedo * received.clamp_min(0)
-    radiance = light * (f0 * fg0 + fg1) + diffuse
-    margins.append((radiance - 0.0031308).abs().amin(dim=-1))
-    color = srgb_encode(radiance) * here[:, None] + (1 - here[:, None]) * background
+    indirect = None if visibility is None else (visibility[pixels][:, None], maps[:, -3:])
+    appearance = maps[:, 8:11] if features.shape[-1] > 11 + 3 * (visibility is not None) else None
+    radiance = radiance_towards(towards, maps, appearance, levels, sides, irradiance, indirect, margins)
+    if not display:
+        margins.append((radiance - 0.0031308).abs().amin(dim=-1))
+    encoded = radiance if display else srgb_encode(radiance)
+    color = encoded * here[:, None] + (1 - here[:, None]) * background
 
     def image(values: Tensor) -> Tensor:
         return values.new_zeros(*alpha.shape, values.shape[-1]).index_put(pixels, values)
@@ -133,6 +122,46 @@ def shade(
     picture = background.expand(*alpha.shape, 3).index_put(pixels, color)
     margin = torch.full_like(alpha, math.inf).index_put(pixels, torch.stack(margins).amin(dim=0).detach())
     return picture, image(maps[:, :3]), image(maps[:, 3:8]), image(radiance), margin
+
+
+def shade_splats(
+    features: Tensor, levels: Tensor, sides: tuple[int, ...], irradiance: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """As refgs.render.shade.shade_splats, for float64 tensors; and how far each surfel is from a kink."""
+    towards, margins = unit(torch.from_numpy(camera.position) - features[:, -3:]), []
+    appearance = features[:, 8:11] if features.shape[-1] > 11 else None
+    radiance = radiance_towards(towards, features, appearance, levels, sides, irradiance, None, margins)
+    return radiance, torch.stack(margins).amin(dim=0)
+
+
+def radiance_towards(
+    towards: Tensor,
+    maps: Tensor,
+    appearance: Tensor | None,
+    levels: Tensor,
+    sides: tuple[int, ...],
+    irradiance: Tensor,
+    indirect: tuple[Tensor, Tensor] | None,
+    margins: list[Tensor],
+) -> Tensor:
+    """The split sum (paper Eq. 5–10) of normals, albedo, metallic and roughness (P, 8 or more), towards unit vectors (P, 3)."""
+    normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
+    dot = (normal * towards).sum(dim=-1)
+    n_v = dot.clamp(1e-4, 1)
+    light = specular(levels, sides, 2 * dot[:, None] * normal - towards, roughness, margins)
+    if indirect is not None:  # Eq. 9
+        free, from_object = indirect
+        light = free * light + (1 - free) * from_object
+    fg0, fg1 = (f[:, None] for f in fg(n_v, roughness, margins))
+    metal = metallic[:, None]
+    f0 = DIELECTRIC_F0 * (1 - metal) + albedo * metal
+    if appearance is not None:
+        diffuse = (1 - metal) * appearance
+    else:
+        received = harmonics.basis(normal, 2) @ irradiance
+        margins += [(dot - 1e-4).abs(), received.abs().amin(dim=-1)]
+        diffuse = (1 - metal) * (1 - DIELECTRIC_F0 * fg0 - fg1) * albedo * received.clamp_min(0)
+    return light * (f0 * fg0 + fg1) + diffuse
 
 
 def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tensor]) -> Tensor:

@@ -10,7 +10,9 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.kernels.load import Shared, Work, check, run
 from refgs.model.surfels import Parameters
-from refgs.settings import DensifySettings
+from refgs.settings import DensifySettings, PropagationSettings
+
+RESET = 0.01  # opacity
 
 
 class _Work(Work):
@@ -83,6 +85,24 @@ def densify(
     if len(chosen):
         _divide(parameters, *halves)
     return len(chosen)
+
+
+@torch.no_grad()
+def reset_opacity(parameters: Parameters, optimizer: torch.optim.Optimizer) -> None:
+    """Make all surfels faint: those that the picture needs come back, the others are removed later (Kerbl et al. 2023)."""
+    parameters["opacity"].clamp_(max=math.log(RESET / (1 - RESET)))
+    optimizer.state.pop(parameters["opacity"], None)
+
+
+@torch.no_grad()
+def propagate_normals(parameters: Parameters, optimizer: torch.optim.Optimizer, settings: PropagationSettings) -> None:
+    """Have what mirrors grow over what surrounds it, all of it being opaque (paper §3.3). The surfels in front then lend their
+    normals to the pixels around, and the others give way or follow."""
+    parameters["opacity"].clamp_(min=math.log(settings.opacity / (1 - settings.opacity)))
+    optimizer.state.pop(parameters["opacity"], None)
+    metallic, roughness = parameters["metallic"].sigmoid(), parameters["roughness"].sigmoid()
+    mirrors = (metallic >= settings.metallic) & (roughness <= settings.roughness)
+    parameters["scale"] += math.log(settings.growth) * mirrors[:, None]
 
 
 @torch.no_grad()
