@@ -30,6 +30,7 @@ class RenderSettings(_Section):
 
 
 class SurfelSettings(_Section):
+    primitive: Literal["2dgs", "3dgs"] = Field(description="flat discs, or 3D Gaussians, to compare with")
     start: int = Field(ge=1, le=10_000_000, description="surfels at the start")
     budget: int = Field(ge=1, le=10_000_000, description="surfels at the most")
     hull: int = Field(ge=16, le=512, description="voxels along each side of the visual hull's grid")
@@ -144,7 +145,9 @@ class Settings(_Section):
     mesh: MeshSettings
 
 
-SHORT = {key: f"render.{key}" for key in RenderSettings.model_fields}  # keys that `--set` takes without their section
+SHORT = {"primitive": "surfels.primitive"} | {
+    key: f"render.{key}" for key in RenderSettings.model_fields
+}  # keys that `--set` takes without their section
 
 
 def preset_names() -> list[str]:

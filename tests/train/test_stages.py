@@ -51,7 +51,13 @@ def test_the_stage_ends_where_the_preset_says(ball_capture, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "changes", [["initial.until=0.3"], ["shading=splat"], ["shading=splat", "diffuse=sh"], ["color_space=display"]]
+    "changes",
+    [
+        ["initial.until=0.3"],
+        ["shading=splat", "diffuse=sh"],
+        ["color_space=display"],
+        ["primitive=3dgs"],
+    ],
 )
 def test_learns_and_renders_as_it_trained(ball_capture, tmp_path, changes):
     made = trainer(ball_capture, tmp_path / "run", "quick", "train.iterations=300", "surfels.metallic=0.9", *changes)

@@ -17,6 +17,7 @@ from refgs.render.facing import facing_normals
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import mirror_directions, shade, shade_splats
 from refgs.render.stack import stack
+from refgs.render.volume import discs, shortest_last
 from refgs.settings import RenderSettings
 
 NEAR = 0.01  # the nearest depth that is drawn, in scene radii
@@ -101,7 +102,10 @@ def render(
     mirror direction (paper Eq. 9).
     """
     deferred, display = settings.shading == "deferred", settings.color_space == "display"
-    normals = facing_normals(surfels.rotations, surfels.positions, camera)
+    facing = surfels.rotations
+    if surfels.scales.shape[1] == 3:
+        facing, _ = shortest_last(surfels.rotations, surfels.scales)
+    normals = facing_normals(facing, surfels.positions, camera)
     lit = [normals, surfels.albedo, surfels.metallic, surfels.roughness]
     if settings.shading == "sh" or settings.diffuse == "sh":
         colour = directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera)
@@ -114,8 +118,7 @@ def render(
         blended = [normals, shade_splats(stack(lit), environment, camera), *lit[1:4]]
     else:
         blended = lit if deferred else [normals, colour]
-    geometry = surfels.positions, surfels.rotations, surfels.scales, surfels.opacities
-    features, depth, alpha = rasterize(*geometry, stack(blended), camera, near=near)
+    features, depth, alpha = rasterize(*discs(surfels, camera), stack(blended), camera, near=near)
     if deferred:
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
         shaded = shade(features, alpha, environment, camera, background, visibility, display)

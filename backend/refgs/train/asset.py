@@ -12,6 +12,7 @@ from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, to_splats
 from refgs.render.rasterize import rasterize
+from refgs.render.volume import discs, shortest_last
 from refgs.run import OCCLUDER, write_text
 from refgs.settings import RenderSettings
 from refgs.train.trainer import Trainer
@@ -22,6 +23,9 @@ def write_asset(trainer: Trainer) -> None:
     folder, settings = trainer.folder, trainer.settings
     with torch.no_grad():
         surfels, environment = trainer.surfels(), trainer.environment()
+    if surfels.scales.shape[1] == 3:
+        rotations, scales = shortest_last(surfels.rotations, surfels.scales)
+        surfels = surfels._replace(rotations=rotations, scales=scales)
     if environment is not None:
         panorama = environment.panorama(4 * environment.resolution)
         display = settings.render.color_space == "display"
@@ -65,7 +69,7 @@ def _facing_outward(surfels: Surfels, trainer: Trainer) -> tuple[Surfels, int]:
     normals = surfels.normals()
     for view in trainer.views:
         feature = torch.ones(count, 1, device=trainer.device, requires_grad=True)
-        raster = rasterize(*surfels[:4], feature, view.camera, near=trainer.near)
+        raster = rasterize(*discs(surfels, view.camera), feature, view.camera, near=trainer.near)
         raster.features.sum().backward()
         weight = feature.grad[:, 0]
         towards = torch.from_numpy(view.camera.position).float().to(trainer.device) - surfels.positions

@@ -51,6 +51,7 @@ def _initial(positions, normals, spacing, colours, surfels: SurfelSettings, opac
         normals,
         spacing,
         colours,
+        axes=3 if surfels.primitive == "3dgs" else 2,
         opacity=opacity,
         sh_degree=surfels.sh_degree,
         albedo=surfels.albedo,
