@@ -108,7 +108,9 @@ def test_table_everywhere():
     for name, (found, expected) in pairs.items():
         error = abs(found - expected)
         at = error.argmax()
-        print(f"{name}: {error[at]:.1e} at N·V {n_v[at]:.3f}, roughness {roughness[at]:.3f}; RMS {(error**2).mean() ** 0.5:.0e}")
+        print(
+            f"{name}: {error[at]:.1e} at N·V {n_v[at]:.3f}, roughness {roughness[at]:.3f}; RMS {(error**2).mean() ** 0.5:.0e}"
+        )
         assert error[at] < 1e-3, name
 
 

@@ -189,9 +189,7 @@ def table(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> Tensor
         margins += [*(at - LEAST_N_V).abs().unbind(-1), *_from_integer(places)]
     low = places.detach().floor().clamp_max(len(values) - 2)
     (x, y), (column, row) = (places - low).unbind(-1), low.long().unbind(-1)
-    top, bottom = (
-        torch.lerp(values[r, column], values[r, column + 1], x[:, None]) for r in (row, row + 1)
-    )
+    top, bottom = (torch.lerp(values[r, column], values[r, column + 1], x[:, None]) for r in (row, row + 1))
     return torch.lerp(top, bottom, y[:, None])
 
 

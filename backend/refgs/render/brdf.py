@@ -6,6 +6,7 @@ Based Shading at Imageworks", 2017); Schlick's Fresnel for metals, a dielectric'
 a dielectric's reflection lies a matte base, lit by what that leaves.
 """
 
+import itertools
 from functools import lru_cache
 
 import numpy as np
@@ -37,7 +38,7 @@ def _gauss(nodes: int) -> tuple[np.ndarray, np.ndarray]:
     return np.sin(angle) ** 2, weight * np.pi / 4 * np.sin(2 * angle)
 
 
-def _one_bounce(n_v: np.ndarray, roughness: float, nodes: int) -> np.ndarray:
+def one_bounce(n_v: np.ndarray, roughness: float, nodes: int) -> np.ndarray:
     """(3, P) at N·V (P,): ∫ D G2 F / (4 N·L N·V) N·L dL for F = 1 − (1 − V·H)⁵, (1 − V·H)⁵ and a dielectric's.
 
     Over the half vector's tangent, α tan ψ, in which D is smooth, and its azimuth, as far as L is above the horizon.
@@ -49,7 +50,7 @@ def _one_bounce(n_v: np.ndarray, roughness: float, nodes: int) -> np.ndarray:
     # L is above the horizon for all azimuths up to the first angle, for none from the second.
     angle = np.arccos(n_v)
     limits = [0 * n_v, *(np.arctan(np.tan((np.pi / 2 + a) / 2) / alpha) for a in (-angle, angle))]
-    for low, high in zip(limits, limits[1:], strict=False):
+    for low, high in itertools.pairwise(limits):
         psi = low + (high - low) * at[:, None]  # (nodes, P)
         tangent = alpha * np.tan(psi)
         c_h = 1 / np.sqrt(1 + tangent**2)
@@ -63,7 +64,9 @@ def _one_bounce(n_v: np.ndarray, roughness: float, nodes: int) -> np.ndarray:
         schlick = share * square * square * np.sqrt(square)
         parts = np.stack([share - schlick, schlick, share * fresnel(v_h)], axis=1)
         by_azimuth = np.einsum("a,acpv->cpv", weight, parts)
-        table += (by_azimuth * np.sin(2 * psi) * above * weight[:, None] / c_h).sum(axis=1) * (high - low) / (np.pi * n_v)
+        table += (
+            (by_azimuth * np.sin(2 * psi) * above * weight[:, None] / c_h).sum(axis=1) * (high - low) / (np.pi * n_v)
+        )
     return table
 
 
@@ -82,7 +85,7 @@ def reflectance_table(size: int = 64, nodes: int = 16) -> Tensor:
     average_fresnel = 2 * ((cosine + 0.5) * fresnel(cosine + 0.5)) @ weight
     table = np.empty((size, size, 4))
     for row, roughness in enumerate(np.maximum(root**2, 1e-3)):
-        fg0, fg1, dielectric = _one_bounce(n_v, roughness, nodes)
+        fg0, fg1, dielectric = one_bounce(n_v, roughness, nodes)
         energy = fg0 + fg1
         average_energy = np.interp(cosine + 0.5, n_v, energy) @ (2 * (cosine + 0.5) * weight)
         dielectric *= bounces(average_fresnel, energy, average_energy)
