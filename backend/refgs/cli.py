@@ -115,8 +115,10 @@ def demo(
 
 
 @app.command()
-def bench(what: Annotated[str, typer.Argument(help="kernels, iteration, scaling, threads or gpu")] = "kernels") -> None:
-    """Measure the parts in milliseconds."""
+def bench(
+    what: Annotated[str, typer.Argument(help="kernels, iteration, scaling, threads, gpu or splitsum")] = "kernels",
+) -> None:
+    """Measure the parts: their milliseconds, and the shading's error."""
     from refgs import commands
 
     commands.bench(what)

@@ -260,10 +260,8 @@ def white_ball(metallic: float, roughness: float, side: int = 64) -> Tensor:
 
 
 @pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("roughness", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("roughness", [0.0, 0.1, 0.3, 0.6, 1.0])
 def test_white_furnace(metallic, roughness):
-    """Under a light of one, nothing sends out more than it receives; a smooth mirror, and what is matte, no less."""
+    """Under a light of one, what is white sends out what it receives at every angle, rough metals with all their bounces too."""
     radiance = white_ball(metallic, roughness)
-    assert float(radiance.max()) <= 1 + 1e-3 and float(radiance.min()) > 0
-    if roughness == 0:
-        assert float(radiance.min()) >= 1 - 5e-3
+    assert float(radiance.max()) <= 1 + 1e-3 and float(radiance.min()) >= 1 - 1e-3

@@ -74,7 +74,7 @@ def follow_to_the_card(monkeypatch) -> list[str]:
         return made
 
     tables = [(prefilter, "matrices"), (prefilter, "_pyramid"), (prefilter, "_projection"), (prefilter, "_order")]
-    for home, name in [*tables, (shade, "_fg_table"), (shade._Padding, "of")]:
+    for home, name in [*tables, (shade, "_reflectance"), (shade._Padding, "of")]:
         monkeypatch.setattr(home, name, computed_on_the_cpu(getattr(home, name)))
     launched = []
     monkeypatch.setattr(cuda, "launch", lambda name, *_: launched.append(name))

@@ -8,7 +8,7 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.color import srgb_encode
 from refgs.model import cubemap, harmonics, prefilter
-from refgs.render.brdf import DIELECTRIC_F0, fg_table
+from refgs.render.brdf import LEAST_N_V, bounces, reflectance_table
 
 ALPHA_CUT, ALPHA_CAP, MIN_TRANSMITTANCE, LOW_PASS, FAR = 1 / 255, 0.99, 1e-4, 2.0, 1e12  # as in splat.h
 COVERED, SHIFT_LIMIT, SHIFT_ALPHA = 1 / 255, 8.0, 0.3  # as in shade.cpp
@@ -147,21 +147,19 @@ def radiance_towards(
     """The split sum (paper Eq. 5–10) of normals, albedo, metallic and roughness (P, 8 or more), towards unit vectors (P, 3)."""
     normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
     dot = (normal * towards).sum(dim=-1)
-    n_v = dot.clamp(1e-4, 1)
     light = specular(levels, sides, 2 * dot[:, None] * normal - towards, roughness, margins)
     if indirect is not None:  # Eq. 9
         free, from_object = indirect
         light = free * light + (1 - free) * from_object
-    fg0, fg1 = (f[:, None] for f in fg(n_v, roughness, margins))
-    metal = metallic[:, None]
-    f0 = DIELECTRIC_F0 * (1 - metal) + albedo * metal
+    metal, dielectric = reflectance(dot, roughness, albedo, margins)
+    share = metallic[:, None]
     if appearance is not None:
-        diffuse = (1 - metal) * appearance
+        diffuse = (1 - share) * appearance
     else:
         received = harmonics.basis(normal, 2) @ irradiance
-        margins += [(dot - 1e-4).abs(), received.abs().amin(dim=-1)]
-        diffuse = (1 - metal) * (1 - DIELECTRIC_F0 * fg0 - fg1) * albedo * received.clamp_min(0)
-    return light * (f0 * fg0 + fg1) + diffuse
+        margins.append(received.abs().amin(dim=-1))
+        diffuse = (1 - share) * (1 - dielectric) * albedo * received.clamp_min(0)
+    return light * ((1 - share) * dielectric + share * metal) + diffuse
 
 
 def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tensor]) -> Tensor:
@@ -212,13 +210,19 @@ def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughne
     return cubemap.sample(levels, sides, directions, interval + (roughness - low) / (high - low))
 
 
-def fg(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> tuple[Tensor, Tensor]:
-    """FG0 and FG1 (P,) at N·V and roughness in [0, 1], bilinear in the table, differentiable in both."""
-    table = fg_table().to(n_v.dtype)
-    at = torch.stack([n_v, roughness], dim=-1)
+def table(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> Tensor:
+    """brdf.reflectance_table at N·V and roughness (P,), (P, 4)."""
+    values, at = reflectance_table().to(n_v.dtype), torch.stack([n_v, roughness], dim=-1)
+    places = at.clamp(LEAST_N_V, 1).sqrt() * (len(values) - 1)
     if margins is not None:
-        margins += _from_integer(at * table.shape[-1] - 0.5)
-    value = torch.nn.functional.grid_sample(
-        table[None], at[None, None] * 2 - 1, mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return value[0, 0, 0], value[0, 1, 0]
+        margins += [*(at - LEAST_N_V).abs().unbind(-1), *_from_integer(places)]
+    low = places.detach().floor().clamp_max(len(values) - 2)
+    (x, y), (column, row) = (places - low).unbind(-1), low.long().unbind(-1)
+    top, bottom = (torch.lerp(values[r, column], values[r, column + 1], x[:, None]) for r in (row, row + 1))
+    return torch.lerp(top, bottom, y[:, None])
+
+
+def reflectance(n_v: Tensor, roughness: Tensor, albedo: Tensor, margins: list | None = None) -> tuple[Tensor, Tensor]:
+    """What a metal (P, 3) and what a dielectric (P, 1) reflect of an even light, at N·V and roughness (P,)."""
+    fg0, fg1, average, dielectric = table(n_v, roughness, margins).split(1, dim=-1)
+    return (albedo * fg0 + fg1) * bounces((20 * albedo + 1) / 21, fg0 + fg1, average), dielectric

@@ -11,7 +11,6 @@ namespace {
 constexpr float COVERED = 1.0f / 255.0f;    // less alpha than this is background
 constexpr float SHIFT_LIMIT = 8;            // pixels
 constexpr float SHIFT_ALPHA = 0.3f;         // a silhouette's blended position says nothing about its surface
-constexpr float DIELECTRIC_F0 = 0.04f;
 constexpr int HALO = (int)SHIFT_LIMIT + 1;  // rows that a displaced look-up reaches beyond its own
 constexpr int NORMAL = 0, ALBEDO = 3, METALLIC = 6, ROUGHNESS = 7;  // channels; Shaded has those that may follow
 
@@ -31,8 +30,8 @@ struct Shade {
   float* padded;                  // (cells, 4): for levels.cells
   const int32_t *starts, *cell;   // the cells of texel i: `cell` from starts[i] to starts[i + 1]
   const float* irradiance;        // (9, 3)
-  const float* fg;                // (fg_side, fg_side, 2)
-  int64_t fg_side;
+  const float* reflectance;       // (reflectance_side, reflectance_side, 4)
+  int64_t reflectance_side;
   float *mirrored;                                        // (height, width, 3)
   float *color, *normal, *material, *radiance;            // (height, width, 3 | 3 | 5 | 3)
   const float *by_color, *by_normal, *by_material;
@@ -462,11 +461,11 @@ struct Shaded {
   static constexpr int APPEARANCE = HARMONICS ? 8 : 0, FROM_OBJECT = INDIRECT ? 8 + 3 * HARMONICS : 0;  // channels
   static constexpr int C = 11 + 3 * HARMONICS + 3 * INDIRECT, S = C - 3;
   Map<SPLATS, C, DERIVATIVES> map;
-  Vector inverse_length, n_dot_v, coat, visibility;
+  Vector inverse_length, n_dot_v, visibility;
   Vectors normal, view;
   Lookup<DERIVATIVES> lookup;
   Irradiance irradiance;
-  ReflectanceTable fg;
+  ReflectanceTable table;
   Vector light[3], received[3], radiance[3], encoded[3], slope[3];
 
   MEMBER Shaded(const Shade& s, const Pixels& pixels)
@@ -476,7 +475,7 @@ struct Shaded {
         view(seen_from(s)),
         lookup(s.levels, mirrored(), map.value[ROUGHNESS]),
         irradiance(normal),
-        fg(s.fg, s.fg_side, clamp(n_dot_v, 1e-4f, 1), map.value[ROUGHNESS]) {
+        table(s.reflectance, s.reflectance_side, n_dot_v, map.value[ROUGHNESS]) {
     const auto& v = map.value;
     Vector metallic = v[METALLIC];
     visibility = Vector() + 1.0f;
@@ -488,13 +487,13 @@ struct Shaded {
     } else {
       for (int c = 0; c < 3; c++) light[c] = lookup.light[c];
     }
-    coat = 1.0f - DIELECTRIC_F0 * fg.value[0] - fg.value[1];
+    Vector dielectric = table.value[ReflectanceTable::DIELECTRIC];
 #pragma unroll
     for (int c = 0; c < 3; c++) {
       received[c] = HARMONICS ? v[APPEARANCE + c] : irradiance.value(s.irradiance, c);
       Vector diffuse = (1.0f - metallic) * received[c];
-      if (!HARMONICS) diffuse *= coat * v[ALBEDO + c];
-      radiance[c] = light[c] * (f0(c) * fg.value[0] + fg.value[1]) + diffuse;
+      if (!HARMONICS) diffuse *= (1.0f - dielectric) * v[ALBEDO + c];
+      radiance[c] = light[c] * (dielectric + metallic * (Metal(table, v[ALBEDO + c]).value - dielectric)) + diffuse;
       if (SPLATS || s.display)
         encoded[c] = radiance[c], slope[c] = Vector() + 1.0f;
       else
@@ -520,39 +519,45 @@ struct Shaded {
     if (!SPLATS) gather<3>(s.by_normal, map.pixels, by_normal), gather<5>(s.by_material, map.pixels, by_material);
 
     const auto& v = map.value;
-    Vector metallic = v[METALLIC], by[S] = {}, by_light[3], by_fg[2] = {}, by_coat = {}, by_received[3];
+    Vector metallic = v[METALLIC], dielectric = table.value[ReflectanceTable::DIELECTRIC];
+    Vector by[S] = {}, by_light[3], by_table[4] = {}, by_received[3];
     by[METALLIC] = by_material[3], by[ROUGHNESS] = by_material[4];
     Vectors by_n = {};
 #pragma unroll
     for (int c = 0; c < 3; c++) {
+      Metal metal(table, v[ALBEDO + c]);
       if (!SPLATS) by_alpha += by_color[c] * (encoded[c] - s.background[c]);
       Vector by_radiance = by_color[c] * map.alpha * slope[c];
-      by_light[c] = by_radiance * (f0(c) * fg.value[0] + fg.value[1]);
+      by_light[c] = by_radiance * (dielectric + metallic * (metal.value - dielectric));
       if (INDIRECT) {
         by[FROM_OBJECT + c] = (1.0f - visibility) * by_light[c];
         by_light[c] *= visibility;
       }
-      Vector reflected = by_radiance * light[c], by_f0 = reflected * fg.value[0];
-      by_fg[0] += reflected * f0(c), by_fg[1] += reflected;
-      by[ALBEDO + c] = by_material[c] + by_f0 * metallic;
-      by[METALLIC] += by_f0 * (v[ALBEDO + c] - DIELECTRIC_F0);
+      Vector by_reflectance = by_radiance * light[c], by_metal = by_reflectance * metallic;
+      by[METALLIC] += by_reflectance * (metal.value - dielectric);
+      by[ALBEDO + c] = by_material[c] + by_metal * metal.by_f0;
+      for (int i = 0; i < 2; i++) by_table[i] += by_metal * metal.by_fg[i];
+      by_table[ReflectanceTable::AVERAGE] += by_metal * metal.by_average;
+      by_table[ReflectanceTable::DIELECTRIC] += by_reflectance - by_metal;
       if (HARMONICS) {
         by[APPEARANCE + c] = by_radiance * (1.0f - metallic);
         by[METALLIC] -= by_radiance * received[c];
       } else {
-        Vector by_diffuse = by_radiance * received[c], base = (1.0f - metallic) * coat;
+        Vector by_diffuse = by_radiance * received[c], base = (1.0f - metallic) * (1.0f - dielectric);
         by[ALBEDO + c] += by_diffuse * base;
-        by[METALLIC] -= by_diffuse * v[ALBEDO + c] * coat;
-        by_coat += by_diffuse * v[ALBEDO + c] * (1.0f - metallic);
+        by_diffuse *= v[ALBEDO + c];
+        by[METALLIC] -= by_diffuse * (1.0f - dielectric);
+        by_table[ReflectanceTable::DIELECTRIC] -= by_diffuse * (1.0f - metallic);
         by_received[c] = select(received[c] > 0.0f, by_radiance * base * v[ALBEDO + c], Vector());
         irradiance.backward(s.irradiance, c, by_received[c], by_n);
       }
     }
     if (!HARMONICS) sums.add_irradiance(irradiance, by_received);
-    by_fg[0] -= DIELECTRIC_F0 * by_coat, by_fg[1] -= by_coat;
-    by[ROUGHNESS] += by_fg[0] * fg.by_roughness[0] + by_fg[1] * fg.by_roughness[1];
-    Vector by_n_v = by_fg[0] * fg.by_n_v[0] + by_fg[1] * fg.by_n_v[1];
-    by_n_v = select((n_dot_v > 1e-4f) & (n_dot_v < 1.0f), by_n_v, Vector());
+    Vector by_n_v = {};
+    for (int i = 0; i < 4; i++) {
+      by[ROUGHNESS] += by_table[i] * table.by_roughness[i];
+      by_n_v += by_table[i] * table.by_n_v[i];
+    }
     Vector by_roughness;
     Vectors by_mirrored = lookup.backward(by_light, by_roughness);
     sums.add_light(lookup, map.pixels.count, by_light);
@@ -579,7 +584,6 @@ struct Shaded {
       return towards_camera(s, map.pixels);
     }
   }
-  MEMBER Vector f0(int c) const { return DIELECTRIC_F0 * (1.0f - map.value[METALLIC]) + map.value[ALBEDO + c] * map.value[METALLIC]; }
 
   MEMBER Vectors mirrored() { return mirror(normal, view, n_dot_v); }
 };

@@ -13,7 +13,7 @@ from refgs.kernels import cuda, load
 from refgs.kernels.load import Shared, Work
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
-from refgs.render.brdf import fg_table
+from refgs.render.brdf import reflectance_table
 
 CHANNELS = 11  # normal, albedo, metallic, roughness, position; before the position those that not every scene has
 
@@ -54,8 +54,8 @@ class _Work(Work):
         + [(n, ctypes.c_void_p) for n in ("features", "alpha", "visibility")]
         + [("levels", _Levels)]
         + [(n, ctypes.c_int64) for n in ("texels", "cells", "lines")]
-        + [(n, ctypes.c_void_p) for n in ("light", "texel", "padded", "starts", "cell", "irradiance", "fg")]
-        + [("fg_side", ctypes.c_int64)]
+        + [(n, ctypes.c_void_p) for n in ("light", "texel", "padded", "starts", "cell", "irradiance", "reflectance")]
+        + [("reflectance_side", ctypes.c_int64)]
         + [(n, ctypes.c_void_p) for n in ("mirrored", "color", "normal", "material", "radiance")]
         + [(n, ctypes.c_void_p) for n in ("by_color", "by_normal", "by_material", "by_features", "by_alpha")]
         + [(n, ctypes.c_void_p) for n in ("by_light", "by_irradiance", "halo", "halo_alpha", "by_cells", "touched")]
@@ -102,21 +102,20 @@ class _Padding(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def _fg_table(device: torch.device) -> Tensor:
-    """FG0 and FG1 side by side, (side, side, 2)."""
-    return fg_table().permute(1, 2, 0).contiguous().to(device)
+def _reflectance(device: torch.device) -> Tensor:
+    return reflectance_table().to(device)
 
 
 class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx, features, alpha, levels, irradiance, sides, camera, background, visibility, display, splats):
         features, alpha, irradiance = features.contiguous(), alpha.contiguous(), irradiance.contiguous()
-        table, padding = _fg_table(features.device), _Padding.of(sides, features.device)
+        table, padding = _reflectance(features.device), _Padding.of(sides, features.device)
         light, cells = levels.contiguous(), len(padding.texel)
         padded = features.new_empty(cells, 4)
         work = _Work.of(features, alpha, camera)
         background = background.to(features)
-        work.attach(background=background, irradiance=irradiance, fg=table, light=light, padded=padded)
+        work.attach(background=background, irradiance=irradiance, reflectance=table, light=light, padded=padded)
         work.attach(texel=padding.texel, starts=padding.starts, cell=padding.cell)
         if visibility is not None:
             work.attach(visibility=visibility)
@@ -127,7 +126,7 @@ class _Shade(torch.autograd.Function):
         work.levels.side[: len(sides)] = sides
         work.levels.start[: len(sides)], work.levels.line[: len(sides)] = padding.first_cells, padding.first_lines
         work.levels.roughness[: len(sides)] = prefilter.ROUGHNESS
-        work.fg_side = table.shape[0]
+        work.reflectance_side = table.shape[0]
         numbers = (3, 0, 0, 0) if splats else (3, 3, 5, 3)
         shaded = Shaded(*(features.new_empty(*alpha.shape, n) for n in numbers))
         work.attach(**shaded._asdict())
