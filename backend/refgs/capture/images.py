@@ -39,7 +39,7 @@ def read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """
     with _open(path) as picture:
         pixels = np.asarray(_decode(picture, path))
-    return np.ascontiguousarray(pixels[..., :3]), (pixels[..., 3].copy() if pixels.shape[2] == 4 else None)
+    return pixels[..., :3].copy(), (pixels[..., 3].copy() if pixels.shape[2] == 4 else None)
 
 
 def read_mask(path: Path, below: float | None = None) -> np.ndarray:
