@@ -277,4 +277,4 @@ def test_published_normals_of_another_size(tmp_path):
     folder = shiny_blender(tmp_path)
     write(folder / "test" / "r_0_normal.png", np.zeros((24, 32, 3), np.uint8))
     capture = read_capture(folder)
-    refused(lambda: published_normals(capture, capture.test_views[0]), "r_0_normal.png", "32×24", "64×48")
+    refused(lambda: published_normals(capture.test_views[0]), "r_0_normal.png", "32×24", "64×48")

@@ -286,7 +286,7 @@ def test_nerf_synthetic_passes_over_depth_and_normals(tmp_path):
             write(photo.with_name(f"{photo.stem}_{what}_0001.png"), np.zeros((48, 64, 4), np.uint8))
     capture = read_capture(folder)
     assert [view.image_path.name for view in capture.test_views] == ["r_0.png", "r_1.png", "r_2.png", "r_3.png"]
-    assert published_normals(capture, capture.test_views[0]) is None
+    assert published_normals(capture.test_views[0]) is None
     assert_sees_the_ball(capture)
 
 
@@ -302,8 +302,9 @@ def test_published_normals(tmp_path, max_side):
     capture = read_capture(shiny_blender(tmp_path))
     for view, pose in zip(capture.test_views, ring(4), strict=True):
         loaded = load_view(view, max_side)
-        normals, alpha = published_normals(capture, view, max_side)
+        normals, alpha = published_normals(view, max_side)
         assert normals.shape == loaded.image.shape and alpha.shape == loaded.alpha.shape
+        assert normals.dtype == alpha.dtype == np.float32
         np.testing.assert_allclose(alpha * 255, loaded.alpha, atol=0.51)
         assert not normals[alpha == 0].any()
         height, width = alpha.shape
@@ -319,7 +320,7 @@ def test_other_layouts_publish_no_normals(tmp_path):
     folder = nerfstudio(tmp_path)
     write(folder / "images" / "0000_normal.png", np.zeros((48, 64, 3), np.uint8))
     capture = read_capture(folder)
-    assert published_normals(capture, capture.test_views[0]) is None
+    assert published_normals(capture.test_views[0]) is None
 
 
 def test_glossy_synthetic_with_its_split(tmp_path):

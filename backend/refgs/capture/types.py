@@ -20,6 +20,7 @@ class View:
     extension, unique within a split. `lens` is the distorted lens of the file, None where the file is already a
     pinhole's. `has_alpha` says that the photo's own alpha channel is its mask; a `mask_path` takes its place. With
     `mask_below` that file is a depth map, and the object is where it is below this part of its whole range.
+    `normal_path` is a picture of the true normals where the data set brings one (see `published_normals`).
     """
 
     camera: Camera
@@ -29,6 +30,7 @@ class View:
     lens: Lens | None = None
     has_alpha: bool = False
     mask_below: float | None = None
+    normal_path: Path | None = None
 
     @property
     def masked(self) -> bool:
