@@ -114,14 +114,15 @@ def demo(
     whole.run(out)
 
 
-@app.command()
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def bench(
-    what: Annotated[str, typer.Argument(help="kernels, iteration, scaling, threads, gpu or splitsum")] = "kernels",
+    context: typer.Context,
+    what: Annotated[str, typer.Argument(help="kernels, iteration, scaling, threads, gpu, splitsum or paper")] = "kernels",
 ) -> None:
-    """Measure the parts: their milliseconds, and the shading's error."""
+    """Measure the parts, in milliseconds or errors; `paper --data DIR [--out DIR] [--preset NAME]`: the whole on the paper's data."""
     from refgs import commands
 
-    commands.bench(what)
+    commands.bench(what, context.args)
 
 
 def _end(*_) -> None:

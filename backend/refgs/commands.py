@@ -313,11 +313,15 @@ def export(
     console.print(f"mesh: {target}")
 
 
-def bench(what: str) -> None:
-    """Run a benchmark of the repository."""
+def bench(what: str, options: list[str]) -> None:
+    """Run a benchmark of the repository, with the options that are its own."""
     files = (clone_root() / "benchmarks").glob("*.py")
-    names = sorted(file.stem for file in files if "__main__" in file.read_text(encoding="utf-8"))
+    texts = {file.stem: file.read_text(encoding="utf-8") for file in sorted(files)}
+    names = [name for name, text in texts.items() if "__main__" in text]
     if what not in names:
         raise InputError(f"no benchmark {what}: take one of {', '.join(names)}")
+    if options and "argparse" not in texts[what]:
+        raise InputError(f"{' '.join(options)}: the benchmark {what} has no options; leave them out")
     sys.path.insert(0, str(clone_root()))
+    sys.argv[1:] = options
     runpy.run_module(f"benchmarks.{what}", run_name="__main__")
