@@ -69,8 +69,13 @@ class Run:
             )
 
 
-def create_run(folder: Path, capture: Capture, settings: Settings, preset: str, device: str) -> None:
-    """Make a new run folder with its run.toml and cameras.json. Raises InputError where the folder is taken."""
+def create_run(
+    folder: Path, capture: Capture, settings: Settings, preset: str, device: str, chosen: dict[str, str] | None = None
+) -> None:
+    """Make a new run folder with its run.toml and cameras.json. Raises InputError where the folder is taken.
+
+    `chosen` says of a setting that was "auto" what was chosen, and why; `settings` have it already.
+    """
     check_free(folder)
     try:
         (folder / "checkpoints").mkdir(parents=True)
@@ -92,6 +97,7 @@ def create_run(folder: Path, capture: Capture, settings: Settings, preset: str, 
             "bounded": bool(capture.bounded),
         },
         "settings": settings.model_dump(mode="json"),
+        "chosen": chosen or {},
     }
     write_text(folder / "run.toml", tomli_w.dumps(facts))
     write_cameras(folder / "cameras.json", capture)
@@ -125,7 +131,9 @@ def open_run(folder: Path) -> Run:
     environment = None
     if settings.render.shading == "deferred":
         panorama = read_environment(folder / "environment.exr")
-        environment = Environment.from_panorama(panorama, settings.environment.resolution)
+        reference = next(c for c, split in zip(cameras, splits, strict=True) if split == "train")
+        reference = reference if settings.light.frame == "camera" else None
+        environment = Environment.from_panorama(panorama, settings.environment.resolution, reference)
     return Run(
         folder=folder,
         settings=settings,

@@ -96,18 +96,21 @@ def shade(
     camera: Camera,
     background: Tensor,
     visibility: Tensor | None = None,
+    exposure: Tensor | float = 1.0,
+    turn: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """As refgs.render.shade.shade, for float64 tensors; and how far each pixel (H, W) is from a kink of the derivatives,
+    """As refgs.render.shade.shade, for float64 tensors and a light that stands turned (3, 3) to the world; and how far each pixel (H, W) is from a kink of the derivatives,
     in the units of what has the kink. Bilinear look-ups have one at every texel."""
     view, pixels = torch.from_numpy(camera.world_to_camera), torch.nonzero(alpha > COVERED, as_tuple=True)
     here, margins = alpha[pixels], []
     own = features[pixels] / here[:, None]
     maps = _displaced(features, alpha, own, pixels, camera, margins)
-    normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
+    turn = torch.eye(3, dtype=features.dtype) if turn is None else turn
+    normal, albedo, (metallic, roughness) = unit(maps[:, :3]) @ turn.T, maps[:, 3:6], maps[:, 6:8].unbind(-1)
 
     row, column = (index + 0.5 for index in pixels)
     ray = torch.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, torch.ones_like(here)], dim=-1)
-    towards = -unit(ray @ view[:3, :3])
+    towards = -unit(ray @ view[:3, :3]) @ turn.T
     dot = (normal * towards).sum(dim=-1)
     n_v = dot.clamp(1e-4, 1)
     light = specular(levels, sides, 2 * dot[:, None] * normal - towards, roughness, margins)
@@ -124,8 +127,9 @@ def shade(
         margins += [(dot - 1e-4).abs(), received.abs().amin(dim=-1)]
         diffuse = (1 - metal) * (1 - DIELECTRIC_F0 * fg0 - fg1) * albedo * received.clamp_min(0)
     radiance = light * (f0 * fg0 + fg1) + diffuse
-    margins.append((radiance - 0.0031308).abs().amin(dim=-1))
-    color = srgb_encode(radiance) * here[:, None] + (1 - here[:, None]) * background
+    exposed = exposure * radiance
+    margins.append((exposed - 0.0031308).abs().amin(dim=-1))
+    color = srgb_encode(exposed) * here[:, None] + (1 - here[:, None]) * background
 
     def image(values: Tensor) -> Tensor:
         return values.new_zeros(*alpha.shape, values.shape[-1]).index_put(pixels, values)

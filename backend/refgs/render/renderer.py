@@ -91,12 +91,14 @@ def render(
     settings: RenderSettings,
     near: float,
     occluder: Occluder | None = None,
+    exposure: Tensor | None = None,
 ) -> Rendering:
     """Render surfels for a camera over a background (3,), sRGB-encoded.
 
     `settings.shading` is "deferred" (split-sum shading of blended maps, paper Eq. 5–8) or "sh" (view-dependent colour
     of each surfel, blended). `near` is in world units. With an `occluder`, deferred shading takes the surfels' own
-    light in place of the environment's where that is in the way of the mirror direction (paper Eq. 9).
+    light in place of the environment's where that is in the way of the mirror direction (paper Eq. 9). It multiplies the
+    radiance by an `exposure`, a scalar, where there is one, before it is encoded.
     """
     deferred = settings.shading == "deferred"
     normals = facing_normals(surfels.rotations, surfels.positions, camera)
@@ -114,7 +116,7 @@ def render(
     features, depth, alpha = rasterize(*geometry, stack(parts), camera, near=near)
     if deferred:
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
-        shaded = shade(features, alpha, environment, camera, background, visibility)
+        shaded = shade(features, alpha, environment, camera, background, visibility, exposure)
         return Rendering(shaded.color, alpha, depth, shaded.normal, shaded.material, shaded.radiance, visibility)
     normal, appearance = features.split(3, dim=-1)
     color = appearance + (1 - alpha[..., None]) * background

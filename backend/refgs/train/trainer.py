@@ -18,12 +18,13 @@ from refgs.geometry.extract import extract
 from refgs.geometry.mesh import Mesh, clean
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
-from refgs.model.surfels import Surfels, activate
+from refgs.model.surfels import Parameters, Surfels, activate
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.settings import Settings
 from refgs.train import checkpoint
 from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify, thin
+from refgs.train.light import light_frame
 from refgs.train.losses import Photo, objective
 from refgs.train.start import start_parameters
 
@@ -83,17 +84,19 @@ class Trainer:
         self.views = [load_view(view, side) for view in capture.train_views]
         self.test = [load_view(view, side) for view in capture.test_views]
         self.background = torch.tensor(settings.image.background, device=self.device)
+        self.from_hull = all(view.alpha is not None for view in self.views)
         self.photos = [Photo.of(view, self.device) for view in self.views]
         self.near = near_plane(capture.radius)
         self.iteration, self.seconds = 0, 0.0
         self._order: tuple[int, list[int]] = (-1, [])
 
         start, source = start_parameters(capture, self.views, settings)
+        self.chosen: dict[str, str] = {}  # by a setting that asked for it: what was chosen, and why
+        self._choose_light_frame(start)
         self.parameters = {name: value.detach().to(self.device).requires_grad_() for name, value in start.items()}
         report("stage", {"what": source})
         texels, radiance = 6 * settings.environment.resolution**2, settings.environment.radiance
         self.light = torch.full((texels, 3), math.log(math.expm1(radiance)), device=self.device).requires_grad_()
-        self.from_hull = all(view.alpha is not None for view in self.views)
         self._drop_unused()
         groups = [
             {"params": [value], "name": name, "rate": self._rate(name)} for name, value in self.parameters.items()
@@ -108,6 +111,23 @@ class Trainer:
         rate = getattr(self.settings.rates, name)
         return rate * self.capture.radius if name == "position" else rate
 
+    def _choose_light_frame(self, start: Parameters) -> None:
+        """Where the settings leave it to the photos. They say which it is from here on."""
+        light, deferred = self.settings.light, self.settings.render.shading == "deferred"
+        if light.frame != "auto":
+            return
+        frame, why = "world", "there is no light" if not deferred else "not every photo has a mask of the object"
+        if deferred and self.from_hull:
+            with torch.no_grad():
+                points = activate(start)
+                found = points.positions.numpy(), points.normals().numpy()
+            frame, why = light_frame(self.views, *found, self.capture.radius)
+        self.settings = self.settings.model_copy(update={"light": light.model_copy(update={"frame": frame})})
+        self.chosen["light.frame"] = f"{frame}: {why}"
+        if deferred:
+            where = "turns with the camera" if frame == "camera" else "stands still"
+            self.report("stage", {"what": f"the light {where}: {why}"})
+
     def _drop_unused(self) -> None:
         """What this run's shading never reads does not learn."""
         render = self.settings.render
@@ -121,8 +141,11 @@ class Trainer:
         self.constant = {name: self.parameters.pop(name).detach()[:1] for name in unused}
 
     def _reflects(self) -> bool:
-        """Whether this run looks for inter-reflection: not without masks, where the mesh is of the surroundings too."""
-        return self.from_hull and self.settings.render.shading == "deferred" and self.settings.indirect.start < 1
+        """Whether this run looks for inter-reflection: not without masks, where the mesh is of the surroundings too, nor under
+        a light that turns with the camera, under which surfels have no light of their own to show others."""
+        settings = self.settings
+        still = settings.render.shading == "deferred" and settings.light.frame != "camera"
+        return self.from_hull and still and settings.indirect.start < 1
 
     def surfels(self) -> Surfels:
         """The activated surfels, with what does not learn filled in."""
@@ -134,7 +157,8 @@ class Trainer:
         """The light as it is now; none where nothing is lit."""
         if self.settings.render.shading == "sh":
             return None
-        return Environment(torch.nn.functional.softplus(self.light))
+        reference = self.views[0].camera if self.settings.light.frame == "camera" else None
+        return Environment(torch.nn.functional.softplus(self.light), reference)
 
     def render(self, camera: Camera) -> Rendering:
         """Render a camera without gradients."""
