@@ -25,7 +25,7 @@ from refgs.train import checkpoint
 from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify, thin
 from refgs.train.light import light_frame
-from refgs.train.losses import Photo, objective
+from refgs.train.losses import Photo, departure, objective
 from refgs.train.start import start_parameters
 
 Report = Callable[[str, dict[str, Any]], None]
@@ -35,6 +35,8 @@ GEOMETRY = ("position", "rotation", "scale", "opacity")
 REPORT_EVERY = 10  # iterations
 HISTORY_EVERY = 100  # iterations
 PLAN_EVERY = 50  # iterations
+EXPOSURES_KNOWN = 0.3  # part of the training after which exposures are known well enough to say whether there are any
+EXPOSURES_ALIKE = 0.07  # in natural logarithms: a tenth of a stop
 TRACED = 24  # views at the least for the mesh that inter-reflection is traced on; all where there are fewer
 FEWER = 0.8  # of the surfels, where there is no memory for all
 LEAST_SURFELS = 1000
@@ -103,6 +105,10 @@ class Trainer:
         ]
         if settings.render.shading == "deferred":
             groups.append({"params": [self.light], "name": "environment", "rate": settings.rates.environment})
+        self.exposures: Tensor | None = None  # natural logarithms (views,), where photos have any of their own
+        if settings.render.shading == "deferred" and settings.light.exposure != "off":
+            self.exposures = torch.zeros(len(self.views), device=self.device).requires_grad_()
+            groups.append({"params": [self.exposures], "name": "exposure", "rate": settings.rates.exposure})
         self.optimizer = Adam(groups)
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
         self.occluder: Occluder | None = None
@@ -165,10 +171,11 @@ class Trainer:
         with torch.no_grad():
             return self._render(self.surfels(), self.environment(), camera)
 
-    def _render(self, surfels: Surfels, environment: Environment | None, camera: Camera) -> Rendering:
-        return render(
-            surfels, environment, camera, self.background, self.settings.render, self.near, occluder=self.occluder
-        )
+    def _render(
+        self, surfels: Surfels, environment: Environment | None, camera: Camera, exposure: Tensor | None = None
+    ) -> Rendering:
+        settings = self.settings.render
+        return render(surfels, environment, camera, self.background, settings, self.near, self.occluder, exposure)
 
     def test_psnr(self, most: int = 4) -> float | None:
         """Mean PSNR over at most this many of the held-out views; None where there are none."""
@@ -180,7 +187,8 @@ class Trainer:
     def step(self) -> dict[str, Tensor]:
         """One iteration. Returns its loss and mean squared error, which are still being computed where there is a card."""
         settings = self.settings
-        photo = self._next_photo()
+        view = self._next_view()
+        photo = self.photos[view]
         progress = min(self.iteration / self.total, 1.0)
         decay = settings.rates.decay**progress
         frozen = (
@@ -190,8 +198,11 @@ class Trainer:
             group["lr"] = 0.0 if frozen and group["name"] in GEOMETRY else group["rate"] * decay
 
         surfels, environment = self.surfels(), self.environment()
-        rendering = self._render(surfels, environment, photo.camera)
+        exposure = None if self.exposures is None else self.exposures[view]
+        rendering = self._render(surfels, environment, photo.camera, None if exposure is None else exposure.exp())
         loss, square = objective(rendering, environment, photo, self.background, settings.loss, progress)
+        if exposure is not None:
+            loss = loss + settings.loss.exposure * departure(exposure)
         loss.backward()
         position = self.parameters["position"]
         self.motion.add(position.detach(), position.grad, photo.camera)
@@ -199,6 +210,7 @@ class Trainer:
         self._forget_gradients()
         self.iteration += 1
         self._densify(progress)
+        self._weigh_exposures(progress)
         due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
         if self._reflects() and due and self.iteration < self.total:
             self._trace()
@@ -208,13 +220,13 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["params"][0].grad = None
 
-    def _next_photo(self) -> Photo:
+    def _next_view(self) -> int:
         """Every view once an epoch, in an order that depends on the seed and the epoch alone, so that a resumed run goes on alike."""
         epoch, place = divmod(self.iteration, len(self.views))
         if self._order[0] != epoch:
             generator = torch.Generator().manual_seed(self.settings.train.seed * 1_000_003 + epoch)
             self._order = epoch, torch.randperm(len(self.views), generator=generator).tolist()
-        return self.photos[self._order[1][place]]
+        return self._order[1][place]
 
     def _densify(self, progress: float) -> None:
         settings = self.settings.densify
@@ -229,6 +241,21 @@ class Trainer:
             divide=progress < settings.stop,
         )
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
+
+    @torch.no_grad()
+    def _weigh_exposures(self, progress: float) -> None:
+        """Leave the exposures out, where that is asked for, once it is seen that the photos have none of their own."""
+        settings = self.settings
+        if self.exposures is None or settings.light.exposure != "auto":
+            return
+        if self.iteration % settings.densify.every or progress < EXPOSURES_KNOWN:
+            return
+        spread = float((self.exposures - self.exposures.median()).abs().max())  # a card waits here, once in a while
+        if spread < EXPOSURES_ALIKE:
+            self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
+            self.optimizer.state.pop(self.exposures, None)
+            self.exposures = None
+            self.report("stage", {"what": f"the photos' exposures agree within {math.expm1(EXPOSURES_ALIKE):.0%}"})
 
     @torch.no_grad()
     def _trace(self) -> None:
@@ -337,6 +364,8 @@ class Trainer:
         tensors = {f"parameter.{name}": value for name, value in self.parameters.items()}
         tensors |= {f"constant.{name}": value for name, value in self.constant.items()}
         tensors |= {"environment": self.light, "motion.total": self.motion.total, "motion.views": self.motion.views}
+        if self.exposures is not None:
+            tensors |= {"exposure": self.exposures}
         if self.occluder is not None:
             mesh = self.occluder.mesh
             tensors |= {"occluder.vertices": torch.from_numpy(mesh.vertices)}
@@ -359,13 +388,18 @@ class Trainer:
         self.total = facts["total"]
         self.motion.total, self.motion.views = tensors["motion.total"], tensors["motion.views"]
         self.optimizer.state.clear()
+        if "exposure" not in tensors:  # they have been left out since
+            self.exposures = None
+            self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
         for group in self.optimizer.param_groups:
             name = group["name"]
-            value = tensors["environment"] if name == "environment" else tensors[f"parameter.{name}"]
+            value = tensors[name if name in ("environment", "exposure") else f"parameter.{name}"]
             value.requires_grad_()
             group["params"][0] = value
             if name == "environment":
                 self.light = value
+            elif name == "exposure":
+                self.exposures = value
             else:
                 self.parameters[name] = value
             prefix = f"adam.{name}."
