@@ -117,7 +117,9 @@ def demo(
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def bench(
     context: typer.Context,
-    what: Annotated[str, typer.Argument(help="kernels, iteration, scaling, threads, gpu, splitsum or paper")] = "kernels",
+    what: Annotated[
+        str, typer.Argument(help="kernels, iteration, scaling, threads, gpu, splitsum or paper")
+    ] = "kernels",
 ) -> None:
     """Measure the parts, in milliseconds or errors; `paper --data DIR [--out DIR] [--preset NAME]`: the whole on the paper's data."""
     from refgs import commands
