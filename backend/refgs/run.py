@@ -100,7 +100,7 @@ def create_run(
         "chosen": chosen or {},
     }
     write_text(folder / "run.toml", tomli_w.dumps(facts))
-    write_cameras(folder / "cameras.json", capture)
+    write_cameras(folder / "cameras.json", capture, settings.light.frame)
 
 
 def check_free(folder: Path) -> None:
