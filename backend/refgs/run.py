@@ -41,6 +41,7 @@ class Run:
     cameras: list[Camera]
     splits: list[str]
     to_capture: np.ndarray
+    exposed: bool  # photos were found to have exposures of their own
     splats: Splats
     environment: Environment | None
     occluder: Occluder | None
@@ -54,7 +55,7 @@ class Run:
         side = self.settings.image.max_side
         return [c.fitted(side) for c, split in zip(self.cameras, self.splits, strict=True) if split == "train"]
 
-    def render(self, camera: Camera, environment: Environment | None = None) -> Rendering:
+    def render(self, camera: Camera, environment: Environment | None = None, exposure: float = 1.0) -> Rendering:
         """Render a camera of the run's frame, under another light where one is given: without inter-reflection then,
         as the surfels know what they mirror of each other under the recovered light alone."""
         with torch.no_grad():
@@ -66,6 +67,7 @@ class Run:
                 self.settings.render,
                 self.near,
                 self.occluder if environment is None else None,
+                torch.tensor(exposure),
             )
 
 
@@ -127,7 +129,7 @@ def open_run(folder: Path) -> Run:
     facts, settings = read_run_facts(folder)
     if not (folder / "splats.ply").exists():
         raise InputError(f"{folder}: the training has not ended: go on with `refgs train … --out {folder} --resume`")
-    cameras, splits, to_capture = read_run_cameras(folder / "cameras.json")
+    cameras, splits, to_capture, exposures = read_run_cameras(folder / "cameras.json")
     environment = None
     if settings.render.shading == "deferred":
         panorama = read_environment(folder / "environment.exr")
@@ -146,6 +148,7 @@ def open_run(folder: Path) -> Run:
         cameras=cameras,
         splits=splits,
         to_capture=to_capture,
+        exposed=any(exposure != 1 for exposure in exposures),
         splats=read_splats(folder / "splats.ply"),
         environment=environment,
         occluder=Occluder(read_mesh(folder / OCCLUDER)) if (folder / OCCLUDER).exists() else None,

@@ -48,7 +48,9 @@ class ImportRun(_Door, bpy.types.Operator):
         run = import_run(Path(bpy.path.abspath(self.directory)), context.scene)
         self.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
         if run.light_of:
-            said = f"The light turned with the camera: the world is as it was for {run.light_of}, and for no other photo"
+            said = (
+                f"The light turned with the camera: the world is as it was for {run.light_of}, and for no other photo"
+            )
             self.report({"WARNING"}, said)
 
 

@@ -37,7 +37,9 @@ def read_cameras(file: Path) -> list[Camera]:
     return cameras
 
 
-def write_cameras(file: Path, capture: Capture, light: str = "world", exposures: dict[str, float] | None = None) -> None:
+def write_cameras(
+    file: Path, capture: Capture, light: str = "world", exposures: dict[str, float] | None = None
+) -> None:
     """Writes the run folder's cameras.json: the capture's undistorted cameras in the run's frame, OpenGL axes.
 
     With a light that stands with the "camera", `light_of` names the photo in which it is as environment.exr has it. The exposures
@@ -71,8 +73,9 @@ def write_cameras(file: Path, capture: Capture, light: str = "world", exposures:
     os.replace(temporary, file)
 
 
-def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray]:
-    """The cameras of a run folder's cameras.json in the run's frame, their splits, and run → capture (4, 4)."""
+def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float]]:
+    """The cameras of a run folder's cameras.json in the run's frame, their splits, run → capture (4, 4), and their exposures,
+    1 where none was found."""
     file = Path(file)
     shared, frames = read_frames(file)
     cameras = [frame_camera(frame)[0] for frame in frames]
@@ -80,6 +83,7 @@ def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray]:
         cameras,
         [frame.values.get("split", "train") for frame in frames],
         _similarity(shared.get("to_capture"), file),
+        [frame.values.get("exposure", 1.0) for frame in frames],
     )
 
 

@@ -55,9 +55,7 @@ class Environment:
         return colour.reshape(height, 2 * height, 3).numpy()
 
     @classmethod
-    def from_panorama(
-        cls, panorama: np.ndarray, resolution: int, reference: Camera | None = None
-    ) -> "Environment":
+    def from_panorama(cls, panorama: np.ndarray, resolution: int, reference: Camera | None = None) -> "Environment":
         """The light of an equirectangular picture (H, W, 3) in Blender's orientation, averaged over each texel."""
         fine = max(1, math.ceil(panorama.shape[0] / (2 * resolution)))  # so that no pixel of the picture is passed over
         directions = cubemap.texel_directions(resolution * fine).numpy()

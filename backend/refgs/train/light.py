@@ -24,10 +24,8 @@ SWEEPS = 4
 LESS = 0.95  # of the error under a light that stands still, below which it turns: where in doubt, it stands
 
 
-def light_frame(
-    views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float
-) -> tuple[str, str]:
-    """"world" or "camera", and why: from points (N, 3) on an object's visual hull, their normals, and the photos.
+def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple[str, str]:
+    """ "world" or "camera", and why: from points (N, 3) on an object's visual hull, their normals, and the photos.
 
     A point's brightness is its own times what the light makes of it. Under a light in the world that changes from photo to
     photo by the mirror direction alone; under one that turns with the camera, by normal and mirror direction in its frame. Its
