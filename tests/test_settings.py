@@ -71,7 +71,8 @@ def test_an_unknown_preset_lists_the_known():
 def test_a_run_of_before_a_setting_still_opens():
     settings = load_settings("quick")
     recorded = settings.model_dump(mode="json")
-    del recorded["loss"]["light"], recorded["mesh"]
+    del recorded["loss"]["light"], recorded["mesh"], recorded["light"]
     opened = recorded_settings(recorded, "run.toml")
     assert opened.train == settings.train
     assert opened.mesh == load_settings("standard").mesh
+    assert (opened.light.frame, opened.light.exposure) == ("world", "off")  # as it then was

@@ -223,7 +223,8 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     if not views:
         raise InputError(f"{run.capture_folder} has no {split} views")
     background = np.array(run.settings.image.background, dtype=np.float32)
-    rows: dict[str, list[float]] = {"psnr": [], "ssim": [], "normal_mae_degrees": []}
+    # A held-out photo's exposure is not known: where they differ it is fitted, in linear radiance, for a second figure.
+    rows: dict[str, list[float]] = {"psnr": [], "ssim": [], "psnr_exposure_fitted": [], "normal_mae_degrees": []}
     with progress_bar("evaluating", len(views)) as bar:
         for done, view in enumerate(views):
             loaded = load_view(view, run.settings.image.max_side)
@@ -232,6 +233,10 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
             photo = composite(loaded, torch.from_numpy(background)).numpy()
             rows["psnr"].append(metrics.psnr(color, photo))
             rows["ssim"].append(metrics.ssim(color, photo))
+            if run.exposed:
+                exposure = metrics.fitted_exposure(rendering.radiance.numpy(), rendering.alpha.numpy(), photo)
+                fitted = run.render(loaded.camera, exposure=exposure).color.numpy()
+                rows["psnr_exposure_fitted"].append(metrics.psnr(np.clip(fitted, 0, 1), photo))
             truth = _true_normals(ground_truth, loaded.camera) if ground_truth else None
             if truth is not None:
                 images = _images(rendering)

@@ -42,6 +42,7 @@ class Run:
     cameras: list[Camera]
     splits: list[str]
     to_capture: np.ndarray
+    exposed: bool  # photos were found to have exposures of their own
     splats: Splats
     environment: Environment | None
     occluder: Occluder | None
@@ -59,7 +60,7 @@ class Run:
         """Another light for `render`: an equirectangular picture (H, W, 3) of linear radiance, in Blender's orientation."""
         return _light(panorama, self.settings)
 
-    def render(self, camera: Camera, environment: Environment | None = None) -> Rendering:
+    def render(self, camera: Camera, environment: Environment | None = None, exposure: float = 1.0) -> Rendering:
         """Render a camera of the run's frame, under another light where one is given: without inter-reflection then,
         as the surfels know what they mirror of each other under the recovered light alone."""
         with torch.no_grad():
@@ -71,6 +72,7 @@ class Run:
                 self.settings.render,
                 self.near,
                 self.occluder if environment is None else None,
+                torch.tensor(exposure),
             )
 
 
@@ -105,7 +107,7 @@ def create_run(
         "chosen": chosen or {},
     }
     write_text(folder / "run.toml", tomli_w.dumps(facts))
-    write_cameras(folder / "cameras.json", capture)
+    write_cameras(folder / "cameras.json", capture, settings.light.frame)
 
 
 def check_free(folder: Path) -> None:
@@ -132,7 +134,7 @@ def open_run(folder: Path) -> Run:
     facts, settings = read_run_facts(folder)
     if not (folder / "splats.ply").exists():
         raise InputError(f"{folder}: the training has not ended: go on with `refgs train … --out {folder} --resume`")
-    cameras, splits, to_capture = read_run_cameras(folder / "cameras.json")
+    cameras, splits, to_capture, exposures = read_run_cameras(folder / "cameras.json")
     environment = None
     if settings.render.shading != "sh":
         reference = next(c for c, split in zip(cameras, splits, strict=True) if split == "train")
@@ -150,6 +152,7 @@ def open_run(folder: Path) -> Run:
         cameras=cameras,
         splits=splits,
         to_capture=to_capture,
+        exposed=any(exposure != 1 for exposure in exposures),
         splats=read_splats(folder / "splats.ply"),
         environment=environment,
         occluder=Occluder(read_mesh(folder / OCCLUDER)) if (folder / OCCLUDER).exists() else None,

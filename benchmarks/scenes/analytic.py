@@ -34,8 +34,18 @@ def meet(origin: np.ndarray, ray: np.ndarray, balls: np.ndarray) -> tuple[np.nda
     return hit, point, (point - balls[first, :3]) / balls[first, 3:]
 
 
-def photo(matrix: np.ndarray, size: int, balls: np.ndarray = ONE, samples: int = 4) -> np.ndarray:
-    """RGBA in 0..1 of balls (B, 4), centre and radius: mirrors with Schlick's Fresnel; alpha by `samples`² rays a pixel."""
+def photo(
+    matrix: np.ndarray,
+    size: int,
+    balls: np.ndarray = ONE,
+    samples: int = 4,
+    turning: bool = False,
+    stops: float = 0.0,
+) -> np.ndarray:
+    """RGBA in 0..1 of balls (B, 4), centre and radius: mirrors with Schlick's Fresnel; alpha by `samples`² rays a pixel.
+
+    The sky stands still, or turns with the camera, which is level, about z. The photo is exposed so many stops more.
+    """
     focal = 0.5 * size / np.tan(ANGLE / 2)
     grid = (np.arange(size * samples) + 0.5) / samples
     x, y = np.meshgrid(grid - size / 2, grid - size / 2)
@@ -49,7 +59,10 @@ def photo(matrix: np.ndarray, size: int, balls: np.ndarray = ONE, samples: int =
         cosine = -(normal * ray).sum(-1, keepdims=True).clip(-1, 0)
         share = np.where(hit[:, None], share * (F0 + (1 - F0) * (1 - cosine) ** 5), share)
         origin, ray = point, np.where(hit[:, None], ray + 2 * cosine * normal, ray)
-    color = np.where(seen[:, None], share * sky(ray), 0)
+    azimuth = np.arctan2(matrix[1, 0], matrix[0, 0]) if turning else 0.0
+    cosine, sine = np.cos(azimuth), np.sin(azimuth)
+    ray = ray @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    color = np.where(seen[:, None], 2**stops * share * sky(ray), 0)
     blocks = (size, samples, size, samples)
     alpha = seen.reshape(blocks).mean(axis=(1, 3))
     color = color.reshape(*blocks, 3).sum(axis=(1, 3)) / np.maximum(seen.reshape(blocks).sum(axis=(1, 3)), 1)[..., None]
@@ -66,8 +79,15 @@ def camera_matrix(direction: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def write_ball_capture(folder: Path, size: int, balls: np.ndarray = ONE, samples: int = 4) -> None:
-    """A NeRF-Blender capture of balls: 24 training and 4 test views."""
+def write_ball_capture(
+    folder: Path,
+    size: int,
+    balls: np.ndarray = ONE,
+    samples: int = 4,
+    turning: bool = False,
+    stops: tuple[float, ...] = (0.0,),
+) -> None:
+    """A NeRF-Blender capture of balls: 24 training and 4 test views. `stops` are the training views' by turns."""
     steps = np.arange(VIEWS + 4) + 0.5
     z = 0.9 - 1.5 * steps / len(steps)
     azimuth = steps * np.pi * (3 - np.sqrt(5))
@@ -77,7 +97,8 @@ def write_ball_capture(folder: Path, size: int, balls: np.ndarray = ONE, samples
         split = "test" if i % 7 == 3 else "train"
         matrix = camera_matrix(direction)
         (folder / split).mkdir(exist_ok=True, parents=True)
-        pixels = np.rint(photo(matrix, size, balls, samples) * 255).astype(np.uint8)
+        more = stops[i % len(stops)] if split == "train" else 0.0
+        pixels = np.rint(photo(matrix, size, balls, samples, turning, more) * 255).astype(np.uint8)
         Image.fromarray(pixels).save(folder / split / f"r_{i}.png")
         frames[split].append({"file_path": f"./{split}/r_{i}", "transform_matrix": matrix.tolist()})
     for split, entries in frames.items():

@@ -29,6 +29,11 @@ def read_cameras(path: Path) -> list[dict]:
     return frames
 
 
+def light_of(path: Path) -> str:
+    """The view that a run's recovered light is right for, where it turned with the camera, as on a turntable; else ""."""
+    return Path(json.loads(path.read_text(encoding="utf-8")).get("light_of", "")).stem
+
+
 def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Object:
     """One frame's camera in a collection: pose, focal length and principal point.
 

@@ -7,7 +7,7 @@ import bpy
 
 from ..errors import InputError
 from . import parts
-from .cameras import add_camera, frame_camera, read_cameras
+from .cameras import add_camera, frame_camera, light_of, read_cameras
 from .relight import light_with_recovered, load_panorama
 from .splats import add_splats, read_splats
 
@@ -22,6 +22,8 @@ class Run:
     world: bpy.types.World | None = None
     cameras: dict[str, bpy.types.Object] = field(default_factory=dict)
     """By view: the name of the photo without its ending."""
+    light_of: str = ""
+    """The view that the world is right for, where the light turned with the camera; the world says so as `refgs_light_of`."""
 
 
 def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
@@ -47,6 +49,9 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
             run.mesh = _add_mesh(folder / "mesh.glb", f"{name} mesh", collection)
         if (folder / "environment.exr").exists():
             run.world = light_with_recovered(scene, f"RefGS {name}", load_panorama(folder / "environment.exr"))
+            run.light_of = light_of(folder / "cameras.json") if frames else ""
+            if run.light_of:
+                run.world["refgs_light_of"] = run.light_of
         if frames:
             cameras = bpy.data.collections.new(f"{name} cameras")
             collection.children.link(cameras)

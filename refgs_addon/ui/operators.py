@@ -47,6 +47,11 @@ class ImportRun(_Door, bpy.types.Operator):
             raise InputError(f"Blender's Python lacks {error.name}: install it (on Debian, python3-numpy)") from None
         run = import_run(Path(bpy.path.abspath(self.directory)), context.scene)
         self.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
+        if run.light_of:
+            said = (
+                f"The light turned with the camera: the world is as it was for {run.light_of}, and for no other photo"
+            )
+            self.report({"WARNING"}, said)
 
 
 class ShowPart(_Door, bpy.types.Operator):

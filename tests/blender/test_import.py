@@ -38,6 +38,15 @@ def evaluated_mesh(item):
     raise AssertionError("the modifier makes no mesh")
 
 
+def test_a_light_that_turned_is_said_to(run_folder, scene):
+    assert "refgs_light_of" not in import_run(run_folder, scene).world
+    file = run_folder / "cameras.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"light_of": "images/shifted"}))
+    run = import_run(run_folder, scene)
+    assert run.light_of == run.world["refgs_light_of"] == "shifted"
+    assert "shifted" in run.cameras
+
+
 def test_points_hold_what_the_file_holds(run_folder, scene):
     run = import_run(run_folder, scene)
     columns, cloud = random_columns(), run.splats.data

@@ -18,10 +18,12 @@ def assert_same(a, b):
 def test_run_cameras_round_trip(tmp_path, make):
     capture = read_capture(make(tmp_path / "capture"))
     file = tmp_path / "cameras.json"
-    write_cameras(file, capture)
+    given = {capture.train_views[1].camera.name: 1.25}
+    write_cameras(file, capture, exposures=given)
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["cameras.json"]
-    cameras, splits, to_capture = read_run_cameras(file)
+    cameras, splits, to_capture, exposures = read_run_cameras(file)
     assert splits == [view.split for view in capture.views]
+    assert exposures == [given.get(view.camera.name, 1.0) for view in capture.views]
     np.testing.assert_array_equal(to_capture, capture.to_capture)
     for camera, view in zip(cameras, capture.views, strict=True):
         assert_same(camera, view.camera)

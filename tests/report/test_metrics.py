@@ -2,6 +2,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from refgs.color import srgb_encode
 from refgs.errors import InputError
 from refgs.report import metrics
 
@@ -71,6 +72,16 @@ def test_one_scale_is_found_and_a_sun_does_not_decide_it():
     raw, aligned, scale = metrics.scale_aligned_psnr(image, reference)
     assert scale == pytest.approx(2)
     assert aligned == pytest.approx(100) and raw < 20
+
+
+def test_an_exposure_is_fitted_where_the_photo_tells():
+    radiance, alpha = RANDOM.uniform(0, 1, (8, 9, 3)), np.ones((8, 9))
+    alpha[:2] = 0
+    photo = srgb_encode(1.5 * radiance)
+    photo[:2] = 0.3
+    assert (photo > 1).any()
+    assert metrics.fitted_exposure(radiance, alpha, photo.clip(0, 1)) == pytest.approx(1.5)
+    assert metrics.fitted_exposure(radiance, 0 * alpha, photo) == 1
 
 
 def test_uncovered_pixels_are_white_on_both_sides():

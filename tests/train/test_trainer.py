@@ -70,7 +70,7 @@ def test_the_asset_renders_as_the_training_did(ball):
 
 def test_what_a_ball_does_without(ball):
     left_out = [entry["what"] for entry in json.loads((ball.folder / "needs.json").read_text())]
-    assert left_out == ["spherical harmonics", "inter-reflection"]
+    assert left_out == ["spherical harmonics", "inter-reflection", "exposures"]
     assert ball.occluder is None and not (ball.folder / "occluder.ply").exists()
     assert open_run(ball.folder).splats.indirect.shape[1] == 0
 
@@ -91,10 +91,11 @@ def test_history_grows_with_time(ball):
 INDIRECT = ["indirect.start=0.2", "indirect.every=30", "indirect.least=0", "indirect.resolution=32"]
 
 
+TURNING = ["light.frame=camera", "light.exposure=on"]
 STAGES = ["initial.until=0.5", "densify.reset_every=30", "propagation.every=20", "propagation.rest=15"]
 
 
-@pytest.mark.parametrize("changes", [[], ["shading=sh"], ["diffuse=sh"], INDIRECT, STAGES])
+@pytest.mark.parametrize("changes", [[], ["shading=sh"], ["diffuse=sh"], INDIRECT, TURNING, STAGES])
 def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
     """Bit for bit, through densification."""
     changes = [*changes, "train.checkpoint_every=40", "densify.every=25"]
@@ -111,6 +112,9 @@ def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
     for name, value in whole.parameters.items():
         assert torch.equal(value, second.parameters[name]), name
     assert torch.equal(whole.light, second.light)
+    assert (second.exposures is not None) == (changes[0] == TURNING[0])
+    if second.exposures is not None:
+        assert torch.equal(whole.exposures, second.exposures) and whole.exposures.any()
     assert (second.occluder is not None) == (changes[0] == INDIRECT[0])
 
 

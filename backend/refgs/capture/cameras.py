@@ -37,13 +37,21 @@ def read_cameras(file: Path) -> list[Camera]:
     return cameras
 
 
-def write_cameras(file: Path, capture: Capture) -> None:
-    """Writes the run folder's cameras.json: the capture's undistorted cameras in the run's frame, OpenGL axes."""
+def write_cameras(
+    file: Path, capture: Capture, light: str = "world", exposures: dict[str, float] | None = None
+) -> None:
+    """Writes the run folder's cameras.json: the capture's undistorted cameras in the run's frame, OpenGL axes.
+
+    With a light that stands with the "camera", `light_of` names the photo in which it is as environment.exr has it. The exposures
+    of those photos that were found to have one are what radiance is to be multiplied by to be as bright as the photo.
+    """
     frames = []
     for view in capture.views:
         camera = view.camera
+        frame = {"exposure": exposures[camera.name]} if exposures and camera.name in exposures else {}
         frames.append(
-            {
+            frame
+            | {
                 "file_path": f"images/{camera.name}",
                 "transform_matrix": (camera.camera_to_world @ OPENGL_TO_OPENCV).tolist(),
                 "fl_x": camera.fx,
@@ -57,13 +65,17 @@ def write_cameras(file: Path, capture: Capture) -> None:
         )
     file = Path(file)
     temporary = file.with_name(file.name + ".tmp")
-    text = json.dumps({"frames": frames, "to_capture": capture.to_capture.tolist()}, indent=1)
+    facts = {"frames": frames, "to_capture": capture.to_capture.tolist()}
+    if light == "camera":
+        facts["light_of"] = f"images/{capture.train_views[0].camera.name}"
+    text = json.dumps(facts, indent=1)
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, file)
 
 
-def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray]:
-    """The cameras of a run folder's cameras.json in the run's frame, their splits, and run → capture (4, 4)."""
+def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float]]:
+    """The cameras of a run folder's cameras.json in the run's frame, their splits, run → capture (4, 4), and their exposures,
+    1 where none was found."""
     file = Path(file)
     shared, frames = read_frames(file)
     cameras = [frame_camera(frame)[0] for frame in frames]
@@ -71,6 +83,7 @@ def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray]:
         cameras,
         [frame.values.get("split", "train") for frame in frames],
         _similarity(shared.get("to_capture"), file),
+        [frame.values.get("exposure", 1.0) for frame in frames],
     )
 
 

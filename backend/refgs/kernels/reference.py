@@ -100,9 +100,8 @@ def shade(
     turn: Tensor | None = None,
     display: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """As refgs.render.shade.shade, for float64 tensors and a light that stands turned (3, 3) to the world; and how far each
-    pixel (H, W) is from a kink of the derivatives, in the units of what has the kink. Bilinear look-ups have one at every
-    texel."""
+    """As refgs.render.shade.shade, for float64 tensors and a light that stands turned (3, 3) to the world; and how far each pixel
+    (H, W) is from a kink of the derivatives, in the units of what has the kink. Bilinear look-ups have one at every texel."""
     view, pixels = torch.from_numpy(camera.world_to_camera), torch.nonzero(alpha > COVERED, as_tuple=True)
     here, margins = alpha[pixels], []
     own = features[pixels] / here[:, None]

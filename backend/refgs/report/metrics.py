@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from refgs.color import srgb_encode
+from refgs.color import srgb_decode, srgb_encode
 from refgs.errors import InputError
 from refgs.export.environment import read_exr
 
@@ -24,6 +24,15 @@ def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = Non
     if mask is not None:
         error = error[mask]
     return float(-10 * np.log10(max(error.mean(), 1e-10)))
+
+
+def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) -> float:
+    """What linear radiance (h, w, 3) is to be multiplied by to come nearest, by least squares, to an encoded photo; over the
+    pixels that are opaque, alpha (h, w), and not clipped in the photo. 1 where there is nothing to go by."""
+    seen = (alpha > 0.5) & (photo.max(axis=-1) < 0.98)
+    rendered, taken = radiance[seen].astype(np.float64), srgb_decode(photo[seen].astype(np.float64))
+    square = (rendered * rendered).sum()
+    return float((rendered * taken).sum() / square) if square > 0 else 1.0
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:

@@ -3,7 +3,9 @@
 import json
 
 import torch
+from torch import Tensor
 
+from refgs.capture import write_cameras
 from refgs.color import srgb_decode, srgb_encode
 from refgs.export.environment import write_environment
 from refgs.export.splats import write_splats
@@ -14,7 +16,6 @@ from refgs.model.surfels import Surfels, to_splats
 from refgs.render.rasterize import rasterize
 from refgs.render.volume import discs, shortest_last
 from refgs.run import OCCLUDER, write_text
-from refgs.settings import RenderSettings
 from refgs.train.trainer import Trainer
 
 
@@ -30,32 +31,52 @@ def write_asset(trainer: Trainer) -> None:
         panorama = environment.panorama(4 * environment.resolution)
         display = settings.render.color_space == "display"
         write_environment(folder / "environment.exr", srgb_decode(panorama) if display else panorama)
-        surfels = _with_relightable_albedo(surfels, environment, settings.render)
+        surfels = _with_relightable_albedo(surfels, environment, trainer)
     if trainer.occluder is not None:
         write_mesh(folder / OCCLUDER, trainer.occluder.mesh)
     else:
         surfels = surfels._replace(indirect_dc=surfels.indirect_dc[:, :0], indirect_rest=surfels.indirect_rest[:, :0])
     surfels, unseen = _facing_outward(surfels, trainer)
     write_splats(folder / "splats.ply", to_splats(surfels))
+    if trainer.exposures is not None:
+        factors = trainer.exposures.detach().exp().tolist()
+        exposures = {view.camera.name: factor for view, factor in zip(trainer.views, factors, strict=True)}
+        write_cameras(folder / "cameras.json", trainer.capture, settings.light.frame, exposures)
     write_text(folder / "needs.json", json.dumps(_left_out(trainer, unseen), indent=1))
 
 
-def _with_relightable_albedo(surfels: Surfels, environment: Environment, settings: RenderSettings) -> Surfels:
+def _with_relightable_albedo(surfels: Surfels, environment: Environment, trainer: Trainer) -> Surfels:
     """Albedo under the recovered light, and the SH that a viewer without lights shows.
 
     Where the diffuse part was learned as SH, a dielectric's albedo is that colour divided by the irradiance it stood in;
     a metal's is its reflectance. Where it was learned as albedo, the SH becomes the matte look under that irradiance.
     """
-    received = environment.diffuse(surfels.normals()).clamp_min(1e-6)
+    received = _received(surfels, environment, trainer)
     metallic = surfels.metallic[:, None]
-    if settings.diffuse == "sh":
+    if trainer.settings.render.diffuse == "sh":
         sent = (0.5 + harmonics.DC * surfels.sh_dc[:, 0]).clamp_min(0)  # the mean over all directions
         albedo = metallic * surfels.albedo + (1 - metallic) * (sent / received).clamp(0, 1)
         return surfels._replace(albedo=albedo)
     look = (surfels.albedo * received).clamp(0, 1)
-    if settings.color_space == "linear":
+    if trainer.settings.render.color_space == "linear":
         look = srgb_encode(look)
     return surfels._replace(sh_dc=((look - 0.5) / harmonics.DC)[:, None], sh_rest=surfels.sh_rest[:, :0])
+
+
+def _received(surfels: Surfels, environment: Environment, trainer: Trainer) -> Tensor:
+    """Irradiance / π of each surfel (N, 3); where the light turned with the camera, its mean over the photos, each by the
+    cosine to the camera, either side being looked at."""
+    normals = surfels.normals()
+    if environment.reference is None:
+        return environment.diffuse(normals).clamp_min(1e-6)
+    total, weights = torch.zeros_like(normals), torch.full_like(normals[:, :1], 1e-6)
+    for camera in (view.camera for view in trainer.views):
+        towards = torch.from_numpy(camera.position).to(normals) - surfels.positions
+        cosine = (torch.nn.functional.normalize(towards, dim=-1) * normals).sum(dim=-1, keepdim=True)
+        turn = torch.from_numpy(environment.turn(camera)).to(normals)
+        total += cosine.abs() * environment.diffuse(cosine.sign() * normals @ turn.T)
+        weights += cosine.abs()
+    return (total / weights).clamp_min(1e-6)
 
 
 def _facing_outward(surfels: Surfels, trainer: Trainer) -> tuple[Surfels, int]:
@@ -108,12 +129,16 @@ def _left_out(trainer: Trainer, unseen: int) -> list[dict[str, str]]:
             why = "not every photo has a mask of the object"
         elif indirect.start >= 1:
             why = "indirect.start = 1"
+        elif settings.light.frame == "camera":
+            why = "the light turns with the camera: what the object mirrors of itself changes from photo to photo"
         elif trainer.total <= max(indirect.every, indirect.start * trainer.total):
             why = "the training was over before its first mesh"
         else:
             why = "the object hardly mirrors itself"
         saved = "tracing rays, and harmonics of light from the object"
         left.append({"what": "inter-reflection", "why": why, "saved": saved})
+    if settings.light.exposure == "auto" and settings.render.shading == "deferred" and trainer.exposures is None:
+        left.append({"what": "exposures", "why": "those of the photos agree", "saved": "one number a photo"})
     if any(view.alpha is None for view in trainer.views):
         left.append({"what": "the mask loss", "why": "not every photo has a mask", "saved": "one term of the loss"})
     if unseen:

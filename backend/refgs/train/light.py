@@ -20,6 +20,7 @@ DARK = 0.01  # radiance beside which less is as good as black
 FOLDS = 4
 FEWEST = 3  # photos of a point from which its own brightness is known
 RIDGE = 1e-4
+SWEEPS = 4
 LESS = 0.95  # of the error under a light that stands still, below which it turns: where in doubt, it stands
 
 
@@ -28,8 +29,9 @@ def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndar
 
     A point's brightness is its own times what the light makes of it. Under a light in the world that changes from photo to
     photo by the mirror direction alone; under one that turns with the camera, by normal and mirror direction in its frame. Its
-    logarithm is fitted by smooth functions of those, harmonics, and by a number a point, in three quarters of the photos, and
-    foretold in the others but for their exposure: whichever light foretells them better it was. Seconds; no chance in it.
+    logarithm is fitted by smooth functions of those, harmonics, by a number a point and by one a photo, its exposure, in three
+    quarters of the photos, and foretold in the others but for their exposure: whichever light foretells them better it was.
+    Seconds; no chance in it.
     """
     points, photos, brightness, still, turning = _observations(views, positions, normals, radius)
     if len(np.unique(photos)) < 2 * FOLDS or len(points) < 100:
@@ -94,14 +96,18 @@ def _harmonics(directions: np.ndarray) -> np.ndarray:
 
 
 def _unforeseen(values: np.ndarray, terms: np.ndarray, points: np.ndarray, photos: np.ndarray) -> float:
-    """Mean squared error of values (M,) in photos that a fit by terms (M, K) and a number a point has not seen."""
+    """Mean squared error of values (M,) in photos that a fit by terms (M, K) and a number a point and a photo has not seen."""
     total = count = 0
     for fold in range(FOLDS):
         known = photos % FOLDS != fold
         often = np.bincount(points[known], minlength=points.max() + 1) >= FEWEST
         asked = ~known & often[points]
         columns = np.column_stack([values, terms])
-        columns = columns - _means(columns[known], points[known], points.max() + 1)[points]
+        of_photo = np.zeros((photos.max() + 1, columns.shape[1]))
+        for _ in range(SWEEPS):  # what points and photos account for alone, one after the other
+            of_point = _means(columns[known] - of_photo[photos[known]], points[known], points.max() + 1)
+            of_photo = _means(columns[known] - of_point[points[known]], photos[known], photos.max() + 1)
+        columns = columns - of_point[points] - of_photo[photos]  # of those asked for that is nothing yet
         y, x = columns[:, 0], columns[:, 1:]
         normal = x[known].T @ x[known] + RIDGE * known.sum() * np.eye(x.shape[1])
         error = (y - x @ np.linalg.solve(normal, x[known].T @ y[known]))[asked]

@@ -1,0 +1,135 @@
+"""Light that turns with the camera, and photos of different exposures, on balls whose every answer is known."""
+
+import json
+import tomllib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.scenes.analytic import DISTANCE, TWO, camera_matrix, sky, write_ball_capture
+from refgs.camera import Camera
+from refgs.capture import read_capture
+from refgs.capture.poses import OPENGL_TO_OPENCV
+from refgs.export.environment import directions
+from refgs.model.environment import turn_between
+from refgs.run import create_run, open_run
+from refgs.settings import load_settings
+from refgs.train.asset import write_asset
+from refgs.train.trainer import Trainer
+
+SMALL = ["surfels.start=1500", "surfels.budget=1800", "environment.resolution=16", "train.light_first=20"]
+SMALL += ["surfels.metallic=0.9", "surfels.hull=64"]
+STOPS = (0.0, 0.7, 0.0, -0.7, 0.0)
+ITERATIONS = 600
+
+
+@pytest.fixture(scope="module")
+def turntable(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("turntable")
+    write_ball_capture(folder, 48, turning=True)
+    return folder
+
+
+def made(capture, folder, *changes, total=ITERATIONS):
+    settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
+    folder.mkdir(exist_ok=True)
+    return Trainer(read_capture(capture), settings, folder, lambda *_: None)
+
+
+def camera(direction) -> Camera:
+    pose = np.linalg.inv(camera_matrix(np.asarray(direction, float)) @ OPENGL_TO_OPENCV)
+    return Camera("c", 8, 8, 8, 8, 4, 4, pose)
+
+
+def test_heading_is_the_turn_about_the_vertical():
+    for elevation in (-1.2, 0.0, 0.4, 1.5):
+        for azimuth in (-3.0, -1.0, 0.0, 0.5, 2.0):
+            level = np.cos(elevation)
+            here = camera([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+            there = camera([1, 0, 0])  # looks along −x
+            assert np.isclose(np.linalg.norm(here.position), DISTANCE)
+            assert np.isclose(np.cos(here.heading - azimuth - np.pi / 2), 1)
+            turned = turn_between(here, there) @ here.position
+            expected = DISTANCE * np.array([level, 0, np.sin(elevation)])
+            np.testing.assert_allclose(turned, expected, atol=1e-9)
+
+
+def test_auto_tells_which_light_it_was(ball_capture, turntable, tmp_path):
+    for turning, capture in ((False, ball_capture), (True, turntable)):
+        found = made(capture, tmp_path / "one")
+        assert found.settings.light.frame == ("camera" if turning else "world"), found.chosen
+        assert "explains" in found.chosen["light.frame"]
+        write_ball_capture(tmp_path / f"two{turning}", 48, TWO, turning=turning)  # which mirror each other, too
+        found = made(tmp_path / f"two{turning}", tmp_path / "two")
+        assert found.settings.light.frame == ("camera" if turning else "world"), found.chosen
+
+
+def test_auto_tells_it_whatever_the_exposures(tmp_path):
+    for turning in (False, True):
+        write_ball_capture(tmp_path / f"{turning}", 48, turning=turning, stops=STOPS)
+        found = made(tmp_path / f"{turning}", tmp_path / "run")
+        assert found.settings.light.frame == ("camera" if turning else "world"), found.chosen
+
+
+def test_without_masks_the_light_stands_still(turntable, tmp_path):
+    write_ball_capture(tmp_path / "bare", 48, turning=True)
+    for file in (tmp_path / "bare").glob("*/*.png"):
+        Image.open(file).convert("RGB").save(file)
+    found = made(tmp_path / "bare", tmp_path / "run")
+    assert found.settings.light.frame == "world"
+    assert "mask" in found.chosen["light.frame"]
+
+
+def test_a_light_that_turns_is_recovered(turntable, tmp_path):
+    """Better pictures than under one that stands still; and what is saved renders, and says, as the training did."""
+    still = made(turntable, tmp_path / "still", "light.frame=world", "light.exposure=off")
+    still.run()
+    turning = made(turntable, tmp_path / "scratch", "light.exposure=off")
+    turning.folder = tmp_path / "run"
+    create_run(turning.folder, turning.capture, turning.settings, "quick", "cpu", turning.chosen)
+    turning.run()
+    write_asset(turning)
+    assert turning.test_psnr() > still.test_psnr() + 1
+
+    run, view = open_run(turning.folder), turning.test[0]
+    assert run.settings.light.frame == "camera"
+    assert float((turning.render(view.camera).color - run.render(view.camera).color).abs().mean()) < 2e-3
+    assert tomllib.loads((run.folder / "run.toml").read_text())["chosen"]["light.frame"].startswith("camera: ")
+    left_out = {entry["what"]: entry["why"] for entry in json.loads((run.folder / "needs.json").read_text())}
+    assert "turns with the camera" in left_out["inter-reflection"]
+
+    # environment.exr is the light as it stood in the photo that cameras.json names.
+    cameras = json.loads((run.folder / "cameras.json").read_text())
+    first = turning.views[0].camera
+    assert cameras["light_of"] == f"images/{first.name}"
+    truth = sky(directions(16, 32) @ turn_between(first, level := camera([0, -1, 0])).T)
+    assert abs(level.heading) < 1e-9
+    found = run.environment.panorama(16)
+    assert np.corrcoef(found.ravel(), truth.ravel())[0, 1] > 0.9
+
+
+def test_exposures_are_learned_where_photos_differ(tmp_path):
+    write_ball_capture(tmp_path / "capture", 48, stops=STOPS)
+    without, with_them = (made(tmp_path / "capture", tmp_path / e, f"light.exposure={e}") for e in ("off", "auto"))
+    without.run()
+    with_them.run()
+    assert with_them.test_psnr() > without.test_psnr() + 1
+    index = [int(view.camera.name.partition("_")[2].partition(".")[0]) for view in with_them.views]
+    truth = np.array([STOPS[i % len(STOPS)] for i in index])
+    found = with_them.exposures.detach().numpy() / np.log(2)
+    assert np.abs(found - truth).max() < 0.2
+    write_asset(with_them)
+    frames = json.loads((tmp_path / "auto" / "cameras.json").read_text())["frames"]
+    factors = [frame.get("exposure") for frame in frames if frame["split"] == "train"]
+    np.testing.assert_allclose(factors, 2**found, rtol=1e-5)
+    assert not any("exposure" in frame for frame in frames if frame["split"] == "test")
+
+
+def test_exposures_cost_nothing_where_photos_agree(ball_capture, tmp_path):
+    without, with_them, asked = (made(ball_capture, tmp_path / e, f"light.exposure={e}") for e in ("off", "on", "auto"))
+    for trainer in (without, with_them, asked):
+        trainer.run()
+    assert asked.exposures is None
+    assert abs(with_them.test_psnr() - without.test_psnr()) < 0.1
+    assert abs(asked.test_psnr() - without.test_psnr()) < 0.1
