@@ -48,19 +48,8 @@ def build() -> Scene:
     ]
     tyres = [mirrored(ring((x, 0.36, -0.25), (0, 1, 0), 0.145, 0.07)) for x in WHEELS]
     axles = [disc((x, 0, -0.25), (0, 1, 0), 0.10, 0.36, 0.01) for x in WHEELS]
-    bumpers = [
-        sweep(
-            [
-                (0.86 * s, -0.42, -0.20),
-                (0.97 * s, -0.26, -0.20),
-                (1.0 * s, 0, -0.20),
-                (0.97 * s, 0.26, -0.20),
-                (0.86 * s, 0.42, -0.20),
-            ],
-            0.035,
-        )
-        for s in (1, -1)
-    ]
+    bar = [(0.84, -0.42), (0.94, -0.26), (0.96, 0.0), (0.94, 0.26), (0.84, 0.42)]
+    bumpers = [sweep([(side * x, y, -0.20) for x, y in bar], 0.035) for side in (1, -1)]
     low, high = np.array([-1.05, -0.55, -0.5]), np.array([1.05, 0.55, 0.5])
     mesh = join(
         sculpt(carve(0.03, hull, *arches), low, high, 0.0095, PAINT),
