@@ -34,7 +34,8 @@ class Renderer:
         scene.world.use_nodes = True
         # What the mirror sees for `visibility`: white, and no lamps that light would be looked for at.
         self._white = bpy.data.worlds.new("White")
-        self._white.color = (1.0, 1.0, 1.0)
+        self._white.use_nodes = True
+        self._white.node_tree.nodes["Background"].inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
         self._white.cycles.sampling_method = "NONE"
         self._mirror = _mirror()
         nodes = scene.world.node_tree.nodes
@@ -84,11 +85,11 @@ class Renderer:
     def visibility(self, camera_to_world: np.ndarray, seed: int) -> np.ndarray:
         """(h, w): the share of the covered part of a pixel whose mirrored rays miss the object; zero where alpha is.
 
-        The object becomes a perfect mirror in a white world, and light may turn once.
+        The object becomes a perfect mirror in a white world, and what it sees of itself is black.
         """
         scene, layer, world = self.scene, self.scene.view_layers[0], self.scene.world
         layer.material_override, scene.world = self._mirror, self._white
-        scene.cycles.max_bounces, bounces = 1, scene.cycles.max_bounces
+        scene.cycles.max_bounces, bounces = 0, scene.cycles.max_bounces
         scene.cycles.use_denoising = False
         try:
             channels = self._channels(camera_to_world, seed)

@@ -15,6 +15,7 @@ from skimage.measure import marching_cubes
 from benchmarks.scenes.shapes import Mesh
 
 Solid = Callable[[np.ndarray], np.ndarray]
+FAR = 0.25  # beyond the width of any blend
 
 
 def ellipsoid(centre, radii) -> Solid:
@@ -73,7 +74,10 @@ def disc(centre, axis, radius: float, half: float, round: float) -> Solid:
 
 
 def sweep(path, radii) -> Solid:
-    """A round limb along a cubic spline through `path` (n, 3), with radii (n,) or one; its ends are half balls."""
+    """A round limb along a cubic spline through `path` (n, 3), with radii (n,) or one; its ends are half balls.
+
+    What is further than FAR from it is not told apart.
+    """
     path = np.asarray(path, float)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     curve, radius = CubicSpline(length, path), PchipInterpolator(length, np.broadcast_to(radii, len(path)))
@@ -81,12 +85,16 @@ def sweep(path, radii) -> Solid:
     tree = cKDTree(curve(steps))
 
     def distance(points):
-        along = steps[tree.query(points)[1]]
+        result = np.full(len(points), FAR)
+        way, nearest = tree.query(points, distance_upper_bound=np.max(radii) + FAR)
+        near = np.isfinite(way)
+        points, along = points[near], steps[nearest[near]]
         for _ in range(2):  # Newton towards the foot of the perpendicular
             apart, tangent = points - curve(along), curve(along, 1)
             bend = (tangent**2).sum(1) - (apart * curve(along, 2)).sum(1)
             along = (along + (apart * tangent).sum(1) / np.maximum(bend, 0.3)).clip(0, length[-1])
-        return np.linalg.norm(points - curve(along), axis=1) - radius(along)
+        result[near] = (np.linalg.norm(points - curve(along), axis=1) - radius(along)).clip(max=FAR)
+        return result
 
     return distance
 
