@@ -192,7 +192,7 @@ def pixel_means(values, per_side):
 def march(solid, origins, directions):
     """Whether rays (n, 3) meet the surface of a distance, and where they come closest to it."""
     along = np.zeros(len(directions))
-    for _ in range(400):
+    for _ in range(200):
         distance = solid(origins + directions * along[:, None])
         along += np.where(along < 10, distance, 0)
     return distance < 1e-4, origins + directions * along[:, None]
