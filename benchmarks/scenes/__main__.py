@@ -1,24 +1,25 @@
-"""`python -m benchmarks.scenes NAME --out DIR`: render a capture with ground truth.
+"""`python -m benchmarks.scenes NAME --out DIR`: render a capture with ground truth; `all` renders each into DIR/NAME.
 
 Standard output carries JSON lines: {"event": "progress", "done": 3, "total": 104, "what": "train views"}; Blender's own
 chatter goes to standard error. Exit status 2 and one line: the input is wrong.
 """
 
 import argparse
-import importlib
 import json
 import os
 import signal
 import sys
 from pathlib import Path
 
+from benchmarks.scenes import MATTE, NAMES, REFLECTIVE, build
 from refgs.errors import InputError
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scenes", description=__doc__.split("\n")[0])
-    parser.add_argument("name", choices=["jar", "ball", "rings"])
-    parser.add_argument("--out", type=Path, required=True, help="a new folder")
+    kinds = f"reflective: {', '.join(REFLECTIVE)}; matte: {', '.join(MATTE)}; all: those that DIR doesn't hold yet"
+    parser.add_argument("name", choices=[*NAMES, "all"], metavar="NAME", help=kinds)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
     parser.add_argument("--size", type=int, default=256, help="pixels, of both sides (256)")
     parser.add_argument("--train", type=int, default=80, help="training views (80)")
     parser.add_argument("--test", type=int, default=8, help="held-out views, which get ground truth (8)")
@@ -35,18 +36,23 @@ def main() -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda number, _: ended.append(number))
 
+    captures = {options.name: options.out}
+    if options.name == "all":
+        captures = {name: options.out / name for name in NAMES if not (options.out / name).exists()}
+
     def progress(done: int, total: int, what: str) -> None:
         if ended:
             raise InterruptedError
+        done, total = done + total * list(captures).index(name), total * len(captures)
+        what = f"{name}: {what}" if options.name == "all" else what
         print(json.dumps({"event": "progress", "done": done, "total": total, "what": what}), file=events)
 
     from benchmarks.scenes.capture import write_capture  # after the descriptor: importing bpy may print too
 
-    scene = importlib.import_module(f"benchmarks.scenes.{options.name}").build()
+    numbers = (options.size, options.train, options.test, options.samples)
     try:
-        write_capture(
-            scene, options.out, options.size, options.train, options.test, options.samples, options.relight, progress
-        )
+        for name, out in captures.items():
+            write_capture(build(name), out, *numbers, options.relight, progress)
     except InputError as error:
         print(error, file=sys.stderr)
         return 2

@@ -38,9 +38,11 @@ def write_capture(
         color/NAME.exr              test views: linear, premultiplied RGBA, before clipping and rounding
         normal|albedo/NAME.exr      RGB: world-space unit normal; base colour
         roughness|metallic|depth|alpha/NAME.exr     Y: one channel; depth along the camera's axis
+        visibility/NAME.exr         Y: 1 where the mirror direction about the true normal leaves the object, 0 where the
+                                    object is in its way
         relight/HDRI/NAME.exr       color of the test views under another panorama, which is relight/HDRI.exr
     All but the photos is float32. In a pixel that the object covers in part, normal (then made unit length again),
-    albedo, roughness, metallic and depth are means over the covered part; where alpha is zero they are zero.
+    albedo, roughness, metallic, depth and visibility are means over the covered part; where alpha is zero they are zero.
 
     `progress(done, total, what)` is called after every view. InputError: `out` exists; an HDRI is unknown.
     """
@@ -69,6 +71,8 @@ def write_capture(
             for index, camera in enumerate(cameras):
                 name = _name(split, index)
                 passes = renderer.render(camera, seed=done)
+                if split == "test":
+                    passes["visibility"] = renderer.visibility(camera, seed=done)  # the same seed: the same alpha
                 _write_photo(folder / split / f"{name}.png", passes["color"])
                 if split == "test":
                     for kind, pixels in passes.items():

@@ -32,6 +32,12 @@ class Renderer:
         scene.camera = self._camera
         scene.world = bpy.data.worlds.new("World")
         scene.world.use_nodes = True
+        # What the mirror sees for `visibility`: white, and no lamps that light would be looked for at.
+        self._white = bpy.data.worlds.new("White")
+        self._white.use_nodes = True
+        self._white.node_tree.nodes["Background"].inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+        self._white.cycles.sampling_method = "NONE"
+        self._mirror = _mirror()
         nodes = scene.world.node_tree.nodes
         self._panorama = nodes.new("ShaderNodeTexEnvironment")
         scene.world.node_tree.links.new(self._panorama.outputs["Color"], nodes["Background"].inputs["Color"])
@@ -74,6 +80,28 @@ class Renderer:
         (h, w, 3): base colour; roughness, metallic, depth (h, w): depth along the camera's axis. All are zero where
         alpha is.
         """
+        return _passes(self._channels(camera_to_world, seed))
+
+    def visibility(self, camera_to_world: np.ndarray, seed: int) -> np.ndarray:
+        """(h, w): the share of the covered part of a pixel whose mirrored rays miss the object; zero where alpha is.
+
+        The object becomes a perfect mirror in a white world, and what it sees of itself is black.
+        """
+        scene, layer, world = self.scene, self.scene.view_layers[0], self.scene.world
+        layer.material_override, scene.world = self._mirror, self._white
+        scene.cycles.max_bounces, bounces = 0, scene.cycles.max_bounces
+        scene.cycles.use_denoising = False
+        try:
+            channels = self._channels(camera_to_world, seed)
+        finally:
+            layer.material_override, scene.world = None, world
+            scene.cycles.max_bounces = bounces
+            scene.cycles.use_denoising = True
+        alpha = channels["ViewLayer.Combined.A"]
+        return (channels["ViewLayer.Combined.R"] / np.where(alpha > 0, alpha, 1)).clip(0, 1)
+
+    def _channels(self, camera_to_world: np.ndarray, seed: int) -> dict[str, np.ndarray]:
+        """The channels of Cycles' multilayer EXR, (h, w) float32 each."""
         self._camera.matrix_world = Matrix(camera_to_world.tolist())  # a list of rows alone would be read as columns
         self.scene.cycles.seed = seed
         with tempfile.TemporaryDirectory() as folder:
@@ -81,26 +109,32 @@ class Renderer:
             self.scene.render.filepath = str(path)
             bpy.ops.render.render(write_still=True)
             parts = OpenEXR.File(str(path), separate_channels=True).parts  # one; a part a pass from Blender 5.0
-            return _passes({name: channel.pixels for part in parts for name, channel in part.channels.items()})
+            return {name: channel.pixels for part in parts for name, channel in part.channels.items()}
 
     def _object(self, mesh: Mesh, materials: tuple[Material, ...]) -> None:
         data = bpy.data.meshes.new("Object")
         data.from_pydata(mesh.vertices, [], mesh.triangles)
         data.polygons.foreach_set("material_index", mesh.material.astype(np.int32))
         data.polygons.foreach_set("use_smooth", np.ones(len(mesh.triangles), bool))
-        for material in materials:
-            data.materials.append(_material(material))
+        for index, material in enumerate(materials):
+            if callable(material.base_color):
+                color = np.ones((len(mesh.vertices), 4), np.float32)
+                color[:, :3] = material.base_color(mesh.vertices)
+                data.attributes.new(f"color{index}", "FLOAT_COLOR", "POINT").data.foreach_set("color", color.ravel())
+            data.materials.append(_material(material, f"color{index}"))
         data.update()
         self.scene.collection.objects.link(bpy.data.objects.new("Object", data))
 
 
-def _material(values: Material) -> bpy.types.Material:
-    """A Principled BSDF whose inputs, the shading normal and the depth also go to the passes."""
+def _material(values: Material, attribute: str) -> bpy.types.Material:
+    """A Principled BSDF whose inputs, the shading normal and the depth also go to the passes.
+
+    Where the base colour is a texture, the mesh has it under the name `attribute`.
+    """
     material = bpy.data.materials.new("Material")
     material.use_nodes = True
     nodes, links = material.node_tree.nodes, material.node_tree.links
     shader = nodes["Principled BSDF"]
-    shader.inputs["Base Color"].default_value = (*values.base_color, 1.0)
     shader.inputs["Metallic"].default_value = values.metallic
     shader.inputs["Roughness"].default_value = values.roughness
 
@@ -109,11 +143,31 @@ def _material(values: Material) -> bpy.types.Material:
         node.aov_name = name
         return node.inputs["Color" if name in VECTORS else "Value"]
 
-    output("albedo").default_value = (*values.base_color, 1.0)
+    if callable(values.base_color):
+        texture = nodes.new("ShaderNodeAttribute")
+        texture.attribute_name = attribute
+        color = texture.outputs["Color"]
+    else:
+        constant = nodes.new("ShaderNodeRGB")
+        color = constant.outputs["Color"]
+        color.default_value = (*values.base_color, 1.0)
+    links.new(color, shader.inputs["Base Color"])
+    links.new(color, output("albedo"))
     output("metallic").default_value = values.metallic
     output("roughness").default_value = values.roughness
     links.new(nodes.new("ShaderNodeNewGeometry").outputs["Normal"], output("normal"))
     links.new(nodes.new("ShaderNodeCameraData").outputs["View Z Depth"], output("depth"))
+    return material
+
+
+def _mirror() -> bpy.types.Material:
+    material = bpy.data.materials.new("Mirror")
+    material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    shader = nodes.new("ShaderNodeBsdfGlossy")
+    shader.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    shader.inputs["Roughness"].default_value = 0.0
+    links.new(shader.outputs["BSDF"], nodes["Material Output"].inputs["Surface"])
     return material
 
 

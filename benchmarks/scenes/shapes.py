@@ -1,5 +1,6 @@
 """Triangle meshes of a benchmark's object, made in numpy, with a material a face."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +9,13 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 
 @dataclass(frozen=True)
 class Material:
-    """A Principled BSDF: linear Rec.709 base colour, metallic 0..1, perceptual roughness 0..1."""
+    """A Principled BSDF: linear Rec.709 base colour, metallic 0..1, perceptual roughness 0..1.
 
-    base_color: tuple[float, float, float]
+    A texture is a function from points (n, 3) to base colours (n, 3); it is evaluated at the vertices, and a triangle
+    shows what lies linearly between its corners.
+    """
+
+    base_color: tuple[float, float, float] | Callable[[np.ndarray], np.ndarray]
     metallic: float
     roughness: float
 
@@ -35,6 +40,22 @@ class Scene:
     materials: tuple[Material, ...]
     light: str
     lowest: float = -0.3
+
+
+def moved(mesh: Mesh, by: tuple[float, float, float]) -> Mesh:
+    """The mesh elsewhere."""
+    return Mesh(mesh.vertices + by, mesh.triangles, mesh.material)
+
+
+def step(start: float, end: float, values: np.ndarray) -> np.ndarray:
+    """From 0 at `start` to 1 at `end`, smoothly; for textures."""
+    t = ((values - start) / (end - start)).clip(0, 1)
+    return t * t * (3 - 2 * t)
+
+
+def mix(one, other, share: np.ndarray) -> np.ndarray:
+    """Colours (n, 3): `one` where share (n,) is 0, `other` where it is 1."""
+    return np.asarray(one) + share[:, None] * (np.asarray(other) - np.asarray(one))
 
 
 def join(*meshes: Mesh) -> Mesh:
