@@ -115,12 +115,17 @@ def demo(
     whole.run(out)
 
 
-@app.command()
-def bench(what: Annotated[str, typer.Argument(help="kernels, iteration, scaling, threads or gpu")] = "kernels") -> None:
-    """Measure the parts in milliseconds."""
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def bench(
+    context: typer.Context,
+    what: Annotated[
+        str, typer.Argument(help="kernels, iteration, scaling, threads, gpu, splitsum or paper")
+    ] = "kernels",
+) -> None:
+    """Measure the parts, in milliseconds or errors; `paper --data DIR [--out DIR] [--preset NAME]`: the whole on the paper's data."""
     from refgs import commands
 
-    commands.bench(what)
+    commands.bench(what, context.args)
 
 
 def _end(*_) -> None:

@@ -20,7 +20,6 @@ from refgs.errors import InputError
 from refgs.export.environment import read_environment, write_exr
 from refgs.export.splats import write_splats
 from refgs.kernels import cuda
-from refgs.model.environment import Environment
 from refgs.paths import clone_root
 from refgs.report.figures import DETAILS, HEADLINE, in_words, relit_in_words
 from refgs.report.pictures import color_picture, maps, picture, write_png
@@ -151,7 +150,7 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
     if hdri is not None:
         if run.environment is None:
             raise InputError("--hdri: a run with shading = sh has no materials to relight")
-        light = Environment.from_panorama(read_environment(hdri), run.settings.environment.resolution)
+        light = run.light(read_environment(hdri))
     to_run = np.linalg.inv(run.to_capture)
     views = [in_frame(camera, to_run) for camera in read_cameras(cameras)]
     background = np.array(run.settings.image.background)
@@ -240,11 +239,15 @@ def export(
     console.print(f"mesh: {target}")
 
 
-def bench(what: str) -> None:
-    """Run a benchmark of the repository."""
+def bench(what: str, options: list[str]) -> None:
+    """Run a benchmark of the repository, with the options that are its own."""
     files = (clone_root() / "benchmarks").glob("*.py")
-    names = sorted(file.stem for file in files if "__main__" in file.read_text(encoding="utf-8"))
+    texts = {file.stem: file.read_text(encoding="utf-8") for file in sorted(files)}
+    names = [name for name, text in texts.items() if "__main__" in text]
     if what not in names:
         raise InputError(f"no benchmark {what}: take one of {', '.join(names)}")
+    if options and "argparse" not in texts[what]:
+        raise InputError(f"{' '.join(options)}: the benchmark {what} has no options; leave them out")
     sys.path.insert(0, str(clone_root()))
+    sys.argv[1:] = options
     runpy.run_module(f"benchmarks.{what}", run_name="__main__")

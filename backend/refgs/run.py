@@ -12,6 +12,7 @@ import torch
 from refgs import __version__
 from refgs.camera import Camera
 from refgs.capture import Capture, read_run_cameras, write_cameras
+from refgs.color import srgb_encode
 from refgs.errors import InputError
 from refgs.export.environment import read_environment
 from refgs.export.splats import Splats, read_splats
@@ -53,6 +54,10 @@ class Run:
         """The cameras of the photos that were trained on, at the size they were trained at."""
         side = self.settings.image.max_side
         return [c.fitted(side) for c, split in zip(self.cameras, self.splits, strict=True) if split == "train"]
+
+    def light(self, panorama: np.ndarray) -> Environment:
+        """Another light for `render`: an equirectangular picture (H, W, 3) of linear radiance, in Blender's orientation."""
+        return _light(panorama, self.settings)
 
     def render(self, camera: Camera, environment: Environment | None = None) -> Rendering:
         """Render a camera of the run's frame, under another light where one is given: without inter-reflection then,
@@ -123,9 +128,8 @@ def open_run(folder: Path) -> Run:
         raise InputError(f"{folder}: the training has not ended: go on with `refgs train … --out {folder} --resume`")
     cameras, splits, to_capture = read_run_cameras(folder / "cameras.json")
     environment = None
-    if settings.render.shading == "deferred":
-        panorama = read_environment(folder / "environment.exr")
-        environment = Environment.from_panorama(panorama, settings.environment.resolution)
+    if settings.render.shading != "sh":
+        environment = _light(read_environment(folder / "environment.exr"), settings)
     return Run(
         folder=folder,
         settings=settings,
@@ -142,6 +146,11 @@ def open_run(folder: Path) -> Run:
         environment=environment,
         occluder=Occluder(read_mesh(folder / OCCLUDER)) if (folder / OCCLUDER).exists() else None,
     )
+
+
+def _light(panorama: np.ndarray, settings: Settings) -> Environment:
+    display = settings.render.color_space == "display"
+    return Environment.from_panorama(srgb_encode(panorama) if display else panorama, settings.environment.resolution)
 
 
 def write_text(file: Path, text: str) -> None:

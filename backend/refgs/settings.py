@@ -20,11 +20,17 @@ class ImageSettings(_Section):
 
 
 class RenderSettings(_Section):
-    shading: Literal["deferred", "sh"] = Field(description="split-sum materials, or plain view-dependent colour")
+    shading: Literal["deferred", "splat", "sh"] = Field(
+        description="split-sum materials, of what was blended or of each surfel before; or plain view-dependent colour"
+    )
     diffuse: Literal["irradiance", "sh"] = Field(description="diffuse light: from the environment, or SH per surfel")
+    color_space: Literal["linear", "display"] = Field(
+        description="radiance is linear, HDR, and encoded as sRGB at the end; or a screen's numbers, 0..1, as in the paper"
+    )
 
 
 class SurfelSettings(_Section):
+    primitive: Literal["2dgs", "3dgs"] = Field(description="flat discs, or 3D Gaussians, to compare with")
     start: int = Field(ge=1, le=10_000_000, description="surfels at the start")
     budget: int = Field(ge=1, le=10_000_000, description="surfels at the most")
     hull: int = Field(ge=16, le=512, description="voxels along each side of the visual hull's grid")
@@ -47,6 +53,14 @@ class TrainSettings(_Section):
     seed: int = Field(ge=0)
 
 
+class InitialSettings(_Section):
+    until: float = Field(
+        ge=0,
+        le=1,
+        description="part of the training in which each surfel is shaded by itself; then colour, material and light start anew",
+    )
+
+
 class IndirectSettings(_Section):
     start: float = Field(
         ge=0, le=1, description="part of the training after which inter-reflection joins; 1 does without"
@@ -57,7 +71,7 @@ class IndirectSettings(_Section):
 
 
 class RateSettings(_Section):
-    """Adam's learning rates, at the start; `decay` is the factor reached at the end. Position is in scene radii."""
+    """Adam's learning rates, at the start; the decays are the factors reached at the end. Position is in scene radii."""
 
     position: float = Field(ge=0)
     rotation: float = Field(ge=0)
@@ -71,7 +85,9 @@ class RateSettings(_Section):
     indirect_dc: float = Field(ge=0)
     indirect_rest: float = Field(ge=0)
     environment: float = Field(ge=0)
-    decay: float = Field(gt=0, le=1, description="every rate's factor at the end of the training")
+    decay: float = Field(gt=0, le=1, description="every rate's factor at the end of the training, but the position's")
+    position_decay: float = Field(gt=0, le=1, description="the position's, reached at `position_until`")
+    position_until: float = Field(gt=0, le=1, description="part of the training after which it stays")
 
 
 class LossSettings(_Section):
@@ -89,6 +105,21 @@ class DensifySettings(_Section):
     every: int = Field(ge=1, description="iterations")
     gradient: float = Field(ge=0, description="mean gradient per pixel of motion above which a surfel is divided")
     prune_opacity: float = Field(ge=0, lt=1, description="surfels fainter than this are removed")
+    reset_every: int = Field(
+        ge=0, description="iterations between making all surfels faint; 0 never does, nor after `stop`"
+    )
+
+
+class PropagationSettings(_Section):
+    """Material-aware normal propagation (paper §3.3): mirrors grow over what surrounds them, now and then."""
+
+    every: int = Field(ge=0, description="iterations; 0 does without")
+    stop: float = Field(ge=0, le=1, description="part of the training after which there is no more of it")
+    metallic: float = Field(ge=0, le=1, description="of surfels that grow, at the least")
+    roughness: float = Field(ge=0, le=1, description="of surfels that grow, at the most")
+    growth: float = Field(ge=1, description="factor of their size")
+    opacity: float = Field(gt=0, lt=1, description="of all surfels then, at the least")
+    rest: int = Field(ge=0, description="iterations for which opacity then stays as it is")
 
 
 class MeshSettings(_Section):
@@ -105,14 +136,18 @@ class Settings(_Section):
     surfels: SurfelSettings
     environment: EnvironmentSettings
     train: TrainSettings
+    initial: InitialSettings
     indirect: IndirectSettings
     rates: RateSettings
     loss: LossSettings
     densify: DensifySettings
+    propagation: PropagationSettings
     mesh: MeshSettings
 
 
-SHORT = {"shading": "render.shading", "diffuse": "render.diffuse"}  # keys that `--set` takes without their section
+SHORT = {"primitive": "surfels.primitive"} | {
+    key: f"render.{key}" for key in RenderSettings.model_fields
+}  # keys that `--set` takes without their section
 
 
 def preset_names() -> list[str]:

@@ -1,6 +1,7 @@
 """Tiny captures of every layout, made on the spot: a ball with a red top and a green bottom, seen from around it."""
 
 import json
+import pickle
 import struct
 from pathlib import Path
 
@@ -34,6 +35,16 @@ def ring(count: int = 16, distance: float = 3.0, centre: np.ndarray = CENTRE) ->
 
 def ball(pose: np.ndarray, width: int, height: int, focal: float, centre: np.ndarray = CENTRE) -> np.ndarray:
     """RGBA (H, W, 4) uint8 of the ball, by ray casting; principal point in the middle."""
+    normals = ball_normals(pose, width, height, focal, centre)
+    image = np.zeros((height, width, 4), np.uint8)
+    image[..., :3] = np.where(normals[..., 2:] > 0, (220, 0, 0), (20, 200, 0))
+    image[..., 3] = 255
+    image[np.isnan(normals[..., 0])] = 0
+    return image
+
+
+def ball_normals(pose: np.ndarray, width: int, height: int, focal: float, centre: np.ndarray = CENTRE) -> np.ndarray:
+    """The ball's normals (H, W, 3) in the world, NaN where there is none."""
     u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     rays = np.stack([u / focal, -v / focal, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -41,11 +52,7 @@ def ball(pose: np.ndarray, width: int, height: int, focal: float, centre: np.nda
     along = rays @ offset
     root = along**2 - (offset @ offset - RADIUS**2)
     point = offset + rays * (-along - np.sqrt(np.maximum(root, 0)))[..., None]
-    image = np.zeros((height, width, 4), np.uint8)
-    image[..., :3] = np.where(point[..., 2:] > 0, (220, 0, 0), (20, 200, 0))
-    image[..., 3] = 255
-    image[root <= 0] = 0
-    return image
+    return np.where(root[..., None] > 0, point / RADIUS, np.nan)
 
 
 def write(path: Path, image: np.ndarray) -> None:
@@ -125,6 +132,41 @@ def colmap(
         (sparse / "images.txt").write_text(text)
         rows = (f"{i} {x!r} {y!r} {z!r} 255 128 0 0.5 1 0 2 1\n" for i, (x, y, z) in enumerate(points.tolist()))
         (sparse / "points3D.txt").write_text("# Number of points: 50, mean track length: 2\n" + "".join(rows))
+    return folder
+
+
+def shiny_blender(folder: Path) -> Path:
+    """Ref-NeRF's scene `ball`: opaque photos with NAME_alpha.png beside them, normals in the world and disparities."""
+    nerf_blender(folder)
+    for split in ("train", "test"):
+        frames = json.loads((folder / f"transforms_{split}.json").read_text())["frames"]
+        for frame in frames:
+            photo = folder / f"{frame['file_path']}.png"
+            pose = np.array(frame["transform_matrix"])
+            image = ball(pose, 64, 48, 60.0)
+            inside = image[..., 3] > 0
+            write(photo, np.where(inside[..., None], image[..., :3], 40).astype(np.uint8))
+            write(photo.with_name(f"{photo.stem}_alpha.png"), image[..., 3])
+            normal = np.where(inside[..., None], ball_normals(pose, 64, 48, 60.0), 0)
+            write(photo.with_name(f"{photo.stem}_normal.png"), np.rint(127.5 * (normal + 1)).astype(np.uint8))
+            write(photo.with_name(f"{photo.stem}_disp.tiff"), image[..., 3])
+    return folder
+
+
+def nero(folder: Path, count: int = 16, split: tuple[list, list] | None = None, protocol: int = 4) -> Path:
+    """A scene of Glossy Synthetic: opaque photos, 16-bit depth, cameras as pickles; beside it the split."""
+    folder.mkdir(parents=True)
+    for i, pose in enumerate(ring(count)):
+        image = ball(pose, 64, 48, 60.0)
+        inside = image[..., 3] > 0
+        write(folder / f"{i}.png", np.where(inside[..., None], image[..., :3], 40).astype(np.uint8))
+        depth = np.where(inside, 2.5 / 15 * 65535, 65535)
+        write(folder / f"{i}-depth.png", np.rint(depth).astype(np.uint16))
+        world_to_camera = np.linalg.inv(pose @ FLIP)[:3]
+        matrix = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)
+        (folder / f"{i}-camera.pkl").write_bytes(pickle.dumps((world_to_camera, matrix), protocol))
+    if split is not None:
+        (folder.parent / "synthetic_split_128.pkl").write_bytes(pickle.dumps(split, protocol))
     return folder
 
 

@@ -1,12 +1,13 @@
 """What is wrong with a capture is said in one line that names the place."""
 
 import json
+import pickle
 
 import numpy as np
 import pytest
-from makers import colmap, edit, nerf_blender, nerfstudio, ring, write
+from makers import colmap, edit, nerf_blender, nerfstudio, nero, ring, shiny_blender, write
 
-from refgs.capture import load_view, read_cameras, read_capture
+from refgs.capture import load_view, published_normals, read_cameras, read_capture
 from refgs.errors import InputError
 
 
@@ -222,3 +223,58 @@ def test_camera_file(tmp_path):
     refused(lambda: read_cameras(file), "image size", "w and h")
     file.write_text(json.dumps({"frames": []}))
     refused(lambda: read_cameras(file), "no frames")
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ((np.eye(4), np.eye(3)), "(3, 4) pose"),
+        ((np.eye(3, 4),), "not a pickle"),
+        (({"a": 1}, np.eye(3)), "a dict"),
+        ((np.array([[None] * 4] * 3), np.eye(3)), "not a pickle"),
+        ((np.array([["1"] * 4] * 3), np.eye(3)), "an array of"),
+        ((np.full((3, 4), np.nan), np.diag([60.0, 60, 1])), "NaN"),
+        ((np.zeros((3, 4)), np.diag([60.0, 60, 1])), "inverted"),
+        ((np.eye(3, 4), np.diag([0.0, 60, 1])), "focal length"),
+        ((np.eye(3, 4), np.full((3, 3), np.nan)), "focal length"),
+        ((np.eye(3, 4), np.array([[60.0, 7, 32], [0, 60, 24], [0, 0, 1]])), "skewed"),
+        ((np.diag([1.0, 1, -1, 1])[:3], np.diag([60.0, 60, 1])), "left-handed"),
+        ((np.zeros(1 << 20), np.eye(3)), "larger than"),
+    ],
+)
+def test_cameras_of_nero(tmp_path, content, says):
+    folder = nero(tmp_path / "bell")
+    (folder / "5-camera.pkl").write_bytes(pickle.dumps(content))
+    refused(lambda: read_capture(folder), "5-camera.pkl", says)
+
+
+def test_missing_photos_of_nero(tmp_path):
+    folder = nero(tmp_path / "bell")
+    (folder / "7.png").unlink()
+    refused(lambda: read_capture(folder), "1 of the 16", "7.png")
+
+
+@pytest.mark.parametrize(
+    ("split", "says"),
+    [
+        ((["1"], ["2", "3"]), "1 + 2 views"),
+        ((["1"], [str(i) for i in range(16)]), "which are not the 16"),
+        ((["one"], ["two"]), "not the numbers"),
+        ((["1"], 2), "not a pickle"),
+    ],
+)
+def test_splits_of_nero(tmp_path, split, says):
+    refused(lambda: read_capture(nero(tmp_path / "bell", split=split)), "synthetic_split_128.pkl", says)
+
+
+def test_missing_photos_among_the_reduced(tmp_path):
+    folder = colmap(tmp_path)
+    (folder / "images_8").mkdir()
+    refused(lambda: read_capture(folder / "images_8"), "16 of the 16", "images_8/0000.png")
+
+
+def test_published_normals_of_another_size(tmp_path):
+    folder = shiny_blender(tmp_path)
+    write(folder / "test" / "r_0_normal.png", np.zeros((24, 32, 3), np.uint8))
+    capture = read_capture(folder)
+    refused(lambda: published_normals(capture.test_views[0]), "r_0_normal.png", "32×24", "64×48")

@@ -4,10 +4,23 @@ import json
 
 import numpy as np
 import pytest
-from makers import CENTRE, RADIUS, ball, colmap, edit, nerf_blender, nerfstudio, ring, write
+from makers import (
+    CENTRE,
+    RADIUS,
+    ball,
+    ball_normals,
+    colmap,
+    edit,
+    nerf_blender,
+    nerfstudio,
+    nero,
+    ring,
+    shiny_blender,
+    write,
+)
 from plyfile import PlyData, PlyElement
 
-from refgs.capture import load_view, read_capture
+from refgs.capture import load_view, published_normals, read_capture, read_run_cameras, write_cameras
 
 RED, GREEN, NOTHING = (220, 0, 0), (20, 200, 0), (0, 0, 0)
 
@@ -37,10 +50,11 @@ def assert_sees_the_ball(capture):
         ):
             point = (to_run @ np.append(CENTRE + RADIUS * offset, 1))[:3]
             u, v = project(view.camera, point).astype(int)
-            assert tuple(loaded.image[v, u]) == expected
+            shown = loaded.image[v, u] if loaded.alpha is None or loaded.alpha[v, u] else NOTHING
+            assert tuple(shown) == expected
 
 
-@pytest.fixture(params=["nerf-blender", "nerfstudio", "colmap", "colmap-text"])
+@pytest.fixture(params=["nerf-blender", "nerfstudio", "colmap", "colmap-text", "nero"])
 def capture(request, tmp_path):
     folder = tmp_path / "été dans le jardin"
     make = {
@@ -48,6 +62,7 @@ def capture(request, tmp_path):
         "nerfstudio": nerfstudio,
         "colmap": colmap,
         "colmap-text": lambda path: colmap(path, binary=False),
+        "nero": nero,
     }
     capture = read_capture(make[request.param](folder))
     assert capture.layout == request.param.removesuffix("-text")
@@ -262,3 +277,110 @@ def test_json_with_a_byte_order_mark(tmp_path):
     file = nerfstudio(tmp_path) / "transforms.json"
     file.write_text(json.dumps(json.loads(file.read_text())), encoding="utf-8-sig")
     assert len(read_capture(tmp_path).views) == 16
+
+
+def test_nerf_synthetic_passes_over_depth_and_normals(tmp_path):
+    folder = nerf_blender(tmp_path, {"train": 12, "val": 3, "test": 4})
+    for photo in sorted((folder / "test").glob("r_?.png")):
+        for what in ("depth", "normal"):
+            write(photo.with_name(f"{photo.stem}_{what}_0001.png"), np.zeros((48, 64, 4), np.uint8))
+    capture = read_capture(folder)
+    assert [view.image_path.name for view in capture.test_views] == ["r_0.png", "r_1.png", "r_2.png", "r_3.png"]
+    assert published_normals(capture.test_views[0]) is None
+    assert_sees_the_ball(capture)
+
+
+def test_shiny_blenders_ball_has_its_alpha_beside_it(tmp_path):
+    capture = read_capture(shiny_blender(tmp_path))
+    assert capture.masked and capture.bounded and not capture.warnings
+    assert (len(capture.train_views), len(capture.test_views)) == (12, 4)
+    assert_sees_the_ball(capture)
+
+
+@pytest.mark.parametrize("max_side", [None, 32])
+def test_published_normals(tmp_path, max_side):
+    capture = read_capture(shiny_blender(tmp_path))
+    for view, pose in zip(capture.test_views, ring(4), strict=True):
+        loaded = load_view(view, max_side)
+        normals, alpha = published_normals(view, max_side)
+        assert normals.shape == loaded.image.shape and alpha.shape == loaded.alpha.shape
+        assert normals.dtype == alpha.dtype == np.float32
+        np.testing.assert_allclose(alpha * 255, loaded.alpha, atol=0.51)
+        assert not normals[alpha == 0].any()
+        height, width = alpha.shape
+        true = ball_normals(pose, width, height, loaded.camera.fx)
+        inside = (alpha > 0.99) & np.isfinite(true[..., 0])
+        assert inside.sum() > 20
+        np.testing.assert_allclose(np.linalg.norm(normals[inside], axis=-1), 1, atol=1e-5)
+        angle = np.degrees(np.arccos(np.clip((normals * true).sum(-1)[inside], -1, 1)))
+        assert np.median(angle) < (1.5 if max_side else 0.5)
+
+
+def test_other_layouts_publish_no_normals(tmp_path):
+    folder = nerfstudio(tmp_path)
+    write(folder / "images" / "0000_normal.png", np.zeros((48, 64, 3), np.uint8))
+    capture = read_capture(folder)
+    assert published_normals(capture.test_views[0]) is None
+
+
+def test_glossy_synthetic_with_its_split(tmp_path):
+    split = (["3", "1", "12"], [str(i) for i in range(16) if i not in (1, 3, 12)])
+    capture = read_capture(nero(tmp_path / "bell", split=split))
+    assert [view.camera.name for view in capture.test_views] == ["1", "3", "12"]
+    assert len(capture.train_views) == 13 and capture.masked and not capture.warnings
+    write_cameras(tmp_path / "cameras.json", capture)
+    cameras, splits, to_capture = read_run_cameras(tmp_path / "cameras.json")
+    assert splits.count("test") == 3 and np.allclose(to_capture, capture.to_capture)
+    assert [camera.fx for camera in cameras] == [60] * 16
+
+
+def test_glossy_synthetic_without_its_split(tmp_path):
+    capture = read_capture(nero(tmp_path / "bell", count=18))
+    assert [view.camera.name for view in capture.test_views] == ["0", "8", "16"]
+    assert len(capture.warnings) == 1 and "synthetic_split_128.pkl" in capture.warnings[0]
+
+
+def test_glossy_synthetic_without_depth_takes_the_photos_alpha(tmp_path):
+    folder = nero(tmp_path / "bell")
+    for i, pose in enumerate(ring(16)):
+        (folder / f"{i}-depth.png").unlink()
+        write(folder / f"{i}.png", ball(pose, 64, 48, 60.0))
+    capture = read_capture(folder)
+    assert capture.masked
+    assert_sees_the_ball(capture)
+
+
+def test_glossy_synthetic_converted_to_nerf_blender(tmp_path):
+    """As its users convert it: photos of both splits in `rgb`, and sizes and focal lengths in the files."""
+    folder = nerf_blender(tmp_path)
+    (folder / "rgb").mkdir()
+    for split, first in (("train", 0), ("test", 20)):
+
+        def convert(data, split=split, first=first):
+            data.update(w=64, h=48, fl_x=60.0, fl_y=60.0)
+            for i, frame in enumerate(data["frames"]):
+                (folder / split / f"r_{i}.png").rename(folder / "rgb" / f"{first + i}.png")
+                frame["file_path"] = f"rgb/{first + i}"
+
+        edit(folder / f"transforms_{split}.json", convert)
+    capture = read_capture(folder)
+    assert capture.masked and len(capture.test_views) == 4
+    assert_sees_the_ball(capture)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".PNG", ".webp"])
+def test_reduced_photos_of_a_colmap_capture(tmp_path, suffix):
+    """Ref-NeRF's real scenes: naming `images_4` takes its photos, every eighth for testing as with the others."""
+    folder = colmap(tmp_path / "sedan")
+    for i, pose in enumerate(ring(16)):
+        write(folder / "images_4" / f"{i:04d}.png", ball(pose, 16, 12, 15.0)[..., :3])
+        (folder / "images_4" / f"{i:04d}.png").rename(folder / "images_4" / f"{i:04d}{suffix}")
+    capture = read_capture(folder / "images_4")
+    assert capture.layout == "colmap" and capture.points is not None
+    assert [view.camera.name for view in capture.test_views] == ["0000", "0008"]
+    whole = read_capture(folder)
+    assert [view.camera.name for view in whole.test_views] == ["0000", "0008"]
+    for small, large in zip(capture.views, whole.views, strict=True):
+        assert (small.camera.width, small.camera.height) == (16, 12)
+        assert small.camera.fx == pytest.approx(large.camera.fx / 4)
+        assert small.image_path.parent.name == "images_4"

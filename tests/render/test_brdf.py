@@ -1,36 +1,123 @@
-import math
+"""The table of what materials reflect of an even light, against the rendering equation."""
 
 import numpy as np
 import pytest
 import torch
 
 from refgs.kernels import reference
+from refgs.render.brdf import bounces
+
+# What Cycles 4.5 renders of a plane under a white world, as a Principled BSDF with its defaults, 65 000 samples each; errors of
+# 0.0003 to 0.0005. Roughness, degrees from the normal, then: a metal of base colour (0.9, 0.6, 0.3); a black dielectric.
+CYCLES = [
+    (0.1, 60, (0.9031, 0.6125, 0.3219), 0.0892),
+    (0.2, 0, (0.8999, 0.5996, 0.2997), 0.0400),
+    (0.2, 80, (0.9332, 0.7325, 0.5355), 0.3506),
+    (0.4, 60, (0.8967, 0.5948, 0.3058), 0.0794),
+    (0.4, 80, (0.9064, 0.6414, 0.3955), 0.1974),
+    (0.7, 0, (0.8650, 0.5157, 0.2331), 0.0294),
+    (0.7, 60, (0.8669, 0.5225, 0.2425), 0.0458),
+    (1.0, 0, (0.7724, 0.3502, 0.1274), 0.0138),
+    (1.0, 80, (0.8406, 0.4879, 0.2295), 0.0477),
+]
 
 
-def integrate(n_v: float, roughness: float, f0: float, steps: int = 1500) -> float:
-    """∫ f_s (N·L) dL by quadrature over the half vector, in float64: independent of the table's sampling."""
-    a = roughness**2
-    u = (np.arange(steps) + 0.5) / steps
-    # θ_h from the CDF of D cos θ gives a smooth integrand; φ uniform.
-    cos_h = np.sqrt((1 - u) / (1 + (a * a - 1) * u))[:, None]
-    phi = 2 * math.pi * ((np.arange(steps // 2) + 0.5) / (steps // 2))[None, :]
-    sin_h = np.sqrt(1 - cos_h**2)
-    v_h = math.sqrt(1 - n_v**2) * sin_h * np.cos(phi) + n_v * cos_h
-    n_l = 2 * v_h * cos_h - n_v
-    seen = (n_l > 0) & (v_h > 0)
-    n_l = np.where(seen, n_l, 1.0)
-
-    def lam(c):
-        return (np.sqrt(1 + a * a * (1 - c * c) / (c * c)) - 1) / 2
-
-    g = 1 / (1 + lam(n_l) + lam(np.array(n_v)))
-    fresnel = f0 + (1 - f0) * (1 - np.clip(v_h, 0, 1)) ** 5
-    return float(np.where(seen, fresnel * g * v_h / (cos_h * n_v), 0).mean())
+def schlick(cosine: np.ndarray) -> np.ndarray:
+    return (1 - cosine) ** 5
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.25, 0.5, 0.9])
-@pytest.mark.parametrize("n_v", [0.15, 0.5, 0.95])
-def test_table_matches_quadrature(n_v, roughness):
-    fg0, fg1 = reference.fg(torch.tensor([n_v]), torch.tensor([roughness]))
-    for f0 in (0.04, 1.0):
-        assert float(f0 * fg0 + fg1) == pytest.approx(integrate(n_v, roughness, f0), abs=2e-3)
+def dielectric(cosine: np.ndarray) -> np.ndarray:
+    """Fresnel's equations at an index of 1.5, by the angle of refraction."""
+    inside = np.sqrt(1 - (1 - cosine**2) / 1.5**2)
+    across, along = (cosine - 1.5 * inside) / (cosine + 1.5 * inside), (inside - 1.5 * cosine) / (inside + 1.5 * cosine)
+    return (across**2 + along**2) / 2
+
+
+def integrate(n_v: np.ndarray, roughness: np.ndarray, nodes: int) -> np.ndarray:
+    """∫ D G2 F / (4 N·L N·V) N·L dL (3, P) for F of 1 − Schlick's (1 − V·H)⁵, of that, and a dielectric's.
+
+    Over light directions, in polar coordinates about the mirrored view, that far out that they are above the horizon. The
+    table is made over half vectors.
+    """
+    x, weight = np.polynomial.legendre.leggauss(nodes)
+    at, weight = np.sin(np.pi / 4 * (x + 1)) ** 2, weight * np.pi / 4 * np.cos(np.pi / 2 * x)
+    sums = []
+    for chunk in np.array_split(np.arange(len(n_v)), max(1, len(n_v) * nodes**2 // 500_000)):
+        c = n_v[chunk][:, None, None]
+        a2, s = roughness[chunk][:, None, None] ** 4, np.sqrt(1 - c**2)
+        total = np.zeros((3, len(chunk)))
+        rise = np.arcsin(c)  # of the mirrored view above the horizon
+        for low, high in ((0 * c, rise), (rise, np.pi - rise)):
+            low, high = (np.arctan(np.tan(np.minimum(b, np.pi - 1e-9) / 2) / np.sqrt(a2)) for b in (low, high))
+            psi = low + (high - low) * at[:, None]  # tan β/2 = α tan ψ
+            tangent = np.sqrt(a2) * np.tan(psi)
+            c_b, s_b = (1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2)
+            by_psi = 2 * np.sqrt(a2) * (1 + np.tan(psi) ** 2) / (1 + tangent**2) * (high - low) * weight[:, None]
+            end = np.arccos(np.clip(-c * c_b / np.maximum(s * s_b, 1e-300), -1, 1))  # of the azimuths above the horizon
+            azimuth = end * at
+            n_l = np.maximum(c_b * c + s_b * s * np.cos(azimuth), 1e-12)
+            v_l = c_b * (2 * c**2 - 1) + s_b * np.cos(azimuth) * 2 * s * c
+            v_h = np.sqrt(np.maximum(1 + v_l, 1e-30) / 2)
+            n_h2 = ((n_l + c) / (2 * v_h)) ** 2
+            # 1 - (1 - α²) N·H² would lose all of a small α's digits; 1 - N·H² by what H has beside N: L's part across the plane.
+            across = (s_b * np.sin(azimuth)) ** 2
+            within = (s + c_b * -s + s_b * np.cos(azimuth) * c) ** 2
+            slope = (across + within) / (n_l + c) ** 2
+            d = a2 / (np.pi * n_h2**2 * (slope + a2) ** 2)
+            smith = [(np.sqrt(1 + a2 * (1 / n**2 - 1)) - 1) / 2 for n in (n_l, c)]
+            share = d / (1 + smith[0] + smith[1]) / (4 * c) * s_b * by_psi * 2 * end * weight
+            v_h = np.minimum(v_h, 1)
+            for i, fresnel in enumerate((1 - schlick(v_h), schlick(v_h), dielectric(v_h))):
+                total[i] += (fresnel * share).sum(axis=(1, 2))
+        sums.append(total)
+    return np.concatenate(sums, axis=1)
+
+
+def grid(n_v: np.ndarray, roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return tuple(v.ravel() for v in np.meshgrid(n_v, roughness))
+
+
+def test_the_integral_converges():
+    """Faster than any power of the nodes: 32 are right to a 40th of what the table may err by."""
+    points = grid(np.array([0.02, 0.05, 0.3, 0.7, 1 - 1e-9]), np.array([0.03, 0.05, 0.1, 0.3, 1.0]))
+    finest = integrate(*points, 96)
+    found = [abs(integrate(*points, nodes) - finest).max() for nodes in (16, 32, 64)]
+    print("the integral's error by 16, 32, 64 nodes:", found)
+    assert found[1] < 2.5e-5 and found[2] < 1e-7
+
+
+def test_table_everywhere():
+    """As the kernels look it up, between its entries too: FG0, FG1, a dielectric's bounce, reflectance at F0 of 0.04 and of 1."""
+    n_v, roughness = grid(np.linspace(0.02, 1 - 1e-9, 59), np.linspace(0.03, 1, 61))
+    exact = integrate(n_v, roughness, 32)
+    fg0, fg1, average, coat = reference.table(torch.from_numpy(n_v), torch.from_numpy(roughness)).numpy().T
+    cosine, weight = np.polynomial.legendre.leggauss(32)
+    cosine = (cosine + 1) / 2
+    rows = np.linspace(0.03, 1, 61)
+    energy = integrate(*grid(cosine, rows), 32)[:2].sum(axis=0).reshape(61, 32)
+    average_energy = np.repeat(energy @ (cosine * weight), 59)
+    coat_exact = exact[2] * bounces((dielectric(cosine) * cosine) @ weight, exact[0] + exact[1], average_energy)
+    pairs = {
+        "FG0": (fg0, exact[0]),
+        "FG1": (fg1, exact[1]),
+        "F0 = 0.04": (0.04 * fg0 + fg1, 0.04 * exact[0] + exact[1]),
+        "F0 = 1": (fg0 + fg1, exact[0] + exact[1]),
+        "the rows' mean": (average, average_energy),
+        "dielectric": (coat, coat_exact),
+    }
+    for name, (found, expected) in pairs.items():
+        error = abs(found - expected)
+        at = error.argmax()
+        print(
+            f"{name}: {error[at]:.1e} at N·V {n_v[at]:.3f}, roughness {roughness[at]:.3f}; RMS {(error**2).mean() ** 0.5:.0e}"
+        )
+        assert error[at] < 1e-3, name
+
+
+@pytest.mark.parametrize(("roughness", "angle", "metal", "black"), CYCLES)
+def test_reflects_as_cycles_does(roughness, angle, metal, black):
+    """A metal, and what lies over a dielectric's base."""
+    n_v, albedo = torch.tensor([np.cos(np.radians(angle))]), torch.tensor([[0.9, 0.6, 0.3]]).double()
+    found = reference.reflectance(n_v, torch.tensor([roughness]).double(), albedo)
+    assert found[0][0].tolist() == pytest.approx(metal, abs=1.5e-3)
+    assert found[1][0].tolist() == pytest.approx([black], abs=1.5e-3)

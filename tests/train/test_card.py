@@ -33,7 +33,7 @@ def make_trainer(capture, folder, *changes: str, device: str = "cpu") -> Trainer
     return Trainer(read_capture(capture), settings, folder, lambda *_: None, device=device)
 
 
-@pytest.mark.parametrize("changes", [["indirect.start=0"], ["render.shading=sh"]])
+@pytest.mark.parametrize("changes", [["indirect.start=0"], ["render.shading=sh"], ["initial.until=1.0"]])
 def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
     """The same steps with the kernels of both, the object in its own way, too."""
     figures, learned = [], []
@@ -74,7 +74,7 @@ def follow_to_the_card(monkeypatch) -> list[str]:
         return made
 
     tables = [(prefilter, "matrices"), (prefilter, "_pyramid"), (prefilter, "_projection"), (prefilter, "_order")]
-    for home, name in [*tables, (shade, "_fg_table"), (shade._Padding, "of")]:
+    for home, name in [*tables, (shade, "_reflectance"), (shade._Padding, "of")]:
         monkeypatch.setattr(home, name, computed_on_the_cpu(getattr(home, name)))
     launched = []
     monkeypatch.setattr(cuda, "launch", lambda name, *_: launched.append(name))

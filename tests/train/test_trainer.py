@@ -91,7 +91,10 @@ def test_history_grows_with_time(ball):
 INDIRECT = ["indirect.start=0.2", "indirect.every=30", "indirect.least=0", "indirect.resolution=32"]
 
 
-@pytest.mark.parametrize("changes", [[], ["shading=sh"], ["diffuse=sh"], INDIRECT])
+STAGES = ["initial.until=0.5", "densify.reset_every=30", "propagation.every=20", "propagation.rest=15"]
+
+
+@pytest.mark.parametrize("changes", [[], ["shading=sh"], ["diffuse=sh"], INDIRECT, STAGES])
 def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
     """Bit for bit, through densification."""
     changes = [*changes, "train.checkpoint_every=40", "densify.every=25"]

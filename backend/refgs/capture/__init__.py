@@ -11,8 +11,9 @@ import numpy as np
 from refgs.capture.cameras import read_cameras, read_run_cameras, write_cameras
 from refgs.capture.colmap import find_model, read_colmap
 from refgs.capture.images import LoadedView, load_view
-from refgs.capture.nerf_blender import read_nerf_blender
+from refgs.capture.nerf_blender import published_normals, read_nerf_blender
 from refgs.capture.nerfstudio import read_nerfstudio
+from refgs.capture.nero import read_nero
 from refgs.capture.poses import in_frame
 from refgs.capture.region import find_region, run_frame, sample_silhouettes, up_direction
 from refgs.capture.types import Capture, View
@@ -23,6 +24,7 @@ __all__ = [
     "LoadedView",
     "View",
     "load_view",
+    "published_normals",
     "read_cameras",
     "read_capture",
     "read_run_cameras",
@@ -45,13 +47,17 @@ def read_capture(folder: Path) -> Capture:
     elif (folder / "transforms.json").is_file():
         layout = "nerfstudio"
         views, points, colors, warnings = read_nerfstudio(folder)
-    elif (model := find_model(folder)) is not None:
+    elif (found := find_model(folder)) is not None:
         layout = "colmap"
-        views, points, colors = read_colmap(folder, model)
+        views, points, colors = read_colmap(*found)
+    elif (folder / "0-camera.pkl").is_file():
+        layout = "nero"
+        views, warnings = read_nero(folder)
     else:
         raise InputError(
             f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender), transforms.json (nerfstudio, "
-            "instant-ngp) and sparse/0 (COLMAP). Photos alone need camera poses first, from COLMAP for instance."
+            "instant-ngp), sparse/0 (COLMAP) and 0-camera.pkl (NeRO). Photos alone need camera poses first, from COLMAP "
+            "for instance."
         )
     photos = Counter((view.split, view.image_path) for view in views)
     for (_, path), count in photos.items():

@@ -8,7 +8,12 @@ from refgs.capture.images import LoadedView, load_view
 from refgs.capture.types import Capture, View
 from refgs.errors import InputError
 
-LAYOUTS = {"nerf-blender": "NeRF-Blender", "nerfstudio": "nerfstudio / instant-ngp", "colmap": "COLMAP"}
+LAYOUTS = {
+    "nerf-blender": "NeRF-Blender",
+    "nerfstudio": "nerfstudio / instant-ngp",
+    "colmap": "COLMAP",
+    "nero": "NeRO's Glossy Synthetic",
+}
 
 
 def describe(capture: Capture) -> list[str]:

@@ -1,5 +1,8 @@
 """COLMAP: a sparse model in `sparse/0` or `sparse`, binary or text, with the photos in `images`.
 
+Ref-NeRF's real scenes and mip-NeRF 360's have the photos reduced as well, in `images_2`, `images_4` and `images_8`:
+naming such a folder takes its photos, which may have another ending than those in the model.
+
 The files are those of COLMAP's documentation, "Output Format". COLMAP's own reader is a large dependency that answers
 a file cut short with an unrelated message or a request for terabytes of memory; this one names the file.
 """
@@ -12,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import Masks, photo_view, report_missing
+from refgs.capture.files import Masks, find_image, photo_view, report_missing
 from refgs.capture.lens import Lens
 from refgs.capture.poses import world_to_camera
 from refgs.capture.transforms import camera_name
@@ -51,14 +54,20 @@ class _Image:
     pose: tuple[float, ...]  # qw qx qy qz tx ty tz, world to camera
 
 
-def find_model(folder: Path) -> Path | None:
-    """The folder of a capture's sparse model, None where there is none."""
-    candidates = (folder / "sparse" / "0", folder / "sparse")
+def find_model(folder: Path) -> tuple[Path, Path] | None:
+    """The folders of a capture's photos and of its sparse model, None where there is no model.
+
+    `folder` is the capture's, or that of its reduced photos.
+    """
+    reduced = re.fullmatch(r"images_\d+", folder.name)
+    root, photos = (folder.parent, folder) if reduced else (folder, folder / "images")
+    candidates = (root / "sparse" / "0", root / "sparse")
     names = ("cameras.bin", "cameras.txt", "images.bin", "images.txt")
-    return next((path for path in candidates if any((path / name).is_file() for name in names)), None)
+    model = next((path for path in candidates if any((path / name).is_file() for name in names)), None)
+    return None if model is None else (photos, model)
 
 
-def read_colmap(folder: Path, model: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None]:
+def read_colmap(photos: Path, model: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None]:
     """The views, points (M, 3) and their colours (M, 3) in 0..1, in the model's frame. Raises InputError."""
     suffix = ".bin" if (model / "images.bin").is_file() else ".txt"
     cameras_file, images_file, points_file = (model / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
@@ -70,10 +79,9 @@ def read_colmap(folder: Path, model: Path) -> tuple[list[View], np.ndarray | Non
     images = sorted(_parse(images_file, readers[1]), key=lambda image: image.name)
     points, colors = _parse(points_file, readers[2]) if points_file.is_file() else (None, None)
 
-    photos = folder / "images"
-    found = [(image, photos / image.name) for image in images]
-    report_missing(images_file, [f"images/{i.name}" for i, path in found if not path.is_file()], len(found))
-    masks = Masks(folder)
+    found = [(image, find_image(photos / image.name, any_suffix=True)) for image in images]
+    report_missing(images_file, [f"{photos.name}/{i.name}" for i, path in found if path is None], len(found))
+    masks = Masks(photos.parent)
     views = []
     for image, path in found:
         where = f"{images_file}, image {image.name}"

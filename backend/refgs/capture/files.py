@@ -12,10 +12,12 @@ from refgs.errors import InputError
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 
 
-def find_image(path: Path) -> Path | None:
-    """The file at `path`, or at `path` with an image's extension added; None where there is none."""
+def find_image(path: Path, any_suffix: bool = False) -> Path | None:
+    """The file at `path`, or at `path` with an image's extension added (or put in place of its own); None without."""
     if path.is_file():
         return path
+    if any_suffix and path.suffix.lower() in IMAGE_SUFFIXES:
+        path = path.with_suffix("")
     names = (path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES + tuple(map(str.upper, IMAGE_SUFFIXES)))
     return next((name for name in names if name.is_file()), None)
 
@@ -30,7 +32,10 @@ def report_missing(source: Path, missing: list[str], total: int) -> None:
 
 
 class Masks:
-    """The masks of a capture: its folder `masks`, NAME.any or NAME.jpg.any, with the photos' sub-folders if any."""
+    """The masks of a capture: its folder `masks`, NAME.any or NAME.jpg.any, with the photos' sub-folders if any.
+
+    Else NAME_alpha.png beside the photo, as in the scene `ball` of Shiny Blender.
+    """
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -53,7 +58,8 @@ class Masks:
             mask = self.files.get(name) or self.files.get(name.removesuffix(image.suffix))
             if mask is not None:
                 return mask
-        return None
+        beside = image.with_name(f"{image.stem}_alpha.png")
+        return beside if beside.is_file() else None
 
 
 def photo_view(
@@ -62,6 +68,7 @@ def photo_view(
     split: Split,
     mask: Path | None,
     where: str,
+    mask_below: float | None = None,
 ) -> View:
     """The view of a photo: `as_given` is the camera and its lens as the capture's file has them.
 
@@ -89,4 +96,4 @@ def photo_view(
                 f"{mask}: the mask has {mask_size[0]}×{mask_size[1]} pixels but its photo {image.name} "
                 f"{width}×{height}. Make the mask the photo's size."
             )
-    return View(camera, image, mask, split, lens, has_alpha and mask is None)
+    return View(camera, image, mask, split, lens, has_alpha and mask is None, mask_below)

@@ -39,12 +39,17 @@ def read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """
     with _open(path) as picture:
         pixels = np.asarray(_decode(picture, path))
-    return np.ascontiguousarray(pixels[..., :3]), (pixels[..., 3].copy() if pixels.shape[2] == 4 else None)
+    return pixels[..., :3].copy(), (pixels[..., 3].copy() if pixels.shape[2] == 4 else None)
 
 
-def read_mask(path: Path) -> np.ndarray:
-    """A mask file as alpha (H, W) uint8: white is the object. Cut-outs (alpha) and 0/1 masks are understood."""
+def read_mask(path: Path, below: float | None = None) -> np.ndarray:
+    """A mask file as alpha (H, W) uint8: white is the object. Cut-outs (alpha) and 0/1 masks are understood.
+
+    With `below` it is a depth map: the object is where it is below this part of its whole range.
+    """
     image, alpha = read_image(path)
+    if below is not None:
+        return np.where(image[..., 0] < 255 * below, np.uint8(255), np.uint8(0))
     if alpha is None or alpha.min() == 255:
         alpha = image.max(axis=2)
     return alpha * np.uint8(255) if alpha.max() == 1 else alpha
@@ -53,7 +58,7 @@ def read_mask(path: Path) -> np.ndarray:
 def read_alpha(view: View) -> np.ndarray | None:
     """The view's mask as stored, before undistortion: (H, W) uint8, or None where it has none."""
     if view.mask_path is not None:
-        return read_mask(view.mask_path)
+        return read_mask(view.mask_path, view.mask_below)
     return read_image(view.image_path)[1] if view.has_alpha else None
 
 
@@ -64,7 +69,9 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
     colours outside the mask do not bleed into its edge. Raises InputError naming the file.
     """
     image, own_alpha = read_image(view.image_path)
-    alpha = read_mask(view.mask_path) if view.mask_path is not None else (own_alpha if view.has_alpha else None)
+    alpha = own_alpha if view.has_alpha else None
+    if view.mask_path is not None:
+        alpha = read_mask(view.mask_path, view.mask_below)
     camera = view.camera
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(f"{view.image_path}: the photo changed its size since the capture was read. Start again.")

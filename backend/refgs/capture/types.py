@@ -18,7 +18,9 @@ class View:
 
     `camera` covers the full-size photo after undistortion. Its name is the last part of the photo's path without the
     extension, unique within a split. `lens` is the distorted lens of the file, None where the file is already a
-    pinhole's. `has_alpha` says that the photo's own alpha channel is its mask; a `mask_path` takes its place.
+    pinhole's. `has_alpha` says that the photo's own alpha channel is its mask; a `mask_path` takes its place. With
+    `mask_below` that file is a depth map, and the object is where it is below this part of its whole range.
+    `normal_path` is a picture of the true normals where the data set brings one (see `published_normals`).
     """
 
     camera: Camera
@@ -27,6 +29,8 @@ class View:
     split: Split
     lens: Lens | None = None
     has_alpha: bool = False
+    mask_below: float | None = None
+    normal_path: Path | None = None
 
     @property
     def masked(self) -> bool:

@@ -152,5 +152,5 @@ def _frames(splats: Splats) -> np.ndarray:
     u = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
     v = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
     scales = np.maximum(splats.scales, 1e-12)
-    n = np.cross(u, v) / scales.mean(1, keepdims=True)
-    return np.stack([u / scales[:, :1], v / scales[:, 1:], n], axis=1).astype(np.float32)
+    n = np.cross(u, v) / scales[:, :2].mean(1, keepdims=True)
+    return np.stack([u / scales[:, :1], v / scales[:, 1:2], n], axis=1).astype(np.float32)

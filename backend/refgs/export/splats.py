@@ -17,9 +17,9 @@ class Splats:
 
     positions (N, 3), normals (N, 3) unit and pointing outward where that is known, sh (N, K, 3) spherical harmonics
     with K = (degree + 1)² and colour = 0.5 + SH (the 3DGS convention), opacities (N,) in 0..1, scales (N, 2) standard
-    deviations in world units, rotations (N, 4) unit quaternions wxyz, albedo (N, 3) linear Rec.709, metallic (N,) and
-    perceptual roughness (N,) in 0..1, indirect (N, K', 3) spherical harmonics of the linear radiance that comes from the
-    object itself; K' is 0 where a scene does without.
+    deviations in world units, or (N, 3) of 3D Gaussians with the normal's last, rotations (N, 4) unit quaternions wxyz,
+    albedo (N, 3) linear Rec.709, metallic (N,) and perceptual roughness (N,) in 0..1, indirect (N, K', 3) spherical harmonics
+    of the linear radiance that comes from the object itself; K' is 0 where a scene does without.
     """
 
     positions: np.ndarray
@@ -64,6 +64,8 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
         splats.indirect.transpose(0, 2, 1).reshape(count, -1),
     ]
     names = [*_HEAD, *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))), *_TAIL, *_MATERIAL]
+    if splats.scales.shape[1] == 3:
+        names.insert(names.index("scale_1") + 1, "scale_2")
     names += [f"ind_{i}" for i in range(3 * splats.indirect.shape[1])]
     table = np.concatenate([np.reshape(c, (count, -1)) for c in columns], axis=1).astype("<f4")
     rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names])[:, 0]
@@ -104,7 +106,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
         normals=columns("nx", "ny", "nz"),
         sh=np.concatenate([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], harmonics("f_rest_", 0, 9, 24, 45)], axis=1),
         opacities=1 / (1 + np.exp(-columns("opacity")[:, 0])),
-        scales=np.exp(columns("scale_0", "scale_1")),
+        scales=np.exp(columns(*(name for name in ("scale_0", "scale_1", "scale_2") if name in names))),
         rotations=columns("rot_0", "rot_1", "rot_2", "rot_3"),
         albedo=columns("albedo_r", "albedo_g", "albedo_b"),
         metallic=columns("metallic")[:, 0],

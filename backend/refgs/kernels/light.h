@@ -1,5 +1,5 @@
 // What a shaded pixel looks up, LANES pixels at a time, with derivatives: the prefiltered light along a direction (paper
-// Eq. 8), irradiance about a normal, the FG table (Eq. 7), the sRGB curve.
+// Eq. 8), irradiance about a normal, reflectance (Eq. 7), the sRGB curve.
 #pragma once
 
 #include "rows.h"
@@ -156,29 +156,64 @@ struct Irradiance {
   }
 };
 
-// FG0 and FG1 by N.V (column) and roughness (row), bilinear between the cells' centres; table (side, side, 2).
+// What a material reflects of an even light, by the square roots of roughness (row) and N.V (column), bilinear; table (side, side, 4)
+// of refgs.render.brdf.
 struct ReflectanceTable {
-  Vector value[2], by_n_v[2], by_roughness[2];  // derivatives: zero beyond the outermost centres
+  static constexpr int FG0 = 0, FG1 = 1, AVERAGE = 2, DIELECTRIC = 3;
+  Vector value[4], by_n_v[4], by_roughness[4];  // derivatives: zero below LEAST and above 1
 
   MEMBER ReflectanceTable(const float* table, int64_t side, Vector n_v, Vector roughness) {
+    constexpr float LEAST = 1e-4f;
     float last = (float)(side - 1);
-    Vector x = n_v * (float)side - 0.5f, y = roughness * (float)side - 0.5f;
-    Mask inside_x = (x > 0.0f) & (x < last), inside_y = (y > 0.0f) & (y < last);
-    x = clamp(x, 0, last), y = clamp(y, 0, last);
+    Vector x = clamp(n_v, LEAST, 1), y = clamp(roughness, LEAST, 1);
+    Vector along_x = inverse_root(x), along_y = inverse_root(y);
+    Vector by_x = select(x == n_v, (0.5f * last) * along_x, Vector()), by_y = select(y == roughness, (0.5f * last) * along_y, Vector());
+    x *= last * along_x, y *= last * along_y;
     Vector column = smaller(round_down(x), Vector() + (last - 1)), row = smaller(round_down(y), Vector() + (last - 1));
     alignas(64) int32_t first[LANES];
     store(first, convert<Mask>(row) * (int32_t)side + convert<Mask>(column));
     x -= column, y -= row;
-    Vector top[4], bottom[4];  // two cells each
-    to_lanes<4>([&](int k, int b) { return Blocks<4>::get(table + 2 * first[k] + Blocks<4>::at(b)); }, top);
-    to_lanes<4>([&](int k, int b) { return Blocks<4>::get(table + 2 * (first[k] + side) + Blocks<4>::at(b)); }, bottom);
-    for (int i = 0; i < 2; i++) {
-      Vector across_top = top[2 + i] - top[i], across_bottom = bottom[2 + i] - bottom[i];
+    Vector top[8], bottom[8];
+    two_cells(table, first, 0, top), two_cells(table, first, side, bottom);
+#pragma unroll
+    for (int i = 0; i < 4; i++) {
+      Vector across_top = top[4 + i] - top[i], across_bottom = bottom[4 + i] - bottom[i];
       Vector above = top[i] + x * across_top, down = bottom[i] + x * across_bottom - above;
       value[i] = above + y * down;
-      by_n_v[i] = select(inside_x, (float)side * (across_top + y * (across_bottom - across_top)), Vector());
-      by_roughness[i] = select(inside_y, (float)side * down, Vector());
+      by_n_v[i] = by_x * (across_top + y * (across_bottom - across_top));
+      by_roughness[i] = by_y * down;
     }
+  }
+
+ private:
+  static MEMBER void two_cells(const float* table, const int32_t (&first)[LANES], int64_t further, Vector (&v)[8]) {
+    auto at = [&](int k) { return table + 4 * (first[k] + further); };
+#ifdef __CUDACC__
+    Four one = ((const Four*)at(0))[0], other = ((const Four*)at(0))[1];
+    for (int c = 0; c < 4; c++) v[c] = one[c], v[4 + c] = other[c];
+#else
+    to_lanes<8>([&](int k, int b) { return Blocks<8>::get(at(k) + Blocks<8>::at(b)); }, v);
+#endif
+  }
+};
+
+// What a metal reflects of an even light: Schlick's Fresnel at F0, and what microfacets pass on to each other; `bounces` of
+// refgs.render.brdf, of a mean Fresnel term of F0 + (1 - F0) / 21.
+struct Metal {
+  Vector value, by_f0, by_fg[2], by_average;
+
+  MEMBER Metal(const ReflectanceTable& table, Vector f0) {
+    Vector fg0 = table.value[ReflectanceTable::FG0], fg1 = table.value[ReflectanceTable::FG1];
+    Vector average = table.value[ReflectanceTable::AVERAGE];
+    Vector inverse_energy = reciprocal(fg0 + fg1), missing = inverse_energy - 1.0f;
+    Vector fresnel = (20 / 21.0f) * f0 + 1 / 21.0f;
+    Vector series = reciprocal(1.0f - fresnel * (1.0f - average)), again = fresnel * average * series;
+    Vector once = f0 * fg0 + fg1, bounces = 1.0f + again * missing;
+    value = once * bounces;
+    Vector by_again = once * missing, by_energy = once * again * inverse_energy * inverse_energy;
+    by_f0 = fg0 * bounces + (20 / 21.0f) * by_again * average * series * series;
+    by_fg[0] = f0 * bounces - by_energy, by_fg[1] = bounces - by_energy;
+    by_average = by_again * fresnel * (1.0f - fresnel) * series * series;
   }
 };
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.color import srgb_encode
 from refgs.model import cubemap, harmonics, prefilter
-from refgs.render.brdf import DIELECTRIC_F0, fg_table
+from refgs.render.brdf import LEAST_N_V, bounces, reflectance_table
 
 ALPHA_CUT, ALPHA_CAP, MIN_TRANSMITTANCE, LOW_PASS, FAR = 1 / 255, 0.99, 1e-4, 2.0, 1e12  # as in splat.h
 COVERED, SHIFT_LIMIT, SHIFT_ALPHA = 1 / 255, 8.0, 0.3  # as in shade.cpp
@@ -96,6 +96,7 @@ def shade(
     camera: Camera,
     background: Tensor,
     visibility: Tensor | None = None,
+    display: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """As refgs.render.shade.shade, for float64 tensors; and how far each pixel (H, W) is from a kink of the derivatives,
     in the units of what has the kink. Bilinear look-ups have one at every texel."""
@@ -103,29 +104,17 @@ def shade(
     here, margins = alpha[pixels], []
     own = features[pixels] / here[:, None]
     maps = _displaced(features, alpha, own, pixels, camera, margins)
-    normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
 
     row, column = (index + 0.5 for index in pixels)
     ray = torch.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, torch.ones_like(here)], dim=-1)
     towards = -unit(ray @ view[:3, :3])
-    dot = (normal * towards).sum(dim=-1)
-    n_v = dot.clamp(1e-4, 1)
-    light = specular(levels, sides, 2 * dot[:, None] * normal - towards, roughness, margins)
-    if visibility is not None:  # Eq. 9
-        free = visibility[pixels][:, None]
-        light = free * light + (1 - free) * maps[:, -3:]
-    fg0, fg1 = (f[:, None] for f in fg(n_v, roughness, margins))
-    metal = metallic[:, None]
-    f0 = DIELECTRIC_F0 * (1 - metal) + albedo * metal
-    if features.shape[-1] > 11 + 3 * (visibility is not None):
-        diffuse = (1 - metal) * maps[:, 8:11]
-    else:
-        received = harmonics.basis(normal, 2) @ irradiance
-        margins += [(dot - 1e-4).abs(), received.abs().amin(dim=-1)]
-        diffuse = (1 - metal) * (1 - DIELECTRIC_F0 * fg0 - fg1) * albedo * received.clamp_min(0)
-    radiance = light * (f0 * fg0 + fg1) + diffuse
-    margins.append((radiance - 0.0031308).abs().amin(dim=-1))
-    color = srgb_encode(radiance) * here[:, None] + (1 - here[:, None]) * background
+    indirect = None if visibility is None else (visibility[pixels][:, None], maps[:, -3:])
+    appearance = maps[:, 8:11] if features.shape[-1] > 11 + 3 * (visibility is not None) else None
+    radiance = radiance_towards(towards, maps, appearance, levels, sides, irradiance, indirect, margins)
+    if not display:
+        margins.append((radiance - 0.0031308).abs().amin(dim=-1))
+    encoded = radiance if display else srgb_encode(radiance)
+    color = encoded * here[:, None] + (1 - here[:, None]) * background
 
     def image(values: Tensor) -> Tensor:
         return values.new_zeros(*alpha.shape, values.shape[-1]).index_put(pixels, values)
@@ -133,6 +122,44 @@ def shade(
     picture = background.expand(*alpha.shape, 3).index_put(pixels, color)
     margin = torch.full_like(alpha, math.inf).index_put(pixels, torch.stack(margins).amin(dim=0).detach())
     return picture, image(maps[:, :3]), image(maps[:, 3:8]), image(radiance), margin
+
+
+def shade_splats(
+    features: Tensor, levels: Tensor, sides: tuple[int, ...], irradiance: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """As refgs.render.shade.shade_splats, for float64 tensors; and how far each surfel is from a kink."""
+    towards, margins = unit(torch.from_numpy(camera.position) - features[:, -3:]), []
+    appearance = features[:, 8:11] if features.shape[-1] > 11 else None
+    radiance = radiance_towards(towards, features, appearance, levels, sides, irradiance, None, margins)
+    return radiance, torch.stack(margins).amin(dim=0)
+
+
+def radiance_towards(
+    towards: Tensor,
+    maps: Tensor,
+    appearance: Tensor | None,
+    levels: Tensor,
+    sides: tuple[int, ...],
+    irradiance: Tensor,
+    indirect: tuple[Tensor, Tensor] | None,
+    margins: list[Tensor],
+) -> Tensor:
+    """The split sum (paper Eq. 5–10) of normals, albedo, metallic and roughness (P, 8 or more), towards unit vectors (P, 3)."""
+    normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
+    dot = (normal * towards).sum(dim=-1)
+    light = specular(levels, sides, 2 * dot[:, None] * normal - towards, roughness, margins)
+    if indirect is not None:  # Eq. 9
+        free, from_object = indirect
+        light = free * light + (1 - free) * from_object
+    metal, dielectric = reflectance(dot, roughness, albedo, margins)
+    share = metallic[:, None]
+    if appearance is not None:
+        diffuse = (1 - share) * appearance
+    else:
+        received = harmonics.basis(normal, 2) @ irradiance
+        margins.append(received.abs().amin(dim=-1))
+        diffuse = (1 - share) * (1 - dielectric) * albedo * received.clamp_min(0)
+    return light * ((1 - share) * dielectric + share * metal) + diffuse
 
 
 def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tensor]) -> Tensor:
@@ -183,13 +210,19 @@ def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughne
     return cubemap.sample(levels, sides, directions, interval + (roughness - low) / (high - low))
 
 
-def fg(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> tuple[Tensor, Tensor]:
-    """FG0 and FG1 (P,) at N·V and roughness in [0, 1], bilinear in the table, differentiable in both."""
-    table = fg_table().to(n_v.dtype)
-    at = torch.stack([n_v, roughness], dim=-1)
+def table(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> Tensor:
+    """brdf.reflectance_table at N·V and roughness (P,), (P, 4)."""
+    values, at = reflectance_table().to(n_v.dtype), torch.stack([n_v, roughness], dim=-1)
+    places = at.clamp(LEAST_N_V, 1).sqrt() * (len(values) - 1)
     if margins is not None:
-        margins += _from_integer(at * table.shape[-1] - 0.5)
-    value = torch.nn.functional.grid_sample(
-        table[None], at[None, None] * 2 - 1, mode="bilinear", padding_mode="border", align_corners=False
-    )
-    return value[0, 0, 0], value[0, 1, 0]
+        margins += [*(at - LEAST_N_V).abs().unbind(-1), *_from_integer(places)]
+    low = places.detach().floor().clamp_max(len(values) - 2)
+    (x, y), (column, row) = (places - low).unbind(-1), low.long().unbind(-1)
+    top, bottom = (torch.lerp(values[r, column], values[r, column + 1], x[:, None]) for r in (row, row + 1))
+    return torch.lerp(top, bottom, y[:, None])
+
+
+def reflectance(n_v: Tensor, roughness: Tensor, albedo: Tensor, margins: list | None = None) -> tuple[Tensor, Tensor]:
+    """What a metal (P, 3) and what a dielectric (P, 1) reflect of an even light, at N·V and roughness (P,)."""
+    fg0, fg1, average, dielectric = table(n_v, roughness, margins).split(1, dim=-1)
+    return (albedo * fg0 + fg1) * bounces((20 * albedo + 1) / 21, fg0 + fg1, average), dielectric

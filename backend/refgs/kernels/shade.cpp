@@ -1,4 +1,5 @@
-// Maps to a picture and back: deferred shading of what the rasteriser blended (paper Eq. 5-10).
+// Maps to a picture and back: deferred shading of what the rasteriser blended (paper Eq. 5-10). Or surfels to their colours, before
+// they are blended (paper 3.3, the initial stage): there a "pixel" is a surfel, seen from where it is.
 //
 // Pixels that nothing covers cost nothing: the others are taken LANES at a time, wherever they lie. The CPU works on the picture in
 // chunks of rows whose size does not depend on the threads, and sums are taken in the chunks' order, so neither does any result.
@@ -10,7 +11,6 @@ namespace {
 constexpr float COVERED = 1.0f / 255.0f;    // less alpha than this is background
 constexpr float SHIFT_LIMIT = 8;            // pixels
 constexpr float SHIFT_ALPHA = 0.3f;         // a silhouette's blended position says nothing about its surface
-constexpr float DIELECTRIC_F0 = 0.04f;
 constexpr int HALO = (int)SHIFT_LIMIT + 1;  // rows that a displaced look-up reaches beyond its own
 constexpr int NORMAL = 0, ALBEDO = 3, METALLIC = 6, ROUGHNESS = 7;  // channels; Shaded has those that may follow
 
@@ -20,6 +20,7 @@ struct Shade {
   float fx, fy, cx, cy;
   const float* background;        // (3)
   int64_t harmonics;              // whether there are channels of colour by direction
+  int64_t splats, display;        // whether pixels are surfels; whether colours are blended and compared as they are, not encoded
   const float *features, *alpha;  // (height, width, channels), (height, width): sums over a pixel's splats
   const float* visibility;        // (height, width): 0 where the object itself stands in the mirror direction; or null
   Levels levels;
@@ -29,8 +30,8 @@ struct Shade {
   float* padded;                  // (cells, 4): for levels.cells
   const int32_t *starts, *cell;   // the cells of texel i: `cell` from starts[i] to starts[i + 1]
   const float* irradiance;        // (9, 3)
-  const float* fg;                // (fg_side, fg_side, 2)
-  int64_t fg_side;
+  const float* reflectance;       // (reflectance_side, reflectance_side, 4)
+  int64_t reflectance_side;
   float *mirrored;                                        // (height, width, 3)
   float *color, *normal, *material, *radiance;            // (height, width, 3 | 3 | 5 | 3)
   const float *by_color, *by_normal, *by_material;
@@ -415,6 +416,31 @@ struct Displaced {
 
 INLINE Vector inverse_norm(Vectors n) { return inverse_root(dot(n, n) + 1e-24f); }
 
+// Surfels: their own channels.
+template <int C>
+struct Own {
+  static constexpr int S = C - 3;
+  const Pixels& pixels;
+  Vector alpha, value[C];
+
+  MEMBER Own(const Shade& s, const Pixels& p) : pixels(p), alpha(Vector() + 1.0f) { gather<C>(s.features, p, value); }
+
+  MEMBER Vectors to_camera(const Shade& s) const {
+    const float* m = s.view;
+    auto along = [&](int i) { return -(m[i] * m[3] + m[4 + i] * m[7] + m[8 + i] * m[11]) - value[S + i]; };
+    return {along(0), along(1), along(2)};
+  }
+};
+
+template <bool SPLATS, int C, bool DERIVATIVES>
+struct Map : Displaced<C, DERIVATIVES> {
+  using Displaced<C, DERIVATIVES>::Displaced;
+};
+template <int C, bool DERIVATIVES>
+struct Map<true, C, DERIVATIVES> : Own<C> {
+  using Own<C>::Own;
+};
+
 INLINE Vectors towards_camera(const Shade& s, const Pixels& p) {
   const float* m = s.view;
   Vector x = ((s.cx - 0.5f) - load(p.column)) * (1 / s.fx), y = ((s.cy - 0.5f) - load(p.row)) * (1 / s.fy);
@@ -429,28 +455,28 @@ INLINE Vectors mirror(Vectors normal, Vectors view, Vector& n_dot_v) {
 }
 
 // The split sum over a metallic-roughness material, of LANES pixels. HARMONICS: colour by direction in place of the reflected
-// irradiance. INDIRECT: light from the object itself where it stands in the mirror direction (Eq. 9).
-template <bool HARMONICS, bool INDIRECT, bool DERIVATIVES>
+// irradiance. INDIRECT: light from the object itself where it stands in the mirror direction (Eq. 9). SPLATS: of surfels.
+template <bool HARMONICS, bool INDIRECT, bool SPLATS, bool DERIVATIVES>
 struct Shaded {
   static constexpr int APPEARANCE = HARMONICS ? 8 : 0, FROM_OBJECT = INDIRECT ? 8 + 3 * HARMONICS : 0;  // channels
   static constexpr int C = 11 + 3 * HARMONICS + 3 * INDIRECT, S = C - 3;
-  Displaced<C, DERIVATIVES> map;
-  Vector inverse_length, n_dot_v, coat, visibility;
+  Map<SPLATS, C, DERIVATIVES> map;
+  Vector inverse_length, n_dot_v, visibility;
   Vectors normal, view;
   Lookup<DERIVATIVES> lookup;
   Irradiance irradiance;
-  ReflectanceTable fg;
+  ReflectanceTable table;
   Vector light[3], received[3], radiance[3], encoded[3], slope[3];
 
   MEMBER Shaded(const Shade& s, const Pixels& pixels)
       : map(s, pixels),
         inverse_length(inverse_norm({map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
         normal(inverse_length * Vectors{map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]}),
-        view(towards_camera(s, pixels)),
+        view(seen_from(s)),
         lookup(s.levels, mirrored(), map.value[ROUGHNESS]),
         irradiance(normal),
-        fg(s.fg, s.fg_side, clamp(n_dot_v, 1e-4f, 1), map.value[ROUGHNESS]) {
-    const Vector(&v)[S] = map.value;
+        table(s.reflectance, s.reflectance_side, n_dot_v, map.value[ROUGHNESS]) {
+    const auto& v = map.value;
     Vector metallic = v[METALLIC];
     visibility = Vector() + 1.0f;
     if (INDIRECT) {
@@ -461,19 +487,23 @@ struct Shaded {
     } else {
       for (int c = 0; c < 3; c++) light[c] = lookup.light[c];
     }
-    coat = 1.0f - DIELECTRIC_F0 * fg.value[0] - fg.value[1];
+    Vector dielectric = table.value[ReflectanceTable::DIELECTRIC];
 #pragma unroll
     for (int c = 0; c < 3; c++) {
       received[c] = HARMONICS ? v[APPEARANCE + c] : irradiance.value(s.irradiance, c);
       Vector diffuse = (1.0f - metallic) * received[c];
-      if (!HARMONICS) diffuse *= coat * v[ALBEDO + c];
-      radiance[c] = light[c] * (f0(c) * fg.value[0] + fg.value[1]) + diffuse;
-      encoded[c] = srgb_encode(radiance[c], slope[c]);
+      if (!HARMONICS) diffuse *= (1.0f - dielectric) * v[ALBEDO + c];
+      radiance[c] = light[c] * (dielectric + metallic * (Metal(table, v[ALBEDO + c]).value - dielectric)) + diffuse;
+      if (SPLATS || s.display)
+        encoded[c] = radiance[c], slope[c] = Vector() + 1.0f;
+      else
+        encoded[c] = srgb_encode(radiance[c], slope[c]);
     }
   }
 
   MEMBER void write(const Shade& s) const {
-    const Vector(&v)[S] = map.value;
+    if (SPLATS) return scatter<3>(s.color, map.pixels, radiance);
+    const auto& v = map.value;
     Vector color[3];
     for (int c = 0; c < 3; c++) color[c] = encoded[c] * map.alpha + (1.0f - map.alpha) * s.background[c];
     scatter<3>(s.color, map.pixels, color);
@@ -484,56 +514,76 @@ struct Shaded {
 
   template <class Sums>
   MEMBER void backward(const Shade& s, Sums& sums) const {
-    Vector by_color[3], by_normal[3], by_material[5], by_alpha = {};
-    gather<3>(s.by_color, map.pixels, by_color), gather<3>(s.by_normal, map.pixels, by_normal);
-    gather<5>(s.by_material, map.pixels, by_material);
+    Vector by_color[3], by_normal[3] = {}, by_material[5] = {}, by_alpha = {};
+    gather<3>(s.by_color, map.pixels, by_color);
+    if (!SPLATS) gather<3>(s.by_normal, map.pixels, by_normal), gather<5>(s.by_material, map.pixels, by_material);
 
-    const Vector(&v)[S] = map.value;
-    Vector metallic = v[METALLIC], by[S] = {}, by_light[3], by_fg[2] = {}, by_coat = {}, by_received[3];
+    const auto& v = map.value;
+    Vector metallic = v[METALLIC], dielectric = table.value[ReflectanceTable::DIELECTRIC];
+    Vector by[S] = {}, by_light[3], by_table[4] = {}, by_received[3];
     by[METALLIC] = by_material[3], by[ROUGHNESS] = by_material[4];
     Vectors by_n = {};
 #pragma unroll
     for (int c = 0; c < 3; c++) {
-      by_alpha += by_color[c] * (encoded[c] - s.background[c]);
+      Metal metal(table, v[ALBEDO + c]);
+      if (!SPLATS) by_alpha += by_color[c] * (encoded[c] - s.background[c]);
       Vector by_radiance = by_color[c] * map.alpha * slope[c];
-      by_light[c] = by_radiance * (f0(c) * fg.value[0] + fg.value[1]);
+      by_light[c] = by_radiance * (dielectric + metallic * (metal.value - dielectric));
       if (INDIRECT) {
         by[FROM_OBJECT + c] = (1.0f - visibility) * by_light[c];
         by_light[c] *= visibility;
       }
-      Vector reflected = by_radiance * light[c], by_f0 = reflected * fg.value[0];
-      by_fg[0] += reflected * f0(c), by_fg[1] += reflected;
-      by[ALBEDO + c] = by_material[c] + by_f0 * metallic;
-      by[METALLIC] += by_f0 * (v[ALBEDO + c] - DIELECTRIC_F0);
+      Vector by_reflectance = by_radiance * light[c], by_metal = by_reflectance * metallic;
+      by[METALLIC] += by_reflectance * (metal.value - dielectric);
+      by[ALBEDO + c] = by_material[c] + by_metal * metal.by_f0;
+      for (int i = 0; i < 2; i++) by_table[i] += by_metal * metal.by_fg[i];
+      by_table[ReflectanceTable::AVERAGE] += by_metal * metal.by_average;
+      by_table[ReflectanceTable::DIELECTRIC] += by_reflectance - by_metal;
       if (HARMONICS) {
         by[APPEARANCE + c] = by_radiance * (1.0f - metallic);
         by[METALLIC] -= by_radiance * received[c];
       } else {
-        Vector by_diffuse = by_radiance * received[c], base = (1.0f - metallic) * coat;
+        Vector by_diffuse = by_radiance * received[c], base = (1.0f - metallic) * (1.0f - dielectric);
         by[ALBEDO + c] += by_diffuse * base;
-        by[METALLIC] -= by_diffuse * v[ALBEDO + c] * coat;
-        by_coat += by_diffuse * v[ALBEDO + c] * (1.0f - metallic);
+        by_diffuse *= v[ALBEDO + c];
+        by[METALLIC] -= by_diffuse * (1.0f - dielectric);
+        by_table[ReflectanceTable::DIELECTRIC] -= by_diffuse * (1.0f - metallic);
         by_received[c] = select(received[c] > 0.0f, by_radiance * base * v[ALBEDO + c], Vector());
         irradiance.backward(s.irradiance, c, by_received[c], by_n);
       }
     }
     if (!HARMONICS) sums.add_irradiance(irradiance, by_received);
-    by_fg[0] -= DIELECTRIC_F0 * by_coat, by_fg[1] -= by_coat;
-    by[ROUGHNESS] += by_fg[0] * fg.by_roughness[0] + by_fg[1] * fg.by_roughness[1];
-    Vector by_n_v = by_fg[0] * fg.by_n_v[0] + by_fg[1] * fg.by_n_v[1];
-    by_n_v = select((n_dot_v > 1e-4f) & (n_dot_v < 1.0f), by_n_v, Vector());
+    Vector by_n_v = {};
+    for (int i = 0; i < 4; i++) {
+      by[ROUGHNESS] += by_table[i] * table.by_roughness[i];
+      by_n_v += by_table[i] * table.by_n_v[i];
+    }
     Vector by_roughness;
     Vectors by_mirrored = lookup.backward(by_light, by_roughness);
     sums.add_light(lookup, map.pixels.count, by_light);
     by[ROUGHNESS] += by_roughness;
-    by_n = by_n + 2.0f * n_dot_v * by_mirrored + (2.0f * dot(by_mirrored, normal) + by_n_v) * view;
+    Vector by_dot = 2.0f * dot(by_mirrored, normal) + by_n_v;
+    by_n = by_n + 2.0f * n_dot_v * by_mirrored + by_dot * view;
     by_n = inverse_length * (by_n - dot(by_n, normal) * normal);
     by[NORMAL] = by_n.x + by_normal[0], by[NORMAL + 1] = by_n.y + by_normal[1], by[NORMAL + 2] = by_n.z + by_normal[2];
-    map.backward(s, by, by_alpha, sums);
+    if constexpr (SPLATS) {
+      Vectors by_view = by_dot * normal - by_mirrored;
+      by_view = inverse_norm(map.to_camera(s)) * (by_view - dot(by_view, view) * view);
+      sums.template add_own<S>(map.pixels, true, by, {-by_view.x, -by_view.y, -by_view.z}, by_alpha);
+    } else {
+      map.backward(s, by, by_alpha, sums);
+    }
   }
 
  private:
-  MEMBER Vector f0(int c) const { return DIELECTRIC_F0 * (1.0f - map.value[METALLIC]) + map.value[ALBEDO + c] * map.value[METALLIC]; }
+  MEMBER Vectors seen_from(const Shade& s) const {
+    if constexpr (SPLATS) {
+      Vectors v = map.to_camera(s);
+      return inverse_norm(v) * v;
+    } else {
+      return towards_camera(s, map.pixels);
+    }
+  }
 
   MEMBER Vectors mirrored() { return mirror(normal, view, n_dot_v); }
 };
@@ -550,27 +600,29 @@ void mirrored_pixels(const Shade& s, int64_t first, int64_t end) {
   });
 }
 
-template <bool HARMONICS, bool INDIRECT>
+template <bool HARMONICS, bool INDIRECT, bool SPLATS = false>
 struct Kind {
   static void forward(const Shade& s, int64_t first, int64_t end) {
     const float background[3] = {s.background[0], s.background[1], s.background[2]};
-    for (int64_t i = first; i < end; i++) {
+    for (int64_t i = first; !SPLATS && i < end; i++) {
       for (int c = 0; c < 3; c++) s.color[3 * i + c] = background[c], s.normal[3 * i + c] = s.radiance[3 * i + c] = 0;
       for (int c = 0; c < 5; c++) s.material[5 * i + c] = 0;
     }
-    each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, false>(s, pixels).write(s); });
+    each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, SPLATS, false>(s, pixels).write(s); });
   }
 
   template <class Sums>
   static void backward(const Shade& s, int64_t first, int64_t end, Sums& sums) {
-    each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, true>(s, pixels).backward(s, sums); });
+    each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, SPLATS, true>(s, pixels).backward(s, sums); });
   }
 };
 
 // body(kind) of what the pixels are.
 template <class Body>
 void by_kind(const Shade& s, Body body) {
-  if (s.visibility)
+  if (s.splats)
+    s.harmonics ? body(Kind<true, false, true>()) : body(Kind<false, false, true>());
+  else if (s.visibility)
     s.harmonics ? body(Kind<true, true>()) : body(Kind<false, true>());
   else
     s.harmonics ? body(Kind<true, false>()) : body(Kind<false, false>());

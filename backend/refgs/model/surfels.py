@@ -1,6 +1,7 @@
 """The surfels: raw parameters as they are learned, and their activated values as they are rendered."""
 
 import ctypes
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -12,10 +13,12 @@ from refgs.export.splats import Splats
 from refgs.kernels.load import Shared, Work, run
 from refgs.model import harmonics
 
+FLAT = 0.3  # thickness of 3D Gaussians at the start, by their width
+
 Parameters = dict[str, Tensor]
-"""Raw leaf tensors, one row a surfel: position (N, 3), rotation (N, 4) wxyz, scale (N, 2) log, opacity (N,) logit,
-sh_dc (N, 1, 3), sh_rest (N, K−1, 3), albedo (N, 3) logit, metallic (N,) logit, roughness (N,) logit, indirect_dc and
-indirect_rest as the SH."""
+"""Raw leaf tensors, one row a surfel: position (N, 3), rotation (N, 4) wxyz, scale (N, 2) log, or (N, 3) of 3D
+Gaussians, opacity (N,) logit, sh_dc (N, 1, 3), sh_rest (N, K−1, 3), albedo (N, 3) logit, metallic (N,) logit, roughness
+(N,) logit, indirect_dc and indirect_rest as the SH."""
 
 
 class Surfels(NamedTuple):
@@ -38,7 +41,7 @@ class Surfels(NamedTuple):
     indirect_rest: Tensor
 
     def normals(self) -> Tensor:
-        """Unit normals t_u × t_v (N, 3): the third column of each rotation."""
+        """Unit normals t_u × t_v (N, 3): the third column of each rotation, if its axis is the shortest."""
         w, x, y, z = torch.nn.functional.normalize(self.rotations, dim=-1).unbind(-1)
         return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
 
@@ -125,6 +128,7 @@ def initial_parameters(
     spacing: np.ndarray,
     colours: np.ndarray | None,
     *,
+    axes: int = 2,
     opacity: float,
     sh_degree: int,
     albedo: float,
@@ -133,7 +137,8 @@ def initial_parameters(
 ) -> Parameters:
     """Round surfels at points (N, 3) facing along normals (N, 3), their standard deviation the spacing (N,).
 
-    `colours` (N, 3), sRGB-encoded 0..1, start the SH; grey where there are none.
+    `colours` (N, 3), sRGB-encoded 0..1, start the SH; grey where there are none. With three `axes` they are 3D Gaussians,
+    FLAT along the normals.
     """
     n = len(positions)
 
@@ -146,7 +151,8 @@ def initial_parameters(
     parameters = {
         "position": torch.from_numpy(np.asarray(positions, np.float32).copy()),
         "rotation": torch.from_numpy(quaternions_towards(np.asarray(normals, np.float64)).astype(np.float32)),
-        "scale": torch.from_numpy(np.log(np.maximum(spacing, 1e-12)).astype(np.float32))[:, None].repeat(1, 2),
+        "scale": torch.from_numpy(np.log(np.maximum(spacing, 1e-12)).astype(np.float32))[:, None]
+        + torch.tensor([0.0, 0.0, math.log(FLAT)])[:axes],
         "opacity": logit(opacity, n),
         "sh_dc": ((colour - 0.5) / harmonics.DC)[:, None].contiguous(),
         "sh_rest": torch.zeros(n, rest, 3),

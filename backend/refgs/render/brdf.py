@@ -1,61 +1,93 @@
-"""The first factor of the split sum (paper Eq. 7): what a metallic-roughness material reflects of an even light."""
+"""The first factor of the split sum (paper Eq. 7): what a metallic-roughness material reflects of an even light.
 
-import math
+The material is Blender's Principled BSDF, with whatever its defaults are: GGX, height-correlated Smith shadowing, and what
+microfacets pass on to each other, which a lobe of one bounce alone would lose (Kulla and Conty, "Revisiting Physically
+Based Shading at Imageworks", 2017); Schlick's Fresnel for metals, a dielectric's own for the index of refraction IOR. Below
+a dielectric's reflection lies a matte base, lit by what that leaves.
+"""
+
+import itertools
 from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
-DIELECTRIC_F0 = 0.04  # index of refraction 1.5: the Principled BSDF's and glTF's default
+IOR = 1.5  # the Principled BSDF's and glTF's default
+LEAST_N_V = 1e-4  # as in shade.cpp
 
 
-def smith_g2(n_l: Tensor, n_v: Tensor, alpha: Tensor) -> Tensor:
-    """Height-correlated Smith masking-shadowing for GGX (Heitz 2014, eq. 99), as Cycles and Eevee use it."""
+def fresnel(cosine: np.ndarray) -> np.ndarray:
+    """Of a dielectric, unpolarised light."""
+    inside = np.sqrt(IOR**2 - 1 + cosine**2)  # IOR times the refracted ray's cosine
+    across, along = (IOR**2 * cosine - inside) / (IOR**2 * cosine + inside), (cosine - inside) / (cosine + inside)
+    return (across**2 + along**2) / 2
 
-    def lam(cosine: Tensor) -> Tensor:
-        tangent2 = (1 - cosine**2) / cosine**2
-        return (torch.sqrt(1 + alpha**2 * tangent2) - 1) / 2
 
-    return 1 / (1 + lam(n_l) + lam(n_v))
+def bounces(average_fresnel, energy, average_energy):
+    """By how much light that meets microfacets more than once adds to what meets one. `energy` is what one bounce off a white
+    lobe sends out, `average_energy` its mean over the cosine-weighted hemisphere, `average_fresnel` that of Fresnel's term."""
+    again = average_fresnel * average_energy / (1 - average_fresnel * (1 - average_energy))
+    return 1 + again * (1 - energy) / energy
+
+
+def _gauss(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points and weights over 0..1. They crowd towards both ends, where an integrand may have a root's slope."""
+    x, weight = np.polynomial.legendre.leggauss(nodes)
+    angle = np.pi / 4 * (x + 1)
+    return np.sin(angle) ** 2, weight * np.pi / 4 * np.sin(2 * angle)
+
+
+def one_bounce(n_v: np.ndarray, roughness: float, nodes: int) -> np.ndarray:
+    """(3, P) at N·V (P,): ∫ D G2 F / (4 N·L N·V) N·L dL for F = 1 − (1 − V·H)⁵, (1 − V·H)⁵ and a dielectric's.
+
+    Over the half vector's tangent, α tan ψ, in which D is smooth, and its azimuth, as far as L is above the horizon.
+    """
+    at, weight = _gauss(nodes)
+    alpha, s_v = roughness**2, np.sqrt(1 - n_v**2)
+    lambda_v = np.sqrt(1 + (alpha * s_v / n_v) ** 2)
+    table = np.zeros((3, len(n_v)))
+    # L is above the horizon for all azimuths up to the first angle, for none from the second.
+    angle = np.arccos(n_v)
+    limits = [0 * n_v, *(np.arctan(np.tan((np.pi / 2 + a) / 2) / alpha) for a in (-angle, angle))]
+    for low, high in itertools.pairwise(limits):
+        psi = low + (high - low) * at[:, None]  # (nodes, P)
+        tangent = alpha * np.tan(psi)
+        c_h = 1 / np.sqrt(1 + tangent**2)
+        s_h = tangent * c_h
+        above = np.arccos(np.clip(n_v * (1 / (2 * c_h) - c_h) / (s_v * s_h), -1, 1))
+        v_h = s_v * s_h * np.cos(above * at[:, None, None]) + n_v * c_h  # (nodes, nodes, P)
+        n_l = np.maximum(2 * c_h * v_h - n_v, 1e-12)
+        g2 = 2 / (lambda_v + np.sqrt(1 - alpha**2 + (alpha / n_l) ** 2))  # Heitz 2014, eq. 99
+        share = g2 * v_h
+        square = (1 - np.minimum(v_h, 1)) ** 2
+        schlick = share * square * square * np.sqrt(square)
+        parts = np.stack([share - schlick, schlick, share * fresnel(v_h)], axis=1)
+        by_azimuth = np.einsum("a,acpv->cpv", weight, parts)
+        table += (
+            (by_azimuth * np.sin(2 * psi) * above * weight[:, None] / c_h).sum(axis=1) * (high - low) / (np.pi * n_v)
+        )
+    return table
 
 
 @lru_cache(maxsize=2)
-def fg_table(size: int = 64, steps: int = 32) -> Tensor:
-    """The first factor of the split sum, (2, size, size) over (roughness row, N·V column), at cell centres.
+def reflectance_table(size: int = 64, nodes: int = 16) -> Tensor:
+    """What is reflected of an even light, (size, size, 4), by the square roots of roughness (row) and N·V (column), each from 0
+    to 1: at small ones of both it changes fastest.
 
-    FG0·F0 + FG1 is ∫ f_s (N·L) dL for Schlick's Fresnel with F0 (Karis 2013). The integral is the mean of F·G2/G1 over
-    the distribution of visible normals (Heitz, "Sampling the GGX Distribution of Visible Normals", 2018), taken by the
-    midpoint rule over his disc's polar coordinates; half the disc, as the other half mirrors it. With r = sin θ the
-    integrand stays smooth at the rim.
+    FG0 and FG1, of which F0·FG0 + FG1 is what one bounce gives with Schlick's Fresnel (Karis 2013); the mean of FG0 + FG1 over
+    the cosine-weighted hemisphere, which is the whole row's; what a dielectric reflects, with all its bounces. Between its
+    entries, where N·V and roughness are more than 0.02, linear interpolation is right to 0.001.
     """
-    mid = (torch.arange(steps, dtype=torch.float64) + 0.5) / steps
-    theta = math.pi / 2 * mid[:, None]
-    r, phi = torch.sin(theta), math.pi * (mid - 0.5)[None, :]
-    area = torch.sin(2 * theta).repeat(1, steps).flatten()
-    area = area / area.sum()
-    t1, t2 = (r * torch.cos(phi)).flatten(), (r * torch.sin(phi)).flatten()
-    centres = (torch.arange(size, dtype=torch.float64) + 0.5) / size
-    n_v = centres[:, None]
-    s_v = torch.sqrt(1 - n_v**2)
-    table = torch.empty(2, size, size, dtype=torch.float64)
-    for row, roughness in enumerate(centres):
-        alpha = roughness**2
-        stretch = torch.sqrt((alpha * s_v) ** 2 + n_v**2)
-        v_x, v_z = alpha * s_v / stretch, n_v / stretch  # the view in the stretched space; T1 = y, T2 = V × T1
-        s = (1 + v_z) / 2
-        rim = torch.sqrt(1 - t1**2)
-        t2_warped = (1 - s) * rim + s * t2
-        up = torch.sqrt((1 - t1**2 - t2_warped**2).clamp_min(0))
-        h_x = alpha * (-v_z * t2_warped + v_x * up)
-        h_y = alpha * t1
-        h_z = (v_x * t2_warped + v_z * up).clamp_min(1e-9)
-        length = torch.sqrt(h_x**2 + h_y**2 + h_z**2)
-        h_x, h_z = h_x / length, h_z / length
-        v_h = (s_v * h_x + n_v * h_z).clamp(0, 1)
-        n_l = 2 * v_h * h_z - n_v
-        ratio = smith_g2(n_l.clamp_min(1e-9), n_v, alpha) / smith_g2(torch.ones_like(n_v), n_v, alpha)
-        weight = torch.where(n_l > 0, ratio, 0.0)
-        fresnel = (1 - v_h) ** 5
-        table[0, row] = ((1 - fresnel) * weight) @ area
-        table[1, row] = (fresnel * weight) @ area
-    return table.float()
+    root = np.linspace(0, 1, size)
+    n_v = np.clip(root**2, LEAST_N_V, 1 - 1e-12)
+    cosine, weight = (v / 2 for v in np.polynomial.legendre.leggauss(64))
+    average_fresnel = 2 * ((cosine + 0.5) * fresnel(cosine + 0.5)) @ weight
+    table = np.empty((size, size, 4))
+    for row, roughness in enumerate(np.maximum(root**2, 1e-3)):
+        fg0, fg1, dielectric = one_bounce(n_v, roughness, nodes)
+        energy = fg0 + fg1
+        average_energy = np.interp(cosine + 0.5, n_v, energy) @ (2 * (cosine + 0.5) * weight)
+        dielectric *= bounces(average_fresnel, energy, average_energy)
+        table[row] = np.stack([fg0, fg1, np.full(size, average_energy), dielectric], axis=-1)
+    return torch.from_numpy(table).float()

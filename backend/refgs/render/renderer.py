@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
+from refgs.color import srgb_decode, srgb_encode
 from refgs.geometry.visibility import Occluder
 from refgs.kernels import load
 from refgs.model.environment import Environment
@@ -14,8 +15,9 @@ from refgs.model.surfels import Surfels
 from refgs.render.directional import directional
 from refgs.render.facing import facing_normals
 from refgs.render.rasterize import rasterize
-from refgs.render.shade import mirror_directions, shade
+from refgs.render.shade import mirror_directions, shade, shade_splats
 from refgs.render.stack import stack
+from refgs.render.volume import discs, shortest_last
 from refgs.settings import RenderSettings
 
 NEAR = 0.01  # the nearest depth that is drawn, in scene radii
@@ -94,28 +96,38 @@ def render(
 ) -> Rendering:
     """Render surfels for a camera over a background (3,), sRGB-encoded.
 
-    `settings.shading` is "deferred" (split-sum shading of blended maps, paper Eq. 5–8) or "sh" (view-dependent colour
-    of each surfel, blended). `near` is in world units. With an `occluder`, deferred shading takes the surfels' own
-    light in place of the environment's where that is in the way of the mirror direction (paper Eq. 9).
+    `settings.shading` is "deferred" (split-sum shading of blended maps, paper Eq. 5–8), "splat" (of each surfel, then
+    blended, paper §3.3) or "sh" (view-dependent colour of each surfel, blended). `near` is in world units. With an
+    `occluder`, deferred shading takes the surfels' own light in place of the environment's where that is in the way of the
+    mirror direction (paper Eq. 9).
     """
-    deferred = settings.shading == "deferred"
-    normals = facing_normals(surfels.rotations, surfels.positions, camera)
-    parts = [normals]
-    if deferred:
-        parts += [surfels.albedo, surfels.metallic, surfels.roughness]
-    if not deferred or settings.diffuse == "sh":
-        parts.append(directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera))
+    deferred, display = settings.shading == "deferred", settings.color_space == "display"
+    facing = surfels.rotations
+    if surfels.scales.shape[1] == 3:
+        facing, _ = shortest_last(surfels.rotations, surfels.scales)
+    normals = facing_normals(facing, surfels.positions, camera)
+    lit = [normals, surfels.albedo, surfels.metallic, surfels.roughness]
+    if settings.shading == "sh" or settings.diffuse == "sh":
+        colour = directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera)
+        lit.append(colour)
     if deferred and occluder is not None:
         indirect = surfels.indirect_dc, surfels.indirect_rest
-        parts.append(directional(*indirect, 0.0, surfels.positions, camera, normals))
-    if deferred:
-        parts.append(surfels.positions)
-    geometry = surfels.positions, surfels.rotations, surfels.scales, surfels.opacities
-    features, depth, alpha = rasterize(*geometry, stack(parts), camera, near=near)
+        lit.append(directional(*indirect, 0.0, surfels.positions, camera, normals))
+    lit.append(surfels.positions)
+    if settings.shading == "splat":
+        blended = [normals, shade_splats(stack(lit), environment, camera), *lit[1:4]]
+    else:
+        blended = lit if deferred else [normals, colour]
+    features, depth, alpha = rasterize(*discs(surfels, camera), stack(blended), camera, near=near)
     if deferred:
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
-        shaded = shade(features, alpha, environment, camera, background, visibility)
-        return Rendering(shaded.color, alpha, depth, shaded.normal, shaded.material, shaded.radiance, visibility)
-    normal, appearance = features.split(3, dim=-1)
-    color = appearance + (1 - alpha[..., None]) * background
-    return Rendering(color, alpha, depth, normal / alpha.clamp_min(COVERED)[..., None])
+        shaded = shade(features, alpha, environment, camera, background, visibility, display)
+        radiance = srgb_decode(shaded.radiance) if display else shaded.radiance
+        return Rendering(shaded.color, alpha, depth, shaded.normal, shaded.material, radiance, visibility)
+    over = (1 - alpha[..., None]) * background
+    if settings.shading == "sh":
+        normal, color = features.split(3, dim=-1)
+        return Rendering(color + over, alpha, depth, normal / alpha.clamp_min(COVERED)[..., None])
+    normal, mean, material = (features / alpha.clamp_min(COVERED)[..., None]).split((3, 3, 5), dim=-1)
+    encoded, radiance = (mean, srgb_decode(mean)) if display else (srgb_encode(mean), mean)
+    return Rendering(encoded * alpha[..., None] + over, alpha, depth, normal, material, radiance.detach())

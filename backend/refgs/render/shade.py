@@ -1,4 +1,4 @@
-"""Maps to a picture: differentiable deferred shading."""
+"""Maps to a picture, or surfels to their colours: differentiable shading."""
 
 import ctypes
 from functools import lru_cache
@@ -13,7 +13,7 @@ from refgs.kernels import cuda, load
 from refgs.kernels.load import Shared, Work
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
-from refgs.render.brdf import fg_table
+from refgs.render.brdf import reflectance_table
 
 CHANNELS = 11  # normal, albedo, metallic, roughness, position; before the position those that not every scene has
 
@@ -49,12 +49,13 @@ class _Work(Work):
         [(n, ctypes.c_int64) for n in ("width", "height", "channels", "chunk_rows")]
         + [("view", ctypes.c_float * 12)]
         + [(n, ctypes.c_float) for n in ("fx", "fy", "cx", "cy")]
-        + [("background", ctypes.c_void_p), ("harmonics", ctypes.c_int64)]
+        + [("background", ctypes.c_void_p)]
+        + [(n, ctypes.c_int64) for n in ("harmonics", "splats", "display")]
         + [(n, ctypes.c_void_p) for n in ("features", "alpha", "visibility")]
         + [("levels", _Levels)]
         + [(n, ctypes.c_int64) for n in ("texels", "cells", "lines")]
-        + [(n, ctypes.c_void_p) for n in ("light", "texel", "padded", "starts", "cell", "irradiance", "fg")]
-        + [("fg_side", ctypes.c_int64)]
+        + [(n, ctypes.c_void_p) for n in ("light", "texel", "padded", "starts", "cell", "irradiance", "reflectance")]
+        + [("reflectance_side", ctypes.c_int64)]
         + [(n, ctypes.c_void_p) for n in ("mirrored", "color", "normal", "material", "radiance")]
         + [(n, ctypes.c_void_p) for n in ("by_color", "by_normal", "by_material", "by_features", "by_alpha")]
         + [(n, ctypes.c_void_p) for n in ("by_light", "by_irradiance", "halo", "halo_alpha", "by_cells", "touched")]
@@ -101,32 +102,33 @@ class _Padding(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def _fg_table(device: torch.device) -> Tensor:
-    """FG0 and FG1 side by side, (side, side, 2)."""
-    return fg_table().permute(1, 2, 0).contiguous().to(device)
+def _reflectance(device: torch.device) -> Tensor:
+    return reflectance_table().to(device)
 
 
 class _Shade(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, features, alpha, levels, irradiance, sides, camera, background, visibility):
+    def forward(ctx, features, alpha, levels, irradiance, sides, camera, background, visibility, display, splats):
         features, alpha, irradiance = features.contiguous(), alpha.contiguous(), irradiance.contiguous()
-        table, padding = _fg_table(features.device), _Padding.of(sides, features.device)
+        table, padding = _reflectance(features.device), _Padding.of(sides, features.device)
         light, cells = levels.contiguous(), len(padding.texel)
         padded = features.new_empty(cells, 4)
         work = _Work.of(features, alpha, camera)
         background = background.to(features)
-        work.attach(background=background, irradiance=irradiance, fg=table, light=light, padded=padded)
+        work.attach(background=background, irradiance=irradiance, reflectance=table, light=light, padded=padded)
         work.attach(texel=padding.texel, starts=padding.starts, cell=padding.cell)
         if visibility is not None:
             work.attach(visibility=visibility)
         work.harmonics = work.channels > CHANNELS + 3 * (visibility is not None)
+        work.display, work.splats = display, splats
         work.texels, work.cells, work.lines = len(light), cells, padding.lines
         work.levels.count, work.levels.cells = len(sides), padded.data_ptr()
         work.levels.side[: len(sides)] = sides
         work.levels.start[: len(sides)], work.levels.line[: len(sides)] = padding.first_cells, padding.first_lines
         work.levels.roughness[: len(sides)] = prefilter.ROUGHNESS
-        work.fg_side = table.shape[0]
-        shaded = Shaded(*(features.new_empty(*alpha.shape, c) for c in (3, 3, 5, 3)))
+        work.reflectance_side = table.shape[0]
+        numbers = (3, 0, 0, 0) if splats else (3, 3, 5, 3)
+        shaded = Shaded(*(features.new_empty(*alpha.shape, n) for n in numbers))
         work.attach(**shaded._asdict())
         load.run("refgs_shade_pad", work, features, items=cells)
         load.run("refgs_shade_forward", work, features, items=alpha.numel())
@@ -141,7 +143,9 @@ class _Shade(torch.autograd.Function):
     def backward(ctx, by_color, by_normal, by_material, _):
         features, alpha, irradiance = ctx.saved_tensors
         work, new = ctx.work, features.new_empty
-        upstream = {"by_color": (by_color, 3), "by_normal": (by_normal, 3), "by_material": (by_material, 5)}
+        upstream = {"by_color": (by_color, 3)}
+        if not work.splats:
+            upstream |= {"by_normal": (by_normal, 3), "by_material": (by_material, 5)}
         given = {n: new(*alpha.shape, c).zero_() if v is None else v.contiguous() for n, (v, c) in upstream.items()}
         by_features, by_alpha, by_light = torch.empty_like(features), torch.empty_like(alpha), new(work.texels, 3)
         work.attach(**given, by_features=by_features, by_alpha=by_alpha, by_light=by_light)
@@ -165,7 +169,7 @@ class _Shade(torch.autograd.Function):
             load.parallel(load.kernels().refgs_shade_backward, work)
         load.run("refgs_shade_gather", work, features, items=alpha.numel())
         load.run("refgs_shade_unpad", work, features, items=work.texels)
-        return by_features, by_alpha, by_light, by_irradiance.sum(dim=0), None, None, None, None
+        return by_features, by_alpha, by_light, by_irradiance.sum(dim=0), *[None] * 6
 
 
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
@@ -187,24 +191,52 @@ def shade(
     camera: Camera,
     background: Tensor,
     visibility: Tensor | None = None,
+    display: bool = False,
 ) -> Shaded:
     """Shade what the rasteriser blended by the split sum (paper Eq. 5–10), over a background (3,), sRGB-encoded.
 
     `features` (H, W, C) are sums over a pixel's splats of, in this order: normal in world space, albedo, metallic,
     roughness; three of colour by direction, where that takes the place of integrated diffuse light (the paper's
     substitute); three of radiance from the object itself, where there is a `visibility` (H, W) in 0..1, by which that
-    gives way to the environment's (Eq. 9); position. `alpha` (H, W). float32, all on the CPU or on one card, differentiable in features,
-    alpha and the light. What the blend's mean position says of its bias towards the camera is undone first: shade.cpp
-    has how. The result does not depend on the number of threads, nor, on a card, does it differ from one call to
-    the next. Where a derivative to hand back is not finite, on a card none is a number.
+    gives way to the environment's (Eq. 9); position. `alpha` (H, W). float32, all on the CPU or on one card, differentiable
+    in features, alpha and the light. What the blend's mean position says of its bias towards the camera is undone first:
+    shade.cpp has how. With `display` light and materials are of a screen's numbers, and nothing is encoded. The result
+    does not depend on the number of threads, nor, on a card, does it differ from one call to the next. Where a derivative
+    to hand back is not finite, on a card none is a number.
     """
     least = CHANNELS + 3 * (visibility is not None)
     if features.shape not in ((*alpha.shape, least), (*alpha.shape, least + 3)):
         size = f"{alpha.shape[1]}×{alpha.shape[0]}"
         raise ValueError(f"expected {least} or {least + 3} features a pixel of {size}, got {tuple(features.shape)}")
-    light = environment.levels, environment.irradiance, environment.sides
-    texels = sum(6 * side * side for side in environment.sides)
+    return _shade(features, alpha, environment, camera, background, visibility, display, False)
+
+
+def shade_splats(features: Tensor, environment: Environment, camera: Camera) -> Tensor:
+    """What surfels send to a camera, (N, 3): the split sum of each, before they are blended (paper §3.3, the initial stage).
+
+    `features` (N, C) are, in this order: normal in world space, albedo, metallic, roughness; three of colour by direction,
+    where that takes the place of integrated diffuse light; position. Differentiable in features and the light.
+    """
+    count, channels = features.shape
+    if channels not in (CHANNELS, CHANNELS + 3):
+        raise ValueError(f"expected {CHANNELS} or {CHANNELS + 3} features a surfel, got {channels}")
+    features, alpha = features[:, None], features.new_ones(count, 1)
+    return _shade(features, alpha, environment, camera, features.new_zeros(3), None, False, True).color[:, 0]
+
+
+def _shade(
+    features: Tensor,
+    alpha: Tensor,
+    light: Environment,
+    camera: Camera,
+    background: Tensor,
+    visibility: Tensor | None,
+    display: bool,
+    splats: bool,
+) -> Shaded:
+    texels = sum(6 * side * side for side in light.sides)
     given = {"features": (features, features.shape), "alpha": (alpha, alpha.shape)}
-    given |= {"levels": (environment.levels, (texels, 3)), "irradiance": (environment.irradiance, (9, 3))}
+    given |= {"levels": (light.levels, (texels, 3)), "irradiance": (light.irradiance, (9, 3))}
     load.check(**given, **({} if visibility is None else {"visibility": (visibility, alpha.shape)}))
-    return Shaded(*_Shade.apply(features, alpha, *light, camera, background, visibility))
+    maps = features, alpha, light.levels, light.irradiance
+    return Shaded(*_Shade.apply(*maps, light.sides, camera, background, visibility, display, splats))

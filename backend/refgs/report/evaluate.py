@@ -197,7 +197,7 @@ def _relit(
     next_step: Callable[[str], None],
 ) -> dict[str, float]:
     """The figures of views under another light, and pictures of both."""
-    light = Environment.from_panorama(truth.panorama(f"relight/{hdri}"), run.settings.environment.resolution)
+    light = run.light(truth.panorama(f"relight/{hdri}"))
 
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:  # rendered again each time: so many pictures aren't kept
         for camera in cameras:

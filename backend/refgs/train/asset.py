@@ -4,7 +4,7 @@ import json
 
 import torch
 
-from refgs.color import srgb_encode
+from refgs.color import srgb_decode, srgb_encode
 from refgs.export.environment import write_environment
 from refgs.export.splats import write_splats
 from refgs.geometry.mesh import write_mesh
@@ -12,7 +12,9 @@ from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, to_splats
 from refgs.render.rasterize import rasterize
+from refgs.render.volume import discs, shortest_last
 from refgs.run import OCCLUDER, write_text
+from refgs.settings import RenderSettings
 from refgs.train.trainer import Trainer
 
 
@@ -21,9 +23,14 @@ def write_asset(trainer: Trainer) -> None:
     folder, settings = trainer.folder, trainer.settings
     with torch.no_grad():
         surfels, environment = trainer.surfels(), trainer.environment()
+    if surfels.scales.shape[1] == 3:
+        rotations, scales = shortest_last(surfels.rotations, surfels.scales)
+        surfels = surfels._replace(rotations=rotations, scales=scales)
     if environment is not None:
-        write_environment(folder / "environment.exr", environment.panorama(4 * environment.resolution))
-        surfels = _with_relightable_albedo(surfels, environment, settings.render.diffuse)
+        panorama = environment.panorama(4 * environment.resolution)
+        display = settings.render.color_space == "display"
+        write_environment(folder / "environment.exr", srgb_decode(panorama) if display else panorama)
+        surfels = _with_relightable_albedo(surfels, environment, settings.render)
     if trainer.occluder is not None:
         write_mesh(folder / OCCLUDER, trainer.occluder.mesh)
     else:
@@ -33,7 +40,7 @@ def write_asset(trainer: Trainer) -> None:
     write_text(folder / "needs.json", json.dumps(_left_out(trainer, unseen), indent=1))
 
 
-def _with_relightable_albedo(surfels: Surfels, environment: Environment, diffuse: str) -> Surfels:
+def _with_relightable_albedo(surfels: Surfels, environment: Environment, settings: RenderSettings) -> Surfels:
     """Albedo under the recovered light, and the SH that a viewer without lights shows.
 
     Where the diffuse part was learned as SH, a dielectric's albedo is that colour divided by the irradiance it stood in;
@@ -41,11 +48,13 @@ def _with_relightable_albedo(surfels: Surfels, environment: Environment, diffuse
     """
     received = environment.diffuse(surfels.normals()).clamp_min(1e-6)
     metallic = surfels.metallic[:, None]
-    if diffuse == "sh":
+    if settings.diffuse == "sh":
         sent = (0.5 + harmonics.DC * surfels.sh_dc[:, 0]).clamp_min(0)  # the mean over all directions
         albedo = metallic * surfels.albedo + (1 - metallic) * (sent / received).clamp(0, 1)
         return surfels._replace(albedo=albedo)
-    look = srgb_encode((surfels.albedo * received).clamp(0, 1))
+    look = (surfels.albedo * received).clamp(0, 1)
+    if settings.color_space == "linear":
+        look = srgb_encode(look)
     return surfels._replace(sh_dc=((look - 0.5) / harmonics.DC)[:, None], sh_rest=surfels.sh_rest[:, :0])
 
 
@@ -60,7 +69,7 @@ def _facing_outward(surfels: Surfels, trainer: Trainer) -> tuple[Surfels, int]:
     normals = surfels.normals()
     for view in trainer.views:
         feature = torch.ones(count, 1, device=trainer.device, requires_grad=True)
-        raster = rasterize(*surfels[:4], feature, view.camera, near=trainer.near)
+        raster = rasterize(*discs(surfels, view.camera), feature, view.camera, near=trainer.near)
         raster.features.sum().backward()
         weight = feature.grad[:, 0]
         towards = torch.from_numpy(view.camera.position).float().to(trainer.device) - surfels.positions
@@ -87,6 +96,12 @@ def _left_out(trainer: Trainer, unseen: int) -> list[dict[str, str]]:
         per = 3 * (settings.surfels.sh_degree + 1) ** 2
         saved = f"{per} parameters a surfel"
         left.append({"what": "spherical harmonics", "why": "diffuse light comes from the environment", "saved": saved})
+    if settings.render.color_space == "display":
+        why = "color_space = display: light and base colour are a screen's numbers"
+        left.append({"what": "linear radiance", "why": why, "saved": "nothing: relit pictures are off"})
+    if settings.render.shading == "splat":
+        saved = "shading pixels; tracing rays"
+        left.append({"what": "deferred shading and inter-reflection", "why": "shading = splat", "saved": saved})
     if settings.render.shading == "deferred" and trainer.occluder is None:
         indirect = settings.indirect
         if not trainer.from_hull:

@@ -10,7 +10,9 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.kernels.load import Shared, Work, check, run
 from refgs.model.surfels import Parameters
-from refgs.settings import DensifySettings
+from refgs.settings import DensifySettings, PropagationSettings
+
+RESET = 0.01  # opacity
 
 
 class _Work(Work):
@@ -86,6 +88,24 @@ def densify(
 
 
 @torch.no_grad()
+def reset_opacity(parameters: Parameters, optimizer: torch.optim.Optimizer) -> None:
+    """Make all surfels faint: those that the picture needs come back, the others are removed later (Kerbl et al. 2023)."""
+    parameters["opacity"].clamp_(max=math.log(RESET / (1 - RESET)))
+    optimizer.state.pop(parameters["opacity"], None)
+
+
+@torch.no_grad()
+def propagate_normals(parameters: Parameters, optimizer: torch.optim.Optimizer, settings: PropagationSettings) -> None:
+    """Have what mirrors grow over what surrounds it, all of it being opaque (paper §3.3). The surfels in front then lend their
+    normals to the pixels around, and the others give way or follow."""
+    parameters["opacity"].clamp_(min=math.log(settings.opacity / (1 - settings.opacity)))
+    optimizer.state.pop(parameters["opacity"], None)
+    metallic, roughness = parameters["metallic"].sigmoid(), parameters["roughness"].sigmoid()
+    mirrors = (metallic >= settings.metallic) & (roughness <= settings.roughness)
+    parameters["scale"] += math.log(settings.growth) * mirrors[:, None]
+
+
+@torch.no_grad()
 def thin(parameters: Parameters, optimizer: torch.optim.Optimizer, count: int) -> None:
     """Keep this many surfels, the most opaque."""
     _take(parameters, optimizer, parameters["opacity"].topk(count).indices.sort().values)
@@ -120,9 +140,12 @@ def _divide(parameters: Parameters, first: Tensor, second: Tensor) -> None:
     rows = torch.arange(len(first), device=first.device)
     sigma = scale[rows, longer].exp()
     w, x, y, z = torch.nn.functional.normalize(parameters["rotation"][first], dim=-1).unbind(-1)
-    t_u = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
-    t_v = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1)
-    axis = torch.where(longer[:, None] == 0, t_u, t_v)
+    axes = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1),
+        torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1),
+        torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1),
+    ]
+    axis = torch.stack(axes)[longer, rows]
     # Two Gaussians of 0.8 σ, 0.6 σ either side of the centre: the same variance as the one, 0.8² + 0.6² = 1.
     for half, sign in ((first, 1.0), (second, -1.0)):
         parameters["position"][half] += sign * 0.6 * sigma[:, None] * axis

@@ -6,8 +6,9 @@ from scipy.spatial import cKDTree
 from refgs.capture import Capture, LoadedView
 from refgs.geometry.hull import visual_hull_points
 from refgs.model.surfels import Parameters, initial_parameters
-from refgs.settings import Settings
+from refgs.settings import Settings, SurfelSettings
 
+GEOMETRY = ("position", "rotation", "scale", "opacity")
 FAINT = 0.1  # opacity, at the most, of points that may lie anywhere
 
 
@@ -34,19 +35,29 @@ def start_parameters(capture: Capture, views: list[LoadedView], settings: Settin
         positions = _random(capture, count, seed)
         normals, spacing, opacity = _towards_cameras(positions, views), _spacing(positions), min(opacity, FAINT)
         source = "random points (no masks and no structure-from-motion points)"
-    s = settings.surfels
-    parameters = initial_parameters(
+    parameters = _initial(positions, normals, spacing, colours, settings.surfels, opacity)
+    return parameters, f"{len(positions)} surfels start on {source}"
+
+
+def start_appearance(settings: Settings) -> Parameters:
+    """Colour and material as they start, one row for all surfels; without gradients."""
+    one = _initial(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.ones(1), None, settings.surfels, 0.5)
+    return {name: value.detach() for name, value in one.items() if name not in GEOMETRY}
+
+
+def _initial(positions, normals, spacing, colours, surfels: SurfelSettings, opacity: float) -> Parameters:
+    return initial_parameters(
         positions,
         normals,
         spacing,
         colours,
+        axes=3 if surfels.primitive == "3dgs" else 2,
         opacity=opacity,
-        sh_degree=s.sh_degree,
-        albedo=s.albedo,
-        metallic=s.metallic,
-        roughness=s.roughness,
+        sh_degree=surfels.sh_degree,
+        albedo=surfels.albedo,
+        metallic=surfels.metallic,
+        roughness=surfels.roughness,
     )
-    return parameters, f"{len(positions)} surfels start on {source}"
 
 
 def _thinned(points: np.ndarray, colours: np.ndarray | None, count: int, seed: int):

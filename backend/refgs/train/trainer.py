@@ -21,17 +21,16 @@ from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, activate
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.report.metrics import decibels, psnr
-from refgs.settings import Settings
+from refgs.settings import RenderSettings, Settings
 from refgs.train import checkpoint
 from refgs.train.adam import Adam
-from refgs.train.densify import ScreenGradient, densify, thin
+from refgs.train.densify import ScreenGradient, densify, propagate_normals, reset_opacity, thin
 from refgs.train.losses import Photo, objective
-from refgs.train.start import start_parameters
+from refgs.train.start import GEOMETRY, start_appearance, start_parameters
 
 Report = Callable[[str, dict[str, Any]], None]
 """Called with an event's name and its facts: "stage", "progress", "warning"."""
 
-GEOMETRY = ("position", "rotation", "scale", "opacity")
 REPORT_EVERY = 10  # iterations
 HISTORY_EVERY = 100  # iterations
 PLAN_EVERY = 50  # iterations
@@ -82,18 +81,19 @@ class Trainer:
         start, source = start_parameters(capture, self.views, settings)
         self.parameters = {name: value.detach().to(self.device).requires_grad_() for name, value in start.items()}
         report("stage", {"what": source})
-        texels, radiance = 6 * settings.environment.resolution**2, settings.environment.radiance
-        self.light = torch.full((texels, 3), math.log(math.expm1(radiance)), device=self.device).requires_grad_()
+        self.light = torch.empty(6 * settings.environment.resolution**2, 3, device=self.device)
+        self.light.fill_(self._start_light()).requires_grad_()
         self.from_hull = all(view.alpha is not None for view in self.views)
         self._drop_unused()
         groups = [
             {"params": [value], "name": name, "rate": self._rate(name)} for name, value in self.parameters.items()
         ]
-        if settings.render.shading == "deferred":
+        if settings.render.shading != "sh":
             groups.append({"params": [self.light], "name": "environment", "rate": settings.rates.environment})
         self.optimizer = Adam(groups)
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
         self.occluder: Occluder | None = None
+        self.initial = settings.render.shading == "deferred" and settings.initial.until > 0  # its stage is not over
 
     def _rate(self, name: str) -> float:
         rate = getattr(self.settings.rates, name)
@@ -125,7 +125,19 @@ class Trainer:
         """The light as it is now; none where nothing is lit."""
         if self.settings.render.shading == "sh":
             return None
-        return Environment(torch.nn.functional.softplus(self.light))
+        display = self.settings.render.color_space == "display"
+        return Environment(torch.sigmoid(self.light) if display else torch.nn.functional.softplus(self.light))
+
+    def _start_light(self) -> float:
+        """What `environment` makes the radiance at the start of."""
+        radiance = self.settings.environment.radiance
+        display = self.settings.render.color_space == "display"
+        return math.log(radiance / (1 - radiance)) if display else math.log(math.expm1(radiance))
+
+    def _shading(self) -> RenderSettings:
+        """How pictures are made at this stage."""
+        settings = self.settings.render
+        return settings.model_copy(update={"shading": "splat"}) if self.initial else settings
 
     def render(self, camera: Camera) -> Rendering:
         """Render a camera without gradients."""
@@ -133,9 +145,7 @@ class Trainer:
             return self._render(self.surfels(), self.environment(), camera)
 
     def _render(self, surfels: Surfels, environment: Environment | None, camera: Camera) -> Rendering:
-        return render(
-            surfels, environment, camera, self.background, self.settings.render, self.near, occluder=self.occluder
-        )
+        return render(surfels, environment, camera, self.background, self._shading(), self.near, occluder=self.occluder)
 
     def test_psnr(self, most: int = 4) -> float | None:
         """Mean PSNR over at most this many of the held-out views; None where there are none."""
@@ -150,12 +160,9 @@ class Trainer:
         settings = self.settings
         photo = self._next_photo()
         progress = min(self.iteration / self.total, 1.0)
-        decay = settings.rates.decay**progress
-        frozen = (
-            self.from_hull and self.iteration < settings.train.light_first and settings.render.shading == "deferred"
-        )
-        for group in self.optimizer.param_groups:
-            group["lr"] = 0.0 if frozen and group["name"] in GEOMETRY else group["rate"] * decay
+        if self.initial and progress >= settings.initial.until:
+            self._begin_deferred()
+        self._set_rates(progress)
 
         surfels, environment = self.surfels(), self.environment()
         rendering = self._render(surfels, environment, photo.camera)
@@ -167,10 +174,45 @@ class Trainer:
         self._forget_gradients()
         self.iteration += 1
         self._densify(progress)
+        self._reshape(progress)
         due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
-        if self._reflects() and due and self.iteration < self.total:
+        if self._reflects() and not self.initial and due and self.iteration < self.total:
             self._trace()
         return {"loss": loss.detach(), "square": square}
+
+    def _set_rates(self, progress: float) -> None:
+        settings, rates, frozen = self.settings, self.settings.rates, []
+        if self.from_hull and self.iteration < settings.train.light_first and settings.render.shading == "deferred":
+            frozen += GEOMETRY
+        since = self._since_propagation()
+        if since is not None and since < settings.propagation.rest:
+            frozen += ["opacity"]
+        for group in self.optimizer.param_groups:
+            decay = rates.decay**progress
+            if group["name"] == "position":
+                decay = rates.position_decay ** min(progress / rates.position_until, 1)
+            group["lr"] = 0.0 if group["name"] in frozen else group["rate"] * decay
+
+    def _since_propagation(self) -> int | None:
+        """Iterations since normals were last propagated, if they are at this stage."""
+        settings = self.settings.propagation
+        if not settings.every or self.iteration < settings.every:
+            return None
+        last = self.iteration // settings.every * settings.every
+        return self.iteration - last if last / self.total < settings.stop else None
+
+    @torch.no_grad()
+    def _begin_deferred(self) -> None:
+        """End the stage in which surfels are shaded one by one: on the geometry that it leaves, colour, material and light
+        start anew (paper §3.3)."""
+        self.initial = False
+        for name, row in start_appearance(self.settings).items():
+            if name in self.parameters:
+                self.parameters[name][:] = row
+                self.optimizer.state.pop(self.parameters[name], None)
+        self.light.fill_(self._start_light())
+        self.optimizer.state.pop(self.light, None)
+        self.report("stage", {"what": "shading what is blended: colour, material and light start anew"})
 
     def _forget_gradients(self) -> None:
         for group in self.optimizer.param_groups:
@@ -197,6 +239,14 @@ class Trainer:
             divide=progress < settings.stop,
         )
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
+
+    def _reshape(self, progress: float) -> None:
+        """What is done to all surfels now and then: mirrors' normals spread, or all grow faint."""
+        densify, due = self.settings.densify, self.iteration % max(self.settings.densify.reset_every, 1) == 0
+        if self._since_propagation() == 0 and self.settings.render.shading != "sh":
+            propagate_normals(self.parameters, self.optimizer, self.settings.propagation)
+        elif densify.reset_every and due and progress < densify.stop:
+            reset_opacity(self.parameters, self.optimizer)
 
     @torch.no_grad()
     def _trace(self) -> None:
@@ -312,7 +362,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             state = self.optimizer.state.get(group["params"][0], {})
             tensors |= {f"adam.{group['name']}.{key}": torch.as_tensor(value) for key, value in state.items()}
-        facts = {"seconds": self.seconds, "total": self.total}
+        facts = {"seconds": self.seconds, "total": self.total, "initial": self.initial}
         checkpoint.save(self.folder / "checkpoints", self.iteration, tensors, facts)
 
     def resume(self) -> None:
@@ -324,7 +374,7 @@ class Trainer:
         mesh = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("occluder.")}
         tensors = {name: value.to(self.device) for name, value in tensors.items()}
         self.iteration, self.seconds = facts["iteration"], facts["seconds"]
-        self.total = facts["total"]
+        self.total, self.initial = facts["total"], facts["initial"]
         self.motion.total, self.motion.views = tensors["motion.total"], tensors["motion.views"]
         self.optimizer.state.clear()
         for group in self.optimizer.param_groups:

@@ -1,0 +1,75 @@
+"""NeRO's Glossy Synthetic: `0.png`, `0-depth.png`, `0-camera.pkl` and so on in one folder.
+
+The layout is what `GlossySyntheticDatabase` reads in `dataset/database.py` of NeRO (Liu et al. 2023). A camera is a
+pickle of two arrays: world to camera (3, 4) with OpenCV's axes, and the intrinsic matrix (3, 3). A depth map has 16 bits
+for 0 to 15 units; what lies beyond 14.5 is background, and the rest is the mask. `synthetic_split_128.pkl`, from
+NeRO's folder `configs`, holds the numbers of the test views and of the training views, in this order; it is looked
+for in the scene's folder and in the one around it.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from refgs.camera import Camera
+from refgs.capture.files import photo_view, report_missing
+from refgs.capture.images import read_header
+from refgs.capture.pickles import read_pair
+from refgs.capture.poses import world_to_camera
+from refgs.capture.types import View
+from refgs.errors import InputError
+
+SPLIT = "synthetic_split_128.pkl"
+FAR = 14.5 / 15  # of a depth map's range: the background begins
+
+
+def read_nero(folder: Path) -> tuple[list[View], list[str]]:
+    """The views in NeRO's frame, and warnings. Raises InputError."""
+    names = (file.name.removesuffix("-camera.pkl") for file in folder.glob("*-camera.pkl"))
+    numbers = sorted(int(name) for name in names if name.isdecimal())
+    photos = [folder / f"{number}.png" for number in numbers]
+    report_missing(folder, [photo.name for photo in photos if not photo.is_file()], len(photos))
+    tested, warnings = _tested(folder, numbers)
+    views = []
+    for number, photo in zip(numbers, photos, strict=True):
+        file = folder / f"{number}-camera.pkl"
+        depth = folder / f"{number}-depth.png"
+        split = "test" if number in tested else "train"
+        camera = _camera(file, str(number), *read_header(photo)[:2])
+        mask, below = (depth, FAR) if depth.is_file() else (None, None)
+        views.append(photo_view(photo, (camera, None), split, mask, str(file), mask_below=below))
+    return views, warnings
+
+
+def _camera(file: Path, name: str, width: int, height: int) -> Camera:
+    pose, matrix = read_pair(file)
+    if np.shape(pose) != (3, 4) or np.shape(matrix) != (3, 3):
+        raise InputError(f"{file}: not a (3, 4) pose and a (3, 3) intrinsic matrix. Download the data set again.")
+    (fx, skew, cx), (_, fy, cy), _ = matrix.astype(float).tolist()
+    if not np.isfinite(matrix).all() or min(fx, fy) <= 0 or abs(skew) > 1e-6 * fx:
+        raise InputError(f"{file}: the focal length is zero, negative or NaN, or the pixels are skewed. Correct it.")
+    try:
+        inverse = np.linalg.inv(np.vstack([pose, [0, 0, 0, 1]]))
+    except np.linalg.LinAlgError:
+        inverse = np.zeros((3, 4))  # which the check of poses reports
+    return Camera(name, width, height, fx, fy, cx, cy, world_to_camera(inverse, str(file)))
+
+
+def _tested(folder: Path, numbers: list[int]) -> tuple[set[int], list[str]]:
+    """The views to test on: NeRO's own where its split is there, else every eighth; and a warning then."""
+    file = next((path for path in (folder / SPLIT, folder.parent / SPLIT) if path.is_file()), None)
+    if file is None:
+        warning = f"{SPLIT} of NeRO is neither in the scene's folder nor beside it: every eighth view is tested on"
+        return set(numbers[::8]), [warning]
+    try:
+        test, train = ({int(number) for number in part} for part in read_pair(file))
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{file}: not the numbers of the test views and of the training views. Download it again."
+        ) from None
+    if test & train or test | train != set(numbers):
+        raise InputError(
+            f"{file}: it splits {len(test)} + {len(train)} views, which are not the {len(numbers)} of {folder}. "
+            "Remove it, or use the one that belongs to the data."
+        )
+    return test, []

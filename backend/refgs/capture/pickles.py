@@ -1,0 +1,112 @@
+"""Pickles that hold NumPy arrays, read without running anything else that they may name.
+
+`pickle.load` calls whatever a file tells it to, and a capture comes from anywhere. Here the few names that a pickled
+array consists of stand for plain containers, any other name is refused, and the numbers are taken from the bytes alone.
+"""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+
+from refgs.errors import InputError
+
+LARGEST = 1 << 20  # bytes: a camera takes some hundred, a split a few thousand
+KINDS = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
+
+
+def read_pair(file: Path) -> tuple[np.ndarray | list[int | str], np.ndarray | list[int | str]]:
+    """The two arrays or lists that a pickle holds. Raises InputError, one line, for anything else."""
+    try:
+        with file.open("rb") as source:
+            data = source.read(LARGEST + 1)
+            if len(data) > LARGEST:
+                raise InputError(f"{file}: larger than a camera or a split can be. Download the data set again.")
+            source.seek(0)
+            first, second = _Arrays(source).load()
+            return _plain(first), _plain(second)
+    except InputError:
+        raise
+    except FileNotFoundError:
+        raise InputError(f"{file}: the file is missing. Download the data set again.") from None
+    except _Refused as error:
+        raise InputError(f"{file}: holds {error}, not only arrays, so it was not opened. Do not trust it.") from None
+    except Exception as error:
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"{file}: not a pickle of arrays ({reason}). Download the data set again.") from error
+
+
+class _Refused(Exception):
+    pass
+
+
+class _Dtype:
+    """Stands for numpy.dtype: made from "f8" and the like, its byte order in the state."""
+
+    def __init__(self, kind: str, *_):
+        self.kind, self.order = kind, "="
+
+    def __setstate__(self, state: tuple):
+        self.order = state[1].replace("|", "=")
+
+
+class _Array:
+    """Stands for numpy.ndarray: shape, type and bytes, made into an array only when all have been read."""
+
+    def __setstate__(self, state: tuple):
+        _, self.shape, self.dtype, fortran, self.data = state
+        self.order = "F" if fortran else "C"
+
+    def numpy(self) -> np.ndarray:
+        kind = self.dtype.kind.lstrip("<>=|")
+        if kind not in KINDS:
+            raise ValueError(f"an array of {kind!r}")
+        numbers = np.frombuffer(self.data, self.dtype.order + kind)
+        return numbers.reshape(self.shape, order=self.order).astype(kind)
+
+
+def _array(*_) -> _Array:
+    return _Array()
+
+
+def _from_buffer(data, dtype, shape, order) -> _Array:
+    result = _Array()
+    result.__setstate__((1, shape, dtype, order == "F", data))
+    return result
+
+
+def _scalar(dtype, data) -> _Array:
+    return _from_buffer(data, dtype, (), "C")
+
+
+def _encode(text: str, encoding: str) -> bytes:
+    if encoding != "latin1":
+        raise _Refused(f"text in {encoding}")
+    return text.encode("latin1")  # how protocols before 3 write bytes
+
+
+# NumPy's own names as releases before and since 2 write them.
+_NAMES = {("numpy", "ndarray"): _Array, ("numpy", "dtype"): _Dtype, ("_codecs", "encode"): _encode}
+for _core in ("numpy.core", "numpy._core"):
+    _NAMES[f"{_core}.multiarray", "_reconstruct"] = _array
+    _NAMES[f"{_core}.multiarray", "scalar"] = _scalar
+    _NAMES[f"{_core}.numeric", "_frombuffer"] = _from_buffer
+
+
+class _Arrays(pickle.Unpickler):
+    def find_class(self, module: str, name: str):
+        try:
+            return _NAMES[module, name]
+        except KeyError:
+            raise _Refused(f"{module}.{name}") from None
+
+
+def _plain(part: object) -> np.ndarray | list:
+    if isinstance(part, _Array):
+        return part.numpy()
+    if not isinstance(part, list | tuple):
+        raise ValueError(f"a {type(part).__name__}")
+    numbers = [item.numpy().item() if isinstance(item, _Array) else item for item in part]
+    if not all(isinstance(number, int | str) for number in numbers):
+        raise ValueError("a list of something else than numbers")
+    return numbers

@@ -1,0 +1,105 @@
+"""3D Gaussians through the rasteriser of surfels, for comparison with them (paper Tables 3 and 7).
+
+EWA splatting (Zwicker et al. 2001, as in Kerbl et al. 2023) projects a Gaussian's covariance by the projection's derivative at its
+centre. The picture of that is a disc's across the camera's axis, at the centre's depth: of such a disc the projection is
+affine, so the rasteriser draws it exactly.
+"""
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from refgs.camera import Camera
+from refgs.model.surfels import Surfels
+
+SIDE = 1.3  # in half pictures: beyond that the projection's derivative is that of the border, or it would grow without bound
+# Turns that bring axis 0, 1 or 2 to the third place, as quaternions wxyz.
+TO_THIRD = ((0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1.0, 0.0, 0.0, 0.0))
+
+
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """Of quaternions wxyz (..., 4): b first, then a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        dim=-1,
+    )
+
+
+def shortest_last(rotations: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
+    """The same Gaussians with their shortest axis, which is their normal, in the third place: quaternions (N, 4), (N, 3)."""
+    shortest = scales.argmin(dim=1)
+    turns = rotations.new_tensor(TO_THIRD)[shortest]
+    order = (shortest[:, None] + torch.arange(1, 4, device=scales.device)) % 3
+    return product(rotations, turns), scales.gather(1, order)
+
+
+class _Angle(torch.autograd.Function):
+    """Half the angle of (x, y). Round Gaussians have none, and feel no turn: no derivative there."""
+
+    @staticmethod
+    def forward(ctx, y, x, size):
+        ctx.save_for_backward(y, x, size)
+        return 0.5 * torch.atan2(y, x)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, by_angle):
+        y, x, size = ctx.saved_tensors
+        scaled = 0.5 * by_angle / (x * x + y * y + (1e-4 * size) ** 2)
+        return scaled * x, -scaled * y, None
+
+
+def discs(surfels: Surfels, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What `rasterize` takes of surfels' geometry: their own, or of 3D Gaussians that of discs with the same picture."""
+    positions, rotations, scales, opacities, *_ = surfels
+    if scales.shape[1] == 3:
+        rotations, scales = across_the_axis(positions, rotations, scales, camera)
+    return positions, rotations, scales, opacities
+
+
+def across_the_axis(positions: Tensor, rotations: Tensor, scales: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Discs with the pictures of Gaussians: quaternions wxyz (N, 4) and standard deviations (N, 2) in world units.
+
+    Of `positions` (N, 3), `rotations` (N, 4) of any length and `scales` (N, 3); differentiable in all three.
+    """
+    w, x, y, z = torch.nn.functional.normalize(rotations, dim=-1).unbind(-1)
+    columns = [
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    view = camera.world_to_camera.tolist()
+    point = [sum(view[i][j] * positions[:, j] for j in range(3)) + view[i][3] for i in range(3)]
+    depth = point[2].clamp_min(1e-9)
+    wide, high = (
+        max(camera.cx, camera.width - camera.cx) / camera.fx,
+        max(camera.cy, camera.height - camera.cy) / camera.fy,
+    )
+    slope = [(p / depth).clamp(-SIDE * most, SIDE * most) for p, most in zip(point, (wide, high), strict=False)]
+    # How the three axes move along the camera's plane at that depth: the projection's derivative, times the depth.
+    moves = []
+    for column, scale in zip(columns, scales.unbind(-1), strict=True):
+        a = [scale * sum(view[i][j] * column[j] for j in range(3)) for i in range(3)]
+        moves.append((a[0] - slope[0] * a[2], a[1] - slope[1] * a[2]))
+    xx, xy, yy = (sum(m[i] * m[j] for m in moves) for i, j in ((0, 0), (0, 1), (1, 1)))
+    middle, apart = (xx + yy) / 2, (xx - yy) / 2
+    half = torch.sqrt(apart * apart + xy * xy + 1e-12 * middle * middle)
+    variances = torch.stack([middle + half, (middle - half).clamp_min(1e-9 * middle.detach())], dim=-1)
+    angle = _Angle.apply(xy, apart, middle.detach()) / 2
+    none = torch.zeros_like(angle)
+    turn = torch.stack([torch.cos(angle), none, none, torch.sin(angle)], dim=-1)
+    return product(_from_camera(camera).to(turn), turn), torch.sqrt(variances + 1e-30)
+
+
+def _from_camera(camera: Camera) -> Tensor:
+    """The quaternion wxyz (4,) of the turn from the camera's axes to the world's."""
+    x, y, z, w = Rotation.from_matrix(camera.world_to_camera[:3, :3].T).as_quat()
+    return torch.tensor([w, x, y, z])

@@ -1,0 +1,190 @@
+"""What the split sum gets wrong: outgoing radiance of this program's shading against a Monte Carlo of the rendering equation.
+
+Under one light the error is that of the split itself: the lobe is taken to be seen from its own axis (N = V = R), so that it
+neither stretches at grazing angles nor ends at the horizon. What texels, levels of roughness and harmonics of degree 2 add
+is the difference between the two figures of a cell.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from refgs.camera import Camera
+from refgs.model import cubemap
+from refgs.model.environment import Environment
+from refgs.model.prefilter import ggx_lobe
+from refgs.render.brdf import bounces, fresnel, one_bounce
+from refgs.render.shade import shade
+
+ROUGHNESS, ANGLES = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0), (0, 30, 60, 80)  # the latter between view and normal, in degrees
+RESOLUTION, SAMPLES = 64, 100_000
+SHARPNESS = 200.0  # of the sun, a standard deviation of 4 degrees
+
+Radiance = Callable[[np.ndarray], np.ndarray]
+
+
+class Material(NamedTuple):
+    metallic: float
+    albedo: float
+
+
+METAL, DIELECTRIC = Material(1.0, 0.7), Material(0.0, 0.5)
+
+
+class View(NamedTuple):
+    """Of a surface whose normal is +z."""
+
+    way: np.ndarray  # to the camera
+    mirrored: np.ndarray
+
+    @classmethod
+    def at(cls, angle: float) -> "View":
+        sine, cosine = np.sin(np.radians(angle)), np.cos(np.radians(angle))
+        return cls(np.array([sine, 0, cosine]), np.array([-sine, 0, cosine]))
+
+
+def lights(sun: np.ndarray) -> dict[str, Radiance]:
+    """Radiance (P,) along directions (P, 3); a sun in that direction."""
+    slope = np.array([-0.48, 0.48, 0.424])
+    return {
+        "constant": lambda d: np.ones(len(d)),
+        "gradient": lambda d: 1 + d @ slope,
+        "sun": lambda d: 0.2 + 20 * np.exp(SHARPNESS * (d @ sun - 1)),
+    }
+
+
+class Reflected(NamedTuple):
+    """Of an even light, exactly: by which the lobe is brighter than its single bounce; what leaves; what the base is left."""
+
+    bounces: float
+    specular: float
+    base: float
+
+    @classmethod
+    @functools.cache
+    def of(cls, material: Material, n_v: float, roughness: float) -> "Reflected":
+        x, weight = np.polynomial.legendre.leggauss(64)
+        cosine, weight = (x + 1) / 2, weight / 2
+        average_energy = one_bounce(cosine, roughness, 48)[:2].sum(axis=0) @ (2 * cosine * weight)
+        fg0, fg1, dielectric = one_bounce(np.array([min(n_v, 1 - 1e-12)]), roughness, 64)[:, 0]
+        average = (20 * material.albedo + 1) / 21 if material.metallic else (2 * cosine * fresnel(cosine)) @ weight
+        scale = bounces(average, fg0 + fg1, average_energy)
+        if material.metallic:
+            return cls(scale, (material.albedo * fg0 + fg1) * scale, 0.0)
+        return cls(scale, dielectric * scale, (1 - dielectric * scale) * material.albedo)
+
+
+def monte_carlo(
+    light: Radiance, sun: np.ndarray, view: View, roughness: float, material: Material, samples: int, seed: int = 0
+) -> tuple[float, float]:
+    """Outgoing radiance by the rendering equation, and its standard error. A third of the samples each by the distribution of
+    visible normals (Heitz 2018), by the cosine and by the sun's shape, weighed by the balance heuristic."""
+    rng, alpha, v = np.random.default_rng(seed), roughness**2, view.way
+    n = samples // 3
+    u, phi = rng.random((3, n)), 2 * np.pi * rng.random((3, n))
+
+    stretched = np.array([alpha * v[0], 0, v[2]]) / np.hypot(alpha * v[0], v[2])
+    t1, t2 = np.sqrt(u[0]) * np.cos(phi[0]), np.sqrt(u[0]) * np.sin(phi[0])
+    s = (1 + stretched[2]) / 2
+    t2 = (1 - s) * np.sqrt(1 - t1**2) + s * t2
+    up = np.sqrt(np.maximum(1 - t1**2 - t2**2, 0))
+    half = np.stack(
+        [alpha * (up * stretched[0] - t2 * stretched[2]), alpha * t1, up * stretched[2] + t2 * stretched[0]], -1
+    )
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    by_lobe = 2 * (half @ v)[:, None] * half - v
+
+    by_cosine = np.stack([np.sqrt(u[1]) * np.cos(phi[1]), np.sqrt(u[1]) * np.sin(phi[1]), np.sqrt(1 - u[1])], -1)
+    cosine = 1 + np.log(u[2] + (1 - u[2]) * np.exp(-2 * SHARPNESS)) / SHARPNESS
+    sine = np.sqrt(np.maximum(1 - cosine**2, 0))
+    side = np.array([sun[2], 0, -sun[0]])
+    by_sun = cosine[:, None] * sun + (sine * np.cos(phi[2]))[:, None] * side
+    by_sun[:, 1] += sine * np.sin(phi[2])
+
+    d = np.concatenate([by_lobe, by_cosine, by_sun])
+    n_l, n_v = d[:, 2], v[2]
+    above = n_l > 0
+    n_l = np.where(above, n_l, 1.0)
+    half = d + v
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    v_h = np.clip(half @ v, 0, 1)
+    ggx = alpha**2 / (np.pi * (half[:, 0] ** 2 + half[:, 1] ** 2 + (alpha * half[:, 2]) ** 2) ** 2)
+    tails = [np.sqrt(1 + alpha**2 * (1 / c**2 - 1)) for c in (n_v, n_l)]
+    schlick = material.albedo + (1 - material.albedo) * (1 - v_h) ** 5
+    reflected = Reflected.of(material, n_v, roughness)
+    lobe = ggx * 2 / (tails[0] + tails[1]) / (4 * n_v) * (schlick if material.metallic else fresnel(v_h))
+    value = light(d) * (lobe * reflected.bounces + reflected.base * n_l / np.pi)
+    density = ggx * 2 / (1 + tails[0]) / (4 * n_v) + n_l / np.pi
+    density += SHARPNESS / (2 * np.pi * -np.expm1(-2 * SHARPNESS)) * np.exp(SHARPNESS * (d @ sun - 1))
+    share = np.where(above, value / density, 0).reshape(3, n)  # the mean over a third of each adds up
+    return float(share.mean(axis=1).sum()), float(np.sqrt(share.var(axis=1).sum() / n))
+
+
+def split_sum(light: Radiance, view: View, roughness: float, material: Material) -> float:
+    """Outgoing radiance by the split sum, both factors exact (Eq. 7 and 8), and by Lambert's law."""
+    x, weight = np.polynomial.legendre.leggauss(200)
+    psi = np.pi / 4 * (x + 1)
+    tangent = roughness**2 * np.tan(psi)  # of half the angle from the mirrored view
+    cosine, sine = (1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2)
+    weight = weight * ggx_lobe(cosine, roughness) * sine * (1 + (tangent / roughness**2) ** 2) / (1 + tangent**2)
+    azimuth = 2 * np.pi * np.arange(64) / 64
+    r, side = view.mirrored, np.array([view.mirrored[2], 0, -view.mirrored[0]])
+    d = cosine[:, None, None] * r + (sine[:, None] * np.cos(azimuth))[..., None] * side
+    d[..., 1] += sine[:, None] * np.sin(azimuth)
+    filtered = weight @ light(d.reshape(-1, 3)).reshape(200, 64).mean(axis=1) / weight.sum()
+    d, area = (v.numpy() for v in (cubemap.texel_directions(128), cubemap.texel_solid_angles(128)))
+    received = (light(d) * np.maximum(d[:, 2], 0)) @ area / np.pi
+    reflected = Reflected.of(material, view.way[2], roughness)
+    return float(filtered * reflected.specular + received * reflected.base)
+
+
+def shaded(light: Radiance, view: View, materials: list[tuple[float, Material]]) -> Tensor:
+    """Outgoing radiance (P,) by this program's kernels: a pixel each."""
+    count = len(materials)
+    right, up = np.array([0.0, 1.0, 0.0]), np.cross(view.way, [0.0, 1.0, 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, -up, -view.way])
+    pose[:3, 3] = [0, 0, 1]  # the camera looks at the origin, from one away; so narrowly that all rays are parallel
+    camera = Camera("view", count, 1, 1e6, 1e6, count / 2, 0.5, pose)
+    across = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) / 1e6
+    features = torch.zeros(1, count, 11)
+    features[0, :, 2] = 1
+    for i, (roughness, material) in enumerate(materials):
+        features[0, i, 3:6], features[0, i, 6], features[0, i, 7] = material.albedo, material.metallic, roughness
+    features[0, :, 8:] = (across[:, None] * torch.from_numpy(right)).float()
+    radiance = torch.from_numpy(light(cubemap.texel_directions(RESOLUTION).numpy())).float()
+    environment = Environment(radiance[:, None].expand(-1, 3).contiguous())
+    return shade(features, torch.ones(1, count), environment, camera, torch.zeros(3)).radiance[0, :, 0]
+
+
+def main() -> None:
+    console = Console()
+    for name, material in (("metal", METAL), ("dielectric", DIELECTRIC)):
+        title = f"{name}, albedo {material.albedo}: error of this program (of the exact split sum), standard error of the truth"
+        table = Table("roughness", "light", *(f"{angle}°" for angle in ANGLES), title=title)
+        for kind in ("constant", "gradient", "sun"):
+            columns = []
+            for angle in ANGLES:
+                view = View.at(angle)
+                light = lights(view.mirrored)[kind]
+                found = shaded(light, view, [(roughness, material) for roughness in ROUGHNESS]).tolist()
+                cells = []
+                for ours, roughness in zip(found, ROUGHNESS, strict=True):
+                    truth, error = monte_carlo(light, view.mirrored, view, roughness, material, SAMPLES)
+                    exact = split_sum(light, view, roughness, material)
+                    cells.append(f"{ours / truth - 1:+.2%} ({exact / truth - 1:+.2%}) {error / truth:.2%}")
+                columns.append(cells)
+            for roughness, row in zip(ROUGHNESS, zip(*columns, strict=True), strict=True):
+                table.add_row(f"{roughness}", kind, *row)
+        console.print(table)
+    console.print(f"A cubemap of 6×{RESOLUTION}²; a sun of 4 degrees, in the mirrored direction.")
+
+
+if __name__ == "__main__":
+    main()

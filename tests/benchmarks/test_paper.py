@@ -1,0 +1,182 @@
+"""The paper's tables: which scenes are found, what of them is done again, and the figures side by side."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from benchmarks import paper
+from refgs import commands
+from refgs.errors import InputError
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "capture"))
+from makers import colmap, nero, shiny_blender
+
+
+def finish(run: Path, **figures: float) -> None:
+    """A run folder as it is after `refgs evaluate`."""
+    run.mkdir(parents=True)
+    (run / "run.toml").touch()
+    (run / "splats.ply").touch()
+    (run / "metrics.json").write_text(json.dumps({"split": "test", **figures}))
+    (run / "history.jsonl").write_text('{"seconds": 60.0}\n{"seconds": 1800.0}\n')
+
+
+def printed(tables) -> list[list[str]]:
+    """The rows of tables as lists of words."""
+    console = Console(width=200)
+    with console.capture() as capture:
+        for table in tables:
+            console.print(table)
+    return [line.replace("│", " ").replace("┃", " ").split() for line in capture.get().splitlines()]
+
+
+def test_the_papers_figures_are_its_means():
+    """Tables 5 and 6 of the paper give the means of Table 1 (its mean PSNR of Glossy Synthetic, 30.33, is not that of its scenes)."""
+
+    def mean(data_set: str, measure: str) -> float:
+        values = paper.PAPER[data_set][measure]
+        assert len(values) == len(paper.PAPER[data_set]["scenes"])
+        return sum(values) / len(values)
+
+    assert mean("shiny_blender", "psnr") == pytest.approx(35.04, abs=0.006)
+    assert mean("shiny_blender", "ssim") == pytest.approx(0.973, abs=0.0006)
+    assert mean("shiny_blender", "lpips") == pytest.approx(0.056, abs=0.0006)
+    assert mean("glossy_synthetic", "psnr") == pytest.approx(30.33, abs=0.05)
+    assert mean("glossy_synthetic", "ssim") == pytest.approx(0.958, abs=0.0006)
+    assert mean("glossy_synthetic", "lpips") == pytest.approx(0.049, abs=0.0006)
+    for data_set in ("ref_real", "nerf_synthetic"):
+        assert 20 < mean(data_set, "psnr") < 40 and mean(data_set, "lpips") < mean(data_set, "ssim") < 1
+
+
+def test_scenes_are_found_where_they_are_put(tmp_path, capsys):
+    for scene in (
+        "shiny_blender/ball",
+        "shiny_blender/unknown",
+        "glossy_synthetic/bell_blender",
+        "nerf_synthetic/lego",
+    ):
+        (tmp_path / scene).mkdir(parents=True)
+    nero(tmp_path / "glossy_synthetic" / "cat", count=1)
+    colmap(tmp_path / "ref_real" / "sedan", count=1)
+    colmap(tmp_path / "ref_real" / "toycar", count=1)
+    (tmp_path / "ref_real" / "toycar" / "images_4").mkdir()
+    scenes = paper.find_scenes(tmp_path)
+    assert [scene.capture.relative_to(tmp_path).as_posix() for scene in scenes] == [
+        "shiny_blender/ball",
+        "glossy_synthetic/bell_blender",
+        "glossy_synthetic/cat",
+        "ref_real/sedan",
+        "ref_real/toycar/images_4",
+        "nerf_synthetic/lego",
+    ]
+    said = capsys.readouterr().out
+    assert "sedan is measured on its photos of full size" in said and "cat is measured on every eighth view" in said
+    assert "toycar" not in said and "bell" not in said
+
+
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules")  # which it is only here
+def test_nothing_there_is_said_in_one_line(tmp_path):
+    with pytest.raises(InputError) as error:
+        commands.bench("paper", ["--data", str(tmp_path), "--preset", "standard"])
+    message = str(error.value)
+    assert "\n" not in message
+    for place in ("shiny_blender/ball", "glossy_synthetic/angel", "ref_real/gardenspheres", "nerf_synthetic/chair"):
+        assert str(tmp_path / place) in message
+
+
+def test_other_benchmarks_take_no_options():
+    with pytest.raises(InputError, match="kernels has no options"):
+        commands.bench("kernels", ["--data", "x"])
+
+
+def test_only_what_is_missing_is_done(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(paper, "call", lambda *arguments: done.append(arguments) or 0)
+    scene = paper.Scene("shiny_blender", "ball", tmp_path / "ball")
+    run = scene.run(tmp_path)
+    assert paper.measure(scene, run, "quick")
+    whole = ("train", scene.capture, "--out", run, "--preset", "quick", "--set", "image.max_side=8192")
+    assert done == [whole, ("evaluate", run)]
+    finish(run, psnr=30.0)
+    done.clear()
+    assert paper.measure(scene, run, "quick") and done == []
+    (run / "metrics.json").write_text('{"split": "train", "psnr": 30.0}')
+    assert paper.measure(scene, run, "quick") and done == [("evaluate", run)]
+    (run / "splats.ply").unlink()
+    done.clear()
+    assert paper.measure(scene, run, "quick")
+    assert done == [("train", scene.capture, "--out", run, "--resume"), ("evaluate", run)]
+    monkeypatch.setattr(paper, "call", lambda *_: 2)
+    assert not paper.measure(scene, run, "quick")
+
+
+def test_tables_of_finished_runs(tmp_path, capsys):
+    """Nothing is trained; a scene without LPIPS has none, and then there is no mean of it."""
+    data, out = tmp_path / "data", tmp_path / "runs"
+    measured = {
+        "shiny_blender/coffee": {"psnr": 36.0, "ssim": 0.98, "lpips": 0.1, "normal_mae_degrees": 1.5},
+        "shiny_blender/toaster": {"psnr": 32.0, "ssim": 0.96, "lpips": 0.03, "normal_mae_degrees": 2.5},
+        "glossy_synthetic/cat": {"psnr": 33.5, "ssim": 0.97, "lpips": 0.04},
+        "nerf_synthetic/materials": {"psnr": 34.0, "ssim": 0.97, "lpips": 0.02},
+        "nerf_synthetic/ship": {"psnr": 30.0, "ssim": 0.9},
+    }
+    for name, figures in measured.items():
+        (data / name).mkdir(parents=True)
+        finish(out / "standard" / name, **figures)
+    paper.main(["--data", str(data), "--out", str(out), "--preset", "standard"])
+    said = capsys.readouterr().out
+    for title in (
+        "Table 1, Shiny Blender",
+        "Table 1, Glossy Synthetic",
+        "Table 8, NeRF-Synthetic",
+        "Table 2, Shiny Blender",
+    ):
+        assert title in " ".join(said.split())
+    found = {tuple(name.split("/")): paper.figures(out / "standard" / name) for name in measured}
+    rows = printed(paper.tables(found, "standard"))
+    assert ["coffee", "36.00", "34.63", "0.980", "0.976", "0.100", "0.076"] in rows
+    assert ["mean", "34.00", "31.34", "0.970", "0.962", "0.065", "0.075"] in rows
+    assert ["cat", "33.50", "33.01", "0.970", "0.973", "0.040", "0.040"] in rows
+    assert ["ship", "30.00", "30.78", "0.900", "0.898", "–", "0.125"] in rows
+    assert ["mean", "32.00", "30.61", "0.935", "0.931", "–", "0.081"] in rows
+    assert (
+        ["toaster", "2.50", "0.50"] in rows and ["mean", "2.00", "0.50"] in rows and ["paper", "2.15", "0.58"] in rows
+    )
+    assert "Ref-Real" not in said
+
+
+def test_a_scene_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, capsys):
+    for name in ("ball", "car"):
+        (tmp_path / "shiny_blender" / name).mkdir(parents=True)
+    finish(tmp_path / "runs" / "standard" / "shiny_blender" / "car", psnr=31.0, ssim=0.9, lpips=0.1)
+    monkeypatch.setattr(paper, "call", lambda *_: 2)
+    with pytest.raises(SystemExit) as left:
+        paper.main(["--data", str(tmp_path), "--out", str(tmp_path / "runs"), "--preset", "standard"])
+    said = capsys.readouterr().out
+    assert left.value.code == 1 and "not measured, see above: shiny_blender/ball" in said and "31.00" in said
+
+
+def test_from_photos_to_the_tables(tmp_path, monkeypatch, capsys):
+    """The ball of Shiny Blender as small as can be, in this process."""
+    shiny_blender(tmp_path / "shiny_blender" / "ball")
+    preset = tmp_path / "tiny.toml"
+    preset.write_text(
+        'base = "quick"\n[surfels]\nstart = 300\nbudget = 300\nhull = 32\n[environment]\nresolution = 16\n'
+        "[train]\niterations = 3\nlight_first = 1\n[indirect]\nstart = 1\n"
+    )
+
+    def call(what, folder, *options):
+        if what == "train":
+            assert options[0] == "--out" and options[2:4] == ("--preset", str(preset))
+            commands.train(folder, options[1], str(preset), "cpu", None, [options[5]], False)
+        else:
+            commands.evaluate(folder, "test", None)
+        return 0
+
+    monkeypatch.setattr(paper, "call", call)
+    paper.main(["--data", str(tmp_path), "--out", str(tmp_path / "runs"), "--preset", str(preset)])
+    assert "Table 1, Shiny Blender: preset tiny, 1 of 6 scenes" in " ".join(capsys.readouterr().out.split())
+    assert (tmp_path / "runs/tiny/shiny_blender/ball/pictures/test/photo/r_0.png").exists()

@@ -1,0 +1,101 @@
+"""Stages of a training: surfels shaded one by one first, opacity resets, normal propagation, a screen's colours."""
+
+import pytest
+import torch
+
+from refgs.capture import read_capture
+from refgs.run import create_run, open_run
+from refgs.settings import load_settings
+from refgs.train.asset import write_asset
+from refgs.train.start import GEOMETRY
+from refgs.train.trainer import Trainer
+
+SMALL = ["surfels.start=1500", "surfels.budget=1800", "surfels.hull=64", "environment.resolution=16"]
+
+
+def trainer(capture_folder, folder, preset, *changes):
+    capture, settings = read_capture(capture_folder), load_settings(preset, [*SMALL, *changes])
+    create_run(folder, capture, settings, preset, "cpu")
+    return Trainer(capture, settings, folder, lambda event, facts: None)
+
+
+def test_the_deferred_stage_keeps_the_geometry_alone(ball_capture, tmp_path):
+    made = trainer(ball_capture, tmp_path / "run", "quick", "train.iterations=60", "initial.until=0.5", "diffuse=sh")
+    start = {name: value.detach().clone() for name, value in made.parameters.items()}
+    light = made.light.detach().clone()
+    for _ in range(30):
+        made.step()
+    learned = {name: value.detach().clone() for name, value in made.parameters.items()}
+    assert made.initial and all(
+        not torch.equal(learned[name], start[name]) for name in ("albedo", "sh_dc", "roughness")
+    )
+    made._begin_deferred()
+    assert not made.initial
+    for name, value in made.parameters.items():
+        if name in GEOMETRY:
+            assert torch.equal(value, learned[name]), name
+        else:
+            assert torch.equal(value, start[name][:1].expand_as(value)), name
+            assert value not in made.optimizer.state
+    assert torch.equal(made.light, light) and made.light not in made.optimizer.state
+    assert made.parameters["position"] in made.optimizer.state
+
+
+def test_the_stage_ends_where_the_preset_says(ball_capture, tmp_path):
+    made = trainer(ball_capture, tmp_path / "run", "quick", "train.iterations=10", "initial.until=0.4")
+    stages = []
+    for _ in range(10):
+        made.step()
+        stages.append(made.initial)
+    assert stages == [True] * 4 + [False] * 6
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ["initial.until=0.3"],
+        ["shading=splat", "diffuse=sh"],
+        ["color_space=display"],
+        ["primitive=3dgs"],
+    ],
+)
+def test_learns_and_renders_as_it_trained(ball_capture, tmp_path, changes):
+    made = trainer(ball_capture, tmp_path / "run", "quick", "train.iterations=300", "surfels.metallic=0.9", *changes)
+    made.run()
+    assert made.test_psnr() > 25
+    write_asset(made)
+    asset, view = open_run(made.folder), made.test[0]
+    assert float((made.render(view.camera).color - asset.render(view.camera).color).abs().mean()) < 3e-3
+
+
+def test_the_papers_schedule_runs_to_its_end(ball_capture, tmp_path):
+    """Through all of its stages, in fewer iterations."""
+    changes = ["train.iterations=300", "densify.every=20", "propagation.every=100", "rates.environment=0.05"]
+    changes += ["propagation.rest=10", "indirect.every=60", "indirect.resolution=32"]
+    made = trainer(ball_capture, tmp_path / "run", "paper", *changes)
+    before = made.test_psnr()
+    made.run()
+    assert not made.initial and made.test_psnr() > before + 5
+
+
+def test_all_grow_faint_and_mirrors_grow(ball_capture, tmp_path):
+    changes = ["train.iterations=100", "densify.every=100", "densify.reset_every=6", "propagation.every=4"]
+    made = trainer(ball_capture, tmp_path / "run", "quick", *changes, "propagation.rest=2")
+    with torch.no_grad():  # half of them are mirrors
+        made.parameters["metallic"][::2], made.parameters["roughness"][::2] = 3.0, -5.0
+        made.parameters["metallic"][1::2], made.parameters["roughness"][1::2] = 3.0, 5.0
+
+    def step():
+        made.step()
+        return {name: value.detach().clone() for name, value in made.parameters.items()}
+
+    for _ in range(3):
+        before = step()
+    made.optimizer.param_groups = [g for g in made.optimizer.param_groups if g["name"] not in ("metallic", "roughness")]
+    after = step()
+    grown = (after["scale"] - before["scale"]).exp().mean(dim=1)
+    assert float(grown[::2].mean()) == pytest.approx(1.5, abs=0.05)
+    assert float(grown[1::2].mean()) == pytest.approx(1, abs=0.05)
+    assert after["opacity"].sigmoid().min() > 0.899
+    assert torch.equal(step()["opacity"], after["opacity"])  # at rest
+    assert step()["opacity"].sigmoid().max() < 0.0101  # the sixth: all grow faint
