@@ -174,6 +174,22 @@ def test_only_what_is_there_is_measured(made, tmp_path):
     assert figures(run).keys() - photos_only == {"environment", "frames_per_second", "frames_device"}
 
 
+def test_normals_that_a_data_set_brings_are_the_truth_where_there_is_no_other(made, monkeypatch):
+    run, truth, _ = made
+    there, asked = open_run(run), []
+
+    def published(view, max_side):
+        asked.append(view.camera.name)
+        images = maps(there.render(view.camera))
+        return np.where(images["alpha"][..., None] > 0.5, -images["normal"], 0), images["alpha"]
+
+    monkeypatch.setattr("refgs.report.evaluate.published_normals", published)
+    commands.evaluate(run, "test", None)
+    assert len(asked) == 4 and figures(run)["normal_mae_degrees"] == pytest.approx(180, abs=0.1)
+    commands.evaluate(run, "test", truth)
+    assert len(asked) == 4 and figures(run)["normal_mae_degrees"] < 0.1
+
+
 def test_a_missing_file_is_one_line(made, tmp_path):
     run, truth, views = made
     (tmp_path / "empty").mkdir()

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from refgs.camera import Camera
-from refgs.capture import LoadedView, View, load_view
+from refgs.capture import LoadedView, View, load_view, published_normals
 from refgs.color import srgb_encode
 from refgs.errors import InputError
 from refgs.export.environment import directions, read_environment, read_exr, sample
@@ -49,6 +49,12 @@ class GroundTruth:
         if not (self.passes or self.hdris or self.has_light or self.has_mesh):
             known = ", ".join([f"{name}/" for name in _PASSES] + ["relight/", "light.exr", "mesh.ply"])
             raise InputError(f"{folder}: there is no ground truth in it; known are {known}")
+
+    def maps(self, camera: Camera) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """All passes of a view that there are, and its coverage."""
+        if not self.passes:
+            return {}, np.zeros((camera.height, camera.width), np.float32)
+        return {name: self.view(name, camera) for name in self.passes}, self.view("alpha", camera)
 
     def view(self, name: str, camera: Camera) -> np.ndarray:
         """A pass of a view, float32 (h, w) or (h, w, channels)."""
@@ -103,7 +109,7 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
     without_lpips = metrics.lpips_missing()
     for view in views:
         loaded = load_view(view, run.settings.image.max_side)
-        figures = _view(run, loaded, truth, pictures / split, without_lpips is None)
+        figures = _view(run, view, loaded, truth, pictures / split, without_lpips is None)
         for name, value in figures.items():
             rows.setdefault(name, []).append(value)
         cameras.append(loaded.camera)
@@ -124,8 +130,11 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
     return found | {"views": len(views), "split": split, "splats": len(run.splats)} | _speed(run, cameras)
 
 
-def _view(run: Run, loaded: LoadedView, truth: GroundTruth | None, pictures: Path, with_lpips: bool) -> dict[str, Any]:
-    """The figures of one view, and its pictures."""
+def _view(
+    run: Run, view: View, loaded: LoadedView, truth: GroundTruth | None, pictures: Path, with_lpips: bool
+) -> dict[str, Any]:
+    """The figures of one view, and its pictures. Where no pass of it is in the ground truth, the normals that its data set
+    brings are the truth."""
     camera, background = loaded.camera, np.array(run.settings.image.background, dtype=np.float32)
     rendering = run.render(camera)
     color = np.clip(rendering.color.numpy(), 0, 1)
@@ -144,12 +153,12 @@ def _view(run: Run, loaded: LoadedView, truth: GroundTruth | None, pictures: Pat
     for name in _PASSES:
         if name in images:
             write(name, picture(name, images[name], alpha))
-    if truth is None or not truth.passes:
-        return figures
-    true_alpha = truth.view("alpha", camera)
+    known, true_alpha = truth.maps(camera) if truth else ({}, np.zeros_like(alpha))
+    if not known:
+        published = published_normals(view, run.settings.image.max_side)
+        known, true_alpha = ({"normal": published[0]}, published[1]) if published else (known, true_alpha)
     covered = true_alpha >= metrics.COVERED
-    for name in truth.passes:
-        true = truth.view(name, camera)
+    for name, true in known.items():
         write(f"true_{name}", picture(name, true, true_alpha))
         if not covered.any():
             continue
