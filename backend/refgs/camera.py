@@ -37,6 +37,14 @@ class Camera:
         """The camera's centre in the world, (3,)."""
         return self.camera_to_world[:3, 3]
 
+    @cached_property
+    def heading(self) -> float:
+        """How far the camera is turned about the world's z, in radians: the twist of its rotation's swing and twist, zero for
+        a level camera that looks along +y. Tilting or rolling it, or lifting it as it goes on looking at a point below,
+        changes nothing."""
+        right, _, forward = self.camera_to_world[:3, :3].T
+        return float(np.arctan2(right[1] - forward[0], right[0] + forward[1]))
+
     def resized(self, width: int, height: int) -> "Camera":
         """The same camera over an image of another size in pixels."""
         sx, sy = width / self.width, height / self.height

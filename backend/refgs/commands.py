@@ -98,7 +98,7 @@ def train(
             trainer.resume()
             report("stage", {"what": f"going on from iteration {trainer.iteration}"})
         else:
-            create_run(out, capture, settings, preset, device)
+            create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
         before = signal.signal(signal.SIGINT, lambda *_: stopped.append(True))
         try:
             ended = trainer.run(lambda: bool(stopped))

@@ -74,8 +74,13 @@ class Run:
             )
 
 
-def create_run(folder: Path, capture: Capture, settings: Settings, preset: str, device: str) -> None:
-    """Make a new run folder with its run.toml and cameras.json. Raises InputError where the folder is taken."""
+def create_run(
+    folder: Path, capture: Capture, settings: Settings, preset: str, device: str, chosen: dict[str, str] | None = None
+) -> None:
+    """Make a new run folder with its run.toml and cameras.json. Raises InputError where the folder is taken.
+
+    `chosen` says of a setting that was "auto" what was chosen, and why; `settings` have it already.
+    """
     check_free(folder)
     try:
         (folder / "checkpoints").mkdir(parents=True)
@@ -97,6 +102,7 @@ def create_run(folder: Path, capture: Capture, settings: Settings, preset: str, 
             "bounded": bool(capture.bounded),
         },
         "settings": settings.model_dump(mode="json"),
+        "chosen": chosen or {},
     }
     write_text(folder / "run.toml", tomli_w.dumps(facts))
     write_cameras(folder / "cameras.json", capture)
@@ -129,7 +135,9 @@ def open_run(folder: Path) -> Run:
     cameras, splits, to_capture = read_run_cameras(folder / "cameras.json")
     environment = None
     if settings.render.shading != "sh":
-        environment = _light(read_environment(folder / "environment.exr"), settings)
+        reference = next(c for c, split in zip(cameras, splits, strict=True) if split == "train")
+        panorama = read_environment(folder / "environment.exr")
+        environment = _light(panorama, settings, reference if settings.light.frame == "camera" else None)
     return Run(
         folder=folder,
         settings=settings,
@@ -148,9 +156,10 @@ def open_run(folder: Path) -> Run:
     )
 
 
-def _light(panorama: np.ndarray, settings: Settings) -> Environment:
+def _light(panorama: np.ndarray, settings: Settings, reference: Camera | None = None) -> Environment:
     display = settings.render.color_space == "display"
-    return Environment.from_panorama(srgb_encode(panorama) if display else panorama, settings.environment.resolution)
+    panorama = srgb_encode(panorama) if display else panorama
+    return Environment.from_panorama(panorama, settings.environment.resolution, reference)
 
 
 def write_text(file: Path, text: str) -> None:

@@ -46,6 +46,15 @@ class EnvironmentSettings(_Section):
     radiance: float = Field(gt=0, le=1e6, description="at the start")
 
 
+class LightSettings(_Section):
+    frame: Literal["auto", "world", "camera"] = Field(
+        description="whether the light stands still or turns with the camera, as on a turntable; auto asks the photos"
+    )
+    exposure: Literal["auto", "on", "off"] = Field(
+        description="whether each photo has an exposure of its own; auto leaves them out where the photos agree"
+    )
+
+
 class TrainSettings(_Section):
     iterations: int = Field(ge=1, le=10_000_000)
     light_first: int = Field(ge=0, description="iterations in which only light and materials learn")
@@ -85,6 +94,7 @@ class RateSettings(_Section):
     indirect_dc: float = Field(ge=0)
     indirect_rest: float = Field(ge=0)
     environment: float = Field(ge=0)
+    exposure: float = Field(ge=0)
     decay: float = Field(gt=0, le=1, description="every rate's factor at the end of the training, but the position's")
     position_decay: float = Field(gt=0, le=1, description="the position's, reached at `position_until`")
     position_until: float = Field(gt=0, le=1, description="part of the training after which it stays")
@@ -97,6 +107,7 @@ class LossSettings(_Section):
     alpha: float = Field(ge=0, description="weight of the mask, where there is one")
     metallic: float = Field(ge=0, description="weight, at the end, of a metallic that is neither 0 nor 1")
     light: float = Field(ge=0, description="weight of the light's being neutral on the whole")
+    exposure: float = Field(ge=0, description="weight of a photo's being exposed as most are")
 
 
 class DensifySettings(_Section):
@@ -135,6 +146,7 @@ class Settings(_Section):
     render: RenderSettings
     surfels: SurfelSettings
     environment: EnvironmentSettings
+    light: LightSettings
     train: TrainSettings
     initial: InitialSettings
     indirect: IndirectSettings
@@ -175,7 +187,8 @@ def load_settings(preset: str, changes: list[str] = ()) -> Settings:
 
 def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
     """Settings that a run wrote down; what the program did not know of yet is as in the standard preset."""
-    return validate(_merge(_read_preset("standard"), tables), source)
+    still = {"light": {"frame": "world", "exposure": "off"}}  # all light was, and no photo had an exposure
+    return validate(_merge(_merge(_read_preset("standard"), still), tables), source)
 
 
 def validate(tables: dict[str, Any], source: str) -> Settings:

@@ -2,6 +2,7 @@
 
 import functools
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -12,11 +13,13 @@ from refgs.model.environment import Environment
 from refgs.render.shade import mirror_directions, shade, shade_splats
 from tests.kernels import scenes
 
-NAMES = ("features", "alpha", "levels", "irradiance")
+NAMES = ("features", "alpha", "levels", "exposure", "irradiance")
 # Pixels nearer to a kink of their derivatives than this are left out of the gradients; their share is checked.
 MARGIN = 1e-4
 FORWARD, GRADIENT = 1e-5, 1e-4
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
+EXPOSURE = 0.7
+TURN = reference.rotation_matrices(torch.tensor([[0.8, 0.3, -0.4, 0.5]], dtype=torch.float64))[0]
 
 
 class Light:
@@ -29,6 +32,10 @@ class Light:
         self.levels = exact.levels.to(device, dtype).requires_grad_()
         irradiance = exact.irradiance + 0.3 * torch.randn(9, 3, generator=generator)
         self.irradiance = irradiance.to(device, dtype).requires_grad_()
+        self.exposure = torch.tensor(EXPOSURE, dtype=dtype, device=device).requires_grad_()
+
+    def turn(self, camera: Camera) -> np.ndarray:
+        return TURN.numpy()
 
 
 def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
@@ -68,20 +75,22 @@ def case(appearance: bool, indirect: bool, size: tuple[int, int]):
     mean, alpha = means(camera, appearance + indirect)
     inputs = (mean * alpha[..., None], alpha)
     light = Light(torch.float64)
-    exact = [*(v.double().requires_grad_() for v in inputs), light.levels, light.irradiance]
+    exact = [*(v.double().requires_grad_() for v in inputs), light.levels, light.exposure, light.irradiance]
     visibility = visible(alpha) if indirect else None
     *maps, margin = reference.shade(
         *exact[:3],
         light.sides,
-        exact[3],
+        light.irradiance,
         camera,
         BACKGROUND.double(),
         None if visibility is None else visibility.double(),
+        light.exposure,
+        TURN,
     )
     safe = margin > MARGIN
     generator = torch.Generator().manual_seed(3)
     upstream = [torch.randn(m.shape, generator=generator) * safe[..., None] for m in maps[:3]]
-    wanted = exact[: 3 if appearance else 4]  # with appearance nothing reads the irradiance
+    wanted = exact[: 4 if appearance else 5]  # with appearance nothing reads the irradiance
     gradients = torch.autograd.grad(maps[:3], wanted, [u.double() for u in upstream])
     return camera, inputs, visibility, [m.detach() for m in maps], safe, upstream, gradients
 
@@ -92,13 +101,13 @@ def run(
     visibility: Tensor | None,
     upstream: list[Tensor],
     device: torch.device,
-    count: int = 4,
+    count: int = 5,
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Maps and gradients, on the CPU."""
     light = Light(torch.float32, device)
-    leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels, light.irradiance]
+    leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels, light.exposure, light.irradiance]
     visibility = None if visibility is None else visibility.to(device)
-    shaded = shade(*leaves[:2], light, camera, BACKGROUND, visibility)
+    shaded = shade(*leaves[:2], light, camera, BACKGROUND, visibility, light.exposure)
     gradients = torch.autograd.grad(shaded[:3], leaves[:count], [u.to(device) for u in upstream])
     return [s.detach().cpu() for s in shaded], [g.cpu() for g in gradients]
 
@@ -132,7 +141,7 @@ def test_display_colours_are_not_encoded(device):
     exact = [v.double().requires_grad_() for v in (features, alpha)]
     light = Light(torch.float64)
     picture, *_, margin = reference.shade(
-        *exact, light.levels, light.sides, light.irradiance, camera, BACKGROUND.double(), display=True
+        *exact, light.levels, light.sides, light.irradiance, camera, BACKGROUND.double(), turn=TURN, display=True
     )
     upstream = torch.randn(picture.shape, generator=torch.Generator().manual_seed(5)) * (margin > MARGIN)[..., None]
     wanted = torch.autograd.grad(picture, exact, upstream.double())
@@ -152,7 +161,7 @@ def test_surfels_match_reference(count, appearance, device):
     features = torch.cat([normal, material, position], dim=1)
     light = Light(torch.float64)
     exact = [features.double().requires_grad_(), light.levels, light.irradiance][: 2 if appearance else 3]
-    expected, margin = reference.shade_splats(exact[0], light.levels, light.sides, light.irradiance, camera)
+    expected, margin = reference.shade_splats(exact[0], light.levels, light.sides, light.irradiance, camera, TURN)
     safe = (margin > MARGIN)[:, None]
     assert safe.float().mean() > 0.8
     upstream = torch.randn(count, 3, generator=generator) * safe

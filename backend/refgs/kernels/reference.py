@@ -96,10 +96,13 @@ def shade(
     camera: Camera,
     background: Tensor,
     visibility: Tensor | None = None,
+    exposure: Tensor | float = 1.0,
+    turn: Tensor | None = None,
     display: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """As refgs.render.shade.shade, for float64 tensors; and how far each pixel (H, W) is from a kink of the derivatives,
-    in the units of what has the kink. Bilinear look-ups have one at every texel."""
+    """As refgs.render.shade.shade, for float64 tensors and a light that stands turned (3, 3) to the world; and how far each
+    pixel (H, W) is from a kink of the derivatives, in the units of what has the kink. Bilinear look-ups have one at every
+    texel."""
     view, pixels = torch.from_numpy(camera.world_to_camera), torch.nonzero(alpha > COVERED, as_tuple=True)
     here, margins = alpha[pixels], []
     own = features[pixels] / here[:, None]
@@ -110,10 +113,11 @@ def shade(
     towards = -unit(ray @ view[:3, :3])
     indirect = None if visibility is None else (visibility[pixels][:, None], maps[:, -3:])
     appearance = maps[:, 8:11] if features.shape[-1] > 11 + 3 * (visibility is not None) else None
-    radiance = radiance_towards(towards, maps, appearance, levels, sides, irradiance, indirect, margins)
+    radiance = radiance_towards(towards, maps, appearance, levels, sides, irradiance, indirect, margins, turn)
+    exposed = exposure * radiance
     if not display:
-        margins.append((radiance - 0.0031308).abs().amin(dim=-1))
-    encoded = radiance if display else srgb_encode(radiance)
+        margins.append((exposed - 0.0031308).abs().amin(dim=-1))
+    encoded = exposed if display else srgb_encode(exposed)
     color = encoded * here[:, None] + (1 - here[:, None]) * background
 
     def image(values: Tensor) -> Tensor:
@@ -125,12 +129,17 @@ def shade(
 
 
 def shade_splats(
-    features: Tensor, levels: Tensor, sides: tuple[int, ...], irradiance: Tensor, camera: Camera
+    features: Tensor,
+    levels: Tensor,
+    sides: tuple[int, ...],
+    irradiance: Tensor,
+    camera: Camera,
+    turn: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """As refgs.render.shade.shade_splats, for float64 tensors; and how far each surfel is from a kink."""
     towards, margins = unit(torch.from_numpy(camera.position) - features[:, -3:]), []
     appearance = features[:, 8:11] if features.shape[-1] > 11 else None
-    radiance = radiance_towards(towards, features, appearance, levels, sides, irradiance, None, margins)
+    radiance = radiance_towards(towards, features, appearance, levels, sides, irradiance, None, margins, turn)
     return radiance, torch.stack(margins).amin(dim=0)
 
 
@@ -143,9 +152,12 @@ def radiance_towards(
     irradiance: Tensor,
     indirect: tuple[Tensor, Tensor] | None,
     margins: list[Tensor],
+    turn: Tensor | None = None,
 ) -> Tensor:
     """The split sum (paper Eq. 5–10) of normals, albedo, metallic and roughness (P, 8 or more), towards unit vectors (P, 3)."""
     normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
+    if turn is not None:
+        normal, towards = normal @ turn.T, towards @ turn.T
     dot = (normal * towards).sum(dim=-1)
     light = specular(levels, sides, 2 * dot[:, None] * normal - towards, roughness, margins)
     if indirect is not None:  # Eq. 9

@@ -12,13 +12,16 @@ constexpr float COVERED = 1.0f / 255.0f;    // less alpha than this is backgroun
 constexpr float SHIFT_LIMIT = 8;            // pixels
 constexpr float SHIFT_ALPHA = 0.3f;         // a silhouette's blended position says nothing about its surface
 constexpr int HALO = (int)SHIFT_LIMIT + 1;  // rows that a displaced look-up reaches beyond its own
+constexpr int TOTALS = 28;                  // derivatives that all pixels add to: 27 by the irradiance, one by the exposure
 constexpr int NORMAL = 0, ALBEDO = 3, METALLIC = 6, ROUGHNESS = 7;  // channels; Shaded has those that may follow
 
 struct Shade {
   int64_t width, height, channels, chunk_rows;
   float view[12];  // world to camera, 3x4, row-major
+  float turn[9];   // world to where the light stands, a rotation, row-major
   float fx, fy, cx, cy;
   const float* background;        // (3)
+  const float* exposure;          // (1): what radiance is multiplied by before it is encoded
   int64_t harmonics;              // whether there are channels of colour by direction
   int64_t splats, display;        // whether pixels are surfels; whether colours are blended and compared as they are, not encoded
   const float *features, *alpha;  // (height, width, channels), (height, width): sums over a pixel's splats
@@ -36,7 +39,7 @@ struct Shade {
   float *color, *normal, *material, *radiance;            // (height, width, 3 | 3 | 5 | 3)
   const float *by_color, *by_normal, *by_material;
   float *by_features, *by_alpha;
-  float *by_light, *by_irradiance;  // (texels, 3), (chunks or, with CUDA, blocks, 27)
+  float *by_light, *by_totals;      // (texels, 3), (chunks or, with CUDA, blocks, TOTALS)
   float *halo, *halo_alpha;         // (chunks, 2 HALO, width, channels), (chunks, 2 HALO, width): for rows above and below a chunk
   float* by_cells;                  // (chunks + 1, cells, 4): the last, their sum
   uint8_t* touched;                 // (chunks, 2 HALO + lines): the rows of those that a chunk has written
@@ -139,7 +142,7 @@ struct Contributions {
   float map_scale, cell_scale;
   int32_t largest_map = 0, largest_cell = 0;
   Vectors normal = {};
-  float by_irradiance[3] = {};
+  float by_irradiance[3] = {}, by_exposure = 0;
 
   Contributions(const Shade& s) : s(s) {
     if (!LARGEST) map_scale = Unit(s.largest[0], SOURCES).per, cell_scale = Unit(s.largest[1], adders(s)).per;
@@ -173,6 +176,8 @@ struct Contributions {
     normal = irradiance.n;
     for (int c = 0; c < 3; c++) by_irradiance[c] = by[c].value;
   }
+
+  void add_exposure(Vector by) { by_exposure = by.value; }
 
   void add_light(const Lookup<true>& l, int, const Vector (&by_light)[3]) {
     Vector weight[2][4];
@@ -210,7 +215,7 @@ struct Chunk {
   int64_t index, first, end;  // pixels
   float* cells;
   uint8_t *halo, *lines;      // touched
-  Vector by_irradiance[27] = {};
+  Vector by_totals[TOTALS] = {};
 
   Chunk(const Shade& s, int64_t index) : s(s), index(index), first(index * s.chunk_rows * s.width) {
     int64_t rows = s.height - index * s.chunk_rows;
@@ -258,8 +263,10 @@ struct Chunk {
 
   MEMBER void add_irradiance(const Irradiance& irradiance, const Vector (&by)[3]) {
     for (int k = 0; k < 9; k++)
-      for (int c = 0; c < 3; c++) by_irradiance[3 * k + c] += by[c] * irradiance.basis[k];
+      for (int c = 0; c < 3; c++) by_totals[3 * k + c] += by[c] * irradiance.basis[k];
   }
+
+  MEMBER void add_exposure(Vector by) { by_totals[TOTALS - 1] += by; }
 
   // To the cells that were looked up.
   MEMBER void add_light(const Lookup<true>& l, int count, const Vector (&by_light)[3]) {
@@ -449,13 +456,24 @@ INLINE Vectors towards_camera(const Shade& s, const Pixels& p) {
   return inverse_norm(v) * v;
 }
 
+// By a rotation; by its inverse.
+INLINE Vectors turned(const float* m, Vectors v) {
+  auto row = [&](int i) { return m[i] * v.x + m[i + 1] * v.y + m[i + 2] * v.z; };
+  return {row(0), row(3), row(6)};
+}
+INLINE Vectors turned_back(const float* m, Vectors v) {
+  auto column = [&](int i) { return m[i] * v.x + m[i + 3] * v.y + m[i + 6] * v.z; };
+  return {column(0), column(1), column(2)};
+}
+
 INLINE Vectors mirror(Vectors normal, Vectors view, Vector& n_dot_v) {
   n_dot_v = dot(normal, view);
   return 2.0f * n_dot_v * normal - view;
 }
 
 // The split sum over a metallic-roughness material, of LANES pixels. HARMONICS: colour by direction in place of the reflected
-// irradiance. INDIRECT: light from the object itself where it stands in the mirror direction (Eq. 9). SPLATS: of surfels.
+// irradiance. INDIRECT: light from the object itself where it stands in the mirror direction (Eq. 9). SPLATS: of surfels. Directions are
+// those of the light's frame, for it may stand with the camera.
 template <bool HARMONICS, bool INDIRECT, bool SPLATS, bool DERIVATIVES>
 struct Shaded {
   static constexpr int APPEARANCE = HARMONICS ? 8 : 0, FROM_OBJECT = INDIRECT ? 8 + 3 * HARMONICS : 0;  // channels
@@ -467,15 +485,17 @@ struct Shaded {
   Irradiance irradiance;
   ReflectanceTable table;
   Vector light[3], received[3], radiance[3], encoded[3], slope[3];
+  float exposure;
 
   MEMBER Shaded(const Shade& s, const Pixels& pixels)
       : map(s, pixels),
         inverse_length(inverse_norm({map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
-        normal(inverse_length * Vectors{map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]}),
-        view(seen_from(s)),
+        normal(inverse_length * turned(s.turn, {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
+        view(turned(s.turn, seen_from(s))),
         lookup(s.levels, mirrored(), map.value[ROUGHNESS]),
         irradiance(normal),
-        table(s.reflectance, s.reflectance_side, n_dot_v, map.value[ROUGHNESS]) {
+        table(s.reflectance, s.reflectance_side, n_dot_v, map.value[ROUGHNESS]),
+        exposure(s.exposure[0]) {
     const auto& v = map.value;
     Vector metallic = v[METALLIC];
     visibility = Vector() + 1.0f;
@@ -494,10 +514,11 @@ struct Shaded {
       Vector diffuse = (1.0f - metallic) * received[c];
       if (!HARMONICS) diffuse *= (1.0f - dielectric) * v[ALBEDO + c];
       radiance[c] = light[c] * (dielectric + metallic * (Metal(table, v[ALBEDO + c]).value - dielectric)) + diffuse;
+      Vector exposed = exposure * radiance[c];
       if (SPLATS || s.display)
-        encoded[c] = radiance[c], slope[c] = Vector() + 1.0f;
+        encoded[c] = exposed, slope[c] = Vector() + 1.0f;
       else
-        encoded[c] = srgb_encode(radiance[c], slope[c]);
+        encoded[c] = srgb_encode(exposed, slope[c]);
     }
   }
 
@@ -514,7 +535,7 @@ struct Shaded {
 
   template <class Sums>
   MEMBER void backward(const Shade& s, Sums& sums) const {
-    Vector by_color[3], by_normal[3] = {}, by_material[5] = {}, by_alpha = {};
+    Vector by_color[3], by_normal[3] = {}, by_material[5] = {}, by_alpha = {}, by_exposure = {};
     gather<3>(s.by_color, map.pixels, by_color);
     if (!SPLATS) gather<3>(s.by_normal, map.pixels, by_normal), gather<5>(s.by_material, map.pixels, by_material);
 
@@ -527,7 +548,8 @@ struct Shaded {
     for (int c = 0; c < 3; c++) {
       Metal metal(table, v[ALBEDO + c]);
       if (!SPLATS) by_alpha += by_color[c] * (encoded[c] - s.background[c]);
-      Vector by_radiance = by_color[c] * map.alpha * slope[c];
+      Vector by_exposed = by_color[c] * map.alpha * slope[c], by_radiance = exposure * by_exposed;
+      by_exposure += by_exposed * radiance[c];
       by_light[c] = by_radiance * (dielectric + metallic * (metal.value - dielectric));
       if (INDIRECT) {
         by[FROM_OBJECT + c] = (1.0f - visibility) * by_light[c];
@@ -553,6 +575,7 @@ struct Shaded {
       }
     }
     if (!HARMONICS) sums.add_irradiance(irradiance, by_received);
+    sums.add_exposure(by_exposure);
     Vector by_n_v = {};
     for (int i = 0; i < 4; i++) {
       by[ROUGHNESS] += by_table[i] * table.by_roughness[i];
@@ -564,11 +587,11 @@ struct Shaded {
     by[ROUGHNESS] += by_roughness;
     Vector by_dot = 2.0f * dot(by_mirrored, normal) + by_n_v;
     by_n = by_n + 2.0f * n_dot_v * by_mirrored + by_dot * view;
-    by_n = inverse_length * (by_n - dot(by_n, normal) * normal);
+    by_n = turned_back(s.turn, inverse_length * (by_n - dot(by_n, normal) * normal));
     by[NORMAL] = by_n.x + by_normal[0], by[NORMAL + 1] = by_n.y + by_normal[1], by[NORMAL + 2] = by_n.z + by_normal[2];
     if constexpr (SPLATS) {
       Vectors by_view = by_dot * normal - by_mirrored;
-      by_view = inverse_norm(map.to_camera(s)) * (by_view - dot(by_view, view) * view);
+      by_view = turned_back(s.turn, inverse_norm(map.to_camera(s)) * (by_view - dot(by_view, view) * view));
       sums.template add_own<S>(map.pixels, true, by, {-by_view.x, -by_view.y, -by_view.z}, by_alpha);
     } else {
       map.backward(s, by, by_alpha, sums);
@@ -662,28 +685,29 @@ void backward_block(const Shade& s) {
     for (int64_t c = 0; c < s.channels; c++) s.by_features[i * s.channels + c] = 0;
     s.by_alpha[i] = 0;
   }
-  __shared__ float by_warp[32][27];
-  bool any = __any_sync(~0u, covered && !s.harmonics);
+  __shared__ float by_warp[32][TOTALS];
+  bool any = __any_sync(~0u, covered);
   Irradiance irradiance(sums.normal);
 #pragma unroll
-  for (int k = 0; k < 27; k++) {
-    float sum = sums.by_irradiance[k % 3] * irradiance.basis[k / 3].value;
-    if (any)
+  for (int k = 0; k < TOTALS; k++) {
+    bool by_light = k < TOTALS - 1;
+    float sum = by_light ? sums.by_irradiance[k % 3] * irradiance.basis[k / 3].value : sums.by_exposure;
+    if (any && !(by_light && s.harmonics))
       for (int step = 16; step; step /= 2) sum += __shfl_xor_sync(~0u, sum, step);
     if (lane == 0) by_warp[warp][k] = sum;
   }
   __syncthreads();
-  if (threadIdx.x < 27) {
+  if (threadIdx.x < TOTALS) {
     float sum = 0;
     for (int w = 0; w < warps; w++) sum += by_warp[w][threadIdx.x];
-    s.by_irradiance[(int64_t)blockIdx.x * 27 + threadIdx.x] = sum;
+    s.by_totals[(int64_t)blockIdx.x * TOTALS + threadIdx.x] = sum;
   }
 }
 #else
 void backward_chunk(const Shade& s, int64_t index) {
   Chunk chunk(s, index);
   by_kind(s, [&](auto kind) { kind.backward(s, chunk.first, chunk.end, chunk); });
-  for (int i = 0; i < 27; i++) s.by_irradiance[index * 27 + i] = total(chunk.by_irradiance[i]);
+  for (int i = 0; i < TOTALS; i++) s.by_totals[index * TOTALS + i] = total(chunk.by_totals[i]);
 }
 
 // What the chunks above and below added to a row.

@@ -6,16 +6,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from refgs.camera import Camera
 from refgs.export.environment import directions as panorama_directions
 from refgs.export.environment import sample as sample_panorama
 from refgs.model import cubemap, harmonics, prefilter
 
 
-class Environment:
-    """Light from afar. `radiance` (6·R², 3), linear, in the order of `refgs.model.cubemap`."""
+def turn_between(camera: Camera, reference: Camera) -> np.ndarray:
+    """The rotation (3, 3) about the world's z from a camera's heading to a reference's."""
+    angle = reference.heading - camera.heading
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
-    def __init__(self, radiance: Tensor):
-        self.radiance = radiance
+
+class Environment:
+    """Light from afar. `radiance` (6·R², 3), linear, in the order of `refgs.model.cubemap`.
+
+    It stands in the world; or, with a `reference`, with the camera, as on a turntable: where a camera has another heading
+    than the reference, the light is turned as far about the world's z. It does not tilt with the camera, for lamps stand in
+    the room, whatever height the photo was taken from. `radiance` is then as it is for the reference.
+    """
+
+    def __init__(self, radiance: Tensor, reference: Camera | None = None):
+        self.radiance, self.reference = radiance, reference
         self.resolution = math.isqrt(len(radiance) // 6)
         self.sides = tuple(prefilter.level_sides(self.resolution))
         self.levels, self.irradiance = prefilter.prefilter(radiance, self.resolution)
@@ -30,6 +43,10 @@ class Environment:
         """Irradiance / π (P, 3) about unit normals (P, 3): what a white matte surface sends out."""
         return (harmonics.basis(normals, 2) @ self.irradiance).clamp_min(0)
 
+    def turn(self, camera: Camera) -> np.ndarray:
+        """The rotation (3, 3) that takes the world's directions to the light's, in a camera's picture."""
+        return np.eye(3) if self.reference is None else turn_between(camera, self.reference)
+
     def panorama(self, height: int) -> np.ndarray:
         """Equirectangular radiance (height, 2·height, 3) in Blender's orientation."""
         directions = torch.from_numpy(panorama_directions(height, 2 * height)).reshape(-1, 3).float()
@@ -38,10 +55,10 @@ class Environment:
         return colour.reshape(height, 2 * height, 3).numpy()
 
     @classmethod
-    def from_panorama(cls, panorama: np.ndarray, resolution: int) -> "Environment":
+    def from_panorama(cls, panorama: np.ndarray, resolution: int, reference: Camera | None = None) -> "Environment":
         """The light of an equirectangular picture (H, W, 3) in Blender's orientation, averaged over each texel."""
         fine = max(1, math.ceil(panorama.shape[0] / (2 * resolution)))  # so that no pixel of the picture is passed over
         directions = cubemap.texel_directions(resolution * fine).numpy()
         colour = torch.from_numpy(np.ascontiguousarray(sample_panorama(panorama, directions), dtype=np.float32))
         colour = colour.reshape(6, resolution, fine, resolution, fine, 3).mean(dim=(2, 4))
-        return cls(colour.reshape(-1, 3))
+        return cls(colour.reshape(-1, 3), reference)

@@ -93,13 +93,15 @@ def render(
     settings: RenderSettings,
     near: float,
     occluder: Occluder | None = None,
+    exposure: Tensor | None = None,
 ) -> Rendering:
     """Render surfels for a camera over a background (3,), sRGB-encoded.
 
     `settings.shading` is "deferred" (split-sum shading of blended maps, paper Eq. 5–8), "splat" (of each surfel, then
     blended, paper §3.3) or "sh" (view-dependent colour of each surfel, blended). `near` is in world units. With an
     `occluder`, deferred shading takes the surfels' own light in place of the environment's where that is in the way of the
-    mirror direction (paper Eq. 9).
+    mirror direction (paper Eq. 9). Radiance is multiplied by an `exposure`, a scalar, where there is one, before it is
+    encoded.
     """
     deferred, display = settings.shading == "deferred", settings.color_space == "display"
     facing = surfels.rotations
@@ -121,7 +123,7 @@ def render(
     features, depth, alpha = rasterize(*discs(surfels, camera), stack(blended), camera, near=near)
     if deferred:
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
-        shaded = shade(features, alpha, environment, camera, background, visibility, display)
+        shaded = shade(features, alpha, environment, camera, background, visibility, exposure, display)
         radiance = srgb_decode(shaded.radiance) if display else shaded.radiance
         return Rendering(shaded.color, alpha, depth, shaded.normal, shaded.material, radiance, visibility)
     over = (1 - alpha[..., None]) * background
@@ -129,5 +131,6 @@ def render(
         normal, color = features.split(3, dim=-1)
         return Rendering(color + over, alpha, depth, normal / alpha.clamp_min(COVERED)[..., None])
     normal, mean, material = (features / alpha.clamp_min(COVERED)[..., None]).split((3, 3, 5), dim=-1)
-    encoded, radiance = (mean, srgb_decode(mean)) if display else (srgb_encode(mean), mean)
+    exposed = mean if exposure is None else exposure * mean
+    encoded, radiance = (exposed, srgb_decode(mean)) if display else (srgb_encode(exposed), mean)
     return Rendering(encoded * alpha[..., None] + over, alpha, depth, normal, material, radiance.detach())

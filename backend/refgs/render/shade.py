@@ -15,6 +15,7 @@ from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
 from refgs.render.brdf import reflectance_table
 
+TOTALS = 28  # of shade.cpp
 CHANNELS = 11  # normal, albedo, metallic, roughness, position; before the position those that not every scene has
 
 
@@ -47,9 +48,9 @@ class _Work(Work):
 
     _fields_ = (
         [(n, ctypes.c_int64) for n in ("width", "height", "channels", "chunk_rows")]
-        + [("view", ctypes.c_float * 12)]
+        + [("view", ctypes.c_float * 12), ("turn", ctypes.c_float * 9)]
         + [(n, ctypes.c_float) for n in ("fx", "fy", "cx", "cy")]
-        + [("background", ctypes.c_void_p)]
+        + [(n, ctypes.c_void_p) for n in ("background", "exposure")]
         + [(n, ctypes.c_int64) for n in ("harmonics", "splats", "display")]
         + [(n, ctypes.c_void_p) for n in ("features", "alpha", "visibility")]
         + [("levels", _Levels)]
@@ -58,7 +59,7 @@ class _Work(Work):
         + [("reflectance_side", ctypes.c_int64)]
         + [(n, ctypes.c_void_p) for n in ("mirrored", "color", "normal", "material", "radiance")]
         + [(n, ctypes.c_void_p) for n in ("by_color", "by_normal", "by_material", "by_features", "by_alpha")]
-        + [(n, ctypes.c_void_p) for n in ("by_light", "by_irradiance", "halo", "halo_alpha", "by_cells", "touched")]
+        + [(n, ctypes.c_void_p) for n in ("by_light", "by_totals", "halo", "halo_alpha", "by_cells", "touched")]
         + [(n, ctypes.c_void_p) for n in ("map_sums", "cell_sums", "largest")]
         + [("scratch", ctypes.c_void_p), ("shared", Shared)]
     )
@@ -106,16 +107,25 @@ def _reflectance(device: torch.device) -> Tensor:
     return reflectance_table().to(device)
 
 
+@lru_cache(maxsize=4)
+def _one(device: torch.device) -> Tensor:
+    return torch.ones((), device=device)
+
+
 class _Shade(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, features, alpha, levels, irradiance, sides, camera, background, visibility, display, splats):
+    def forward(
+        ctx, features, alpha, levels, irradiance, exposure, sides, camera, turn, background, visibility, display, splats
+    ):
         features, alpha, irradiance = features.contiguous(), alpha.contiguous(), irradiance.contiguous()
         table, padding = _reflectance(features.device), _Padding.of(sides, features.device)
         light, cells = levels.contiguous(), len(padding.texel)
         padded = features.new_empty(cells, 4)
         work = _Work.of(features, alpha, camera)
         background = background.to(features)
-        work.attach(background=background, irradiance=irradiance, reflectance=table, light=light, padded=padded)
+        work.turn[:] = turn.reshape(-1).tolist()
+        work.attach(background=background, exposure=exposure, irradiance=irradiance, reflectance=table)
+        work.attach(light=light, padded=padded)
         work.attach(texel=padding.texel, starts=padding.starts, cell=padding.cell)
         if visibility is not None:
             work.attach(visibility=visibility)
@@ -133,7 +143,7 @@ class _Shade(torch.autograd.Function):
         load.run("refgs_shade_pad", work, features, items=cells)
         load.run("refgs_shade_forward", work, features, items=alpha.numel())
         ctx.save_for_backward(features, alpha, irradiance)
-        ctx.work, ctx.kept = work, (padded, background, visibility, table, padding)
+        ctx.work, ctx.kept = work, (padded, background, exposure, visibility, table, padding)
         ctx.mark_non_differentiable(shaded.radiance)
         ctx.set_materialize_grads(False)
         return tuple(shaded)
@@ -151,25 +161,27 @@ class _Shade(torch.autograd.Function):
         work.attach(**given, by_features=by_features, by_alpha=by_alpha, by_light=by_light)
         if load.on_gpu(features):
             blocks = -(-alpha.numel() // cuda.BLOCK)
-            by_irradiance = new(blocks, *irradiance.shape)
+            by_totals = new(blocks, TOTALS)
             sizes = (work.channels - 2) * alpha.numel(), 3 * work.cells, 1
             map_sums, cell_sums, largest = new(sum(sizes), dtype=torch.int64).zero_().split(sizes)
-            work.attach(by_irradiance=by_irradiance, map_sums=map_sums, cell_sums=cell_sums, largest=largest)
+            work.attach(by_totals=by_totals, map_sums=map_sums, cell_sums=cell_sums, largest=largest)
             cuda.launch("refgs_shade_largest", work, features.device, blocks)
             cuda.launch("refgs_shade_backward", work, features.device, blocks)
         else:
-            by_irradiance, halo = new(work.chunks, *irradiance.shape), load.kernels().refgs_shade_halo()
+            by_totals, halo = new(work.chunks, TOTALS), load.kernels().refgs_shade_halo()
             buffers = {
                 "halo": new(work.chunks, halo, work.width, work.channels),
                 "halo_alpha": new(work.chunks, halo, work.width),
                 "by_cells": new(work.chunks + 1, work.cells, 4),
                 "touched": new(work.chunks, halo + work.lines, dtype=torch.uint8),
             }
-            work.attach(by_irradiance=by_irradiance, **buffers)
+            work.attach(by_totals=by_totals, **buffers)
             load.parallel(load.kernels().refgs_shade_backward, work)
         load.run("refgs_shade_gather", work, features, items=alpha.numel())
         load.run("refgs_shade_unpad", work, features, items=work.texels)
-        return by_features, by_alpha, by_light, by_irradiance.sum(dim=0), *[None] * 6
+        totals = by_totals.sum(dim=0)
+        by_irradiance, by_exposure = totals[:-1].view(irradiance.shape), totals[-1]
+        return by_features, by_alpha, by_light, by_irradiance, by_exposure, *[None] * 7
 
 
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
@@ -191,6 +203,7 @@ def shade(
     camera: Camera,
     background: Tensor,
     visibility: Tensor | None = None,
+    exposure: Tensor | None = None,
     display: bool = False,
 ) -> Shaded:
     """Shade what the rasteriser blended by the split sum (paper Eq. 5–10), over a background (3,), sRGB-encoded.
@@ -198,17 +211,18 @@ def shade(
     `features` (H, W, C) are sums over a pixel's splats of, in this order: normal in world space, albedo, metallic,
     roughness; three of colour by direction, where that takes the place of integrated diffuse light (the paper's
     substitute); three of radiance from the object itself, where there is a `visibility` (H, W) in 0..1, by which that
-    gives way to the environment's (Eq. 9); position. `alpha` (H, W). float32, all on the CPU or on one card, differentiable
-    in features, alpha and the light. What the blend's mean position says of its bias towards the camera is undone first:
-    shade.cpp has how. With `display` light and materials are of a screen's numbers, and nothing is encoded. The result
-    does not depend on the number of threads, nor, on a card, does it differ from one call to the next. Where a derivative
-    to hand back is not finite, on a card none is a number.
+    gives way to the environment's (Eq. 9); position. `alpha` (H, W). The picture's radiance is multiplied by the
+    `exposure`, a scalar, before it is encoded; 1 where there is none. float32, all on the CPU or on one card, differentiable
+    in features, alpha, the light and the exposure. What the blend's mean position says of its bias towards the camera is
+    undone first: shade.cpp has how. With `display` light and materials are of a screen's numbers, and nothing is encoded.
+    The result does not depend on the number of threads, nor, on a card, does it differ from one call to the next. Where a
+    derivative to hand back is not finite, on a card none is a number.
     """
     least = CHANNELS + 3 * (visibility is not None)
     if features.shape not in ((*alpha.shape, least), (*alpha.shape, least + 3)):
         size = f"{alpha.shape[1]}×{alpha.shape[0]}"
         raise ValueError(f"expected {least} or {least + 3} features a pixel of {size}, got {tuple(features.shape)}")
-    return _shade(features, alpha, environment, camera, background, visibility, display, False)
+    return _shade(features, alpha, environment, camera, background, visibility, exposure, display, splats=False)
 
 
 def shade_splats(features: Tensor, environment: Environment, camera: Camera) -> Tensor:
@@ -221,7 +235,7 @@ def shade_splats(features: Tensor, environment: Environment, camera: Camera) -> 
     if channels not in (CHANNELS, CHANNELS + 3):
         raise ValueError(f"expected {CHANNELS} or {CHANNELS + 3} features a surfel, got {channels}")
     features, alpha = features[:, None], features.new_ones(count, 1)
-    return _shade(features, alpha, environment, camera, features.new_zeros(3), None, False, True).color[:, 0]
+    return _shade(features, alpha, environment, camera, features.new_zeros(3), splats=True).color[:, 0]
 
 
 def _shade(
@@ -230,13 +244,17 @@ def _shade(
     light: Environment,
     camera: Camera,
     background: Tensor,
-    visibility: Tensor | None,
-    display: bool,
+    visibility: Tensor | None = None,
+    exposure: Tensor | None = None,
+    display: bool = False,
+    *,
     splats: bool,
 ) -> Shaded:
     texels = sum(6 * side * side for side in light.sides)
-    given = {"features": (features, features.shape), "alpha": (alpha, alpha.shape)}
+    exposure = _one(features.device) if exposure is None else exposure
+    given = {"features": (features, features.shape), "alpha": (alpha, alpha.shape), "exposure": (exposure, ())}
     given |= {"levels": (light.levels, (texels, 3)), "irradiance": (light.irradiance, (9, 3))}
     load.check(**given, **({} if visibility is None else {"visibility": (visibility, alpha.shape)}))
-    maps = features, alpha, light.levels, light.irradiance
-    return Shaded(*_Shade.apply(*maps, light.sides, camera, background, visibility, display, splats))
+    maps = features, alpha, light.levels, light.irradiance, exposure
+    how = light.sides, camera, light.turn(camera), background, visibility, display, splats
+    return Shaded(*_Shade.apply(*maps, *how))

@@ -17,6 +17,7 @@ from refgs.render.ssim import dssim
 from refgs.settings import LossSettings
 
 TILE = 32, 8  # pixels of a row, and rows, that a block of losses.cpp has on CUDA
+ROUND_OFF = 0.02
 SUMS = 3  # of a row or a block: of the loss, of the pixels with a surface, of squared errors
 
 
@@ -133,6 +134,13 @@ class _Objective(torch.autograd.Function):
         one = not load.on_gpu(by_loss) and by_loss == 1  # nearly always, but a card would have to wait to know
         scaled = ctx.gradients if one else [None if g is None else by_loss * g for g in ctx.gradients]
         return *scaled, None, None, None, None
+
+
+def departure(exposure: Tensor) -> Tensor:
+    """What it costs a photo to have an exposure, the natural logarithm given, other than one: its magnitude, rounded off below
+    2 %. Nothing tells a brighter light from longer exposures, so one of them has to be held: by magnitudes, unlike by squares, a
+    few photos that differ do not move the rest."""
+    return torch.sqrt(exposure * exposure + ROUND_OFF**2) - ROUND_OFF
 
 
 def objective(

@@ -18,14 +18,15 @@ from refgs.geometry.extract import extract
 from refgs.geometry.mesh import Mesh, clean
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
-from refgs.model.surfels import Surfels, activate
+from refgs.model.surfels import Parameters, Surfels, activate
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.report.metrics import decibels, psnr
 from refgs.settings import RenderSettings, Settings
 from refgs.train import checkpoint
 from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify, propagate_normals, reset_opacity, thin
-from refgs.train.losses import Photo, objective
+from refgs.train.light import light_frame
+from refgs.train.losses import Photo, departure, objective
 from refgs.train.start import GEOMETRY, start_appearance, start_parameters
 
 Report = Callable[[str, dict[str, Any]], None]
@@ -34,6 +35,8 @@ Report = Callable[[str, dict[str, Any]], None]
 REPORT_EVERY = 10  # iterations
 HISTORY_EVERY = 100  # iterations
 PLAN_EVERY = 50  # iterations
+EXPOSURES_KNOWN = 0.3  # part of the training after which exposures are known well enough to say whether there are any
+EXPOSURES_ALIKE = 0.07  # in natural logarithms: a tenth of a stop
 TRACED = 24  # views at the least for the mesh that inter-reflection is traced on; all where there are fewer
 FEWER = 0.8  # of the surfels, where there is no memory for all
 LEAST_SURFELS = 1000
@@ -73,23 +76,29 @@ class Trainer:
         self.views = [load_view(view, side) for view in capture.train_views]
         self.test = [load_view(view, side) for view in capture.test_views]
         self.background = torch.tensor(settings.image.background, device=self.device)
+        self.from_hull = all(view.alpha is not None for view in self.views)
         self.photos = [Photo.of(view, self.device) for view in self.views]
         self.near = near_plane(capture.radius)
         self.iteration, self.seconds = 0, 0.0
         self._order: tuple[int, list[int]] = (-1, [])
 
         start, source = start_parameters(capture, self.views, settings)
+        self.chosen: dict[str, str] = {}  # by a setting that asked for it: what was chosen, and why
+        self._choose_light_frame(start)
         self.parameters = {name: value.detach().to(self.device).requires_grad_() for name, value in start.items()}
         report("stage", {"what": source})
         self.light = torch.empty(6 * settings.environment.resolution**2, 3, device=self.device)
         self.light.fill_(self._start_light()).requires_grad_()
-        self.from_hull = all(view.alpha is not None for view in self.views)
         self._drop_unused()
         groups = [
             {"params": [value], "name": name, "rate": self._rate(name)} for name, value in self.parameters.items()
         ]
         if settings.render.shading != "sh":
             groups.append({"params": [self.light], "name": "environment", "rate": settings.rates.environment})
+        self.exposures: Tensor | None = None  # natural logarithms (views,), where photos have any of their own
+        if settings.render.shading != "sh" and settings.light.exposure != "off":
+            self.exposures = torch.zeros(len(self.views), device=self.device).requires_grad_()
+            groups.append({"params": [self.exposures], "name": "exposure", "rate": settings.rates.exposure})
         self.optimizer = Adam(groups)
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
         self.occluder: Occluder | None = None
@@ -98,6 +107,23 @@ class Trainer:
     def _rate(self, name: str) -> float:
         rate = getattr(self.settings.rates, name)
         return rate * self.capture.radius if name == "position" else rate
+
+    def _choose_light_frame(self, start: Parameters) -> None:
+        """Where the settings leave it to the photos. They say which it is from here on."""
+        light, lit = self.settings.light, self.settings.render.shading != "sh"
+        if light.frame != "auto":
+            return
+        frame, why = "world", "there is no light" if not lit else "not every photo has a mask of the object"
+        if lit and self.from_hull:
+            with torch.no_grad():
+                points = activate(start)
+                found = points.positions.numpy(), points.normals().numpy()
+            frame, why = light_frame(self.views, *found, self.capture.radius)
+        self.settings = self.settings.model_copy(update={"light": light.model_copy(update={"frame": frame})})
+        self.chosen["light.frame"] = f"{frame}: {why}"
+        if lit:
+            where = "turns with the camera" if frame == "camera" else "stands still"
+            self.report("stage", {"what": f"the light {where}: {why}"})
 
     def _drop_unused(self) -> None:
         """What this run's shading never reads does not learn."""
@@ -112,8 +138,11 @@ class Trainer:
         self.constant = {name: self.parameters.pop(name).detach()[:1] for name in unused}
 
     def _reflects(self) -> bool:
-        """Whether this run looks for inter-reflection: not without masks, where the mesh is of the surroundings too."""
-        return self.from_hull and self.settings.render.shading == "deferred" and self.settings.indirect.start < 1
+        """Whether this run looks for inter-reflection: not without masks, where the mesh is of the surroundings too, nor under
+        a light that turns with the camera, under which surfels have no light of their own to show others."""
+        settings = self.settings
+        still = settings.render.shading == "deferred" and settings.light.frame != "camera"
+        return self.from_hull and still and settings.indirect.start < 1
 
     def surfels(self) -> Surfels:
         """The activated surfels, with what does not learn filled in."""
@@ -125,8 +154,11 @@ class Trainer:
         """The light as it is now; none where nothing is lit."""
         if self.settings.render.shading == "sh":
             return None
+        reference = self.views[0].camera if self.settings.light.frame == "camera" else None
         display = self.settings.render.color_space == "display"
-        return Environment(torch.sigmoid(self.light) if display else torch.nn.functional.softplus(self.light))
+        return Environment(
+            torch.sigmoid(self.light) if display else torch.nn.functional.softplus(self.light), reference
+        )
 
     def _start_light(self) -> float:
         """What `environment` makes the radiance at the start of."""
@@ -144,8 +176,11 @@ class Trainer:
         with torch.no_grad():
             return self._render(self.surfels(), self.environment(), camera)
 
-    def _render(self, surfels: Surfels, environment: Environment | None, camera: Camera) -> Rendering:
-        return render(surfels, environment, camera, self.background, self._shading(), self.near, occluder=self.occluder)
+    def _render(
+        self, surfels: Surfels, environment: Environment | None, camera: Camera, exposure: Tensor | None = None
+    ) -> Rendering:
+        settings = self._shading()
+        return render(surfels, environment, camera, self.background, settings, self.near, self.occluder, exposure)
 
     def test_psnr(self, most: int = 4) -> float | None:
         """Mean PSNR over at most this many of the held-out views; None where there are none."""
@@ -158,15 +193,19 @@ class Trainer:
     def step(self) -> dict[str, Tensor]:
         """One iteration. Returns its loss and mean squared error, which are still being computed where there is a card."""
         settings = self.settings
-        photo = self._next_photo()
+        view = self._next_view()
+        photo = self.photos[view]
         progress = min(self.iteration / self.total, 1.0)
         if self.initial and progress >= settings.initial.until:
             self._begin_deferred()
         self._set_rates(progress)
 
         surfels, environment = self.surfels(), self.environment()
-        rendering = self._render(surfels, environment, photo.camera)
+        exposure = None if self.exposures is None else self.exposures[view]
+        rendering = self._render(surfels, environment, photo.camera, None if exposure is None else exposure.exp())
         loss, square = objective(rendering, environment, photo, self.background, settings.loss, progress)
+        if exposure is not None:
+            loss = loss + settings.loss.exposure * departure(exposure)
         loss.backward()
         position = self.parameters["position"]
         self.motion.add(position.detach(), position.grad, photo.camera)
@@ -175,6 +214,7 @@ class Trainer:
         self.iteration += 1
         self._densify(progress)
         self._reshape(progress)
+        self._weigh_exposures(progress)
         due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
         if self._reflects() and not self.initial and due and self.iteration < self.total:
             self._trace()
@@ -218,13 +258,13 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["params"][0].grad = None
 
-    def _next_photo(self) -> Photo:
+    def _next_view(self) -> int:
         """Every view once an epoch, in an order that depends on the seed and the epoch alone, so that a resumed run goes on alike."""
         epoch, place = divmod(self.iteration, len(self.views))
         if self._order[0] != epoch:
             generator = torch.Generator().manual_seed(self.settings.train.seed * 1_000_003 + epoch)
             self._order = epoch, torch.randperm(len(self.views), generator=generator).tolist()
-        return self.photos[self._order[1][place]]
+        return self._order[1][place]
 
     def _densify(self, progress: float) -> None:
         settings = self.settings.densify
@@ -247,6 +287,21 @@ class Trainer:
             propagate_normals(self.parameters, self.optimizer, self.settings.propagation)
         elif densify.reset_every and due and progress < densify.stop:
             reset_opacity(self.parameters, self.optimizer)
+
+    @torch.no_grad()
+    def _weigh_exposures(self, progress: float) -> None:
+        """Leave the exposures out, where that is asked for, once it is seen that the photos have none of their own."""
+        settings = self.settings
+        if self.exposures is None or settings.light.exposure != "auto":
+            return
+        if self.iteration % settings.densify.every or progress < EXPOSURES_KNOWN:
+            return
+        spread = float((self.exposures - self.exposures.median()).abs().max())  # a card waits here, once in a while
+        if spread < EXPOSURES_ALIKE:
+            self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
+            self.optimizer.state.pop(self.exposures, None)
+            self.exposures = None
+            self.report("stage", {"what": f"the photos' exposures agree within {math.expm1(EXPOSURES_ALIKE):.0%}"})
 
     @torch.no_grad()
     def _trace(self) -> None:
@@ -355,6 +410,8 @@ class Trainer:
         tensors = {f"parameter.{name}": value for name, value in self.parameters.items()}
         tensors |= {f"constant.{name}": value for name, value in self.constant.items()}
         tensors |= {"environment": self.light, "motion.total": self.motion.total, "motion.views": self.motion.views}
+        if self.exposures is not None:
+            tensors |= {"exposure": self.exposures}
         if self.occluder is not None:
             mesh = self.occluder.mesh
             tensors |= {"occluder.vertices": torch.from_numpy(mesh.vertices)}
@@ -377,13 +434,18 @@ class Trainer:
         self.total, self.initial = facts["total"], facts["initial"]
         self.motion.total, self.motion.views = tensors["motion.total"], tensors["motion.views"]
         self.optimizer.state.clear()
+        if "exposure" not in tensors:  # they have been left out since
+            self.exposures = None
+            self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
         for group in self.optimizer.param_groups:
             name = group["name"]
-            value = tensors["environment"] if name == "environment" else tensors[f"parameter.{name}"]
+            value = tensors[name if name in ("environment", "exposure") else f"parameter.{name}"]
             value.requires_grad_()
             group["params"][0] = value
             if name == "environment":
                 self.light = value
+            elif name == "exposure":
+                self.exposures = value
             else:
                 self.parameters[name] = value
             prefix = f"adam.{name}."
