@@ -185,7 +185,7 @@ def _light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dic
 
     light = read_environment(run.folder / "environment.exr")
     write("environment", light)
-    if truth is None or not truth.has_light:
+    if truth is None or not truth.has_light or run.settings.light.frame == "camera":  # the true light stands still
         return {}
     true = truth.panorama("light")
     write("environment_truth", true)
@@ -223,7 +223,7 @@ def _speed(run: Run, cameras: list[Camera]) -> dict[str, float | str]:
     """Frames a second of the renderer on what there is to render with: the median frame's, each waited for."""
     device = torch.device("cuda" if cuda.unusable() is None else "cpu")
     surfels = Surfels(*(value.to(device) for value in run.surfels()))
-    light = None if run.environment is None else Environment(run.environment.radiance.to(device))
+    light = run.environment and Environment(run.environment.radiance.to(device), run.environment.reference)
     background = torch.tensor(run.settings.image.background, device=device)
     seconds = []
     for i in range(-2, FRAMES):  # the first ones are not counted
