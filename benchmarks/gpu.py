@@ -8,8 +8,8 @@ card's work being done.
 
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
 
+import json
 import platform
-import re
 import statistics
 import subprocess
 import sys
@@ -211,9 +211,9 @@ def training_table(device: torch.device, folder: Path) -> None:
         command = [*cli, "train", str(capture), "--out", str(run), "--preset", preset, "--device", device.type]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
         seconds = time.perf_counter() - at
-        said = subprocess.run([*cli, "evaluate", str(run)], check=True, stdout=subprocess.PIPE, text=True).stdout
-        found = re.search(r"psnr ([\d.]+), ssim ([\d.]+)", said)
-        table.add_row(preset, f"{seconds:.0f}", *found.groups())
+        subprocess.run([*cli, "evaluate", str(run)], check=True, stdout=subprocess.DEVNULL)
+        found = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+        table.add_row(preset, f"{seconds:.0f}", f"{found['psnr']:.2f}", f"{found['ssim']:.4f}")
     console.print(table)
 
 

@@ -68,7 +68,8 @@ def evaluate(
     run: RunFolder,
     split: Annotated[str, typer.Option(help="test or train")] = "test",
     ground_truth: Annotated[
-        Path | None, typer.Option(help="folder with normal/, albedo/ … of the views, as EXR")
+        Path | None,
+        typer.Option(help="folder with light.exr, mesh.ply, relight/, and normal/, albedo/ … of the views, as EXR"),
     ] = None,
 ) -> None:
     """Compare renderings with photos that were held out; writes metrics.json and pictures/."""

@@ -1,7 +1,6 @@
 """What the command line does, one function a command."""
 
 import json
-import os
 import resource
 import runpy
 import signal
@@ -10,26 +9,23 @@ import traceback
 from contextlib import contextmanager
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from refgs.camera import Camera
-from refgs.capture import load_view, read_cameras, read_capture
+from refgs.capture import read_cameras, read_capture
 from refgs.capture.poses import in_frame
-from refgs.color import srgb_encode
 from refgs.errors import InputError
-from refgs.export.environment import read_environment, read_exr, write_exr
+from refgs.export.environment import read_environment, write_exr
 from refgs.export.splats import write_splats
 from refgs.kernels import cuda
 from refgs.paths import clone_root
-from refgs.render.renderer import Rendering
-from refgs.report import metrics
+from refgs.report.figures import DETAILS, HEADLINE, in_words, relit_in_words
+from refgs.report.pictures import color_picture, maps, picture, write_png
 from refgs.run import check_free, create_run, open_run, read_run_facts, write_text
 from refgs.settings import load_settings
-from refgs.train.trainer import Trainer, composite, full_card
+from refgs.train.trainer import Trainer, full_card
 
 console = Console(highlight=False, soft_wrap=True)
 PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha", "visibility")
@@ -120,6 +116,11 @@ def train(
             f"stopped at iteration {trainer.iteration}; go on with: refgs train {capture_folder} --out {out} --resume"
         )
         raise KeyboardInterrupt
+    facts = {"training_seconds": trainer.seconds}
+    facts["peak_memory_bytes"] = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if device == "cuda":
+        facts["peak_card_memory_bytes"] = torch.cuda.max_memory_allocated()
+    update_metrics(out, facts)
     try:
         write_asset(trainer)
         quality = trainer.test_psnr(most=len(trainer.test))
@@ -128,50 +129,6 @@ def train(
         raise InputError(f"the card's memory is full; nothing is lost, go on with: {again}") from None
     held_out = "" if quality is None else f", {quality:.2f} dB on {len(trainer.test)} held-out views"
     console.print(f"trained {trainer.iteration} iterations in {trainer.seconds:.0f} s{held_out}: {out}")
-
-
-def _images(rendering: Rendering) -> dict[str, np.ndarray]:
-    """A rendering's passes as float arrays: colours (H, W, 4) premultiplied, the rest (H, W, 3) or (H, W)."""
-    alpha = rendering.alpha.numpy()
-    normal = torch.nn.functional.normalize(rendering.normal, dim=-1).numpy()
-    images = {"normal": normal, "depth": rendering.depth.numpy(), "alpha": alpha}
-    if rendering.material is not None:
-        images["color"] = np.dstack([rendering.radiance.numpy() * alpha[..., None], alpha])
-        images |= {name: getattr(rendering, name).numpy() for name in ("albedo", "metallic", "roughness")}
-    if rendering.visibility is not None:
-        images["visibility"] = rendering.visibility.numpy()
-    return images
-
-
-def _as_png(name: str, rendering: Rendering, background: np.ndarray) -> np.ndarray:
-    """A pass as 8-bit RGB(A) to look at: colours sRGB-encoded, straight alpha; normals n/2 + 1/2; depth divided by its largest."""
-    alpha = rendering.alpha.numpy()
-    if name == "color":
-        over = rendering.color.numpy() - background * (1 - alpha[..., None])
-        straight = over / np.maximum(alpha, 1e-6)[..., None]
-        return _bytes(np.dstack([straight, alpha]))
-    value = _images(rendering)[name]
-    if name == "normal":
-        value = (value * 0.5 + 0.5) * (alpha > 0.5)[..., None]
-    elif name == "albedo":
-        value = srgb_encode(value)
-    elif name == "depth":
-        value = value / max(float(value.max()), 1e-12)
-    return _bytes(value)
-
-
-def _bytes(value: np.ndarray) -> np.ndarray:
-    return np.rint(np.clip(np.nan_to_num(value), 0, 1) * 255).astype(np.uint8)
-
-
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write (H, W), (H, W, 3) or (H, W, 4) uint8 as PNG, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if pixels.ndim == 3:
-        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR if pixels.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
-    os.replace(temporary, path)
 
 
 def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path | None, format: str) -> None:
@@ -200,19 +157,25 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
     with progress_bar("rendering", len(views)) as bar:
         for done, camera in enumerate(views):
             rendering = run.render(camera, light)
+            images = maps(rendering)
             for name in passes:
                 path = out / name / f"{camera.name}.{format}"
-                if format == "png":
-                    write_png(path, _as_png(name, rendering, background))
-                else:
+                if format == "exr":
                     path.parent.mkdir(parents=True, exist_ok=True)
-                    write_exr(path, _images(rendering)[name])
+                    write_exr(path, images[name])
+                elif name == "color":
+                    write_png(path, color_picture(rendering, background))
+                else:
+                    write_png(path, picture(name, images[name], images["alpha"]))
             bar(done + 1)
     console.print(f"{len(views)} views, {', '.join(passes)}: {out}")
 
 
 def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     """Compare renderings with held-out photos, and with ground truth where there is some; write metrics.json and pictures."""
+    from refgs.report.evaluate import GroundTruth
+    from refgs.report.evaluate import evaluate as measure
+
     run = open_run(folder)
     if split not in ("test", "train"):
         raise InputError(f"--split {split}: take test or train")
@@ -222,67 +185,25 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     views = capture.test_views if split == "test" else capture.train_views
     if not views:
         raise InputError(f"{run.capture_folder} has no {split} views")
-    background = np.array(run.settings.image.background, dtype=np.float32)
-    # A held-out photo's exposure is not known: where they differ it is fitted, in linear radiance, for a second figure.
-    rows: dict[str, list[float]] = {"psnr": [], "ssim": [], "psnr_exposure_fitted": [], "normal_mae_degrees": []}
+    truth = GroundTruth(ground_truth, run.to_capture) if ground_truth else None
     with progress_bar("evaluating", len(views)) as bar:
-        for done, view in enumerate(views):
-            loaded = load_view(view, run.settings.image.max_side)
-            rendering = run.render(loaded.camera)
-            color = np.clip(rendering.color.numpy(), 0, 1)
-            photo = composite(loaded, torch.from_numpy(background)).numpy()
-            rows["psnr"].append(metrics.psnr(color, photo))
-            rows["ssim"].append(metrics.ssim(color, photo))
-            if run.exposed:
-                exposure = metrics.fitted_exposure(rendering.radiance.numpy(), rendering.alpha.numpy(), photo)
-                fitted = run.render(loaded.camera, exposure=exposure).color.numpy()
-                rows["psnr_exposure_fitted"].append(metrics.psnr(np.clip(fitted, 0, 1), photo))
-            truth = _true_normals(ground_truth, loaded.camera) if ground_truth else None
-            if truth is not None:
-                images = _images(rendering)
-                rows["normal_mae_degrees"].append(
-                    metrics.normal_mae_degrees(images["normal"], truth[0], images["alpha"], truth[1])
-                )
-            _write_pictures(folder / "pictures" / split, loaded.camera.name, rendering, photo, background)
-            bar(done + 1)
-    result = {name: float(np.mean(values)) for name, values in rows.items() if values}
-    facts = result | {"views": len(views), "split": split, "splats": len(run.splats)}
-    facts["peak_memory_bytes"] = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    update_metrics(folder, facts)
-    if run.environment is not None:
-        panorama = run.environment.panorama(256)
-        write_png(folder / "pictures" / "environment.png", _bytes(srgb_encode(panorama)))
-    console.print(
-        ", ".join(f"{name} {value:.4g}" for name, value in result.items()) + f" on {len(views)} {split} views"
-    )
-
-
-def _true_normals(folder: Path, camera: Camera) -> tuple[np.ndarray, np.ndarray] | None:
-    normal, alpha = (folder / name / f"{camera.name}.exr" for name in ("normal", "alpha"))
-    if not normal.exists() or not alpha.exists():
-        raise InputError(f"{folder}: {normal.relative_to(folder)} or {alpha.relative_to(folder)} is missing")
-    normals, alphas = read_exr(normal), read_exr(alpha)
-    if normals.shape[:2] != (camera.height, camera.width):
-        raise InputError(f"{normal}: its size is not the view's ({camera.width}×{camera.height})")
-    return normals[..., :3], alphas[..., 0] if alphas.ndim == 3 else alphas
-
-
-def _write_pictures(folder: Path, name: str, rendering: Rendering, photo: np.ndarray, background: np.ndarray) -> None:
-    write_png(folder / "photo" / f"{name}.png", _bytes(photo))
-    write_png(folder / "color" / f"{name}.png", _bytes(rendering.color.numpy()))
-    write_png(folder / "normal" / f"{name}.png", _as_png("normal", rendering, background))
-    if rendering.material is not None:
-        for what in ("albedo", "metallic", "roughness"):
-            write_png(folder / what / f"{name}.png", _as_png(what, rendering, background))
-    if rendering.visibility is not None:
-        write_png(folder / "visibility" / f"{name}.png", _as_png("visibility", rendering, background))
+        figures = measure(run, split, views, truth, bar)
+    update_metrics(folder, figures)
+    console.print(f"{len(views)} {split} views: {', '.join(in_words(figures, HEADLINE))}")
+    for line in [*in_words(figures, DETAILS), *relit_in_words(figures)]:
+        console.print(f"  {line}")
 
 
 def update_metrics(folder: Path, facts: dict) -> None:
-    """Put figures into a run's metrics.json beside those that are there, replacing the ones of the same name."""
+    """Put figures into a run's metrics.json beside those that are there, replacing the ones of the same name at every depth."""
+
+    def merged(known: dict, new: dict) -> dict:
+        both = {key: merged(known[key], new[key]) for key in new if isinstance(known.get(key), dict)}
+        return known | new | both
+
     file = folder / "metrics.json"
     known = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
-    write_text(file, json.dumps(known | facts, indent=1))
+    write_text(file, json.dumps(merged(known, facts), indent=1))
 
 
 def export(

@@ -10,14 +10,11 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
-
 from refgs import commands
-from refgs.color import srgb_encode
 from refgs.errors import InputError
-from refgs.export.environment import read_exr
 from refgs.paths import clone_root
 from refgs.report import metrics
+from refgs.report.evaluate import read_relit
 from refgs.report.page import write_report
 
 SCENE = "jar"
@@ -98,24 +95,19 @@ def _child(root: Path, what: str, module: str, *arguments: object) -> None:
 
 
 def _compare(folder: Path, truth: Path, previews: Path) -> None:
-    """PSNR of the Eevee previews against Cycles' under the same light; pictures of both for the report."""
+    """Figures of the Eevee previews against Cycles' pictures under the same light; the previews go into the report."""
     result: dict[str, dict[str, dict[str, float]]] = {}
     pictures = folder / "pictures" / "relight"
     for hdri in HDRIS:
         for kind in ("splats", "mesh"):
-            rows = []
+            files = []
             for view in VIEWS:
                 preview = previews / f"{hdri}_{kind}_{view}"
-                rows.append(metrics.compare_relight(preview.with_suffix(".exr"), truth / hdri / f"{view}.exr"))
+                files.append((preview.with_suffix(".exr"), truth / hdri / f"{view}.exr"))
                 (pictures / kind).mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(preview.with_suffix(".png"), pictures / kind / f"{hdri}_{view}.png")
-            result.setdefault(hdri, {})[kind] = {key: float(np.mean([r[key] for r in rows])) for key in rows[0]}
-        for view in VIEWS:
-            pixels = read_exr(truth / hdri / f"{view}.exr")
-            straight = pixels[..., :3] / np.maximum(pixels[..., 3:], 1e-6)
-            encoded = np.dstack([srgb_encode(straight), pixels[..., 3]])
-            pixels = np.rint(encoded.clip(0, 1) * 255).astype(np.uint8)
-            commands.write_png(pictures / "truth" / f"{hdri}_{view}.png", pixels)
+            pairs = [(read_relit(image), read_relit(true)) for image, true in files]
+            result.setdefault(hdri, {})[kind] = metrics.relit(lambda pairs=pairs: pairs)
     commands.update_metrics(folder, {"relight": result})
 
 

@@ -1,6 +1,5 @@
 """The run folder: what a training leaves, and the only thing that rendering, evaluation, export and Blender read."""
 
-import os
 import platform
 import tomllib
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from refgs.geometry.mesh import read_mesh
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, from_splats
+from refgs.paths import whole
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.settings import Settings, recorded_settings
 
@@ -167,6 +167,5 @@ def _light(panorama: np.ndarray, settings: Settings, reference: Camera | None = 
 
 def write_text(file: Path, text: str) -> None:
     """Write a text file whole or not at all."""
-    temporary = file.with_name(file.name + ".tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, file)
+    with whole(file) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -1,9 +1,12 @@
-import numpy as np
-import OpenEXR
-import pytest
+import sys
+import types
 
-from refgs.color import srgb_encode
-from refgs.errors import InputError
+import numpy as np
+import pytest
+import torch
+
+from refgs.color import srgb_decode, srgb_encode
+from refgs.export.environment import directions, sample
 from refgs.report import metrics
 
 RANDOM = np.random.default_rng(7)
@@ -12,12 +15,6 @@ RANDOM = np.random.default_rng(7)
 def test_psnr_of_a_known_error():
     reference = RANDOM.uniform(0.2, 0.8, (16, 20, 3))
     assert metrics.psnr(reference + 0.1, reference) == pytest.approx(20.0)
-    mask = np.zeros((16, 20), bool)
-    mask[:4] = True
-    image = reference.copy()
-    image[:4] += 0.01
-    image[4:] += 0.3
-    assert metrics.psnr(image, reference, mask) == pytest.approx(40.0)
     assert metrics.psnr(reference, reference) == 100.0
 
 
@@ -63,15 +60,79 @@ def test_missing_normals_count_as_ninety_degrees_and_the_background_not_at_all()
     assert metrics.normal_mae_degrees(normals, reference, rendered, covered) == pytest.approx(90 * 3 / 5, abs=1e-5)
 
 
-def test_one_scale_is_found_and_a_sun_does_not_decide_it():
-    reference = np.dstack([RANDOM.uniform(0, 0.9, (20, 20, 3)), np.ones((20, 20))])
-    image = reference.copy()
-    image[..., :3] *= 0.5
-    reference[3, 3, :3] = 4000.0
-    image[3, 3, :3] = 3.0
-    raw, aligned, scale = metrics.scale_aligned_psnr(image, reference)
-    assert scale == pytest.approx(2)
-    assert aligned == pytest.approx(100) and raw < 20
+def test_flip_of_flat_greys_is_the_papers_colour_distance():
+    picture = RANDOM.uniform(0, 1, (32, 40, 3))
+    assert metrics.flip(picture, picture) == 0
+    # Without features only the colours are left (Andersson et al. 2020, §4.1): the difference in lightness to the power 0.7, of
+    # the largest there is, that of green and blue, 41.28; from 0.4 of it on compressed into 0.95 to 1.
+    black, white = np.zeros((32, 32, 3)), np.ones((32, 32, 3))
+    largest = 41.28
+    expected = 0.95 + 0.05 * (100**0.7 - 0.4 * largest) / (0.6 * largest)
+    assert metrics.flip(black, white) == pytest.approx(expected, abs=1e-3)
+    lightness = 116 * np.cbrt(srgb_decode(np.array([0.5, 0.55]))) - 16
+    expected = 0.95 * abs(lightness[1] - lightness[0]) ** 0.7 / (0.4 * largest)
+    assert metrics.flip(0.55 * white, 0.5 * white) == pytest.approx(expected, rel=0.02)
+
+
+def test_lpips_says_why_it_is_missing_and_never_fetches_weights(tmp_path, monkeypatch):
+    for name in ("lpips", "torchvision"):
+        package = types.ModuleType(name)
+        package.__spec__ = types.SimpleNamespace(name=name)
+        monkeypatch.setitem(sys.modules, name, package)
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    assert "vgg16-397923af.pth" in metrics.lpips_missing()
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "vgg16-397923af.pth").touch()
+    assert metrics.lpips_missing() is None
+    monkeypatch.delitem(sys.modules, "lpips")
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert metrics.lpips_missing() == "the package lpips is not installed"
+
+
+def test_normal_ssim_is_of_encoded_normals_over_white():
+    up = np.zeros((24, 24, 3))
+    up[..., 2] = 1
+    side, ones = up[..., [2, 0, 1]], np.ones((24, 24))
+    assert metrics.normal_ssim(up, up, ones, ones) == pytest.approx(1)
+
+    def luminance(a, b):
+        return (2 * a * b + 0.01**2) / (a * a + b * b + 0.01**2)
+
+    # (½, ½, 1) against (1, ½, ½): flat, so only the luminance term of Wang et al. is left.
+    assert metrics.normal_ssim(up, side, ones, ones) == pytest.approx((2 * luminance(0.5, 1) + 1) / 3)
+    # What is not there is white, whatever its normal is.
+    normals = up.copy()
+    normals[:] = np.nan
+    assert metrics.normal_ssim(normals, up, 0 * ones, ones) == pytest.approx((2 * luminance(0.5, 1) + 1) / 3)
+
+
+def test_base_colours_are_aligned_by_one_scale_a_channel_for_all_views():
+    truth = RANDOM.uniform(0.1, 0.9, (2, 12, 10, 3))
+    tint = np.array([0.5, 0.8, 1.1])
+    mask = RANDOM.uniform(size=(12, 10)) > 0.4
+    wrong = truth * tint
+    wrong[:, ~mask] = 7  # not the object's
+    result = metrics.aligned_psnr([metrics.channel_products(a, b, mask) for a, b in zip(wrong, truth, strict=True)])
+    assert result["psnr_aligned"] == pytest.approx(100, abs=1e-6)
+    assert result["scale"] == pytest.approx(1 / tint)
+    by_hand = [-10 * np.log10(((a - b)[mask] ** 2).mean()) for a, b in zip(wrong, truth, strict=True)]
+    assert result["psnr_raw"] == pytest.approx(np.mean(by_hand))
+    wrong[1] = truth[1] * 2 * tint  # no one scale suits both views
+    result = metrics.aligned_psnr([metrics.channel_products(a, b, mask) for a, b in zip(wrong, truth, strict=True)])
+    assert result["psnr_aligned"] < 30
+
+
+def test_one_scale_for_all_views_is_found_and_a_sun_does_not_decide_it():
+    truth = [np.dstack([RANDOM.uniform(0, 0.9, (20, 20, 3)), np.ones((20, 20))]) for _ in range(2)]
+    images = [view * [0.5, 0.5, 0.5, 1] for view in truth]
+    truth[0][3, 3, :3] = 4000.0
+    images[0][3, 3, :3] = 3.0
+    result = metrics.relit(lambda: zip(images, truth, strict=True))
+    assert result["scale"] == pytest.approx(2)
+    assert result["psnr_aligned"] == pytest.approx(100) and result["psnr_raw"] < 20
+    assert result["flip_aligned"] == pytest.approx(0, abs=1e-6) and result["flip_raw"] > 0.1
+    images[1][..., :3] *= 2
+    assert metrics.relit(lambda: zip(images, truth, strict=True))["psnr_aligned"] < 30
 
 
 def test_an_exposure_is_fitted_where_the_photo_tells():
@@ -85,10 +146,10 @@ def test_an_exposure_is_fitted_where_the_photo_tells():
 
 
 def test_uncovered_pixels_are_white_on_both_sides():
-    empty = np.zeros((8, 8, 4))
+    empty = np.zeros((12, 12, 4))
     black = empty.copy()
     black[..., 3] = 1
-    assert metrics.scale_aligned_psnr(empty, black)[0] == pytest.approx(0)
+    assert metrics.relit(lambda: [(empty, black)])["psnr_raw"] == pytest.approx(0)
 
 
 def test_environment_error_ignores_scale_and_size_and_measures_the_log():
@@ -109,21 +170,40 @@ def test_environment_pixels_count_by_solid_angle():
     assert metrics.environment_log_rmse(polar, light)[0] < 0.4 * metrics.environment_log_rmse(equatorial, light)[0]
 
 
-def write(path, pixels):
-    OpenEXR.File({}, {"RGBA"[: pixels.shape[2]]: pixels.astype(np.float32)}).write(str(path))
-    return path
+def lamps(turn=0.0, lift=0.0, height=64):
+    """A dim room with two lamps, the second half as bright, moved by degrees round the axis and upwards."""
+    rays = directions(height, 2 * height).astype(np.float64)
+    light = np.full((height, 2 * height), 0.1)
+    for azimuth, elevation, bright in ((40, 10, 20.0), (160, 35, 10.0)):
+        a, e = np.radians(azimuth + turn), np.radians(elevation + lift)
+        centre = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        light += bright * np.exp((rays @ centre - 1) / np.radians(4) ** 2)
+    return np.repeat(light[..., None], 3, axis=2)
 
 
-def test_relit_files_are_compared(tmp_path):
-    truth = np.dstack([RANDOM.uniform(0, 0.9, (20, 20, 3)), np.ones((20, 20))])
-    half = truth * [0.5, 0.5, 0.5, 1]
-    result = metrics.compare_relight(write(tmp_path / "a.exr", half), write(tmp_path / "b.exr", truth))
-    assert result["scale"] == pytest.approx(2, rel=1e-4) and result["psnr_aligned"] > 90 > 30 > result["psnr_raw"]
+def test_lights_are_found_where_they_are():
+    found, bright = metrics.find_lights(lamps())
+    azimuth = np.degrees(np.arctan2(found[:2, 1], found[:2, 0]))
+    np.testing.assert_allclose(azimuth, [40, 160], atol=0.1)
+    np.testing.assert_allclose(np.degrees(np.arcsin(found[:2, 2])), [10, 35], atol=0.1)
+    assert bright[0] == pytest.approx(2 * bright[1], rel=0.05)
 
 
-def test_relit_files_that_do_not_fit_are_refused(tmp_path):
-    truth = write(tmp_path / "truth.exr", np.ones((20, 20, 4)))
-    with pytest.raises(InputError, match="not the same size"):
-        metrics.compare_relight(write(tmp_path / "small.exr", np.ones((10, 20, 4))), truth)
-    with pytest.raises(InputError, match="no alpha"):
-        metrics.compare_relight(write(tmp_path / "opaque.exr", np.ones((20, 20, 3))), truth)
+def test_lights_error_is_the_angle_they_are_off_whatever_the_scale():
+    truth = lamps()
+    assert metrics.lights_error(3 * truth, truth) == (pytest.approx(0, abs=1e-3), 2)
+    up, count = metrics.lights_error(lamps(lift=7), truth)
+    assert up == pytest.approx(7, abs=0.1) and count == 2
+    # A turn about the axis moves a light by less the higher it stands; the first counts twice.
+    moved = [2 * np.degrees(np.arcsin(np.sin(np.radians(5)) * np.cos(np.radians(e)))) for e in (10, 35)]
+    assert metrics.lights_error(lamps(turn=10), truth)[0] == pytest.approx((2 * moved[0] + moved[1]) / 3, abs=0.1)
+    # Of another size, in another frame: half a turn about the vertical.
+    turned = sample(lamps(height=100), directions(100, 200) * np.float32([-1, -1, 1]))
+    assert metrics.lights_error(turned, lamps(turn=180))[0] < 0.2
+
+
+def test_a_light_that_was_not_found_counts_as_thirty_degrees_and_an_even_sky_has_none():
+    truth = lamps()
+    without = np.minimum(truth, lamps(turn=60))  # neither lamp
+    assert metrics.lights_error(without, truth)[0] == pytest.approx(30)
+    assert metrics.lights_error(truth, np.ones((32, 64, 3))) is None

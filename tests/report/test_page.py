@@ -60,6 +60,7 @@ def run(tmp_path):
         picture(folder / f"pictures/relight/{kind}/studio_test_002.png", 50, channels=4)
     picture(folder / "pictures/environment.png", 70)
     relight = {"studio": {"splats": {"psnr_raw": 21.25, "psnr_aligned": 23.5}, "mesh": {"psnr_raw": 20.75}}}
+    relight["studio"]["refgs"] = {"psnr_raw": 24.5, "flip_raw": 0.125, "flip_aligned": 0.111}
     figures = {"psnr": 29.604, "ssim": 0.94126, "normal_mae_degrees": 4.2, "seconds": 431.2, "splats": 19832}
     figures |= {"peak_memory_bytes": 2**31, "relight": relight, "environment": {"log_rmse": 0.3125}, "split": "test"}
     (folder / "metrics.json").write_text(json.dumps(figures))
@@ -79,7 +80,16 @@ def test_everything_is_on_the_page_and_in_the_page(run):
     page = Page(out.read_text(encoding="utf-8"))
     for words in (
         *("vases/first <run>", "29.60 dB", "0.9413", "4.20°", "7 min 11 s", "19,832", "2.00 GiB", "“urn”"),
-        *("21.25 / 23.50", "20.75", "0.3125", "412 surfels", "no view sees them", "2 %", "iterations = 4000"),
+        *(
+            "21.25 / 23.50",
+            "20.75",
+            "0.312",
+            "studio surfels (RefGS) 24.50 dB, FLIP 0.125 / 0.111",
+            "412 surfels",
+            "no view sees them",
+            "2 %",
+            "iterations = 4000",
+        ),
     ):
         assert words in page.text, words
     assert "is not there" not in page.text

@@ -179,6 +179,8 @@ def test_ctrl_c_leaves_a_run_that_goes_on(ball_capture, tmp_path):
     done = refgs("train", ball_capture, "--out", out, "--resume", "--minutes", "0.05")
     assert done.returncode == 0, done.stderr
     assert (out / "splats.ply").exists()
+    figures = json.loads((out / "metrics.json").read_text())
+    assert figures["training_seconds"] > 0 and figures["peak_memory_bytes"] > 1e8
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Camera files: the paths that `refgs render --cameras` follows, and a run folder's cameras.json."""
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from refgs.capture.poses import OPENGL_TO_OPENCV, in_frame
 from refgs.capture.transforms import frame_camera, read_frames
 from refgs.capture.types import Capture
 from refgs.errors import InputError
+from refgs.paths import whole
 
 
 def read_cameras(file: Path) -> list[Camera]:
@@ -63,14 +63,12 @@ def write_cameras(
                 "split": view.split,
             }
         )
-    file = Path(file)
-    temporary = file.with_name(file.name + ".tmp")
     facts = {"frames": frames, "to_capture": capture.to_capture.tolist()}
     if light == "camera":
         facts["light_of"] = f"images/{capture.train_views[0].camera.name}"
     text = json.dumps(facts, indent=1)
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, file)
+    with whole(file) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float]]:

@@ -7,6 +7,7 @@ import numpy as np
 import OpenEXR
 
 from refgs.errors import InputError
+from refgs.paths import whole
 
 # Rec.709 / sRGB: x and y of red, green, blue and the D65 white (ITU-R BT.709-6, table 1).
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
@@ -14,7 +15,6 @@ _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
     """Write float32 linear Rec.709: (H, W, 4) as premultiplied RGBA, (H, W, 3) as RGB, (H, W) as Y; ZIP, scan lines."""
-    path = Path(path)
     pixels = np.ascontiguousarray(pixels, np.float32)
     name = "Y" if pixels.ndim == 2 else {3: "RGB", 4: "RGBA"}[pixels.shape[2]]
     header = {
@@ -22,12 +22,8 @@ def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
         "type": OpenEXR.scanlineimage,
         "chromaticities": _REC709,
     }
-    temporary = path.with_name(path.name + ".tmp")
-    try:
+    with whole(path) as temporary:
         OpenEXR.File(header, {name: pixels}).write(str(temporary))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_exr(path: str | os.PathLike) -> np.ndarray:

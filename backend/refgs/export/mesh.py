@@ -10,9 +10,13 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
 from refgs.color import srgb_encode
+from refgs.errors import InputError
 from refgs.export.bake import Textures
 from refgs.export.environment import write_exr
 from refgs.geometry.mesh import Mesh
+from refgs.paths import whole
+
+_Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # glTF 2.0, 3.4: +Y is up
 
 
 def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
@@ -37,7 +41,8 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
         pictures[name] = _bytes(srgb_encode(linear.clip(0, 1)) if name == "base_color" else linear)
         png = io.BytesIO()
         Image.fromarray(pictures[name]).save(png, "PNG")
-        _write(folder / f"{name}.png", png.getvalue())
+        with whole(folder / f"{name}.png") as temporary:
+            temporary.write_bytes(png.getvalue())
         write_exr(folder / f"{name}.exr", linear)
 
     roughness, metallic = pictures["roughness"], pictures["metallic"]
@@ -52,27 +57,28 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
         roughnessFactor=1.0,
         doubleSided=True,  # a capture from above leaves a mesh without a bottom
     )
-    y_up = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # glTF 2.0, 3.4: +Y is up
     model = trimesh.Trimesh(
-        mesh.vertices @ y_up.T,
+        mesh.vertices @ _Y_UP.T,
         mesh.faces,
-        vertex_normals=mesh.normals @ y_up.T,
+        vertex_normals=mesh.normals @ _Y_UP.T,
         visual=trimesh.visual.TextureVisuals(uv=mesh.uv, material=material),
         process=False,
     )
     scene = trimesh.Scene()
     scene.add_geometry(model, node_name="RefGS", geom_name="RefGS")
-    _write(path, scene.export(file_type="glb", include_normals=True))
+    with whole(path) as temporary:
+        temporary.write_bytes(scene.export(file_type="glb", include_normals=True))
+
+
+def read_glb(path: str | os.PathLike) -> Mesh:
+    """Vertices and faces, Z up, of what `write_glb` wrote. Raises InputError for a file that is broken."""
+    try:
+        model = trimesh.load_mesh(path, file_type="glb", process=False, skip_materials=True)
+        vertices, faces = np.asarray(model.vertices, np.float64), np.asarray(model.faces)
+    except Exception as error:  # trimesh raises what its parsing ran into
+        raise InputError(f"{path} is not a whole binary glTF file of a mesh ({error}): export it again") from None
+    return Mesh(vertices @ _Y_UP, faces)
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:
     return np.rint(values.clip(0, 1) * 255).astype(np.uint8)
-
-
-def _write(path: Path, data: bytes) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

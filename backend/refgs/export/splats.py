@@ -8,6 +8,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from refgs.errors import InputError
+from refgs.paths import whole
 
 
 @dataclass
@@ -47,7 +48,6 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
     Opacity is stored as a logit and scales as logarithms, as 3DGS viewers expect; spherical harmonics of the first
     degree and above are channel-major; materials are stored as they are. Opacities are clipped to 1e-6 .. 1 - 1e-6.
     """
-    path = Path(path)
     count, coefficients = splats.sh.shape[:2]
     opacity = np.clip(splats.opacities.astype(np.float64), 1e-6, 1 - 1e-6)
     columns = [
@@ -69,12 +69,8 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
     names += [f"ind_{i}" for i in range(3 * splats.indirect.shape[1])]
     table = np.concatenate([np.reshape(c, (count, -1)) for c in columns], axis=1).astype("<f4")
     rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names])[:, 0]
-    temporary = path.with_name(path.name + ".tmp")
-    try:
+    with whole(path) as temporary:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_splats(path: str | os.PathLike) -> Splats:

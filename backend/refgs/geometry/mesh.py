@@ -2,13 +2,13 @@
 
 import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import fast_simplification
 import numpy as np
 import trimesh
 
 from refgs.errors import InputError
+from refgs.paths import whole
 
 
 @dataclass
@@ -28,13 +28,8 @@ class Mesh:
 
 def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
     """Write vertices and faces as a binary PLY, whole or not at all."""
-    path = Path(path)
-    temporary = path.with_name(path.name + ".tmp")
-    try:
+    with whole(path) as temporary:
         temporary.write_bytes(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply"))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_mesh(path: str | os.PathLike) -> Mesh:

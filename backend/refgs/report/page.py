@@ -2,22 +2,21 @@
 
 What is read of a run folder, each part left out where it is absent:
 
-    metrics.json     numbers, nested at will; known keys: psnr, ssim, normal_mae_degrees, seconds, peak_memory_bytes, splats,
-                     relight.HDRI.{splats,mesh}.{psnr_raw,psnr_aligned}
+    metrics.json     numbers, nested at will; those of `refgs.report.figures` are named, and
+                     relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}
     history.jsonl    one object a line: seconds, iteration, loss, psnr_train, psnr_test, splats
     needs.json       a list of {"what", "why", "saved"}
     run.toml         the settings, and what was trained on
-    pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png
-    pictures/relight/{truth,splats,mesh}/HDRI_VIEW.png
+    pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png, and true_normal/VIEW.png … where it is known
+    pictures/relight/{truth,refgs,splats,mesh}/HDRI_VIEW.png
     pictures/environment.png, and environment_truth.png where the true light is known
 """
 
 import base64
 import io
 import json
-import math
-import os
 import tomllib
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,6 +29,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from refgs import __version__
 from refgs.errors import InputError
+from refgs.paths import whole
+from refgs.report.figures import DETAILS, HEADLINE, RELIT, Quantity, flatten, is_number, relit_pair
 
 PASSES = {
     "photo": "photo",
@@ -38,9 +39,12 @@ PASSES = {
     "albedo": "base colour",
     "roughness": "roughness",
     "metallic": "metallic",
+    "true_normal": "true normal",
+    "true_albedo": "true base colour",
+    "true_roughness": "true roughness",
+    "true_metallic": "true metallic",
 }
-RELIT = {"truth": "ground truth (Cycles)", "splats": "splats (Eevee)", "mesh": "mesh (Eevee)"}
-MOST_VIEWS = 4
+MOST_VIEWS, MOST_RELIT = 4, 8
 LARGEST_SIDE = 512  # pixels; a page of full-size photos would be too heavy to open
 INK = "#010203"  # stands for the page's own text colour in a chart, light or dark
 
@@ -70,7 +74,8 @@ def write_report(runs: list[Path], out: Path) -> None:
     html = environment.get_template("template.html").render(
         runs=pages,
         version=__version__,
-        headline=_headline(pages),
+        headline=_columns(pages, HEADLINE),
+        details=_columns(pages, DETAILS),
         relit_table=_relit_table(pages),
         rest=_rest(pages),
         views=_names(page.views for page in pages),
@@ -80,9 +85,8 @@ def write_report(runs: list[Path], out: Path) -> None:
         chart=_chart(pages),
     )
     out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(out.name + ".tmp")
-    temporary.write_text(html, encoding="utf-8")
-    os.replace(temporary, out)
+    with whole(out) as temporary:
+        temporary.write_text(html, encoding="utf-8")
 
 
 def _read_run(folder: Path) -> RunPage:
@@ -111,13 +115,13 @@ def _read_run(folder: Path) -> RunPage:
     pictures = folder / "pictures"
     page = RunPage(
         name="/".join(folder.resolve().parts[-2:]).lstrip("/"),
-        figures=dict(_flatten(metrics)),
+        figures=dict(flatten(metrics)),
         history=history,
         left_out=[item for item in left_out if isinstance(item, dict)] if isinstance(left_out, list) else [],
         settings=settings,
         trained_on=trained_on,
         views=_pictures(pictures / "test", PASSES, MOST_VIEWS),
-        relit=_pictures(pictures / "relight", RELIT, None),
+        relit=_pictures(pictures / "relight", RELIT, MOST_RELIT),
         light={kind: _embed(pictures / f"{kind}.png") for kind in ("environment", "environment_truth")},
         missing=missing,
     )
@@ -138,26 +142,15 @@ def _lines(text: str) -> list[dict]:
             found.append(json.loads(line))
         except json.JSONDecodeError:
             continue
-    return [item for item in found if isinstance(item, dict) and _number(item.get("seconds"))]
+    return [item for item in found if isinstance(item, dict) and is_number(item.get("seconds"))]
 
 
-def _number(value) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _flatten(values, prefix: str = ""):
-    """("a.b", number) for each finite number in nested dicts."""
-    if isinstance(values, dict):
-        for key, value in values.items():
-            yield from _flatten(value, f"{prefix}.{key}" if prefix else str(key))
-    elif _number(values):
-        yield prefix, values
-
-
-def _pictures(folder: Path, kinds: dict[str, str], most: int | None) -> dict[str, dict[str, str]]:
-    """{name: {kind: data address}} of the pictures in folder/KIND/NAME.png, at most so many names, evenly chosen."""
-    names = sorted({path.stem for kind in kinds for path in folder.glob(f"{kind}/*.png")})
-    if most is not None and len(names) > most:
+def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[str, str]]:
+    """{name: {kind: data address}} of the pictures in folder/KIND/NAME.png: of the names that there are most kinds of, at
+    most so many, evenly chosen."""
+    count = Counter(path.stem for kind in kinds for path in folder.glob(f"{kind}/*.png"))
+    names = sorted(name for name in count if count[name] == max(count.values()))
+    if len(names) > most:
         names = [names[i] for i in np.linspace(0, len(names) - 1, most).round().astype(int)]
     found = {name: {kind: _embed(folder / kind / f"{name}.png") for kind in kinds} for name in names}
     return {name: images for name, images in found.items() if any(images.values())}
@@ -181,26 +174,10 @@ def _names(groups) -> list[str]:
     return list(dict.fromkeys(name for group in groups for name in group))
 
 
-def _time(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
-
-
-# key, heading, how it is written, which way is better
-HEADLINE = [
-    ("psnr", "PSNR, held-out views", lambda x: f"{x:.2f} dB", max),
-    ("ssim", "SSIM", lambda x: f"{x:.4f}", max),
-    ("normal_mae_degrees", "normal error", lambda x: f"{x:.2f}°", min),
-    ("seconds", "time", _time, min),
-    ("splats", "surfels", lambda x: f"{x:,.0f}", None),
-    ("peak_memory_bytes", "peak memory", lambda x: f"{x / 2**30:.2f} GiB", min),
-]
-
-
-def _headline(pages: list[RunPage]) -> list[dict]:
-    """The columns that some run has: heading, and for each run the text and whether it is the best of several."""
+def _columns(pages: list[RunPage], figures: list[Quantity]) -> list[dict]:
+    """The figures that some run has: heading, and for each run the text and whether it is the best of several."""
     columns = []
-    for key, heading, text, better in HEADLINE:
+    for key, heading, text, better in figures:
         values = [page.figures.get(key) for page in pages]
         known = [value for value in values if value is not None]
         if not known:
@@ -212,25 +189,24 @@ def _headline(pages: list[RunPage]) -> list[dict]:
 
 
 def _relit_table(pages: list[RunPage]) -> list[dict]:
-    """Rows of relit PSNR: HDRI, what was lit, and for each run "raw / aligned" in dB."""
+    """Rows of what was lit by an HDRI, and how well for each run."""
     found = _names({key.rsplit(".", 1)[0] for key in sorted(page.figures) if _is_relit(key)} for page in pages)
     rows = []
     for prefix in sorted(found):
         _, hdri, kind = prefix.split(".")
-        pairs = [[page.figures.get(f"{prefix}.psnr_{which}") for which in ("raw", "aligned")] for page in pages]
-        cells = [" / ".join(f"{x:.2f}" for x in pair if x is not None) or "–" for pair in pairs]
+        cells = [relit_pair(page.figures, prefix) for page in pages]
         rows.append({"hdri": hdri, "kind": RELIT.get(kind, kind), "cells": cells})
     return rows
 
 
 def _is_relit(key: str) -> bool:
     parts = key.split(".")
-    return parts[0] == "relight" and len(parts) == 4 and parts[3] in ("psnr_raw", "psnr_aligned")
+    return parts[0] == "relight" and len(parts) == 4 and parts[3].startswith(("psnr_", "flip_"))
 
 
 def _rest(pages: list[RunPage]) -> list[dict]:
     """Every figure that no other table has."""
-    shown = {key for key, *_ in HEADLINE}
+    shown = {figure.key for figure in HEADLINE + DETAILS}
     keys = [key for key in _names(page.figures for page in pages) if key not in shown and not _is_relit(key)]
     texts = {key: [page.figures.get(key) for page in pages] for key in keys}
     return [{"key": key, "cells": ["–" if x is None else f"{x:.5g}" for x in row]} for key, row in texts.items()]
@@ -276,5 +252,5 @@ def _chart(pages: list[RunPage]) -> str:
 
 def _series(history: list[dict], key: str) -> tuple[list[float], list[float]]:
     """Seconds and values of the lines that have this key."""
-    points = [(line["seconds"], line[key]) for line in history if _number(line.get(key)) and line["seconds"] > 0]
+    points = [(line["seconds"], line[key]) for line in history if is_number(line.get(key)) and line["seconds"] > 0]
     return [x for x, _ in points], [y for _, y in points]

@@ -20,6 +20,7 @@ from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Parameters, Surfels, activate
 from refgs.render.renderer import Rendering, near_plane, render
+from refgs.report.metrics import decibels, psnr
 from refgs.settings import RenderSettings, Settings
 from refgs.train import checkpoint
 from refgs.train.adam import Adam
@@ -48,16 +49,6 @@ def composite(view: LoadedView, background: Tensor) -> Tensor:
         return image
     alpha = torch.from_numpy(view.alpha).to(background.device).float()[..., None] / 255
     return image * alpha + background * (1 - alpha)
-
-
-def decibels(square: float) -> float:
-    """Peak signal-to-noise ratio in dB of a mean squared error."""
-    return -10 * math.log10(max(square, 1e-10))
-
-
-def psnr(image: Tensor, photo: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of a rendering, clipped to 0..1."""
-    return decibels(float(((image.clamp(0, 1) - photo) ** 2).mean()))
 
 
 def full_card() -> InputError:
@@ -196,7 +187,8 @@ class Trainer:
         chosen = self.test[:: max(1, len(self.test) // most)][:most]
         if not chosen:
             return None
-        return float(np.mean([psnr(self.render(v.camera).color, composite(v, self.background)) for v in chosen]))
+        pairs = ((self.render(v.camera).color.clamp(0, 1), composite(v, self.background)) for v in chosen)
+        return float(np.mean([psnr(*(image.numpy(force=True) for image in pair)) for pair in pairs]))
 
     def step(self) -> dict[str, Tensor]:
         """One iteration. Returns its loss and mean squared error, which are still being computed where there is a card."""

@@ -1,0 +1,94 @@
+"""How figures are said, on the console and on the page."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+RELIT = {
+    "truth": "ground truth (Cycles)",
+    "refgs": "surfels (RefGS)",
+    "splats": "splats (Eevee)",
+    "mesh": "mesh (Eevee)",
+}
+
+
+class Quantity(NamedTuple):
+    """A key of metrics.json, nested ones joined by dots; what it is; how its value is written; which way is better."""
+
+    key: str
+    heading: str
+    text: Callable[[float], str]
+    better: Callable[[Iterable[float]], float] | None
+
+
+def _time(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
+
+
+HEADLINE = [
+    Quantity("psnr", "PSNR", "{:.2f} dB".format, max),
+    Quantity("ssim", "SSIM", "{:.4f}".format, max),
+    Quantity("flip", "FLIP", "{:.4f}".format, min),
+    Quantity("normal_mae_degrees", "normal error", "{:.2f}°".format, min),
+    Quantity("training_seconds", "training", _time, min),
+    Quantity("seconds", "all of it", _time, min),
+    Quantity("frames_per_second", "renders", "{:.3g} a second".format, max),
+    Quantity("splats", "surfels", "{:,.0f}".format, None),
+    Quantity("peak_memory_bytes", "peak memory", lambda x: f"{x / 2**30:.2f} GiB", min),
+]
+
+DETAILS = [
+    Quantity("psnr_exposure_fitted", "PSNR, each photo's exposure fitted", "{:.2f} dB".format, max),
+    Quantity("lpips", "LPIPS, VGG", "{:.4f}".format, min),
+    Quantity("normal_ssim", "normals: SSIM", "{:.4f}".format, max),
+    Quantity("albedo.psnr_raw", "base colour: PSNR", "{:.2f} dB".format, max),
+    Quantity("albedo.psnr_aligned", "base colour: PSNR after one scale a channel", "{:.2f} dB".format, max),
+    Quantity("roughness_mae", "roughness: mean error", "{:.4f}".format, min),
+    Quantity("metallic_mae", "metallic: mean error", "{:.4f}".format, min),
+    Quantity("visibility_agreement", "mirror visibility: pixels that agree", "{:.1%}".format, max),
+    Quantity("visibility_free", "mirror visibility: pixels that are free in truth", "{:.1%}".format, None),
+    Quantity("environment.log_rmse", "light: RMS error of log radiance after one scale", "{:.3f}".format, min),
+    Quantity("environment.lights_degrees", "light: how far the brightest lights are off", "{:.2f}°".format, min),
+    Quantity("mesh.chamfer", "mesh: Chamfer distance, of the object's radius", "{:.3%}".format, min),
+    Quantity("mesh.normal_consistency", "mesh: normal consistency", "{:.4f}".format, max),
+    Quantity("peak_card_memory_bytes", "peak memory on the card", lambda x: f"{x / 2**30:.2f} GiB", min),
+]
+
+
+def is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def flatten(values: object, prefix: str = "") -> Iterator[tuple[str, float]]:
+    """("a.b", number) for each finite number in nested dicts."""
+    if isinstance(values, dict):
+        for key, value in values.items():
+            yield from flatten(value, f"{prefix}.{key}" if prefix else str(key))
+    elif is_number(values):
+        yield prefix, values
+
+
+def in_words(metrics: dict, figures: list[Quantity]) -> list[str]:
+    """Those of the figures that there are, each with its name."""
+    known = dict(flatten(metrics))
+    return [f"{heading} {text(known[key])}" for key, heading, text, _ in figures if key in known]
+
+
+def relit_pair(figures: dict[str, float], prefix: str) -> str:
+    """What is known of a picture under another light, e.g. of "relight.studio.mesh": raw / after one scale."""
+    parts = []
+    for name, text in (("psnr", "{:.2f}"), ("flip", "{:.3f}")):
+        found = [figures.get(f"{prefix}.{name}_{which}") for which in ("raw", "aligned")]
+        parts.append(" / ".join(text.format(x) for x in found if x is not None))
+    psnr, flip = parts
+    return ", ".join([f"{psnr} dB"] * bool(psnr) + [f"FLIP {flip}"] * bool(flip)) or "–"
+
+
+def relit_in_words(metrics: dict) -> list[str]:
+    """A line for each light and what was lit."""
+    known = dict(flatten(metrics))
+    lit = [(hdri, kind) for hdri, kinds in metrics.get("relight", {}).items() for kind in kinds]
+    return [
+        f"relit by {hdri}, {RELIT.get(kind, kind)}: {relit_pair(known, f'relight.{hdri}.{kind}')}" for hdri, kind in lit
+    ]

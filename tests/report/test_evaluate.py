@@ -1,0 +1,212 @@
+"""`refgs evaluate`: a run whose ground truth is known, in a capture whose frame is turned, moved and scaled from the run's."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from benchmarks.scenes.analytic import sky
+from refgs import commands
+from refgs.capture import read_capture
+from refgs.color import srgb_encode
+from refgs.errors import InputError
+from refgs.export.environment import directions, write_environment, write_exr
+from refgs.export.splats import write_splats
+from refgs.model.environment import Environment
+from refgs.model.surfels import activate, initial_parameters, to_splats
+from refgs.report import surface
+from refgs.report.evaluate import GroundTruth
+from refgs.report.pictures import maps
+from refgs.run import create_run, open_run
+from refgs.settings import load_settings
+
+TURN = Rotation.from_euler("zyx", [40, 25, -70], degrees=True).as_matrix()
+SCALE, MOVE = 3.0, np.array([5.0, -2.0, 1.0])
+BOX = trimesh.creation.box((1.0, 1.4, 0.8)).subdivide().subdivide()
+
+
+def dusk(direction):
+    """Another light than the sky that the run holds."""
+    return sky(direction[..., [1, 2, 0]]) * [1.0, 0.6, 0.3]
+
+
+def turned(light, turn, height=64):
+    """The panorama that shows in a frame, where `turn` leads to it, what `light` is in the frame it comes from."""
+    return light(directions(height, 2 * height) @ turn)
+
+
+def write_run(folder, capture):
+    """A ball of surfels of a metal, rough above and smooth below, and a box for a mesh."""
+    create_run(folder, capture, load_settings("quick", ["environment.resolution=16"]), "quick", "cpu")
+    steps = np.arange(3000) + 0.5
+    z, azimuth = 1 - 2 * steps / len(steps), steps * np.pi * (3 - np.sqrt(5))
+    points = np.stack([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z], axis=1)
+    look = {"opacity": 0.95, "sh_degree": 0, "albedo": 0.7, "metallic": 0.9, "roughness": 0.3}
+    surfels = activate(initial_parameters(points, points, np.full(3000, 0.04), None, **look))
+    roughness = torch.where(torch.from_numpy(z) > 0, 0.6, 0.2).float()
+    splats = to_splats(surfels._replace(roughness=roughness, indirect_dc=surfels.indirect_dc[:, :0]))
+    write_splats(folder / "splats.ply", splats)
+    write_environment(folder / "environment.exr", sky(directions(64, 128)))
+    box = BOX.copy()
+    box.vertices = box.vertices[:, [0, 2, 1]] * [1, 1, -1]  # glTF's axes: Y up
+    box.export(folder / "mesh.glb")
+    cameras = json.loads((folder / "cameras.json").read_text())
+    cameras["to_capture"] = [*np.hstack([SCALE * TURN, MOVE[:, None]]).tolist(), [0, 0, 0, 1]]
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+    return folder
+
+
+def write_truth(folder, run, views):
+    """All that there can be, from what the run itself shows and holds: it has no error but what a test puts there."""
+    lights = {"light": sky, "relight/dusk": dusk}
+    for name, light in lights.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_environment(folder / f"{name}.exr", turned(light, TURN))
+    box = BOX.copy()
+    box.vertices = SCALE * box.vertices @ TURN.T + MOVE
+    box.export(folder / "mesh.ply")
+    relit = Environment.from_panorama(dusk(directions(64, 128)).astype(np.float32), 16)
+    for view in views:
+        images = maps(run.render(view.camera))
+        images["normal"] = images["normal"] @ TURN.T
+        images["visibility"] = np.ones_like(images["alpha"])
+        images["relight/dusk"] = maps(run.render(view.camera, relit))["color"]
+        for name in ("alpha", "normal", "albedo", "roughness", "metallic", "visibility", "relight/dusk"):
+            (folder / name).mkdir(exist_ok=True)
+            write_exr(folder / name / f"{view.camera.name}.exr", images[name])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(ball_capture, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("evaluate")
+    capture = read_capture(ball_capture)
+    run = write_run(folder / "run", capture)
+    views = capture.test_views
+    return run, write_truth(folder / "truth", open_run(run), views), views
+
+
+@pytest.fixture(autouse=True)
+def fewer_points(monkeypatch):
+    monkeypatch.setattr(surface, "POINTS", 2000)
+
+
+def figures(run):
+    return json.loads((run / "metrics.json").read_text())
+
+
+def test_a_run_that_is_the_truth_has_no_error_in_whatever_frame(made, capsys):
+    run, truth, views = made
+    commands.update_metrics(run, {"relight": {"dusk": {"mesh": {"psnr_raw": 20.0}}}, "psnr": 1.0})
+    commands.evaluate(run, "test", truth)
+    found = figures(run)
+    assert found["views"] == len(views) == 4 and found["splats"] == 3000 and found["frames_per_second"] > 0
+    assert found["psnr"] > 15 and 0 < found["ssim"] < 1 and 0 < found["flip"] < 0.5
+    assert found["lpips"] is None and found["lpips_reason"]
+    assert found["normal_mae_degrees"] < 0.1 and found["normal_ssim"] > 0.9999
+    assert found["albedo"]["psnr_raw"] > 90 and found["albedo"]["scale"] == pytest.approx([1, 1, 1], abs=1e-4)
+    assert found["roughness_mae"] < 1e-6 and found["metallic_mae"] < 1e-6
+    assert found["visibility_agreement"] == found["visibility_free"] == 1
+    assert found["environment"]["log_rmse"] < 0.02 and found["environment"]["scale"] == pytest.approx(1, abs=0.01)
+    assert found["mesh"]["chamfer"] < 1e-3 and found["mesh"]["normal_consistency"] > 0.99
+    relit = found["relight"]["dusk"]
+    assert relit["refgs"]["psnr_raw"] > 45 and relit["refgs"]["flip_raw"] < 0.01
+    assert relit["refgs"]["scale"] == pytest.approx(1, abs=0.01)
+    assert relit["mesh"] == {"psnr_raw": 20.0}, "the figures of others stay"
+    said = capsys.readouterr().out
+    assert "4 test views: PSNR" in said and "relit by dusk, surfels (RefGS)" in said
+    name = views[0].camera.name
+    for kind in ("photo", "color", "normal", "true_normal", "true_albedo", "true_visibility", "metallic"):
+        assert (run / "pictures" / "test" / kind / f"{name}.png").exists()
+    pictures = [cv2.imread(str(run / "pictures" / f"environment{which}.png")) for which in ("", "_truth")]
+    np.testing.assert_array_equal(
+        pictures[0], np.rint(255 * srgb_encode(sky(directions(64, 128))).clip(0, 1))[..., ::-1]
+    )
+    assert np.abs(pictures[0].astype(int) - pictures[1]).max() < 12, "both in the run's frame, at one exposure"
+    for kind in ("truth", "refgs"):
+        assert (run / "pictures" / "relight" / kind / f"dusk_{name}.png").exists()
+
+
+def test_known_errors_are_found(made, tmp_path):
+    run, _, views = made
+    there = open_run(run)
+    truth = write_truth(tmp_path, there, views)
+    tilt = Rotation.from_euler("x", 10, degrees=True).as_matrix()
+    for view in views:
+        name = f"{view.camera.name}.exr"
+        images = maps(there.render(view.camera))
+        write_exr(truth / "albedo" / name, images["albedo"] * [0.5, 0.8, 1.0])
+        write_exr(truth / "roughness" / name, images["roughness"] + 0.125)
+        hidden = np.ones_like(images["alpha"])
+        hidden[: view.camera.height // 2] = 0
+        write_exr(truth / "visibility" / name, hidden)
+        normal = images["normal"] @ TURN.T
+        axis = np.cross(normal, view.camera.position @ TURN.T)  # tilted about an axis that lies in the surface
+        axis /= np.linalg.norm(axis, axis=-1, keepdims=True) + 1e-12
+        write_exr(truth / "normal" / name, np.cos(0.2) * normal + np.sin(0.2) * np.cross(axis, normal))
+        image = maps(there.render(view.camera, Environment.from_panorama(dusk(directions(64, 128)), 16)))["color"]
+        write_exr(truth / "relight" / "dusk" / name, image * np.float32([0.5, 0.5, 0.5, 1]))
+    write_environment(truth / "light.exr", 2 * turned(sky, TURN @ tilt))
+    commands.evaluate(run, "test", truth)
+    found = figures(run)
+    assert found["albedo"]["psnr_aligned"] > 90 and found["albedo"]["scale"] == pytest.approx([0.5, 0.8, 1], abs=1e-4)
+    assert found["albedo"]["psnr_raw"] == pytest.approx(-10 * np.log10(0.7**2 * (0.5**2 + 0.2**2) / 3), abs=0.05)
+    assert found["roughness_mae"] == pytest.approx(0.125, abs=1e-4)
+    assert found["visibility_agreement"] == pytest.approx(0.5, abs=0.05) == found["visibility_free"]
+    assert found["normal_mae_degrees"] == pytest.approx(np.degrees(0.2), abs=0.1)
+    assert found["environment"]["scale"] == pytest.approx(2, rel=0.02) and found["environment"]["log_rmse"] > 0.03
+    relit = found["relight"]["dusk"]["refgs"]
+    assert relit["scale"] == pytest.approx(0.5, rel=0.01) and relit["psnr_aligned"] > 45 > 30 > relit["psnr_raw"]
+
+
+def test_only_what_is_there_is_measured(made, tmp_path):
+    run, truth, _ = made
+    (run / "metrics.json").unlink(missing_ok=True)
+    commands.evaluate(run, "test", None)
+    photos_only = {"psnr", "ssim", "flip", "lpips", "lpips_reason", "views", "split", "splats"}
+    assert figures(run).keys() == photos_only | {"frames_per_second", "frames_device"}
+    (tmp_path / "light.exr").write_bytes((truth / "light.exr").read_bytes())
+    commands.evaluate(run, "test", tmp_path)
+    assert figures(run).keys() - photos_only == {"environment", "frames_per_second", "frames_device"}
+
+
+def test_normals_that_a_data_set_brings_are_the_truth_where_there_is_no_other(made, monkeypatch):
+    run, truth, _ = made
+    there, asked = open_run(run), []
+
+    def published(view, max_side):
+        asked.append(view.camera.name)
+        images = maps(there.render(view.camera))
+        return np.where(images["alpha"][..., None] > 0.5, -images["normal"], 0), images["alpha"]
+
+    monkeypatch.setattr("refgs.report.evaluate.published_normals", published)
+    commands.evaluate(run, "test", None)
+    assert len(asked) == 4 and figures(run)["normal_mae_degrees"] == pytest.approx(180, abs=0.1)
+    commands.evaluate(run, "test", truth)
+    assert len(asked) == 4 and figures(run)["normal_mae_degrees"] < 0.1
+
+
+def test_a_missing_file_is_one_line(made, tmp_path):
+    run, truth, views = made
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no ground truth in it"):
+        GroundTruth(tmp_path / "empty", np.eye(4))
+    for name in ("albedo", "relight/dusk"):
+        file = truth / name / f"{views[2].camera.name}.exr"
+        kept = file.rename(tmp_path / "kept.exr")
+        with pytest.raises(InputError, match=f"{views[2].camera.name}.exr is missing"):
+            commands.evaluate(run, "test", truth)
+        kept.rename(file)
+    known = GroundTruth(truth, np.eye(4))
+    with pytest.raises(InputError, match="its size is not the view's"):
+        known.view("albedo", views[0].camera.resized(32, 32))
+    with pytest.raises(InputError, match="it should be 32×32"):
+        known.relit("dusk", views[0].camera.resized(32, 32))
+    (tmp_path / "grey" / "normal").mkdir(parents=True)
+    write_exr(tmp_path / "grey" / "normal" / f"{views[0].camera.name}.exr", np.ones((64, 64)))
+    with pytest.raises(InputError, match="one channel where there should be 3"):
+        GroundTruth(tmp_path / "grey", np.eye(4)).view("normal", views[0].camera)
