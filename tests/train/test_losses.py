@@ -123,7 +123,7 @@ def test_the_light_is_held_to_be_neutral_on_the_whole(device):
     for scale in (1e-6, 1, 1e6):
         exact = (scale * irradiance).double().requires_grad_()
         expected = 0.5 * ((exact[0] / exact[0].mean() - 1) ** 2).mean()
-        light = SimpleNamespace(irradiance=exact.detach().float().to(device).requires_grad_())
+        light = SimpleNamespace(irradiance=exact.detach().float().to(device).requires_grad_(), reference=None)
         found = leaves(rendering, torch.float32, device)
         without = objective(found, None, moved(view, device), BACKGROUND.to(device), only, 1.0).loss
         loss = objective(found, light, moved(view, device), BACKGROUND.to(device), only, 1.0).loss
@@ -132,7 +132,7 @@ def test_the_light_is_held_to_be_neutral_on_the_whole(device):
         torch.testing.assert_close(
             light.irradiance.grad.cpu().double(), *torch.autograd.grad(expected, exact), rtol=1e-4, atol=1e-6 / scale
         )
-    dark = SimpleNamespace(irradiance=torch.zeros(9, 3, device=device, requires_grad=True))
+    dark = SimpleNamespace(irradiance=torch.zeros(9, 3, device=device, requires_grad=True), reference=None)
     objective(found, dark, moved(view, device), BACKGROUND.to(device), only, 1.0).loss.backward()
     assert not dark.irradiance.grad.any()
 

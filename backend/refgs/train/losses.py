@@ -160,7 +160,8 @@ def objective(
 
     The light: squared departure from grey of its mean over all directions. Warm metal under a neutral light and neutral metal
     under a warm light look almost alike; without a word for one of them, white balance drifts between the two. Only the
-    mean is held: the light's colours may differ by direction.
+    mean is held: the light's colours may differ by direction. Of a light that stands with the camera it is the mean over what
+    can be seen mirrored, for the rest would take on whatever colour the mean lacks.
 
     And m (1 − m) of the metallic m, over the object: nothing real is half a metal. Where the metallic is decided, the
     highlights of dielectrics, 4 % of the light and without colour, fix the light's scale and white balance, which metals
@@ -168,5 +169,7 @@ def objective(
     """
     material = rendering.material if weights.metallic > 0 else None
     maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material
-    irradiance = environment.irradiance if environment is not None and weights.light > 0 else None
-    return Objective(*_Objective.apply(*maps, irradiance, photo, background, weights, progress))
+    light = environment.irradiance if environment is not None and weights.light > 0 else None
+    if light is not None and environment.reference is not None:
+        light = torch.cat([environment.seen()[None], light[1:].detach()])  # of which the first are held
+    return Objective(*_Objective.apply(*maps, light, photo, background, weights, progress))
