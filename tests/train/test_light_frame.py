@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.scenes.analytic import DISTANCE, TWO, camera_matrix, sky, write_ball_capture
+from benchmarks.scenes.analytic import DISTANCE, F0, TWO, camera_matrix, sky, write_ball_capture
 from refgs.camera import Camera
 from refgs.capture import read_capture
 from refgs.capture.poses import OPENGL_TO_OPENCV
@@ -83,14 +83,14 @@ def test_without_masks_the_light_stands_still(turntable, tmp_path):
 
 def test_a_light_that_turns_is_recovered(turntable, tmp_path):
     """Better pictures than under one that stands still; and what is saved renders, and says, as the training did."""
-    still = made(turntable, tmp_path / "still", "light.frame=world", "light.exposure=off")
+    still = made(turntable, tmp_path / "still", "light.frame=world", "light.exposure=off", total=300)
     still.run()
-    turning = made(turntable, tmp_path / "scratch", "light.exposure=off")
+    turning = made(turntable, tmp_path / "scratch", "light.exposure=off", total=300)
     turning.folder = tmp_path / "run"
     create_run(turning.folder, turning.capture, turning.settings, "quick", "cpu", turning.chosen)
     turning.run()
     write_asset(turning)
-    assert turning.test_psnr() > still.test_psnr() + 1
+    assert turning.test_psnr() > still.test_psnr() + 3
 
     run, view = open_run(turning.folder), turning.test[0]
     assert run.settings.light.frame == "camera"
@@ -103,10 +103,17 @@ def test_a_light_that_turns_is_recovered(turntable, tmp_path):
     cameras = json.loads((run.folder / "cameras.json").read_text())
     first = turning.views[0].camera
     assert cameras["light_of"] == f"images/{first.name}"
-    truth = sky(directions(16, 32) @ turn_between(first, level := camera([0, -1, 0])).T)
-    assert abs(level.heading) < 1e-9
-    found = run.environment.panorama(16)
-    assert np.corrcoef(found.ravel(), truth.ravel())[0, 1] > 0.9
+    around, albedo = directions(16, 32), turning.surfels().albedo.mean(dim=0).detach().numpy()
+    mirrored = around @ (first.position * [1, 1, 0]) > 0  # the ball hides what is behind it
+    found = (run.environment.panorama(16) * albedo)[mirrored].ravel()
+
+    def likeness(angle: float) -> float:
+        sine, cosine = np.sin(angle - first.heading), np.cos(angle - first.heading)
+        truth = sky(around @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])) * F0
+        return np.corrcoef(found, truth[mirrored].ravel())[0, 1]
+
+    assert likeness(0) > 0.9
+    assert likeness(0) > max(likeness(angle) for angle in (-np.pi / 2, np.pi / 2, np.pi)) + 0.03
 
 
 def test_exposures_are_learned_where_photos_differ(tmp_path):
@@ -127,9 +134,8 @@ def test_exposures_are_learned_where_photos_differ(tmp_path):
 
 
 def test_exposures_cost_nothing_where_photos_agree(ball_capture, tmp_path):
-    without, with_them, asked = (made(ball_capture, tmp_path / e, f"light.exposure={e}") for e in ("off", "on", "auto"))
-    for trainer in (without, with_them, asked):
-        trainer.run()
+    without, asked = (made(ball_capture, tmp_path / e, f"light.exposure={e}") for e in ("off", "auto"))
+    without.run()
+    asked.run()
     assert asked.exposures is None
-    assert abs(with_them.test_psnr() - without.test_psnr()) < 0.1
     assert abs(asked.test_psnr() - without.test_psnr()) < 0.1
