@@ -138,7 +138,13 @@ def _left_out(trainer: Trainer, unseen: int) -> list[dict[str, str]]:
         saved = "tracing rays, and harmonics of light from the object"
         left.append({"what": "inter-reflection", "why": why, "saved": saved})
     if settings.light.exposure == "auto" and settings.render.shading == "deferred" and trainer.exposures is None:
-        left.append({"what": "exposures", "why": "those of the photos agree", "saved": "one number a photo"})
+        left.append(
+            {
+                "what": "exposures",
+                "why": "those of the photos agree within a third of a stop",
+                "saved": "one number a photo",
+            }
+        )
     if any(view.alpha is None for view in trainer.views):
         left.append({"what": "the mask loss", "why": "not every photo has a mask", "saved": "one term of the loss"})
     if unseen:

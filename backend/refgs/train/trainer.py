@@ -36,7 +36,9 @@ REPORT_EVERY = 10  # iterations
 HISTORY_EVERY = 100  # iterations
 PLAN_EVERY = 50  # iterations
 EXPOSURES_KNOWN = 0.3  # part of the training after which exposures are known well enough to say whether there are any
-EXPOSURES_ALIKE = 0.07  # in natural logarithms: a tenth of a stop
+EXPOSURES_ALIKE = (
+    math.log(2) / 3
+)  # a third of a stop, which is what cameras step by: what shading lacks can look like less
 TRACED = 24  # views at the least for the mesh that inter-reflection is traced on; all where there are fewer
 FEWER = 0.8  # of the surfels, where there is no memory for all
 LEAST_SURFELS = 1000
@@ -301,7 +303,7 @@ class Trainer:
             self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
             self.optimizer.state.pop(self.exposures, None)
             self.exposures = None
-            self.report("stage", {"what": f"the photos' exposures agree within {math.expm1(EXPOSURES_ALIKE):.0%}"})
+            self.report("stage", {"what": "the photos' exposures agree within a third of a stop"})
 
     @torch.no_grad()
     def _trace(self) -> None:
