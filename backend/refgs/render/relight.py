@@ -26,6 +26,9 @@ BOUNCES = 4  # between the object's parts
 DEGREE = 3  # of harmonics
 PRIOR = 2.0  # rays that the object's mean radiance counts as, for surfels that see little of the object
 CONE = 0.3  # what roughness blurs a mirrored light as one of the directions does, which stands for a cell
+WHITE = (
+    1.0  # harmonics would smear what is brighter over all that a surfel sees: to them it is as bright as on a screen
+)
 NEIGHBOURS = 8  # surfels that a point of the mesh is blended of
 CHUNK = 512  # surfels at a time
 
@@ -156,20 +159,28 @@ def _gather(t: Transport, light: Environment, bounces: int) -> tuple[Tensor, Ten
     past = _past_the_object(t, light)
     firsts = [_first(t, rays, light) for _, rays, _ in t.chunks()]
     basis, count = harmonics.basis(t.directions, DEGREE), (t.starts[1:] - t.starts[:-1]).clamp_min(1)[:, None]
-    sums, received, mean = torch.zeros(len(past), basis.shape[1], 3), past, torch.zeros_like(past)
-    for _ in range(bounces):
+
+    def sums(received: Tensor, mean: Tensor, most: float) -> Tensor:
+        """Radiance up to `most` times harmonics, over each surfel's rays (N, 16, 3)."""
         there = t.at_vertices(torch.cat([received, mean], dim=1))
+        of_surfels = []
         for (surfels, rays, surfel), (first, share, matte) in zip(t.chunks(), firsts, strict=True):
             scattered, mirrored = there[t.vertex[rays]].split(3, dim=1)
             brought = torch.zeros(surfels.stop - surfels.start, len(t.directions), 3)
-            brought[surfel, t.direction[rays]] = first + matte * scattered + share * mirrored
-            sums[surfels] = (brought.transpose(1, 2) @ basis).transpose(1, 2)
-        mean = sums[:, 0] / harmonics.DC / count
+            brought[surfel, t.direction[rays]] = (first + matte * scattered + share * mirrored).clamp_max(most)
+            of_surfels.append((brought.transpose(1, 2) @ basis).transpose(1, 2))
+        return torch.cat(of_surfels)
+
+    received, mean = past, torch.zeros_like(past)
+    for _ in range(bounces):
+        found = sums(received, mean, math.inf)
+        mean = found[:, 0] / harmonics.DC / count
         # Harmonics of degree 1 are the direction's coordinates: these are sums of radiance · cosine, 4π / D steradians a ray.
-        about = torch.stack([-sums[:, 3], -sums[:, 1], sums[:, 2]], dim=1) / harmonics.C1
+        about = torch.stack([-found[:, 3], -found[:, 1], found[:, 2]], dim=1) / harmonics.C1
         received = past + 4 / len(t.directions) * torch.einsum("nac,na->nc", about, t.normals).clamp_min(0)
-    sums[:, 0] += PRIOR * harmonics.DC * (mean * count).sum(dim=0) / max(len(t.vertex), 1)
-    return received, t.fit @ sums
+    found = sums(received, mean, WHITE)
+    found[:, 0] += PRIOR * found[:, 0].sum(dim=0) / max(len(t.vertex), 1)
+    return received, t.fit @ found
 
 
 def _first(t: Transport, rays: slice, light: Environment) -> tuple[Tensor, Tensor, Tensor]:
