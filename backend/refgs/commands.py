@@ -140,8 +140,6 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
     unknown = [p for p in passes if p not in known]
     if unknown:
         raise InputError(f"--passes {unknown[0]}: this run has {', '.join(known)}")
-    if "visibility" in passes and hdri is not None:
-        raise InputError("--passes visibility: it is not traced under another light; leave out --hdri")
     if format not in ("png", "exr"):
         raise InputError(f"--format {format}: take png or exr")
     if format == "exr" and "color" in passes and run.environment is None:
@@ -151,6 +149,9 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
         if run.environment is None:
             raise InputError("--hdri: a run with shading = sh has no materials to relight")
         light = run.light(read_environment(hdri))
+        if run.occluder is not None:
+            with progress_bar("tracing light", len(run.splats)) as bar:
+                run.relit(light, lambda done, total: bar(done))
     to_run = np.linalg.inv(run.to_capture)
     views = [in_frame(camera, to_run) for camera in read_cameras(cameras)]
     background = np.array(run.settings.image.background)

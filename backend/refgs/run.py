@@ -2,7 +2,7 @@
 
 import platform
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, from_splats
 from refgs.paths import whole
+from refgs.render.relight import Progress, Transport, relit
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.settings import Settings, recorded_settings
 
@@ -46,6 +47,7 @@ class Run:
     splats: Splats
     environment: Environment | None
     occluder: Occluder | None
+    _traced: dict = field(default_factory=dict, repr=False, compare=False)
 
     def surfels(self) -> Surfels:
         """The asset's surfels as tensors."""
@@ -60,19 +62,28 @@ class Run:
         """Another light for `render`: an equirectangular picture (H, W, 3) of linear radiance, in Blender's orientation."""
         return _light(panorama, self.settings)
 
+    def relit(self, light: Environment, progress: Progress = lambda done, total: None) -> Surfels:
+        """The surfels under another light, with what they receive of each other where the run has a mesh to trace that on:
+        seconds for the first light, less for others, nothing for the last one again. `progress` hears how much is traced."""
+        if self.occluder is None:
+            return self.surfels()
+        with torch.no_grad():
+            if "transport" not in self._traced:
+                self._traced["transport"] = Transport(self.surfels(), self.occluder, progress=progress)
+            if self._traced.get("light") is not light:
+                self._traced.update(light=light, surfels=relit(self._traced["transport"], light))
+        return self._traced["surfels"]
+
     def render(self, camera: Camera, environment: Environment | None = None, exposure: float = 1.0) -> Rendering:
-        """Render a camera of the run's frame, under another light where one is given: without inter-reflection then,
-        as the surfels know what they mirror of each other under the recovered light alone."""
+        """Render a camera of the run's frame, under another light where one is given; radiance is multiplied by the exposure."""
+        surfels, settings = self.surfels(), self.settings.render
+        if environment is not None:
+            surfels = self.relit(environment)
+            settings = settings.model_copy(update={"diffuse": "irradiance" if self.occluder is None else "sh"})
+        light, background = environment or self.environment, torch.tensor(self.settings.image.background)
         with torch.no_grad():
             return render(
-                self.surfels(),
-                environment or self.environment,
-                camera,
-                torch.tensor(self.settings.image.background),
-                self.settings.render,
-                self.near,
-                self.occluder if environment is None else None,
-                torch.tensor(exposure),
+                surfels, light, camera, background, settings, self.near, self.occluder, torch.tensor(exposure)
             )
 
 

@@ -79,11 +79,16 @@ def test_visibility_is_that_of_the_balls(trained):
 
 
 def test_the_run_folder_has_it_all(trained):
-    """Rendered from the files as it was in training; without it under another light, for which it would be wrong."""
+    """Rendered from the files as it was in training; much the same where its light is taken for another."""
     made = trained[0]
     run, view = open_run(made.folder), made.test[0]
     shown, asset = made.render(view.camera), run.render(view.camera)
     assert float((shown.color - asset.color).abs().mean()) < 2e-3
     assert run.splats.indirect.shape[1:] == (16, 3) and np.abs(run.splats.indirect).max() > 0
-    assert run.render(view.camera, run.environment).visibility is None
+    relit = run.render(view.camera, run.environment)
+    torch.testing.assert_close(relit.visibility, asset.visibility)
+    free = asset.visibility > 0.5
+    assert float((relit.color - asset.color)[free].abs().mean()) < 5e-3
+    assert float((relit.color - asset.color)[~free].abs().mean()) < 0.1
+    assert run.relit(run.environment) is run.relit(run.environment)
     assert open_run(trained[1].folder).occluder is None

@@ -35,8 +35,13 @@ class Occluder:
         return self._tree
 
     def visible(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Whether nothing is in the way (P,) of rays from `points` (P, 3) of the surface, in the mesh's own frame, in
-        unit `directions` (P, 3). `normals` (P, 3) are the surface's: rays start a little above it.
+        """Whether nothing is in the way (P,) of rays as `meet` takes them."""
+        return self.meet(points, normals, directions)[0] < 0
+
+    def meet(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What rays from `points` (P, 3) of the surface, in the mesh's own frame, meet first in unit `directions` (P, 3):
+        the face (P,), -1 where there is none, and the weights of its corners (P, 3). `normals` (P, 3) are the surface's:
+        rays start a little above it.
 
         Only the front of a face blocks. A ray that meets a back face first began below the mesh, or comes to its open
         side: it goes on.
@@ -44,17 +49,19 @@ class Occluder:
         lift = self.lift / self._size
         directions = np.ascontiguousarray(directions, np.float32)
         origins = ((points - self._centre) / self._size + lift * normals).astype(np.float32)
-        free = np.ones(len(origins), bool)
+        face, weights = np.full(len(origins), -1, np.int32), np.zeros((len(origins), 3), np.float32)
         going = np.arange(len(origins))
         for _ in range(_PASSES):
             hit = self._scene.run(origins, directions, query="INTERSECT", output=True)
             facing = np.einsum("pa,pa->p", hit["Ng"], directions)
             met = hit["primID"] >= 0
             front = met & (facing < 0)
-            free[going[front]] = False
+            face[going[front]] = hit["primID"][front]
+            u, v = hit["u"][front], hit["v"][front]
+            weights[going[front]] = np.stack([1 - u - v, u, v], axis=1)
             on = met & ~front
             if not on.any():
                 break
             going, directions = going[on], directions[on]
             origins = origins[on] + (hit["tfar"][on, None] + 0.1 * lift) * directions
-        return free
+        return face, weights

@@ -1,0 +1,231 @@
+"""Surfels under another light: what of it reaches each of them past the object, and what the object itself sends them.
+
+All surfels look in the same directions, each of which stands for its cell of the sphere, so that a small sun is in one of
+them, whole. These rays are traced once; each light then takes a few products. What a ray meets sends on what it reflects by
+the split sum: of light from afar, where that is what it mirrors, and of what was found a bounce before.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from refgs.geometry.mesh import smooth_normals
+from refgs.geometry.visibility import Occluder
+from refgs.model import cubemap, harmonics, prefilter
+from refgs.model.environment import Environment
+from refgs.model.surfels import Surfels
+from refgs.render.brdf import DIELECTRIC_F0, fg_table
+
+DIRECTIONS = 1024  # of the whole sphere
+BOUNCES = 4  # between the object's parts
+DEGREE = 3  # of harmonics
+PRIOR = 2.0  # rays that the object's mean radiance counts as, for surfels that see little of the object
+CONE = 0.3  # what roughness blurs a mirrored light as one of the directions does, which stands for a cell
+WHITE = (
+    1.0  # harmonics would smear what is brighter over all that a surfel sees: to them it is as bright as on a screen
+)
+NEIGHBOURS = 8  # surfels that a point of the mesh is blended of
+CHUNK = 512  # surfels at a time
+
+Progress = Callable[[int, int], None]
+
+
+def sphere(count: int) -> np.ndarray:
+    """Unit directions (count, 3) whose cells are about equal: a Fibonacci lattice (Swinbank and Purser 2006)."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    azimuth = np.pi * (3 - math.sqrt(5)) * np.arange(count)
+    across = np.sqrt(1 - z * z)
+    return np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=1)
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30)
+
+
+def _mirror(directions, normals):
+    """Directions (P, 3) mirrored at surfaces with unit normals (P, 3)."""
+    return directions - 2 * (directions * normals).sum(-1)[:, None] * normals
+
+
+def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
+    """What parts of the light from the mirrored direction and of irradiance / π (P, 3) materials (P, 3), (P,), (P,) send to
+    where `cosine` (P,) is that of the angle to the normal."""
+    table = fg_table()
+    row, column = ((v * table.shape[1]).long().clamp(0, table.shape[1] - 1) for v in (roughness, cosine))
+    scale, bias = table[:, row, column, None]
+    metallic = metallic[:, None]
+    f0 = DIELECTRIC_F0 * (1 - metallic) + albedo * metallic
+    return f0 * scale + bias, (1 - DIELECTRIC_F0 * scale - bias) * albedo * (1 - metallic)
+
+
+def _prefiltered(light: Environment, directions: Tensor, roughness: Tensor) -> Tensor:
+    """The light (P, 3) about unit directions (P, 3), as surfaces of these roughnesses (P,) mirror it."""
+    level = np.interp(roughness.numpy(), prefilter.ROUGHNESS, np.arange(len(prefilter.ROUGHNESS)))
+    return cubemap.sample(light.levels, light.sides, directions, torch.from_numpy(level).float())
+
+
+class Transport:
+    """What rays from surfels whose normals point outward meet, whatever the light. On the CPU. `progress` hears how many of
+    the surfels are done."""
+
+    def __init__(
+        self,
+        surfels: Surfels,
+        occluder: Occluder,
+        directions: int = DIRECTIONS,
+        progress: Progress = lambda done, total: None,
+    ):
+        self.surfels, self.occluder = surfels, occluder
+        ways, points = sphere(directions), surfels.positions.double().numpy()
+        normals, mesh = surfels.normals().double().numpy(), occluder.mesh
+        material = [surfels.albedo, surfels.metallic[:, None], surfels.roughness[:, None]]
+        self._to_mesh = _blend(surfels, normals, mesh.vertices, smooth_normals(mesh.vertices, mesh.faces))
+        self.material = self.at_vertices(torch.cat(material, dim=1))  # (V, 5)
+        self.vertex_normals = _unit(self._to_mesh @ normals)
+        self.directions, self.normals = torch.from_numpy(ways).float(), torch.from_numpy(normals).float()
+
+        basis = harmonics.basis(torch.from_numpy(ways), DEGREE)
+        squares = (basis[:, :, None] * basis[:, None]).flatten(1).float()
+        degrees = torch.arange(DEGREE + 1)
+        prior = torch.diag((degrees + 1.0).repeat_interleave(2 * degrees + 1) ** 2) * PRIOR * harmonics.DC**2
+
+        # H rays meet the mesh, in the surfels' order: where each surfel's begin; of each ray, the direction, the vertex next
+        # to what it meets, and whether light from afar reaches that, such as is mirrored to the surfel. Of each surfel, what
+        # takes sums of radiance times harmonics over its rays to the harmonics that fit best.
+        counts, parts, fits = [torch.zeros(1, dtype=torch.int64)], [], []
+        for start in range(0, len(points), CHUNK):
+            at = slice(start, start + CHUNK)
+            surfel, way = np.nonzero(normals[at] @ ways.T > 0)
+            face, weights = occluder.meet(points[at][surfel], normals[at][surfel], ways[way])
+            met = face >= 0
+            surfel, way = surfel[met], way[met]
+            vertex = mesh.faces[face[met], weights[met].argmax(axis=1)]
+            there = self.vertex_normals[vertex]
+            free = occluder.visible(mesh.vertices[vertex], there, _mirror(ways[way], there))
+            parts.append([torch.from_numpy(part) for part in (way.astype(np.int32), vertex.astype(np.int32), free)])
+            seen = torch.zeros(len(points[at]), directions)
+            seen[surfel, way] = 1
+            counts.append(seen.sum(dim=1).long())
+            fits.append(torch.linalg.inv((seen @ squares).unflatten(1, prior.shape) + prior))
+            progress(min(start + CHUNK, len(points)), len(points))
+        self.starts, self.fit = torch.cat(counts).cumsum(dim=0), torch.cat(fits)
+        self.direction, self.vertex, self.free = (torch.cat(part) for part in zip(*parts, strict=True))
+
+    def at_vertices(self, values: Tensor) -> Tensor:
+        """Values (N, C) of the surfels, blended at the mesh's vertices (V, C)."""
+        return torch.from_numpy(self._to_mesh @ values.numpy())
+
+    def chunks(self):
+        """A slice of the surfels, that of their rays, and which surfel of the slice each ray is of."""
+        for start in range(0, len(self.normals), CHUNK):
+            end = min(start + CHUNK, len(self.normals))
+            count = self.starts[start + 1 : end + 1] - self.starts[start:end]
+            rays = slice(int(self.starts[start]), int(self.starts[end]))
+            yield slice(start, end), rays, torch.arange(end - start).repeat_interleave(count)
+
+
+def _blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: np.ndarray) -> sparse.csr_matrix:
+    """Weights (P, N) of surfels at points (P, 3) of a surface with normals `outward` (P, 3)."""
+    positions = surfels.positions.double().numpy()
+    near = min(NEIGHBOURS, len(positions))
+    distance, at = cKDTree(positions).query(points, k=np.arange(1, near + 1))
+    apart = distance / (surfels.scales.double().numpy().mean(axis=1)[at] + 1e-12)
+    facing = np.einsum("pka,pa->pk", normals[at], outward).clip(0)
+    weight = facing * surfels.opacities.numpy()[at] * np.exp(-0.5 * apart**2)
+    weight += 1e-5 / (1 + apart**2)  # where none reaches
+    weight /= weight.sum(axis=1, keepdims=True)
+    rows = near * np.arange(len(points) + 1)
+    return sparse.csr_matrix((weight.ravel().astype(np.float32), at.ravel(), rows), (len(points), len(positions)))
+
+
+def relit(t: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
+    """The surfels with their `sh` and `indirect` as they are under `light`, to be rendered with the occluder that was
+    traced and diffuse = "sh"."""
+    received, indirect = _gather(t, light, bounces)
+    sh = _colour(t.surfels, t.normals, received)
+    return t.surfels._replace(
+        sh_dc=sh[:, :1], sh_rest=sh[:, 1:], indirect_dc=indirect[:, :1], indirect_rest=indirect[:, 1:]
+    )
+
+
+def _gather(t: Transport, light: Environment, bounces: int) -> tuple[Tensor, Tensor]:
+    """What surfels receive of the light and of each other: irradiance / π (N, 3); harmonics (N, 16, 3) of the radiance that
+    comes from the object."""
+    past = _past_the_object(t, light)
+    firsts = [_first(t, rays, light) for _, rays, _ in t.chunks()]
+    basis, count = harmonics.basis(t.directions, DEGREE), (t.starts[1:] - t.starts[:-1]).clamp_min(1)[:, None]
+
+    def sums(received: Tensor, mean: Tensor, most: float) -> Tensor:
+        """Radiance up to `most` times harmonics, over each surfel's rays (N, 16, 3)."""
+        there = t.at_vertices(torch.cat([received, mean], dim=1))
+        of_surfels = []
+        for (surfels, rays, surfel), (first, share, matte) in zip(t.chunks(), firsts, strict=True):
+            scattered, mirrored = there[t.vertex[rays]].split(3, dim=1)
+            brought = torch.zeros(surfels.stop - surfels.start, len(t.directions), 3)
+            brought[surfel, t.direction[rays]] = (first + matte * scattered + share * mirrored).clamp_max(most)
+            of_surfels.append((brought.transpose(1, 2) @ basis).transpose(1, 2))
+        return torch.cat(of_surfels)
+
+    received, mean = past, torch.zeros_like(past)
+    for _ in range(bounces):
+        found = sums(received, mean, math.inf)
+        mean = found[:, 0] / harmonics.DC / count
+        # Harmonics of degree 1 are the direction's coordinates: these are sums of radiance · cosine, 4π / D steradians a ray.
+        about = torch.stack([-found[:, 3], -found[:, 1], found[:, 2]], dim=1) / harmonics.C1
+        received = past + 4 / len(t.directions) * torch.einsum("nac,na->nc", about, t.normals).clamp_min(0)
+    found = sums(received, mean, WHITE)
+    found[:, 0] += PRIOR * found[:, 0].sum(dim=0) / max(len(t.vertex), 1)
+    return received, t.fit @ found
+
+
+def _first(t: Transport, rays: slice, light: Environment) -> tuple[Tensor, Tensor, Tensor]:
+    """Of what rays meet: the light from afar that it mirrors to the surfel (P, 3); the parts that it mirrors of other light, and
+    that it scatters of irradiance / π (P, 3)."""
+    vertex, ray, free = t.vertex[rays], t.directions[t.direction[rays]], t.free[rays]
+    albedo, metallic, roughness = t.material[vertex].split((3, 1, 1), dim=1)
+    normals = torch.from_numpy(t.vertex_normals[vertex.numpy()]).float()
+    share, matte = _split_sum(albedo, metallic[:, 0], roughness[:, 0], -(ray * normals).sum(dim=1))
+    first = torch.zeros_like(share)
+    # Lobes that follow each other add up as Gaussians do; a lobe's width is roughness².
+    blurred = (roughness[free, 0] ** 4 + CONE**4) ** 0.25
+    first[free] = share[free] * _prefiltered(light, _mirror(ray, normals)[free], blurred)
+    share[free] = 0
+    return first, share, matte
+
+
+def _past_the_object(t: Transport, light: Environment) -> Tensor:
+    """Irradiance / π (N, 3) from afar: as it is without the object, times the part that is free."""
+    texels, area = cubemap.texel_directions(light.resolution), cubemap.texel_solid_angles(light.resolution)
+    cell = torch.from_numpy(cKDTree(t.directions.numpy()).query(texels.numpy())[1])
+    power = torch.zeros(len(t.directions), 3).index_add_(0, cell, light.radiance * area[:, None].float())
+    free = torch.empty_like(t.normals)
+    for surfels, rays, surfel in t.chunks():
+        cosine = (t.normals[surfels] @ t.directions.T).clamp_min(0)
+        whole = cosine @ power
+        cosine[surfel, t.direction[rays]] = 0
+        free[surfels] = torch.where(whole > 0, cosine @ power / whole, 1)
+    return light.diffuse(t.normals) * free
+
+
+def _colour(surfels: Surfels, normals: Tensor, received: Tensor) -> Tensor:
+    """Harmonics (N, 16, 3) of the colour of the surfels' diffuse part, as the renderer takes them.
+
+    A coat that mirrors lets less through at a grazing angle: that is a function of the angle to the normal alone, and so is
+    Σ_m Y_lm(n) Y_lm(d) = (2l + 1) / 4π P_l(n·d).
+    """
+    scale, bias = fg_table().double()
+    size, degrees = len(scale), torch.arange(4)
+    cosine = (np.arange(size) + 0.5) / size
+    legendre = torch.from_numpy(np.polynomial.legendre.legvander(-cosine, 3))  # d leads from the camera to the surfel
+    coat = 1 - DIELECTRIC_F0 * scale - bias
+    zonal = torch.linalg.lstsq(legendre, coat.T).solution.T * 4 * math.pi / (2 * degrees + 1)
+    zonal = zonal.repeat_interleave(2 * degrees + 1, dim=1).float()
+    row = (surfels.roughness * size).long().clamp(0, size - 1)
+    sh = (zonal[row] * harmonics.basis(normals, 3))[..., None] * (surfels.albedo * received)[:, None]
+    sh[:, 0] -= 0.5 / harmonics.DC
+    return sh

@@ -1,0 +1,146 @@
+"""Light that is hidden and light that is sent on, in places where both are known."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from refgs.camera import Camera
+from refgs.geometry.mesh import Mesh
+from refgs.geometry.visibility import Occluder
+from refgs.model import cubemap, harmonics
+from refgs.model.environment import Environment
+from refgs.model.surfels import Surfels, quaternions_towards
+from refgs.render import relight
+from refgs.render.brdf import fg_table
+from refgs.render.directional import directional
+from tests.geometry.test_visibility import plate
+
+
+def surfels(points: np.ndarray, normals: np.ndarray, albedo: float = 0.5, metallic: float = 0.0) -> Surfels:
+    n = len(points)
+    return Surfels(
+        positions=torch.from_numpy(np.float32(points)),
+        rotations=torch.from_numpy(quaternions_towards(normals)).float(),
+        scales=torch.full((n, 2), 0.05),
+        opacities=torch.ones(n),
+        sh_dc=torch.zeros(n, 1, 3),
+        sh_rest=torch.zeros(n, 0, 3),
+        albedo=torch.full((n, 3), albedo),
+        metallic=torch.full((n,), metallic),
+        roughness=torch.full((n,), 0.5),
+        indirect_dc=torch.zeros(n, 1, 3),
+        indirect_rest=torch.zeros(n, 0, 3),
+    )
+
+
+def even(radiance: float = 1.0) -> Environment:
+    return Environment(torch.full((6 * 32**2, 3), radiance))
+
+
+def colourful() -> Environment:
+    x, y, z = cubemap.texel_directions(32).float().unbind(-1)
+    return Environment(torch.stack([1 + 0.5 * x, 1 + 0.8 * z, 1 - 0.6 * y * x], dim=1))
+
+
+def mirrors(monkeypatch, part: float) -> None:
+    """Surfaces mirror this part of the light, whatever the angle, and scatter the rest; metals that part of their albedo."""
+    table = torch.tensor([0.0, part]).reshape(2, 1, 1).expand(2, 64, 64)
+    monkeypatch.setattr(relight, "fg_table", lambda: table)
+
+
+def plates(*shapes: trimesh.Trimesh) -> Occluder:
+    mesh = trimesh.util.concatenate(shapes)
+    return Occluder(Mesh(mesh.vertices, np.asarray(mesh.faces)))
+
+
+@pytest.fixture(scope="module")
+def bowl() -> tuple[Occluder, np.ndarray, np.ndarray]:
+    """Half a sphere's inside, of radius 1 below z = 0; points whose rays start on it, and their normals."""
+    ball = trimesh.creation.icosphere(5)
+    inside = ball.faces[ball.triangles_center[:, 2] < 0][:, ::-1]
+    occluder = Occluder(Mesh(ball.vertices, inside))
+    points = trimesh.creation.icosphere(3).vertices
+    points = points[points[:, 2] < -0.1]
+    return occluder, points * (1 + occluder.lift - 0.002), -points
+
+
+def received(points: Surfels, occluder: Occluder, light: Environment, directions: int = relight.DIRECTIONS, bounces=4):
+    return relight._gather(relight.Transport(points, occluder, directions), light, bounces)[0]
+
+
+def test_an_open_plane_has_the_whole_light():
+    """Its diffuse part is what it is without the object; its coat as the split sum has it, to 2 % of white."""
+    light, up = colourful(), np.tile([0.0, 0.0, 1.0], (5, 1))
+    plane = surfels(np.zeros((5, 3)), up)
+    transport = relight.Transport(plane, plates(plate(0.0, 1)))
+    assert torch.equal(relight._gather(transport, light, 4)[0], light.diffuse(transport.normals))
+    lit = relight.relit(transport, light)
+    for angle in (0.0, 0.5, 1.0, 1.3):
+        camera = looking_down(np.array([3 * math.sin(angle), 0, 3 * math.cos(angle)]))
+        found = directional(lit.sh_dc, lit.sh_rest, 0.5, lit.positions, camera)[0]
+        scale, bias = fg_table()[:, 32, int(64 * math.cos(angle) - 1e-6)]
+        exact = (1 - 0.04 * scale - bias) * 0.5 * light.diffuse(transport.normals)[0]
+        torch.testing.assert_close(found, exact, rtol=0, atol=0.02)
+
+
+def looking_down(position: np.ndarray) -> Camera:
+    matrix = np.eye(4)
+    matrix[:3, 3] = -position
+    return Camera("c", 8, 8, 8.0, 8.0, 4.0, 4.0, matrix)
+
+
+def test_between_two_plates():
+    """In the middle of a black square below another: the light but for the upper square's form factor (Howell, B-4). The
+    error falls at least as the number of directions grows."""
+    occluder = plates(plate(0.0, 1), plate(1.0, -1))
+    middle = surfels(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), albedo=0.0)
+    a = 1 / (1 - occluder.lift)
+    hidden = 4 / math.pi * a / math.sqrt(1 + a * a) * math.atan(a / math.sqrt(1 + a * a))
+    errors = []
+    for directions in (256, 1024, 4096):
+        transport = relight.Transport(middle, occluder, directions)
+        errors.append(float((relight._past_the_object(transport, even()) - (1 - hidden)).abs().max()))
+    assert errors[0] < 0.04
+    assert errors[1] < errors[0] / 2
+    assert errors[2] < errors[1] / 2
+
+
+@pytest.mark.parametrize("albedo", [0.0, 0.5, 0.9])
+def test_inside_a_matte_bowl(bowl, albedo, monkeypatch):
+    """Any point of half a sphere sees half of the sky and half of the bowl: x = 1/2 + albedo x / 2."""
+    occluder, points, normals = bowl
+    mirrors(monkeypatch, 0.0)
+    found = received(surfels(points, normals, albedo), occluder, even(), bounces=20)
+    exact = 0.5 / (1 - albedo / 2)
+    assert abs(float(found.mean()) / exact - 1) < 0.01
+    assert float((found / exact - 1).square().mean().sqrt()) < 0.02
+
+
+@pytest.mark.parametrize("part", [0.0, 0.3, 1.0])
+def test_a_white_bowl_under_an_even_sky_cannot_be_seen(bowl, part, monkeypatch):
+    """Whatever part of the light its surface mirrors; light from the object is as even as the sky."""
+    occluder, points, normals = bowl
+    mirrors(monkeypatch, part)
+    transport = relight.Transport(surfels(points, normals, 1.0), occluder)
+    found, indirect = relight._gather(transport, even(), 20)
+    torch.testing.assert_close(found, torch.ones_like(found), rtol=0, atol=0.01)
+    across = torch.tensor([0.0, 0.0, -1.0]) - transport.normals * -transport.normals[:, 2:]
+    ways = torch.nn.functional.normalize(transport.normals + 0.5 * across, dim=1)  # towards the bowl's bottom
+    seen = torch.einsum("nk,nkc->nc", harmonics.basis(ways, 3), indirect)
+    torch.testing.assert_close(seen, torch.ones_like(seen), rtol=0, atol=0.03)
+
+
+def test_a_light_that_the_object_hides_reaches_nothing():
+    """A small sun behind the upper of two plates; beside it, all of it."""
+    radiance = torch.full((6 * 32**2, 3), 1e-3)
+    directions = cubemap.texel_directions(32)
+    radiance[(directions[:, 2] > 0.99)] = 100.0
+    occluder = plates(plate(0.0, 1), plate(1.0, -1))
+    up = np.tile([0.0, 0.0, 1.0], (2, 1))
+    below = surfels(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.5]]), up, albedo=0.0)
+    found = relight._past_the_object(relight.Transport(below, occluder), Environment(radiance))
+    assert float(found[0].max()) < 1e-3 * float(found[1].max())
+    torch.testing.assert_close(found[1], Environment(radiance).diffuse(torch.tensor([[0.0, 0.0, 1.0]]))[0])
