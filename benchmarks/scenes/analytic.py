@@ -1,4 +1,4 @@
-"""Metal balls under a smooth sky, photographed by a formula: a capture whose every answer is known, made without Blender."""
+"""Balls under a smooth sky, photographed by formulas: captures whose every answer is known, made without Blender."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from benchmarks.scenes.shapes import Material
 from refgs.color import srgb_encode
+from refgs.render.brdf import bounces, fresnel, one_bounce
 
 VIEWS, DISTANCE, ANGLE = 24, 4.0, 0.7  # training views, radii, radians
 F0 = np.array([0.9, 0.6, 0.3])
@@ -34,6 +36,75 @@ def meet(origin: np.ndarray, ray: np.ndarray, balls: np.ndarray) -> tuple[np.nda
     return hit, point, (point - balls[first, :3]) / balls[first, 3:]
 
 
+# From the top down, each where the normal's z is more than this: what a mirror says of the light, the others are seen under.
+BANDS = (
+    (0.25, Material((0.9, 0.6, 0.3), 1.0, 0.1)),
+    (-0.3, Material((0.7, 0.7, 0.8), 1.0, 0.5)),
+    (-1.0, Material((0.2, 0.4, 0.5), 0.0, 0.6)),
+)
+SUNS = np.array([[0.6, 0.0, 0.8], [-0.64, 0.6, 0.48], [0.0, -0.96, 0.28]])
+STEPS = 14  # of the lobe's quadrature, both ways
+
+
+def sunny(direction: np.ndarray) -> np.ndarray:
+    """The sky with soft suns, 10 degrees wide: enough for a roughness to show."""
+    return 0.4 * sky(direction) + 0.55 * np.exp(30 * (direction @ SUNS.T - 1)).sum(axis=-1, keepdims=True)
+
+
+def reflect(material: Material, ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Radiance (P, 3) against unit rays (P, 3) off a convex object under that light, by quadrature of the rendering equation: of
+    the specular lobe over its visible normals (Heitz 2018), of the matte base over the cosine."""
+    view, alpha = -ray, material.roughness**2
+    n_v = (view * normal).sum(-1).clip(1e-3, 1 - 1e-9)
+    side = view - (view * normal).sum(-1, keepdims=True) * normal
+    side /= np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 1e-12)
+    frame = np.stack([side, np.cross(normal, side), normal], axis=1)
+    mid = (np.arange(STEPS) + 0.5) / STEPS
+    radius, azimuth = (v.ravel() for v in np.meshgrid(np.sqrt(mid), 2 * np.pi * mid))
+    disc_x, disc_y = radius * np.cos(azimuth), radius * np.sin(azimuth)
+
+    s_v = np.sqrt(1 - n_v**2)[:, None]
+    c_v = n_v[:, None]
+    stretch = np.hypot(alpha * s_v, c_v)
+    v_x, v_z = alpha * s_v / stretch, c_v / stretch
+    share = (1 + v_z) / 2
+    across = (1 - share) * np.sqrt(1 - disc_x**2) + share * disc_y
+    up = np.sqrt(np.maximum(1 - disc_x**2 - across**2, 0))
+    half = np.stack([alpha * (v_x * up - v_z * across), alpha * disc_x + 0 * up, v_x * across + v_z * up], axis=-1)
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    v_h = (s_v * half[..., 0] + c_v * half[..., 2]).clip(0, 1)
+    n_l = 2 * v_h * half[..., 2] - c_v
+    view_local = np.concatenate([s_v, 0 * s_v, c_v], axis=-1)[:, None]
+    light = sunny(np.einsum("psa,pab->psb", 2 * v_h[..., None] * half - view_local, frame))
+    shadow_v, shadow_l = (np.sqrt(1 + alpha**2 * (1 / np.maximum(c, 1e-9) ** 2 - 1)) for c in (c_v, n_l))
+    weight = np.where(n_l > 0, (1 + shadow_v) / (shadow_v + shadow_l), 0)[..., None] / len(disc_x)
+
+    x, w = np.polynomial.legendre.leggauss(32)
+    cosine = (x + 1) / 2
+    average_energy = one_bounce(cosine, material.roughness, 32)[:2].sum(axis=0) @ (cosine * w)
+    energy = weight.sum(axis=(1, 2))[:, None]
+    base = np.array(material.base_color)
+    if material.metallic:
+        lobe = base + (1 - base) * (1 - v_h[..., None]) ** 5
+        return (light * lobe * weight).sum(axis=1) * bounces((20 * base + 1) / 21, energy, average_energy)
+    lobe = fresnel(v_h)[..., None] * weight
+    scale = bounces((fresnel(cosine) * cosine) @ w, energy, average_energy)
+    matte = np.stack([disc_x, disc_y, np.sqrt(1 - radius**2)], axis=-1)
+    received = sunny(np.einsum("sa,pab->psb", matte, frame)).mean(axis=1)
+    return (light * lobe).sum(axis=1) * scale + (1 - lobe.sum(axis=1) * scale) * base * received
+
+
+def banded(ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Radiance (P, 3) of a ball of BANDS."""
+    color, left = np.zeros_like(ray), np.ones(len(ray), bool)
+    for lowest, material in BANDS:
+        here = left & (normal[:, 2] >= lowest)
+        left &= ~here
+        for some in np.array_split(np.flatnonzero(here), 1 + here.sum() // 256):  # what the caches hold
+            color[some] = reflect(material, ray[some], normal[some])
+    return color
+
+
 def photo(
     matrix: np.ndarray,
     size: int,
@@ -41,10 +112,12 @@ def photo(
     samples: int = 4,
     turning: bool = False,
     stops: float = 0.0,
+    bands: bool = False,
 ) -> np.ndarray:
-    """RGBA in 0..1 of balls (B, 4), centre and radius: mirrors with Schlick's Fresnel; alpha by `samples`² rays a pixel.
+    """RGBA in 0..1 of balls (B, 4), centre and radius: mirrors with Schlick's Fresnel, or one of BANDS; alpha by `samples`² rays a
+    pixel.
 
-    The sky stands still, or turns with the camera, which is level, about z. The photo is exposed so many stops more.
+    The mirrors' sky stands still, or turns with the camera, which is level, about z. Their photo is exposed so many stops more.
     """
     focal = 0.5 * size / np.tan(ANGLE / 2)
     grid = (np.arange(size * samples) + 0.5) / samples
@@ -55,7 +128,7 @@ def photo(
     for bounce in range(BOUNCES):
         hit, point, normal = meet(origin, ray, balls)
         if bounce == 0:
-            seen = hit
+            seen, first_ray, first_normal = hit, ray, normal
         cosine = -(normal * ray).sum(-1, keepdims=True).clip(-1, 0)
         share = np.where(hit[:, None], share * (F0 + (1 - F0) * (1 - cosine) ** 5), share)
         origin, ray = point, np.where(hit[:, None], ray + 2 * cosine * normal, ray)
@@ -65,7 +138,16 @@ def photo(
     color = np.where(seen[:, None], 2**stops * share * sky(ray), 0)
     blocks = (size, samples, size, samples)
     alpha = seen.reshape(blocks).mean(axis=(1, 3))
-    color = color.reshape(*blocks, 3).sum(axis=(1, 3)) / np.maximum(seen.reshape(blocks).sum(axis=(1, 3)), 1)[..., None]
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        total = np.where(seen[:, None], values, 0).reshape(*blocks, 3).sum(axis=(1, 3))
+        return total / np.maximum(seen.reshape(blocks).sum(axis=(1, 3)), 1)[..., None]
+
+    color = mean(color)
+    if bands:  # these are smooth: once a pixel
+        there = alpha > 0
+        ray, normal = (mean(v)[there] for v in (first_ray, first_normal))
+        color[there] = banded(*(v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (ray, normal)))
     return np.dstack([srgb_encode(color).clip(0, 1), alpha])
 
 
@@ -86,8 +168,9 @@ def write_ball_capture(
     samples: int = 4,
     turning: bool = False,
     stops: tuple[float, ...] = (0.0,),
+    bands: bool = False,
 ) -> None:
-    """A NeRF-Blender capture of balls: 24 training and 4 test views. `stops` are the training views' by turns."""
+    """A NeRF-Blender capture of balls, mirrors or with BANDS: 24 training and 4 test views. `stops` are the training views' by turns."""
     steps = np.arange(VIEWS + 4) + 0.5
     z = 0.9 - 1.5 * steps / len(steps)
     azimuth = steps * np.pi * (3 - np.sqrt(5))
@@ -98,7 +181,7 @@ def write_ball_capture(
         matrix = camera_matrix(direction)
         (folder / split).mkdir(exist_ok=True, parents=True)
         more = stops[i % len(stops)] if split == "train" else 0.0
-        pixels = np.rint(photo(matrix, size, balls, samples, turning, more) * 255).astype(np.uint8)
+        pixels = np.rint(photo(matrix, size, balls, samples, turning, more, bands) * 255).astype(np.uint8)
         Image.fromarray(pixels).save(folder / split / f"r_{i}.png")
         frames[split].append({"file_path": f"./{split}/r_{i}", "transform_matrix": matrix.tolist()})
     for split, entries in frames.items():

@@ -1,14 +1,23 @@
 """Colour by direction against the harmonics in float64."""
 
+import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from refgs.geometry.mesh import Mesh
+from refgs.geometry.visibility import Occluder
 from refgs.kernels import reference
 from refgs.model import harmonics
+from refgs.model.environment import Environment
+from refgs.model.surfels import Surfels
 from refgs.render.directional import directional
+from refgs.render.renderer import render
+from refgs.settings import load_settings
 from tests.kernels import scenes
 
 
@@ -55,18 +64,79 @@ def test_same_bits_for_any_number_of_threads():
     scenes.check_same_bits_for_any_number_of_threads(all_of_it)
 
 
-def test_light_from_the_object_turns_with_it():
-    """The mirrored colour of surfels is that of the turned surfels, under the harmonics of the turned light."""
-    values, positions, normals = surfels(4)
-    camera = scenes.camera(40, 30)
-    turn = torch.from_numpy(Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()).float()
-    # Degree 1 is (-y, z, -x): its coefficients turn as a vector.
-    vector = torch.stack([-values[:, 3], -values[:, 1], values[:, 2]], dim=1)
-    x, y, z = torch.einsum("ab,nbc->nac", turn, vector).unbind(dim=1)
-    turned = torch.stack([values[:, 0], -y, z, -x], dim=1)
+def turned(values, turn):
+    """Harmonics (N, K, 3) of what they say, turned: their value along any direction becomes that along the turned one."""
+    directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(2)).double())
+    degree = math.isqrt(values.shape[1]) - 1
+    before, after = (harmonics.basis(d, degree) for d in (directions, directions @ turn.T))
+    return torch.einsum("ij,njc->nic", torch.linalg.lstsq(after, before).solution, values.double()).float()
+
+
+TURN = torch.from_numpy(Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix())
+
+
+@pytest.mark.parametrize("coefficients", [4, 9, 16])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_harmonics_are_of_the_world(mirrored, coefficients):
+    """A surfel's colour is that of the turned surfel under turned harmonics; left as they are, they do not turn with it."""
+    values, positions, normals = surfels(coefficients)
+    camera, turn = scenes.camera(40, 30), TURN.float()
     middle = torch.from_numpy(camera.position).float()  # about the camera, which then need not turn
-    before = directional(values[:, :1], values[:, 1:], 0.5, positions, camera, normals)
-    after = directional(
-        turned[:, :1], turned[:, 1:], 0.5, (positions - middle) @ turn.T + middle, camera, normals @ turn.T
-    )
-    torch.testing.assert_close(before, after, atol=1e-5, rtol=0)
+    there, normals_there = (positions - middle) @ turn.T + middle, normals @ turn.T
+
+    def colour(values, positions, normals):
+        return directional(values[:, :1], values[:, 1:], 0.5, positions, camera, normals if mirrored else None)
+
+    before = colour(values, positions, normals)
+    torch.testing.assert_close(before, colour(turned(values, TURN), there, normals_there), atol=2e-5, rtol=0)
+    assert (before - colour(values, there, normals_there)).abs().mean() > 0.1
+
+
+def test_a_picture_turns_with_its_object():
+    """Surfels inside a closed room that hides the environment, so that all they mirror is light from the object; turned with
+    room, camera and harmonics."""
+    generator = torch.Generator().manual_seed(3)
+    positions, rotations, scales, opacities, _ = scenes.surfels("mixed", 1)
+    count = len(positions)
+    sh, indirect = 0.3 * torch.randn(2, count, 16, 3, generator=generator)
+    indirect[:, 0] += 2
+    materials = torch.rand(5, count, generator=generator)
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    points *= 20 / np.linalg.norm(points, axis=1, keepdims=True)
+    faces = ConvexHull(points).simplices
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    outward = np.einsum("fa,fa->f", np.cross(b - a, c - a), a) > 0
+    faces[outward] = faces[outward][:, ::-1]
+    camera, environment = scenes.camera(40, 30), Environment(torch.ones(6 * 16**2, 3))
+    settings = load_settings("quick", ["diffuse=sh"]).render
+
+    def picture(turn, sh, indirect):
+        pose = camera.world_to_camera.copy()
+        pose[:3, :3] = pose[:3, :3] @ turn.T
+        quaternions = Rotation.from_quat(rotations.numpy()[:, [1, 2, 3, 0]])
+        quaternions = (Rotation.from_matrix(turn) * quaternions).as_quat()[:, [3, 0, 1, 2]]
+        made = Surfels(
+            positions @ torch.from_numpy(turn).float().T,
+            torch.from_numpy(quaternions).float(),
+            scales,
+            opacities,
+            sh[:, :1].contiguous(),
+            sh[:, 1:].contiguous(),
+            materials[:3].T.contiguous(),
+            *materials[3:],
+            indirect[:, :1].contiguous(),
+            indirect[:, 1:].contiguous(),
+        )
+        occluder = Occluder(Mesh(points @ turn.T, faces))
+        seen = dataclasses.replace(camera, world_to_camera=pose)
+        return render(made, environment, seen, torch.zeros(3), settings, 0.1, occluder)
+
+    before = picture(np.eye(3), sh, indirect)
+    after = picture(TURN.numpy(), turned(sh, TURN), turned(indirect, TURN))
+    left = picture(TURN.numpy(), sh, indirect)
+    covered = before.alpha > 0.1
+    assert covered.any() and before.visibility[covered].eq(0).all() and after.visibility[covered].eq(0).all()
+    assert (
+        (after.color - before.color).abs().amax(dim=-1) < 1e-3
+    ).float().mean() > 0.99  # of two as deep either may be in front
+    assert (left.color - before.color)[covered].abs().mean() > 0.02

@@ -10,11 +10,11 @@ import trimesh
 from refgs.camera import Camera
 from refgs.geometry.mesh import Mesh
 from refgs.geometry.visibility import Occluder
+from refgs.kernels import reference
 from refgs.model import cubemap, harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, quaternions_towards
 from refgs.render import relight
-from refgs.render.brdf import fg_table
 from refgs.render.directional import directional
 from tests.geometry.test_visibility import plate
 
@@ -46,9 +46,12 @@ def colourful() -> Environment:
 
 
 def mirrors(monkeypatch, part: float) -> None:
-    """Surfaces mirror this part of the light, whatever the angle, and scatter the rest; metals that part of their albedo."""
-    table = torch.tensor([0.0, part]).reshape(2, 1, 1).expand(2, 64, 64)
-    monkeypatch.setattr(relight, "fg_table", lambda: table)
+    """Surfaces mirror this part of the light, whatever the angle, and scatter the rest."""
+
+    def shares(albedo, metallic, roughness, cosine):
+        return torch.full_like(albedo, part), (1 - part) * albedo
+
+    monkeypatch.setattr(relight, "_split_sum", shares)
 
 
 def plates(*shapes: trimesh.Trimesh) -> Occluder:
@@ -81,8 +84,8 @@ def test_an_open_plane_has_the_whole_light():
     for angle in (0.0, 0.5, 1.0, 1.3):
         camera = looking_down(np.array([3 * math.sin(angle), 0, 3 * math.cos(angle)]))
         found = directional(lit.sh_dc, lit.sh_rest, 0.5, lit.positions, camera)[0]
-        scale, bias = fg_table()[:, 32, int(64 * math.cos(angle) - 1e-6)]
-        exact = (1 - 0.04 * scale - bias) * 0.5 * light.diffuse(transport.normals)[0]
+        dielectric = reference.table(torch.tensor([math.cos(angle)]), torch.tensor([0.5]))[0, 3]
+        exact = (1 - dielectric) * 0.5 * light.diffuse(transport.normals)[0]
         torch.testing.assert_close(found, exact, rtol=0, atol=0.02)
 
 

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from refgs.geometry.mesh import smooth_normals
 from refgs.geometry.visibility import Occluder
+from refgs.kernels import reference
 from refgs.model import cubemap, harmonics, prefilter
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
-from refgs.render.brdf import DIELECTRIC_F0, fg_table
 
 DIRECTIONS = 1024  # of the whole sphere
 BOUNCES = 4  # between the object's parts
@@ -29,6 +29,7 @@ CONE = 0.3  # what roughness blurs a mirrored light as one of the directions doe
 WHITE = (
     1.0  # harmonics would smear what is brighter over all that a surfel sees: to them it is as bright as on a screen
 )
+ROUGHNESSES = 64  # for which a coat's dependence on the angle is known
 NEIGHBOURS = 8  # surfels that a point of the mesh is blended of
 CHUNK = 512  # surfels at a time
 
@@ -55,12 +56,9 @@ def _mirror(directions, normals):
 def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
     """What parts of the light from the mirrored direction and of irradiance / π (P, 3) materials (P, 3), (P,), (P,) send to
     where `cosine` (P,) is that of the angle to the normal."""
-    table = fg_table()
-    row, column = ((v * table.shape[1]).long().clamp(0, table.shape[1] - 1) for v in (roughness, cosine))
-    scale, bias = table[:, row, column, None]
+    metal, dielectric = reference.reflectance(cosine, roughness, albedo)
     metallic = metallic[:, None]
-    f0 = DIELECTRIC_F0 * (1 - metallic) + albedo * metallic
-    return f0 * scale + bias, (1 - DIELECTRIC_F0 * scale - bias) * albedo * (1 - metallic)
+    return metallic * metal + (1 - metallic) * dielectric, (1 - metallic) * (1 - dielectric) * albedo
 
 
 def _prefiltered(light: Environment, directions: Tensor, roughness: Tensor) -> Tensor:
@@ -218,11 +216,12 @@ def _colour(surfels: Surfels, normals: Tensor, received: Tensor) -> Tensor:
     A coat that mirrors lets less through at a grazing angle: that is a function of the angle to the normal alone, and so is
     Σ_m Y_lm(n) Y_lm(d) = (2l + 1) / 4π P_l(n·d).
     """
-    scale, bias = fg_table().double()
-    size, degrees = len(scale), torch.arange(4)
-    cosine = (np.arange(size) + 0.5) / size
-    legendre = torch.from_numpy(np.polynomial.legendre.legvander(-cosine, 3))  # d leads from the camera to the surfel
-    coat = 1 - DIELECTRIC_F0 * scale - bias
+    size, degrees = ROUGHNESSES, torch.arange(4)
+    middle = (torch.arange(size).double() + 0.5) / size  # of cosines and of roughnesses
+    legendre = torch.from_numpy(
+        np.polynomial.legendre.legvander(-middle.numpy(), 3)
+    )  # d leads from the camera to the surfel
+    coat = 1 - reference.table(middle.repeat(size), middle.repeat_interleave(size))[:, 3].view(size, size)
     zonal = torch.linalg.lstsq(legendre, coat.T).solution.T * 4 * math.pi / (2 * degrees + 1)
     zonal = zonal.repeat_interleave(2 * degrees + 1, dim=1).float()
     row = (surfels.roughness * size).long().clamp(0, size - 1)
