@@ -25,6 +25,7 @@ def test_set_changes_one_value():
         ("train.iterations=0", ["train.iterations", "greater than or equal to 1"]),
         ("train.iterations=many", ["train.iterations", "integer"]),
         ("shading=phong", ["render.shading", "deferred"]),
+        ("reflection=mirror", ["render", "diffuse = sh"]),
         ("iterations", ["section.key=value"]),
         ("rates.decay=2", ["rates.decay", "less than or equal to 1"]),
     ],

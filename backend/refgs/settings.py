@@ -4,7 +4,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from refgs.errors import InputError
 from refgs.paths import PRESETS
@@ -24,9 +24,18 @@ class RenderSettings(_Section):
         description="split-sum materials, of what was blended or of each surfel before; or plain view-dependent colour"
     )
     diffuse: Literal["irradiance", "sh"] = Field(description="diffuse light: from the environment, or SH per surfel")
+    reflection: Literal["microfacet", "mirror"] = Field(
+        description="of metals and dielectrics, by roughness; or, to compare with, a mirror's before diffuse = sh, metallic its share"
+    )
     color_space: Literal["linear", "display"] = Field(
         description="radiance is linear, HDR, and encoded as sRGB at the end; or a screen's numbers, 0..1, as in the paper"
     )
+
+    @model_validator(mode="after")
+    def _mirrors_have_colours_of_their_own(self) -> "RenderSettings":
+        if self.reflection == "mirror" and self.diffuse != "sh":
+            raise ValueError("reflection = mirror takes diffuse = sh")
+        return self
 
 
 class SurfelSettings(_Section):

@@ -127,26 +127,24 @@ def test_matches_reference(indirect, appearance, size, device):
         assert error <= GRADIENT, (name, error.item())
 
 
-def test_display_colours_are_not_encoded(device):
-    """As they are, over the background: what `radiance` says."""
-    camera, (features, alpha), _, maps, _, _, _ = case(False, False, (45, 30))
-    light = Light(torch.float32, device)
-    leaves = [v.to(device).clone().requires_grad_() for v in (features, alpha)]
-    shaded = shade(*leaves, light, camera, BACKGROUND, display=True)
-    covered = alpha > reference.COVERED
-    expected = torch.where(
-        covered[..., None], maps[3] * alpha[..., None] + (1 - alpha[..., None]) * BACKGROUND, BACKGROUND
-    )
-    assert (shaded.color.detach().cpu() - expected).abs().max() <= FORWARD * expected.abs().max()
-    exact = [v.double().requires_grad_() for v in (features, alpha)]
-    light = Light(torch.float64)
+@pytest.mark.parametrize("how", ["display", "mirror"])
+def test_other_ways_match_reference(how, device):
+    """A screen's colours, which are not encoded; a mirror's, of which metallic is the share."""
+    camera, (features, alpha), *_ = case(True, False, (45, 30))
+    inputs, light = (features, alpha), Light(torch.float64)
+    exact = [*(v.double().requires_grad_() for v in inputs), light.levels]
     picture, *_, margin = reference.shade(
-        *exact, light.levels, light.sides, light.irradiance, camera, BACKGROUND.double(), turn=TURN, display=True
+        *exact, light.sides, light.irradiance, camera, BACKGROUND.double(), turn=TURN, **{how: True}
     )
     upstream = torch.randn(picture.shape, generator=torch.Generator().manual_seed(5)) * (margin > MARGIN)[..., None]
+    assert (margin > MARGIN).float().mean() > 0.9
+    light = Light(torch.float32, device)
+    leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels]
+    found = shade(*leaves[:2], light, camera, BACKGROUND, **{how: True}).color
+    error = (found.detach().cpu() - picture).abs() * (margin > MARGIN)[..., None]
+    assert error.max() <= FORWARD * picture.abs().max()
     wanted = torch.autograd.grad(picture, exact, upstream.double())
-    found = torch.autograd.grad(shaded.color, leaves, upstream.to(device))
-    for value, expected in zip(found, wanted, strict=True):
+    for value, expected in zip(torch.autograd.grad(found, leaves, upstream.to(device)), wanted, strict=True):
         assert (value.cpu() - expected).abs().max() <= GRADIENT * expected.abs().max()
 
 

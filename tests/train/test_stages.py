@@ -57,12 +57,13 @@ def test_the_stage_ends_where_the_preset_says(ball_capture, tmp_path):
         ["shading=splat", "diffuse=sh"],
         ["color_space=display"],
         ["primitive=3dgs"],
+        ["reflection=mirror", "diffuse=sh"],
     ],
 )
 def test_learns_and_renders_as_it_trained(ball_capture, tmp_path, changes):
     made = trainer(ball_capture, tmp_path / "run", "quick", "train.iterations=300", "surfels.metallic=0.9", *changes)
     made.run()
-    assert made.test_psnr() > 25
+    assert made.test_psnr() > (22 if "reflection=mirror" in changes else 25)  # a mirror has no colour of its own
     write_asset(made)
     asset, view = open_run(made.folder), made.test[0]
     assert float((made.render(view.camera).color - asset.render(view.camera).color).abs().mean()) < 3e-3

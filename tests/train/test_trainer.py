@@ -20,7 +20,13 @@ from refgs.settings import load_settings
 from refgs.train.asset import write_asset
 from refgs.train.trainer import Trainer
 
-SMALL = ["surfels.start=1500", "surfels.budget=1800", "environment.resolution=16", "train.light_first=20"]
+SMALL = [
+    "surfels.start=1500",
+    "surfels.budget=1800",
+    "surfels.hull=64",
+    "environment.resolution=16",
+    "train.light_first=20",
+]
 
 
 def trainer(capture_folder, folder, *changes, total=150):

@@ -99,6 +99,7 @@ def shade(
     exposure: Tensor | float = 1.0,
     turn: Tensor | None = None,
     display: bool = False,
+    mirror: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """As refgs.render.shade.shade, for float64 tensors and a light that stands turned (3, 3) to the world; and how far each pixel
     (H, W) is from a kink of the derivatives, in the units of what has the kink. Bilinear look-ups have one at every texel."""
@@ -112,7 +113,7 @@ def shade(
     towards = -unit(ray @ view[:3, :3])
     indirect = None if visibility is None else (visibility[pixels][:, None], maps[:, -3:])
     appearance = maps[:, 8:11] if features.shape[-1] > 11 + 3 * (visibility is not None) else None
-    radiance = radiance_towards(towards, maps, appearance, levels, sides, irradiance, indirect, margins, turn)
+    radiance = radiance_towards(towards, maps, appearance, levels, sides, irradiance, indirect, margins, turn, mirror)
     exposed = exposure * radiance
     if not display:
         margins.append((exposed - 0.0031308).abs().amin(dim=-1))
@@ -152,18 +153,22 @@ def radiance_towards(
     indirect: tuple[Tensor, Tensor] | None,
     margins: list[Tensor],
     turn: Tensor | None = None,
+    mirror: bool = False,
 ) -> Tensor:
     """The split sum (paper Eq. 5–10) of normals, albedo, metallic and roughness (P, 8 or more), towards unit vectors (P, 3)."""
     normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
     if turn is not None:
         normal, towards = normal @ turn.T, towards @ turn.T
     dot = (normal * towards).sum(dim=-1)
+    roughness = torch.zeros_like(roughness) if mirror else roughness
     light = specular(levels, sides, 2 * dot[:, None] * normal - towards, roughness, margins)
     if indirect is not None:  # Eq. 9
         free, from_object = indirect
         light = free * light + (1 - free) * from_object
-    metal, dielectric = reflectance(dot, roughness, albedo, margins)
     share = metallic[:, None]
+    if mirror:
+        return light * share + (1 - share) * appearance
+    metal, dielectric = reflectance(dot, roughness, albedo, margins)
     if appearance is not None:
         diffuse = (1 - share) * appearance
     else:

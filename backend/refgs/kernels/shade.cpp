@@ -24,6 +24,7 @@ struct Shade {
   const float* exposure;          // (1): what radiance is multiplied by before it is encoded
   int64_t harmonics;              // whether there are channels of colour by direction
   int64_t splats, display;        // whether pixels are surfels; whether colours are blended and compared as they are, not encoded
+  int64_t mirror;                 // whether the light that is mirrored is the sharp one, and metallic its share, as in 3DGS-DR
   const float *features, *alpha;  // (height, width, channels), (height, width): sums over a pixel's splats
   const float* visibility;        // (height, width): 0 where the object itself stands in the mirror direction; or null
   Levels levels;
@@ -492,7 +493,7 @@ struct Shaded {
         inverse_length(inverse_norm({map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
         normal(inverse_length * turned(s.turn, {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
         view(turned(s.turn, seen_from(s))),
-        lookup(s.levels, mirrored(), map.value[ROUGHNESS]),
+        lookup(s.levels, mirrored(), s.mirror ? Vector() : map.value[ROUGHNESS]),
         irradiance(normal),
         table(s.reflectance, s.reflectance_side, n_dot_v, map.value[ROUGHNESS]),
         exposure(s.exposure[0]) {
@@ -513,7 +514,7 @@ struct Shaded {
       received[c] = HARMONICS ? v[APPEARANCE + c] : irradiance.value(s.irradiance, c);
       Vector diffuse = (1.0f - metallic) * received[c];
       if (!HARMONICS) diffuse *= (1.0f - dielectric) * v[ALBEDO + c];
-      radiance[c] = light[c] * (dielectric + metallic * (Metal(table, v[ALBEDO + c]).value - dielectric)) + diffuse;
+      radiance[c] = light[c] * reflected(s, Metal(table, v[ALBEDO + c])) + diffuse;
       Vector exposed = exposure * radiance[c];
       if (SPLATS || s.display)
         encoded[c] = exposed, slope[c] = Vector() + 1.0f;
@@ -550,12 +551,14 @@ struct Shaded {
       if (!SPLATS) by_alpha += by_color[c] * (encoded[c] - s.background[c]);
       Vector by_exposed = by_color[c] * map.alpha * slope[c], by_radiance = exposure * by_exposed;
       by_exposure += by_exposed * radiance[c];
-      by_light[c] = by_radiance * (dielectric + metallic * (metal.value - dielectric));
+      by_light[c] = by_radiance * reflected(s, metal);
       if (INDIRECT) {
         by[FROM_OBJECT + c] = (1.0f - visibility) * by_light[c];
         by_light[c] *= visibility;
       }
-      Vector by_reflectance = by_radiance * light[c], by_metal = by_reflectance * metallic;
+      Vector by_reflectance = by_radiance * light[c];
+      if (s.mirror) by[METALLIC] += by_reflectance, by_reflectance = Vector();
+      Vector by_metal = by_reflectance * metallic;
       by[METALLIC] += by_reflectance * (metal.value - dielectric);
       by[ALBEDO + c] = by_material[c] + by_metal * metal.by_f0;
       for (int i = 0; i < 2; i++) by_table[i] += by_metal * metal.by_fg[i];
@@ -584,7 +587,7 @@ struct Shaded {
     Vector by_roughness;
     Vectors by_mirrored = lookup.backward(by_light, by_roughness);
     sums.add_light(lookup, map.pixels.count, by_light);
-    by[ROUGHNESS] += by_roughness;
+    if (!s.mirror) by[ROUGHNESS] += by_roughness;
     Vector by_dot = 2.0f * dot(by_mirrored, normal) + by_n_v;
     by_n = by_n + 2.0f * n_dot_v * by_mirrored + by_dot * view;
     by_n = turned_back(s.turn, inverse_length * (by_n - dot(by_n, normal) * normal));
@@ -599,6 +602,11 @@ struct Shaded {
   }
 
  private:
+  // The part of the light in the mirror direction that is sent on.
+  MEMBER Vector reflected(const Shade& s, const Metal& metal) const {
+    Vector metallic = map.value[METALLIC], dielectric = table.value[ReflectanceTable::DIELECTRIC];
+    return s.mirror ? metallic : dielectric + metallic * (metal.value - dielectric);
+  }
   MEMBER Vectors seen_from(const Shade& s) const {
     if constexpr (SPLATS) {
       Vectors v = map.to_camera(s);

@@ -104,6 +104,7 @@ def render(
     encoded.
     """
     deferred, display = settings.shading == "deferred", settings.color_space == "display"
+    mirror = settings.reflection == "mirror"
     facing = surfels.rotations
     if surfels.scales.shape[1] == 3:
         facing, _ = shortest_last(surfels.rotations, surfels.scales)
@@ -117,13 +118,13 @@ def render(
         lit.append(directional(*indirect, 0.0, surfels.positions, camera, normals))
     lit.append(surfels.positions)
     if settings.shading == "splat":
-        blended = [normals, shade_splats(stack(lit), environment, camera), *lit[1:4]]
+        blended = [normals, shade_splats(stack(lit), environment, camera, mirror), *lit[1:4]]
     else:
         blended = lit if deferred else [normals, colour]
     features, depth, alpha = rasterize(*discs(surfels, camera), stack(blended), camera, near=near)
     if deferred:
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
-        shaded = shade(features, alpha, environment, camera, background, visibility, exposure, display)
+        shaded = shade(features, alpha, environment, camera, background, visibility, exposure, display, mirror)
         radiance = srgb_decode(shaded.radiance) if display else shaded.radiance
         return Rendering(shaded.color, alpha, depth, shaded.normal, shaded.material, radiance, visibility)
     over = (1 - alpha[..., None]) * background

@@ -51,7 +51,7 @@ class _Work(Work):
         + [("view", ctypes.c_float * 12), ("turn", ctypes.c_float * 9)]
         + [(n, ctypes.c_float) for n in ("fx", "fy", "cx", "cy")]
         + [(n, ctypes.c_void_p) for n in ("background", "exposure")]
-        + [(n, ctypes.c_int64) for n in ("harmonics", "splats", "display")]
+        + [(n, ctypes.c_int64) for n in ("harmonics", "splats", "display", "mirror")]
         + [(n, ctypes.c_void_p) for n in ("features", "alpha", "visibility")]
         + [("levels", _Levels)]
         + [(n, ctypes.c_int64) for n in ("texels", "cells", "lines")]
@@ -114,9 +114,7 @@ def _one(device: torch.device) -> Tensor:
 
 class _Shade(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx, features, alpha, levels, irradiance, exposure, sides, camera, turn, background, visibility, display, splats
-    ):
+    def forward(ctx, features, alpha, levels, irradiance, exposure, sides, camera, turn, background, visibility, *how):
         features, alpha, irradiance = features.contiguous(), alpha.contiguous(), irradiance.contiguous()
         table, padding = _reflectance(features.device), _Padding.of(sides, features.device)
         light, cells = levels.contiguous(), len(padding.texel)
@@ -130,14 +128,14 @@ class _Shade(torch.autograd.Function):
         if visibility is not None:
             work.attach(visibility=visibility)
         work.harmonics = work.channels > CHANNELS + 3 * (visibility is not None)
-        work.display, work.splats = display, splats
+        work.display, work.mirror, work.splats = how
         work.texels, work.cells, work.lines = len(light), cells, padding.lines
         work.levels.count, work.levels.cells = len(sides), padded.data_ptr()
         work.levels.side[: len(sides)] = sides
         work.levels.start[: len(sides)], work.levels.line[: len(sides)] = padding.first_cells, padding.first_lines
         work.levels.roughness[: len(sides)] = prefilter.ROUGHNESS
         work.reflectance_side = table.shape[0]
-        numbers = (3, 0, 0, 0) if splats else (3, 3, 5, 3)
+        numbers = (3, 0, 0, 0) if work.splats else (3, 3, 5, 3)
         shaded = Shaded(*(features.new_empty(*alpha.shape, n) for n in numbers))
         work.attach(**shaded._asdict())
         load.run("refgs_shade_pad", work, features, items=cells)
@@ -181,7 +179,7 @@ class _Shade(torch.autograd.Function):
         load.run("refgs_shade_unpad", work, features, items=work.texels)
         totals = by_totals.sum(dim=0)
         by_irradiance, by_exposure = totals[:-1].view(irradiance.shape), totals[-1]
-        return by_features, by_alpha, by_light, by_irradiance, by_exposure, *[None] * 7
+        return by_features, by_alpha, by_light, by_irradiance, by_exposure, *[None] * 8
 
 
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
@@ -205,6 +203,7 @@ def shade(
     visibility: Tensor | None = None,
     exposure: Tensor | None = None,
     display: bool = False,
+    mirror: bool = False,
 ) -> Shaded:
     """Shade what the rasteriser blended by the split sum (paper Eq. 5–10), over a background (3,), sRGB-encoded.
 
@@ -214,7 +213,8 @@ def shade(
     gives way to the environment's (Eq. 9); position. `alpha` (H, W). The picture's radiance is multiplied by the
     `exposure`, a scalar, before it is encoded; 1 where there is none. float32, all on the CPU or on one card, differentiable
     in features, alpha, the light and the exposure. What the blend's mean position says of its bias towards the camera is
-    undone first: shade.cpp has how. With `display` light and materials are of a screen's numbers, and nothing is encoded.
+    undone first: shade.cpp has how. With `display` light and materials are of a screen's numbers, and nothing is encoded. With
+    `mirror` the sharp light is mirrored, and metallic is its share (Ye et al., 3DGS-DR, 2024).
     The result does not depend on the number of threads, nor, on a card, does it differ from one call to the next. Where a
     derivative to hand back is not finite, on a card none is a number.
     """
@@ -222,10 +222,10 @@ def shade(
     if features.shape not in ((*alpha.shape, least), (*alpha.shape, least + 3)):
         size = f"{alpha.shape[1]}×{alpha.shape[0]}"
         raise ValueError(f"expected {least} or {least + 3} features a pixel of {size}, got {tuple(features.shape)}")
-    return _shade(features, alpha, environment, camera, background, visibility, exposure, display, splats=False)
+    return _shade(features, alpha, environment, camera, background, visibility, exposure, display, mirror, splats=False)
 
 
-def shade_splats(features: Tensor, environment: Environment, camera: Camera) -> Tensor:
+def shade_splats(features: Tensor, environment: Environment, camera: Camera, mirror: bool = False) -> Tensor:
     """What surfels send to a camera, (N, 3): the split sum of each, before they are blended (paper §3.3, the initial stage).
 
     `features` (N, C) are, in this order: normal in world space, albedo, metallic, roughness; three of colour by direction,
@@ -235,7 +235,7 @@ def shade_splats(features: Tensor, environment: Environment, camera: Camera) -> 
     if channels not in (CHANNELS, CHANNELS + 3):
         raise ValueError(f"expected {CHANNELS} or {CHANNELS + 3} features a surfel, got {channels}")
     features, alpha = features[:, None], features.new_ones(count, 1)
-    return _shade(features, alpha, environment, camera, features.new_zeros(3), splats=True).color[:, 0]
+    return _shade(features, alpha, environment, camera, features.new_zeros(3), mirror=mirror, splats=True).color[:, 0]
 
 
 def _shade(
@@ -247,6 +247,7 @@ def _shade(
     visibility: Tensor | None = None,
     exposure: Tensor | None = None,
     display: bool = False,
+    mirror: bool = False,
     *,
     splats: bool,
 ) -> Shaded:
@@ -256,5 +257,5 @@ def _shade(
     given |= {"levels": (light.levels, (texels, 3)), "irradiance": (light.irradiance, (9, 3))}
     load.check(**given, **({} if visibility is None else {"visibility": (visibility, alpha.shape)}))
     maps = features, alpha, light.levels, light.irradiance, exposure
-    how = light.sides, camera, light.turn(camera), background, visibility, display, splats
+    how = light.sides, camera, light.turn(camera), background, visibility, display, mirror, splats
     return Shaded(*_Shade.apply(*maps, *how))
