@@ -1,0 +1,150 @@
+"""What each part of the method is worth: `refgs bench ablations --scenes DIR`.
+
+DIR holds captures with ground truth, as `python -m benchmarks.scenes all` makes them. The whole method is a preset with the paper's
+stages (`WHOLE`); each ablation leaves out or replaces one part, by a setting. Each is trained for as many iterations as the whole,
+and again for as long as the whole took on that scene. Runs lie in OUT/PRESET/iterations|time/NAME/SCENE: one that is finished is not
+trained again, one that was interrupted goes on. Prints means over the scenes, how far they are from the whole's, and how far
+the paper's Tables 3 and 4 are from its own.
+"""
+
+import argparse
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.paper import call, figures
+from benchmarks.scenes import NAMES
+from refgs.errors import InputError
+from refgs.paths import clone_root
+from refgs.settings import load_settings
+
+# The shares of the training are the paper's: 18,000 of 58,000 iterations, and normals propagated every 2,000.
+WHOLE = ("diffuse=sh", "initial.until=0.31")
+PROPAGATIONS = 29
+ABLATIONS = {
+    "the whole": (),
+    "without 2DGS": ("primitive=3dgs",),
+    "without PBR": ("reflection=mirror",),
+    "without inter-reflection": ("indirect.start=1",),
+    "without deferred shading": ("shading=splat",),
+    "without the initial stage": ("initial.until=0",),
+    "without normal propagation": ("propagation.every=0",),
+    "propagation without materials": ("propagation.metallic=0", "propagation.roughness=1"),
+    "2DGS, colour by direction": ("shading=sh",),
+    "3DGS, colour by direction": ("shading=sh", "primitive=3dgs"),
+}
+MEASURES = (
+    ("psnr", "PSNR", ".2f"),
+    ("ssim", "SSIM", ".4f"),
+    ("flip", "FLIP", ".4f"),
+    ("normal_mae_degrees", "normals °", ".2f"),
+)
+# PSNR on Glossy Synthetic (Table 4), and degrees of normals on Shiny Blender (Table 3).
+PAPER = {
+    "the whole": (30.33, 2.15),
+    "without 2DGS": (None, 4.45),
+    "without PBR": (29.84, 3.81),
+    "without inter-reflection": (30.14, None),
+    "without deferred shading": (28.85, None),
+    "without the initial stage": (29.94, 3.53),
+    "propagation without materials": (29.68, 3.86),
+}
+console = Console(soft_wrap=True)
+
+
+def find_scenes(folder: Path) -> list[Path]:
+    """The captures in a folder. Raises InputError where there are none."""
+    found = [folder / name for name in NAMES if (folder / name / "ground_truth").is_dir()]
+    if not found:
+        raise InputError(f"{folder}: no scene is here: render them with python -m benchmarks.scenes all --out {folder}")
+    return found
+
+
+def train(capture: Path, run: Path, words: list[object]) -> bool:
+    """Train and evaluate what of it is not done yet; whether that succeeded."""
+    if figures(run) is not None:
+        return True
+    if not (run / "splats.ply").exists():
+        console.rule(str(run))
+        begun = ["--resume"] if (run / "run.toml").exists() else words
+        if call("train", capture, "--out", run, *begun) != 0:
+            return False
+    return call("evaluate", run, "--ground-truth", capture / "ground_truth") == 0
+
+
+def measure(scenes: list[Path], out: Path, preset: str) -> dict[str, dict[str, dict[str, dict]]]:
+    """Figures by "iterations" or "time", ablation and scene; without those that failed."""
+    every = max(1, load_settings(preset).train.iterations // PROPAGATIONS)
+    found: dict[str, dict[str, dict[str, dict]]] = {"iterations": {}, "time": {}}
+    for scene in scenes:
+        for kind, rows in found.items():
+            for name, changes in ABLATIONS.items():
+                run = out / kind / name.replace(" ", "_").replace(",", "") / scene.name
+                settings = [*WHOLE, f"propagation.every={every}", *changes]
+                words = ["--preset", preset, *(word for change in settings for word in ("--set", change))]
+                if kind == "time":
+                    whole = found["iterations"].get("the whole", {}).get(scene.name)
+                    if name == "the whole" or whole is None:
+                        continue
+                    words += ["--minutes", whole["training_seconds"] / 60]
+                if train(scene, run, words):
+                    rows.setdefault(name, {})[scene.name] = figures(run)
+    return found
+
+
+def tables(found: dict[str, dict[str, dict[str, dict]]]) -> list[Table]:
+    """A table for equal iterations and one for equal time: means over the scenes that all of it was measured on."""
+    whole, result = found["iterations"].get("the whole", {}), []
+    for kind, rows in found.items():
+        rows = {"the whole": whole} | rows
+        scenes = [name for name in whole if all(name in row for row in rows.values())]
+        if not scenes:
+            continue
+        table = Table(
+            kind, title=f"as many {kind}" if kind == "iterations" else "as much time", caption=", ".join(scenes)
+        )
+        for _, heading, _ in MEASURES:
+            table.add_column(heading, justify="right")
+        table.add_column("paper: PSNR, normals °", justify="right")
+        mean = {
+            name: {key: _mean([row[s].get(key) for s in scenes]) for key, *_ in MEASURES} for name, row in rows.items()
+        }
+        for name, values in mean.items():
+            cells = []
+            for key, _, form in MEASURES:
+                cells.append(_beside(values[key], mean["the whole"][key], form, name))
+            theirs = zip(PAPER.get(name, (None, None)), PAPER["the whole"], (".2f", ".2f"), strict=True)
+            table.add_row(
+                name, *cells, ", ".join(_beside(value, of_whole, form, name) for value, of_whole, form in theirs)
+            )
+        result.append(table)
+    return result
+
+
+def _mean(values: list[float | None]) -> float | None:
+    return None if None in values else sum(values) / len(values)
+
+
+def _beside(value: float | None, of_whole: float | None, form: str, name: str) -> str:
+    """A figure, and how far it is from the whole method's."""
+    if value is None:
+        return "–"
+    away = f" ({value - of_whole:+{form}})" if name != "the whole" and of_whole is not None else ""
+    return f"{value:{form}}{away}"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Train what is not trained yet, and print the tables."""
+    parser = argparse.ArgumentParser(prog="refgs bench ablations", description="What each part of the method is worth.")
+    parser.add_argument("--scenes", type=Path, required=True, help="folder of captures by benchmarks.scenes")
+    parser.add_argument("--out", type=Path, default=None, help="folder for the runs (default: demo/ablations)")
+    parser.add_argument("--preset", default="quick", help="a preset's name or a TOML file")
+    options = parser.parse_args(arguments)
+    out = (options.out or clone_root() / "demo" / "ablations") / Path(options.preset).stem
+    for table in tables(measure(find_scenes(options.scenes), out, options.preset)):
+        console.print(table)
+
+
+if __name__ == "__main__":
+    main()
