@@ -67,21 +67,27 @@ def train(capture: Path, run: Path, words: list[object]) -> bool:
         return True
     if not (run / "splats.ply").exists():
         console.rule(str(run))
-        begun = ["--resume"] if (run / "run.toml").exists() else words
+        minutes = words[words.index("--minutes") :] if "--minutes" in words else []
+        begun = ["--resume", *minutes] if (run / "run.toml").exists() else words
         if call("train", capture, "--out", run, *begun) != 0:
             return False
     return call("evaluate", run, "--ground-truth", capture / "ground_truth") == 0
 
 
-def measure(scenes: list[Path], out: Path, preset: str) -> dict[str, dict[str, dict[str, dict]]]:
-    """Figures by "iterations" or "time", ablation and scene; without those that failed."""
+Found = dict[str, dict[str, dict[str, dict]]]
+"""Figures by "iterations" or "time", ablation and scene."""
+
+
+def measure(scenes: list[Path], out: Path, preset: str) -> tuple[Found, list[Path]]:
+    """What was measured; and the run folders of what failed."""
+    failed = []
     every = max(1, load_settings(preset).train.iterations // PROPAGATIONS)
-    found: dict[str, dict[str, dict[str, dict]]] = {"iterations": {}, "time": {}}
+    found: Found = {"iterations": {}, "time": {}}
     for scene in scenes:
         for kind, rows in found.items():
             for name, changes in ABLATIONS.items():
                 run = out / kind / name.replace(" ", "_").replace(",", "") / scene.name
-                settings = [*WHOLE, f"propagation.every={every}", *changes]
+                settings = [*WHOLE, f"propagation.every={every}", f"propagation.rest={max(1, every // 10)}", *changes]
                 words = ["--preset", preset, *(word for change in settings for word in ("--set", change))]
                 if kind == "time":
                     whole = found["iterations"].get("the whole", {}).get(scene.name)
@@ -90,10 +96,12 @@ def measure(scenes: list[Path], out: Path, preset: str) -> dict[str, dict[str, d
                     words += ["--minutes", whole["training_seconds"] / 60]
                 if train(scene, run, words):
                     rows.setdefault(name, {})[scene.name] = figures(run)
-    return found
+                else:
+                    failed.append(run)
+    return found, failed
 
 
-def tables(found: dict[str, dict[str, dict[str, dict]]]) -> list[Table]:
+def tables(found: Found) -> list[Table]:
     """A table for equal iterations and one for equal time: means over the scenes that all of it was measured on."""
     whole, result = found["iterations"].get("the whole", {}), []
     for kind, rows in found.items():
@@ -142,8 +150,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--preset", default="quick", help="a preset's name or a TOML file")
     options = parser.parse_args(arguments)
     out = (options.out or clone_root() / "demo" / "ablations") / Path(options.preset).stem
-    for table in tables(measure(find_scenes(options.scenes), out, options.preset)):
+    found, failed = measure(find_scenes(options.scenes), out, options.preset)
+    for table in tables(found):
         console.print(table)
+    if failed:
+        console.print(f"not measured, see above: {', '.join(map(str, failed))}")
+        raise SystemExit(1)
 
 
 if __name__ == "__main__":

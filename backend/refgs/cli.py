@@ -30,7 +30,7 @@ def check(capture: Annotated[Path, typer.Argument(help="a folder with photos and
 def train(
     capture: Annotated[Path, typer.Argument(help="a folder with photos and cameras")],
     out: Annotated[Path, typer.Option(help="the run folder to make")],
-    preset: Annotated[str, typer.Option(help="quick, standard, or a TOML file")] = "standard",
+    preset: Annotated[str, typer.Option(help="quick, standard, paper, or a TOML file")] = "standard",
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
     minutes: Annotated[
         float | None, typer.Option(min=0.05, help="train for this long instead of the preset's iterations")

@@ -75,11 +75,12 @@ class Run:
         return self._traced["surfels"]
 
     def render(self, camera: Camera, environment: Environment | None = None, exposure: float = 1.0) -> Rendering:
-        """Render a camera of the run's frame, under another light where one is given; radiance is multiplied by the exposure."""
+        """Render a camera of the run's frame, under another light where one is given; the picture is exposed so much more."""
         surfels, settings = self.surfels(), self.settings.render
         if environment is not None:
             surfels = self.relit(environment)
-            settings = settings.model_copy(update={"diffuse": "irradiance" if self.occluder is None else "sh"})
+            diffuse = "irradiance" if self.occluder is None else "sh"
+            settings = settings.model_copy(update={"diffuse": diffuse, "reflection": "microfacet"})
         light, background = environment or self.environment, torch.tensor(self.settings.image.background)
         with torch.no_grad():
             return render(

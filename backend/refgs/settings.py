@@ -34,7 +34,7 @@ class RenderSettings(_Section):
     @model_validator(mode="after")
     def _mirrors_have_colours_of_their_own(self) -> "RenderSettings":
         if self.reflection == "mirror" and self.diffuse != "sh":
-            raise ValueError("reflection = mirror takes diffuse = sh")
+            raise ValueError("reflection = mirror takes diffuse = sh; add --set diffuse=sh")
         return self
 
 
@@ -74,7 +74,7 @@ class TrainSettings(_Section):
 class InitialSettings(_Section):
     until: float = Field(
         ge=0,
-        le=1,
+        lt=1,
         description="part of the training in which each surfel is shaded by itself; then colour, material and light start anew",
     )
 
@@ -212,6 +212,8 @@ def validate(tables: dict[str, Any], source: str) -> Settings:
             raise InputError(f"{source}: unknown key {key}; known here: {', '.join(known)}") from None
         if first["type"] == "missing":
             raise InputError(f'{source}: {key} is missing; add it, or start the file with base = "standard"') from None
+        if first["type"] == "value_error":
+            raise InputError(f"{source}: {key}: {first['ctx']['error']}") from None
         raise InputError(f"{source}: {key} = {first['input']!r}: {first['msg'].lower()}") from None
 
 

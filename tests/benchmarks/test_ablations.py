@@ -43,12 +43,13 @@ def test_nothing_is_trained_twice_and_figures_stand_beside_the_wholes(tmp_path, 
         return 0
 
     monkeypatch.setattr(ablations, "call", call)
-    found = ablations.measure(ablations.find_scenes(tmp_path), tmp_path / "out", "quick")
+    found, failed = ablations.measure(ablations.find_scenes(tmp_path), tmp_path / "out", "quick")
+    assert not failed
     assert [words[:2] for words in called if words[0] == "train"] == [("train", "ball")] * 3 + [("train", "rings")] * 3
     timed = [words for words in called if "--minutes" in words]
     assert len(timed) == 2 and all(words[-1] == "1.5" and "reflection=mirror" in words for words in timed)
     called.clear()
-    assert ablations.measure(ablations.find_scenes(tmp_path), tmp_path / "out", "quick") == found and not called
+    assert ablations.measure(ablations.find_scenes(tmp_path), tmp_path / "out", "quick") == (found, []) and not called
     console = Console(width=200)
     with console.capture() as capture:
         for table in ablations.tables(found):

@@ -43,12 +43,13 @@ def write_cameras(
     """Writes the run folder's cameras.json: the capture's undistorted cameras in the run's frame, OpenGL axes.
 
     With a light that stands with the "camera", `light_of` names the photo in which it is as environment.exr has it. The exposures
-    of those photos that were found to have one are what radiance is to be multiplied by to be as bright as the photo.
+    of those training photos that were found to have one are what radiance is to be multiplied by to be as bright as the photo.
     """
     frames = []
     for view in capture.views:
         camera = view.camera
-        frame = {"exposure": exposures[camera.name]} if exposures and camera.name in exposures else {}
+        known = exposures is not None and view.split == "train" and camera.name in exposures
+        frame = {"exposure": exposures[camera.name]} if known else {}
         frames.append(
             frame
             | {

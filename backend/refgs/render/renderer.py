@@ -28,9 +28,9 @@ COVERED = 1 / 255  # pixels with less alpha than this are background
 class Rendering:
     """What a camera sees. `color` (H, W, 3) is sRGB-encoded, over the background. The maps are alpha-weighted means over
     the splats of a pixel, linear, zero where nothing is: `normal` (H, W, 3) in world space, not normalised, towards the
-    camera; `depth` (H, W) along the camera's axis, of which `blended_depth` is the sum that is divided by alpha. Deferred
-    shading has two more: `material` (H, W, 5) is albedo, metallic, roughness; `radiance` (H, W, 3) is before the
-    background. With inter-reflection, `visibility` (H, W) is 0 where the object itself stands in the mirror direction,
+    camera; `depth` (H, W) along the camera's axis, of which `blended_depth` is the sum that is divided by alpha. Where
+    there is a light there are two more: `material` (H, W, 5) is albedo, metallic, roughness; `radiance` (H, W, 3) is linear,
+    before exposure and background. With inter-reflection, `visibility` (H, W) is 0 where the object itself stands in the mirror direction,
     else 1."""
 
     color: Tensor
@@ -101,7 +101,7 @@ def render(
     blended, paper §3.3) or "sh" (view-dependent colour of each surfel, blended). `near` is in world units. With an
     `occluder`, deferred shading takes the surfels' own light in place of the environment's where that is in the way of the
     mirror direction (paper Eq. 9). Radiance is multiplied by an `exposure`, a scalar, where there is one, before it is
-    encoded.
+    encoded. `settings.reflection` says what reflects, `settings.color_space` whether radiance is linear or a screen's numbers.
     """
     deferred, display = settings.shading == "deferred", settings.color_space == "display"
     mirror = settings.reflection == "mirror"

@@ -140,7 +140,8 @@ def _view(
     color = np.clip(rendering.color.numpy(), 0, 1)
     photo = composite(loaded, torch.from_numpy(background)).numpy()
     figures = {measure.__name__: measure(color, photo) for measure in (metrics.psnr, metrics.ssim, metrics.flip)}
-    if run.exposed:  # a held-out photo's exposure is not known: it is fitted, in linear radiance, for a second figure
+    if run.exposed and run.settings.render.color_space == "linear":
+        # A held-out photo's exposure is not known: it is fitted, in linear radiance, for a second figure.
         exposure = metrics.fitted_exposure(rendering.radiance.numpy(), rendering.alpha.numpy(), photo)
         fitted = run.render(camera, exposure=exposure).color.numpy()
         figures["psnr_exposure_fitted"] = metrics.psnr(np.clip(fitted, 0, 1), photo)

@@ -20,7 +20,7 @@ from refgs.train.trainer import Trainer
 
 
 def write_asset(trainer: Trainer) -> None:
-    """Write splats.ply, environment.exr and needs.json of a training that has ended."""
+    """Write splats.ply, environment.exr, needs.json and, where they are known, occluder.ply and the exposures in cameras.json."""
     folder, settings = trainer.folder, trainer.settings
     with torch.no_grad():
         surfels, environment = trainer.surfels(), trainer.environment()
@@ -120,6 +120,9 @@ def _left_out(trainer: Trainer, unseen: int) -> list[dict[str, str]]:
     if settings.render.color_space == "display":
         why = "color_space = display: light and base colour are a screen's numbers"
         left.append({"what": "linear radiance", "why": why, "saved": "nothing: relit pictures are off"})
+    if settings.render.reflection == "mirror" and settings.render.shading != "sh":
+        saved = "four parameters a surfel, and the table of reflectances"
+        left.append({"what": "base colour and roughness", "why": "reflection = mirror", "saved": saved})
     if settings.render.shading == "splat":
         saved = "shading pixels; tracing rays"
         left.append({"what": "deferred shading and inter-reflection", "why": "shading = splat", "saved": saved})
@@ -131,13 +134,13 @@ def _left_out(trainer: Trainer, unseen: int) -> list[dict[str, str]]:
             why = "indirect.start = 1"
         elif settings.light.frame == "camera":
             why = "the light turns with the camera: what the object mirrors of itself changes from photo to photo"
-        elif trainer.total <= max(indirect.every, indirect.start * trainer.total):
+        elif trainer.total <= max(indirect.every, max(indirect.start, settings.initial.until) * trainer.total):
             why = "the training was over before its first mesh"
         else:
             why = "the object hardly mirrors itself"
         saved = "tracing rays, and harmonics of light from the object"
         left.append({"what": "inter-reflection", "why": why, "saved": saved})
-    if settings.light.exposure == "auto" and settings.render.shading == "deferred" and trainer.exposures is None:
+    if settings.light.exposure == "auto" and settings.render.shading != "sh" and trainer.exposures is None:
         left.append(
             {
                 "what": "exposures",

@@ -19,6 +19,7 @@ from refgs.geometry.mesh import Mesh, clean
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Parameters, Surfels, activate
+from refgs.paths import whole
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.report.metrics import decibels, psnr
 from refgs.settings import RenderSettings, Settings
@@ -42,6 +43,7 @@ EXPOSURES_ALIKE = (
 TRACED = 24  # views at the least for the mesh that inter-reflection is traced on; all where there are fewer
 FEWER = 0.8  # of the surfels, where there is no memory for all
 LEAST_SURFELS = 1000
+MIRROR = 7.0  # logit of a mirror's base colour, and the negative of its roughness's
 
 
 def composite(view: LoadedView, background: Tensor) -> Tensor:
@@ -137,7 +139,12 @@ class Trainer:
             unused = ["sh_dc", "sh_rest"]
         if not self._reflects():
             unused += ["indirect_dc", "indirect_rest"]
-        self.constant = {name: self.parameters.pop(name).detach()[:1] for name in unused}
+        mirror = (
+            {"albedo": MIRROR, "roughness": -MIRROR} if render.reflection == "mirror" and render.shading != "sh" else {}
+        )
+        self.constant = {name: self.parameters.pop(name).detach()[:1] for name in [*unused, *mirror]}
+        for name, value in mirror.items():
+            self.constant[name].fill_(value)
 
     def _reflects(self) -> bool:
         """Whether this run looks for inter-reflection: not without masks, where the mesh is of the surroundings too, nor under
@@ -214,12 +221,12 @@ class Trainer:
         self.optimizer.step()
         self._forget_gradients()
         self.iteration += 1
-        self._densify(progress)
-        self._reshape(progress)
-        self._weigh_exposures(progress)
         due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
         if self._reflects() and not self.initial and due and self.iteration < self.total:
-            self._trace()
+            self._trace()  # before what may make all surfels faint, of which no mesh could be made
+        self._densify(progress)
+        self._reshape()
+        self._weigh_exposures(progress)
         return {"loss": loss.detach(), "square": square}
 
     def _set_rates(self, progress: float) -> None:
@@ -238,7 +245,7 @@ class Trainer:
     def _since_propagation(self) -> int | None:
         """Iterations since normals were last propagated, if they are at this stage."""
         settings = self.settings.propagation
-        if not settings.every or self.iteration < settings.every:
+        if not settings.every or self.iteration < settings.every or self.settings.render.shading == "sh":
             return None
         last = self.iteration // settings.every * settings.every
         return self.iteration - last if last / self.total < settings.stop else None
@@ -254,6 +261,9 @@ class Trainer:
                 self.optimizer.state.pop(self.parameters[name], None)
         self.light.fill_(self._start_light())
         self.optimizer.state.pop(self.light, None)
+        if self.exposures is not None:  # learned against that light
+            self.exposures.zero_()
+            self.optimizer.state.pop(self.exposures, None)
         self.report("stage", {"what": "shading what is blended: colour, material and light start anew"})
 
     def _forget_gradients(self) -> None:
@@ -282,19 +292,19 @@ class Trainer:
         )
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
 
-    def _reshape(self, progress: float) -> None:
+    def _reshape(self) -> None:
         """What is done to all surfels now and then: mirrors' normals spread, or all grow faint."""
         densify, due = self.settings.densify, self.iteration % max(self.settings.densify.reset_every, 1) == 0
-        if self._since_propagation() == 0 and self.settings.render.shading != "sh":
-            propagate_normals(self.parameters, self.optimizer, self.settings.propagation)
-        elif densify.reset_every and due and progress < densify.stop:
+        if self._since_propagation() == 0:
+            propagate_normals(self.constant | self.parameters, self.optimizer, self.settings.propagation)
+        elif densify.reset_every and due and self.iteration / self.total < densify.stop:
             reset_opacity(self.parameters, self.optimizer)
 
     @torch.no_grad()
     def _weigh_exposures(self, progress: float) -> None:
         """Leave the exposures out, where that is asked for, once it is seen that the photos have none of their own."""
         settings = self.settings
-        if self.exposures is None or settings.light.exposure != "auto":
+        if self.exposures is None or settings.light.exposure != "auto" or self.initial:
             return
         if self.iteration % settings.densify.every or progress < EXPOSURES_KNOWN:
             return
@@ -433,7 +443,7 @@ class Trainer:
         mesh = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("occluder.")}
         tensors = {name: value.to(self.device) for name, value in tensors.items()}
         self.iteration, self.seconds = facts["iteration"], facts["seconds"]
-        self.total, self.initial = facts["total"], facts["initial"]
+        self.total, self.initial = facts["total"], facts.get("initial", self.initial)
         self.motion.total, self.motion.views = tensors["motion.total"], tensors["motion.views"]
         self.optimizer.state.clear()
         if "exposure" not in tensors:  # they have been left out since
@@ -464,4 +474,5 @@ class Trainer:
         if file.exists():
             lines = file.read_text(encoding="utf-8").splitlines()
             kept = [line for line in lines if json.loads(line)["iteration"] <= self.iteration]
-            file.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+            with whole(file) as temporary:
+                temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
