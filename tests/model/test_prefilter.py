@@ -23,7 +23,7 @@ def errors(radiance: torch.Tensor, fine: torch.Tensor, rows: int) -> list[float]
     of the mean."""
     side, fine_side = (math.isqrt(len(v) // 6) for v in (radiance, fine))
     levels = prefilter.prefilter(radiance, side)[0].cpu()
-    levels = levels[cubemap.orbit_order(tuple(prefilter.level_sides(side))).argsort()].numpy()
+    levels = cubemap.in_texel_order(levels, tuple(prefilter.level_sides(side))).numpy()
     directions, area = cubemap.texel_directions(fine_side).numpy(), cubemap.texel_solid_angles(fine_side).numpy()
     start, found, rng = 6 * side * side, [], np.random.default_rng(0)
     for level_side, roughness in zip(prefilter.level_sides(side)[1:], prefilter.ROUGHNESS[1:], strict=True):

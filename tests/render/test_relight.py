@@ -136,6 +136,23 @@ def test_a_white_bowl_under_an_even_sky_cannot_be_seen(bowl, part, monkeypatch):
     torch.testing.assert_close(seen, torch.ones_like(seen), rtol=0, atol=0.03)
 
 
+def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
+    """What a mirror above sends down is the light from below, by direction."""
+    light = colourful()
+    mirrors(monkeypatch, 1.0)
+    occluder = plates(plate(1.0, -1))
+    below = surfels(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))._replace(roughness=torch.tensor([0.05]))
+    transport = relight.Transport(below, occluder)
+    levels = cubemap.in_texel_order(light.levels, light.sides)
+    first, _, _ = relight._first(transport, slice(0, len(transport.direction)), levels, light.sides)
+    ways = transport.directions[transport.direction.long()] * torch.tensor([1.0, 1.0, -1.0])
+    x, y, z = ways.unbind(-1)
+    exact = torch.stack([1 + 0.5 * x, 1 + 0.8 * z, 1 - 0.6 * y * x], dim=1)
+    free = transport.free
+    assert free.float().mean() > 0.9
+    torch.testing.assert_close(first[free], exact[free], rtol=0, atol=0.05)
+
+
 def test_a_light_that_the_object_hides_reaches_nothing():
     """A small sun behind the upper of two plates; beside it, all of it."""
     radiance = torch.full((6 * 32**2, 3), 1e-3)

@@ -222,7 +222,7 @@ def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughne
     for i in (0, 1):
         half = torch.tensor(sides)[interval + i] / 2
         margins += _from_integer(torch.stack([(s + 1) * half + 0.5, (t + 1) * half + 0.5], dim=-1))
-    levels = levels[cubemap.orbit_order(sides).argsort()]
+    levels = cubemap.in_texel_order(levels, sides)
     return cubemap.sample(levels, sides, directions, interval + (roughness - low) / (high - low))
 
 

@@ -82,6 +82,11 @@ def orbit_order(sides: tuple[int, ...]) -> Tensor:
     return torch.cat([orbits(side).flatten() + start for side, start in zip(sides, starts, strict=False)])
 
 
+def in_texel_order(levels: Tensor, sides: tuple[int, ...]) -> Tensor:
+    """Cubemaps one after another (Σ 6·side², C) whose texels are in the order of orbits, as `sample` takes them."""
+    return levels[orbit_order(sides).argsort()]
+
+
 @lru_cache(maxsize=1)
 def compositions() -> Tensor:
     """(24, 24): which symmetry it is to apply the row's, then the column's."""

@@ -61,10 +61,10 @@ def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tens
     return metallic * metal + (1 - metallic) * dielectric, (1 - metallic) * (1 - dielectric) * albedo
 
 
-def _prefiltered(light: Environment, directions: Tensor, roughness: Tensor) -> Tensor:
-    """The light (P, 3) about unit directions (P, 3), as surfaces of these roughnesses (P,) mirror it."""
+def _prefiltered(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor) -> Tensor:
+    """The light (P, 3) about unit directions (P, 3), as surfaces of these roughnesses (P,) mirror it; its levels by texel."""
     level = np.interp(roughness.numpy(), prefilter.ROUGHNESS, np.arange(len(prefilter.ROUGHNESS)))
-    return cubemap.sample(light.levels, light.sides, directions, torch.from_numpy(level).float())
+    return cubemap.sample(levels, sides, directions, torch.from_numpy(level).float())
 
 
 class Transport:
@@ -155,7 +155,8 @@ def _gather(t: Transport, light: Environment, bounces: int) -> tuple[Tensor, Ten
     """What surfels receive of the light and of each other: irradiance / π (N, 3); harmonics (N, 16, 3) of the radiance that
     comes from the object."""
     past = _past_the_object(t, light)
-    firsts = [_first(t, rays, light) for _, rays, _ in t.chunks()]
+    levels = cubemap.in_texel_order(light.levels, light.sides)
+    firsts = [_first(t, rays, levels, light.sides) for _, rays, _ in t.chunks()]
     basis, count = harmonics.basis(t.directions, DEGREE), (t.starts[1:] - t.starts[:-1]).clamp_min(1)[:, None]
 
     def sums(received: Tensor, mean: Tensor, most: float) -> Tensor:
@@ -181,7 +182,7 @@ def _gather(t: Transport, light: Environment, bounces: int) -> tuple[Tensor, Ten
     return received, t.fit @ found
 
 
-def _first(t: Transport, rays: slice, light: Environment) -> tuple[Tensor, Tensor, Tensor]:
+def _first(t: Transport, rays: slice, levels: Tensor, sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
     """Of what rays meet: the light from afar that it mirrors to the surfel (P, 3); the parts that it mirrors of other light, and
     that it scatters of irradiance / π (P, 3)."""
     vertex, ray, free = t.vertex[rays], t.directions[t.direction[rays]], t.free[rays]
@@ -191,7 +192,7 @@ def _first(t: Transport, rays: slice, light: Environment) -> tuple[Tensor, Tenso
     first = torch.zeros_like(share)
     # Lobes that follow each other add up as Gaussians do; a lobe's width is roughness².
     blurred = (roughness[free, 0] ** 4 + CONE**4) ** 0.25
-    first[free] = share[free] * _prefiltered(light, _mirror(ray, normals)[free], blurred)
+    first[free] = share[free] * _prefiltered(levels, sides, _mirror(ray, normals)[free], blurred)
     share[free] = 0
     return first, share, matte
 
