@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.paper import call, figures
+from benchmarks.paper import call, figures, mean
 from benchmarks.scenes import NAMES
 from refgs.errors import InputError
 from refgs.paths import clone_root
@@ -115,23 +115,19 @@ def tables(found: Found) -> list[Table]:
         for _, heading, _ in MEASURES:
             table.add_column(heading, justify="right")
         table.add_column("paper: PSNR, normals °", justify="right")
-        mean = {
-            name: {key: _mean([row[s].get(key) for s in scenes]) for key, *_ in MEASURES} for name, row in rows.items()
+        means = {
+            name: {key: mean([row[s].get(key) for s in scenes]) for key, *_ in MEASURES} for name, row in rows.items()
         }
-        for name, values in mean.items():
+        for name, values in means.items():
             cells = []
             for key, _, form in MEASURES:
-                cells.append(_beside(values[key], mean["the whole"][key], form, name))
+                cells.append(_beside(values[key], means["the whole"][key], form, name))
             theirs = zip(PAPER.get(name, (None, None)), PAPER["the whole"], (".2f", ".2f"), strict=True)
             table.add_row(
                 name, *cells, ", ".join(_beside(value, of_whole, form, name) for value, of_whole, form in theirs)
             )
         result.append(table)
     return result
-
-
-def _mean(values: list[float | None]) -> float | None:
-    return None if None in values else sum(values) / len(values)
 
 
 def _beside(value: float | None, of_whole: float | None, form: str, name: str) -> str:

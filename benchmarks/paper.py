@@ -122,7 +122,7 @@ def tables(found: dict[tuple[str, str], dict[str, float]], preset: str) -> list[
             theirs = [data_set[measure][number] for _, number in rows]
             for title, values in ((heading, ours), ("paper", theirs)):
                 table.add_column(title, justify="right")
-                columns.append([_text(value, form) for value in (*values, _mean(values))])
+                columns.append([_text(value, form) for value in (*values, mean(values))])
         for name, *cells in zip([*(name for name, _ in rows), "mean"], *columns, strict=True):
             if name == "mean":
                 table.add_section()
@@ -140,13 +140,13 @@ def tables(found: dict[tuple[str, str], dict[str, float]], preset: str) -> list[
         for name, row in shiny.items():
             table.add_row(name, *(_text(row.get(key), form) for key, _, form in keys))
         table.add_section()
-        table.add_row("mean", *(_text(_mean([r.get(key) for r in shiny.values()]), form) for key, _, form in keys))
+        table.add_row("mean", *(_text(mean([r.get(key) for r in shiny.values()]), form) for key, _, form in keys))
         table.add_row("paper", *(_text(NORMALS[key], form) for key, _, form in keys))
         result.append(table)
     return result
 
 
-def _mean(values: list[float | None]) -> float | None:
+def mean(values: list[float | None]) -> float | None:
     """None unless all are known: a mean over other scenes than the paper's beside it would mislead."""
     return None if None in values or not values else sum(values) / len(values)
 

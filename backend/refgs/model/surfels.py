@@ -21,6 +21,16 @@ Gaussians, opacity (N,) logit, sh_dc (N, 1, 3), sh_rest (N, K−1, 3), albedo (N
 (N,) logit, indirect_dc and indirect_rest as the SH."""
 
 
+def axes(rotations: Tensor) -> list[Tensor]:
+    """The columns (N, 3) of the matrices of quaternions wxyz (N, 4) of any length."""
+    w, x, y, z = torch.nn.functional.normalize(rotations, dim=-1).unbind(-1)
+    return [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1),
+        torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1),
+        torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1),
+    ]
+
+
 class Surfels(NamedTuple):
     """Activated values of N surfels: world units, linear Rec.709 albedo, materials in 0..1, SH with colour = 0.5 + SH.
 
@@ -42,8 +52,7 @@ class Surfels(NamedTuple):
 
     def normals(self) -> Tensor:
         """Unit normals t_u × t_v (N, 3): the third column of each rotation, if its axis is the shortest."""
-        w, x, y, z = torch.nn.functional.normalize(self.rotations, dim=-1).unbind(-1)
-        return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
+        return axes(self.rotations)[2]
 
 
 class _Activation(ctypes.Structure):

@@ -26,9 +26,7 @@ BOUNCES = 4  # between the object's parts
 DEGREE = 3  # of harmonics
 PRIOR = 2.0  # rays that the object's mean radiance counts as, for surfels that see little of the object
 CONE = 0.3  # what roughness blurs a mirrored light as one of the directions does, which stands for a cell
-WHITE = (
-    1.0  # harmonics would smear what is brighter over all that a surfel sees: to them it is as bright as on a screen
-)
+WHITE = 1.0  # as bright as on a screen: what is brighter harmonics would smear over all that a surfel sees
 ROUGHNESSES = 64  # for which a coat's dependence on the angle is known
 NEIGHBOURS = 8  # surfels that a point of the mesh is blended of
 CHUNK = 512  # surfels at a time
@@ -219,9 +217,8 @@ def _colour(surfels: Surfels, normals: Tensor, received: Tensor) -> Tensor:
     """
     size, degrees = ROUGHNESSES, torch.arange(4)
     middle = (torch.arange(size).double() + 0.5) / size  # of cosines and of roughnesses
-    legendre = torch.from_numpy(
-        np.polynomial.legendre.legvander(-middle.numpy(), 3)
-    )  # d leads from the camera to the surfel
+    # d leads from the camera to the surfel
+    legendre = torch.from_numpy(np.polynomial.legendre.legvander(-middle.numpy(), 3))
     coat = 1 - reference.table(middle.repeat(size), middle.repeat_interleave(size))[:, 3].view(size, size)
     zonal = torch.linalg.lstsq(legendre, coat.T).solution.T * 4 * math.pi / (2 * degrees + 1)
     zonal = zonal.repeat_interleave(2 * degrees + 1, dim=1).float()

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
-from refgs.model.surfels import Surfels
+from refgs.model.surfels import Surfels, axes
 
 SIDE = 1.3  # in half pictures: beyond that the projection's derivative is that of the border, or it would grow without bound
 # Turns that bring axis 0, 1 or 2 to the third place, as quaternions wxyz.
@@ -70,12 +70,7 @@ def across_the_axis(positions: Tensor, rotations: Tensor, scales: Tensor, camera
 
     Of `positions` (N, 3), `rotations` (N, 4) of any length and `scales` (N, 3); differentiable in all three.
     """
-    w, x, y, z = torch.nn.functional.normalize(rotations, dim=-1).unbind(-1)
-    columns = [
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    ]
+    columns = [axis.unbind(-1) for axis in axes(rotations)]
     view = camera.world_to_camera.tolist()
     point = [sum(view[i][j] * positions[:, j] for j in range(3)) + view[i][3] for i in range(3)]
     depth = point[2].clamp_min(1e-9)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.kernels.load import Shared, Work, check, run
-from refgs.model.surfels import Parameters
+from refgs.model.surfels import Parameters, axes
 from refgs.settings import DensifySettings, PropagationSettings
 
 RESET = 0.01  # opacity
@@ -139,13 +139,7 @@ def _divide(parameters: Parameters, first: Tensor, second: Tensor) -> None:
     longer = scale.argmax(dim=1)
     rows = torch.arange(len(first), device=first.device)
     sigma = scale[rows, longer].exp()
-    w, x, y, z = torch.nn.functional.normalize(parameters["rotation"][first], dim=-1).unbind(-1)
-    axes = [
-        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1),
-        torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1),
-        torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1),
-    ]
-    axis = torch.stack(axes)[longer, rows]
+    axis = torch.stack(axes(parameters["rotation"][first]))[longer, rows]
     # Two Gaussians of 0.8 σ, 0.6 σ either side of the centre: the same variance as the one, 0.8² + 0.6² = 1.
     for half, sign in ((first, 1.0), (second, -1.0)):
         parameters["position"][half] += sign * 0.6 * sigma[:, None] * axis
