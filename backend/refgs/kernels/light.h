@@ -10,7 +10,7 @@ struct Levels {
   static constexpr int MOST = 8;
   int64_t count;
   int32_t side[MOST], start[MOST], line[MOST];  // where a level starts, in cells, and in lines: rows of cells
-  float roughness[MOST];
+  float alpha[MOST];  // of GGX: roughness²
   const float* cells;  // (cells, 4): red, green, blue, nothing
 
   MEMBER int level_of(int32_t at) const {
@@ -25,7 +25,7 @@ struct Levels {
   }
 };
 
-// Trilinear look-up: linear in roughness between two levels, bilinear in direction in each.
+// Trilinear look-up: linear in roughness² between two levels, as a lobe is about that wide; bilinear in direction in each.
 template <bool DERIVATIVES>
 struct Lookup {
   Vector s, t, inverse_major;  // on the face: the two coordinates; 1 / the direction's largest component
@@ -44,22 +44,22 @@ struct Lookup {
     s = choose(d.y, d.z, d.x) * scale, t = choose(d.z, d.x, d.y) * scale;
     Mask face = select(on_x, Mask(), select(on_y, Mask() + 2, Mask() + 4)) - (major < 0.0f);
 
-    Vector low = Vector() + levels.roughness[0], high = Vector() + levels.roughness[1];
+    Vector alpha = roughness * roughness, low = Vector() + levels.alpha[0], high = Vector() + levels.alpha[1];
     Mask side[2], start[2], first_line[2];
     for (int i = 0; i < 2; i++) {
       side[i] = Mask() + levels.side[i], start[i] = Mask() + levels.start[i], first_line[i] = Mask() + levels.line[i];
     }
     for (int k = 1; k + 1 < levels.count; k++) {
-      Mask above = roughness > levels.roughness[k];
-      low = select(above, Vector() + levels.roughness[k], low), high = select(above, Vector() + levels.roughness[k + 1], high);
+      Mask above = alpha > levels.alpha[k];
+      low = select(above, Vector() + levels.alpha[k], low), high = select(above, Vector() + levels.alpha[k + 1], high);
       for (int i = 0; i < 2; i++) {
         side[i] = select(above, Mask() + levels.side[k + i], side[i]);
         start[i] = select(above, Mask() + levels.start[k + i], start[i]);
         first_line[i] = select(above, Mask() + levels.line[k + i], first_line[i]);
       }
     }
-    slope = reciprocal(high - low);
-    fraction = (roughness - low) * slope;
+    Vector by_alpha = reciprocal(high - low);
+    fraction = (alpha - low) * by_alpha, slope = 2.0f * roughness * by_alpha;
 
     for (int c = 0; c < 3; c++) light[c] = by_s[c] = by_t[c] = by_fraction[c] = Vector();
 #pragma unroll

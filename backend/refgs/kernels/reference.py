@@ -212,9 +212,9 @@ def _from_integer(x: Tensor, counts: Tensor | bool = True) -> list[Tensor]:
 
 def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor, margins: list) -> Tensor:
     """Radiance (P, 3) filtered by the GGX lobe of a roughness (P,) about a direction (P, 3)."""
-    known = torch.tensor(prefilter.ROUGHNESS, dtype=roughness.dtype)
+    known, alpha = torch.tensor(prefilter.ROUGHNESS, dtype=roughness.dtype), roughness**2
     interval = (torch.bucketize(roughness.detach().contiguous(), known) - 1).clamp(0, len(known) - 2)
-    low, high = known[interval], known[interval + 1]
+    low, high = known[interval] ** 2, known[interval + 1] ** 2
     margins.append((roughness[:, None] - known[1:-1]).abs().amin(dim=-1))
     _, s, t = cubemap.face_coordinates(directions)
     largest = torch.sort(directions.abs(), dim=-1).values
@@ -223,7 +223,7 @@ def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughne
         half = torch.tensor(sides)[interval + i] / 2
         margins += _from_integer(torch.stack([(s + 1) * half + 0.5, (t + 1) * half + 0.5], dim=-1))
     levels = cubemap.in_texel_order(levels, sides)
-    return cubemap.sample(levels, sides, directions, interval + (roughness - low) / (high - low))
+    return cubemap.sample(levels, sides, directions, interval + (alpha - low) / (high - low))
 
 
 def table(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> Tensor:

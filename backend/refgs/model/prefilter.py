@@ -21,10 +21,11 @@ from refgs.kernels.load import Shared, Work, check, run
 from refgs.model import cubemap, harmonics
 from refgs.model.cubemap import SYMMETRIES
 
-ROUGHNESS = (0.0, 0.18, 0.35, 0.6, 1.0)  # of the levels; level 0 is the cubemap itself
-DIVISOR = (1, 2, 4, 8, 8)  # a level's side is the cubemap's divided by this
+ROUGHNESS = (0.0, 0.08, 0.15, 0.25, 0.4, 0.65, 1.0)  # of the levels; level 0 is the cubemap itself
+DIVISOR = (1, 1, 2, 4, 4, 8, 8)  # a level's side is the cubemap's divided by this
 CELLS = 256  # a texel of the pyramid is split while it holds more than 1/CELLS of the lobe
 COARSEST = 4  # side of the last pooled mip
+BLOCK = 32  # orbits that one product adds up: half of those of the smallest cubemap, for a single product is shared, too
 SAMPLES = 3  # sub-samples of the lobe along each side of a texel
 # A clamped cosine's harmonics divided by π, by degree (Ramamoorthi and Hanrahan 2001, eq. 8).
 COSINE = (1.0,) + (2 / 3,) * 3 + (1 / 4,) * 5
@@ -33,6 +34,11 @@ COSINE = (1.0,) + (2 / 3,) * 3 + (1 / 4,) * 5
 def level_sides(resolution: int) -> list[int]:
     """Side of each prefiltered level, in texels."""
     return [max(resolution // d, COARSEST) for d in DIVISOR]
+
+
+def level_of(roughness):
+    """Which of the levels a roughness lies at, linear in its square from one to the next; a float array or a number."""
+    return np.interp(np.square(roughness), np.square(ROUGHNESS), np.arange(len(ROUGHNESS)))
 
 
 def _pyramid_sides(resolution: int) -> list[int]:
@@ -192,7 +198,9 @@ class _Prefilter(torch.autograd.Function):
         pyramid = _product(_pyramid(resolution, device)[0], ordered)
         levels = _product(matrices(resolution, device)[0], pyramid)
         first, turned = _projection(resolution, device)
-        irradiance = turned @ (first @ ordered.view(-1, 3 * SYMMETRIES)).view(-1, 3)
+        # BLAS may share one long sum among threads, and so round it by their number; short ones it does not.
+        blocks = first.unflatten(1, (-1, BLOCK)).transpose(0, 1), ordered.view(-1, BLOCK, 3 * SYMMETRIES)
+        irradiance = (turned[:, :, None] * torch.bmm(*blocks).sum(dim=0).view(-1, 3)).sum(dim=1)
         return levels, irradiance
 
     @staticmethod

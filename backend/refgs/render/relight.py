@@ -61,8 +61,7 @@ def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tens
 
 def _prefiltered(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor) -> Tensor:
     """The light (P, 3) about unit directions (P, 3), as surfaces of these roughnesses (P,) mirror it; its levels by texel."""
-    level = np.interp(roughness.numpy(), prefilter.ROUGHNESS, np.arange(len(prefilter.ROUGHNESS)))
-    return cubemap.sample(levels, sides, directions, torch.from_numpy(level).float())
+    return cubemap.sample(levels, sides, directions, torch.from_numpy(prefilter.level_of(roughness.numpy())).float())
 
 
 class Transport:

@@ -38,7 +38,7 @@ class _Levels(ctypes.Structure):
         ("side", ctypes.c_int32 * 8),
         ("start", ctypes.c_int32 * 8),
         ("line", ctypes.c_int32 * 8),
-        ("roughness", ctypes.c_float * 8),
+        ("alpha", ctypes.c_float * 8),
         ("cells", ctypes.c_void_p),
     )
 
@@ -133,7 +133,7 @@ class _Shade(torch.autograd.Function):
         work.levels.count, work.levels.cells = len(sides), padded.data_ptr()
         work.levels.side[: len(sides)] = sides
         work.levels.start[: len(sides)], work.levels.line[: len(sides)] = padding.first_cells, padding.first_lines
-        work.levels.roughness[: len(sides)] = prefilter.ROUGHNESS
+        work.levels.alpha[: len(sides)] = [roughness**2 for roughness in prefilter.ROUGHNESS]
         work.reflectance_side = table.shape[0]
         numbers = (3, 0, 0, 0) if work.splats else (3, 3, 5, 3)
         shaded = Shaded(*(features.new_empty(*alpha.shape, n) for n in numbers))
