@@ -25,7 +25,9 @@ ROUGHNESS = (0.0, 0.08, 0.15, 0.25, 0.4, 0.65, 1.0)  # of the levels; level 0 is
 DIVISOR = (1, 1, 2, 4, 4, 8, 8)  # a level's side is the cubemap's divided by this
 CELLS = 256  # a texel of the pyramid is split while it holds more than 1/CELLS of the lobe
 COARSEST = 4  # side of the last pooled mip
-BLOCK = 32  # orbits that one product adds up: half of those of the smallest cubemap, for a single product is shared, too
+BLOCK = (
+    32  # orbits that one product adds up: half of those of the smallest cubemap, for a single product is shared, too
+)
 SAMPLES = 3  # sub-samples of the lobe along each side of a texel
 # A clamped cosine's harmonics divided by π, by degree (Ramamoorthi and Hanrahan 2001, eq. 8).
 COSINE = (1.0,) + (2 / 3,) * 3 + (1 / 4,) * 5
