@@ -114,7 +114,9 @@ class LossSettings(_Section):
     normal: float = Field(ge=0, description="weight of normal consistency with the depth")
     smooth: float = Field(ge=0, description="weight of edge-aware normal smoothness")
     alpha: float = Field(ge=0, description="weight of the mask, where there is one")
-    metallic: float = Field(ge=0, description="weight, at the end, of a metallic that is neither 0 nor 1")
+    metallic: float = Field(
+        ge=0, description="weight, at the end, of a metallic that is neither 0 nor 1; and of metals too dark for any"
+    )
     light: float = Field(ge=0, description="weight of the light's being neutral on the whole")
     exposure: float = Field(ge=0, description="weight of a photo's being exposed as most are")
 

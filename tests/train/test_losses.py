@@ -15,6 +15,7 @@ from refgs.train.losses import Photo, objective
 from tests.kernels import scenes, test_ssim
 from tests.kernels.emulate import emulate
 
+DARK = 0.1
 ALL = LossSettings(dssim=0.2, normal=0.3, smooth=0.4, alpha=0.5, metallic=0.6, light=0.0, exposure=0.0)
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
 MAPS = ("color", "normal", "blended_depth", "alpha", "material")
@@ -52,6 +53,8 @@ def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress
     if rendering.material is not None:
         m, covered = rendering.metallic, (rendering.alpha.detach() > COVERED).sum().clamp_min(1)
         terms["metallic"] = weights.metallic * progress**2 * (m * (1 - m)).sum() / covered
+        dark = (1 - rendering.albedo.detach().amax(dim=-1) / DARK).clamp(0, 1)
+        terms["dark metal"] = weights.metallic * (dark * m).sum() / covered
     return terms
 
 
@@ -67,7 +70,9 @@ def pictures(width: int, height: int, masked: bool, material: bool) -> tuple[Ren
     depth = 2.5 + 0.3 * torch.sin(x) * torch.cos(y) + 0.01 * random(*size)
     normal = torch.tensor(camera.world_to_camera[2, :3] * -1).float() + 0.6 * (random(*size, 3) - 0.5)
     alpha = (random(*size) + 0.4).clamp_max(1) - 0.003 * random(*size)
-    maps = [1.2 * random(*size, 3), alpha, depth * alpha, normal, random(*size, 5) if material else None]
+    materials = random(*size, 5)
+    materials[::3, :, :3] *= DARK
+    maps = [1.2 * random(*size, 3), alpha, depth * alpha, normal, materials if material else None]
     photo, mask = (torch.tensor((300 * rng.uniform(size=s)).clip(0, 255)).byte() for s in ((*size, 3), size))
     return Rendering(*maps), Photo(photo, mask if masked else None, camera)
 

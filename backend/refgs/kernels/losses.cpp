@@ -12,7 +12,7 @@ struct Losses {
   const uint8_t *image, *mask;                             // (H, W, 3), (H, W) or null: as on disk, 255 is 1
   const float* background;                                 // (3)
   float rotation[9], across, down, left, top;              // world to camera; at depth 1 a pixel's size, and where the first one is
-  float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, alpha_weight, metallic_weight;
+  float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, alpha_weight, metallic_weight, dark_weight;
   float *photo, *clipped;   // (H, W, 3) the photo over the background; C as above, for D-SSIM
   const float* by_clipped;  // (H, W, 3) D-SSIM's share
   float *by_color, *by_normal, *by_depth, *by_alpha, *by_material;
@@ -31,6 +31,7 @@ enum { LOSS, SURFACES, SQUARES, SUMS };  // weighted terms; pixels with a surfac
 constexpr float SATURATED = 0.998f;  // a photo's value above which the true radiance is unknown
 constexpr float SOLID = 0.5f, COVERED = 1 / 255.0f;  // alphas of an opaque pixel, and of one that is not background
 constexpr int MATERIAL = 5, METAL = 3;               // numbers of a material; which is the metallic
+constexpr float DARK = 0.1f;                         // no metal's base colour is darker in all of its channels
 
 // A vector's worth of pixels of a row.
 struct Pixels {
@@ -225,11 +226,16 @@ KERNEL(refgs_losses_second, Losses, l) {
     r.put3(l.by_color, by + Vectors{open(color.x, clipped.x, share.x), open(color.y, clipped.y, share.y), open(color.z, clipped.z, share.z)});
 
     if (!l.material) return;
-    Vector metallic = r.at.get(r.of(l.material, MATERIAL) + METAL, MATERIAL);
-    float surfaces = (float)l.totals[0][SURFACES], weight = l.metallic_weight / (surfaces > 1 ? surfaces : 1);
-    r.add(sums[LOSS], weight * metallic * (1.0f - metallic));
+    const float* material = r.of(l.material, MATERIAL);
+    auto of_material = [&](int i) { return r.at.get(material + i, MATERIAL); };
+    Vector metallic = of_material(METAL), brightest = larger(larger(of_material(0), of_material(1)), of_material(2));
+    float surfaces = (float)l.totals[0][SURFACES], share_of_each = 1 / (surfaces > 1 ? surfaces : 1);
+    float weight = share_of_each * l.metallic_weight;
+    Vector dark = share_of_each * l.dark_weight * clamp(1.0f - brightest * (1 / DARK), 0, 1);
+    r.add(sums[LOSS], weight * metallic * (1.0f - metallic) + dark * metallic);
+    Vector by_metallic = weight * (1.0f - 2.0f * metallic) + dark;
     float* row = r.of(l.by_material, MATERIAL);
-    for (int i = 0; i < MATERIAL; i++) r.at.put(row + i, MATERIAL, i == METAL ? weight * (1.0f - 2.0f * metallic) : Vector());
+    for (int i = 0; i < MATERIAL; i++) r.at.put(row + i, MATERIAL, i == METAL ? by_metallic : Vector());
   });
 }
 

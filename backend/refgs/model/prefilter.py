@@ -22,8 +22,9 @@ from refgs.model import cubemap, harmonics
 from refgs.model.cubemap import SYMMETRIES
 
 ROUGHNESS = (0.0, 0.08, 0.15, 0.25, 0.4, 0.65, 1.0)  # of the levels; level 0 is the cubemap itself
-DIVISOR = (1, 1, 2, 4, 4, 8, 8)  # a level's side is the cubemap's divided by this
+DIVISOR = (1, 2, 2, 4, 4, 8, 8)  # a level's side is the cubemap's divided by this
 CELLS = 256  # a texel of the pyramid is split while it holds more than 1/CELLS of the lobe
+LEAST_SIDE = 8  # of a level, where the cubemap is as fine
 COARSEST = 4  # side of the last pooled mip
 BLOCK = (
     32  # orbits that one product adds up: half of those of the smallest cubemap, for a single product is shared, too
@@ -35,7 +36,7 @@ COSINE = (1.0,) + (2 / 3,) * 3 + (1 / 4,) * 5
 
 def level_sides(resolution: int) -> list[int]:
     """Side of each prefiltered level, in texels."""
-    return [max(resolution // d, COARSEST) for d in DIVISOR]
+    return [max(resolution // d, min(resolution, LEAST_SIDE)) for d in DIVISOR]
 
 
 def level_of(roughness):

@@ -53,7 +53,10 @@ class _Work(Work):
         ),
         ("rotation", ctypes.c_float * 9),
         *((n, ctypes.c_float) for n in ("across", "down", "left", "top")),
-        *((f"{n}_weight", ctypes.c_float) for n in ("color", "normal", "smooth_x", "smooth_y", "alpha", "metallic")),
+        *(
+            (f"{n}_weight", ctypes.c_float)
+            for n in ("color", "normal", "smooth_x", "smooth_y", "alpha", "metallic", "dark")
+        ),
         *((n, ctypes.c_void_p) for n in ("photo", "clipped", "by_clipped")),
         *((f"by_{n}", ctypes.c_void_p) for n in ("color", "normal", "depth", "alpha", "material")),
         *((n, ctypes.c_void_p) for n in ("slopes", "sums", "first", "second", "structure", "irradiance")),
@@ -104,7 +107,7 @@ class _Objective(torch.autograd.Function):
         work.smooth_x_weight = weights.smooth / max(height * (width - 1), 1)
         work.smooth_y_weight = weights.smooth / max((height - 1) * width, 1)
         work.alpha_weight = weights.alpha / alpha.numel()
-        work.metallic_weight = weights.metallic * progress**2
+        work.metallic_weight, work.dark_weight = weights.metallic * progress**2, weights.metallic
         work.dssim_weight, work.light_weight = weights.dssim, weights.light
         by = {f"by_{name}": value for name, value in gradients.items()}
         work.attach(**inputs, **codes, **by, **buffers, sums=sums[0])
@@ -165,7 +168,8 @@ def objective(
 
     And m (1 − m) of the metallic m, over the object: nothing real is half a metal. Where the metallic is decided, the
     highlights of dielectrics, 4 % of the light and without colour, fix the light's scale and white balance, which metals
-    alone cannot. Not before it is known which is which, hence with the square of the progress.
+    alone cannot. Not before it is known which is which, hence with the square of the progress. From the start, though, m of what
+    is darker than any metal, by how much it is: a metal of 4 % would mirror as dark glass does.
     """
     material = rendering.material if weights.metallic > 0 else None
     maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material

@@ -17,6 +17,7 @@ from refgs.errors import InputError
 from refgs.geometry.extract import extract
 from refgs.geometry.mesh import Mesh, clean
 from refgs.geometry.visibility import Occluder
+from refgs.model import cubemap
 from refgs.model.environment import Environment
 from refgs.model.surfels import Parameters, Surfels, activate
 from refgs.paths import whole
@@ -41,6 +42,8 @@ EXPOSURES_ALIKE = (
     math.log(2) / 3
 )  # a third of a stop, which is what cameras step by: what shading lacks can look like less
 TRACED = 24  # views at the least for the mesh that inter-reflection is traced on; all where there are fewer
+LIGHT_REFINED = 0.2  # part of the training after which the light has all its texels
+LEAST_LIGHT = 16  # texels along a side
 FEWER = 0.8  # of the surfels, where there is no memory for all
 LEAST_SURFELS = 1000
 MIRROR = 7.0  # logit of a mirror's base colour, and the negative of its roughness's
@@ -91,7 +94,7 @@ class Trainer:
         self._choose_light_frame(start)
         self.parameters = {name: value.detach().to(self.device).requires_grad_() for name, value in start.items()}
         report("stage", {"what": source})
-        self.light = torch.empty(6 * settings.environment.resolution**2, 3, device=self.device)
+        self.light = torch.empty(6 * self._light_resolution(0) ** 2, 3, device=self.device)
         self.light.fill_(self._start_light()).requires_grad_()
         self._drop_unused()
         groups = [
@@ -175,6 +178,21 @@ class Trainer:
         display = self.settings.render.color_space == "display"
         return math.log(radiance / (1 - radiance)) if display else math.log(math.expm1(radiance))
 
+    def _light_resolution(self, progress: float) -> int:
+        """Fewer texels learn sooner, each being seen more often: at first the light has half as many along each side."""
+        finest = self.settings.environment.resolution
+        return finest if progress >= LIGHT_REFINED else max(finest // 2, LEAST_LIGHT)
+
+    @torch.no_grad()
+    def _refine_light(self) -> None:
+        """Go on with twice as many texels along each side."""
+        side = math.isqrt(len(self.light) // 6)
+        directions = cubemap.texel_directions(2 * side).float()
+        finer = cubemap.sample(self.light.cpu(), (side,), directions, torch.zeros(len(directions)))
+        self.optimizer.state.pop(self.light, None)
+        self.light = finer.to(self.device).requires_grad_()
+        next(g for g in self.optimizer.param_groups if g["name"] == "environment")["params"] = [self.light]
+
     def _shading(self) -> RenderSettings:
         """How pictures are made at this stage."""
         settings = self.settings.render
@@ -208,6 +226,8 @@ class Trainer:
         if self.initial and progress >= settings.initial.until:
             self._begin_deferred()
         self._set_rates(progress)
+        if settings.render.shading != "sh" and len(self.light) < 6 * self._light_resolution(progress) ** 2:
+            self._refine_light()
 
         surfels, environment = self.surfels(), self.environment()
         exposure = None if self.exposures is None else self.exposures[view]
