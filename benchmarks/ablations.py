@@ -10,10 +10,10 @@ the paper's Tables 3 and 4 are from its own.
 import argparse
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
-from benchmarks.paper import call, figures, mean
+from benchmarks import runs
+from benchmarks.runs import console, figures, mean
 from benchmarks.scenes import NAMES
 from refgs.errors import InputError
 from refgs.paths import clone_root
@@ -50,7 +50,6 @@ PAPER = {
     "without the initial stage": (29.94, 3.53),
     "propagation without materials": (29.68, 3.86),
 }
-console = Console(soft_wrap=True)
 
 
 def find_scenes(folder: Path) -> list[Path]:
@@ -59,19 +58,6 @@ def find_scenes(folder: Path) -> list[Path]:
     if not found:
         raise InputError(f"{folder}: no scene is here: render them with python -m benchmarks.scenes all --out {folder}")
     return found
-
-
-def train(capture: Path, run: Path, words: list[object]) -> bool:
-    """Train and evaluate what of it is not done yet; whether that succeeded."""
-    if figures(run) is not None:
-        return True
-    if not (run / "splats.ply").exists():
-        console.rule(str(run))
-        minutes = words[words.index("--minutes") :] if "--minutes" in words else []
-        begun = ["--resume", *minutes] if (run / "run.toml").exists() else words
-        if call("train", capture, "--out", run, *begun) != 0:
-            return False
-    return call("evaluate", run, "--ground-truth", capture / "ground_truth") == 0
 
 
 Found = dict[str, dict[str, dict[str, dict]]]
@@ -89,12 +75,13 @@ def measure(scenes: list[Path], out: Path, preset: str) -> tuple[Found, list[Pat
                 run = out / kind / name.replace(" ", "_").replace(",", "") / scene.name
                 settings = [*WHOLE, f"propagation.every={every}", f"propagation.rest={max(1, every // 10)}", *changes]
                 words = ["--preset", preset, *(word for change in settings for word in ("--set", change))]
+                minutes = None
                 if kind == "time":
                     whole = found["iterations"].get("the whole", {}).get(scene.name)
                     if name == "the whole" or whole is None:
                         continue
-                    words += ["--minutes", whole["training_seconds"] / 60]
-                if train(scene, run, words):
+                    minutes = whole["training_seconds"] / 60
+                if runs.measure(scene, run, words, minutes, scene / "ground_truth"):
                     rows.setdefault(name, {})[scene.name] = figures(run)
                 else:
                     failed.append(run)

@@ -9,17 +9,14 @@ again, one that was interrupted goes on. Prints Tables 1, 2 and 8 with the paper
 """
 
 import argparse
-import json
-import signal
-import subprocess
-import sys
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
+from benchmarks import runs
+from benchmarks.runs import console, figures, mean, text
 from refgs.capture.nero import SPLIT
 from refgs.errors import InputError
 from refgs.paths import clone_root
@@ -28,7 +25,6 @@ from refgs.settings import load_settings
 PAPER = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 NORMALS = PAPER.pop("normals")
 MEASURES = (("psnr", "PSNR", ".2f"), ("ssim", "SSIM", ".3f"), ("lpips", "LPIPS", ".3f"))
-console = Console(soft_wrap=True)
 
 
 @dataclass(frozen=True)
@@ -67,43 +63,7 @@ def find_scenes(data: Path) -> list[Scene]:
 
 def measure(scene: Scene, run: Path, preset: str) -> bool:
     """Train and evaluate what of it is not done yet; whether that succeeded."""
-    if figures(run) is not None:
-        return True
-    if not (run / "splats.ply").exists():
-        begun = ["--resume"] if (run / "run.toml").exists() else ["--preset", preset, "--set", "image.max_side=8192"]
-        console.rule(f"{scene.data_set}: {scene.name}")
-        if call("train", scene.capture, "--out", run, *begun) != 0:
-            return False
-    return call("evaluate", run) == 0
-
-
-def call(*arguments: object) -> int:
-    """Run a command of refgs in a process of its own, which gives all memory back; its exit status."""
-    process = subprocess.Popen([sys.executable, "-m", "refgs.cli", *map(str, arguments)])
-    try:
-        status = process.wait()
-    except KeyboardInterrupt:
-        process.send_signal(signal.SIGINT)
-        process.wait()  # a training writes a checkpoint first
-        raise
-    if status == 130:
-        raise KeyboardInterrupt
-    return status
-
-
-def figures(run: Path) -> dict[str, float] | None:
-    """What a finished run was measured to be, with the hours of its training where known; None if it is not finished."""
-    try:
-        found = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    if "psnr" not in found or found.get("split") != "test":
-        return None
-    try:
-        last = (run / "history.jsonl").read_text(encoding="utf-8").splitlines()[-1]
-        return found | {"hours": json.loads(last)["seconds"] / 3600}
-    except (OSError, ValueError, LookupError):
-        return found
+    return runs.measure(scene.capture, run, ["--preset", preset, "--set", "image.max_side=8192"])
 
 
 def tables(found: dict[tuple[str, str], dict[str, float]], preset: str) -> list[Table]:
@@ -122,13 +82,17 @@ def tables(found: dict[tuple[str, str], dict[str, float]], preset: str) -> list[
             theirs = [data_set[measure][number] for _, number in rows]
             for title, values in ((heading, ours), ("paper", theirs)):
                 table.add_column(title, justify="right")
-                columns.append([_text(value, form) for value in (*values, mean(values))])
+                columns.append([text(value, form) for value in (*values, mean(values))])
         for name, *cells in zip([*(name for name, _ in rows), "mean"], *columns, strict=True):
             if name == "mean":
                 table.add_section()
             table.add_row(name, *cells)
         result.append(table)
-    shiny = {name: row for (key, name), row in found.items() if key == "shiny_blender"}
+    shiny = {}
+    for (key, name), row in found.items():
+        if key == "shiny_blender":
+            seconds = row.get("training_seconds")
+            shiny[name] = row | {"hours": None if seconds is None else seconds / 3600}
     if shiny:
         title = (
             f"Table 2, Shiny Blender: preset {preset}, {len(shiny)} of {len(PAPER['shiny_blender']['scenes'])} scenes"
@@ -138,21 +102,12 @@ def tables(found: dict[tuple[str, str], dict[str, float]], preset: str) -> list[
         for _, heading, _ in keys:
             table.add_column(heading, justify="right")
         for name, row in shiny.items():
-            table.add_row(name, *(_text(row.get(key), form) for key, _, form in keys))
+            table.add_row(name, *(text(row.get(key), form) for key, _, form in keys))
         table.add_section()
-        table.add_row("mean", *(_text(mean([r.get(key) for r in shiny.values()]), form) for key, _, form in keys))
-        table.add_row("paper", *(_text(NORMALS[key], form) for key, _, form in keys))
+        table.add_row("mean", *(text(mean([r.get(key) for r in shiny.values()]), form) for key, _, form in keys))
+        table.add_row("paper", *(text(NORMALS[key], form) for key, _, form in keys))
         result.append(table)
     return result
-
-
-def mean(values: list[float | None]) -> float | None:
-    """None unless all are known: a mean over other scenes than the paper's beside it would mislead."""
-    return None if None in values or not values else sum(values) / len(values)
-
-
-def _text(value: float | None, form: str) -> str:
-    return "–" if value is None else format(value, form)
 
 
 def main(arguments: list[str] | None = None) -> None:

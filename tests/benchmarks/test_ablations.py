@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from benchmarks import ablations
+from benchmarks import ablations, runs
 from refgs.errors import InputError
 from refgs.settings import load_settings
 
@@ -42,7 +42,7 @@ def test_nothing_is_trained_twice_and_figures_stand_beside_the_wholes(tmp_path, 
             finish(run, psnr=psnr + (run.name == "rings"), ssim=0.9, flip=0.1, normal_mae_degrees=3.0)
         return 0
 
-    monkeypatch.setattr(ablations, "call", call)
+    monkeypatch.setattr(runs, "call", call)
     found, failed = ablations.measure(ablations.find_scenes(tmp_path), tmp_path / "out", "quick")
     assert not failed
     assert [words[:2] for words in called if words[0] == "train"] == [("train", "ball")] * 3 + [("train", "rings")] * 3

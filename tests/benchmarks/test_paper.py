@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from benchmarks import paper
+from benchmarks import paper, runs
 from refgs import commands
 from refgs.errors import InputError
 
@@ -21,7 +21,6 @@ def finish(run: Path, **figures: float) -> None:
     (run / "run.toml").touch()
     (run / "splats.ply").touch()
     (run / "metrics.json").write_text(json.dumps({"split": "test", **figures}))
-    (run / "history.jsonl").write_text('{"seconds": 60.0}\n{"seconds": 1800.0}\n')
 
 
 def printed(tables) -> list[list[str]]:
@@ -94,7 +93,7 @@ def test_other_benchmarks_take_no_options():
 
 def test_only_what_is_missing_is_done(tmp_path, monkeypatch):
     done = []
-    monkeypatch.setattr(paper, "call", lambda *arguments: done.append(arguments) or 0)
+    monkeypatch.setattr(runs, "call", lambda *arguments: done.append(arguments) or 0)
     scene = paper.Scene("shiny_blender", "ball", tmp_path / "ball")
     run = scene.run(tmp_path)
     assert paper.measure(scene, run, "quick")
@@ -109,7 +108,7 @@ def test_only_what_is_missing_is_done(tmp_path, monkeypatch):
     done.clear()
     assert paper.measure(scene, run, "quick")
     assert done == [("train", scene.capture, "--out", run, "--resume"), ("evaluate", run)]
-    monkeypatch.setattr(paper, "call", lambda *_: 2)
+    monkeypatch.setattr(runs, "call", lambda *_: 2)
     assert not paper.measure(scene, run, "quick")
 
 
@@ -117,8 +116,20 @@ def test_tables_of_finished_runs(tmp_path, capsys):
     """Nothing is trained; a scene without LPIPS has none, and then there is no mean of it."""
     data, out = tmp_path / "data", tmp_path / "runs"
     measured = {
-        "shiny_blender/coffee": {"psnr": 36.0, "ssim": 0.98, "lpips": 0.1, "normal_mae_degrees": 1.5},
-        "shiny_blender/toaster": {"psnr": 32.0, "ssim": 0.96, "lpips": 0.03, "normal_mae_degrees": 2.5},
+        "shiny_blender/coffee": {
+            "psnr": 36.0,
+            "ssim": 0.98,
+            "lpips": 0.1,
+            "normal_mae_degrees": 1.5,
+            "training_seconds": 1800,
+        },
+        "shiny_blender/toaster": {
+            "psnr": 32.0,
+            "ssim": 0.96,
+            "lpips": 0.03,
+            "normal_mae_degrees": 2.5,
+            "training_seconds": 1800,
+        },
         "glossy_synthetic/cat": {"psnr": 33.5, "ssim": 0.97, "lpips": 0.04},
         "nerf_synthetic/materials": {"psnr": 34.0, "ssim": 0.97, "lpips": 0.02},
         "nerf_synthetic/ship": {"psnr": 30.0, "ssim": 0.9},
@@ -152,7 +163,7 @@ def test_a_scene_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, caps
     for name in ("ball", "car"):
         (tmp_path / "shiny_blender" / name).mkdir(parents=True)
     finish(tmp_path / "runs" / "standard" / "shiny_blender" / "car", psnr=31.0, ssim=0.9, lpips=0.1)
-    monkeypatch.setattr(paper, "call", lambda *_: 2)
+    monkeypatch.setattr(runs, "call", lambda *_: 2)
     with pytest.raises(SystemExit) as left:
         paper.main(["--data", str(tmp_path), "--out", str(tmp_path / "runs"), "--preset", "standard"])
     said = capsys.readouterr().out
@@ -176,7 +187,7 @@ def test_from_photos_to_the_tables(tmp_path, monkeypatch, capsys):
             commands.evaluate(folder, "test", None)
         return 0
 
-    monkeypatch.setattr(paper, "call", call)
+    monkeypatch.setattr(runs, "call", call)
     paper.main(["--data", str(tmp_path), "--out", str(tmp_path / "runs"), "--preset", str(preset)])
     assert "Table 1, Shiny Blender: preset tiny, 1 of 6 scenes" in " ".join(capsys.readouterr().out.split())
     assert (tmp_path / "runs/tiny/shiny_blender/ball/pictures/test/photo/r_0.png").exists()

@@ -85,6 +85,21 @@ def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, 
     return torch.from_numpy(visible)
 
 
+def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirect: bool) -> list[Tensor]:
+    """What `shade` takes of surfels, as a camera sees them, (N, C) each: normals, albedo, metallic, roughness; colour by direction
+    where there is any; with `indirect`, radiance from the object itself; positions."""
+    facing = surfels.rotations
+    if surfels.scales.shape[1] == 3:
+        facing, _ = shortest_last(surfels.rotations, surfels.scales)
+    normals = facing_normals(facing, surfels.positions, camera)
+    lit = [normals, surfels.albedo, surfels.metallic, surfels.roughness]
+    if settings.shading == "sh" or settings.diffuse == "sh":
+        lit.append(directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera))
+    if indirect:
+        lit.append(directional(surfels.indirect_dc, surfels.indirect_rest, 0.0, surfels.positions, camera, normals))
+    return [*lit, surfels.positions]
+
+
 def render(
     surfels: Surfels,
     environment: Environment | None,
@@ -105,22 +120,11 @@ def render(
     """
     deferred, display = settings.shading == "deferred", settings.color_space == "display"
     mirror = settings.reflection == "mirror"
-    facing = surfels.rotations
-    if surfels.scales.shape[1] == 3:
-        facing, _ = shortest_last(surfels.rotations, surfels.scales)
-    normals = facing_normals(facing, surfels.positions, camera)
-    lit = [normals, surfels.albedo, surfels.metallic, surfels.roughness]
-    if settings.shading == "sh" or settings.diffuse == "sh":
-        colour = directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera)
-        lit.append(colour)
-    if deferred and occluder is not None:
-        indirect = surfels.indirect_dc, surfels.indirect_rest
-        lit.append(directional(*indirect, 0.0, surfels.positions, camera, normals))
-    lit.append(surfels.positions)
+    lit = channels(surfels, camera, settings, deferred and occluder is not None)
     if settings.shading == "splat":
-        blended = [normals, shade_splats(stack(lit), environment, camera, mirror), *lit[1:4]]
+        blended = [lit[0], shade_splats(stack(lit), environment, camera, mirror), *lit[1:4]]
     else:
-        blended = lit if deferred else [normals, colour]
+        blended = lit if deferred else [lit[0], lit[4]]
     features, depth, alpha = rasterize(*discs(surfels, camera), stack(blended), camera, near=near)
     if deferred:
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
