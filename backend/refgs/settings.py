@@ -113,6 +113,7 @@ class LossSettings(_Section):
     dssim: float = Field(ge=0, le=1, description="λ of (1 − λ) L1 + λ D-SSIM")
     normal: float = Field(ge=0, description="weight of normal consistency with the depth")
     smooth: float = Field(ge=0, description="weight of edge-aware normal smoothness")
+    even: float = Field(ge=0, description="weight of edge-aware smoothness of metallic and roughness")
     alpha: float = Field(ge=0, description="weight of the mask, where there is one")
     metallic: float = Field(
         ge=0, description="weight, at the end, of a metallic that is neither 0 nor 1; and of metals too dark for any"

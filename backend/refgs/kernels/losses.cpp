@@ -12,7 +12,7 @@ struct Losses {
   const uint8_t *image, *mask;                             // (H, W, 3), (H, W) or null: as on disk, 255 is 1
   const float* background;                                 // (3)
   float rotation[9], across, down, left, top;              // world to camera; at depth 1 a pixel's size, and where the first one is
-  float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, alpha_weight, metallic_weight, dark_weight;
+  float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, even_x_weight, even_y_weight, alpha_weight, metallic_weight, dark_weight;
   float *photo, *clipped;   // (H, W, 3) the photo over the background; C as above, for D-SSIM
   const float* by_clipped;  // (H, W, 3) D-SSIM's share
   float *by_color, *by_normal, *by_depth, *by_alpha, *by_material;
@@ -30,7 +30,7 @@ struct Losses {
 enum { LOSS, SURFACES, SQUARES, SUMS };  // weighted terms; pixels with a surface; squared errors
 constexpr float SATURATED = 0.998f;  // a photo's value above which the true radiance is unknown
 constexpr float SOLID = 0.5f, COVERED = 1 / 255.0f;  // alphas of an opaque pixel, and of one that is not background
-constexpr int MATERIAL = 5, METAL = 3;               // numbers of a material; which is the metallic
+constexpr int MATERIAL = 5, METAL = 3;               // numbers of a material; which is the metallic, before the roughness
 constexpr float DARK = 0.1f;                         // no metal's base colour is darker in all of its channels
 
 // A vector's worth of pixels of a row.
@@ -157,18 +157,23 @@ INLINE void normal_term(const Row& r, Sum& loss) {
   r.put(slopes[0], by_q + by_p), r.put(slopes[1], by_q - by_p), r.put(slopes[2], by_s + by_t), r.put(slopes[3], by_s - by_t);
 }
 
-// The change of the normal towards a neighbour, and its derivative, which both of them feel; counted once, by the pixel before.
-INLINE Vectors smooth_term(const Row& r, int dx, int dy, float weight, Sum& loss) {
+// The change of the normal, and of metallic and roughness, towards a neighbour, and its derivatives, which both of them feel; counted
+// once, by the pixel before.
+INLINE void smooth_term(const Row& r, int dx, int dy, float smooth, float even, Sum& loss, Vectors& by_normal, Vector (&by_material)[2]) {
   const Losses& l = r.l;
   Mask both = r.inside & r.at.beside(dx).inside();
-  if (weight == 0 || r.y + dy < 0 || r.y + dy >= l.height) return {};
+  if ((smooth == 0 && even == 0) || r.y + dy < 0 || r.y + dy >= l.height) return;
   both &= (r.get(l.alpha) > SOLID) & (r.get(l.alpha, dx, dy) > SOLID);
-  if (!any(both)) return {};
+  if (!any(both)) return;
   Vectors n = r.get3(l.normal) - r.get3(l.normal, dx, dy), photo = r.get3(l.photo) - r.get3(l.photo, dx, dy);
-  Vector edge = magnitude(photo.x) + magnitude(photo.y) + magnitude(photo.z);
-  Vector w = select(both, weight * exp2(-1.442695f * edge), Vector());
-  if (dx + dy > 0) r.add(loss, w * (magnitude(n.x) + magnitude(n.y) + magnitude(n.z)));
-  return {w * sign(n.x), w * sign(n.y), w * sign(n.z)};
+  Vector edge = magnitude(photo.x) + magnitude(photo.y) + magnitude(photo.z), kept = select(both, exp2(-1.442695f * edge), Vector());
+  Vector w = smooth * kept, by_even = even * kept, cost = w * (magnitude(n.x) + magnitude(n.y) + magnitude(n.z));
+  by_normal = by_normal + Vectors{w * sign(n.x), w * sign(n.y), w * sign(n.z)};
+  for (int i = 0; i < 2 && even != 0; i++) {
+    Vector m = r.at.get(r.of(l.material, MATERIAL) + METAL + i, MATERIAL) - r.at.beside(dx).get(r.of(l.material, MATERIAL, dy) + METAL + i, MATERIAL);
+    cost += by_even * magnitude(m), by_material[i] += by_even * sign(m);
+  }
+  if (dx + dy > 0) r.add(loss, cost);
 }
 
 // Body(row) for all the pixels; its sums are those of a row, or on CUDA of a block, which has a tile of 32 x 8 pixels.
@@ -210,8 +215,11 @@ KERNEL(refgs_losses_second, Losses, l) {
   each(l, [](const Row& r, Sum (&sums)[SUMS]) {
     const Losses& l = r.l;
     Vectors by_normal = r.get3(l.by_normal);
-    by_normal = by_normal + smooth_term(r, 1, 0, l.smooth_x_weight, sums[LOSS]) + smooth_term(r, -1, 0, l.smooth_x_weight, sums[LOSS]);
-    by_normal = by_normal + smooth_term(r, 0, 1, l.smooth_y_weight, sums[LOSS]) + smooth_term(r, 0, -1, l.smooth_y_weight, sums[LOSS]);
+    Vector by_smooth[2] = {};  // of metallic and roughness
+    for (int step = -1; step <= 1; step += 2) {
+      smooth_term(r, step, 0, l.smooth_x_weight, l.even_x_weight, sums[LOSS], by_normal, by_smooth);
+      smooth_term(r, 0, step, l.smooth_y_weight, l.even_y_weight, sums[LOSS], by_normal, by_smooth);
+    }
 
     int64_t size = l.width * l.height;
     Vector by_depth = r.get(l.slopes, -1) + r.get(l.slopes + size, 1);
@@ -233,9 +241,9 @@ KERNEL(refgs_losses_second, Losses, l) {
     float weight = share_of_each * l.metallic_weight;
     Vector dark = share_of_each * l.dark_weight * clamp(1.0f - brightest * (1 / DARK), 0, 1);
     r.add(sums[LOSS], weight * metallic * (1.0f - metallic) + dark * metallic);
-    Vector by_metallic = weight * (1.0f - 2.0f * metallic) + dark;
+    by_smooth[0] += weight * (1.0f - 2.0f * metallic) + dark;
     float* row = r.of(l.by_material, MATERIAL);
-    for (int i = 0; i < MATERIAL; i++) r.at.put(row + i, MATERIAL, i == METAL ? by_metallic : Vector());
+    for (int i = 0; i < MATERIAL; i++) r.at.put(row + i, MATERIAL, i < METAL ? Vector() : by_smooth[i - METAL]);
   });
 }
 

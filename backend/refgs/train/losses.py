@@ -55,7 +55,7 @@ class _Work(Work):
         *((n, ctypes.c_float) for n in ("across", "down", "left", "top")),
         *(
             (f"{n}_weight", ctypes.c_float)
-            for n in ("color", "normal", "smooth_x", "smooth_y", "alpha", "metallic", "dark")
+            for n in ("color", "normal", "smooth_x", "smooth_y", "even_x", "even_y", "alpha", "metallic", "dark")
         ),
         *((n, ctypes.c_void_p) for n in ("photo", "clipped", "by_clipped")),
         *((f"by_{n}", ctypes.c_void_p) for n in ("color", "normal", "depth", "alpha", "material")),
@@ -104,8 +104,10 @@ class _Objective(torch.autograd.Function):
         work.down, work.top = 1 / camera.fy, (0.5 - camera.cy) / camera.fy
         work.color_weight = (1 - weights.dssim) / color.numel()
         work.normal_weight = weights.normal / max((height - 2) * (width - 2), 1)
-        work.smooth_x_weight = weights.smooth / max(height * (width - 1), 1)
-        work.smooth_y_weight = weights.smooth / max((height - 1) * width, 1)
+        across, down = max(height * (width - 1), 1), max((height - 1) * width, 1)
+        work.smooth_x_weight, work.smooth_y_weight = weights.smooth / across, weights.smooth / down
+        if material is not None:
+            work.even_x_weight, work.even_y_weight = weights.even / across, weights.even / down
         work.alpha_weight = weights.alpha / alpha.numel()
         work.metallic_weight, work.dark_weight = weights.metallic * progress**2, weights.metallic
         work.dssim_weight, work.light_weight = weights.dssim, weights.light
@@ -159,7 +161,8 @@ def objective(
     Colour: (1 − λ) L1 + λ D-SSIM on sRGB, against the photo over the background. The rendering is clipped only where the
     photo is: elsewhere an over-bright pixel must feel its gradient. Normals: 1 − ÑᵀN, Ñ from the depth by central
     differences, where the surface is opaque around the pixel. Smoothness: ‖∇N‖ exp(−‖∇C_gt‖), forward differences, where
-    the surface is opaque. The mask: |α − mask|.
+    the surface is opaque; with a weight of its own, of metallic and roughness too, which no photo tells where all that is mirrored
+    there is even. The mask: |α − mask|.
 
     The light: squared departure from grey of its mean over all directions. Warm metal under a neutral light and neutral metal
     under a warm light look almost alike; without a word for one of them, white balance drifts between the two. Only the
@@ -171,7 +174,7 @@ def objective(
     alone cannot. Not before it is known which is which, hence with the square of the progress. From the start, though, m of what
     is darker than any metal, by how much it is: a metal of 4 % would mirror as dark glass does.
     """
-    material = rendering.material if weights.metallic > 0 else None
+    material = rendering.material if weights.metallic > 0 or weights.even > 0 else None
     maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material
     light = environment.irradiance if environment is not None and weights.light > 0 else None
     if light is not None and environment.reference is not None:
