@@ -82,7 +82,7 @@ def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
     at = record("activations and light's prefilter", at)
     rendering = render(surfels, environment, photo.camera, trainer.background, settings.render, trainer.near)
     at = record("raster and shading", at)
-    loss, _ = objective(rendering, environment, photo, trainer.background, settings.loss, 0.5)
+    loss, _ = objective(rendering, trainer.mean_light(environment), photo, trainer.background, settings.loss, 0.5)
     at = record("losses", at)
     loss.backward()
     record("backward of all", at)

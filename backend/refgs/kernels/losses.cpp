@@ -20,9 +20,9 @@ struct Losses {
   double* sums;             // (SUMS) of each row, or of each block's pixels
   const double* totals[2];  // (SUMS) of each pass
   const float* structure;   // D-SSIM, or null
-  const float* irradiance;  // (9, 3) of the light, or null
+  const float* light;  // (3): its mean radiance; or null
   float dssim_weight, light_weight;
-  float *loss, *square, *by_irradiance;  // what comes of it: the loss; the mean squared error; (9, 3)
+  float *loss, *square, *by_light;  // what comes of it: the loss; the mean squared error; (3)
   float* scratch;           // none is used
   mutable Shared shared;
 };
@@ -247,24 +247,24 @@ KERNEL(refgs_losses_second, Losses, l) {
   });
 }
 
-// The whole, with the light's own word: the squared departure from grey of its mean over all directions, the constant harmonic. Of
+// The whole, with the light's own word: the squared departure from grey of its mean. Of
 // numbers m with mean u that is mean((m / u - 1)^2).
 KERNEL(refgs_losses_total, Losses, l) {
   share(l->shared, 1, 1, [&](int64_t) {
     const double *first = l->totals[0], *second = l->totals[1];
     double loss = first[LOSS] + second[LOSS];
     if (l->structure) loss += l->dssim_weight * (double)*l->structure;
-    if (l->irradiance) {
+    if (l->light) {
       double mean = 0, square = 0, along = 0, departure[3];  // along: what all three do to the mean
-      for (int c = 0; c < 3; c++) mean += l->irradiance[c] / 3.0;
+      for (int c = 0; c < 3; c++) mean += l->light[c] / 3.0;
       double weight = mean > 1e-9 ? l->light_weight : 0;  // darkness has no colour
       mean = mean > 1e-9 ? mean : 1;
       for (int c = 0; c < 3; c++) {
-        departure[c] = l->irradiance[c] / mean - 1;
+        departure[c] = l->light[c] / mean - 1;
         square += departure[c] * departure[c] / 3, along += departure[c] * (departure[c] + 1) / 3;
       }
       loss += weight * square;
-      for (int i = 0; i < 27; i++) l->by_irradiance[i] = i < 3 ? (float)(weight * 2 / 3 * (departure[i] - along) / mean) : 0;
+      for (int c = 0; c < 3; c++) l->by_light[c] = (float)(weight * 2 / 3 * (departure[c] - along) / mean);
     }
     *l->loss = (float)loss;
     *l->square = (float)(first[SQUARES] / (3 * l->width * l->height));

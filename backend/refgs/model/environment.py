@@ -1,7 +1,6 @@
 """The light: a cubemap of linear HDR radiance, prefiltered for the split sum, with the irradiance that lights the diffuse part."""
 
 import math
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -18,13 +17,6 @@ def turn_between(camera: Camera, reference: Camera) -> np.ndarray:
     angle = reference.heading - camera.heading
     sine, cosine = math.sin(angle), math.cos(angle)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-
-
-@lru_cache(maxsize=4)
-def _facing(resolution: int, direction: tuple[float, float, float], device: torch.device) -> Tensor:
-    """Weights of texels (6·R²,): their solid angles by the cosine to a direction, zero behind."""
-    cosine = cubemap.texel_directions(resolution) @ torch.tensor(direction, dtype=torch.float64)
-    return (cosine.clamp_min(0) * cubemap.texel_solid_angles(resolution)).float().to(device)
 
 
 class Environment:
@@ -50,12 +42,6 @@ class Environment:
     def diffuse(self, normals: Tensor) -> Tensor:
         """Irradiance / π (P, 3) about unit normals (P, 3): what a white matte surface sends out."""
         return (harmonics.basis(normals, 2) @ self.irradiance).clamp_min(0)
-
-    def seen(self) -> Tensor:
-        """The mean radiance (3,), but for a factor, of a light that stands with the camera, over the directions before the object, by
-        their cosine to the way to the camera. What is behind it is hardly ever mirrored, so may have any colour."""
-        towards = -self.reference.camera_to_world[:3, 2]
-        return _facing(self.resolution, tuple(towards.tolist()), self.radiance.device) @ self.radiance
 
     def turn(self, camera: Camera) -> np.ndarray:
         """The rotation (3, 3) that takes the world's directions to the light's, in a camera's picture."""

@@ -1,15 +1,24 @@
-"""Whether the light stood still or turned with the camera, asked of the photos before training."""
+"""What is known of the light before training: whether it stood still or turned with the camera, as the photos tell; and which part of
+it the object can show."""
 
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.capture import LoadedView
 from refgs.color import srgb_decode
 from refgs.geometry.project import inside, project, sample
-from refgs.model import harmonics
-from refgs.model.environment import turn_between
+from refgs.model import cubemap, harmonics
+from refgs.model.environment import Environment, turn_between
+from refgs.model.surfels import Surfels
+from refgs.render.rasterize import rasterize
+from refgs.render.renderer import channels
+from refgs.render.shade import mirror_directions
+from refgs.render.stack import stack
+from refgs.render.volume import discs
+from refgs.settings import RenderSettings
 
 SIDE = 96  # pixels: finer than this the hull is not the object
 POINTS = 2000
@@ -21,7 +30,33 @@ FOLDS = 4
 FEWEST = 3  # photos of a point from which its own brightness is known
 RIDGE = 1e-4
 SWEEPS = 4
+PART = 16  # texels along a side of the cubemap that says which directions are mirrored
+SOLID = 0.5  # alpha
 LESS = 0.95  # of the error under a light that stands still, below which it turns: where in doubt, it stands
+
+
+def mirrored(
+    surfels: Surfels, cameras: list[Camera], light: Environment, settings: RenderSettings, near: float
+) -> Tensor:
+    """Which part of the light is seen mirrored by some camera: weights of its texels (6·R²,), their solid angles there and zero
+    elsewhere, that sum to one. Where nothing is seen all of it counts."""
+    seen = torch.zeros(6 * PART * PART, dtype=torch.bool)
+    for camera in cameras:
+        lit = stack(channels(surfels, camera, settings, indirect=True))
+        features, _, alpha = rasterize(*discs(surfels, camera), lit, camera, near=near)
+        turn = torch.from_numpy(light.turn(camera)).float().T
+        seen[_cells(mirror_directions(features, alpha, camera)[alpha > SOLID].cpu() @ turn)] = True
+    weights = cubemap.texel_solid_angles(light.resolution).float()
+    part = seen[_cells(cubemap.texel_directions(light.resolution).float())]
+    weights = weights * part if part.any() else weights
+    return (weights / weights.sum()).to(light.radiance.device)
+
+
+def _cells(directions: Tensor) -> Tensor:
+    """Which texels of a cubemap of PART texels along a side directions (P, 3) lie in."""
+    face, s, t = cubemap.face_coordinates(directions)
+    column, row = (((x + 1) / 2 * PART).long().clamp(0, PART - 1) for x in (s, t))
+    return (face * PART + row) * PART + column
 
 
 def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple[str, str]:

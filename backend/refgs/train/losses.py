@@ -11,7 +11,6 @@ from refgs.camera import Camera
 from refgs.capture import LoadedView
 from refgs.kernels import cuda, load
 from refgs.kernels.load import Shared, Work, check, run
-from refgs.model.environment import Environment
 from refgs.render.renderer import Rendering
 from refgs.render.ssim import dssim
 from refgs.settings import LossSettings
@@ -59,9 +58,9 @@ class _Work(Work):
         ),
         *((n, ctypes.c_void_p) for n in ("photo", "clipped", "by_clipped")),
         *((f"by_{n}", ctypes.c_void_p) for n in ("color", "normal", "depth", "alpha", "material")),
-        *((n, ctypes.c_void_p) for n in ("slopes", "sums", "first", "second", "structure", "irradiance")),
+        *((n, ctypes.c_void_p) for n in ("slopes", "sums", "first", "second", "structure", "light")),
         *((n, ctypes.c_float) for n in ("dssim_weight", "light_weight")),
-        *((n, ctypes.c_void_p) for n in ("loss", "square", "by_irradiance", "scratch")),
+        *((n, ctypes.c_void_p) for n in ("loss", "square", "by_light", "scratch")),
         ("shared", Shared),
     )
 
@@ -69,10 +68,10 @@ class _Work(Work):
 class _Objective(torch.autograd.Function):
     """The derivatives are had with the value."""
 
-    DIFFERENTIABLE = "color", "normal", "depth", "alpha", "material", "irradiance"
+    DIFFERENTIABLE = "color", "normal", "depth", "alpha", "material", "light"
 
     @staticmethod
-    def forward(ctx, color, normal, depth, alpha, material, irradiance, photo, background, weights, progress):
+    def forward(ctx, color, normal, depth, alpha, material, light, photo, background, weights, progress):
         camera, (height, width) = photo.camera, alpha.shape
         inputs = {"color": color, "normal": normal, "depth": depth, "alpha": alpha}
         shapes = dict.fromkeys(inputs, (height, width))
@@ -80,8 +79,8 @@ class _Objective(torch.autograd.Function):
         inputs["background"] = background
         if material is not None:
             inputs["material"], shapes["material"] = material, (height, width, 5)
-        if irradiance is not None:
-            inputs["irradiance"], shapes["irradiance"] = irradiance, (9, 3)
+        if light is not None:
+            inputs["light"], shapes["light"] = light, (3,)
         check(**{name: (value, shapes[name]) for name, value in inputs.items()})
         inputs = {name: value.contiguous() for name, value in inputs.items()}
         color = inputs["color"]
@@ -150,7 +149,7 @@ def departure(exposure: Tensor) -> Tensor:
 
 def objective(
     rendering: Rendering,
-    environment: Environment | None,
+    light: Tensor | None,
     photo: Photo,
     background: Tensor,
     weights: LossSettings,
@@ -164,10 +163,10 @@ def objective(
     the surface is opaque; with a weight of its own, of metallic and roughness too, which no photo tells where all that is mirrored
     there is even. The mask: |α − mask|.
 
-    The light: squared departure from grey of its mean over all directions. Warm metal under a neutral light and neutral metal
-    under a warm light look almost alike; without a word for one of them, white balance drifts between the two. Only the
-    mean is held: the light's colours may differ by direction. Of a light that stands with the camera it is the mean over what
-    can be seen mirrored, for the rest would take on whatever colour the mean lacks.
+    The light: squared departure from grey of its mean radiance (3,), where one is given. Warm metal under a neutral light and
+    neutral metal under a warm light look almost alike; without a word for one of them, white balance drifts between the two. Only
+    the mean is held: the light's colours may differ by direction. It is to be the mean over what is seen mirrored, for the rest would
+    take on whatever colour the mean lacks.
 
     And m (1 − m) of the metallic m, over the object: nothing real is half a metal. Where the metallic is decided, the
     highlights of dielectrics, 4 % of the light and without colour, fix the light's scale and white balance, which metals
@@ -176,7 +175,4 @@ def objective(
     """
     material = rendering.material if weights.metallic > 0 or weights.even > 0 else None
     maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material
-    light = environment.irradiance if environment is not None and weights.light > 0 else None
-    if light is not None and environment.reference is not None:
-        light = torch.cat([environment.seen()[None], light[1:].detach()])  # of which the first are held
     return Objective(*_Objective.apply(*maps, light, photo, background, weights, progress))

@@ -27,7 +27,7 @@ from refgs.settings import RenderSettings, Settings
 from refgs.train import checkpoint
 from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify, propagate_normals, reset_opacity, thin
-from refgs.train.light import light_frame
+from refgs.train.light import light_frame, mirrored
 from refgs.train.losses import Photo, departure, objective
 from refgs.train.start import GEOMETRY, start_appearance, start_parameters
 
@@ -109,6 +109,7 @@ class Trainer:
         self.optimizer = Adam(groups)
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
         self.occluder: Occluder | None = None
+        self._mirrored: Tensor | None = None  # which part of the light the object shows
         self.initial = settings.render.shading == "deferred" and settings.initial.until > 0  # its stage is not over
 
     def _rate(self, name: str) -> float:
@@ -193,6 +194,16 @@ class Trainer:
         self.light = finer.to(self.device).requires_grad_()
         next(g for g in self.optimizer.param_groups if g["name"] == "environment")["params"] = [self.light]
 
+    def mean_light(self, light: Environment) -> Tensor | None:
+        """The light's mean radiance (3,) over what the object mirrors of it, if that is held to be grey."""
+        if self.settings.loss.light == 0:
+            return None
+        if self._mirrored is None or len(self._mirrored) != len(light.radiance):
+            cameras = [view.camera for view in self.views[:: max(1, len(self.views) // TRACED)]]
+            with torch.no_grad():
+                self._mirrored = mirrored(self.surfels(), cameras, light, self.settings.render, self.near)
+        return self._mirrored @ light.radiance
+
     def _shading(self) -> RenderSettings:
         """How pictures are made at this stage."""
         settings = self.settings.render
@@ -232,7 +243,8 @@ class Trainer:
         surfels, environment = self.surfels(), self.environment()
         exposure = None if self.exposures is None else self.exposures[view]
         rendering = self._render(surfels, environment, photo.camera, None if exposure is None else exposure.exp())
-        loss, square = objective(rendering, environment, photo, self.background, settings.loss, progress)
+        mean = None if environment is None else self.mean_light(environment)
+        loss, square = objective(rendering, mean, photo, self.background, settings.loss, progress)
         if exposure is not None:
             loss = loss + settings.loss.exposure * departure(exposure)
         loss.backward()
@@ -444,6 +456,8 @@ class Trainer:
         tensors |= {"environment": self.light, "motion.total": self.motion.total, "motion.views": self.motion.views}
         if self.exposures is not None:
             tensors |= {"exposure": self.exposures}
+        if self._mirrored is not None:
+            tensors |= {"mirrored": self._mirrored}
         if self.occluder is not None:
             mesh = self.occluder.mesh
             tensors |= {"occluder.vertices": torch.from_numpy(mesh.vertices)}
@@ -484,6 +498,7 @@ class Trainer:
             state = {key.removeprefix(prefix): t for key, t in tensors.items() if key.startswith(prefix)}
             if state:
                 self.optimizer.state[value] = state | {"step": int(state["step"])}
+        self._mirrored = tensors.get("mirrored")
         self.constant = {name: tensors[f"constant.{name}"] for name in self.constant}
         self.occluder = Occluder(Mesh(mesh["occluder.vertices"], mesh["occluder.faces"])) if mesh else None
         self._trim_history()
