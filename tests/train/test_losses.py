@@ -14,7 +14,7 @@ from refgs.train.losses import Photo, objective
 from tests.kernels import scenes, test_ssim
 from tests.kernels.emulate import emulate
 
-DARK = 0.1
+DARK, FLAT = 0.1, 0.01
 ALL = LossSettings(dssim=0.2, normal=0.3, smooth=0.4, even=0.25, alpha=0.5, metallic=0.6, light=0.0, exposure=0.0)
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
 MAPS = ("color", "normal", "blended_depth", "alpha", "material")
@@ -49,7 +49,11 @@ def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress
         kept = torch.exp(-step(photo)) * both
         terms[f"smooth {axis}"] = weights.smooth * (step(rendering.normal) * kept).mean()
         if rendering.material is not None:
-            terms[f"even {axis}"] = weights.even * (step(rendering.material[..., 3:]) * kept).mean()
+            change = rendering.material[..., 3:].diff(dim=axis)
+            change = (
+                torch.nn.functional.huber_loss(change, torch.zeros_like(change), reduction="none", delta=FLAT) / FLAT
+            )
+            terms[f"even {axis}"] = weights.even * (change.sum(dim=-1) * kept).mean()
     if mask is not None:
         terms["alpha"] = weights.alpha * (rendering.alpha - mask).abs().mean()
     if rendering.material is not None:

@@ -31,6 +31,7 @@ enum { LOSS, SURFACES, SQUARES, SUMS };  // weighted terms; pixels with a surfac
 constexpr float SATURATED = 0.998f;  // a photo's value above which the true radiance is unknown
 constexpr float SOLID = 0.5f, COVERED = 1 / 255.0f;  // alphas of an opaque pixel, and of one that is not background
 constexpr int MATERIAL = 5, METAL = 3;               // numbers of a material; which is the metallic, before the roughness
+constexpr float FLAT = 0.01f;                        // a smaller change of metallic or roughness hardly counts
 constexpr float DARK = 0.1f;                         // no metal's base colour is darker in all of its channels
 
 // A vector's worth of pixels of a row.
@@ -171,7 +172,8 @@ INLINE void smooth_term(const Row& r, int dx, int dy, float smooth, float even, 
   by_normal = by_normal + Vectors{w * sign(n.x), w * sign(n.y), w * sign(n.z)};
   for (int i = 0; i < 2 && even != 0; i++) {
     Vector m = r.at.get(r.of(l.material, MATERIAL) + METAL + i, MATERIAL) - r.at.beside(dx).get(r.of(l.material, MATERIAL, dy) + METAL + i, MATERIAL);
-    cost += by_even * magnitude(m), by_material[i] += by_even * sign(m);
+    Vector slope = clamp(m * (1 / FLAT), -1, 1);  // Huber's: where all is even, rounding has no say
+    cost += by_even * slope * (m - 0.5f * FLAT * slope), by_material[i] += by_even * slope;
   }
   if (dx + dy > 0) r.add(loss, cost);
 }
