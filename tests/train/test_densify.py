@@ -39,8 +39,7 @@ def test_the_budget_holds_and_the_largest_gradients_go_first():
         state = optimizer.state[group["params"][0]]
         assert len(state["exp_avg"]) == 23
         assert (state["exp_avg"][-6:-3] == 0).all() and (state["exp_avg"][-3:] == 0).all()
-    state = optimizer.state[parameters["position"]]
-    assert (state["exp_avg"][:17] != 0).any() and (state["exp_avg_sq"] > 0).all()
+    assert (optimizer.state[parameters["position"]]["exp_avg"][:17] != 0).any()
 
 
 def test_a_division_keeps_the_variance():

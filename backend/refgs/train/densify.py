@@ -61,8 +61,8 @@ def densify(
 ) -> int:
     """Remove faint surfels; divide those with the largest screen gradient in two along their longer axis, up to the budget.
 
-    Parameters are replaced in the dictionary and in the optimiser; the moments of the survivors are kept, of the
-    new ones the second. Returns how many were divided. At least one surfel is kept.
+    Parameters are replaced in the dictionary and in the optimiser; the moments of the survivors are kept, those of the
+    new ones are zero. Returns how many were divided. At least one surfel is kept.
     """
     opacity = parameters["opacity"].sigmoid()
     keep = (opacity >= settings.prune_opacity) & torch.stack(
@@ -114,9 +114,9 @@ def thin(parameters: Parameters, optimizer: torch.optim.Optimizer, count: int) -
 def _take(
     parameters: Parameters, optimizer: torch.optim.Optimizer, index: Tensor, fresh: Sequence[Tensor] = ()
 ) -> None:
-    """Replace the surfels by those of an index, with their moments; those at `fresh` begin without the first: they stand elsewhere,
-    but gradients are as large as they were. Without the second, which says so, Adam's steps would be several times its rate for
-    hundreds of iterations. All of them or, where there is no memory for that, none."""
+    """Replace the surfels by those of an index, with their moments; those at `fresh` begin without. Adam's steps of these are then
+    several times its rate for a while, which sets the picture back at first but finds them their places: a capture without masks
+    ends better for it. All of them or, where there is no memory for that, none."""
     groups = [group for group in optimizer.param_groups if group["name"] in parameters]  # not the light
     made = []
     for group in groups:
@@ -124,8 +124,8 @@ def _take(
         new, state = old.detach()[index].requires_grad_(), dict(optimizer.state.get(old, {}))
         for key in ("exp_avg", "exp_avg_sq") if state else ():
             state[key] = state[key][index]
-        for rows in fresh if state else ():
-            state["exp_avg"][rows] = 0
+            for rows in fresh:
+                state[key][rows] = 0
         made.append((new, state))
     for group, (new, state) in zip(groups, made, strict=True):
         optimizer.state.pop(group["params"][0], None)
