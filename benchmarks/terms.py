@@ -39,9 +39,9 @@ def terms(folder: Path, truth: Path) -> dict[str, float]:
 
 @torch.no_grad()
 def _view(run: Run, truth: GroundTruth, light: Environment, camera: Camera) -> dict[str, float]:
-    rendering, settings = run.render(camera), run.settings.render
-    lit = channels(run.surfels(), camera, settings, run.occluder is not None)
-    features, _, alpha = rasterize(*discs(run.surfels(), camera), stack(lit), camera, near=run.near)
+    rendering, surfels, inter_reflects = run.render(camera), run.surfels(), run.occluder is not None
+    lit = channels(surfels, camera, run.settings.render, inter_reflects)
+    features, _, alpha = rasterize(*discs(surfels, camera), stack(lit), camera, near=run.near)
     others = features[..., 8:-3] / alpha.clamp_min(1e-6)[..., None]  # colour by direction, light from the object
     y, x = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     pixels = torch.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, torch.ones_like(x)], -1)
@@ -59,7 +59,6 @@ def _view(run: Run, truth: GroundTruth, light: Environment, camera: Camera) -> d
         visibility = true["visibility"] if "visibility" in parts else rendering.visibility
         stacked = torch.cat([normal, material, others, points.float()], dim=-1)
         given = opaque, light if "light" in parts else run.environment, camera, torch.ones(3)
-        inter_reflects = run.occluder is not None
         shaded = shade(stacked, *given, visibility if inter_reflects else None)
         return _fitted(shaded.radiance, photo)
 
@@ -70,9 +69,8 @@ def _view(run: Run, truth: GroundTruth, light: Environment, camera: Camera) -> d
 def _fitted(radiance: Tensor, photo: np.ndarray) -> float:
     alpha = photo[..., 3:]
     image = radiance.numpy() * alpha
-    seen = (np.maximum(image, photo[..., :3]).max(-1) < 1) & (
-        alpha[..., 0] > metrics.COVERED
-    )  # a few suns would decide it
+    # Where neither is brighter than a screen: a few suns would decide it.
+    seen = (np.maximum(image, photo[..., :3]).max(-1) < 1) & (alpha[..., 0] > metrics.COVERED)
     aa, ab = ((image[seen] * other[seen][:, :3]).sum(0, dtype=np.float64) for other in (image, photo))
     image = image * np.where(aa > 0, ab / np.where(aa > 0, aa, 1), 1).astype(np.float32)
     return metrics.psnr(over_white(np.dstack([image, alpha])), over_white(photo))

@@ -26,9 +26,7 @@ DIVISOR = (1, 2, 2, 4, 4, 8, 8)  # a level's side is the cubemap's divided by th
 CELLS = 256  # a texel of the pyramid is split while it holds more than 1/CELLS of the lobe
 LEAST_SIDE = 8  # of a level, where the cubemap is as fine
 COARSEST = 4  # side of the last pooled mip
-BLOCK = (
-    32  # orbits that one product adds up: half of those of the smallest cubemap, for a single product is shared, too
-)
+BLOCK = 32  # orbits that one product adds up: half of those of the smallest cubemap, for a lone product is shared
 SAMPLES = 3  # sub-samples of the lobe along each side of a texel
 # A clamped cosine's harmonics divided by π, by degree (Ramamoorthi and Hanrahan 2001, eq. 8).
 COSINE = (1.0,) + (2 / 3,) * 3 + (1 / 4,) * 5
