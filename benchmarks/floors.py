@@ -19,8 +19,8 @@ FORWARD_OPERATIONS, BACKWARD_OPERATIONS = 45, 110
 CHANNEL_OPERATIONS = (2, 4)
 # Of a pixel's channel: windows of 11 + 11 over four images, the index and its derivatives; windows over those three.
 SSIM_OPERATIONS = 208 + 123
-# Of a pixel: eleven channels resampled, eight texels, the table, irradiance, colour; backward those again, and the derivatives.
-SHADING_OPERATIONS = 500 + 1200
+# Of a pixel: its normal resampled, twelve texels, the table, colour; backward those again, and the derivatives.
+SHADING_OPERATIONS = 410 + 1000
 
 
 class Need(NamedTuple):

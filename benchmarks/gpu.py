@@ -150,7 +150,7 @@ def frame_table(device: torch.device, splats: int = FRAMES[0], side: int = FRAME
     (positions, rotations, scales, opacities, _), camera = make_ball(splats, side, side, device)
     one = torch.ones(splats, device=device)
     none = [torch.zeros(splats, count, 3, device=device) for count in (1, 0)]
-    materials = 0.7 * one[:, None].expand(-1, 3), one, 0.3 * one
+    materials = 0.7 * one[:, None].expand(-1, 3), one, 0.3 * one, one[:, None].expand(-1, 3)
     surfels = Surfels(positions, rotations, scales, opacities, *none, *materials, *none)
     background, settings = torch.ones(3, device=device), load_settings("standard").render
     with torch.no_grad():

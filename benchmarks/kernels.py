@@ -96,7 +96,7 @@ def _shading() -> Callable[[], None]:
     material = torch.tensor([0.9, 0.7, 0.5, 1.0, 0.3]).expand(SPLATS, 5)
     raster = rasterize(positions, *geometry, torch.cat([positions, material, positions], dim=1), camera, near=0.1)
     light = Environment(torch.rand(6 * 64**2, 3))
-    leaves = [v.requires_grad_() for v in (raster.features, raster.alpha, light.levels, light.irradiance)]
+    leaves = [v.requires_grad_() for v in (raster.features, raster.alpha, light.levels)]
     upstream = [torch.rand(SIDE, SIDE, n) for n in (3, 3, 5)]
 
     def step() -> None:
@@ -109,7 +109,7 @@ def _shading() -> Callable[[], None]:
 def _prefilter(side: int) -> Callable[[], None]:
     """Of a cubemap of 6·side² texels, both ways."""
     radiance = torch.rand(6 * side**2, 3, requires_grad=True)
-    upstream = [torch.rand_like(part) for part in prefilter(radiance, side)]
+    upstream = torch.rand_like(prefilter(radiance, side))
     return lambda: torch.autograd.grad(prefilter(radiance, side), radiance, upstream)
 
 

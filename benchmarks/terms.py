@@ -59,7 +59,8 @@ def _view(run: Run, truth: GroundTruth, light: Environment, camera: Camera) -> d
         visibility = true["visibility"] if "visibility" in parts else rendering.visibility
         stacked = torch.cat([normal, material, others, points.float()], dim=-1)
         given = opaque, light if "light" in parts else run.environment, camera, torch.ones(3)
-        shaded = shade(stacked, *given, visibility if inter_reflects else None)
+        by_direction = run.settings.render.diffuse == "sh"
+        shaded = shade(stacked, *given, visibility if inter_reflects else None, by_direction=by_direction)
         return _fitted(shaded.radiance, photo)
 
     rows = {"as it is": decibels(())} | {name: decibels((name,)) for name in PARTS}

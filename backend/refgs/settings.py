@@ -43,6 +43,9 @@ class SurfelSettings(_Section):
     start: int = Field(ge=1, le=10_000_000, description="surfels at the start")
     budget: int = Field(ge=1, le=10_000_000, description="surfels at the most")
     hull: int = Field(ge=16, le=512, description="voxels along each side of the visual hull's grid")
+    inside: float = Field(
+        ge=0, lt=1, description="part of the surfels that start inside the visual hull, the others on it"
+    )
     sh_degree: int = Field(ge=0, le=3)
     opacity: float = Field(gt=0, lt=1, description="at the start")
     albedo: float = Field(gt=0, lt=1, description="at the start")
@@ -66,7 +69,6 @@ class LightSettings(_Section):
 
 class TrainSettings(_Section):
     iterations: int = Field(ge=1, le=10_000_000)
-    light_first: int = Field(ge=0, description="iterations in which only light and materials learn")
     checkpoint_every: int = Field(ge=1, description="iterations")
     seed: int = Field(ge=0)
 
@@ -200,7 +202,10 @@ def load_settings(preset: str, changes: list[str] = ()) -> Settings:
 def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
     """Settings that a run wrote down; what the program did not know of yet is as in the standard preset."""
     still = {"light": {"frame": "world", "exposure": "off"}}  # all light was, and no photo had an exposure
-    return validate(_merge(_merge(_read_preset("standard"), still), tables), source)
+    known = _merge(_merge(_read_preset("standard"), still), tables)
+    if isinstance(known["train"], dict):
+        known["train"].pop("light_first", None)  # of 0.1.0
+    return validate(known, source)
 
 
 def validate(tables: dict[str, Any], source: str) -> Settings:

@@ -35,6 +35,7 @@ def sphere_of_splats(count=4000, radius=1.0, outward=1.0):
         albedo=paint(n).astype(f),
         metallic=(0.5 + 0.5 * n[:, 2]).astype(f),
         roughness=(0.5 - 0.4 * n[:, 0]).astype(f),
+        received=np.ones((count, 3), f),
         indirect=np.zeros((count, 0, 3), f),
     )
 

@@ -22,6 +22,7 @@ def make(count=7, coefficients=16, indirect=0):
         albedo=f(count, 3),
         metallic=f(count),
         roughness=f(count),
+        received=f(count, 3) if indirect else np.ones((count, 3), np.float32),
         indirect=f(count, indirect, 3),
     )
 

@@ -31,6 +31,17 @@ def test_points_lie_evenly_on_the_hull_of_a_sphere():
     assert spacing.std() < 0.2 * spacing.mean()
 
 
+def test_some_points_lie_inside():
+    """As many in every part of the volume, their normals those of the surface that is near."""
+    positions, normals, _ = visual_hull_points(DISCS, VIEWS, (0.1, 0, -0.1), 1.5, 4000, resolution=48, on_hull=1000)
+    assert positions.shape == normals.shape == (4000, 3)
+    assert np.abs(sphere(positions[:1000])).max() < VOXEL
+    radius = np.linalg.norm(positions[1000:], axis=1)  # of a ball of radius 1 about the origin
+    assert radius.max() < 1 + 2 * VOXEL and abs((radius**3).mean() - 0.5) < 0.05
+    deep = radius > 0.3
+    assert degrees(normals[1000:][deep], positions[1000:][deep] / radius[deep, None]).mean() < 10
+
+
 def test_a_hole_through_the_object_stays_open():
     positions, normals, _ = visual_hull_points(
         [mask(view, torus) for view in VIEWS], VIEWS, (0, 0, 0), 1.5, 2000, resolution=64

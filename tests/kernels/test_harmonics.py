@@ -124,6 +124,7 @@ def test_a_picture_turns_with_its_object():
             sh[:, 1:].contiguous(),
             materials[:3].T.contiguous(),
             *materials[3:],
+            torch.ones(count, 3),
             indirect[:, :1].contiguous(),
             indirect[:, 1:].contiguous(),
         )

@@ -13,7 +13,7 @@ from refgs.model.environment import Environment
 from refgs.render.shade import mirror_directions, shade, shade_splats
 from tests.kernels import scenes
 
-NAMES = ("features", "alpha", "levels", "exposure", "irradiance")
+NAMES = ("features", "alpha", "levels", "exposure")
 # Pixels nearer to a kink of their derivatives than this are left out of the gradients; their share is checked.
 MARGIN = 1e-4
 FORWARD, GRADIENT = 1e-5, 1e-4
@@ -30,8 +30,6 @@ class Light:
         exact = Environment(torch.exp(0.5 * torch.randn(6 * resolution**2, 3, generator=generator)))
         self.sides = exact.sides
         self.levels = exact.levels.to(device, dtype).requires_grad_()
-        irradiance = exact.irradiance + 0.3 * torch.randn(9, 3, generator=generator)
-        self.irradiance = irradiance.to(device, dtype).requires_grad_()
         self.exposure = torch.tensor(EXPOSURE, dtype=dtype, device=device).requires_grad_()
 
     def turn(self, camera: Camera) -> np.ndarray:
@@ -72,26 +70,25 @@ def visible(alpha: Tensor) -> Tensor:
 @functools.cache
 def case(appearance: bool, indirect: bool, size: tuple[int, int]):
     camera = scenes.camera(*size)
-    mean, alpha = means(camera, appearance + indirect)
+    mean, alpha = means(camera, 2 if indirect else int(appearance))
     inputs = (mean * alpha[..., None], alpha)
     light = Light(torch.float64)
-    exact = [*(v.double().requires_grad_() for v in inputs), light.levels, light.exposure, light.irradiance]
+    exact = [*(v.double().requires_grad_() for v in inputs), light.levels, light.exposure]
     visibility = visible(alpha) if indirect else None
     *maps, margin = reference.shade(
         *exact[:3],
         light.sides,
-        light.irradiance,
         camera,
         BACKGROUND.double(),
         None if visibility is None else visibility.double(),
         light.exposure,
         TURN,
+        by_direction=appearance,
     )
     safe = margin > MARGIN
     generator = torch.Generator().manual_seed(3)
     upstream = [torch.randn(m.shape, generator=generator) * safe[..., None] for m in maps[:3]]
-    wanted = exact[: 4 if appearance else 5]  # with appearance nothing reads the irradiance
-    gradients = torch.autograd.grad(maps[:3], wanted, [u.double() for u in upstream])
+    gradients = torch.autograd.grad(maps[:3], exact, [u.double() for u in upstream])
     return camera, inputs, visibility, [m.detach() for m in maps], safe, upstream, gradients
 
 
@@ -101,14 +98,14 @@ def run(
     visibility: Tensor | None,
     upstream: list[Tensor],
     device: torch.device,
-    count: int = 5,
+    by_direction: bool = False,
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Maps and gradients, on the CPU."""
     light = Light(torch.float32, device)
-    leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels, light.exposure, light.irradiance]
+    leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels, light.exposure]
     visibility = None if visibility is None else visibility.to(device)
-    shaded = shade(*leaves[:2], light, camera, BACKGROUND, visibility, light.exposure)
-    gradients = torch.autograd.grad(shaded[:3], leaves[:count], [u.to(device) for u in upstream])
+    shaded = shade(*leaves[:2], light, camera, BACKGROUND, visibility, light.exposure, by_direction=by_direction)
+    gradients = torch.autograd.grad(shaded[:3], leaves, [u.to(device) for u in upstream])
     return [s.detach().cpu() for s in shaded], [g.cpu() for g in gradients]
 
 
@@ -118,7 +115,7 @@ def run(
 def test_matches_reference(indirect, appearance, size, device):
     camera, inputs, visibility, maps, safe, upstream, gradients = case(appearance, indirect, size)
     assert safe.float().mean() > 0.9
-    found, by = run(camera, inputs, visibility, upstream, device, len(gradients))
+    found, by = run(camera, inputs, visibility, upstream, device, appearance)
     for value, expected in zip(found, maps, strict=True):
         error = (value - expected)[safe].abs().max() / expected.abs().max()
         assert error <= FORWARD
@@ -134,13 +131,13 @@ def test_other_ways_match_reference(how, device):
     inputs, light = (features, alpha), Light(torch.float64)
     exact = [*(v.double().requires_grad_() for v in inputs), light.levels]
     picture, *_, margin = reference.shade(
-        *exact, light.sides, light.irradiance, camera, BACKGROUND.double(), turn=TURN, **{how: True}
+        *exact, light.sides, camera, BACKGROUND.double(), turn=TURN, by_direction=True, **{how: True}
     )
     upstream = torch.randn(picture.shape, generator=torch.Generator().manual_seed(5)) * (margin > MARGIN)[..., None]
     assert (margin > MARGIN).float().mean() > 0.9
     light = Light(torch.float32, device)
     leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels]
-    found = shade(*leaves[:2], light, camera, BACKGROUND, **{how: True}).color
+    found = shade(*leaves[:2], light, camera, BACKGROUND, by_direction=True, **{how: True}).color
     error = (found.detach().cpu() - picture).abs() * (margin > MARGIN)[..., None]
     assert error.max() <= FORWARD * picture.abs().max()
     wanted = torch.autograd.grad(picture, exact, upstream.double())
@@ -158,18 +155,18 @@ def test_surfels_match_reference(count, appearance, device):
     material = torch.rand(count, 8 if appearance else 5, generator=generator)
     features = torch.cat([normal, material, position], dim=1)
     light = Light(torch.float64)
-    exact = [features.double().requires_grad_(), light.levels, light.irradiance][: 2 if appearance else 3]
-    expected, margin = reference.shade_splats(exact[0], light.levels, light.sides, light.irradiance, camera, TURN)
+    exact = [features.double().requires_grad_(), light.levels]
+    expected, margin = reference.shade_splats(exact[0], light.levels, light.sides, camera, TURN)
     safe = (margin > MARGIN)[:, None]
     assert safe.float().mean() > 0.8
     upstream = torch.randn(count, 3, generator=generator) * safe
     light = Light(torch.float32, device)
-    leaves = [features.to(device).requires_grad_(), light.levels, light.irradiance][: len(exact)]
+    leaves = [features.to(device).requires_grad_(), light.levels]
     found = shade_splats(leaves[0], light, camera)
     assert ((found.detach().cpu() - expected).abs() * safe).max() <= FORWARD * expected.abs().max()
     wanted = torch.autograd.grad(expected, exact, upstream.double())
     for name, value, exact_value in zip(
-        ("features", "levels", "irradiance"),
+        ("features", "levels"),
         torch.autograd.grad(found, leaves, upstream.to(device)),
         wanted,
         strict=False,

@@ -21,6 +21,7 @@ def raw() -> dict[str, torch.Tensor]:
         "rotation": (4,),
         "sh_dc": (1, 3),
         "sh_rest": (0, 3),
+        "received": (3,),
         "indirect_dc": (1, 3),
         "indirect_rest": (0, 3),
     }

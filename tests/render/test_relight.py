@@ -31,6 +31,7 @@ def surfels(points: np.ndarray, normals: np.ndarray, albedo: float = 0.5, metall
         albedo=torch.full((n, 3), albedo),
         metallic=torch.full((n,), metallic),
         roughness=torch.full((n,), 0.5),
+        received=torch.ones(n, 3),
         indirect_dc=torch.zeros(n, 1, 3),
         indirect_rest=torch.zeros(n, 0, 3),
     )
@@ -120,6 +121,22 @@ def test_inside_a_matte_bowl(bowl, albedo, monkeypatch):
     exact = 0.5 / (1 - albedo / 2)
     assert abs(float(found.mean()) / exact - 1) < 0.01
     assert float((found / exact - 1).square().mean().sqrt()) < 0.02
+
+
+def test_what_training_takes_of_it(bowl, monkeypatch):
+    """As a part of what an unhidden surface would receive, whichever way normals point; from some of the surfels alone."""
+    occluder, points, normals = bowl
+    mirrors(monkeypatch, 0.0)
+    inside = surfels(points, normals).turned(torch.arange(len(points)) % 2 == 0)
+    assert (inside.normals() * torch.from_numpy(normals)).sum(dim=1)[::2].max() < -0.99
+    for probes, error in ((10_000, 0.03), (len(points) // 4, 0.05)):
+        monkeypatch.setattr(relight, "PROBES", probes)
+        found = relight.received(inside, occluder, even(3.0))
+        assert abs(float(found.mean()) * 1.5 - 1) < 0.01 and float((found * 1.5 - 1).square().mean().sqrt()) < error
+    ball = trimesh.creation.icosphere(4)
+    outside = surfels(np.asarray(ball.vertices), np.asarray(ball.vertices))
+    convex = relight.received(outside, Occluder(Mesh(ball.vertices, np.asarray(ball.faces))), colourful())
+    assert (convex - 1).abs().max() < 0.01
 
 
 @pytest.mark.parametrize("part", [0.0, 0.3, 1.0])

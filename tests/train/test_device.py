@@ -72,7 +72,13 @@ def test_a_driver_that_refuses(monkeypatch, said):
 
 
 def small_trainer(ball_capture, folder, reports: list, start: int) -> Trainer:
-    changes = [f"surfels.start={start}", "train.iterations=12", "surfels.hull=48"]
+    changes = [
+        f"surfels.start={start}",
+        "train.iterations=12",
+        "surfels.hull=48",
+        "surfels.inside=0.0",
+        "surfels.opacity=0.73",
+    ]
     settings = load_settings("quick", changes)
     (folder / "checkpoints").mkdir(parents=True)
     return Trainer(read_capture(ball_capture), settings, folder, lambda *event: reports.append(event))

@@ -76,7 +76,7 @@ def test_the_papers_schedule_runs_to_its_end(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", "paper", *changes)
     before = made.test_psnr()
     made.run()
-    assert not made.initial and made.test_psnr() > before + 5
+    assert not made.initial and made.test_psnr() > before + 4
 
 
 def test_all_grow_faint_and_mirrors_grow(ball_capture, tmp_path):

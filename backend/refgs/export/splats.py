@@ -18,8 +18,9 @@ class Splats:
     positions (N, 3), normals (N, 3) unit and pointing outward where that is known, sh (N, K, 3) spherical harmonics
     with K = (degree + 1)² and colour = 0.5 + SH (the 3DGS convention), opacities (N,) in 0..1, scales (N, 2) standard
     deviations in world units, or (N, 3) of 3D Gaussians with the normal's last, rotations (N, 4) unit quaternions wxyz,
-    albedo (N, 3) linear Rec.709, metallic (N,) and perceptual roughness (N,) in 0..1, indirect (N, K', 3) spherical harmonics
-    of the linear radiance that comes from the object itself; K' is 0 where a scene does without.
+    albedo (N, 3) linear Rec.709, metallic (N,) and perceptual roughness (N,) in 0..1, received (N, 3) the part of the recovered
+    light's irradiance that reaches a surfel, with what comes from the object itself, indirect (N, K', 3) spherical harmonics
+    of the linear radiance that comes from the object itself; K' is 0 where a scene does without, all of `received` is 1 then.
     """
 
     positions: np.ndarray
@@ -31,6 +32,7 @@ class Splats:
     albedo: np.ndarray
     metallic: np.ndarray
     roughness: np.ndarray
+    received: np.ndarray
     indirect: np.ndarray
 
     def __len__(self) -> int:
@@ -39,6 +41,7 @@ class Splats:
 
 _HEAD = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 _TAIL = ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
+_RECEIVED = ["received_r", "received_g", "received_b"]
 _MATERIAL = ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
 
 
@@ -66,7 +69,9 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
     names = [*_HEAD, *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))), *_TAIL, *_MATERIAL]
     if splats.scales.shape[1] == 3:
         names.insert(names.index("scale_1") + 1, "scale_2")
-    names += [f"ind_{i}" for i in range(3 * splats.indirect.shape[1])]
+    if splats.indirect.shape[1]:
+        columns.insert(-1, splats.received)
+        names += [*_RECEIVED, *(f"ind_{i}" for i in range(3 * splats.indirect.shape[1]))]
     table = np.concatenate([np.reshape(c, (count, -1)) for c in columns], axis=1).astype("<f4")
     rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names])[:, 0]
     with whole(path) as temporary:
@@ -111,6 +116,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
         albedo=columns("albedo_r", "albedo_g", "albedo_b"),
         metallic=columns("metallic")[:, 0],
         roughness=columns("roughness")[:, 0],
+        received=columns(*_RECEIVED) if {*_RECEIVED} <= names else np.ones((vertex.count, 3), np.float32),
         indirect=harmonics("ind_", 0, 3, 12, 27, 48),
     )
     for field in fields(splats):

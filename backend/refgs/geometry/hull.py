@@ -1,4 +1,4 @@
-"""The visual hull: the largest shape that fits inside every mask, and points spread evenly on it."""
+"""The visual hull: the largest shape that fits inside every mask, and points spread on it and in it."""
 
 import logging
 from collections.abc import Sequence
@@ -26,9 +26,11 @@ def visual_hull_points(
     count: int,
     resolution: int = 96,
     seed: int = 0,
+    on_hull: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points spread evenly on the visual hull of an object: positions (count, 3), outward unit normals (count, 3),
-    and spacing (count,), the mean distance to the three nearest neighbours; float32, world units.
+    and spacing (count,), the mean distance to the three nearest neighbours; float32, world units. Where not all are `on_hull`,
+    those that follow lie inside it, at random; their normals are those of the hull next to them.
 
     `alphas` are masks (H, W), float in 0..1 or unsigned integers, one for each camera. The hull is sought in the cube
     of half-side `radius` around `centre`, first coarsely, then on a grid of `resolution`³ around what was found. A
@@ -80,14 +82,19 @@ def visual_hull_points(
         )
     voxel = (high - low) / resolution
     vertices, faces, _, _ = marching_cubes(field, 0.5)
-    dense = _sample_triangles(vertices * voxel, faces, 10 * count, np.random.default_rng(seed))
-    points = _spread(dense, count)
+    rng = np.random.default_rng(seed)
+    on_hull = count if on_hull is None else on_hull
+    points = _spread(_sample_triangles(vertices * voxel, faces, 10 * on_hull, rng), on_hull)
     # The masks' edges are about a voxel wide, so a voxel's own gradient is noise: normals come from a wider filter.
     wide = gaussian_filter(field, 1.5)
     normals = np.stack(
         [-map_coordinates(np.gradient(wide, voxel[a], axis=a), (points / voxel).T, order=1) for a in range(3)], axis=1
     )
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+    solid = rng.choice(np.argwhere(field > 0.5), count - on_hull)
+    within = (solid + rng.uniform(-0.5, 0.5, solid.shape)) * voxel
+    normals = np.concatenate([normals, normals[cKDTree(points).query(within)[1]]])
+    points = np.concatenate([points, within])
     spacing = cKDTree(points).query(points, k=min(4, count))[0][:, 1:].mean(1)
     positions = points + low + voxel * (0.5 - 3)
     return positions.astype(np.float32), normals.astype(np.float32), spacing.astype(np.float32)

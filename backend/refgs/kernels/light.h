@@ -4,8 +4,8 @@
 
 #include "rows.h"
 
-// Cubemaps of several roughnesses, one after another; see refgs.model.cubemap for the order of texels. Each face is padded by one, so
-// that a look-up's four neighbours lie side by side, two and two.
+// Cubemaps of several roughnesses and one of irradiance / pi, one after another; see refgs.model.cubemap for the order of texels. Each
+// face is padded by one, so that a look-up's four neighbours lie side by side, two and two.
 struct Levels {
   static constexpr int MOST = 8;
   int64_t count;
@@ -25,31 +25,34 @@ struct Levels {
   }
 };
 
-// Trilinear look-up: linear in roughness² between two levels, as a lobe is about that wide; bilinear in direction in each.
-template <bool DERIVATIVES>
+// Look-up of a direction, bilinear, in N levels that are blended: in the two about a roughness, linear in its square, as a lobe is about
+// that wide; or in the last one, which is irradiance / pi about a normal.
+template <int N, bool DERIVATIVES>
 struct Lookup {
   Vector s, t, inverse_major;  // on the face: the two coordinates; 1 / the direction's largest component
-  Mask on_x, on_y;
-  Vector fraction, slope;      // towards the upper level; its derivative by roughness
-  Vector x[2], y[2];           // in each level, how far from one cell's centre to the next
-  alignas(64) int32_t cell[2][LANES], width[2][LANES], line[2][LANES];  // the first of the four
-  Vector light[3], by_s[3], by_t[3], by_fraction[3];                    // the light and its derivatives
+  Mask on_x, on_y, face;
+  Vector share[N], slope;      // of the levels; the upper one's derivative by roughness
+  Vector x[N], y[N];           // in each level, how far from one cell's centre to the next
+  alignas(64) int32_t cell[N][LANES], width[N][LANES], line[N][LANES];  // the first of the four
+  Vector light[3] = {}, by_s[3] = {}, by_t[3] = {}, by_share[3] = {};   // the light and its derivatives
+
+  MEMBER Lookup(const Levels& levels, Vectors d) {
+    static_assert(N == 1);
+    find_face(d);
+    int last = (int)levels.count - 1;
+    share[0] = Vector() + 1.0f;
+    blend(levels, 0, Mask() + levels.side[last], Mask() + levels.start[last], Mask() + levels.line[last]);
+  }
 
   MEMBER Lookup(const Levels& levels, Vectors d, Vector roughness) {
-    Vector ax = larger(d.x, -d.x), ay = larger(d.y, -d.y), az = larger(d.z, -d.z);
-    on_x = (ax >= ay) & (ax >= az), on_y = ~on_x & (ay >= az);
-    Vector major = choose(d.x, d.y, d.z), size = larger(major, -major);
-    inverse_major = reciprocal(select(size > 1e-20f, major, Vector() + 1e-20f));
-    Vector scale = larger(inverse_major, -inverse_major);
-    s = choose(d.y, d.z, d.x) * scale, t = choose(d.z, d.x, d.y) * scale;
-    Mask face = select(on_x, Mask(), select(on_y, Mask() + 2, Mask() + 4)) - (major < 0.0f);
-
+    static_assert(N == 2);
+    find_face(d);
     Vector alpha = roughness * roughness, low = Vector() + levels.alpha[0], high = Vector() + levels.alpha[1];
     Mask side[2], start[2], first_line[2];
     for (int i = 0; i < 2; i++) {
       side[i] = Mask() + levels.side[i], start[i] = Mask() + levels.start[i], first_line[i] = Mask() + levels.line[i];
     }
-    for (int k = 1; k + 1 < levels.count; k++) {
+    for (int k = 1; k + 2 < levels.count; k++) {
       Mask above = alpha > levels.alpha[k];
       low = select(above, Vector() + levels.alpha[k], low), high = select(above, Vector() + levels.alpha[k + 1], high);
       for (int i = 0; i < 2; i++) {
@@ -59,53 +62,65 @@ struct Lookup {
       }
     }
     Vector by_alpha = reciprocal(high - low);
-    fraction = (alpha - low) * by_alpha, slope = 2.0f * roughness * by_alpha;
-
-    for (int c = 0; c < 3; c++) light[c] = by_s[c] = by_t[c] = by_fraction[c] = Vector();
+    share[N - 1] = (alpha - low) * by_alpha, share[0] = 1.0f - share[N - 1], slope = 2.0f * roughness * by_alpha;
 #pragma unroll
-    for (int i = 0; i < 2; i++) {
-      Vector sides = convert<Vector>(side[i]), half = 0.5f * sides, column, row;
-      x[i] = along(s, half, sides, column), y[i] = along(t, half, sides, row);
-      Mask across = side[i] + 2, down = face * across + convert<Mask>(row);
-      store(cell[i], start[i] + down * across + convert<Mask>(column)), store(width[i], across), store(line[i], first_line[i] + down);
-      Vector top[8], bottom[8], share = i ? fraction : 1.0f - fraction;  // two cells each
-      two_cells(levels, i, 0, top), two_cells(levels, i, 1, bottom);
-      for (int c = 0; c < 3; c++) {
-        Vector across_top = top[4 + c] - top[c], across_bottom = bottom[4 + c] - bottom[c];
-        Vector above = top[c] + x[i] * across_top, down = bottom[c] + x[i] * across_bottom - above;
-        Vector value = above + y[i] * down;
-        light[c] += share * value;
-        if (DERIVATIVES) {
-          by_s[c] += share * half * (across_top + y[i] * (across_bottom - across_top));
-          by_t[c] += share * half * down;
-          by_fraction[c] += i ? value : -value;
-        }
-      }
-    }
+    for (int i = 0; i < 2; i++) blend(levels, i, side[i], start[i], first_line[i]);
   }
 
   // The derivatives by direction and by roughness.
   MEMBER Vectors backward(const Vector (&by_light)[3], Vector& by_roughness) const {
-    Vector s_sum = {}, t_sum = {};
     by_roughness = Vector();
-    for (int c = 0; c < 3; c++) {
-      s_sum += by_light[c] * by_s[c], t_sum += by_light[c] * by_t[c];
-      by_roughness += by_light[c] * slope * by_fraction[c];
-    }
+    for (int c = 0; c < 3; c++) by_roughness += by_light[c] * slope * by_share[c];
+    return backward(by_light);
+  }
+  MEMBER Vectors backward(const Vector (&by_light)[3]) const {
+    Vector s_sum = {}, t_sum = {};
+    for (int c = 0; c < 3; c++) s_sum += by_light[c] * by_s[c], t_sum += by_light[c] * by_t[c];
     Vector scale = larger(inverse_major, -inverse_major), by_major = -(s_sum * s + t_sum * t) * inverse_major;
     s_sum *= scale, t_sum *= scale;
     return {choose(by_major, t_sum, s_sum), choose(s_sum, by_major, t_sum), choose(t_sum, s_sum, by_major)};
   }
 
-  // Of the two levels' four cells each.
-  MEMBER void weights(Vector (&w)[2][4]) const {
-    for (int i = 0; i < 2; i++) {
-      Vector share = i ? fraction : 1.0f - fraction, below = share * y[i], above = share - below;
+  // Of the levels' four cells each.
+  MEMBER void weights(Vector (&w)[N][4]) const {
+    for (int i = 0; i < N; i++) {
+      Vector below = share[i] * y[i], above = share[i] - below;
       w[i][1] = above * x[i], w[i][0] = above - w[i][1], w[i][3] = below * x[i], w[i][2] = below - w[i][3];
     }
   }
 
  private:
+  MEMBER void find_face(Vectors d) {
+    Vector ax = larger(d.x, -d.x), ay = larger(d.y, -d.y), az = larger(d.z, -d.z);
+    on_x = (ax >= ay) & (ax >= az), on_y = ~on_x & (ay >= az);
+    Vector major = choose(d.x, d.y, d.z), size = larger(major, -major);
+    inverse_major = reciprocal(select(size > 1e-20f, major, Vector() + 1e-20f));
+    Vector scale = larger(inverse_major, -inverse_major);
+    s = choose(d.y, d.z, d.x) * scale, t = choose(d.z, d.x, d.y) * scale;
+    face = select(on_x, Mask(), select(on_y, Mask() + 2, Mask() + 4)) - (major < 0.0f);
+  }
+
+  // Adds what is looked up in one level, of this side, which starts at that cell and line.
+  MEMBER void blend(const Levels& levels, int i, Mask side, Mask start, Mask first_line) {
+    Vector sides = convert<Vector>(side), half = 0.5f * sides, column, row;
+    x[i] = along(s, half, sides, column), y[i] = along(t, half, sides, row);
+    Mask across = side + 2, down = face * across + convert<Mask>(row);
+    store(cell[i], start + down * across + convert<Mask>(column)), store(width[i], across), store(line[i], first_line + down);
+    Vector top[8], bottom[8];  // two cells each
+    two_cells(levels, i, 0, top), two_cells(levels, i, 1, bottom);
+    for (int c = 0; c < 3; c++) {
+      Vector across_top = top[4 + c] - top[c], across_bottom = bottom[4 + c] - bottom[c];
+      Vector above = top[c] + x[i] * across_top, further = bottom[c] + x[i] * across_bottom - above;
+      Vector value = above + y[i] * further;
+      light[c] += share[i] * value;
+      if (DERIVATIVES) {
+        by_s[c] += share[i] * half * (across_top + y[i] * (across_bottom - across_top));
+        by_t[c] += share[i] * half * further;
+        by_share[c] += i ? value : -value;
+      }
+    }
+  }
+
   MEMBER Vector choose(Vector if_x, Vector if_y, Vector if_z) const { return select(on_x, if_x, select(on_y, if_y, if_z)); }
 
   // Of those of level i, in the first line or in the second.
@@ -124,35 +139,6 @@ struct Lookup {
     Vector x = (s + 1.0f) * half + 0.5f;
     at = smaller(larger(round_down(x), Vector()), side);
     return x - at;
-  }
-};
-
-// Irradiance / pi about a unit normal from nine coefficients a colour (9, 3): real harmonics in the order and signs of
-// refgs.model.harmonics. Never negative.
-struct Irradiance {
-  static constexpr float Y0 = 0.28209479f, Y1 = 0.48860251f, XY = 1.0925485f, ZZ = 0.31539157f, XX = 0.54627422f;
-  Vector basis[9];
-  Vectors n;
-
-  MEMBER explicit Irradiance(Vectors n) : n(n) {
-    basis[0] = Vector() + Y0;
-    basis[1] = -Y1 * n.y, basis[2] = Y1 * n.z, basis[3] = -Y1 * n.x;
-    basis[4] = XY * n.x * n.y, basis[5] = -XY * n.y * n.z, basis[6] = ZZ * (3.0f * n.z * n.z - 1.0f);
-    basis[7] = -XY * n.x * n.z, basis[8] = XX * (n.x * n.x - n.y * n.y);
-  }
-
-  MEMBER Vector value(const float* coefficients, int c) const {
-    Vector sum = {};
-    for (int k = 0; k < 9; k++) sum += basis[k] * coefficients[3 * k + c];
-    return larger(sum, Vector());
-  }
-
-  // Adds to by_normal; `by` is zero where the value was cut off. By a coefficient it is `by` times its basis.
-  MEMBER void backward(const float* coefficients, int c, Vector by, Vectors& by_normal) const {
-    const float* i = coefficients + c;
-    by_normal.x += by * (-Y1 * i[9] + XY * i[12] * n.y - XY * i[21] * n.z + 2.0f * XX * i[24] * n.x);
-    by_normal.y += by * (-Y1 * i[3] + XY * i[12] * n.x - XY * i[15] * n.z - 2.0f * XX * i[24] * n.y);
-    by_normal.z += by * (Y1 * i[6] - XY * i[15] * n.y + 6.0f * ZZ * i[18] * n.z - XY * i[21] * n.x);
   }
 };
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.color import srgb_encode
-from refgs.model import cubemap, harmonics, prefilter
+from refgs.model import cubemap, prefilter
 from refgs.render.brdf import LEAST_N_V, bounces, reflectance_table
 
 ALPHA_CUT, ALPHA_CAP, MIN_TRANSMITTANCE, LOW_PASS, FAR = 1 / 255, 0.99, 1e-4, 2.0, 1e12  # as in splat.h
@@ -92,7 +92,6 @@ def shade(
     alpha: Tensor,
     levels: Tensor,
     sides: tuple[int, ...],
-    irradiance: Tensor,
     camera: Camera,
     background: Tensor,
     visibility: Tensor | None = None,
@@ -100,6 +99,7 @@ def shade(
     turn: Tensor | None = None,
     display: bool = False,
     mirror: bool = False,
+    by_direction: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """As refgs.render.shade.shade, for float64 tensors and a light that stands turned (3, 3) to the world; and how far each pixel
     (H, W) is from a kink of the derivatives, in the units of what has the kink. Bilinear look-ups have one at every texel."""
@@ -111,9 +111,9 @@ def shade(
     row, column = (index + 0.5 for index in pixels)
     ray = torch.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, torch.ones_like(here)], dim=-1)
     towards = -unit(ray @ view[:3, :3])
-    indirect = None if visibility is None else (visibility[pixels][:, None], maps[:, -3:])
-    appearance = maps[:, 8:11] if features.shape[-1] > 11 + 3 * (visibility is not None) else None
-    radiance = radiance_towards(towards, maps, appearance, levels, sides, irradiance, indirect, margins, turn, mirror)
+    indirect = None if visibility is None else (visibility[pixels][:, None], maps[:, 11:])
+    given = levels, sides, indirect, margins, turn, mirror
+    radiance = radiance_towards(towards, maps, maps[:, 8:11] if by_direction else None, *given)
     exposed = exposure * radiance
     if not display:
         margins.append((exposed - 0.0031308).abs().amin(dim=-1))
@@ -132,14 +132,13 @@ def shade_splats(
     features: Tensor,
     levels: Tensor,
     sides: tuple[int, ...],
-    irradiance: Tensor,
     camera: Camera,
     turn: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """As refgs.render.shade.shade_splats, for float64 tensors; and how far each surfel is from a kink."""
     towards, margins = unit(torch.from_numpy(camera.position) - features[:, -3:]), []
     appearance = features[:, 8:11] if features.shape[-1] > 11 else None
-    radiance = radiance_towards(towards, features, appearance, levels, sides, irradiance, None, margins, turn)
+    radiance = radiance_towards(towards, features, appearance, levels, sides, None, margins, turn)
     return radiance, torch.stack(margins).amin(dim=0)
 
 
@@ -149,7 +148,6 @@ def radiance_towards(
     appearance: Tensor | None,
     levels: Tensor,
     sides: tuple[int, ...],
-    irradiance: Tensor,
     indirect: tuple[Tensor, Tensor] | None,
     margins: list[Tensor],
     turn: Tensor | None = None,
@@ -172,9 +170,9 @@ def radiance_towards(
     if appearance is not None:
         diffuse = (1 - share) * appearance
     else:
-        received = harmonics.basis(normal, 2) @ irradiance
-        margins.append(received.abs().amin(dim=-1))
-        diffuse = (1 - share) * (1 - dielectric) * albedo * received.clamp_min(0)
+        received = irradiance(levels, sides, normal, margins)
+        hidden = 1 if indirect is None else maps[:, 8:11]
+        diffuse = (1 - share) * (1 - dielectric) * albedo * received * hidden
     return light * ((1 - share) * dielectric + share * metal) + diffuse
 
 
@@ -191,7 +189,7 @@ def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tenso
     moves = (here > SHIFT_ALPHA)[:, None] & (shift.abs() < SHIFT_LIMIT) & (to > 0) & (to < last)
     margins += _from_integer(to, moves)
     to = to.clamp_min(0).minimum(last)
-    stacked = torch.cat([features[..., :-3], alpha[..., None]], dim=-1)
+    stacked = torch.cat([features[..., :3], alpha[..., None]], dim=-1)
     low = to.detach().floor()
     x, y = (to - low).unbind(-1)
     (x0, y0), (x1, y1) = low.long().unbind(-1), (low + 1).minimum(last).long().unbind(-1)
@@ -202,12 +200,27 @@ def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tenso
     margins += [(there - SHIFT_ALPHA).abs()]
     trust = ((there - SHIFT_ALPHA) / SHIFT_ALPHA).clamp(0, 1).detach()[:, None]
     moved = sampled[:, :-1] / there.clamp_min(SHIFT_ALPHA)[:, None]
-    return trust * moved + (1 - trust) * own[:, :-3]
+    return torch.cat([trust * moved + (1 - trust) * own[:, :3], own[:, 3:-3]], dim=-1)
 
 
 def _from_integer(x: Tensor, counts: Tensor | bool = True) -> list[Tensor]:
     distance = (x - x.round()).abs().detach()
     return list(torch.where(torch.as_tensor(counts), distance, math.inf).unbind(-1))
+
+
+def irradiance(levels: Tensor, sides: tuple[int, ...], normals: Tensor, margins: list) -> Tensor:
+    """Irradiance / π (P, 3) about unit normals (P, 3), the last of the levels."""
+    _cube_margins(normals, [torch.tensor(sides[-1])], margins)
+    last = cubemap.in_texel_order(levels, sides)[-6 * sides[-1] ** 2 :]
+    return cubemap.sample(last, sides[-1:], normals, torch.zeros(len(normals), dtype=normals.dtype))
+
+
+def _cube_margins(directions: Tensor, sides: list[Tensor], margins: list) -> None:
+    _, s, t = cubemap.face_coordinates(directions)
+    largest = torch.sort(directions.abs(), dim=-1).values
+    margins.append((largest[:, 2] - largest[:, 1]).abs())
+    for half in (side / 2 for side in sides):
+        margins += _from_integer(torch.stack([(s + 1) * half + 0.5, (t + 1) * half + 0.5], dim=-1))
 
 
 def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor, margins: list) -> Tensor:
@@ -216,12 +229,7 @@ def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughne
     interval = (torch.bucketize(roughness.detach().contiguous(), known) - 1).clamp(0, len(known) - 2)
     low, high = known[interval] ** 2, known[interval + 1] ** 2
     margins.append((roughness[:, None] - known[1:-1]).abs().amin(dim=-1))
-    _, s, t = cubemap.face_coordinates(directions)
-    largest = torch.sort(directions.abs(), dim=-1).values
-    margins.append((largest[:, 2] - largest[:, 1]).abs())
-    for i in (0, 1):
-        half = torch.tensor(sides)[interval + i] / 2
-        margins += _from_integer(torch.stack([(s + 1) * half + 0.5, (t + 1) * half + 0.5], dim=-1))
+    _cube_margins(directions, [torch.tensor(sides)[interval + i] for i in (0, 1)], margins)
     levels = cubemap.in_texel_order(levels, sides)
     return cubemap.sample(levels, sides, directions, interval + (alpha - low) / (high - low))
 

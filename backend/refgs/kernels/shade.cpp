@@ -12,7 +12,6 @@ constexpr float COVERED = 1.0f / 255.0f;    // less alpha than this is backgroun
 constexpr float SHIFT_LIMIT = 8;            // pixels
 constexpr float SHIFT_ALPHA = 0.3f;         // a silhouette's blended position says nothing about its surface
 constexpr int HALO = (int)SHIFT_LIMIT + 1;  // rows that a displaced look-up reaches beyond its own
-constexpr int TOTALS = 28;                  // derivatives that all pixels add to: 27 by the irradiance, one by the exposure
 constexpr int NORMAL = 0, ALBEDO = 3, METALLIC = 6, ROUGHNESS = 7;  // channels; Shaded has those that may follow
 
 struct Shade {
@@ -33,19 +32,18 @@ struct Shade {
   const int32_t* texel;           // (cells): under each cell of the padded faces
   float* padded;                  // (cells, 4): for levels.cells
   const int32_t *starts, *cell;   // the cells of texel i: `cell` from starts[i] to starts[i + 1]
-  const float* irradiance;        // (9, 3)
   const float* reflectance;       // (reflectance_side, reflectance_side, 4)
   int64_t reflectance_side;
   float *mirrored;                                        // (height, width, 3)
   float *color, *normal, *material, *radiance;            // (height, width, 3 | 3 | 5 | 3)
   const float *by_color, *by_normal, *by_material;
   float *by_features, *by_alpha;
-  float *by_light, *by_totals;      // (texels, 3), (chunks or, with CUDA, blocks, TOTALS)
-  float *halo, *halo_alpha;         // (chunks, 2 HALO, width, channels), (chunks, 2 HALO, width): for rows above and below a chunk
+  float *by_light, *by_exposure;    // (texels, 3), (chunks or, with CUDA, blocks)
+  float* near;                      // (chunks, chunk_rows + 2 HALO, width, 4): by the normals that a chunk looked up, and by their alpha
   float* by_cells;                  // (chunks + 1, cells, 4): the last, their sum
-  uint8_t* touched;                 // (chunks, 2 HALO + lines): the rows of those that a chunk has written
+  uint8_t* touched;                 // (chunks, chunk_rows + 2 HALO + lines): the rows of those that a chunk has written
   // With CUDA in place of those four, zero at first:
-  int64_t *map_sums, *cell_sums;    // (channels - 2, height, width), (cells, 3)
+  int64_t *map_sums, *cell_sums;    // (4, height, width), (cells, 3)
   int32_t* largest;                 // (2): of the numbers that are added to each
   float* scratch;                   // none is used
   mutable Shared shared;
@@ -105,7 +103,7 @@ INLINE void scatter(float* map, const Pixels& p, const Vector (&v)[N]) {
 
 // The four pixels about each of LANES points: the first, and how far it is to the one beside it and to the one below.
 struct Corners {
-  int32_t first[LANES];
+  int32_t first[LANES], row[LANES];
   int64_t next, below;
   Vector x, y;  // how far the point is along
 
@@ -132,8 +130,8 @@ struct Unit {
 
 constexpr int SOURCES = 9;  // 2^9 > (2 HALO + 1)^2: the pixels that can add to one, each with weights of up to 1 in all
 
-// Of cells: all pixels may add to one, eight numbers each.
-int adders(const Shade& s) { return 3 + 64 - __clzll(s.width * s.height); }
+// Of cells: all pixels may add to one, twelve numbers each.
+int adders(const Shade& s) { return 4 + 64 - __clzll(s.width * s.height); }
 
 // The derivatives by the maps and by the light of a pixel: what it adds to others. A first pass takes the LARGEST of that in
 // magnitude, a second adds it.
@@ -142,28 +140,24 @@ struct Contributions {
   const Shade& s;
   float map_scale, cell_scale;
   int32_t largest_map = 0, largest_cell = 0;
-  Vectors normal = {};
-  float by_irradiance[3] = {}, by_exposure = 0;
+  float by_exposure = 0;
 
   Contributions(const Shade& s) : s(s) {
     if (!LARGEST) map_scale = Unit(s.largest[0], SOURCES).per, cell_scale = Unit(s.largest[1], adders(s)).per;
   }
 
-  template <int S>
-  void add_own(const Pixels& p, bool, const Vector (&by_own)[S], const Vector (&by_position)[3], Vector by_alpha) {
+  template <int C>
+  void add_own(const Pixels& p, const Vector (&by_own)[C], Vector by_alpha) {
     if (LARGEST) return;
-    float* to = s.by_features + (int64_t)p.at[0] * (S + 3);
-    for (int c = 0; c < S; c++) to[c] = by_own[c].value;
-    for (int i = 0; i < 3; i++) to[S + i] = by_position[i].value;
+    for (int c = 0; c < C; c++) s.by_features[(int64_t)p.at[0] * C + c] = by_own[c].value;
     s.by_alpha[p.at[0]] = by_alpha.value;
   }
 
-  template <int S>
-  void add_sampled(const Corners& c, int, const Vector (&by_sampled)[S], Vector by_there) {
+  void add_sampled(const Corners& c, int, const Vector (&by_sampled)[4]) {
     Vector weight[4];
     c.weights(weight);
-    for (int i = 0; i <= S; i++) {
-      float by = (i < S ? by_sampled[i] : by_there).value;
+    for (int i = 0; i < 4; i++) {
+      float by = by_sampled[i].value;
       if (LARGEST) {
         raise(largest_map, by);
       } else {
@@ -173,17 +167,13 @@ struct Contributions {
     }
   }
 
-  void add_irradiance(const Irradiance& irradiance, const Vector (&by)[3]) {
-    normal = irradiance.n;
-    for (int c = 0; c < 3; c++) by_irradiance[c] = by[c].value;
-  }
-
   void add_exposure(Vector by) { by_exposure = by.value; }
 
-  void add_light(const Lookup<true>& l, int, const Vector (&by_light)[3]) {
-    Vector weight[2][4];
+  template <int N>
+  void add_light(const Lookup<N, true>& l, int, const Vector (&by_light)[3]) {
+    Vector weight[N][4];
     l.weights(weight);
-    for (int i = 0; i < 2; i++)
+    for (int i = 0; i < N; i++)
       for (int j = 0; j < 4; j++)
         for (int c = 0; c < 3; c++) {
           float by = by_light[c].value * weight[i][j].value;
@@ -214,71 +204,57 @@ void zero(float* p, int64_t n) {
 struct Chunk {
   const Shade& s;
   int64_t index, first, end;  // pixels
-  float* cells;
-  uint8_t *halo, *lines;      // touched
-  Vector by_totals[TOTALS] = {};
+  float *near, *cells;        // near: as for the picture's first pixel
+  uint8_t *rows, *lines;      // touched
+  Vector by_exposure = {};
 
   Chunk(const Shade& s, int64_t index) : s(s), index(index), first(index * s.chunk_rows * s.width) {
-    int64_t rows = s.height - index * s.chunk_rows;
-    end = first + (rows < s.chunk_rows ? rows : s.chunk_rows) * s.width;
-    cells = s.by_cells + index * 4 * s.cells;
-    halo = s.touched + index * (2 * HALO + s.lines), lines = halo + 2 * HALO;
+    int64_t left = s.height - index * s.chunk_rows;
+    end = first + (left < s.chunk_rows ? left : s.chunk_rows) * s.width;
+    int64_t before = index * s.chunk_rows - HALO, most = s.chunk_rows + 2 * HALO;
+    cells = s.by_cells + index * 4 * s.cells, near = s.near + 4 * s.width * (index * most - before);
+    rows = s.touched + index * (most + s.lines) - before, lines = rows + before + most;
     zero(s.by_features + first * s.channels, (end - first) * s.channels);
     zero(s.by_alpha + first, end - first);
-    for (int64_t i = 0; i < 2 * HALO + s.lines; i++) halo[i] = 0;
+    for (int64_t i = before; i < before + most + s.lines; i++) rows[i] = 0;
   }
 
-  // To the pixels themselves: all channels but the position, if any are not zero; those of the position.
-  template <int S>
-  MEMBER void add_own(const Pixels& p, bool any, const Vector (&by_own)[S], const Vector (&by_position)[3], Vector by_alpha) {
-    constexpr int C = S + 3;
-    if (any) {
-      Rows<S> rows(by_own);
-      for (int k = 0; k < p.count; k++) rows.add(k, 1, s.by_features + (int64_t)p.at[k] * C);
-    }
-    alignas(64) float lanes[4][LANES];
-    for (int i = 0; i < 3; i++) store(lanes[i], by_position[i]);
-    store(lanes[3], by_alpha);
-    for (int k = 0; k < p.count; k++) {
-      for (int i = 0; i < 3; i++) s.by_features[(int64_t)p.at[k] * C + S + i] = lanes[i][k];
-      s.by_alpha[p.at[k]] += lanes[3][k];
-    }
+  // To the pixels themselves.
+  template <int C>
+  MEMBER void add_own(const Pixels& p, const Vector (&by_own)[C], Vector by_alpha) {
+    Rows<C> own(by_own);
+    alignas(64) float alpha[LANES];
+    store(alpha, by_alpha);
+    for (int k = 0; k < p.count; k++) own.add(k, 1, s.by_features + (int64_t)p.at[k] * C), s.by_alpha[p.at[k]] = alpha[k];
   }
 
   // To the corners, by their weights.
-  template <int S>
-  MEMBER void add_sampled(const Corners& c, int count, const Vector (&by_sampled)[S], Vector by_there) {
-    alignas(64) float w[4][LANES], there[4][LANES];
+  MEMBER void add_sampled(const Corners& c, int count, const Vector (&by_sampled)[4]) {
+    alignas(64) float w[4][LANES];
     Vector weight[4];
     c.weights(weight);
-    for (int j = 0; j < 4; j++) store(w[j], weight[j]), store(there[j], weight[j] * by_there);
-    Rows<S> rows(by_sampled);
-    for (int k = 0; k < count; k++)
-      for (int j = 0; j < 4; j += 2) {
-        float *features, *alpha;
-        place(c.at(k, j), features, alpha);
-        rows.add(k, w[j][k], features), rows.add(k, w[j + 1][k], features + c.next * (S + 3));
-        alpha[0] += there[j][k], alpha[c.next] += there[j + 1][k];
-      }
+    for (int j = 0; j < 4; j++) store(w[j], weight[j]);
+    Rows<4> sampled(by_sampled);
+    for (int k = 0; k < count; k++) {
+      int64_t row = c.row[k], below = row + (c.below > 0);
+      if (!(rows[row] & rows[below])) touch_row(row), touch_row(below);
+      for (int j = 0; j < 4; j++) sampled.add(k, w[j][k], near + 4 * c.at(k, j));
+    }
   }
 
-  MEMBER void add_irradiance(const Irradiance& irradiance, const Vector (&by)[3]) {
-    for (int k = 0; k < 9; k++)
-      for (int c = 0; c < 3; c++) by_totals[3 * k + c] += by[c] * irradiance.basis[k];
-  }
-
-  MEMBER void add_exposure(Vector by) { by_totals[TOTALS - 1] += by; }
+  MEMBER void add_exposure(Vector by) { by_exposure += by; }
 
   // To the cells that were looked up.
-  MEMBER void add_light(const Lookup<true>& l, int count, const Vector (&by_light)[3]) {
-    Vector weight[2][4];
+  template <int N>
+  MEMBER void add_light(const Lookup<N, true>& l, int count, const Vector (&by_light)[3]) {
+    Vector weight[N][4];
     l.weights(weight);
-    Rows<4> w[2] = {Rows<4>(weight[0]), Rows<4>(weight[1])}, by({by_light[0], by_light[1], by_light[2], Vector()});
-    for (int k = 0; k < count; k++) {
-      Four light = by.get(k, 0);
-      Eight twice = __builtin_shufflevector(light, light, 0, 1, 2, 3, 0, 1, 2, 3);
-      for (int i = 0; i < 2; i++) {
-        Four four = w[i].get(k, 0);
+    Rows<4> by({by_light[0], by_light[1], by_light[2], Vector()});
+    for (int i = 0; i < N; i++) {
+      Rows<4> w(weight[i]);
+      for (int k = 0; k < count; k++) {
+        Four light = by.get(k, 0), four = w.get(k, 0);
+        Eight twice = __builtin_shufflevector(light, light, 0, 1, 2, 3, 0, 1, 2, 3);
         int32_t line = l.line[i][k];
         if (!(lines[line] & lines[line + 1])) touch(line), touch(line + 1);
         float *above = cells + 4 * (int64_t)l.cell[i][k], *below = above + 4 * (int64_t)l.width[i][k];
@@ -295,19 +271,9 @@ struct Chunk {
   }
 
  private:
-  // Where to add what is added to a pixel; those of its row lie beside it.
-  MEMBER void place(int64_t at, float*& features, float*& alpha) {
-    if (at >= first && at < end)
-      features = s.by_features + at * s.channels, alpha = s.by_alpha + at;
-    else
-      place_in_halo(at, features, alpha);
-  }
-  __attribute__((noinline)) void place_in_halo(int64_t at, float*& features, float*& alpha) {
-    int64_t row = HALO + (at < first ? at / s.width - first / s.width : (at - end) / s.width);
-    int64_t start = (index * 2 * HALO + row) * s.width, x = at % s.width;
-    if (!halo[row]) zero(s.halo + start * s.channels, s.width * s.channels), zero(s.halo_alpha + start, s.width);
-    halo[row] = 1;
-    features = s.halo + (start + x) * s.channels, alpha = s.halo_alpha + start + x;
+  __attribute__((noinline)) void touch_row(int64_t row) {
+    if (!rows[row]) zero(near + 4 * row * s.width, 4 * s.width);
+    rows[row] = 1;
   }
   __attribute__((noinline)) void touch(int32_t line) {
     if (lines[line]) return;
@@ -319,22 +285,22 @@ struct Chunk {
 
 // Discs sorted and blended by their centres favour those in front: on a curved surface the blend at a pixel is that of a point
 // nearer to the camera, whose normal leans towards it. The blended position tells which point; the pixel whose blend is *this*
-// pixel's point lies the same way back. C channels, of which all but the position are read there.
+// pixel's point lies the same way back, and the normal is read there. The other channels are this pixel's own: what a surface looks
+// like is learned where it shows, and reading it elsewhere would blur it. C channels.
 template <int C, bool DERIVATIVES>
 struct Displaced {
   static constexpr int S = C - 3;
   const Pixels& pixels;
-  Vector alpha, inverse, own[C], value[S];  // own: the position, and the others where any is needed
+  Vector alpha, inverse, own[C], value[S];
   Vector x, y, inverse_z, px, py;  // the blended point in camera space; where it projects
   Mask moves_x, moves_y;           // the derivative passes the limits
   Corners corners;
   Vector there, trust, scale, inverse_there;
-  Vector sampled[S], by_x[S], by_y[S], there_by_x, there_by_y;  // blended over the four corners, and how that changes along x and y
+  Vector sampled[4], by_x[4], by_y[4], there_by_x, there_by_y;  // normals blended over the four corners, and how that changes along x and y
 
   MEMBER Displaced(const Shade& s, const Pixels& p) : pixels(p), alpha(load(p.alpha)), inverse(reciprocal(alpha)) {
-    Vector last[4];  // channels: one more than the position's, as four are quick to load
-    to_lanes<4>([&](int k, int b) { return Blocks<4>::get(s.features + (int64_t)p.at[k] * C + S - 1 + Blocks<4>::at(b)); }, last);
-    for (int i = 0; i < 3; i++) own[S + i] = inverse * last[1 + i];
+    to_lanes<C>([&](int k, int b) { return Blocks<C>::get(s.features + (int64_t)p.at[k] * C + Blocks<C>::at(b)); }, own);
+    for (int c = 0; c < C; c++) own[c] *= inverse;
 
     const float* m = s.view;
     auto row = [&](int i) { return m[i] * own[S] + m[i + 1] * own[S + 1] + m[i + 2] * own[S + 2] + m[i + 3]; };
@@ -357,16 +323,17 @@ struct Displaced {
     corners.next = s.width > 1, corners.below = s.height > 1 ? s.width : 0;
     Vector u0 = smaller(round_down(u), Vector() + (right - (float)corners.next));
     Vector v0 = smaller(round_down(v), Vector() + (s.height > 1 ? bottom - 1 : 0));
-    store(corners.first, convert<Mask>(v0) * (int32_t)s.width + convert<Mask>(u0));
+    Mask first_row = convert<Mask>(v0);
+    store(corners.row, first_row), store(corners.first, first_row * (int32_t)s.width + convert<Mask>(u0));
     corners.x = u - u0, corners.y = v - v0;
 
     alignas(64) float along_x[LANES], along_y[LANES];
     store(along_x, corners.x), store(along_y, corners.y);
-    typedef typename Blocks<S>::Numbers Numbers;
-    Rows<S> rows_by_x, rows_by_y;
-    to_lanes<S>(
+    typedef typename Blocks<4>::Numbers Numbers;  // the normal's, and one more, as four are quick to load
+    Rows<4> rows_by_x, rows_by_y;
+    to_lanes<4>(
         [&](int k, int b) {
-          auto corner = [&](int j) { return Blocks<S>::get(s.features + corners.at(k, j) * C + Blocks<S>::at(b)); };
+          auto corner = [&](int j) { return Blocks<4>::get(s.features + corners.at(k, j) * C + Blocks<4>::at(b)); };
           Numbers first = corner(0), second = corner(2), across = corner(1) - first, across_below = corner(3) - second;
           Numbers above = first + along_x[k] * across, down = second + along_x[k] * across_below - above;
           if (DERIVATIVES) rows_by_x.set(k, b, across + along_y[k] * (across_below - across)), rows_by_y.set(k, b, down);
@@ -374,8 +341,8 @@ struct Displaced {
         },
         sampled);
     if (DERIVATIVES) {
-      to_lanes<S>([&](int k, int b) { return rows_by_x.get(k, b); }, by_x);
-      to_lanes<S>([&](int k, int b) { return rows_by_y.get(k, b); }, by_y);
+      to_lanes<4>([&](int k, int b) { return rows_by_x.get(k, b); }, by_x);
+      to_lanes<4>([&](int k, int b) { return rows_by_y.get(k, b); }, by_y);
     }
     alignas(64) float a[4][LANES];
     for (int k = 0; k < LANES; k++)
@@ -388,37 +355,28 @@ struct Displaced {
     trust = clamp((there - SHIFT_ALPHA) * (1 / SHIFT_ALPHA), 0, 1);
     inverse_there = reciprocal(larger(there, Vector() + SHIFT_ALPHA));
     scale = trust * inverse_there;
-    for (int c = 0; c < S; c++) value[c] = scale * sampled[c], own[c] = Vector();
-    if (any(trust < 1.0f)) {
-      Vector first[S];
-      to_lanes<S>([&](int k, int b) { return Blocks<S>::get(s.features + (int64_t)p.at[k] * C + Blocks<S>::at(b)); }, first);
-      for (int c = 0; c < S; c++) own[c] = inverse * first[c], value[c] += (1.0f - trust) * own[c];
-    }
+    for (int c = 0; c < S; c++) value[c] = c < ALBEDO ? scale * sampled[c] + (1.0f - trust) * own[c] : own[c];
   }
 
   // From the derivatives by `value` and by the pixel's own alpha.
   template <class Sums>
   MEMBER void backward(const Shade& s, const Vector (&by_value)[S], Vector by_alpha, Sums& sums) const {
-    Vector by_sampled[S], by_own[S], by_there = {}, by_u = {}, by_v = {};
-    for (int c = 0; c < S; c++) {
+    Vector by_sampled[4], by_own[C], by_there = {}, by_u = {}, by_v = {};
+    for (int c = 0; c < ALBEDO; c++) {
       by_sampled[c] = scale * by_value[c];
       by_there -= by_sampled[c] * sampled[c];
       by_u += by_sampled[c] * by_x[c], by_v += by_sampled[c] * by_y[c];
-      by_own[c] = (1.0f - trust) * by_value[c] * inverse;
-      by_alpha -= by_own[c] * own[c];
     }
-    by_there = select(there > SHIFT_ALPHA, by_there * inverse_there, Vector());
+    by_there = by_sampled[3] = select(there > SHIFT_ALPHA, by_there * inverse_there, Vector());
     by_u += by_there * there_by_x, by_v += by_there * there_by_y;
     Vector by_px = select(moves_x, -by_u, Vector()), by_py = select(moves_y, -by_v, Vector());
     Vector by_camera_x = s.fx * inverse_z * by_px, by_camera_y = s.fy * inverse_z * by_py;
-    Vector by_z = -inverse_z * (px * by_px + py * by_py), by_position[3];
-    for (int i = 0; i < 3; i++) {
-      Vector by = s.view[i] * by_camera_x + s.view[4 + i] * by_camera_y + s.view[8 + i] * by_z;
-      by_position[i] = by * inverse;
-      by_alpha -= by_position[i] * own[S + i];
-    }
-    sums.template add_own<S>(pixels, any(trust < 1.0f), by_own, by_position, by_alpha);
-    sums.template add_sampled<S>(corners, pixels.count, by_sampled, by_there);
+    Vector by_z = -inverse_z * (px * by_px + py * by_py);
+    for (int i = 0; i < 3; i++) by_own[S + i] = s.view[i] * by_camera_x + s.view[4 + i] * by_camera_y + s.view[8 + i] * by_z;
+    for (int c = 0; c < S; c++) by_own[c] = c < ALBEDO ? (1.0f - trust) * by_value[c] : by_value[c];
+    for (int c = 0; c < C; c++) by_own[c] *= inverse, by_alpha -= by_own[c] * own[c];
+    sums.add_own(pixels, by_own, by_alpha);
+    sums.add_sampled(corners, pixels.count, by_sampled);
   }
 };
 
@@ -473,17 +431,18 @@ INLINE Vectors mirror(Vectors normal, Vectors view, Vector& n_dot_v) {
 }
 
 // The split sum over a metallic-roughness material, of LANES pixels. HARMONICS: colour by direction in place of the reflected
-// irradiance. INDIRECT: light from the object itself where it stands in the mirror direction (Eq. 9). SPLATS: of surfels. Directions are
-// those of the light's frame, for it may stand with the camera.
+// irradiance. INDIRECT: light from the object itself where it stands in the mirror direction (Eq. 9), and its shadow on the irradiance.
+// SPLATS: of surfels. Directions are those of the light's frame, for it may stand with the camera.
 template <bool HARMONICS, bool INDIRECT, bool SPLATS, bool DERIVATIVES>
 struct Shaded {
-  static constexpr int APPEARANCE = HARMONICS ? 8 : 0, FROM_OBJECT = INDIRECT ? 8 + 3 * HARMONICS : 0;  // channels
-  static constexpr int C = 11 + 3 * HARMONICS + 3 * INDIRECT, S = C - 3;
+  static constexpr bool SHADOW = INDIRECT && !HARMONICS;
+  static constexpr int DIFFUSE = 8, FROM_OBJECT = INDIRECT ? 11 : 0;  // channels: the first of colour by direction, or of the shadow
+  static constexpr int C = 11 + 3 * (HARMONICS || INDIRECT) + 3 * INDIRECT, S = C - 3;
   Map<SPLATS, C, DERIVATIVES> map;
   Vector inverse_length, n_dot_v, visibility;
   Vectors normal, view;
-  Lookup<DERIVATIVES> lookup;
-  Irradiance irradiance;
+  Lookup<2, DERIVATIVES> lookup;
+  Lookup<1, DERIVATIVES> irradiance;
   ReflectanceTable table;
   Vector light[3], received[3], radiance[3], encoded[3], slope[3];
   float exposure;
@@ -494,7 +453,7 @@ struct Shaded {
         normal(inverse_length * turned(s.turn, {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
         view(turned(s.turn, seen_from(s))),
         lookup(s.levels, mirrored(), s.mirror ? Vector() : map.value[ROUGHNESS]),
-        irradiance(normal),
+        irradiance(s.levels, normal),
         table(s.reflectance, s.reflectance_side, n_dot_v, map.value[ROUGHNESS]),
         exposure(s.exposure[0]) {
     const auto& v = map.value;
@@ -511,7 +470,7 @@ struct Shaded {
     Vector dielectric = table.value[ReflectanceTable::DIELECTRIC];
 #pragma unroll
     for (int c = 0; c < 3; c++) {
-      received[c] = HARMONICS ? v[APPEARANCE + c] : irradiance.value(s.irradiance, c);
+      received[c] = HARMONICS ? v[DIFFUSE + c] : SHADOW ? v[DIFFUSE + c] * irradiance.light[c] : irradiance.light[c];
       Vector diffuse = (1.0f - metallic) * received[c];
       if (!HARMONICS) diffuse *= (1.0f - dielectric) * v[ALBEDO + c];
       radiance[c] = light[c] * reflected(s, Metal(table, v[ALBEDO + c])) + diffuse;
@@ -542,7 +501,7 @@ struct Shaded {
 
     const auto& v = map.value;
     Vector metallic = v[METALLIC], dielectric = table.value[ReflectanceTable::DIELECTRIC];
-    Vector by[S] = {}, by_light[3], by_table[4] = {}, by_received[3];
+    Vector by[S] = {}, by_light[3], by_table[4] = {}, by_irradiance[3];
     by[METALLIC] = by_material[3], by[ROUGHNESS] = by_material[4];
     Vectors by_n = {};
 #pragma unroll
@@ -565,7 +524,7 @@ struct Shaded {
       by_table[ReflectanceTable::AVERAGE] += by_metal * metal.by_average;
       by_table[ReflectanceTable::DIELECTRIC] += by_reflectance - by_metal;
       if (HARMONICS) {
-        by[APPEARANCE + c] = by_radiance * (1.0f - metallic);
+        by[DIFFUSE + c] = by_radiance * (1.0f - metallic);
         by[METALLIC] -= by_radiance * received[c];
       } else {
         Vector by_diffuse = by_radiance * received[c], base = (1.0f - metallic) * (1.0f - dielectric);
@@ -573,11 +532,11 @@ struct Shaded {
         by_diffuse *= v[ALBEDO + c];
         by[METALLIC] -= by_diffuse * (1.0f - dielectric);
         by_table[ReflectanceTable::DIELECTRIC] -= by_diffuse * (1.0f - metallic);
-        by_received[c] = select(received[c] > 0.0f, by_radiance * base * v[ALBEDO + c], Vector());
-        irradiance.backward(s.irradiance, c, by_received[c], by_n);
+        by_irradiance[c] = by_radiance * base * v[ALBEDO + c];
+        if (SHADOW) by[DIFFUSE + c] = by_irradiance[c] * irradiance.light[c], by_irradiance[c] *= v[DIFFUSE + c];
       }
     }
-    if (!HARMONICS) sums.add_irradiance(irradiance, by_received);
+    if (!HARMONICS) by_n = irradiance.backward(by_irradiance), sums.add_light(irradiance, map.pixels.count, by_irradiance);
     sums.add_exposure(by_exposure);
     Vector by_n_v = {};
     for (int i = 0; i < 4; i++) {
@@ -595,7 +554,10 @@ struct Shaded {
     if constexpr (SPLATS) {
       Vectors by_view = by_dot * normal - by_mirrored;
       by_view = turned_back(s.turn, inverse_norm(map.to_camera(s)) * (by_view - dot(by_view, view) * view));
-      sums.template add_own<S>(map.pixels, true, by, {-by_view.x, -by_view.y, -by_view.z}, by_alpha);
+      Vector by_own[C] = {};
+      for (int c = 0; c < S; c++) by_own[c] = by[c];
+      by_own[S] = -by_view.x, by_own[S + 1] = -by_view.y, by_own[S + 2] = -by_view.z;
+      sums.add_own(map.pixels, by_own, by_alpha);
     } else {
       map.backward(s, by, by_alpha, sums);
     }
@@ -619,11 +581,10 @@ struct Shaded {
   MEMBER Vectors mirrored() { return mirror(normal, view, n_dot_v); }
 };
 
-template <int C>
 void mirrored_pixels(const Shade& s, int64_t first, int64_t end) {
   for (int64_t i = 3 * first; i < 3 * end; i++) s.mirrored[i] = 0;
   each_covered(s, first, end, [&](const Pixels& pixels) {
-    Displaced<C, false> map(s, pixels);
+    Displaced<17, false> map(s, pixels);  // INDIRECT's channels
     Vectors normal = {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]}, view = towards_camera(s, pixels);
     Vector n_dot_v;
     Vectors m = mirror(inverse_norm(normal) * normal, view, n_dot_v);
@@ -693,41 +654,34 @@ void backward_block(const Shade& s) {
     for (int64_t c = 0; c < s.channels; c++) s.by_features[i * s.channels + c] = 0;
     s.by_alpha[i] = 0;
   }
-  __shared__ float by_warp[32][TOTALS];
-  bool any = __any_sync(~0u, covered);
-  Irradiance irradiance(sums.normal);
-#pragma unroll
-  for (int k = 0; k < TOTALS; k++) {
-    bool by_light = k < TOTALS - 1;
-    float sum = by_light ? sums.by_irradiance[k % 3] * irradiance.basis[k / 3].value : sums.by_exposure;
-    if (any && !(by_light && s.harmonics))
-      for (int step = 16; step; step /= 2) sum += __shfl_xor_sync(~0u, sum, step);
-    if (lane == 0) by_warp[warp][k] = sum;
-  }
+  __shared__ float by_warp[32];
+  float sum = sums.by_exposure;
+  for (int step = 16; step; step /= 2) sum += __shfl_xor_sync(~0u, sum, step);
+  if (lane == 0) by_warp[warp] = sum;
   __syncthreads();
-  if (threadIdx.x < TOTALS) {
-    float sum = 0;
-    for (int w = 0; w < warps; w++) sum += by_warp[w][threadIdx.x];
-    s.by_totals[(int64_t)blockIdx.x * TOTALS + threadIdx.x] = sum;
+  if (threadIdx.x == 0) {
+    for (int w = 1; w < warps; w++) sum += by_warp[w];
+    s.by_exposure[blockIdx.x] = sum;
   }
 }
 #else
 void backward_chunk(const Shade& s, int64_t index) {
   Chunk chunk(s, index);
   by_kind(s, [&](auto kind) { kind.backward(s, chunk.first, chunk.end, chunk); });
-  for (int i = 0; i < TOTALS; i++) s.by_totals[index * TOTALS + i] = total(chunk.by_totals[i]);
+  s.by_exposure[index] = total(chunk.by_exposure);
 }
 
-// What the chunks above and below added to a row.
-void add_halo(const Shade& s, int64_t y) {
-  int64_t chunk = y / s.chunk_rows, first = chunk * s.chunk_rows, end = first + s.chunk_rows;
-  for (int64_t from = chunk - 1; from <= chunk + 1; from += 2) {
-    int64_t row = HALO + y - (from < chunk ? first : end);
-    if (from < 0 || from >= chunks(s) || row < 0 || row >= 2 * HALO) continue;
-    if (!s.touched[from * (2 * HALO + s.lines) + row]) continue;
-    int64_t start = (from * 2 * HALO + row) * s.width, n = s.width * s.channels;
-    for (int64_t i = 0; i < n; i++) s.by_features[y * n + i] += s.halo[start * s.channels + i];
-    for (int64_t x = 0; x < s.width; x++) s.by_alpha[y * s.width + x] += s.halo_alpha[start + x];
+// What chunks added to the normals of a row: its own, that above and that below.
+void add_near(const Shade& s, int64_t y) {
+  int64_t chunk = y / s.chunk_rows, most = s.chunk_rows + 2 * HALO;
+  for (int64_t from = chunk - 1; from <= chunk + 1; from++) {
+    int64_t row = y - from * s.chunk_rows + HALO;
+    if (from < 0 || from >= chunks(s) || row < 0 || row >= most || !s.touched[from * (most + s.lines) + row]) continue;
+    const float* near = s.near + 4 * (from * most + row) * s.width;
+    for (int64_t i = 0; i < s.width; i++) {
+      for (int c = 0; c < ALBEDO; c++) s.by_features[(y * s.width + i) * s.channels + c] += near[4 * i + c];
+      s.by_alpha[y * s.width + i] += near[4 * i + 3];
+    }
   }
 }
 
@@ -737,7 +691,8 @@ void add_line(const Shade& s, int32_t line) {
   float* sum = s.by_cells + chunks(s) * 4 * s.cells + first;
   zero(sum, n);
   for (int64_t k = 0; k < chunks(s); k++) {
-    if (!s.touched[k * (2 * HALO + s.lines) + 2 * HALO + line]) continue;
+    int64_t most = s.chunk_rows + 2 * HALO;
+    if (!s.touched[k * (most + s.lines) + most + line]) continue;
     const float* from = s.by_cells + k * 4 * s.cells + first;
     for (int64_t i = 0; i < n; i++) sum[i] += from[i];
   }
@@ -758,9 +713,7 @@ KERNEL(refgs_shade_pad, Shade, s) {
 }
 
 KERNEL(refgs_shade_mirrored, Shade, s) {
-  share_pixels(*s, [&](int64_t first, int64_t end) {
-    s->channels == 14 ? mirrored_pixels<14>(*s, first, end) : mirrored_pixels<17>(*s, first, end);
-  });
+  share_pixels(*s, [&](int64_t first, int64_t end) { mirrored_pixels(*s, first, end); });
 }
 
 KERNEL(refgs_shade_forward, Shade, s) {
@@ -772,11 +725,11 @@ KERNEL(refgs_shade_largest, Shade, s) { backward_block<true>(*s); }
 KERNEL(refgs_shade_backward, Shade, s) { backward_block<false>(*s); }
 
 KERNEL(refgs_shade_gather, Shade, s) {
-  int64_t pixels = s->width * s->height, S = s->channels - 3;
+  int64_t pixels = s->width * s->height;
   float unit = Unit(s->largest[0], SOURCES).size;
   share(s->shared, pixels, 1, [&](int64_t i) {
-    for (int64_t c = 0; c < S; c++) s->by_features[i * s->channels + c] += unit * (float)s->map_sums[c * pixels + i];
-    s->by_alpha[i] += unit * (float)s->map_sums[S * pixels + i];
+    for (int64_t c = 0; c < ALBEDO; c++) s->by_features[i * s->channels + c] += unit * (float)s->map_sums[c * pixels + i];
+    s->by_alpha[i] += unit * (float)s->map_sums[3 * pixels + i];
   });
 }
 
@@ -796,7 +749,7 @@ KERNEL(refgs_shade_backward, Shade, s) {
 
 KERNEL(refgs_shade_gather, Shade, s) {
   share(s->shared, s->height + s->lines, 8, [&](int64_t k) {
-    k < s->height ? add_halo(*s, k) : add_line(*s, (int32_t)(k - s->height));
+    k < s->height ? add_near(*s, k) : add_line(*s, (int32_t)(k - s->height));
   });
 }
 

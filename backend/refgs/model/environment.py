@@ -31,7 +31,7 @@ class Environment:
         self.radiance, self.reference = radiance, reference
         self.resolution = math.isqrt(len(radiance) // 6)
         self.sides = tuple(prefilter.level_sides(self.resolution))
-        self.levels, self.irradiance = prefilter.prefilter(radiance, self.resolution)
+        self.levels = prefilter.prefilter(radiance, self.resolution)
 
     @property
     def harmonics(self) -> Tensor:
@@ -41,7 +41,9 @@ class Environment:
 
     def diffuse(self, normals: Tensor) -> Tensor:
         """Irradiance / π (P, 3) about unit normals (P, 3): what a white matte surface sends out."""
-        return (harmonics.basis(normals, 2) @ self.irradiance).clamp_min(0)
+        levels, last = cubemap.in_texel_order(self.levels.cpu(), self.sides), self.sides[-1]
+        found = cubemap.sample(levels[-6 * last**2 :], (last,), normals.cpu(), torch.zeros(len(normals)))
+        return found.to(normals)
 
     def turn(self, camera: Camera) -> np.ndarray:
         """The rotation (3, 3) that takes the world's directions to the light's, in a camera's picture."""

@@ -8,7 +8,8 @@ cubemap of 6×64² texels and 0.25 s for 6×128², too little to want a file.
 """
 
 import ctypes
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,23 +19,22 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.kernels.load import Shared, Work, check, run
-from refgs.model import cubemap, harmonics
+from refgs.model import cubemap
 from refgs.model.cubemap import SYMMETRIES
 
 ROUGHNESS = (0.0, 0.08, 0.15, 0.25, 0.4, 0.65, 1.0)  # of the levels; level 0 is the cubemap itself
 DIVISOR = (1, 2, 2, 4, 4, 8, 8)  # a level's side is the cubemap's divided by this
 CELLS = 256  # a texel of the pyramid is split while it holds more than 1/CELLS of the lobe
 LEAST_SIDE = 8  # of a level, where the cubemap is as fine
+IRRADIANCE_SIDE = 16  # of the last one: a sun's edge of shadow is as sharp as that
 COARSEST = 4  # side of the last pooled mip
-BLOCK = 32  # orbits that one product adds up: half of those of the smallest cubemap, for a lone product is shared
 SAMPLES = 3  # sub-samples of the lobe along each side of a texel
-# A clamped cosine's harmonics divided by π, by degree (Ramamoorthi and Hanrahan 2001, eq. 8).
-COSINE = (1.0,) + (2 / 3,) * 3 + (1 / 4,) * 5
 
 
 def level_sides(resolution: int) -> list[int]:
-    """Side of each prefiltered level, in texels."""
-    return [max(resolution // d, min(resolution, LEAST_SIDE)) for d in DIVISOR]
+    """Side of each prefiltered level, in texels: those of `ROUGHNESS`, and of irradiance."""
+    sides = [max(resolution // d, min(resolution, LEAST_SIDE)) for d in DIVISOR]
+    return [*sides, min(resolution, IRRADIANCE_SIDE)]
 
 
 def level_of(roughness):
@@ -56,20 +56,32 @@ def ggx_lobe(cosine: np.ndarray, roughness: float) -> np.ndarray:
     return np.maximum(cosine, 0) / (half * (a2 - 1) + 1) ** 2
 
 
-def _level(resolution: int, side: int, roughness: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def cosine_lobe(cosine: np.ndarray) -> np.ndarray:
+    """What irradiance weighs radiance by, up to a factor."""
+    return np.maximum(cosine, 0)
+
+
+Lobe = Callable[[np.ndarray], np.ndarray]
+LOBES = (*(partial(ggx_lobe, roughness=roughness) for roughness in ROUGHNESS[1:]), cosine_lobe)  # of levels 1 and up
+
+
+def _level(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the pyramid's texels of the quarter s, t > 0 of face +x give to a level's, and by symmetry the others to the others:
-    (which of them, the level's texel in the order of orbits, weight). All that a level's texel is given sums to one."""
+    (which of them, the level's texel in the order of orbits, weight). All that a level's texel is given sums to one, none from
+    pooled mips whose side is below `coarsest`."""
     axes = cubemap.texel_directions(side)[cubemap.orbits(side).flatten()].numpy()
     sides = _pyramid_sides(resolution)
     starts = np.cumsum([0] + [n * n // 4 for n in sides])
     cosine = 1 - np.linspace(0, 1, 100_001) ** 4  # dense where a narrow lobe is
-    whole = -2 * np.pi * integrate.trapezoid(ggx_lobe(cosine, roughness), cosine)
+    whole = -2 * np.pi * integrate.trapezoid(lobe(cosine), cosine)
     parts = []
-    axis, row, column = np.indices((len(axes), COARSEST // 2, COARSEST // 2)).reshape(3, -1)
+    axis, row, column = np.indices((len(axes), coarsest // 2, coarsest // 2)).reshape(3, -1)
     for n, start in zip(reversed(sides), reversed(starts[:-1]), strict=True):
+        if n < coarsest:
+            continue
         half = n // 2
         area = cubemap.texel_solid_angles(n).numpy().reshape(6, n, n)[0, half:, half:]
-        share = _lobe_over_texels(axes[axis], row, column, n, roughness) * area[row, column] / whole
+        share = _lobe_over_texels(axes[axis], row, column, n, lobe) * area[row, column] / whole
         split = (share > 1 / CELLS) & (n < resolution)
         kept = (share > 1e-5) & ~split
         parts.append((start + row[kept] * half + column[kept], axis[kept], share[kept]))
@@ -79,14 +91,14 @@ def _level(resolution: int, side: int, roughness: float) -> tuple[np.ndarray, np
     return orbit, axis, weight / np.bincount(axis // SYMMETRIES, weight)[axis // SYMMETRIES]
 
 
-def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, side: int, roughness: float) -> np.ndarray:
+def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, side: int, lobe: Lobe) -> np.ndarray:
     """The lobe about each axis, averaged over a texel, counted from the middle of face +x: it changes within one."""
     value = np.zeros(len(axes))
     x, y, z = np.ascontiguousarray(axes.T)
     for i in range(SAMPLES):
         for j in range(SAMPLES):
             s, t = (2 / side * (place + (k + 0.5) / SAMPLES) for place, k in ((column, j), (row, i)))
-            value += ggx_lobe((x + y * s + z * t) / np.sqrt(1 + s * s + t * t), roughness)
+            value += lobe((x + y * s + z * t) / np.sqrt(1 + s * s + t * t))
     return value / SAMPLES**2
 
 
@@ -128,8 +140,10 @@ def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
     """The levels stacked, as a matrix over the pyramid's texels, and its transpose."""
     itself = np.arange(resolution**2 // 4)  # level 0
     parts, start = [(itself, SYMMETRIES * itself, np.ones(len(itself)))], 6 * resolution**2
-    for side, roughness in zip(level_sides(resolution)[1:], ROUGHNESS[1:], strict=True):
-        orbit, texel, weight = _level(resolution, side, roughness)
+    for side, lobe in zip(level_sides(resolution)[1:], LOBES, strict=True):
+        # A sun's light falls off as evenly near the edge of its shadow as elsewhere: there, too, it needs its place.
+        coarsest = side if lobe is cosine_lobe else COARSEST
+        orbit, texel, weight = _level(resolution, side, lobe, coarsest)
         parts.append((orbit, start + texel, weight))
         start += 6 * side * side
     shape = sum(n * n // 4 for n in _pyramid_sides(resolution)), start // SYMMETRIES
@@ -159,18 +173,6 @@ def _order(resolution: int, device: torch.device) -> Tensor:
     return cubemap.orbit_order((resolution,)).int().to(device)
 
 
-@lru_cache(maxsize=4)
-def _projection(resolution: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Radiance → irradiance / π in harmonics, in two steps: (9, orbits), of an orbit's first texel; (9, 9 · 24), from what the
-    first step gives for each symmetry to the sum over all of them, each being the harmonics of the first turned."""
-    orbits = cubemap.orbits(resolution)
-    basis = harmonics.basis(cubemap.texel_directions(resolution), 2)[orbits]  # (orbits, 24, 9)
-    turned = torch.linalg.lstsq(basis[:, 0], basis.flatten(1)).solution.unflatten(1, (SYMMETRIES, 9))
-    turned = turned * torch.tensor(COSINE, dtype=torch.float64)
-    first = (basis[:, 0] * cubemap.texel_solid_angles(resolution)[orbits[:, :1]]).T
-    return tuple(m.float().contiguous().to(device) for m in (first, turned.permute(2, 0, 1).flatten(1)))
-
-
 class _Work(Work):
     """`struct Product` of sparse.cpp."""
 
@@ -193,30 +195,22 @@ def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tenso
 
 class _Prefilter(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, radiance: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
+    def forward(ctx, radiance: Tensor, resolution: int) -> Tensor:
         ctx.resolution, device = resolution, radiance.device
         ordered = radiance.index_select(0, _order(resolution, device))
         pyramid = _product(_pyramid(resolution, device)[0], ordered)
-        levels = _product(matrices(resolution, device)[0], pyramid)
-        first, turned = _projection(resolution, device)
-        # BLAS may share one long sum among threads, and so round it by their number; short ones it does not.
-        blocks = first.unflatten(1, (-1, BLOCK)).transpose(0, 1), ordered.view(-1, BLOCK, 3 * SYMMETRIES)
-        irradiance = (turned[:, :, None] * torch.bmm(*blocks).sum(dim=0).view(-1, 3)).sum(dim=1)
-        return levels, irradiance
+        return _product(matrices(resolution, device)[0], pyramid)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, by_levels: Tensor, by_irradiance: Tensor):
-        resolution, device, count = ctx.resolution, by_levels.device, 6 * ctx.resolution**2
+    def backward(ctx, by_levels: Tensor):
+        resolution, device = ctx.resolution, by_levels.device
         by_pyramid = _product(matrices(resolution, device)[1], by_levels.contiguous())
-        first, turned = _projection(resolution, device)
-        by_first = (turned.T @ by_irradiance).view(-1, 3 * SYMMETRIES)
-        by_pyramid[:count].view(-1, 3 * SYMMETRIES).addmm_(first.T, by_first)  # it begins with the cubemap itself
         return _product(_pyramid(resolution, device)[1], by_pyramid, rows=_order(resolution, device)), None
 
 
-def prefilter(radiance: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
-    """Of a cubemap (6·R², 3) all levels one after another, (Σ 6·side², 3), each in the order of `cubemap.orbits`; and the
-    irradiance / π in harmonics up to degree 2, (9, 3). Linear radiance in, linear radiance out."""
+def prefilter(radiance: Tensor, resolution: int) -> Tensor:
+    """Of a cubemap (6·R², 3) all levels one after another, (Σ 6·side², 3), each in the order of `cubemap.orbits`; the last is
+    irradiance / π. Linear radiance in, linear radiance out."""
     check(radiance=(radiance, (6 * resolution**2, 3)))
     return _Prefilter.apply(radiance, resolution)

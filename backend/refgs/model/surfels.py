@@ -18,7 +18,7 @@ FLAT = 0.3  # thickness of 3D Gaussians at the start, by their width
 Parameters = dict[str, Tensor]
 """Raw leaf tensors, one row a surfel: position (N, 3), rotation (N, 4) wxyz, scale (N, 2) log, or (N, 3) of 3D
 Gaussians, opacity (N,) logit, sh_dc (N, 1, 3), sh_rest (N, K−1, 3), albedo (N, 3) logit, metallic (N,) logit, roughness
-(N,) logit, indirect_dc and indirect_rest as the SH."""
+(N,) logit, received (N, 3), which does not learn, indirect_dc and indirect_rest as the SH."""
 
 
 def axes(rotations: Tensor) -> list[Tensor]:
@@ -34,7 +34,8 @@ def axes(rotations: Tensor) -> list[Tensor]:
 class Surfels(NamedTuple):
     """Activated values of N surfels: world units, linear Rec.709 albedo, materials in 0..1, SH with colour = 0.5 + SH.
 
-    SH are taken apart into their constant (N, 1, 3) and the rest (N, K − 1, 3), as they are learned. `indirect` are those of
+    `received` (N, 3) is what part of the irradiance of an unhidden surface reaches a surfel; with the object's own light it can be
+    above 1. SH are taken apart into their constant (N, 1, 3) and the rest (N, K − 1, 3), as they are learned. `indirect` are those of
     the linear radiance that reaches a surfel from the object itself (paper Eq. 10).
     """
 
@@ -47,12 +48,19 @@ class Surfels(NamedTuple):
     albedo: Tensor
     metallic: Tensor
     roughness: Tensor
+    received: Tensor
     indirect_dc: Tensor
     indirect_rest: Tensor
 
     def normals(self) -> Tensor:
         """Unit normals t_u × t_v (N, 3): the third column of each rotation, if its axis is the shortest."""
         return axes(self.rotations)[2]
+
+    def turned(self, which: Tensor) -> "Surfels":
+        """With the normals of some (N,) pointing the other way."""
+        w, x, y, z = self.rotations.unbind(-1)
+        turned = torch.stack([-x, w, z, -y], dim=-1)  # q · (0, 1, 0, 0): half a turn about t_u
+        return self._replace(rotations=torch.where(which[:, None], turned, self.rotations))
 
 
 class _Activation(ctypes.Structure):
@@ -118,6 +126,7 @@ def activate(p: Parameters) -> Surfels:
         albedo=albedo,
         metallic=metallic,
         roughness=roughness,
+        received=p["received"].detach(),
         indirect_dc=p["indirect_dc"],
         indirect_rest=p["indirect_rest"],
     )
@@ -168,6 +177,7 @@ def initial_parameters(
         "albedo": logit(albedo, n, 3),
         "metallic": logit(metallic, n),
         "roughness": logit(roughness, n),
+        "received": torch.ones(n, 3),
         "indirect_dc": torch.zeros(n, 1, 3),
         "indirect_rest": torch.zeros(n, rest, 3),
     }

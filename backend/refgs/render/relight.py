@@ -30,6 +30,9 @@ WHITE = 1.0  # as bright as on a screen: what is brighter harmonics would smear 
 ROUGHNESSES = 64  # for which a coat's dependence on the angle is known
 NEIGHBOURS = 8  # surfels that a point of the mesh is blended of
 CHUNK = 512  # surfels at a time
+PROBES = 6000  # surfels that stand for all, and directions that they look in,
+PROBE_DIRECTIONS = 256  # where but the irradiance is wanted
+MOST_RECEIVED = 4.0  # times what an unhidden surface would: where that is next to nothing
 
 Progress = Callable[[int, int], None]
 
@@ -146,6 +149,24 @@ def relit(t: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
     return t.surfels._replace(
         sh_dc=sh[:, :1], sh_rest=sh[:, 1:], indirect_dc=indirect[:, :1], indirect_rest=indirect[:, 1:]
     )
+
+
+def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor:
+    """What of the irradiance of unhidden surfaces reaches the surfels past the object, and from the object itself, (N, 3). Their
+    normals may point either way. Traced from some of them, between which it is interpolated."""
+    mesh, positions = occluder.mesh, surfels.positions.double().numpy()
+    near = cKDTree(mesh.vertices).query(positions)[1]
+    outward = smooth_normals(mesh.vertices, mesh.faces)[near]
+    inward = np.einsum("na,na->n", surfels.normals().numpy(), outward) < 0
+    surfels = surfels.turned(torch.from_numpy(inward))
+    chosen = torch.randperm(len(positions), generator=torch.Generator().manual_seed(0))[:PROBES]
+    probes = Surfels(*(value[chosen] for value in surfels))
+    traced = Transport(probes, occluder, PROBE_DIRECTIONS)
+    found, _ = _gather(traced, light, BOUNCES)
+    part = (found / light.diffuse(traced.normals).clamp_min(1e-6)).clamp_max(MOST_RECEIVED)
+    wide = probes._replace(scales=probes.scales * math.sqrt(len(positions) / len(chosen)))
+    blend = _blend(wide, traced.normals.double().numpy(), positions, surfels.normals().double().numpy())
+    return torch.from_numpy(blend @ part.numpy())
 
 
 def _gather(t: Transport, light: Environment, bounces: int) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ from refgs.render.facing import facing_normals
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import mirror_directions, shade, shade_splats
 from refgs.render.stack import stack
-from refgs.render.volume import discs, shortest_last
+from refgs.render.volume import discs, with_normals_last
 from refgs.settings import RenderSettings
 
 NEAR = 0.01  # the nearest depth that is drawn, in scene radii
@@ -87,14 +87,14 @@ def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, 
 
 def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirect: bool) -> list[Tensor]:
     """What `shade` takes of surfels, as a camera sees them, (N, C) each: normals, albedo, metallic, roughness; colour by direction
-    where there is any; with `indirect`, radiance from the object itself; positions."""
-    facing = surfels.rotations
-    if surfels.scales.shape[1] == 3:
-        facing, _ = shortest_last(surfels.rotations, surfels.scales)
-    normals = facing_normals(facing, surfels.positions, camera)
+    where there is any; with `indirect`, if not what part of the irradiance they receive, and radiance from the object itself;
+    positions."""
+    normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
     lit = [normals, surfels.albedo, surfels.metallic, surfels.roughness]
     if settings.shading == "sh" or settings.diffuse == "sh":
         lit.append(directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera))
+    elif indirect:
+        lit.append(surfels.received)
     if indirect:
         lit.append(directional(surfels.indirect_dc, surfels.indirect_rest, 0.0, surfels.positions, camera, normals))
     return [*lit, surfels.positions]
@@ -128,7 +128,8 @@ def render(
     features, depth, alpha = rasterize(*discs(surfels, camera), stack(blended), camera, near=near)
     if deferred:
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
-        shaded = shade(features, alpha, environment, camera, background, visibility, exposure, display, mirror)
+        how = display, mirror, settings.diffuse == "sh"
+        shaded = shade(features, alpha, environment, camera, background, visibility, exposure, *how)
         radiance = srgb_decode(shaded.radiance) if display else shaded.radiance
         return Rendering(shaded.color, alpha, depth, shaded.normal, shaded.material, radiance, visibility)
     over = (1 - alpha[..., None]) * background

@@ -15,8 +15,8 @@ from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
 from refgs.render.brdf import reflectance_table
 
-TOTALS = 28  # of shade.cpp
 CHANNELS = 11  # normal, albedo, metallic, roughness, position; before the position those that not every scene has
+INDIRECT = 6  # more of them with inter-reflection
 
 
 class Shaded(NamedTuple):
@@ -55,11 +55,11 @@ class _Work(Work):
         + [(n, ctypes.c_void_p) for n in ("features", "alpha", "visibility")]
         + [("levels", _Levels)]
         + [(n, ctypes.c_int64) for n in ("texels", "cells", "lines")]
-        + [(n, ctypes.c_void_p) for n in ("light", "texel", "padded", "starts", "cell", "irradiance", "reflectance")]
+        + [(n, ctypes.c_void_p) for n in ("light", "texel", "padded", "starts", "cell", "reflectance")]
         + [("reflectance_side", ctypes.c_int64)]
         + [(n, ctypes.c_void_p) for n in ("mirrored", "color", "normal", "material", "radiance")]
         + [(n, ctypes.c_void_p) for n in ("by_color", "by_normal", "by_material", "by_features", "by_alpha")]
-        + [(n, ctypes.c_void_p) for n in ("by_light", "by_totals", "halo", "halo_alpha", "by_cells", "touched")]
+        + [(n, ctypes.c_void_p) for n in ("by_light", "by_exposure", "near", "by_cells", "touched")]
         + [(n, ctypes.c_void_p) for n in ("map_sums", "cell_sums", "largest")]
         + [("scratch", ctypes.c_void_p), ("shared", Shared)]
     )
@@ -114,33 +114,32 @@ def _one(device: torch.device) -> Tensor:
 
 class _Shade(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, features, alpha, levels, irradiance, exposure, sides, camera, turn, background, visibility, *how):
-        features, alpha, irradiance = features.contiguous(), alpha.contiguous(), irradiance.contiguous()
+    def forward(ctx, features, alpha, levels, exposure, sides, camera, turn, background, visibility, *how):
+        features, alpha = features.contiguous(), alpha.contiguous()
         table, padding = _reflectance(features.device), _Padding.of(sides, features.device)
         light, cells = levels.contiguous(), len(padding.texel)
         padded = features.new_empty(cells, 4)
         work = _Work.of(features, alpha, camera)
         background = background.to(features)
         work.turn[:] = turn.reshape(-1).tolist()
-        work.attach(background=background, exposure=exposure, irradiance=irradiance, reflectance=table)
+        work.attach(background=background, exposure=exposure, reflectance=table)
         work.attach(light=light, padded=padded)
         work.attach(texel=padding.texel, starts=padding.starts, cell=padding.cell)
         if visibility is not None:
             work.attach(visibility=visibility)
-        work.harmonics = work.channels > CHANNELS + 3 * (visibility is not None)
-        work.display, work.mirror, work.splats = how
+        work.harmonics, work.display, work.mirror, work.splats = how
         work.texels, work.cells, work.lines = len(light), cells, padding.lines
         work.levels.count, work.levels.cells = len(sides), padded.data_ptr()
         work.levels.side[: len(sides)] = sides
         work.levels.start[: len(sides)], work.levels.line[: len(sides)] = padding.first_cells, padding.first_lines
-        work.levels.alpha[: len(sides)] = [roughness**2 for roughness in prefilter.ROUGHNESS]
+        work.levels.alpha[: len(prefilter.ROUGHNESS)] = [roughness**2 for roughness in prefilter.ROUGHNESS]
         work.reflectance_side = table.shape[0]
         numbers = (3, 0, 0, 0) if work.splats else (3, 3, 5, 3)
         shaded = Shaded(*(features.new_empty(*alpha.shape, n) for n in numbers))
         work.attach(**shaded._asdict())
         load.run("refgs_shade_pad", work, features, items=cells)
         load.run("refgs_shade_forward", work, features, items=alpha.numel())
-        ctx.save_for_backward(features, alpha, irradiance)
+        ctx.save_for_backward(features, alpha)
         ctx.work, ctx.kept = work, (padded, background, exposure, visibility, table, padding)
         ctx.mark_non_differentiable(shaded.radiance)
         ctx.set_materialize_grads(False)
@@ -149,7 +148,7 @@ class _Shade(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, by_color, by_normal, by_material, _):
-        features, alpha, irradiance = ctx.saved_tensors
+        features, alpha = ctx.saved_tensors
         work, new = ctx.work, features.new_empty
         upstream = {"by_color": (by_color, 3)}
         if not work.splats:
@@ -159,34 +158,31 @@ class _Shade(torch.autograd.Function):
         work.attach(**given, by_features=by_features, by_alpha=by_alpha, by_light=by_light)
         if load.on_gpu(features):
             blocks = -(-alpha.numel() // cuda.BLOCK)
-            by_totals = new(blocks, TOTALS)
-            sizes = (work.channels - 2) * alpha.numel(), 3 * work.cells, 1
+            by_exposure = new(blocks)
+            sizes = 4 * alpha.numel(), 3 * work.cells, 1
             map_sums, cell_sums, largest = new(sum(sizes), dtype=torch.int64).zero_().split(sizes)
-            work.attach(by_totals=by_totals, map_sums=map_sums, cell_sums=cell_sums, largest=largest)
+            work.attach(by_exposure=by_exposure, map_sums=map_sums, cell_sums=cell_sums, largest=largest)
             cuda.launch("refgs_shade_largest", work, features.device, blocks)
             cuda.launch("refgs_shade_backward", work, features.device, blocks)
         else:
-            by_totals, halo = new(work.chunks, TOTALS), load.kernels().refgs_shade_halo()
+            by_exposure, rows = new(work.chunks), work.chunk_rows + load.kernels().refgs_shade_halo()
             buffers = {
-                "halo": new(work.chunks, halo, work.width, work.channels),
-                "halo_alpha": new(work.chunks, halo, work.width),
+                "near": new(work.chunks, rows, work.width, 4),
                 "by_cells": new(work.chunks + 1, work.cells, 4),
-                "touched": new(work.chunks, halo + work.lines, dtype=torch.uint8),
+                "touched": new(work.chunks, rows + work.lines, dtype=torch.uint8),
             }
-            work.attach(by_totals=by_totals, **buffers)
+            work.attach(by_exposure=by_exposure, **buffers)
             load.parallel(load.kernels().refgs_shade_backward, work)
         load.run("refgs_shade_gather", work, features, items=alpha.numel())
         load.run("refgs_shade_unpad", work, features, items=work.texels)
-        totals = by_totals.sum(dim=0)
-        by_irradiance, by_exposure = totals[:-1].view(irradiance.shape), totals[-1]
-        return by_features, by_alpha, by_light, by_irradiance, by_exposure, *[None] * 8
+        return by_features, by_alpha, by_light, by_exposure.sum(), *[None] * 9
 
 
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
     """Where `shade` looks for light (H, W, 3): the ways to the camera, mirrored at the blended normals; unit vectors in
     world space, zero where nothing is. `features` and `alpha` as `shade` takes them beside a visibility; without gradients."""
-    if features.shape not in ((*alpha.shape, CHANNELS + 3), (*alpha.shape, CHANNELS + 6)):
-        raise ValueError(f"expected {CHANNELS + 3} or {CHANNELS + 6} features a pixel, got {tuple(features.shape)}")
+    if features.shape != (*alpha.shape, CHANNELS + INDIRECT):
+        raise ValueError(f"expected {CHANNELS + INDIRECT} features a pixel, got {tuple(features.shape)}")
     features, alpha = features.detach().contiguous(), alpha.detach().contiguous()
     work, mirrored = _Work.of(features, alpha, camera), features.new_empty(*alpha.shape, 3)
     work.attach(mirrored=mirrored)
@@ -204,13 +200,15 @@ def shade(
     exposure: Tensor | None = None,
     display: bool = False,
     mirror: bool = False,
+    by_direction: bool = False,
 ) -> Shaded:
     """Shade what the rasteriser blended by the split sum (paper Eq. 5–10), over a background (3,), sRGB-encoded.
 
     `features` (H, W, C) are sums over a pixel's splats of, in this order: normal in world space, albedo, metallic,
-    roughness; three of colour by direction, where that takes the place of integrated diffuse light (the paper's
-    substitute); three of radiance from the object itself, where there is a `visibility` (H, W) in 0..1, by which that
-    gives way to the environment's (Eq. 9); position. `alpha` (H, W). The picture's radiance is multiplied by the
+    roughness; with `by_direction`, three of colour by direction, which takes the place of integrated diffuse light (the paper's
+    substitute); where there is a `visibility` (H, W) in 0..1, three by which integrated diffuse light is multiplied, unless
+    colour by direction stands in their place, and three of radiance from the object itself, which gives way by the visibility
+    to the environment's (Eq. 9); position. `alpha` (H, W). The picture's radiance is multiplied by the
     `exposure`, a scalar, before it is encoded; 1 where there is none. float32, all on the CPU or on one card, differentiable
     in features, alpha, the light and the exposure. What the blend's mean position says of its bias towards the camera is
     undone first: shade.cpp has how. With `display` light and materials are of a screen's numbers, and nothing is encoded. With
@@ -218,11 +216,12 @@ def shade(
     The result does not depend on the number of threads, nor, on a card, does it differ from one call to the next. Where a
     derivative to hand back is not finite, on a card none is a number.
     """
-    least = CHANNELS + 3 * (visibility is not None)
-    if features.shape not in ((*alpha.shape, least), (*alpha.shape, least + 3)):
+    expected = CHANNELS + (3 * by_direction if visibility is None else INDIRECT)
+    if features.shape != (*alpha.shape, expected):
         size = f"{alpha.shape[1]}×{alpha.shape[0]}"
-        raise ValueError(f"expected {least} or {least + 3} features a pixel of {size}, got {tuple(features.shape)}")
-    return _shade(features, alpha, environment, camera, background, visibility, exposure, display, mirror, splats=False)
+        raise ValueError(f"expected {expected} features a pixel of {size}, got {tuple(features.shape)}")
+    how = by_direction, display, mirror, False
+    return _shade(features, alpha, environment, camera, background, how, visibility, exposure)
 
 
 def shade_splats(features: Tensor, environment: Environment, camera: Camera, mirror: bool = False) -> Tensor:
@@ -235,7 +234,8 @@ def shade_splats(features: Tensor, environment: Environment, camera: Camera, mir
     if channels not in (CHANNELS, CHANNELS + 3):
         raise ValueError(f"expected {CHANNELS} or {CHANNELS + 3} features a surfel, got {channels}")
     features, alpha = features[:, None], features.new_ones(count, 1)
-    return _shade(features, alpha, environment, camera, features.new_zeros(3), mirror=mirror, splats=True).color[:, 0]
+    how = channels > CHANNELS, False, mirror, True
+    return _shade(features, alpha, environment, camera, features.new_zeros(3), how).color[:, 0]
 
 
 def _shade(
@@ -244,18 +244,14 @@ def _shade(
     light: Environment,
     camera: Camera,
     background: Tensor,
+    how: tuple[bool, bool, bool, bool],  # by direction, display, mirror, of surfels
     visibility: Tensor | None = None,
     exposure: Tensor | None = None,
-    display: bool = False,
-    mirror: bool = False,
-    *,
-    splats: bool,
 ) -> Shaded:
     texels = sum(6 * side * side for side in light.sides)
     exposure = _one(features.device) if exposure is None else exposure
     given = {"features": (features, features.shape), "alpha": (alpha, alpha.shape), "exposure": (exposure, ())}
-    given |= {"levels": (light.levels, (texels, 3)), "irradiance": (light.irradiance, (9, 3))}
+    given |= {"levels": (light.levels, (texels, 3))}
     load.check(**given, **({} if visibility is None else {"visibility": (visibility, alpha.shape)}))
-    maps = features, alpha, light.levels, light.irradiance, exposure
-    how = light.sides, camera, light.turn(camera), background, visibility, display, mirror, splats
-    return Shaded(*_Shade.apply(*maps, *how))
+    maps = features, alpha, light.levels, exposure
+    return Shaded(*_Shade.apply(*maps, light.sides, camera, light.turn(camera), background, visibility, *how))

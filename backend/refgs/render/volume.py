@@ -41,6 +41,14 @@ def shortest_last(rotations: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
     return product(rotations, turns), scales.gather(1, order)
 
 
+def with_normals_last(surfels: Surfels) -> Surfels:
+    """3D Gaussians with their normal as the third axis, where flat surfels have it; those as they are."""
+    if surfels.scales.shape[1] == 2:
+        return surfels
+    rotations, scales = shortest_last(surfels.rotations, surfels.scales)
+    return surfels._replace(rotations=rotations, scales=scales)
+
+
 class _Angle(torch.autograd.Function):
     """Half the angle of (x, y). Round Gaussians have none, and feel no turn: no derivative there."""
 

@@ -14,7 +14,7 @@ from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, to_splats
 from refgs.render.rasterize import rasterize
-from refgs.render.volume import discs, shortest_last
+from refgs.render.volume import discs, with_normals_last
 from refgs.run import OCCLUDER, write_text
 from refgs.train.trainer import Trainer
 
@@ -23,19 +23,17 @@ def write_asset(trainer: Trainer) -> None:
     """Write splats.ply, environment.exr, needs.json and, where they are known, occluder.ply and the exposures in cameras.json."""
     folder, settings = trainer.folder, trainer.settings
     with torch.no_grad():
-        surfels, environment = trainer.surfels(), trainer.environment()
-    if surfels.scales.shape[1] == 3:
-        rotations, scales = shortest_last(surfels.rotations, surfels.scales)
-        surfels = surfels._replace(rotations=rotations, scales=scales)
+        surfels, environment = with_normals_last(trainer.surfels()), trainer.environment()
+    if trainer.occluder is None:
+        nothing, whole = surfels.indirect_dc[:, :0], torch.ones_like(surfels.received)
+        surfels = surfels._replace(indirect_dc=nothing, indirect_rest=nothing, received=whole)
+    else:
+        write_mesh(folder / OCCLUDER, trainer.occluder.mesh)
     if environment is not None:
         panorama = environment.panorama(4 * environment.resolution)
         display = settings.render.color_space == "display"
         write_environment(folder / "environment.exr", srgb_decode(panorama) if display else panorama)
         surfels = _with_relightable_albedo(surfels, environment, trainer)
-    if trainer.occluder is not None:
-        write_mesh(folder / OCCLUDER, trainer.occluder.mesh)
-    else:
-        surfels = surfels._replace(indirect_dc=surfels.indirect_dc[:, :0], indirect_rest=surfels.indirect_rest[:, :0])
     surfels, unseen = _facing_outward(surfels, trainer)
     write_splats(folder / "splats.ply", to_splats(surfels))
     if trainer.exposures is not None:
@@ -68,7 +66,7 @@ def _received(surfels: Surfels, environment: Environment, trainer: Trainer) -> T
     cosine to the camera, either side being looked at."""
     normals = surfels.normals()
     if environment.reference is None:
-        return environment.diffuse(normals).clamp_min(1e-6)
+        return (surfels.received * environment.diffuse(normals)).clamp_min(1e-6)
     total, weights = torch.zeros_like(normals), torch.full_like(normals[:, :1], 1e-6)
     for camera in (view.camera for view in trainer.views):
         towards = torch.from_numpy(camera.position).to(normals) - surfels.positions
@@ -96,13 +94,10 @@ def _facing_outward(surfels: Surfels, trainer: Trainer) -> tuple[Surfels, int]:
         towards = torch.from_numpy(view.camera.position).float().to(trainer.device) - surfels.positions
         side += weight * torch.sign((normals * towards).sum(dim=-1))
         seen += weight
-    w, x, y, z = surfels.rotations.unbind(-1)
-    turned = torch.stack([-x, w, z, -y], dim=-1)  # q · (0, 1, 0, 0): half a turn about t_u
-    rotations = torch.where((side < 0)[:, None], turned, surfels.rotations)
     keep = seen > 0
     if not keep.any():
         keep[:] = True
-    surfels = Surfels(*(value[keep] for value in surfels._replace(rotations=rotations)))
+    surfels = Surfels(*(value[keep] for value in surfels.turned(side < 0)))
     return surfels, int(count - keep.sum())
 
 

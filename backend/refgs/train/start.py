@@ -1,5 +1,7 @@
 """Where surfels start: on the visual hull, on structure-from-motion points, or at random."""
 
+import math
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -15,8 +17,9 @@ FAINT = 0.1  # opacity, at the most, of points that may lie anywhere
 def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings) -> tuple[Parameters, str]:
     """Initial parameters and one line that says where they came from."""
     count, seed = min(settings.surfels.start, settings.surfels.budget), settings.train.seed
-    colours, opacity = None, settings.surfels.opacity
+    colours, opacity, shown = None, settings.surfels.opacity, count
     if all(view.alpha is not None for view in views):
+        shown = on_hull(count, settings.surfels)
         positions, normals, spacing = visual_hull_points(
             [view.alpha for view in views],
             [view.camera for view in views],
@@ -25,6 +28,7 @@ def start_parameters(capture: Capture, views: list[LoadedView], settings: Settin
             count,
             resolution=settings.surfels.hull,
             seed=seed,
+            on_hull=shown,
         )
         source = "the visual hull of the masks"
     elif capture.points is not None and len(capture.points) >= 100:
@@ -36,7 +40,13 @@ def start_parameters(capture: Capture, views: list[LoadedView], settings: Settin
         normals, spacing, opacity = _towards_cameras(positions, views), _spacing(positions), min(opacity, FAINT)
         source = "random points (no masks and no structure-from-motion points)"
     parameters = _initial(positions, normals, spacing, colours, settings.surfels, opacity)
+    parameters["opacity"].data[shown:].clamp_(max=math.log(FAINT / (1 - FAINT)))
     return parameters, f"{len(positions)} surfels start on {source}"
+
+
+def on_hull(count: int, settings: SurfelSettings) -> int:
+    """How many of the surfels start on the visual hull; those that follow start inside, where it has hollows that no mask shows."""
+    return max(1, count - round(settings.inside * count))
 
 
 def start_appearance(settings: Settings) -> Parameters:

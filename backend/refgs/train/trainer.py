@@ -21,7 +21,9 @@ from refgs.model import cubemap
 from refgs.model.environment import Environment
 from refgs.model.surfels import Parameters, Surfels, activate
 from refgs.paths import whole
+from refgs.render.relight import received
 from refgs.render.renderer import Rendering, near_plane, render
+from refgs.render.volume import with_normals_last
 from refgs.report.metrics import decibels, psnr
 from refgs.settings import RenderSettings, Settings
 from refgs.train import checkpoint
@@ -29,7 +31,7 @@ from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify, propagate_normals, reset_opacity, thin
 from refgs.train.light import light_frame, mirrored
 from refgs.train.losses import Photo, departure, objective
-from refgs.train.start import GEOMETRY, start_appearance, start_parameters
+from refgs.train.start import on_hull, start_appearance, start_parameters
 
 Report = Callable[[str, dict[str, Any]], None]
 """Called with an event's name and its facts: "stage", "progress", "warning"."""
@@ -113,7 +115,7 @@ class Trainer:
         self.initial = settings.render.shading == "deferred" and settings.initial.until > 0  # its stage is not over
 
     def _rate(self, name: str) -> float:
-        rate = getattr(self.settings.rates, name)
+        rate = getattr(self.settings.rates, name, 0.0)  # what is traced does not learn
         return rate * self.capture.radius if name == "position" else rate
 
     def _choose_light_frame(self, start: Parameters) -> None:
@@ -125,7 +127,8 @@ class Trainer:
         if lit and self.from_hull:
             with torch.no_grad():
                 points = activate(start)
-                found = points.positions.numpy(), points.normals().numpy()
+                shown = slice(on_hull(len(points.positions), self.settings.surfels))
+                found = points.positions[shown].numpy(), points.normals()[shown].numpy()
             frame, why = light_frame(self.views, *found, self.capture.radius)
         self.settings = self.settings.model_copy(update={"light": light.model_copy(update={"frame": frame})})
         self.chosen["light.frame"] = f"{frame}: {why}"
@@ -143,6 +146,8 @@ class Trainer:
             unused = ["sh_dc", "sh_rest"]
         if not self._reflects():
             unused += ["indirect_dc", "indirect_rest"]
+        if not self._reflects() or render.diffuse == "sh":
+            unused += ["received"]
         mirror = (
             {"albedo": MIRROR, "roughness": -MIRROR} if render.reflection == "mirror" and render.shading != "sh" else {}
         )
@@ -263,8 +268,6 @@ class Trainer:
 
     def _set_rates(self, progress: float) -> None:
         settings, rates, frozen = self.settings, self.settings.rates, []
-        if self.from_hull and self.iteration < settings.train.light_first and settings.render.shading == "deferred":
-            frozen += GEOMETRY
         since = self._since_propagation()
         if since is not None and since < settings.propagation.rest:
             frozen += ["opacity"]
@@ -377,6 +380,11 @@ class Trainer:
             # What the surfels mirrored until now, so that the picture changes little.
             start, rest = environment.harmonics, self.parameters["indirect_rest"]
             self.parameters["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
+        if self.occluder is not None and "received" in self.parameters:
+            # Anew each time, for light and mesh are better known; until the next it stays.
+            traced = Surfels(*(value.cpu() for value in with_normals_last(surfels)))
+            light = Environment(environment.radiance.cpu(), environment.reference)
+            self.parameters["received"][:] = received(traced, self.occluder, light)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
         """Train to the end, or until `stop` says so; a checkpoint is written either way. True when the end was reached."""
