@@ -33,7 +33,7 @@ ALONE = ("refgs_sort", "refgs_bin", "refgs_rows")  # kernels of one thread
 def make_trainer(folder: Path, device: str = "cpu") -> Trainer:
     """In the middle of a training."""
     write_ball_capture(folder / "ball", SIZE, samples=2)
-    changes = [f"surfels.start={SURFELS}", f"surfels.budget={SURFELS}"]
+    changes = [f"surfels.start={SURFELS}", f"surfels.budget={SURFELS}", "train.light_first=0"]
     settings = load_settings("quick", changes)
     trainer = Trainer(read_capture(folder / "ball"), settings, folder, lambda *_: None, device=device)
     for _ in range(5):

@@ -73,7 +73,6 @@ def test_a_run_of_before_a_setting_still_opens():
     settings = load_settings("quick")
     recorded = settings.model_dump(mode="json")
     del recorded["loss"]["light"], recorded["mesh"], recorded["light"]
-    recorded["train"]["light_first"] = 50  # which is no more
     opened = recorded_settings(recorded, "run.toml")
     assert opened.train == settings.train
     assert opened.mesh == load_settings("standard").mesh

@@ -69,6 +69,7 @@ class LightSettings(_Section):
 
 class TrainSettings(_Section):
     iterations: int = Field(ge=1, le=10_000_000)
+    light_first: int = Field(ge=0, description="iterations in which only light and materials learn")
     checkpoint_every: int = Field(ge=1, description="iterations")
     seed: int = Field(ge=0)
 
@@ -202,10 +203,7 @@ def load_settings(preset: str, changes: list[str] = ()) -> Settings:
 def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
     """Settings that a run wrote down; what the program did not know of yet is as in the standard preset."""
     still = {"light": {"frame": "world", "exposure": "off"}}  # all light was, and no photo had an exposure
-    known = _merge(_merge(_read_preset("standard"), still), tables)
-    if isinstance(known["train"], dict):
-        known["train"].pop("light_first", None)  # of 0.1.0
-    return validate(known, source)
+    return validate(_merge(_merge(_read_preset("standard"), still), tables), source)
 
 
 def validate(tables: dict[str, Any], source: str) -> Settings:

@@ -176,7 +176,7 @@ def test_from_photos_to_the_tables(tmp_path, monkeypatch, capsys):
     preset = tmp_path / "tiny.toml"
     preset.write_text(
         'base = "quick"\n[surfels]\nstart = 300\nbudget = 300\nhull = 32\n[environment]\nresolution = 16\n'
-        "[train]\niterations = 3\n[indirect]\nstart = 1\n"
+        "[train]\niterations = 3\nlight_first = 1\n[indirect]\nstart = 1\n"
     )
 
     def call(what, folder, *options):

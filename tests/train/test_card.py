@@ -25,6 +25,7 @@ def make_trainer(capture, folder, *changes: str, device: str = "cpu") -> Trainer
         "surfels.start=600",
         "surfels.budget=800",
         "surfels.hull=48",
+        "train.light_first=0",
         "environment.resolution=16",
         "surfels.metallic=0.8",  # half a metal is so nearly as bright as half a dielectric that its derivatives are mere rounding
     ]

@@ -18,7 +18,7 @@ from refgs.settings import load_settings
 from refgs.train.asset import write_asset
 from refgs.train.trainer import Trainer
 
-SMALL = ["surfels.start=1500", "surfels.budget=1800", "environment.resolution=16"]
+SMALL = ["surfels.start=1500", "surfels.budget=1800", "environment.resolution=16", "train.light_first=20"]
 SMALL += ["surfels.metallic=0.9", "surfels.hull=64"]
 STOPS = (0.0, 0.7, 0.0, -0.7, 0.0)
 ITERATIONS = 600

@@ -26,6 +26,7 @@ SMALL = [
     "surfels.budget=1800",
     "surfels.hull=64",
     "environment.resolution=16",
+    "train.light_first=20",
 ]
 
 

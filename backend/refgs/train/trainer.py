@@ -31,7 +31,7 @@ from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify, propagate_normals, reset_opacity, thin
 from refgs.train.light import light_frame, mirrored
 from refgs.train.losses import Photo, departure, objective
-from refgs.train.start import on_hull, start_appearance, start_parameters
+from refgs.train.start import GEOMETRY, on_hull, start_appearance, start_parameters
 
 Report = Callable[[str, dict[str, Any]], None]
 """Called with an event's name and its facts: "stage", "progress", "warning"."""
@@ -268,6 +268,8 @@ class Trainer:
 
     def _set_rates(self, progress: float) -> None:
         settings, rates, frozen = self.settings, self.settings.rates, []
+        if self.from_hull and self.iteration < settings.train.light_first and settings.render.shading == "deferred":
+            frozen += GEOMETRY
         since = self._since_propagation()
         if since is not None and since < settings.propagation.rest:
             frozen += ["opacity"]
