@@ -171,8 +171,8 @@ def radiance_towards(
         diffuse = (1 - share) * appearance
     else:
         received = irradiance(levels, sides, normal, margins)
-        hidden = 1 if indirect is None else maps[:, 8:11]
-        diffuse = (1 - share) * (1 - dielectric) * albedo * received * hidden
+        reaching = 1 if indirect is None else maps[:, 8:11]
+        diffuse = (1 - share) * (1 - dielectric) * albedo * received * reaching
     return light * ((1 - share) * dielectric + share * metal) + diffuse
 
 
