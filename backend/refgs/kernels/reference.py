@@ -170,7 +170,8 @@ def radiance_towards(
     if appearance is not None:
         diffuse = (1 - share) * appearance
     else:
-        received = irradiance(levels, sides, normal, margins)
+        received = prefilter.irradiance(levels, sides, normal)
+        _cube_margins(normal, [torch.tensor(sides[-1])], margins)
         reaching = 1 if indirect is None else maps[:, 8:11]
         diffuse = (1 - share) * (1 - dielectric) * albedo * received * reaching
     return light * ((1 - share) * dielectric + share * metal) + diffuse
@@ -206,13 +207,6 @@ def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tenso
 def _from_integer(x: Tensor, counts: Tensor | bool = True) -> list[Tensor]:
     distance = (x - x.round()).abs().detach()
     return list(torch.where(torch.as_tensor(counts), distance, math.inf).unbind(-1))
-
-
-def irradiance(levels: Tensor, sides: tuple[int, ...], normals: Tensor, margins: list) -> Tensor:
-    """Irradiance / π (P, 3) about unit normals (P, 3), the last of the levels."""
-    _cube_margins(normals, [torch.tensor(sides[-1])], margins)
-    last = cubemap.in_texel_order(levels, sides)[-6 * sides[-1] ** 2 :]
-    return cubemap.sample(last, sides[-1:], normals, torch.zeros(len(normals), dtype=normals.dtype))
 
 
 def _cube_margins(directions: Tensor, sides: list[Tensor], margins: list) -> None:

@@ -42,7 +42,7 @@ struct Shade {
   float* near;                      // (chunks, chunk_rows + 2 HALO, width, 4): by the normals that a chunk looked up, and by their alpha
   float* by_cells;                  // (chunks + 1, cells, 4): the last, their sum
   uint8_t* touched;                 // (chunks, chunk_rows + 2 HALO + lines): the rows of those that a chunk has written
-  // With CUDA in place of those four, zero at first:
+  // With CUDA in place of those three, zero at first:
   int64_t *map_sums, *cell_sums;    // (4, height, width), (cells, 3)
   int32_t* largest;                 // (2): of the numbers that are added to each
   float* scratch;                   // none is used
@@ -203,12 +203,12 @@ void zero(float* p, int64_t n) {
 // The derivatives by the maps and by the light of a chunk of rows.
 struct Chunk {
   const Shade& s;
-  int64_t index, first, end;  // pixels
+  int64_t first, end;         // pixels
   float *near, *cells;        // near: as for the picture's first pixel
   uint8_t *rows, *lines;      // touched
   Vector by_exposure = {};
 
-  Chunk(const Shade& s, int64_t index) : s(s), index(index), first(index * s.chunk_rows * s.width) {
+  Chunk(const Shade& s, int64_t index) : s(s), first(index * s.chunk_rows * s.width) {
     int64_t left = s.height - index * s.chunk_rows;
     end = first + (left < s.chunk_rows ? left : s.chunk_rows) * s.width;
     int64_t before = index * s.chunk_rows - HALO, most = s.chunk_rows + 2 * HALO;

@@ -41,9 +41,7 @@ class Environment:
 
     def diffuse(self, normals: Tensor) -> Tensor:
         """Irradiance / π (P, 3) about unit normals (P, 3): what a white matte surface sends out."""
-        levels, last = cubemap.in_texel_order(self.levels.cpu(), self.sides), self.sides[-1]
-        found = cubemap.sample(levels[-6 * last**2 :], (last,), normals.cpu(), torch.zeros(len(normals)))
-        return found.to(normals)
+        return prefilter.irradiance(self.levels.cpu(), self.sides, normals.cpu()).to(normals)
 
     def turn(self, camera: Camera) -> np.ndarray:
         """The rotation (3, 3) that takes the world's directions to the light's, in a camera's picture."""

@@ -214,3 +214,10 @@ def prefilter(radiance: Tensor, resolution: int) -> Tensor:
     irradiance / π. Linear radiance in, linear radiance out."""
     check(radiance=(radiance, (6 * resolution**2, 3)))
     return _Prefilter.apply(radiance, resolution)
+
+
+def irradiance(levels: Tensor, sides: tuple[int, ...], normals: Tensor) -> Tensor:
+    """Irradiance / π (P, 3) about unit normals (P, 3), from all levels (Σ 6·side², 3), each in the order of `cubemap.orbits`. On the
+    CPU; differentiable."""
+    last = cubemap.in_texel_order(levels, sides)[-6 * sides[-1] ** 2 :]
+    return cubemap.sample(last, sides[-1:], normals, torch.zeros(len(normals), dtype=normals.dtype))

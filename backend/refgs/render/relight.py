@@ -30,8 +30,8 @@ WHITE = 1.0  # as bright as on a screen: what is brighter harmonics would smear 
 ROUGHNESSES = 64  # for which a coat's dependence on the angle is known
 NEIGHBOURS = 8  # surfels that a point of the mesh is blended of
 CHUNK = 512  # surfels at a time
-PROBES = 6000  # surfels that stand for all, and directions that they look in,
-PROBE_DIRECTIONS = 256  # where but the irradiance is wanted
+PROBES = 6000  # surfels that stand for all where irradiance alone is wanted
+PROBE_DIRECTIONS = 256  # that those look in
 MOST_RECEIVED = 4.0  # times what an unhidden surface would: where that is next to nothing
 
 Progress = Callable[[int, int], None]

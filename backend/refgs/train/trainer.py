@@ -385,7 +385,7 @@ class Trainer:
         if self.occluder is not None and "received" in self.parameters:
             # Anew each time, for light and mesh are better known; until the next it stays.
             traced = Surfels(*(value.cpu() for value in with_normals_last(surfels)))
-            light = Environment(environment.radiance.cpu(), environment.reference)
+            light = Environment(environment.radiance.cpu())  # it stands in the world, or nothing would be traced
             self.parameters["received"][:] = received(traced, self.occluder, light)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
