@@ -15,7 +15,9 @@ from tests.kernels import scenes, test_ssim
 from tests.kernels.emulate import emulate
 
 DARK, FLAT = 0.1, 0.01
-ALL = LossSettings(dssim=0.2, normal=0.3, smooth=0.4, even=0.25, alpha=0.5, metallic=0.6, light=0.0, exposure=0.0)
+ALL = LossSettings(
+    dssim=0.2, normal=0.3, smooth=0.4, even=0.25, alpha=0.5, metallic=0.6, roughness=0.0, light=0.0, exposure=0.0
+)
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
 MAPS = ("color", "normal", "blended_depth", "alpha", "material")
 
@@ -129,7 +131,7 @@ def test_matches_float64(size, material, masked, device):
 def test_the_light_is_held_to_be_neutral_on_the_whole(device):
     """Departure of the mean from grey, and its derivative, in float64."""
     rendering, view = pictures(8, 8, masked=True, material=True)
-    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, light=0.5, exposure=0)
+    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, roughness=0, light=0.5, exposure=0)
     mean = torch.rand(3, generator=torch.Generator().manual_seed(0))
     for scale in (1e-6, 1, 1e6):
         exact = (scale * mean).double().requires_grad_()
@@ -194,7 +196,7 @@ def test_normals_of_a_plane_agree_with_its_depth():
     flat = Rendering(
         torch.zeros(30, 40, 3), one, torch.tensor(depth).float(), torch.tensor(normal).float().expand(30, 40, 3)
     )
-    only = LossSettings(dssim=0, normal=1, smooth=1, even=1, alpha=0, metallic=0, light=0, exposure=0)
+    only = LossSettings(dssim=0, normal=1, smooth=1, even=1, alpha=0, metallic=0, roughness=0, light=0, exposure=0)
     assert abs(float(objective(flat, None, view, BACKGROUND, only, 1.0).loss)) < 1e-6
     turned = replace(flat, normal=-flat.normal)
     assert float(objective(turned, None, view, BACKGROUND, only, 1.0).loss) == pytest.approx(2, abs=1e-6)
