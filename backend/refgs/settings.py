@@ -121,9 +121,7 @@ class LossSettings(_Section):
     metallic: float = Field(
         ge=0, description="weight, at the end, of a metallic that is neither 0 nor 1; and of metals too dark for any"
     )
-    roughness: float = Field(
-        ge=0, description="weight decay of roughness above what it starts as: only photos make a surface matte"
-    )
+    matte: float = Field(ge=0, description="weight of roughness above 0.3: a surface is matte where photos say so")
     light: float = Field(ge=0, description="weight of the light's being neutral on the whole")
     exposure: float = Field(ge=0, description="weight of a photo's being exposed as most are")
 

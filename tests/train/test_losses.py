@@ -16,7 +16,7 @@ from tests.kernels.emulate import emulate
 
 DARK, FLAT = 0.1, 0.01
 ALL = LossSettings(
-    dssim=0.2, normal=0.3, smooth=0.4, even=0.25, alpha=0.5, metallic=0.6, roughness=0.0, light=0.0, exposure=0.0
+    dssim=0.2, normal=0.3, smooth=0.4, even=0.25, alpha=0.5, metallic=0.6, matte=0.7, light=0.0, exposure=0.0
 )
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
 MAPS = ("color", "normal", "blended_depth", "alpha", "material")
@@ -62,6 +62,7 @@ def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress
         m, covered = rendering.metallic, (rendering.alpha.detach() > COVERED).sum().clamp_min(1)
         terms["metallic"] = weights.metallic * progress**2 * (m * (1 - m)).sum() / covered
         dark = (1 - rendering.albedo.detach().amax(dim=-1) / DARK).clamp(0, 1)
+        terms["matte"] = weights.matte * (rendering.roughness - 0.3).clamp_min(0).sum() / covered
         terms["dark metal"] = weights.metallic * (dark * m).sum() / covered
     return terms
 
@@ -131,7 +132,7 @@ def test_matches_float64(size, material, masked, device):
 def test_the_light_is_held_to_be_neutral_on_the_whole(device):
     """Departure of the mean from grey, and its derivative, in float64."""
     rendering, view = pictures(8, 8, masked=True, material=True)
-    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, roughness=0, light=0.5, exposure=0)
+    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, matte=0, light=0.5, exposure=0)
     mean = torch.rand(3, generator=torch.Generator().manual_seed(0))
     for scale in (1e-6, 1, 1e6):
         exact = (scale * mean).double().requires_grad_()
@@ -150,7 +151,7 @@ def test_the_light_is_held_to_be_neutral_on_the_whole(device):
     assert not dark.grad.any()
 
 
-@pytest.mark.parametrize("term", ["dssim", "normal", "smooth", "even", "alpha", "metallic"])
+@pytest.mark.parametrize("term", ["dssim", "normal", "smooth", "even", "alpha", "metallic", "matte"])
 def test_a_term_without_weight_is_not_there(term, device):
     check(*pictures(30, 20, masked=True, material=True), ALL.model_copy(update={term: 0.0}), 1.0, 1, device)
 
@@ -196,7 +197,7 @@ def test_normals_of_a_plane_agree_with_its_depth():
     flat = Rendering(
         torch.zeros(30, 40, 3), one, torch.tensor(depth).float(), torch.tensor(normal).float().expand(30, 40, 3)
     )
-    only = LossSettings(dssim=0, normal=1, smooth=1, even=1, alpha=0, metallic=0, roughness=0, light=0, exposure=0)
+    only = LossSettings(dssim=0, normal=1, smooth=1, even=1, alpha=0, metallic=0, matte=0, light=0, exposure=0)
     assert abs(float(objective(flat, None, view, BACKGROUND, only, 1.0).loss)) < 1e-6
     turned = replace(flat, normal=-flat.normal)
     assert float(objective(turned, None, view, BACKGROUND, only, 1.0).loss) == pytest.approx(2, abs=1e-6)

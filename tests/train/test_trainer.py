@@ -129,20 +129,6 @@ def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
     assert (second.occluder is not None) == (changes[0] == INDIRECT[0])
 
 
-def test_a_surface_is_matte_only_where_photos_say_so(ball_capture, tmp_path):
-    """Noise does not: its gradients disagree from view to view."""
-    generator, matte = torch.Generator().manual_seed(0), []
-    for weight in (0.0, 4.0):
-        made = trainer(ball_capture, tmp_path / str(weight), f"loss.roughness={weight}", total=100)
-        noise = [torch.randint(0, 256, photo.image.shape, generator=generator) for photo in made.photos]
-        made.photos = [p._replace(image=n.to(torch.uint8)) for p, n in zip(made.photos, noise, strict=True)]
-        for _ in range(100):
-            made.step()
-        excess = made.surfels().roughness.detach() - made.settings.surfels.roughness
-        matte.append(float(excess.clamp_min(0).mean()))
-    assert matte[1] < 0.5 * matte[0] and matte[0] > 0.02, matte
-
-
 def test_shading_sh_learns_colour_alone(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "sh", "shading=sh", total=150)
     before = made.test_psnr()

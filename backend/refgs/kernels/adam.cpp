@@ -1,6 +1,5 @@
 // A step of Adam (Kingma and Ba 2015) for several tensors at once. What has no gradient stays as it is, moments and all: surfels
-// that this view does not see. (Adam itself would move them on, by what earlier views said.) What is above
-// some value decays towards it (decoupled, as Loshchilov and Hutter 2019 have it): faster than gradients move it that disagree.
+// that this view does not see. (Adam itself would move them on, by what earlier views said.)
 #include "vector.h"
 
 namespace {
@@ -10,7 +9,6 @@ struct Learned {
   float *value, *mean, *square;  // running means of the gradient and of its square
   const float* gradient;
   double rate, square_scale;     // with the corrections of the means' start: α / (1 − β1^t), and 1 / √(1 − β2^t)
-  double decay, above;           // what part of what a number is more than that a step takes off
 };
 
 constexpr int MOST = 16;  // tensors
@@ -30,8 +28,7 @@ INLINE void step(const Adam& a, const Learned& t, int64_t i, int64_t n) {
   Vector m = read(t.mean + i, n), v = read(t.square + i, n), x = read(t.value + i, n);
   Vector mean = m + (float)(1 - a.beta1) * (g - m);
   Vector square = (float)a.beta2 * v + (float)(1 - a.beta2) * (g * g);
-  Vector value = x - (float)t.rate * mean / ((float)t.square_scale * root(square) + (float)a.epsilon)
-                 - (float)t.decay * larger(x - (float)t.above, Vector() + 0.0f);
+  Vector value = x - (float)t.rate * mean / ((float)t.square_scale * root(square) + (float)a.epsilon);
   write(t.mean + i, select(felt, mean, m), n), write(t.square + i, select(felt, square, v), n);
   write(t.value + i, select(felt, value, x), n);
 }

@@ -1,7 +1,8 @@
 // The objective of a view but for D-SSIM, and its derivatives by the rendering's maps: two passes over the rows.
 //
 // Colour: |C - C_gt|, C clipped only where the photo is. Normals: 1 - N.n between the depth's normal N and the blended n. Smoothness:
-// |grad n| exp(-|grad C_gt|). Mask: |alpha - mask|. Metallic: m (1 - m), which is zero at both ends. A weight is that of one pixel's term.
+// |grad n| exp(-|grad C_gt|). Mask: |alpha - mask|. Metallic: m (1 - m), which is zero at both ends. Roughness: by how much it is above
+// GLOSSY. A weight is that of one pixel's term.
 #include "vector.h"
 
 namespace {
@@ -12,7 +13,7 @@ struct Losses {
   const uint8_t *image, *mask;                             // (H, W, 3), (H, W) or null: as on disk, 255 is 1
   const float* background;                                 // (3)
   float rotation[9], across, down, left, top;              // world to camera; at depth 1 a pixel's size, and where the first one is
-  float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, even_x_weight, even_y_weight, alpha_weight, metallic_weight, dark_weight;
+  float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, even_x_weight, even_y_weight, alpha_weight, metallic_weight, dark_weight, matte_weight;
   float *photo, *clipped;   // (H, W, 3) the photo over the background; C as above, for D-SSIM
   const float* by_clipped;  // (H, W, 3) D-SSIM's share
   float *by_color, *by_normal, *by_depth, *by_alpha, *by_material;
@@ -30,8 +31,9 @@ struct Losses {
 enum { LOSS, SURFACES, SQUARES, SUMS };  // weighted terms; pixels with a surface; squared errors
 constexpr float SATURATED = 0.998f;  // a photo's value above which the true radiance is unknown
 constexpr float SOLID = 0.5f, COVERED = 1 / 255.0f;  // alphas of an opaque pixel, and of one that is not background
-constexpr int MATERIAL = 5, METAL = 3;               // numbers of a material; which is the metallic, before the roughness
+constexpr int MATERIAL = 5, METAL = 3, ROUGH = 4;    // numbers of a material; which is the metallic, which the roughness
 constexpr float FLAT = 0.01f;                        // a smaller change of metallic or roughness hardly counts
+constexpr float GLOSSY = 0.3f;                       // rougher than this a surface is only where photos say so
 constexpr float DARK = 0.1f;                         // no metal's base colour is darker in all of its channels
 
 // A vector's worth of pixels of a row.
@@ -242,8 +244,9 @@ KERNEL(refgs_losses_second, Losses, l) {
     float surfaces = (float)l.totals[0][SURFACES], share_of_each = 1 / (surfaces > 1 ? surfaces : 1);
     float weight = share_of_each * l.metallic_weight;
     Vector dark = share_of_each * l.dark_weight * clamp(1.0f - brightest * (1 / DARK), 0, 1);
-    r.add(sums[LOSS], weight * metallic * (1.0f - metallic) + dark * metallic);
-    by_smooth[0] += weight * (1.0f - 2.0f * metallic) + dark;
+    Vector matte = of_material(ROUGH) - GLOSSY, felt = select(matte > 0.0f, Vector() + share_of_each * l.matte_weight, Vector());
+    r.add(sums[LOSS], weight * metallic * (1.0f - metallic) + dark * metallic + felt * matte);
+    by_smooth[0] += weight * (1.0f - 2.0f * metallic) + dark, by_smooth[1] += felt;
     float* row = r.of(l.by_material, MATERIAL);
     for (int i = 0; i < MATERIAL; i++) r.at.put(row + i, MATERIAL, i < METAL ? Vector() : by_smooth[i - METAL]);
   });

@@ -16,7 +16,7 @@ class _Learned(Work):
     _fields_ = (
         ("count", ctypes.c_int64),
         *((n, ctypes.c_void_p) for n in ("value", "mean", "square", "gradient")),
-        *((n, ctypes.c_double) for n in ("rate", "square_scale", "decay", "above")),
+        *((n, ctypes.c_double) for n in ("rate", "square_scale")),
     )
 
 
@@ -37,14 +37,13 @@ class Adam(torch.optim.Optimizer):
 
     A number whose gradient is zero, as of a surfel that the view does not see, is left as it is, with its moments: these
     neither fade nor move it on, as they would in Adam itself. So is a parameter without a gradient. Groups and state as in
-    `torch.optim.Adam`, the step a plain number. A group's `weight_decay` is decoupled, as in `torch.optim.AdamW`, but of what
-    is above `above` alone, and towards that.
+    `torch.optim.Adam`, the step a plain number.
     """
 
     BETAS, EPSILON = (0.9, 0.999), 1e-15
 
     def __init__(self, groups: list[dict]):
-        super().__init__(groups, {"lr": 0.0, "weight_decay": 0.0, "above": 0.0})
+        super().__init__(groups, {"lr": 0.0})
 
     @torch.no_grad()
     def step(self) -> None:
@@ -61,7 +60,6 @@ class Adam(torch.optim.Optimizer):
                 t = state["step"]
                 work = _Learned(count=value.numel(), rate=group["lr"] / (1 - beta1**t))
                 work.square_scale = (1 - beta2**t) ** -0.5
-                work.decay, work.above = group["lr"] * group["weight_decay"], group["above"]
                 gradient: Tensor = value.grad.contiguous()
                 work.attach(value=value, mean=state["exp_avg"], square=state["exp_avg_sq"], gradient=gradient)
                 learned.append(work)

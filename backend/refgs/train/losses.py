@@ -52,10 +52,8 @@ class _Work(Work):
         ),
         ("rotation", ctypes.c_float * 9),
         *((n, ctypes.c_float) for n in ("across", "down", "left", "top")),
-        *(
-            (f"{n}_weight", ctypes.c_float)
-            for n in ("color", "normal", "smooth_x", "smooth_y", "even_x", "even_y", "alpha", "metallic", "dark")
-        ),
+        *((f"{n}_weight", ctypes.c_float) for n in ("color", "normal", "smooth_x", "smooth_y", "even_x", "even_y")),
+        *((f"{n}_weight", ctypes.c_float) for n in ("alpha", "metallic", "dark", "matte")),
         *((n, ctypes.c_void_p) for n in ("photo", "clipped", "by_clipped")),
         *((f"by_{n}", ctypes.c_void_p) for n in ("color", "normal", "depth", "alpha", "material")),
         *((n, ctypes.c_void_p) for n in ("slopes", "sums", "first", "second", "structure", "light")),
@@ -109,6 +107,7 @@ class _Objective(torch.autograd.Function):
             work.even_x_weight, work.even_y_weight = weights.even / across, weights.even / down
         work.alpha_weight = weights.alpha / alpha.numel()
         work.metallic_weight, work.dark_weight = weights.metallic * progress**2, weights.metallic
+        work.matte_weight = weights.matte
         work.dssim_weight, work.light_weight = weights.dssim, weights.light
         by = {f"by_{name}": value for name, value in gradients.items()}
         work.attach(**inputs, **codes, **by, **buffers, sums=sums[0])
@@ -172,7 +171,10 @@ def objective(
     highlights of dielectrics, 4 % of the light and without colour, fix the light's scale and white balance, which metals
     alone cannot. Not before it is known which is which, hence with the square of the progress. From the start, though, m of what
     is darker than any metal, by how much it is: a metal of 4 % would mirror as dark glass does.
+
+    And the roughness, by how much it is above 0.3, over the object: where photos are clipped, or show nothing bright, a broad lobe
+    explains all that a sharp one does, and forgives wrong normals.
     """
-    material = rendering.material if weights.metallic > 0 or weights.even > 0 else None
+    material = rendering.material if max(weights.metallic, weights.even, weights.matte) > 0 else None
     maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material
     return Objective(*_Objective.apply(*maps, light, photo, background, weights, progress))

@@ -102,9 +102,6 @@ class Trainer:
         groups = [
             {"params": [value], "name": name, "rate": self._rate(name)} for name, value in self.parameters.items()
         ]
-        for group in groups:
-            if group["name"] == "roughness":
-                group |= {"weight_decay": settings.loss.roughness, "above": float(group["params"][0][0].detach())}
         if settings.render.shading != "sh":
             groups.append({"params": [self.light], "name": "environment", "rate": settings.rates.environment})
         self.exposures: Tensor | None = None  # natural logarithms (views,), where photos have any of their own
