@@ -62,7 +62,9 @@ def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress
         m, covered = rendering.metallic, (rendering.alpha.detach() > COVERED).sum().clamp_min(1)
         terms["metallic"] = weights.metallic * progress**2 * (m * (1 - m)).sum() / covered
         dark = (1 - rendering.albedo.detach().amax(dim=-1) / DARK).clamp(0, 1)
-        terms["matte"] = weights.matte * (rendering.roughness - 0.3).clamp_min(0).sum() / covered
+        over = (rendering.roughness - 0.3).clamp_min(0)
+        over = torch.nn.functional.huber_loss(over, torch.zeros_like(over), reduction="sum", delta=FLAT) / FLAT
+        terms["matte"] = weights.matte * over / covered
         terms["dark metal"] = weights.metallic * (dark * m).sum() / covered
     return terms
 

@@ -244,8 +244,9 @@ KERNEL(refgs_losses_second, Losses, l) {
     float surfaces = (float)l.totals[0][SURFACES], share_of_each = 1 / (surfaces > 1 ? surfaces : 1);
     float weight = share_of_each * l.metallic_weight;
     Vector dark = share_of_each * l.dark_weight * clamp(1.0f - brightest * (1 / DARK), 0, 1);
-    Vector matte = of_material(ROUGH) - GLOSSY, felt = select(matte > 0.0f, Vector() + share_of_each * l.matte_weight, Vector());
-    r.add(sums[LOSS], weight * metallic * (1.0f - metallic) + dark * metallic + felt * matte);
+    Vector matte = of_material(ROUGH) - GLOSSY, slope = clamp(matte * (1 / FLAT), 0, 1);  // Huber's: surfels may start at the kink
+    Vector felt = share_of_each * l.matte_weight * slope;
+    r.add(sums[LOSS], weight * metallic * (1.0f - metallic) + dark * metallic + felt * (matte - 0.5f * FLAT * slope));
     by_smooth[0] += weight * (1.0f - 2.0f * metallic) + dark, by_smooth[1] += felt;
     float* row = r.of(l.by_material, MATERIAL);
     for (int i = 0; i < MATERIAL; i++) r.at.put(row + i, MATERIAL, i < METAL ? Vector() : by_smooth[i - METAL]);
