@@ -128,6 +128,14 @@ def bench(
     commands.bench(what, context.args)
 
 
+@app.command()
+def worker() -> None:
+    """Speak the job protocol on stdin and stdout, as the extension does with it."""
+    from refgs import worker
+
+    worker.work()
+
+
 def _end(*_) -> None:
     raise KeyboardInterrupt
 

@@ -1,31 +1,24 @@
 """What the command line does, one function a command."""
 
-import json
-import resource
 import runpy
 import signal
 import sys
-import traceback
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from refgs import jobs
 from refgs.capture import read_cameras, read_capture
 from refgs.capture.poses import in_frame
 from refgs.errors import InputError
 from refgs.export.environment import read_environment, write_exr
-from refgs.export.splats import write_splats
-from refgs.kernels import cuda
 from refgs.paths import clone_root
 from refgs.report.figures import DETAILS, HEADLINE, in_words, relit_in_words
 from refgs.report.pictures import color_picture, maps, picture, write_png
-from refgs.run import check_free, create_run, open_run, read_run_facts, write_text
-from refgs.settings import load_settings
-from refgs.train.trainer import Trainer, full_card
+from refgs.run import open_run
 
 console = Console(highlight=False, soft_wrap=True)
 PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha", "visibility")
@@ -46,87 +39,43 @@ def progress_bar(what: str, total: int):
         yield lambda done, note="", total=total: progress.update(task, completed=done, note=note, total=total)
 
 
-def choose_device(device: str) -> str:
-    """What to train on, "cpu" or "cuda". Says so where a card was asked for, or is there, and cannot be used."""
-    if device not in ("auto", "cpu", "cuda"):
-        raise InputError(f"--device {device}: take auto, cpu or cuda")
-    if device == "cpu":
-        return "cpu"
-    why = cuda.unusable()
-    if why is None:
-        return "cuda"
-    if device == "cuda" or why != cuda.NO_CARD:
-        console.print(f"warning: training on the CPU: {why}")
-    return "cpu"
+def say(event: str, facts: dict) -> None:
+    """An event of a job as a line."""
+    console.print(("warning: " if event == "warning" else "") + facts["what"])
 
 
 def train(
     capture_folder: Path, out: Path, preset: str, device: str, minutes: float | None, changes: list[str], resume: bool
 ) -> None:
-    """Train a capture into a run folder; Ctrl-C leaves a run that `--resume` goes on with."""
-    from refgs.train.asset import write_asset
-
-    device = choose_device(device)
-    if resume:
-        facts, settings = read_run_facts(out)
-        if changes:
-            raise InputError("--set cannot change a run that is resumed: train into a new folder")
-        if (out / "splats.ply").exists():
-            raise InputError(f"{out}: this training has ended; there is nothing to resume")
-    else:
-        settings = load_settings(preset, changes)
-        check_free(out)
-    capture = read_capture(capture_folder)
-    if resume and capture.fingerprint() != facts["fingerprint"]:
-        raise InputError(f"{capture_folder} is not the capture that {out} was trained on, or it was changed since")
-
+    """Train a capture into a run folder; Ctrl-C leaves a run that `--resume` goes on with, twice ends it at once."""
     stopped = []
-    with progress_bar("training", settings.train.iterations) as bar:
+    with progress_bar("training", 1) as bar:
 
         def report(event: str, facts: dict) -> None:
             if event == "progress":
                 note = f"loss {facts['loss']:.4f}  {facts['psnr']:.2f} dB  {facts['splats']:,} surfels"
                 bar(facts["iteration"], note, facts["total"])
             else:
-                console.print(facts["what"])
+                say(event, facts)
 
+        def stop(*_) -> None:
+            if stopped:
+                raise KeyboardInterrupt
+            stopped.append(True)  # at the end of the iteration, with a checkpoint
+
+        before = signal.signal(signal.SIGINT, stop)
         try:
-            trainer = Trainer(capture, settings, out, report, minutes, device)
-        except torch.OutOfMemoryError:
-            raise full_card() from None
-        if resume:
-            trainer.resume()
-            report("stage", {"what": f"going on from iteration {trainer.iteration}"})
-        else:
-            create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
-        before = signal.signal(signal.SIGINT, lambda *_: stopped.append(True))
-        try:
-            ended = trainer.run(lambda: bool(stopped))
-        except InputError:
-            raise
-        except torch.OutOfMemoryError:
-            raise full_card() from None
-        except Exception:
-            (out / "log.txt").write_text(traceback.format_exc(), encoding="utf-8")
-            raise
+            trainer = jobs.train(
+                capture_folder, out, preset, device, minutes, changes, resume, report, lambda _: bool(stopped)
+            )
         finally:
             signal.signal(signal.SIGINT, before)
-    if not ended:
+    if not trainer.ended:
         console.print(
             f"stopped at iteration {trainer.iteration}; go on with: refgs train {capture_folder} --out {out} --resume"
         )
         raise KeyboardInterrupt
-    facts = {"training_seconds": trainer.seconds}
-    facts["peak_memory_bytes"] = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    if device == "cuda":
-        facts["peak_card_memory_bytes"] = torch.cuda.max_memory_allocated()
-    update_metrics(out, facts)
-    try:
-        write_asset(trainer)
-        quality = trainer.test_psnr(most=len(trainer.test))
-    except torch.OutOfMemoryError:
-        again = f"refgs train {capture_folder} --out {out} --resume --device cpu"
-        raise InputError(f"the card's memory is full; nothing is lost, go on with: {again}") from None
+    quality = trainer.test_psnr(most=len(trainer.test))
     held_out = "" if quality is None else f", {quality:.2f} dB on {len(trainer.test)} held-out views"
     console.print(f"trained {trainer.iteration} iterations in {trainer.seconds:.0f} s{held_out}: {out}")
 
@@ -189,55 +138,17 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     truth = GroundTruth(ground_truth, run.to_capture) if ground_truth else None
     with progress_bar("evaluating", len(views)) as bar:
         figures = measure(run, split, views, truth, bar)
-    update_metrics(folder, figures)
+    jobs.update_metrics(folder, figures)
     console.print(f"{len(views)} {split} views: {', '.join(in_words(figures, HEADLINE))}")
     for line in [*in_words(figures, DETAILS), *relit_in_words(figures)]:
         console.print(f"  {line}")
-
-
-def update_metrics(folder: Path, facts: dict) -> None:
-    """Put figures into a run's metrics.json beside those that are there, replacing the ones of the same name at every depth."""
-
-    def merged(known: dict, new: dict) -> dict:
-        both = {key: merged(known[key], new[key]) for key in new if isinstance(known.get(key), dict)}
-        return known | new | both
-
-    file = folder / "metrics.json"
-    known = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
-    write_text(file, json.dumps(merged(known, facts), indent=1))
 
 
 def export(
     folder: Path, mesh_file: Path | None, texture: int | None, splats_file: Path | None, overwrite: bool
 ) -> None:
     """Fuse, clean, unwrap, bake; write the mesh and its textures."""
-    from refgs.export.bake import bake, unwrap
-    from refgs.export.mesh import write_glb
-    from refgs.geometry.extract import extract
-    from refgs.geometry.mesh import clean, is_crumbs
-
-    run = open_run(folder)
-    target = mesh_file or folder / "mesh.glb"
-    for file in (target, target.parent / "textures", splats_file):
-        if file is not None and file.exists() and not overwrite:
-            raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
-    if splats_file is not None:
-        write_splats(splats_file, run.splats)
-        console.print(f"splats: {splats_file}")
-    settings = run.settings.mesh
-    mesh = extract(run.render, run.training_cameras(), run.centre, run.radius, settings.resolution)
-    console.print(f"fused {len(mesh.faces):,} triangles")
-    mesh = clean(mesh, settings.triangles)
-    console.print(f"simplified to {len(mesh.faces):,} triangles; unwrapping")
-    if is_crumbs(mesh):
-        console.print(
-            "warning: the mesh is in pieces, none of them half of it: the photos do not agree on a surface; "
-            "give them masks of the object, or take more of them"
-        )
-    mesh = unwrap(mesh)
-    textures = bake(mesh, run.splats, texture or settings.texture)
-    write_glb(target, mesh, textures)
-    console.print(f"mesh: {target}")
+    console.print(f"mesh: {jobs.export(folder, mesh_file, texture, splats_file, overwrite, say)}")
 
 
 def bench(what: str, options: list[str]) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -10,7 +9,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from refgs import commands
+from refgs import commands, jobs
 from refgs.errors import InputError
 from refgs.paths import clone_root
 from refgs.report import metrics
@@ -108,10 +107,12 @@ def _compare(folder: Path, truth: Path, previews: Path) -> None:
                 shutil.copyfile(preview.with_suffix(".png"), pictures / kind / f"{hdri}_{view}.png")
             pairs = [(read_relit(image), read_relit(true)) for image, true in files]
             result.setdefault(hdri, {})[kind] = metrics.relit(lambda pairs=pairs: pairs)
-    commands.update_metrics(folder, {"relight": result})
+    jobs.update_metrics(folder, {"relight": result})
 
 
 def _record(folder: Path, seconds: float) -> None:
     """Add the demo's own time and the largest memory of any of its processes to metrics.json."""
-    largest = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    commands.update_metrics(folder, {"seconds": seconds, "peak_memory_bytes": 1024 * largest})
+    facts, largest = {"seconds": seconds}, [jobs.peak_memory(children) for children in (False, True)]
+    if None not in largest:
+        facts["peak_memory_bytes"] = max(largest)
+    jobs.update_metrics(folder, facts)

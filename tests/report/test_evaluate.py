@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.scenes.analytic import sky
 from benchmarks.terms import PARTS, terms
-from refgs import commands
+from refgs import commands, jobs
 from refgs.capture import read_capture
 from refgs.color import srgb_encode
 from refgs.errors import InputError
@@ -104,7 +104,7 @@ def figures(run):
 
 def test_a_run_that_is_the_truth_has_no_error_in_whatever_frame(made, capsys):
     run, truth, views = made
-    commands.update_metrics(run, {"relight": {"dusk": {"mesh": {"psnr_raw": 20.0}}}, "psnr": 1.0})
+    jobs.update_metrics(run, {"relight": {"dusk": {"mesh": {"psnr_raw": 20.0}}}, "psnr": 1.0})
     commands.evaluate(run, "test", truth)
     found = figures(run)
     assert found["views"] == len(views) == 4 and found["splats"] == 3000 and found["frames_per_second"] > 0

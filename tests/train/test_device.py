@@ -5,7 +5,7 @@ import warnings
 import pytest
 import torch
 
-from refgs import commands
+from refgs import jobs
 from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.kernels import cuda
@@ -13,11 +13,10 @@ from refgs.settings import load_settings
 from refgs.train.trainer import Trainer
 
 
-@pytest.fixture
-def said(monkeypatch) -> list[str]:
-    lines = []
-    monkeypatch.setattr(commands.console, "print", lines.append)
-    return lines
+def chosen(device: str) -> tuple[str, list[str]]:
+    """What is trained on, and the warnings."""
+    said = []
+    return jobs.choose_device(device, lambda event, facts: said.append(facts["what"])), said
 
 
 def card(monkeypatch, capability: tuple[int, int], driver: str | None = None) -> None:
@@ -36,39 +35,45 @@ def card(monkeypatch, capability: tuple[int, int], driver: str | None = None) ->
     monkeypatch.setattr(cuda, "_module", module)
 
 
-def test_a_card_is_taken(monkeypatch, said):
+def test_a_card_is_taken(monkeypatch):
     card(monkeypatch, (7, 5))
-    assert [commands.choose_device(d) for d in ("auto", "cuda", "cpu")] == ["cuda", "cuda", "cpu"] and not said
+    assert [chosen(d) for d in ("auto", "cuda", "cpu")] == [("cuda", []), ("cuda", []), ("cpu", [])]
 
 
-def test_no_card(monkeypatch, said):
+def test_no_card(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert commands.choose_device("auto") == "cpu" and not said
-    assert commands.choose_device("cuda") == "cpu"
-    assert len(said) == 1 and "no NVIDIA card, or no driver" in said[0]
+    assert chosen("auto") == ("cpu", [])
+    device, said = chosen("cuda")
+    assert device == "cpu" and len(said) == 1 and "no NVIDIA card, or no driver" in said[0]
 
 
-def test_a_driver_that_is_too_old_for_torch(monkeypatch, said):
+def test_a_driver_that_is_too_old_for_torch(monkeypatch):
     def available() -> bool:
         warnings.warn("The NVIDIA driver on your system is too old", stacklevel=1)
         return False
 
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", available)
-    assert commands.choose_device("auto") == "cpu"
-    assert len(said) == 1 and "driver is too old" in said[0]
+    device, said = chosen("auto")
+    assert device == "cpu" and len(said) == 1 and "driver is too old" in said[0]
 
 
-def test_a_card_that_is_too_old(monkeypatch, said):
+@pytest.mark.parametrize("asked", ["auto", "cuda"])
+def test_a_card_that_is_too_old(monkeypatch, asked):
     card(monkeypatch, (6, 1))
-    assert [commands.choose_device(d) for d in ("auto", "cuda")] == ["cpu", "cpu"]
-    assert len(said) == 2 and all("GeForce is too old: its compute capability is 6.1, 7.5" in line for line in said)
+    device, said = chosen(asked)
+    assert device == "cpu" and len(said) == 1
+    assert "GeForce is too old: its compute capability is 6.1, 7.5" in said[0]
 
 
-def test_a_driver_that_refuses(monkeypatch, said):
+def test_a_driver_that_refuses(monkeypatch):
     card(monkeypatch, (8, 6), driver="adam.cpp: CUDA_ERROR_INVALID_IMAGE\nand more")
-    assert commands.choose_device("auto") == "cpu"
-    assert len(said) == 1 and said[0].endswith("(adam.cpp: CUDA_ERROR_INVALID_IMAGE): a newer driver may do")
+    device, said = chosen("auto")
+    assert (
+        device == "cpu"
+        and len(said) == 1
+        and said[0].endswith("(adam.cpp: CUDA_ERROR_INVALID_IMAGE): a newer driver may do")
+    )
 
 
 def small_trainer(ball_capture, folder, reports: list, start: int) -> Trainer:

@@ -26,8 +26,8 @@ def maps(rendering: Rendering) -> dict[str, np.ndarray]:
 
 def color_picture(rendering: Rendering, background: np.ndarray) -> np.ndarray:
     """The colours as 8-bit RGBA, sRGB-encoded, straight alpha."""
-    alpha = rendering.alpha.numpy()[..., None]
-    over = rendering.color.numpy() - background * (1 - alpha)
+    alpha = rendering.alpha.numpy(force=True)[..., None]
+    over = rendering.color.numpy(force=True) - background * (1 - alpha)
     return as_bytes(np.dstack([over / np.maximum(alpha, 1e-6), alpha]))
 
 

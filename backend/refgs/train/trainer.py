@@ -388,10 +388,14 @@ class Trainer:
             light = Environment(environment.radiance.cpu())  # it stands in the world, or nothing would be traced
             self.parameters["received"][:] = received(traced, self.occluder, light)
 
+    @property
+    def ended(self) -> bool:
+        return self.iteration >= self.total
+
     def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
         """Train to the end, or until `stop` says so; a checkpoint is written either way. True when the end was reached."""
-        means, started, first = {}, time.perf_counter(), self.iteration
-        while self.iteration < self.total and not stop():
+        means, before, first = {}, self.seconds, self.iteration
+        while not self.ended and not stop():
             begun = time.perf_counter()
             figures = self._step_within_memory()
             self.seconds += time.perf_counter() - begun
@@ -402,7 +406,7 @@ class Trainer:
                 loss, quality = float(means["loss"]), decibels(float(means["square"]))
                 if not math.isfinite(loss):
                     raise FloatingPointError(f"the loss is {loss} at iteration {self.iteration}")
-                pace = (time.perf_counter() - started) / (self.iteration - first)
+                pace = (self.seconds - before) / (self.iteration - first)
                 self.report(
                     "progress",
                     {
@@ -420,7 +424,7 @@ class Trainer:
             if self.iteration % self.settings.train.checkpoint_every == 0 and self.iteration < self.total:
                 self.save()
         self.save()
-        return self.iteration >= self.total
+        return self.ended
 
     def _step_within_memory(self) -> dict[str, Tensor]:
         """One iteration; where the card's memory does not hold it, with fewer surfels from here on."""

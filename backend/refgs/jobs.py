@@ -1,0 +1,153 @@
+"""Training and export, saying how they go: what the terminal (`commands`) and the job protocol (`worker`) have in common."""
+
+import json
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from refgs.capture import read_capture
+from refgs.errors import InputError
+from refgs.export.splats import write_splats
+from refgs.kernels import cuda
+from refgs.run import check_free, create_run, open_run, read_run_facts, write_text
+from refgs.settings import load_settings
+from refgs.train.trainer import Report, Trainer, full_card
+
+
+def choose_device(device: str, report: Report) -> str:
+    """What to train on, "cpu" or "cuda". Warns where a card was asked for, or is there, and cannot be used."""
+    if device not in ("auto", "cpu", "cuda"):
+        raise InputError(f"--device {device}: take auto, cpu or cuda")
+    if device == "cpu":
+        return "cpu"
+    why = cuda.unusable()
+    if why is None:
+        return "cuda"
+    if device == "cuda" or why != cuda.NO_CARD:
+        report("warning", {"what": f"training on the CPU: {why}"})
+    return "cpu"
+
+
+def train(
+    capture_folder: Path,
+    out: Path,
+    preset: str,
+    device: str,
+    minutes: float | None,
+    changes: list[str],
+    resume: bool,
+    report: Report,
+    attend: Callable[[Trainer], bool],
+) -> Trainer:
+    """Train a capture into a run folder; its asset is written when the training has ended.
+
+    `attend` is called before each iteration and stops it by True; the checkpoint then written is what `resume` goes on from.
+    The trainer that is returned says by `ended` which it was.
+    """
+    from refgs.train.asset import write_asset
+
+    device = choose_device(device, report)
+    if resume:
+        facts, settings = read_run_facts(out)
+        if changes:
+            raise InputError("--set cannot change a run that is resumed: train into a new folder")
+        if (out / "splats.ply").exists():
+            raise InputError(f"{out}: this training has ended; there is nothing to resume")
+    else:
+        settings = load_settings(preset, changes)
+        check_free(out)
+    capture = read_capture(capture_folder)
+    if resume and capture.fingerprint() != facts["fingerprint"]:
+        raise InputError(f"{capture_folder} is not the capture that {out} was trained on, or it was changed since")
+    try:
+        trainer = Trainer(capture, settings, out, report, minutes, device)
+        if resume:
+            trainer.resume()
+            report("stage", {"what": f"going on from iteration {trainer.iteration}"})
+        else:
+            create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
+        trainer.run(lambda: attend(trainer))
+    except torch.OutOfMemoryError:
+        raise full_card() from None
+    except InputError:
+        raise
+    except Exception:
+        if out.is_dir():
+            (out / "log.txt").write_text(traceback.format_exc(), encoding="utf-8")
+        raise
+    if not trainer.ended:
+        return trainer
+    facts = {"training_seconds": trainer.seconds}
+    if peak := peak_memory():
+        facts["peak_memory_bytes"] = peak
+    if device == "cuda":
+        facts["peak_card_memory_bytes"] = torch.cuda.max_memory_allocated()
+    update_metrics(out, facts)
+    try:
+        write_asset(trainer)
+    except torch.OutOfMemoryError:
+        again = f"refgs train {capture_folder} --out {out} --resume --device cpu"
+        raise InputError(f"the card's memory is full; nothing is lost, go on with: {again}") from None
+    return trainer
+
+
+def export(
+    folder: Path, mesh_file: Path | None, texture: int | None, splats_file: Path | None, overwrite: bool, report: Report
+) -> Path:
+    """Fuse, clean, unwrap, bake; write the mesh and its textures. Returns the mesh's file."""
+    from refgs.export.bake import bake, unwrap
+    from refgs.export.mesh import write_glb
+    from refgs.geometry.extract import extract
+    from refgs.geometry.mesh import clean, is_crumbs
+
+    run = open_run(folder)
+    target = mesh_file or folder / "mesh.glb"
+    for file in (target, target.parent / "textures", splats_file):
+        if file is not None and file.exists() and not overwrite:
+            raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
+    if splats_file is not None:
+        write_splats(splats_file, run.splats)
+        report("stage", {"what": f"splats: {splats_file}"})
+    settings = run.settings.mesh
+    mesh = extract(run.render, run.training_cameras(), run.centre, run.radius, settings.resolution)
+    report("stage", {"what": f"fused {len(mesh.faces):,} triangles"})
+    mesh = clean(mesh, settings.triangles)
+    report("stage", {"what": f"simplified to {len(mesh.faces):,} triangles; unwrapping"})
+    if is_crumbs(mesh):
+        what = (
+            "the mesh is in pieces, none of them half of it: the photos do not agree on a surface; "
+            "give them masks of the object, or take more of them"
+        )
+        report("warning", {"what": what})
+    mesh = unwrap(mesh)
+    report("stage", {"what": "baking the textures"})
+    textures = bake(mesh, run.splats, texture or settings.texture)
+    write_glb(target, mesh, textures)
+    return target
+
+
+def update_metrics(folder: Path, facts: dict[str, Any]) -> None:
+    """Put figures into a run's metrics.json beside those that are there, replacing the ones of the same name at every depth."""
+
+    def merged(known: dict, new: dict) -> dict:
+        both = {key: merged(known[key], new[key]) for key in new if isinstance(known.get(key), dict)}
+        return known | new | both
+
+    file = folder / "metrics.json"
+    known = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    write_text(file, json.dumps(merged(known, facts), indent=1))
+
+
+def peak_memory(children: bool = False) -> int | None:
+    """The most memory that this process has held, or any of its children that have ended, in bytes; None where the system, which is
+    Windows, does not keep it so."""
+    try:
+        import resource
+    except ModuleNotFoundError:
+        return None
+    most = resource.getrusage(resource.RUSAGE_CHILDREN if children else resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else 1024 * most

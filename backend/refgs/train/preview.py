@@ -1,0 +1,28 @@
+"""A look at a training while it runs."""
+
+import numpy as np
+import torch
+
+from refgs.export.splats import write_splats
+from refgs.model.surfels import to_splats
+from refgs.render.volume import with_normals_last
+from refgs.report.pictures import color_picture, write_png
+from refgs.train.trainer import Trainer
+
+FOLDER = "preview"  # in the run folder
+
+
+def write_preview(trainer: Trainer) -> dict[str, str | int]:
+    """Write RUN/preview/view.png, a view as it is rendered now, and RUN/preview/splats.ply, the surfels as they are, each whole or not
+    at all. Returns their names, and the iteration that they are of."""
+    folder = trainer.folder / FOLDER
+    view = (trainer.test or trainer.views)[0]
+    rendering = trainer.render(view.camera)
+    write_png(folder / "view.png", color_picture(rendering, np.array(trainer.settings.image.background)))
+    with torch.no_grad():
+        write_splats(folder / "splats.ply", to_splats(with_normals_last(trainer.surfels())))
+    return {
+        "iteration": trainer.iteration,
+        "view": str((folder / "view.png").resolve()),
+        "splats": str((folder / "splats.ply").resolve()),
+    }

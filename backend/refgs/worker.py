@@ -1,0 +1,193 @@
+"""`refgs worker`: the job protocol of docs/job-protocol.md. Commands come in on stdin, events go out on stdout, a JSON object a line."""
+
+import _thread
+import json
+import os
+import queue
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Annotated, Any, Literal
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from refgs import __version__, jobs
+from refgs.capture import read_capture
+from refgs.capture.check import describe
+from refgs.errors import InputError
+from refgs.kernels import cuda
+from refgs.train.preview import write_preview
+from refgs.train.trainer import Trainer
+
+PROTOCOL = 1
+
+
+class _Command(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+
+class Check(_Command):
+    command: Literal["check"]
+    capture: str
+
+
+class Train(_Command):
+    command: Literal["train"]
+    capture: str
+    out: str
+    preset: str = "standard"
+    device: str = "auto"
+    minutes: Annotated[float, Field(ge=0.05)] | None = None
+    settings: list[str] = []
+    resume: bool = False
+
+
+class Export(_Command):
+    command: Literal["export"]
+    run: str
+    texture: Annotated[int, Field(ge=64, le=8192)] | None = None
+
+
+class During(_Command):
+    """What can be asked of a job while it runs. "stop" ends a training here, with its asset; "cancel" leaves it to be resumed."""
+
+    command: Literal["preview", "pause", "resume", "stop", "cancel"]
+
+
+COMMANDS = TypeAdapter(Annotated[Check | Train | Export | During, Field(discriminator="command")])
+CLOSED = None  # in place of a command: there will be no more of them
+
+
+class Worker:
+    """Does one job after another, each said to be `started`, then `done`, `cancelled` or `failed`."""
+
+    def __init__(self, events: IO[str]):
+        self._events = events
+        self._commands: queue.SimpleQueue[_Command | None] = queue.SimpleQueue()  # a signal may put while it is read
+        self._waiting: list[_Command] = []  # jobs that were asked for during a training
+        self._open, self._deaf = True, False
+
+    def listen(self, commands: IO[str]) -> None:
+        """Take commands until there are no more; in a thread of its own."""
+        for line in commands:
+            try:
+                self._commands.put(COMMANDS.validate_json(line))
+            except ValidationError as error:
+                what = "; ".join(f"{'.'.join(map(str, e['loc']))} {e['msg']}".strip() for e in error.errors())
+                self.say("warning", {"what": f"not a command of protocol {PROTOCOL}: {what}"})
+        self.close()
+        if self._deaf:
+            _thread.interrupt_main()
+
+    def close(self) -> None:
+        """No more commands will come."""
+        self._commands.put(CLOSED)
+
+    def interrupted(self, *_) -> None:
+        """End: a training after its iteration, with a checkpoint; other jobs at once, for they leave nothing half done."""
+        self.close()
+        if self._deaf:
+            raise KeyboardInterrupt
+
+    def say(self, event: str, facts: dict[str, Any]) -> None:
+        """Send an event. Where nobody listens any more it is time to end."""
+        try:
+            self._events.write(json.dumps({"event": event} | facts) + "\n")
+            self._events.flush()
+        except (BrokenPipeError, ValueError):
+            self.close()
+
+    def run(self) -> None:
+        """Work until there are no more commands."""
+        why = cuda.unusable()
+        card = torch.cuda.get_device_name() if why is None else None
+        self.say("ready", {"protocol": PROTOCOL, "refgs": __version__, "card": card, "no_card": why})
+        jobs_of = {Check: self._check, Train: self._train, Export: self._export}
+        while self._open:
+            command = self._waiting.pop(0) if self._waiting else self._commands.get()
+            if command is CLOSED:
+                break
+            if type(command) in jobs_of:
+                self._do(command.command, jobs_of[type(command)], command)
+            else:
+                self.say("warning", {"what": f"nothing to {command.command}: no job is running"})
+
+    def _do(self, name: str, job: Callable[[Any], tuple[str, dict]], command: _Command) -> None:
+        self.say("started", {"job": name})
+        self._deaf = name != "train"
+        try:
+            event, facts = job(command)
+        except InputError as error:
+            event, facts = "failed", {"what": str(error), "fault": False}
+        except Exception as error:
+            traceback.print_exc()
+            event, facts = "failed", {"what": f"a fault of ours: {type(error).__name__}: {error}", "fault": True}
+        finally:
+            self._deaf = False
+        self.say(event, {"job": name} | facts)
+
+    def _check(self, command: Check) -> tuple[str, dict]:
+        lines = describe(read_capture(Path(command.capture)))
+        return "done", {"lines": lines}
+
+    def _train(self, command: Train) -> tuple[str, dict]:
+        out = Path(command.out)
+        trainer = jobs.train(
+            Path(command.capture),
+            out,
+            command.preset,
+            command.device,
+            command.minutes,
+            command.settings,
+            command.resume,
+            self.say,
+            self._attend,
+        )
+        facts = {"run": str(out.resolve()), "iteration": trainer.iteration, "seconds": trainer.seconds}
+        if not trainer.ended:
+            return "cancelled", facts
+        left_out = json.loads((out / "needs.json").read_text(encoding="utf-8"))
+        return "done", facts | {"psnr": trainer.test_psnr(), "left_out": left_out}
+
+    def _attend(self, trainer: Trainer) -> bool:
+        """Do what was asked since the last iteration; True to stop here."""
+        paused = False
+        while paused or not self._commands.empty():
+            command = self._commands.get()
+            if command is CLOSED:
+                self._open = False
+                return True
+            match command.command:
+                case "pause" | "resume":
+                    paused = command.command == "pause"
+                    self.say("paused" if paused else "resumed", {"iteration": trainer.iteration})
+                case "preview":
+                    self.say("preview", write_preview(trainer))
+                case "cancel":
+                    return True
+                case "stop":
+                    trainer.total = trainer.iteration
+                    return True
+                case _:
+                    self._waiting.append(command)
+        return False
+
+    def _export(self, command: Export) -> tuple[str, dict]:
+        mesh = jobs.export(Path(command.run), None, command.texture, None, overwrite=False, report=self.say)
+        return "done", {"mesh": str(mesh.resolve())}
+
+
+def work() -> None:
+    """Speak the protocol on this process's stdin and stdout. Whatever else prints goes to stderr."""
+    events = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    sys.stdin.reconfigure(encoding="utf-8")
+    worker = Worker(events)
+    for kind in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(kind, worker.interrupted)
+    threading.Thread(target=worker.listen, args=(sys.stdin,), daemon=True).start()
+    worker.run()

@@ -1,0 +1,132 @@
+"""The job protocol, spoken with the real process."""
+
+import json
+import queue
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+SMALL = [
+    "surfels.start=1000",
+    "surfels.budget=1000",
+    "surfels.hull=48",
+    "environment.resolution=16",
+    "train.iterations=100000",
+]
+PATIENCE = 120  # seconds
+
+
+class Talk:
+    """A worker, and what it has said."""
+
+    def __init__(self):
+        command = [sys.executable, "-m", "refgs.cli", "worker"]
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
+        )
+        self.lines: queue.Queue[str] = queue.Queue()
+        self.heard: list[dict] = []
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        for line in self.process.stdout:
+            self.lines.put(line)
+        self.lines.put("")
+
+    def tell(self, command: str, **facts) -> None:
+        self.process.stdin.write(json.dumps({"command": command} | facts) + "\n")
+        self.process.stdin.flush()
+
+    def until(self, event: str) -> dict:
+        """The next event of this kind."""
+        while line := self.lines.get(timeout=PATIENCE):
+            self.heard.append(json.loads(line))
+            if self.heard[-1]["event"] == event:
+                return self.heard[-1]
+        raise AssertionError(f"it ended before {event}: {self.heard[-3:]}")
+
+    def end(self) -> int:
+        self.process.stdin.close()
+        return self.process.wait(timeout=PATIENCE)
+
+
+@pytest.fixture
+def talk():
+    talk = Talk()
+    yield talk
+    talk.process.kill()
+    talk.process.wait()
+
+
+def test_jobs_one_after_another(talk, ball_capture, tmp_path):
+    """What is asked is done in turn; what is wrong is said in one line, and the next job is none the worse."""
+    run = tmp_path / "größe 'a'"
+    talk.tell("check", capture=str(ball_capture))
+    talk.tell("check", capture=str(tmp_path / "nothing"))
+    talk.tell("train", capture=str(ball_capture), out=str(run), preset="quick", settings=SMALL)
+    talk.tell("train", capture=str(ball_capture), out=str(run), preset="quick")
+    talk.tell("train", capture=str(ball_capture))
+    talk.process.stdin.write("no JSON\n")
+    talk.tell("export", run=str(run), texture=64)
+    ready = talk.until("ready")
+    assert ready["protocol"] == 1 and (ready["card"] is None) == bool(ready["no_card"])
+    assert any("28" in line for line in talk.until("done")["lines"])
+    failed = talk.until("failed")
+    assert (
+        failed["job"] == "check" and not failed["fault"] and "nothing" in failed["what"] and "\n" not in failed["what"]
+    )
+    assert talk.until("progress").keys() >= {"iteration", "total", "seconds_left", "loss", "psnr", "splats"}
+    wrong = [event["what"] for event in talk.heard if event["event"] == "warning"]
+    assert len(wrong) >= 2 and "train.out Field required" in wrong[0] and "JSON" in wrong[1]
+    talk.tell("stop")
+    trained = talk.until("done")
+    assert (
+        trained["run"] == str(run)
+        and trained["psnr"] > 5
+        and any(x["what"] == "inter-reflection" for x in trained["left_out"])
+    )
+    assert "holds another run" in talk.until("failed")["what"]
+    assert talk.until("done")["mesh"] == str(run / "mesh.glb") and (run / "mesh.glb").exists()
+    talk.tell("pause")
+    assert "no job is running" in talk.until("warning")["what"]
+    assert talk.end() == 0
+
+
+def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture, tmp_path):
+    run = tmp_path / "run"
+    talk.tell("train", capture=str(ball_capture), out=str(run), preset="quick", settings=SMALL)
+    talk.until("progress")
+    talk.tell("pause")
+    paused = talk.until("paused")["iteration"]
+    time.sleep(0.5)
+    assert talk.lines.empty()
+    talk.tell("preview")
+    shown = talk.until("preview")
+    assert shown["iteration"] == paused
+    assert Path(shown["view"]).read_bytes()[:4] == b"\x89PNG" and Path(shown["splats"]).read_bytes()[:3] == b"ply"
+    talk.tell("resume")
+    assert talk.until("resumed")["iteration"] == paused
+    assert talk.until("progress")["seconds"] < 60
+    talk.tell("cancel")
+    cancelled = talk.until("cancelled")
+    assert cancelled["iteration"] > paused and not (run / "splats.ply").exists()
+    talk.tell("train", capture=str(ball_capture), out=str(run), resume=True)
+    assert talk.until("progress")["iteration"] > cancelled["iteration"]
+    # Whoever listened is gone: the training ends by itself, and can be gone on with.
+    assert talk.end() == 0
+    ended = talk.until("cancelled")
+    assert (run / "checkpoints" / f"{ended['iteration']:08d}.toml").exists(), list((run / "checkpoints").iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")
+def test_a_terminated_training_can_be_resumed(talk, ball_capture, tmp_path):
+    run = tmp_path / "run"
+    talk.tell("train", capture=str(ball_capture), out=str(run), preset="quick", settings=SMALL)
+    talk.until("progress")
+    talk.process.terminate()
+    assert talk.until("cancelled")["iteration"] > 0
+    assert talk.process.wait(timeout=PATIENCE) == 0
