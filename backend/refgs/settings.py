@@ -56,6 +56,10 @@ class SurfelSettings(_Section):
 class EnvironmentSettings(_Section):
     resolution: Literal[16, 32, 64, 128, 256] = Field(description="side of the cubemap's faces, in texels")
     radiance: float = Field(gt=0, le=1e6, description="at the start")
+    diffusion: float = Field(
+        ge=0,
+        description="of texels into their neighbours, a part of the light's rate; keeps noise out of what photos hardly show",
+    )
 
 
 class LightSettings(_Section):

@@ -100,3 +100,20 @@ def test_all_grow_faint_and_mirrors_grow(ball_capture, tmp_path):
     assert after["opacity"].sigmoid().min() > 0.899
     assert torch.equal(step()["opacity"], after["opacity"])  # at rest
     assert step()["opacity"].sigmoid().max() < 0.0101  # the sixth: all grow faint
+
+
+@pytest.mark.parametrize("waves", [1, 5, 15])
+def test_the_light_diffuses_as_heat_does(ball_capture, tmp_path, waves):
+    """A cosine between insulated ends is an eigenvector of the discrete Laplacian: it fades by 1 − 4 c sin²(θ / 2) a step."""
+    changes = ["environment.diffusion=0.4", "rates.environment=0.5", "train.iterations=10"]
+    made = trainer(ball_capture, tmp_path / "run", "quick", *changes)
+    made._set_rates(0.0)
+    angle = torch.pi * waves / 16
+    wave = torch.cos(angle * (torch.arange(16) + 0.5))
+    texels = made.light.detach().view(6, 16, 16, 3)
+    texels[:] = 0.7 + wave[:, None, None]
+    texels[1] = 0.7 + wave[:, None]
+    made._diffuse_light()
+    faded = 0.7 + (1 - 4 * 0.2 * torch.sin(torch.tensor(angle / 2)) ** 2) * wave
+    for face, expected in ((0, faded[:, None, None]), (1, faded[:, None])):
+        assert torch.allclose(texels[face], expected.expand(16, 16, 3), atol=1e-6)

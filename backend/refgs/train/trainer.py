@@ -199,6 +199,21 @@ class Trainer:
         self.light = finer.to(self.device).requires_grad_()
         next(g for g in self.optimizer.param_groups if g["name"] == "environment")["params"] = [self.light]
 
+    @torch.no_grad()
+    def _diffuse_light(self) -> None:
+        """Let texels flow into their neighbours on the face, beside the optimiser's step and in proportion to its rate, as decoupled
+        weight decay is (Loshchilov and Hutter 2019). What photos agree on moves by the whole rate, and stays sharp; what only
+        noise moves evens out. The mean stays."""
+        group = next(g for g in self.optimizer.param_groups if g["name"] == "environment")
+        side, part = math.isqrt(len(self.light) // 6), min(group["lr"] * self.settings.environment.diffusion, 0.25)
+        if part == 0:
+            return
+        texels = self.light.view(6, side, side, 3)
+        for axis in (1, 2):
+            flow = part * texels.diff(dim=axis)
+            texels.narrow(axis, 0, side - 1).add_(flow)
+            texels.narrow(axis, 1, side - 1).sub_(flow)
+
     def mean_light(self, light: Environment) -> Tensor | None:
         """The light's mean radiance (3,) over what the object mirrors of it, if that is held to be grey."""
         if self.settings.loss.light == 0:
@@ -256,6 +271,8 @@ class Trainer:
         position = self.parameters["position"]
         self.motion.add(position.detach(), position.grad, photo.camera)
         self.optimizer.step()
+        if environment is not None:
+            self._diffuse_light()
         self._forget_gradients()
         self.iteration += 1
         due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
