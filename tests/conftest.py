@@ -2,6 +2,7 @@ import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait,
 
 import os
 import sys
+from pathlib import Path
 
 import pytest
 import torch._dynamo  # its Triton brings an LLVM that crashes when it is loaded after Mesa's, which Eevee draws with
@@ -41,6 +42,20 @@ def ball_capture(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ball")
     write_ball_capture(folder, 64)
     return folder
+
+
+@pytest.fixture
+def python(tmp_path):
+    """A Python that has a trainer in it which only speaks as one, and nothing else."""
+    from refgs_addon import jobs
+
+    if sys.platform == "win32":
+        pytest.skip("the fake trainer is a script that Windows does not start")
+    file, fake = tmp_path / "the Python", Path(__file__).parent / "addon" / "fake_worker.py"
+    file.write_text(f"#!{sys.executable}\nimport runpy\nrunpy.run_path({str(fake)!r})\n")
+    file.chmod(0o755)
+    yield file
+    jobs.stop_all()
 
 
 _status = 0

@@ -2,16 +2,30 @@
 
 import bpy
 
-from . import operators, panels
+from .. import follow, preferences, properties
+from . import operators, panels, pictures, training
 
-CLASSES = (*operators.CLASSES, *panels.CLASSES)
+CLASSES = (
+    *preferences.CLASSES,
+    *properties.CLASSES,
+    *operators.CLASSES,
+    *training.CLASSES,
+    *panels.CLASSES,
+)
 
 
 def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
+    properties.register()
+    pictures.register()
+    training.register()
 
 
 def unregister() -> None:
+    follow.unregister()
+    training.unregister()
+    pictures.unregister()
+    properties.unregister()
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

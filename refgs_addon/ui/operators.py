@@ -14,7 +14,7 @@ from ..scene.preview import render_preview
 from ..scene.relight import relight
 
 
-class _Door:
+class Door:
     """Runs `work`; an InputError becomes one line of report."""
 
     bl_options: ClassVar = {"REGISTER", "UNDO"}
@@ -28,7 +28,20 @@ class _Door:
         return {"FINISHED"}
 
 
-class ImportRun(_Door, bpy.types.Operator):
+def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> None:
+    """Import a run, and report what came of it."""
+    try:
+        from ..scene.run import import_run
+    except ModuleNotFoundError as error:  # Debian's Blender may come without numpy; the rest works without
+        raise InputError(f"Blender's Python lacks {error.name}: install it (on Debian, python3-numpy)") from None
+    run = import_run(folder, context.scene)
+    operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
+    if run.light_of:
+        said = f"The light turned with the camera: the world is as it was for {run.light_of}, and for no other photo"
+        operator.report({"WARNING"}, said)
+
+
+class ImportRun(Door, bpy.types.Operator):
     bl_idname = "refgs.import_run"
     bl_label = "Import RefGS Run"
     bl_description = "Import a run folder: splats, mesh, recovered light and cameras"
@@ -41,20 +54,10 @@ class ImportRun(_Door, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def work(self, context: bpy.types.Context) -> None:
-        try:
-            from ..scene.run import import_run
-        except ModuleNotFoundError as error:  # Debian's Blender may come without numpy; the rest works without
-            raise InputError(f"Blender's Python lacks {error.name}: install it (on Debian, python3-numpy)") from None
-        run = import_run(Path(bpy.path.abspath(self.directory)), context.scene)
-        self.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
-        if run.light_of:
-            said = (
-                f"The light turned with the camera: the world is as it was for {run.light_of}, and for no other photo"
-            )
-            self.report({"WARNING"}, said)
+        import_run_folder(self, context, Path(bpy.path.abspath(self.directory)))
 
 
-class ShowPart(_Door, bpy.types.Operator):
+class ShowPart(Door, bpy.types.Operator):
     bl_idname = "refgs.show"
     bl_label = "Show"
     bl_description = "Show the run's splats or its mesh, in the viewport and in renders"
@@ -66,7 +69,7 @@ class ShowPart(_Door, bpy.types.Operator):
         show(bpy.data.collections[self.collection], self.part)
 
 
-class Relight(_Door, ImportHelper, bpy.types.Operator):
+class Relight(Door, ImportHelper, bpy.types.Operator):
     bl_idname = "refgs.relight"
     bl_label = "Relight with HDRI"
     bl_description = "Light the scene with a panorama; the recovered light is kept"
@@ -82,7 +85,7 @@ class Relight(_Door, ImportHelper, bpy.types.Operator):
         relight(context.scene, Path(bpy.path.abspath(self.filepath)), self.rotation, self.strength)
 
 
-class RecoveredLight(_Door, bpy.types.Operator):
+class RecoveredLight(Door, bpy.types.Operator):
     bl_idname = "refgs.recovered_light"
     bl_label = "Recovered Light"
     bl_description = "Light the scene with the panorama that was recovered from the photos"
@@ -91,7 +94,7 @@ class RecoveredLight(_Door, bpy.types.Operator):
         relight(context.scene, None)
 
 
-class RenderPreview(_Door, ExportHelper, bpy.types.Operator):
+class RenderPreview(Door, ExportHelper, bpy.types.Operator):
     bl_idname = "refgs.render_preview"
     bl_label = "Render Preview"
     bl_description = "Render the scene camera's view in Eevee to a PNG with a transparent background"

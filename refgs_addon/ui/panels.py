@@ -9,13 +9,13 @@ from ..scene.parts import parts
 from . import operators
 
 
-class _Panel:
+class Tab:
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "RefGS"
 
 
-class RunPanel(_Panel, bpy.types.Panel):
+class RunPanel(Tab, bpy.types.Panel):
     bl_idname = "REFGS_PT_run"
     bl_label = "Run"
 
@@ -43,7 +43,7 @@ class RunPanel(_Panel, bpy.types.Panel):
             layout.label(text=f"{len(splats.data.points):,} splats")
 
 
-class LightPanel(_Panel, bpy.types.Panel):
+class LightPanel(Tab, bpy.types.Panel):
     bl_idname = "REFGS_PT_light"
     bl_label = "Light"
 
@@ -64,7 +64,7 @@ class LightPanel(_Panel, bpy.types.Panel):
         column.prop(nodes[STRENGTH].inputs["Strength"], "default_value", text="Strength")
 
 
-class PreviewPanel(_Panel, bpy.types.Panel):
+class PreviewPanel(Tab, bpy.types.Panel):
     bl_idname = "REFGS_PT_preview"
     bl_label = "Preview"
 

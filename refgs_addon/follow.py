@@ -1,0 +1,47 @@
+"""A timer that takes in what the jobs say, and has the window drawn anew where that changed anything."""
+
+import bpy
+
+from . import jobs
+
+EVERY = 0.2  # seconds between looks while there is a job, which cost microseconds when nothing was said
+LOOK = 4.0  # seconds between previews of a training
+
+_since_look = 0.0
+
+
+def follow() -> None:
+    """Look at the jobs from now on, until all have ended."""
+    if not bpy.app.timers.is_registered(_look):
+        bpy.app.timers.register(_look, first_interval=EVERY, persistent=True)
+
+
+def _look() -> float | None:
+    global _since_look
+    _since_look += EVERY
+    changed = jobs.poll()
+    if _since_look >= LOOK:
+        _since_look = 0.0
+        for job in jobs.JOBS:
+            if job.state == "running" and job.progress and "train" not in job.results:
+                job.tell("preview")
+    if changed:
+        redraw()
+    return EVERY if any(not job.ended for job in jobs.JOBS) else None
+
+
+def redraw() -> None:
+    """Draw the panel, the preferences and the status bar anew."""
+    manager = bpy.context.window_manager
+    for window in manager.windows if manager else ():
+        for area in window.screen.areas:
+            if area.type in ("VIEW_3D", "PREFERENCES"):
+                area.tag_redraw()
+        window.workspace.status_text_set_internal(None)  # the bar is no area that could be tagged
+
+
+def unregister() -> None:
+    """Follow no longer, and end the jobs cleanly."""
+    if bpy.app.timers.is_registered(_look):
+        bpy.app.timers.unregister(_look)
+    jobs.stop_all()

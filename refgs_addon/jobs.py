@@ -1,0 +1,248 @@
+"""The backend's processes: started, told and heard without the window ever waiting for them. Nothing here needs bpy.
+
+A job is a `refgs worker` (docs/job-protocol.md) of its own. A thread reads what it says into a queue; `poll`, called now and then,
+takes it from there. The process ends by itself when Blender does, for then its standard input closes.
+"""
+
+import contextlib
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from .errors import InputError
+
+PROTOCOL = 1
+ENDED = ("done", "cancelled", "failed")
+
+
+@dataclass
+class Job:
+    """What a worker is asked to do, one command after another, and what it has said so far.
+
+    `state` is "waiting" (for the jobs before it), "starting", "running", "paused", or one of ENDED. With no commands it is asked for
+    its version alone.
+    """
+
+    name: str
+    python: Path
+    commands: list[dict]
+    log: Path
+    run: Path | None = None  # the folder that is trained into; such jobs run one at a time
+    state: str = "waiting"
+    line: str = ""  # what is being done; at the end, what was wrong
+    warnings: list[str] = field(default_factory=list)
+    progress: dict = field(default_factory=dict)  # the newest event of its kind, as are the next
+    preview: dict = field(default_factory=dict)
+    ready: dict = field(default_factory=dict)
+    results: dict[str, dict] = field(default_factory=dict)  # "done" events by their jobs
+    curve: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR
+    _stopped: bool = False
+    _process: subprocess.Popen | None = None
+    _heard: queue.SimpleQueue = field(default_factory=queue.SimpleQueue)
+
+    @property
+    def ended(self) -> bool:
+        return self.state in ENDED
+
+    @property
+    def active(self) -> bool:
+        """Whether it has a process to do something."""
+        return not self.ended and self.state != "waiting"
+
+    def start(self) -> None:
+        """Start the process; where that fails the job has failed."""
+        self.state, self.line = "starting", "Starting"
+        try:
+            self.log.parent.mkdir(parents=True, exist_ok=True)
+            with open(self.log, "wb") as log:
+                self._process = subprocess.Popen(
+                    [str(self.python), "-E", "-m", "refgs.cli", "worker"],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=log,
+                    cwd=self.log.parent,
+                    creationflags=subprocess.CREATE_NO_WINDOW if sys.platform == "win32" else 0,
+                )
+        except OSError as error:
+            self._fail(f"{self.python} cannot be started ({error.strerror}): choose another Python in the preferences")
+            return
+        threading.Thread(target=_listen, args=(self._process, self._heard), daemon=True).start()
+        if self.commands:
+            self._next()
+        else:
+            self._close()
+
+    def tell(self, command: str, **facts) -> None:
+        """Send a command. One that nobody hears is no matter: that the process has ended is heard too."""
+        with contextlib.suppress(OSError, ValueError):
+            self._process.stdin.write(json.dumps({"command": command} | facts).encode() + b"\n")
+            self._process.stdin.flush()
+
+    def poll(self) -> bool:
+        """Take in what was said since; whether that was anything."""
+        heard = False
+        while not self._heard.empty():
+            heard, event = True, self._heard.get()
+            if event is None:
+                self._gone()
+            elif not self.ended:
+                self._take(event)
+        return heard
+
+    def _take(self, event: dict) -> None:
+        match event.get("event"):
+            case "ready":
+                self.ready = event
+                if event["protocol"] != PROTOCOL:
+                    newer = "older" if event["protocol"] < PROTOCOL else "newer"
+                    self._fail(f"the trainer, {event['refgs']}, is {newer} than this add-on: install the same release")
+            case "started":
+                self.state, self.line = "running", {"train": "Reading the photos"}.get(event["job"], "")
+            case "stage":
+                self.line = event["what"]
+            case "warning":
+                self.warnings.append(event["what"])
+            case "progress":
+                self.progress, self.line = event, ""
+                self.curve.append((event["seconds"], event["psnr"]))
+            case "preview":
+                self.preview = event
+            case "paused" | "resumed" as which:
+                self.state = "paused" if which == "paused" else "running"
+            case "done":
+                self.results[event["job"]] = event
+                if self.commands:
+                    self._next()
+                else:
+                    self.state, self.line = "done", ""
+                    self._close()
+            case "cancelled":
+                self.state, self.line = "cancelled", f"Stopped at iteration {event['iteration']:,}"
+                self._close()
+            case "failed":
+                self._fail(event["what"])
+
+    def _next(self) -> None:
+        command = dict(self.commands.pop(0))
+        self.tell(command.pop("command"), **command)
+
+    def _fail(self, what: str) -> None:
+        self.state, self.line = "failed", what
+        self._close()
+
+    def _close(self) -> None:
+        if self._process is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+
+    def _gone(self) -> None:
+        """The process has ended, or said something that is no event."""
+        status = self._process.wait()
+        if self.ready and not self.commands and self.state == "starting":
+            self.state, self.line = "done", ""
+        elif self._stopped and not self.ended:
+            self.state, self.line = "cancelled", "Stopped"
+        elif not self.ended:
+            self._fail(f"the trainer ended unexpectedly (status {status}): its log says more")
+
+    def stop(self) -> None:
+        """End cleanly: a training with a checkpoint, after its iteration."""
+        if self.state == "waiting":
+            self.state, self.line = "cancelled", "Taken back"
+        elif not self.ended:
+            self._stopped = True
+            self._close()
+
+
+def _listen(process: subprocess.Popen, heard: queue.SimpleQueue) -> None:
+    with process.stdout:
+        for line in process.stdout:
+            try:
+                heard.put(json.loads(line))
+            except ValueError:
+                heard.put({"event": "warning", "what": line.decode(errors="replace").strip()})
+    heard.put(None)
+
+
+JOBS: list[Job] = []
+"""All jobs of this session that have not been put away, the oldest first. Of those that train one runs at a time."""
+
+
+def check(python: Path, capture: Path, log: Path) -> Job:
+    """Have a capture read, beside whatever else runs. The lines about it are in `results["check"]["lines"]`."""
+    return _add(Job(capture.name, python, [{"command": "check", "capture": str(capture)}], log))
+
+
+def ask(python: Path, log: Path) -> Job:
+    """Ask a Python whether RefGS's trainer is in it, which one, and what it would train on: `ready`, when the job is done."""
+    return _add(Job("trainer", python, [], log))
+
+
+def train(
+    python: Path,
+    capture: Path,
+    out: Path,
+    log: Path,
+    *,
+    preset: str = "standard",
+    minutes: float | None = None,
+    settings: Mapping[str, object] | None = None,
+    mesh: bool = True,
+    resume: bool = False,
+) -> Job:
+    """Train a capture into a run folder, and make its mesh, after the jobs that wait already.
+
+    `settings` are those of a preset by their names, `{"train.iterations": 2000}`. Raises InputError where there is nothing to train
+    from, or a run in the folder already.
+    """
+    if not capture.is_dir():
+        raise InputError(f"{capture} is not a folder: choose the folder of a capture")
+    if not resume and out.exists() and any(out.iterdir()):
+        raise InputError(f"{out} is not empty: choose another folder for the run")
+    if any(job.run == out and not job.ended for job in JOBS):
+        raise InputError(f"{out} is being trained already")
+    words = {"preset": preset, "minutes": minutes, "settings": [f"{k}={v}" for k, v in (settings or {}).items()]}
+    if resume:
+        words = {"minutes": minutes, "resume": True}
+    commands = [{"command": "train", "capture": str(capture), "out": str(out)} | words]
+    if mesh:
+        commands.append({"command": "export", "run": str(out)})
+    return _add(Job(out.name, python, commands, log, out))
+
+
+def _add(job: Job) -> Job:
+    JOBS.append(job)
+    poll()
+    return job
+
+
+def poll() -> bool:
+    """Take in what all jobs have said, start the one whose turn it is; whether anything changed."""
+    changed = [job.poll() for job in JOBS]
+    busy = any(job.run and job.active for job in JOBS)
+    for job in JOBS:
+        if job.state == "waiting" and not (job.run and busy):
+            job.start()
+            busy, changed = busy or job.run is not None, [True]
+    return any(changed)
+
+
+def stop_all() -> None:
+    """End everything cleanly, and forget it."""
+    for job in JOBS:
+        job.stop()
+    JOBS.clear()
+
+
+def run_state(folder: Path) -> str:
+    """What a run folder holds: "finished", "stopped" (it can be gone on with), or "" where it is none."""
+    if (folder / "splats.ply").is_file():
+        return "finished"
+    notes = folder / "checkpoints"
+    return "stopped" if notes.is_dir() and any(file.endswith(".toml") for file in os.listdir(notes)) else ""

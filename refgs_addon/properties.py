@@ -1,0 +1,54 @@
+"""What a .blend file keeps of RefGS: the capture, how to train it, and where its runs are."""
+
+import bpy
+from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, PointerProperty, StringProperty
+
+
+class KnownRun(bpy.types.PropertyGroup):
+    """A run folder that was trained from this file."""
+
+    folder: StringProperty(subtype="DIR_PATH")
+    capture: StringProperty(subtype="DIR_PATH")
+
+
+class Training(bpy.types.PropertyGroup):
+    capture: StringProperty(
+        name="Capture",
+        description="The folder with the photos and their cameras: NeRF-Blender, nerfstudio or COLMAP",
+        subtype="DIR_PATH",
+    )
+    out: StringProperty(
+        name="Run Folder",
+        description="Where the result goes: a new or an empty folder. Left empty, one beside the capture",
+        subtype="DIR_PATH",
+    )
+    preset: EnumProperty(
+        name="Quality",
+        items=[
+            ("quick", "Quick", "A few minutes on a laptop: photos of 400 pixels, a coarse mesh"),
+            ("standard", "Standard", "Finer light, mesh and textures, photos of 800 pixels; several times as long"),
+            ("paper", "Paper", "The published schedule, 58,000 iterations: for a graphics card"),
+        ],
+        default="quick",
+    )
+    limited: BoolProperty(
+        name="Limit Time", description="Train for so many minutes in place of the preset's iterations"
+    )
+    minutes: FloatProperty(
+        name="Minutes", description="How long to train", default=5.0, min=0.05, soft_min=1.0, soft_max=120.0
+    )
+    mesh: BoolProperty(
+        name="Make Mesh", description="Fuse a mesh and bake its textures when the training has ended", default=True
+    )
+    runs: CollectionProperty(type=KnownRun)
+
+
+CLASSES = (KnownRun, Training)
+
+
+def register() -> None:
+    bpy.types.Scene.refgs = PointerProperty(type=Training, name="RefGS")
+
+
+def unregister() -> None:
+    del bpy.types.Scene.refgs

@@ -1,0 +1,75 @@
+"""Training from a scene's settings: what the buttons of the Train panel do."""
+
+from pathlib import Path
+
+import bpy
+
+from .. import jobs
+from ..errors import InputError
+from ..follow import follow
+from ..preferences import log_file, python
+
+
+def check(scene: bpy.types.Scene) -> jobs.Job:
+    """Have the scene's capture read; `results["check"]["lines"]` of the job say what was found."""
+    capture = _capture(scene)
+    job = jobs.check(python(), capture, log_file(f"check {capture.name}"))
+    follow()
+    return job
+
+
+def train(scene: bpy.types.Scene) -> jobs.Job:
+    """Train the scene's capture as its settings say, after what is being trained already. The scene remembers the run folder.
+
+    Raises InputError where the trainer, the capture or a free folder is missing.
+    """
+    settings, capture = scene.refgs, _capture(scene)
+    out = Path(bpy.path.abspath(settings.out)) if settings.out else _free_folder(capture, scene)
+    minutes = settings.minutes if settings.limited else None
+    job = jobs.train(
+        python(), capture, out, log_file(out.name), preset=settings.preset, minutes=minutes, mesh=settings.mesh
+    )
+    if all(Path(known.folder) != out for known in settings.runs):
+        known = settings.runs.add()
+        known.folder, known.capture = str(out), str(capture)
+    follow()
+    return job
+
+
+def resume(scene: bpy.types.Scene, folder: Path) -> jobs.Job:
+    """Go on with a run of the scene's that was stopped."""
+    known = next((known for known in scene.refgs.runs if Path(known.folder) == folder), None)
+    if known is None or jobs.run_state(folder) != "stopped":
+        raise InputError(f"{folder} holds no training that was stopped: start a new one")
+    mesh = scene.refgs.mesh
+    job = jobs.train(python(), Path(known.capture), folder, log_file(folder.name), mesh=mesh, resume=True)
+    follow()
+    return job
+
+
+def forget(scene: bpy.types.Scene, folder: Path) -> None:
+    """No longer list a run; its folder stays as it is."""
+    runs = scene.refgs.runs
+    for number in reversed(range(len(runs))):
+        if Path(runs[number].folder) == folder:
+            runs.remove(number)
+    jobs.JOBS[:] = [job for job in jobs.JOBS if not (job.ended and job.run == folder)]
+
+
+def _capture(scene: bpy.types.Scene) -> Path:
+    if not scene.refgs.capture:
+        raise InputError("no capture is chosen: choose the folder with the photos")
+    capture = Path(bpy.path.abspath(scene.refgs.capture))
+    if not capture.is_dir():
+        raise InputError(f"{capture} is not a folder: choose the folder with the photos")
+    return capture
+
+
+def _free_folder(capture: Path, scene: bpy.types.Scene) -> Path:
+    """A folder beside the capture that is not there yet, nor about to be."""
+    taken = {Path(known.folder) for known in scene.refgs.runs}
+    number, out = 1, capture.with_name(f"{capture.name} RefGS")
+    while out in taken or out.exists():
+        number += 1
+        out = capture.with_name(f"{capture.name} RefGS {number}")
+    return out

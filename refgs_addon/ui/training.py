@@ -1,0 +1,258 @@
+"""The Train panel and its buttons."""
+
+from pathlib import Path
+from typing import ClassVar
+
+import bpy
+from bpy.props import IntProperty, StringProperty
+
+from .. import jobs, preferences
+from ..scene import training
+from .operators import Door, import_run_folder
+from .panels import Tab
+from .pictures import curve, picture
+
+
+class AskTrainer(Door, bpy.types.Operator):
+    bl_idname = "refgs.ask_trainer"
+    bl_label = "Ask the Trainer"
+    bl_description = "Ask the Python that is chosen in the preferences for RefGS's trainer"
+    bl_options: ClassVar = {"REGISTER"}
+
+    def work(self, context: bpy.types.Context) -> None:
+        preferences.ask()
+
+
+class CheckCapture(Door, bpy.types.Operator):
+    bl_idname = "refgs.check_capture"
+    bl_label = "Check"
+    bl_description = "Read all of the capture's photos and cameras, and say what is wrong with them"
+    bl_options: ClassVar = {"REGISTER"}
+
+    def work(self, context: bpy.types.Context) -> None:
+        training.check(context.scene)
+
+
+class Train(Door, bpy.types.Operator):
+    bl_idname = "refgs.train"
+    bl_label = "Train"
+    bl_description = "Learn surfels, materials and light from the photos, in a process of its own: Blender stays yours"
+
+    def work(self, context: bpy.types.Context) -> None:
+        training.train(context.scene)
+
+
+class Resume(Door, bpy.types.Operator):
+    bl_idname = "refgs.resume"
+    bl_label = "Go On"
+    bl_description = "Go on with this training from where it was stopped"
+    bl_options: ClassVar = {"REGISTER"}
+
+    folder: StringProperty(name="Run Folder")
+
+    def work(self, context: bpy.types.Context) -> None:
+        training.resume(context.scene, Path(self.folder))
+
+
+class Forget(Door, bpy.types.Operator):
+    bl_idname = "refgs.forget"
+    bl_label = "Take off the List"
+    bl_description = "Do not list this run any longer; its folder stays as it is"
+
+    folder: StringProperty(name="Run Folder")
+
+    def work(self, context: bpy.types.Context) -> None:
+        training.forget(context.scene, Path(self.folder))
+
+
+class Tell(Door, bpy.types.Operator):
+    bl_idname = "refgs.tell"
+    bl_label = "Tell the Training"
+    bl_options: ClassVar = {"REGISTER"}
+
+    number: IntProperty(name="Number", description="Of the job in the list")
+    command: StringProperty(name="Command", description="pause, resume, stop or cancel")
+
+    @classmethod
+    def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return {
+            "pause": "Let the training rest, and the machine with it",
+            "resume": "Let the training go on",
+            "stop": "Good enough: take what has been learned so far as the result",
+            "cancel": "Stop here; the training can be gone on with later",
+        }.get(properties.command, "")
+
+    def work(self, context: bpy.types.Context) -> None:
+        job = jobs.JOBS[self.number]
+        if self.command == "cancel":
+            job.stop()
+        else:
+            job.tell(self.command)
+
+
+class PutAway(Door, bpy.types.Operator):
+    bl_idname = "refgs.put_away"
+    bl_label = "Put Away"
+    bl_description = "Do not show this any longer"
+    bl_options: ClassVar = {"REGISTER"}
+
+    number: IntProperty(name="Number", description="Of the job in the list")
+
+    def work(self, context: bpy.types.Context) -> None:
+        if jobs.JOBS[self.number].ended:
+            del jobs.JOBS[self.number]
+
+
+class ImportTrained(Door, bpy.types.Operator):
+    bl_idname = "refgs.import_trained"
+    bl_label = "Import"
+    bl_description = "Import this run: splats, mesh, recovered light and cameras"
+
+    folder: StringProperty(name="Run Folder")
+
+    def work(self, context: bpy.types.Context) -> None:
+        import_run_folder(self, context, Path(self.folder))
+
+
+class TrainPanel(Tab, bpy.types.Panel):
+    bl_idname = "REFGS_PT_train"
+    bl_label = "Train"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, settings = self.layout, context.scene.refgs
+        width = max(context.region.width / (7 * context.preferences.system.ui_scale) - 6, 20)  # letters
+        if not preferences.preferences().python:
+            _lines(layout.box(), preferences.state()[1], width, "INFO")
+            layout.operator(
+                "preferences.addon_show", text="Preferences", icon="PREFERENCES"
+            ).module = preferences.PACKAGE
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        column.prop(settings, "capture")
+        column.prop(settings, "preset")
+        row = column.row(heading="Limit Time", align=True)
+        row.prop(settings, "limited", text="")
+        sub = row.row()
+        sub.active = settings.limited
+        sub.prop(settings, "minutes", text="")
+        column.prop(settings, "mesh")
+        column.prop(settings, "out")
+        row = layout.row(align=True)
+        row.enabled = bool(settings.capture and preferences.preferences().python)
+        row.operator(CheckCapture.bl_idname, icon="VIEWZOOM")
+        row.operator(Train.bl_idname, icon="PLAY")
+        for number, job in enumerate(jobs.JOBS):
+            if job not in preferences.asked():
+                _job(layout.box(), number, job, width)
+        for known in settings.runs:
+            if not any(job.run == Path(known.folder) for job in jobs.JOBS):
+                _run(layout.box(), Path(known.folder))
+
+
+def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: float) -> None:
+    head = box.row()
+    icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE", "paused": "PAUSE"}.get(job.state, "SORTTIME")
+    head.label(text=job.name, icon=icon)
+    if job.ended:
+        head.operator(PutAway.bl_idname, text="", icon="X", emboss=False).number = number
+    if job.run and job.active:
+        box.progress(factor=_part(job), text=_how_far(job).capitalize())
+    if job.line:
+        _lines(box, job.line[0].upper() + job.line[1:], width)
+    for warning in job.warnings:
+        _lines(box, warning[0].upper() + warning[1:], width, "ERROR")
+    for line in job.results.get("check", {}).get("lines", ()):
+        _lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
+    if job.progress:
+        facts = job.progress
+        row = box.row()
+        row.label(text=f"{facts['psnr']:.1f} dB")
+        row.label(text=f"{facts['splats'] / 1000:.1f} k splats")
+        row.label(text=f"after {_duration(facts['seconds'])}")
+        if shown := curve(job):
+            box.template_icon(icon_value=shown, scale=6)
+    if shown := picture(job):
+        box.template_icon(icon_value=shown, scale=10)
+    if job.run and job.state in ("running", "paused") and "train" not in job.results:
+        row = box.row(align=True)
+        command = "resume" if job.state == "paused" else "pause"
+        _tell(row, number, command, command.title(), "PLAY" if command == "resume" else "PAUSE")
+        _tell(row, number, "stop", "Finish", "CHECKMARK")
+        _tell(row, number, "cancel", "Stop", "CANCEL")
+    elif job.run and not job.ended:
+        _tell(box, number, "cancel", "Stop", "CANCEL")
+    if job.state == "failed":
+        box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
+    if job.run and job.ended:
+        _run(box, job.run)
+
+
+def draw_status(self, context: bpy.types.Context) -> None:
+    """A training's bar in the status bar."""
+    job = next((job for job in jobs.JOBS if job.run and job.active), None)
+    if job is not None:
+        row = self.layout.row()
+        row.ui_units_x = 14
+        row.progress(factor=_part(job), text=f"{job.name}: {_how_far(job)}")
+
+
+def _part(job: jobs.Job) -> float:
+    """How much of the training is done, 0..1."""
+    return job.progress["iteration"] / max(job.progress["total"], 1) if job.progress else 0.0
+
+
+def _how_far(job: jobs.Job) -> str:
+    """A few words on where a job is."""
+    if job.state == "paused":
+        return "paused"
+    if "train" in job.results:
+        return "making the mesh"
+    if not job.progress:
+        return "waiting" if job.state == "waiting" else "starting"
+    return f"{_duration(job.progress['seconds_left'])} left"
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+
+
+def _tell(layout: bpy.types.UILayout, number: int, command: str, text: str, icon: str) -> None:
+    button = layout.operator(Tell.bl_idname, text=text, icon=icon)
+    button.number, button.command = number, command
+
+
+def _run(box: bpy.types.UILayout, folder: Path) -> None:
+    """What can be done with a run folder."""
+    state = jobs.run_state(folder)
+    row = box.row(align=True)
+    if state == "finished":
+        row.operator(ImportTrained.bl_idname, text=f"Import {folder.name}", icon="IMPORT").folder = str(folder)
+    elif state == "stopped":
+        row.operator(Resume.bl_idname, text=f"Go On with {folder.name}", icon="PLAY").folder = str(folder)
+    else:
+        row.label(text=f"{folder.name} is not there", icon="GHOST_DISABLED")
+    row.operator(Forget.bl_idname, text="", icon="X").folder = str(folder)
+
+
+def _lines(layout: bpy.types.UILayout, text: str, width: float, icon: str = "NONE") -> None:
+    """A text on as many lines as it takes."""
+    column, line = layout.column(align=True), ""
+    column.scale_y = 0.8
+    for word in [*text.split(), ""]:
+        if line and (not word or len(line) + len(word) >= width):
+            column.label(text=line, icon=icon)
+            line, icon = "", "NONE" if icon == "NONE" else "BLANK1"
+        line = f"{line} {word}".strip()
+
+
+CLASSES = (AskTrainer, CheckCapture, Train, Resume, Forget, Tell, PutAway, ImportTrained, TrainPanel)
+
+
+def register() -> None:
+    bpy.types.STATUSBAR_HT_header.append(draw_status)
+
+
+def unregister() -> None:
+    bpy.types.STATUSBAR_HT_header.remove(draw_status)

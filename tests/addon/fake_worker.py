@@ -1,0 +1,86 @@
+"""Speaks the job protocol without training anything. What it does is in the name of the capture: "good", "newer", "crash", "noise"."""
+
+import json
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+
+
+def say(event, **facts):
+    print(json.dumps({"event": event} | facts), flush=True)
+
+
+def train(command, asked):
+    out = Path(command["out"])
+    (out / "checkpoints").mkdir(parents=True, exist_ok=True)
+    (out / "started").write_text(json.dumps(command))
+    paused, iteration = False, 0
+    while iteration < 1000:
+        time.sleep(0.002)
+        for other in asked():
+            if other is None or other["command"] == "cancel":
+                (out / "checkpoints" / "00000010.toml").touch()
+                return say("cancelled", job="train", run=str(out), iteration=iteration, seconds=1.0)
+            paused = {"pause": True, "resume": False}.get(other["command"], paused)
+            if other["command"] in ("pause", "resume"):
+                say("paused" if paused else "resumed", iteration=iteration)
+            if other["command"] == "stop":
+                iteration = 1000
+        if not paused and iteration < 1000:
+            iteration += 10
+            if "crash" in command["capture"] and iteration > 100:
+                os._exit(3)
+            facts = {
+                "iteration": iteration,
+                "total": 1000,
+                "seconds": iteration / 100,
+                "seconds_left": 10 - iteration / 100,
+            }
+            say("progress", **facts, loss=0.1, psnr=20 + iteration / 100, splats=10)
+    (out / "splats.ply").touch()
+    say("done", job="train", run=str(out), iteration=1000, seconds=10.0, psnr=30.0, left_out=[])
+
+
+def main():
+    heard, lock = [], threading.Lock()
+
+    def listen():
+        for line in sys.stdin:
+            with lock:
+                heard.append(json.loads(line))
+        with lock:
+            heard.append(None)
+
+    def asked():
+        with lock:
+            taken = heard[:]
+            heard[:] = [None] if None in heard else []  # the end stays the end
+        return taken
+
+    threading.Thread(target=listen, daemon=True).start()
+    say(
+        "ready",
+        protocol=2 if "newer" in os.environ.get("FAKE", "") else 1,
+        refgs="9.9",
+        card=None,
+        no_card="it is a fake",
+    )
+    while True:
+        for command in asked():
+            if command is None:
+                return
+            say("started", job=command["command"])
+            if command["command"] == "train":
+                if "noise" in command["capture"]:
+                    print("this is no JSON", flush=True)
+                train(command, asked)
+            elif command["command"] == "check":
+                say("done", job="check", lines=["Views: 3", "Warning: they are dark"])
+            else:
+                say("failed", job=command["command"], what="the mesh is crumbs", fault=False)
+        time.sleep(0.002)
+
+
+main()

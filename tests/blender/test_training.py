@@ -1,0 +1,109 @@
+"""Training from Blender: the scene's settings, the buttons, and what a file remembers, with a trainer that only speaks as one."""
+
+import json
+import time
+
+import bpy
+import pytest
+
+from refgs_addon import jobs, preferences, ui
+from refgs_addon.errors import InputError
+from refgs_addon.scene import training
+
+
+@pytest.fixture
+def addon(scene, python):
+    """The add-on, enabled, with the trainer chosen in its preferences."""
+    enabled = bpy.context.preferences.addons.new()
+    enabled.module = preferences.PACKAGE
+    ui.register()
+    preferences.preferences().python = str(python)
+    yield scene
+    ui.unregister()
+    bpy.context.preferences.addons.remove(enabled)
+
+
+@pytest.fixture
+def capture(addon, tmp_path):
+    folder = tmp_path / "good photos"
+    folder.mkdir()
+    addon.refgs.capture = f"{folder}/"
+    return folder
+
+
+def until(condition, seconds=30):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, [(job.name, job.state, job.line) for job in jobs.JOBS]
+        jobs.poll()
+        time.sleep(0.005)
+
+
+def test_the_trainer_is_asked_when_it_is_chosen(addon):
+    assert preferences.state()[1] == "Asking …"
+    until(lambda: all(job.ended for job in jobs.JOBS))
+    assert preferences.state() == ("CHECKMARK", "RefGS 9.9, training on the processor: it is a fake")
+    preferences.preferences().python = "/no/python"
+    assert preferences.state()[0] == "ERROR" and "cannot be started" in preferences.state()[1]
+    preferences.preferences().python = ""
+    assert "not set up" in preferences.state()[1]
+    with pytest.raises(InputError, match="no trainer is set up"):
+        preferences.python()
+
+
+def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
+    addon.refgs.limited, addon.refgs.minutes, addon.refgs.mesh = True, 3.0, False
+    assert bpy.ops.refgs.train() == {"FINISHED"}
+    job = jobs.JOBS[-1]
+    out = tmp_path / "good photos RefGS"
+    assert job.run == out and addon.refgs.runs[0].folder == str(out)
+    until(lambda: job.progress)
+    number = len(jobs.JOBS) - 1
+    bpy.ops.refgs.tell(number=number, command="pause")
+    until(lambda: job.state == "paused")
+    bpy.ops.refgs.tell(number=number, command="cancel")
+    until(lambda: job.state == "cancelled")
+    assert json.loads((out / "started").read_text())["minutes"] == 3.0
+    bpy.ops.refgs.put_away(number=number)
+    assert job not in jobs.JOBS
+    # Saved and opened again, the file knows of the run; it is gone on with.
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    addon.refgs.runs.clear()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    scene = bpy.context.scene
+    assert scene.refgs.runs[0].folder == str(out) and jobs.run_state(out) == "stopped"
+    bpy.ops.refgs.resume(folder=str(out))
+    until(lambda: jobs.JOBS[-1].ended)
+    assert jobs.run_state(out) == "finished"
+    with pytest.raises(InputError, match="no training that was stopped"):
+        training.resume(scene, out)
+    training.forget(scene, out)
+    assert not scene.refgs.runs and out.is_dir()
+
+
+def test_runs_go_into_new_folders(addon, capture, tmp_path):
+    (tmp_path / "good photos RefGS").mkdir()
+    names = [training.train(addon).run.name for _ in range(2)]
+    assert names == ["good photos RefGS 2", "good photos RefGS 3"]
+    addon.refgs.out = str(capture)
+    (capture / "a.png").touch()
+    with pytest.raises(InputError, match="is not empty"):
+        training.train(addon)
+
+
+def test_a_capture_that_is_not_there(addon):
+    with pytest.raises(InputError, match="no capture is chosen"):
+        training.check(addon)
+    addon.refgs.capture = "/nowhere"
+    with pytest.raises(InputError, match="/nowhere is not a folder"):
+        training.check(addon)
+
+
+def test_taken_away_while_it_trains(addon, capture):
+    """Disabling the add-on ends what it started."""
+    training.train(addon)
+    job = jobs.JOBS[-1]
+    until(lambda: job.progress)
+    ui.unregister()
+    assert job._process.wait(timeout=20) == 0 and not jobs.JOBS
+    ui.register()

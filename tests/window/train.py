@@ -1,0 +1,120 @@
+"""Runs inside Blender with its window: acts as an artist who trains a capture with the real trainer, and takes pictures of each step.
+
+blender --python train.py -- EXTENSION.zip PYTHON CAPTURE OUT
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+import traceback
+from pathlib import Path
+
+import bpy
+
+ARCHIVE, PYTHON, CAPTURE, OUT = map(Path, sys.argv[sys.argv.index("--") + 1 :])
+MODULE = "bl_ext.user_default.refgs"
+PATIENCE = 180  # seconds, for a machine that is busy
+bpy.context.preferences.view.show_splash = False
+report = {"steps": {}, "longest": {}}
+
+
+def jobs():
+    return sys.modules[f"{MODULE}.refgs_addon.jobs"].JOBS
+
+
+def area():
+    return next(area for area in bpy.context.window_manager.windows[0].screen.areas if area.type == "VIEW_3D")
+
+
+def last(state):
+    return lambda: jobs() and jobs()[-1].state == state
+
+
+def tell(command):
+    bpy.ops.refgs.tell(number=len(jobs()) - 1, command=command)
+
+
+def artist():
+    """Yields what to wait for, and the name of the picture then: each step is what a click does."""
+    bpy.ops.extensions.package_install_files(filepath=str(ARCHIVE), repo="user_default", enable_on_install=True)
+    area().spaces.active.show_region_ui = True
+    yield lambda: True, None
+    next(region for region in area().regions if region.type == "UI").active_panel_category = "RefGS"
+    yield lambda: True, "empty"
+    bpy.context.preferences.addons[MODULE].preferences.python = str(PYTHON)
+    settings = bpy.context.scene.refgs
+    settings.capture, settings.preset, settings.limited, settings.minutes = str(CAPTURE), "quick", True, 2.0
+    yield last("done"), None
+    bpy.ops.refgs.check_capture()
+    yield last("done"), "checked"
+    report["checked"] = jobs()[-1].results["check"]["lines"]
+    bpy.ops.refgs.put_away(number=len(jobs()) - 1)
+    bpy.ops.refgs.train()
+    yield lambda: len(jobs()[-1].curve) > 4 and jobs()[-1].preview, "training"
+    tell("pause")
+    yield last("paused"), "paused"
+    tell("cancel")
+    yield last("cancelled"), "stopped"
+    folder = jobs()[-1].run
+    report["run"], report["stopped"] = str(folder), jobs()[-1].progress["iteration"]
+    bpy.ops.refgs.put_away(number=len(jobs()) - 1)
+    bpy.ops.refgs.resume(folder=str(folder))
+    yield lambda: jobs()[-1].progress.get("iteration", 0) > report["stopped"], "resumed"
+    tell("stop")
+    yield last("done"), "done"
+    try:
+        report["imported"] = list(bpy.ops.refgs.import_trained(folder=str(folder)))
+    except RuntimeError as error:
+        report["imported"] = str(error)
+    yield lambda: True, "imported"
+
+
+def photograph(name):
+    if shutil.which("import"):
+        subprocess.run(["import", "-window", "root", str(OUT / f"{name}.png")], check=True)
+    else:
+        bpy.ops.screen.screenshot(filepath=str(OUT / f"{name}.png"))
+
+
+def finish():
+    (OUT / "report.json").write_text(json.dumps(report))
+    bpy.ops.wm.quit_blender()
+
+
+steps, waiting, due, longest = artist(), None, time.perf_counter() + 3.0, 0.0
+
+
+def tick() -> float | None:
+    """Ten times a second: go on where what was waited for has come. How late it comes is how long the window was busy."""
+    global waiting, due, longest
+    now = time.perf_counter()
+    longest = max(longest, now - due)
+    due = now + 0.1
+    try:
+        if waiting is None:
+            with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+                found = next(steps, None)
+            if found is None:
+                return finish()
+            waiting = (*found, now + PATIENCE)
+            due = time.perf_counter() + 3.0  # the click itself is not in the time, but what comes of it is
+            return 3.0  # so that it is drawn
+        condition, name, until = waiting
+        if condition():
+            waiting = None
+            if name:
+                report["longest"][name], longest = longest, 0.0
+                photograph(name)
+                report["steps"][name] = [(job.name, job.state, job.line) for job in jobs()]
+            due = time.perf_counter() + 0.1
+        elif now > until:
+            raise TimeoutError(f"{name}: {[(job.name, job.state, job.line) for job in jobs()]}")
+    except Exception:
+        report["error"] = traceback.format_exc()
+        return finish()
+    return 0.1
+
+
+bpy.app.timers.register(tick, first_interval=3.0)
