@@ -1,0 +1,82 @@
+"""How long Blender takes to import splats: `refgs bench importing`. Needs Blender's Python module.
+
+A run of so many splats on a sphere, without mesh and light. Reading the file, how normals change across splats, and all of the import,
+in seconds; the least of three.
+"""
+
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from rich.table import Table
+
+from benchmarks.runs import console
+from refgs.export.splats import Splats, write_splats
+
+COUNTS = 24_000, 100_000, 1_000_000
+
+
+def sphere(count: int) -> Splats:
+    """Splats all over a sphere, turned at random about its normals."""
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    # From z to the normal, about an axis between them; as good as any, but at −z.
+    rotation = np.column_stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(count)])
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    values = {
+        "positions": normal,
+        "normals": normal,
+        "rotations": rotation,
+        "scales": np.full((count, 2), 2 / np.sqrt(count)),
+        "opacities": np.full(count, 0.9),
+        "sh": np.zeros((count, 1, 3)),
+        "albedo": rng.uniform(size=(count, 3)),
+        "metallic": np.ones(count),
+        "roughness": np.full(count, 0.1),
+        "indirect": np.zeros((count, 0, 3)),
+        "received": np.ones((count, 3)),
+    }
+    return Splats(**{name: value.astype(np.float32) for name, value in values.items()})
+
+
+def timed(work, times: int = 3) -> float:
+    """The least seconds of so many times."""
+    seconds = []
+    for _ in range(times):
+        started = time.perf_counter()
+        work()
+        seconds.append(time.perf_counter() - started)
+    return min(seconds)
+
+
+def main() -> None:
+    import bpy
+
+    from refgs_addon.scene.run import import_run
+    from refgs_addon.scene.splats import normal_slopes, read_splats
+
+    table = Table("splats", "reading", "normals", "all of it", title="seconds to import")
+    with tempfile.TemporaryDirectory() as folder:
+        for count in COUNTS:
+            run = Path(folder) / str(count)
+            run.mkdir()
+            write_splats(run / "splats.ply", sphere(count))
+            splats = read_splats(run / "splats.ply")
+
+            def whole(run: Path = run) -> None:
+                bpy.ops.wm.read_factory_settings(use_empty=True)
+                import_run(run, bpy.context.scene)
+
+            parts = (
+                lambda run=run: read_splats(run / "splats.ply"),
+                lambda splats=splats: normal_slopes(splats),
+                whole,
+            )
+            table.add_row(f"{count:,}", *(f"{timed(part):.2f}" for part in parts))
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main()
