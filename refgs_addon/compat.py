@@ -64,3 +64,16 @@ def set_modifier_input(modifier: bpy.types.NodesModifier, name: str, value) -> N
             value = next(item[4] for item in items if item[0] == value)
         owner[key] = value
     modifier.id_data.update_tag()
+
+
+def get_modifier_input(modifier: bpy.types.NodesModifier, name: str):
+    """The value of an input; of a menu the item's name. An object may be None."""
+    owner, path = modifier_input(modifier, name)
+    if path == "value":
+        return owner.value
+    key = path[2:-2]
+    value = owner.get(key)
+    if modifier.node_group.interface.items_tree[name].socket_type == "NodeSocketMenu":
+        items = modifier.id_properties_ui(key).as_dict()["items"]
+        return next((item[0] for item in items if item[4] == value), "")
+    return value

@@ -43,6 +43,7 @@ def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Objec
     data = bpy.data.cameras.new(frame["name"])
     width, height = frame["w"], frame["h"]
     aspect = frame["fl_x"] / frame["fl_y"]  # a pixel's height over its width
+    data.display_size = 0.15  # in the way of the object otherwise, there being a hundred of them
     data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR_WIDTH
     data.lens = SENSOR_WIDTH * frame["fl_x"] / width
     # Shifts are in widths of the picture, positive to the right and up; cx, cy run right and down.

@@ -19,3 +19,11 @@ def show(collection: bpy.types.Collection, part: str) -> None:
     for name, items in parts(collection).items():
         for item in items:
             item.hide_viewport = item.hide_render = name != part
+
+
+def active_run(context: bpy.types.Context) -> bpy.types.Collection | None:
+    """The run that the active object belongs to, else the newest of the scene."""
+    runs = [collection for collection in context.scene.collection.children if parts(collection)]
+    chosen = context.view_layer.objects.active
+    of_chosen = [run for run in runs if chosen is not None and chosen.name in run.all_objects]
+    return (of_chosen or runs or [None])[-1]

@@ -3,7 +3,7 @@
 import bpy
 
 from .. import follow, preferences, properties
-from . import operators, panels, pictures, training
+from . import materials, operators, panels, pictures, training
 
 CLASSES = (
     *preferences.CLASSES,
@@ -11,6 +11,7 @@ CLASSES = (
     *operators.CLASSES,
     *training.CLASSES,
     *panels.CLASSES,
+    *materials.CLASSES,
 )
 
 

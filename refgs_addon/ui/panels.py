@@ -18,6 +18,7 @@ class Tab:
 class RunPanel(Tab, bpy.types.Panel):
     bl_idname = "REFGS_PT_run"
     bl_label = "Run"
+    bl_order = 1
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
@@ -46,6 +47,7 @@ class RunPanel(Tab, bpy.types.Panel):
 class LightPanel(Tab, bpy.types.Panel):
     bl_idname = "REFGS_PT_light"
     bl_label = "Light"
+    bl_order = 3
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
@@ -67,6 +69,7 @@ class LightPanel(Tab, bpy.types.Panel):
 class PreviewPanel(Tab, bpy.types.Panel):
     bl_idname = "REFGS_PT_preview"
     bl_label = "Preview"
+    bl_order = 4
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout

@@ -117,6 +117,7 @@ class ImportTrained(Door, bpy.types.Operator):
 class TrainPanel(Tab, bpy.types.Panel):
     bl_idname = "REFGS_PT_train"
     bl_label = "Train"
+    bl_order = 0
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.refgs

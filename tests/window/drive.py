@@ -22,7 +22,7 @@ report = {"version": bpy.app.version_string, "numpy": importlib.util.find_spec("
 def install() -> float:
     bpy.ops.extensions.package_install_files(filepath=str(ARCHIVE), repo="user_default", enable_on_install=True)
     report["enabled"] = MODULE in bpy.context.preferences.addons
-    for panel in ("REFGS_PT_train", "REFGS_PT_run", "REFGS_PT_light", "REFGS_PT_preview"):
+    for panel in ("REFGS_PT_train", "REFGS_PT_run", "REFGS_PT_materials", "REFGS_PT_light", "REFGS_PT_preview"):
         # Functions appended to a panel run each time Blender draws it, after its own.
         getattr(bpy.types, panel).append(lambda self, context: report["drawn"].append(self.bl_idname))
     return 1.0

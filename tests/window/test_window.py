@@ -59,7 +59,7 @@ def in_window(script, tmp_path, *words):
 def test_the_tab_shows_in_a_window(tmp_path):
     report = in_window("drive.py", tmp_path, write_run(tmp_path / "pot"))
     assert report["enabled"]
-    assert report["drawn"] == ["REFGS_PT_light", "REFGS_PT_preview", "REFGS_PT_run", "REFGS_PT_train"]
+    assert report["drawn"] == [f"REFGS_PT_{name}" for name in ("light", "materials", "preview", "run", "train")]
     if report["numpy"]:
         assert report["import"] == ["FINISHED"]
     else:

@@ -1,0 +1,209 @@
+"""Trees that change the splats' materials without touching what was learned, and that carry the changes over to the mesh."""
+
+import bpy
+
+from . import add, out
+
+NAME = "RefGS Edit"  # of the tree, and the beginning of the names of modifiers that use it
+FOLLOW = "RefGS Follow"  # of the mesh's tree and modifier
+REGIONS = ("Everywhere", "Box", "Sphere", "Similar")
+# What the edits so far have made of a point: values times how much of them there is, as in alpha compositing, and how much that is, of
+# the colour, of the metallic and of the roughness.
+COLOR, SURFACE, AMOUNT = "edit_color", "edit_surface", "edit_amount"
+_MIXED = "RefGS Edited"  # the node of a mesh's material that says it knows the edits
+
+
+def edit_tree() -> bpy.types.NodeTree:
+    """The tree `RefGS Edit`, made the first time and shared by all edits in the file.
+
+    Where its mask is one the splats' base_color, metallic and roughness become its own, as far as the amounts say. The mask
+    is one inside a box or a ball of the size of the object Region, an Empty of size 1, and falls to zero towards its border over the part
+    Falloff; with "Similar" it is one where the material is that of the splat nearest to the object, and zero where it differs by more
+    than Tolerance.
+    """
+    if NAME in bpy.data.node_groups:
+        return bpy.data.node_groups[NAME]
+    tree = bpy.data.node_groups.new(NAME, "GeometryNodeTree")
+    tree.is_modifier = True
+    interface = tree.interface
+    interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    where = interface.new_socket("Where", in_out="INPUT", socket_type="NodeSocketMenu")
+    where.description = (
+        "Which splats: all, those in a box or a ball, or those of a material like the one that the region stands at"
+    )
+    interface.new_socket(
+        "Region", in_out="INPUT", socket_type="NodeSocketObject"
+    ).description = "Move, turn and scale it"
+    factors = {
+        "Falloff": (0.2, "How much of the region is its soft border"),
+        "Tolerance": (0.2, "How much a material may differ from the one at the region and still be changed"),
+        "Color Amount": (1.0, "How much of the base colour is replaced"),
+        "Metallic": (1.0, "Metallic of what is changed"),
+        "Metallic Amount": (1.0, "How much of the metallic is replaced"),
+        "Roughness": (0.2, "Roughness of what is changed"),
+        "Roughness Amount": (1.0, "How much of the roughness is replaced"),
+    }
+    color = interface.new_socket("Base Color", in_out="INPUT", socket_type="NodeSocketColor")
+    color.default_value, color.description = (1.0, 0.77, 0.34, 1.0), "Base colour of what is changed"
+    for name, (value, description) in factors.items():
+        socket = interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat")
+        socket.default_value, socket.min_value, socket.max_value, socket.subtype = value, 0.0, 1.0, "FACTOR"
+        socket.description = description
+
+    group = add(tree, "NodeGroupInput").outputs
+    mask = _mask(tree, group)
+    by_color, by_metallic, by_roughness = (
+        _math(tree, "MULTIPLY", mask, group[f"{name} Amount"]) for name in ("Color", "Metallic", "Roughness")
+    )
+    surface = out(add(tree, "ShaderNodeCombineXYZ", {"X": group["Metallic"], "Y": group["Roughness"]}))
+    surface_amount = out(add(tree, "ShaderNodeCombineXYZ", {"X": by_metallic, "Y": by_roughness}))
+    amount = out(add(tree, "ShaderNodeCombineXYZ", {"X": by_color, "Y": by_metallic, "Z": by_roughness}))
+    color_amount = out(add(tree, "ShaderNodeCombineXYZ", {"X": by_color, "Y": by_color, "Z": by_color}))
+    changed = [
+        ("base_color", "FLOAT_COLOR", "RGBA", by_color, group["Base Color"]),
+        ("metallic", "FLOAT", "FLOAT", by_metallic, group["Metallic"]),
+        ("roughness", "FLOAT", "FLOAT", by_roughness, group["Roughness"]),
+        (COLOR, "FLOAT_VECTOR", "VECTOR", color_amount, group["Base Color"]),
+        (SURFACE, "FLOAT_VECTOR", "VECTOR", surface_amount, surface),
+        (AMOUNT, "FLOAT_VECTOR", "VECTOR", amount, (1.0, 1.0, 1.0)),
+    ]
+    # All are read before any is written: where the mask asks for similar splats, it is by what they were.
+    values = {}
+    for name, kind, mix, factor, value in changed:
+        node = add(tree, "ShaderNodeMix", data_type=mix, factor_mode="NON_UNIFORM" if mix == "VECTOR" else "UNIFORM")
+        sockets = {socket.name: socket for socket in node.inputs if socket.enabled}
+        for key, source in (("Factor", factor), ("A", _attribute(tree, name, kind)), ("B", value)):
+            if isinstance(source, bpy.types.NodeSocket):
+                tree.links.new(source, sockets[key])
+            else:
+                sockets[key].default_value = source
+        values[name] = kind, out(node)
+    geometry = add(tree, "GeometryNodeCaptureAttribute", {"Geometry": group["Geometry"]}, domain="POINT")
+    for name, (kind, _) in values.items():
+        geometry.capture_items.new({"FLOAT_COLOR": "RGBA", "FLOAT_VECTOR": "VECTOR", "FLOAT": "FLOAT"}[kind], name)
+    stored = geometry.outputs["Geometry"]
+    for name, (_, value) in values.items():
+        tree.links.new(value, geometry.inputs[name])
+    for name, (kind, _) in values.items():
+        store = add(tree, "GeometryNodeStoreNamedAttribute", {"Geometry": stored, "Name": name}, data_type=kind)
+        tree.links.new(geometry.outputs[name], next(s for s in store.inputs if s.name == "Value" and s.enabled))
+        stored = out(store)
+    add(tree, "NodeGroupOutput", {"Geometry": stored})
+    return tree
+
+
+def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.NodeSocket:
+    """How much each splat is changed, 0..1."""
+    menu = add(tree, "GeometryNodeMenuSwitch", data_type="FLOAT")
+    menu.enum_items.clear()
+    for name in REGIONS:
+        menu.enum_items.new(name)
+    tree.links.new(group["Where"], menu.inputs["Menu"])
+    region = add(tree, "GeometryNodeObjectInfo", {"Object": group["Region"]}, transform_space="RELATIVE")
+    inverse = add(tree, "FunctionNodeInvertMatrix", {"Matrix": region.outputs["Transform"]})
+    position = out(add(tree, "GeometryNodeInputPosition"))
+    inside = out(add(tree, "FunctionNodeTransformPoint", {"Vector": position, "Transform": inverse.outputs["Matrix"]}))
+    x, y, z = add(
+        tree, "ShaderNodeSeparateXYZ", {0: out(add(tree, "ShaderNodeVectorMath", {0: inside}, operation="ABSOLUTE"))}
+    ).outputs
+    box = _math(tree, "MAXIMUM", _math(tree, "MAXIMUM", x, y), z)
+    ball = add(tree, "ShaderNodeVectorMath", {0: inside}, operation="LENGTH").outputs["Value"]
+    nearest = add(
+        tree,
+        "GeometryNodeSampleNearest",
+        {"Geometry": group["Geometry"], "Sample Position": region.outputs["Location"]},
+    )
+    squares = []
+    for name, kind in (("base_color", "FLOAT_VECTOR"), ("metallic", "FLOAT"), ("roughness", "FLOAT")):
+        value = _attribute(tree, name, kind)
+        there = add(tree, "GeometryNodeSampleIndex", data_type=kind)
+        for key, source in (("Geometry", group["Geometry"]), ("Value", value), ("Index", out(nearest))):
+            tree.links.new(source, next(s for s in there.inputs if s.name == key and s.enabled))
+        if kind == "FLOAT":
+            squares.append(_math(tree, "POWER", _math(tree, "SUBTRACT", value, out(there)), 2.0))
+        else:
+            apart = out(add(tree, "ShaderNodeVectorMath", {0: value, 1: out(there)}, operation="SUBTRACT"))
+            squares.append(
+                add(tree, "ShaderNodeVectorMath", {0: apart, 1: apart}, operation="DOT_PRODUCT").outputs["Value"]
+            )
+    unlike = _math(tree, "SQRT", _math(tree, "ADD", _math(tree, "ADD", *squares[:2]), squares[2]))
+    unlike = _math(tree, "DIVIDE", unlike, _math(tree, "MAXIMUM", group["Tolerance"], 1e-6))
+    tree.links.new(box, menu.inputs["Box"])
+    tree.links.new(ball, menu.inputs["Sphere"])
+    tree.links.new(unlike, menu.inputs["Similar"])
+    menu.inputs["Everywhere"].default_value = 0.0
+    begin = _math(tree, "SUBTRACT", 0.9999, group["Falloff"])
+    falling = add(
+        tree,
+        "ShaderNodeMapRange",
+        {"Value": out(menu), "From Min": begin, "From Max": 1.0, "To Min": 1.0, "To Max": 0.0},
+        interpolation_type="SMOOTHSTEP",
+    )
+    tree.interface.items_tree["Where"].default_value = REGIONS[0]
+    return out(falling)
+
+
+def follow_tree() -> bpy.types.NodeTree:
+    """The tree `RefGS Follow`: each corner of a mesh takes the edits of the splat nearest to it, both being in the run's frame."""
+    if FOLLOW in bpy.data.node_groups:
+        return bpy.data.node_groups[FOLLOW]
+    tree = bpy.data.node_groups.new(FOLLOW, "GeometryNodeTree")
+    tree.is_modifier = True
+    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    tree.interface.new_socket("Splats", in_out="INPUT", socket_type="NodeSocketObject")
+    group = add(tree, "NodeGroupInput").outputs
+    splats = add(tree, "GeometryNodeObjectInfo", {"Object": group["Splats"]}, transform_space="ORIGINAL")
+    # What the modifiers leave of a splat is a quad: a point in the middle of each is where the splat was.
+    centres = out(add(tree, "GeometryNodeMeshToPoints", {"Mesh": splats.outputs["Geometry"]}, mode="FACES"))
+    position = out(add(tree, "GeometryNodeInputPosition"))
+    nearest = add(tree, "GeometryNodeSampleNearest", {"Geometry": centres, "Sample Position": position})
+    stored = group["Geometry"]
+    for name in (COLOR, SURFACE, AMOUNT):
+        value = add(tree, "GeometryNodeSampleIndex", data_type="FLOAT_VECTOR")
+        sources = {"Geometry": centres, "Value": _attribute(tree, name, "FLOAT_VECTOR"), "Index": out(nearest)}
+        for key, source in sources.items():
+            tree.links.new(source, next(s for s in value.inputs if s.name == key and s.enabled))
+        store = {"Geometry": stored, "Name": name, "Value": out(value)}
+        stored = out(add(tree, "GeometryNodeStoreNamedAttribute", store, data_type="FLOAT_VECTOR"))
+    add(tree, "NodeGroupOutput", {"Geometry": stored})
+    return tree
+
+
+def show_edits(material: bpy.types.Material) -> None:
+    """Have a mesh's material show what edits make of its textures; once."""
+    nodes = material.node_tree.nodes
+    principled = next((node for node in nodes if node.type == "BSDF_PRINCIPLED"), None)
+    if principled is None or _MIXED in nodes:
+        return
+    tree = material.node_tree
+
+    def attribute(name: str) -> bpy.types.NodeSocket:
+        return add(tree, "ShaderNodeAttribute", attribute_name=name).outputs["Vector"]
+
+    amounts = add(tree, "ShaderNodeSeparateXYZ", {0: attribute(AMOUNT)}, name=_MIXED).outputs
+    surface = add(tree, "ShaderNodeSeparateXYZ", {0: attribute(SURFACE)}).outputs
+    for key, amount, added in (
+        ("Base Color", amounts[0], attribute(COLOR)),
+        ("Metallic", amounts[1], surface[0]),
+        ("Roughness", amounts[2], surface[1]),
+    ):
+        socket = principled.inputs[key]
+        learned = socket.links[0].from_socket if socket.links else socket.default_value
+        kept = _math(tree, "SUBTRACT", 1.0, amount)
+        if key == "Base Color":
+            learned = learned if socket.links else tuple(learned)[:3]
+            scaled = out(add(tree, "ShaderNodeVectorMath", {0: learned, "Scale": kept}, operation="SCALE"))
+            result = out(add(tree, "ShaderNodeVectorMath", {0: scaled, 1: added}, operation="ADD"))
+        else:
+            result = out(add(tree, "ShaderNodeMath", {0: learned, 1: kept, 2: added}, operation="MULTIPLY_ADD"))
+        tree.links.new(result, socket)
+
+
+def _attribute(tree: bpy.types.NodeTree, name: str, kind: str) -> bpy.types.NodeSocket:
+    return out(add(tree, "GeometryNodeInputNamedAttribute", {"Name": name}, data_type=kind))
+
+
+def _math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
+    return out(add(tree, "ShaderNodeMath", dict(enumerate(inputs)), operation=operation))

@@ -1,0 +1,107 @@
+"""Edits of materials: each is a modifier on the splats, that can be changed, switched off, reordered or removed at any time."""
+
+import bpy
+
+from .. import compat
+from ..errors import InputError
+from ..nodes.edit import FOLLOW, NAME, REGIONS, edit_tree, follow_tree, show_edits
+from ..nodes.splats import NAME as SPLATS
+from .parts import parts
+
+# Base colour (linear Rec.709), metallic, roughness; None leaves the base colour as it was learned.
+MATERIALS: dict[str, tuple[tuple[float, float, float] | None, float, float]] = {
+    "Gold": ((1.0, 0.766, 0.336), 1.0, 0.15),
+    "Silver": ((0.972, 0.960, 0.915), 1.0, 0.1),
+    "Copper": ((0.955, 0.638, 0.538), 1.0, 0.2),
+    "Chrome": ((0.55, 0.556, 0.554), 1.0, 0.02),
+    "Brushed Steel": ((0.56, 0.57, 0.58), 1.0, 0.4),
+    "Rubber": ((0.02, 0.02, 0.02), 0.0, 0.9),
+    "Glazed Ceramic": ((0.8, 0.78, 0.72), 0.0, 0.08),
+    "Clay": (None, 0.0, 0.9),
+    "Polished": (None, 1.0, 0.05),
+}
+
+
+def add_edit(
+    collection: bpy.types.Collection, where: str = "Everywhere", material: str = "Gold"
+) -> bpy.types.NodesModifier:
+    """Add an edit to a run's collection, on top of those that are there; its mesh, if it has one, follows.
+
+    `where` is one of REGIONS; all but "Everywhere" get an Empty in the middle of the splats, to move, turn and scale. `material` is one
+    of MATERIALS. Raises InputError where the collection has no splats.
+    """
+    if where not in REGIONS or material not in MATERIALS:
+        raise InputError(f"there is no region {where} or no material {material}")
+    splats = _splats(collection)
+    edit = splats.modifiers.new(NAME, "NODES")
+    edit.node_group = edit_tree()
+    splats.modifiers.move(len(splats.modifiers) - 1, splats.modifiers.find(SPLATS))
+    edit = splats.modifiers[edit.name]
+    compat.set_modifier_input(edit, "Where", where)
+    if where != "Everywhere":
+        compat.set_modifier_input(edit, "Region", _region(splats, collection, where))
+    set_material(edit, material)
+    for mesh in parts(collection).get("mesh", []):
+        _follow(mesh, splats)
+    return edit
+
+
+def set_material(edit: bpy.types.NodesModifier, material: str) -> None:
+    """Give an edit the values of one of MATERIALS."""
+    color, metallic, roughness = MATERIALS[material]
+    values = {"Metallic": metallic, "Roughness": roughness, "Color Amount": float(color is not None)}
+    values |= {"Metallic Amount": 1.0, "Roughness Amount": 1.0}
+    if color is not None:
+        values["Base Color"] = (*color, 1.0)
+    for name, value in values.items():
+        compat.set_modifier_input(edit, name, value)
+
+
+def edits(splats: bpy.types.Object) -> list[bpy.types.NodesModifier]:
+    """The edits of splats, in the order in which they are applied."""
+    return [m for m in splats.modifiers if m.type == "NODES" and m.node_group and m.node_group.name == NAME]
+
+
+def remove_edit(splats: bpy.types.Object, name: str) -> None:
+    """Remove an edit, and its region where no other edit has it."""
+    edit = splats.modifiers.get(name)
+    if edit is None or edit not in edits(splats):
+        raise InputError(f"{splats.name} has no edit {name}")
+    region = compat.get_modifier_input(edit, "Region")
+    splats.modifiers.remove(edit)
+    if region is not None and region.get("refgs_region") and region.users <= 1 + len(region.users_collection):
+        bpy.data.objects.remove(region)
+
+
+def _splats(collection: bpy.types.Collection) -> bpy.types.Object:
+    found = parts(collection).get("splats", [])
+    if not found or SPLATS not in found[0].modifiers:
+        raise InputError(f"{collection.name} has no splats: import a RefGS run")
+    return found[0]
+
+
+def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: str) -> bpy.types.Object:
+    """An Empty in the middle of the splats, a third of their size; for "Similar" a small one, to be put on a splat."""
+    region = bpy.data.objects.new(f"{where} of {splats.name}", None)
+    region["refgs_region"] = True
+    region.empty_display_type = {"Box": "CUBE", "Sphere": "SPHERE", "Similar": "ARROWS"}[where]
+    cloud = splats.data
+    places = [0.0] * (3 * len(cloud.points))
+    cloud.attributes["position"].data.foreach_get("vector", places)
+    axes = [sorted(places[axis::3]) for axis in range(3)]
+    low, middle, high = ([axis[int(part * (len(axis) - 1))] for axis in axes] for part in (0.02, 0.5, 0.98))
+    region.location = splats.matrix_world @ type(splats.location)(middle)
+    size = max(b - a for a, b in zip(low, high, strict=True)) or 1.0
+    region.scale = [size / (12 if where == "Similar" else 6)] * 3
+    collection.objects.link(region)
+    return region
+
+
+def _follow(mesh: bpy.types.Object, splats: bpy.types.Object) -> None:
+    if FOLLOW not in mesh.modifiers:
+        modifier = mesh.modifiers.new(FOLLOW, "NODES")
+        modifier.node_group = follow_tree()
+        compat.set_modifier_input(modifier, "Splats", splats)
+    for material in mesh.data.materials:
+        if material is not None and material.node_tree is not None:
+            show_edits(material)

@@ -1,0 +1,133 @@
+"""The Materials panel: the edits of a run's materials."""
+
+import bpy
+from bpy.props import EnumProperty, StringProperty
+
+from .. import compat
+from ..nodes.edit import REGIONS
+from ..scene.edit import MATERIALS, add_edit, edits, remove_edit, set_material
+from ..scene.parts import active_run, parts
+from .operators import Door
+from .panels import Tab
+
+_WHERE = {
+    "Everywhere": ("Change all of the object", "WORLD"),
+    "Box": ("Change what is in a box, which you move, turn and scale", "MESH_CUBE"),
+    "Sphere": ("Change what is in a ball, which you move, turn and scale", "MESH_UVSPHERE"),
+    "Similar": ("Change what has a material like the one at a point that you move", "EYEDROPPER"),
+}
+
+
+class AddEdit(Door, bpy.types.Operator):
+    bl_idname = "refgs.add_edit"
+    bl_label = "Edit Material"
+    bl_description = "Change the material of all of the object or a part of it; what was learned stays beneath"
+
+    where: EnumProperty(
+        name="Where", items=[(name, name, _WHERE[name][0], _WHERE[name][1], i) for i, name in enumerate(REGIONS)]
+    )
+    material: EnumProperty(name="Material", items=[(name, name, "") for name in MATERIALS])
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        run = active_run(context)
+        if run is None or not parts(run).get("splats"):
+            cls.poll_message_set("Import a run first")
+            return False
+        return True
+
+    def work(self, context: bpy.types.Context) -> None:
+        edit = add_edit(active_run(context), self.where, self.material)
+        region = compat.get_modifier_input(edit, "Region")
+        if region is not None:
+            for item in context.selected_objects:
+                item.select_set(False)
+            region.select_set(True)
+            context.view_layer.objects.active = region
+
+
+class _OfEdit(Door):
+    """An operator on one edit."""
+
+    splats: StringProperty(name="Splats")
+    edit: StringProperty(name="Edit")
+
+    def modifier(self) -> bpy.types.NodesModifier:
+        return bpy.data.objects[self.splats].modifiers[self.edit]
+
+
+class RemoveEdit(_OfEdit, bpy.types.Operator):
+    bl_idname = "refgs.remove_edit"
+    bl_label = "Remove Edit"
+    bl_description = "Remove this edit; what was learned shows again"
+
+    def work(self, context: bpy.types.Context) -> None:
+        remove_edit(bpy.data.objects[self.splats], self.edit)
+
+
+class SetMaterial(_OfEdit, bpy.types.Operator):
+    bl_idname = "refgs.set_material"
+    bl_label = "Set Material"
+    bl_description = "Give this edit the values of a material"
+
+    material: EnumProperty(name="Material", items=[(name, name, "") for name in MATERIALS])
+
+    def work(self, context: bpy.types.Context) -> None:
+        set_material(self.modifier(), self.material)
+
+
+class MaterialMenu(bpy.types.Menu):
+    bl_idname = "REFGS_MT_materials"
+    bl_label = "Material"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        for name in MATERIALS:
+            button = self.layout.operator(SetMaterial.bl_idname, text=name)
+            button.splats, button.edit, button.material = context.refgs_edit.id_data.name, context.refgs_edit.name, name
+
+
+class MaterialPanel(Tab, bpy.types.Panel):
+    bl_idname = "REFGS_PT_materials"
+    bl_label = "Materials"
+    bl_order = 2
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, run = self.layout, active_run(context)
+        layout.operator_menu_enum(AddEdit.bl_idname, "where", text="Edit Material", icon="ADD")
+        for splats in parts(run).get("splats", []) if run else ():
+            for edit in edits(splats):
+                self._edit(layout.box(), edit)
+
+    def _edit(self, box: bpy.types.UILayout, edit: bpy.types.NodesModifier) -> None:
+        row = box.row(align=True)
+        row.prop(edit, "name", text="")
+        row.context_pointer_set("refgs_edit", edit)
+        row.menu(MaterialMenu.bl_idname, text="", icon="MATERIAL")
+        row.prop(edit, "show_viewport", text="")
+        row.prop(edit, "show_render", text="")
+        button = row.operator(RemoveEdit.bl_idname, text="", icon="X")
+        button.splats, button.edit = edit.id_data.name, edit.name
+        column = box.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        where = compat.get_modifier_input(edit, "Where")
+        names = ["Where"] + ([] if where == "Everywhere" else ["Region", "Falloff"])
+        for name in names + (["Tolerance"] if where == "Similar" else []):
+            self._input(column, edit, name, name)
+        for name, amount in (
+            ("Base Color", "Color Amount"),
+            ("Metallic", "Metallic Amount"),
+            ("Roughness", "Roughness Amount"),
+        ):
+            group = column.column(align=True)
+            self._input(group, edit, name, name)
+            self._input(group, edit, amount, "Amount")
+
+    def _input(self, layout: bpy.types.UILayout, edit: bpy.types.NodesModifier, name: str, text: str) -> None:
+        owner, path = compat.modifier_input(edit, name)
+        if name == "Region" and path != "value":
+            layout.prop_search(owner, path, bpy.data, "objects", text=text)
+        else:
+            layout.prop(owner, path, text=text)
+
+
+CLASSES = (AddEdit, RemoveEdit, SetMaterial, MaterialMenu, MaterialPanel)

@@ -1,0 +1,168 @@
+"""Edits of materials: what they change, where, and what they leave as it was learned."""
+
+import bpy
+import numpy as np
+import pytest
+
+from refgs_addon import compat, ui
+from refgs_addon.errors import InputError
+from refgs_addon.nodes.edit import AMOUNT, COLOR, SURFACE
+from refgs_addon.scene.edit import MATERIALS, add_edit, edits, remove_edit, set_material
+from refgs_addon.scene.parts import show
+from refgs_addon.scene.run import import_run
+
+
+@pytest.fixture
+def run(run_folder, scene):
+    return import_run(run_folder, scene)
+
+
+def drawn(run, name, field="value", width=1):
+    """An attribute of the splats as they are drawn: of the first corner of each quad."""
+    bpy.context.view_layer.update()
+    graph = bpy.context.evaluated_depsgraph_get()
+    mesh = next(
+        i.object.data for i in graph.object_instances if i.object.original == run.splats and i.object.type == "MESH"
+    )
+    values = np.empty((len(mesh.attributes[name].data), width), np.float32)
+    mesh.attributes[name].data.foreach_get(field, values.ravel())
+    return values[::4, 0] if width == 1 else values[::4]
+
+
+def learned(run, name, field="value", width=1):
+    data = run.splats.data.attributes[name].data
+    values = np.empty((len(data), width), np.float32)
+    data.foreach_get(field, values.ravel())
+    return values[:, 0] if width == 1 else values
+
+
+def positions(run):
+    return learned(run, "position", "vector", 3)
+
+
+def test_everything_becomes_gold_and_nothing_is_lost(run):
+    before = learned(run, "metallic").copy(), learned(run, "base_color", "color", 4).copy()
+    edit = add_edit(run.collection, material="Gold")
+    color, metallic, roughness = MATERIALS["Gold"]
+    assert drawn(run, "metallic") == pytest.approx(metallic) and drawn(run, "roughness") == pytest.approx(roughness)
+    np.testing.assert_allclose(drawn(run, "base_color", "color", 4)[:, :3], np.tile(color, (40, 1)), rtol=1e-5)
+    np.testing.assert_array_equal(learned(run, "metallic"), before[0])
+    np.testing.assert_array_equal(learned(run, "base_color", "color", 4), before[1])
+    edit.show_viewport = False
+    np.testing.assert_allclose(drawn(run, "metallic"), before[0])
+    edit.show_viewport = True
+    remove_edit(run.splats, edit.name)
+    np.testing.assert_allclose(drawn(run, "metallic"), before[0])
+
+
+def test_a_material_that_leaves_the_colour(run):
+    add_edit(run.collection, material="Polished")
+    np.testing.assert_allclose(
+        drawn(run, "base_color", "color", 4)[:, :3], learned(run, "base_color", "color", 4)[:, :3], atol=1e-6
+    )
+    assert drawn(run, "metallic") == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("where", "size"), [("Box", lambda p: abs(p).max(axis=1)), ("Sphere", lambda p: np.linalg.norm(p, axis=1))]
+)
+def test_a_region_is_moved_turned_and_scaled(run, where, size):
+    edit = add_edit(run.collection, where, "Chrome")
+    compat.set_modifier_input(edit, "Falloff", 0.0)
+    region = compat.get_modifier_input(edit, "Region")
+    region.location, region.rotation_euler, region.scale = (0.3, -0.2, 0.1), (0.4, 0.5, 0.6), (0.9, 1.2, 0.7)
+    bpy.context.view_layer.update()
+    inverse = np.array(region.matrix_world.inverted())
+    inside = size(positions(run) @ inverse[:3, :3].T + inverse[:3, 3]) < 1
+    assert 3 < inside.sum() < 37
+    expected = np.where(inside, MATERIALS["Chrome"][2], learned(run, "roughness"))
+    np.testing.assert_allclose(drawn(run, "roughness"), expected, atol=1e-5)
+    # The splats' own place takes part: what is moved along keeps its edit.
+    run.splats.location = region.location = (5, 0, 0)
+    run.splats.location.x, region.location = 5.0, (5.3, -0.2, 0.1)
+    np.testing.assert_allclose(drawn(run, "roughness"), expected, atol=1e-5)
+
+
+def test_the_border_is_soft(run):
+    edit = add_edit(run.collection, "Sphere", "Chrome")
+    compat.set_modifier_input(edit, "Falloff", 0.5)
+    region = compat.get_modifier_input(edit, "Region")
+    region.location, region.scale = (0, 0, 0), (2, 2, 2)
+    distance = np.linalg.norm(positions(run), axis=1) / 2
+    t = np.clip((1 - distance) / 0.5, 0, 1)
+    mask = t * t * (3 - 2 * t)
+    assert ((mask > 0.1) & (mask < 0.9)).any()
+    expected = learned(run, "roughness") * (1 - mask) + MATERIALS["Chrome"][2] * mask
+    np.testing.assert_allclose(drawn(run, "roughness"), expected, atol=2e-3)
+
+
+def test_what_is_like_the_splat_at_the_region(run):
+    edit = add_edit(run.collection, "Similar", "Rubber")
+    compat.set_modifier_input(edit, "Falloff", 0.0)
+    compat.set_modifier_input(edit, "Tolerance", 0.6)
+    compat.get_modifier_input(edit, "Region").location = positions(run)[7]
+    of = np.column_stack(
+        [learned(run, "base_color", "color", 4)[:, :3], learned(run, "metallic"), learned(run, "roughness")]
+    )
+    alike = np.linalg.norm(of - of[7], axis=1) < 0.6
+    assert 1 < alike.sum() < 39
+    np.testing.assert_allclose(drawn(run, "metallic"), np.where(alike, 0, of[:, 3]), atol=1e-5)
+
+
+def test_the_mesh_follows_all_edits(run):
+    """What is stored for the mesh, put over any material, is what the edits one after another make of it."""
+    first = add_edit(run.collection, material="Gold")
+    compat.set_modifier_input(first, "Color Amount", 0.7)
+    second = add_edit(run.collection, "Sphere", "Rubber")
+    compat.set_modifier_input(second, "Metallic Amount", 0.4)
+    compat.get_modifier_input(second, "Region").location = (0.5, 0, 0)
+    assert [m.name for m in edits(run.splats)] == [first.name, second.name]
+    amount, color, surface = (drawn(run, name, "vector", 3) for name in (AMOUNT, COLOR, SURFACE))
+    learned_color = learned(run, "base_color", "color", 4)[:, :3]
+    np.testing.assert_allclose(
+        learned_color * (1 - amount[:, :1]) + color, drawn(run, "base_color", "color", 4)[:, :3], atol=1e-5
+    )
+    for column, name in enumerate(("metallic", "roughness")):
+        made = learned(run, name) * (1 - amount[:, column + 1]) + surface[:, column]
+        np.testing.assert_allclose(made, drawn(run, name), atol=1e-5)
+    # Each corner of the mesh has the nearest splat's.
+    (box,) = run.mesh
+    show(run.collection, "mesh")
+    bpy.context.view_layer.update()
+    shown = box.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    corners = np.array([v.co for v in shown.vertices])
+    nearest = np.linalg.norm(corners[:, None] - positions(run)[None], axis=2).argmin(axis=1)
+    found = np.empty((len(corners), 3), np.float32)
+    shown.attributes[AMOUNT].data.foreach_get("vector", found.ravel())
+    np.testing.assert_allclose(found, amount[nearest], atol=1e-5)
+
+
+def test_what_is_removed_takes_its_region_along(run):
+    edit = add_edit(run.collection, "Box")
+    other = add_edit(run.collection, "Sphere")
+    set_material(other, "Copper")
+    region = compat.get_modifier_input(edit, "Region").name
+    remove_edit(run.splats, edit.name)
+    assert region not in bpy.data.objects and len(edits(run.splats)) == 1
+    with pytest.raises(InputError, match="has no edit"):
+        remove_edit(run.splats, "RefGS Splats")
+    with pytest.raises(InputError, match="has no splats"):
+        add_edit(bpy.data.collections.new("empty"))
+
+
+def test_the_buttons(run):
+    ui.register()
+    try:
+        bpy.context.view_layer.objects.active = run.splats
+        assert bpy.ops.refgs.add_edit(where="Sphere", material="Chrome") == {"FINISHED"}
+        (edit,) = edits(run.splats)
+        region = compat.get_modifier_input(edit, "Region")
+        assert bpy.context.view_layer.objects.active == region  # a click and it can be moved
+        bpy.ops.refgs.set_material(splats=run.splats.name, edit=edit.name, material="Rubber")
+        assert compat.get_modifier_input(edit, "Metallic") == 0
+        bpy.ops.refgs.remove_edit(splats=run.splats.name, edit=edit.name)
+        assert not edits(run.splats)
+        bpy.data.batch_remove([run.collection])
+        assert not bpy.ops.refgs.add_edit.poll()
+    finally:
+        ui.unregister()
