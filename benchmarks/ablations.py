@@ -22,10 +22,11 @@ from refgs.settings import load_settings
 # The shares of the training are the paper's: 18,000 of 58,000 iterations, and normals propagated every 2,000.
 WHOLE = ("diffuse=sh", "initial.until=0.31")
 PROPAGATIONS = 29
+REST = 300  # iterations between them at the least: in fewer, what has grown does not shrink again, and all becomes fog
 ABLATIONS = {
     "the whole": (),
     "without 2DGS": ("primitive=3dgs",),
-    "without PBR": ("reflection=mirror",),
+    "without PBR": ("reflection=mirror", "surfels.metallic=0.01"),  # or all of them are mirrors, which grow and grow
     "without inter-reflection": ("indirect.start=1",),
     "without deferred shading": ("shading=splat",),
     "without the initial stage": ("initial.until=0",),
@@ -67,7 +68,7 @@ Found = dict[str, dict[str, dict[str, dict]]]
 def measure(scenes: list[Path], out: Path, preset: str) -> tuple[Found, list[Path]]:
     """What was measured; and the run folders of what failed."""
     failed = []
-    every = max(1, load_settings(preset).train.iterations // PROPAGATIONS)
+    every = max(REST, load_settings(preset).train.iterations // PROPAGATIONS)
     found: Found = {"iterations": {}, "time": {}}
     for scene in scenes:
         for kind, rows in found.items():
