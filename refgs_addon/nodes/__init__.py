@@ -3,6 +3,15 @@
 import bpy
 
 
+def modifier_tree(name: str) -> bpy.types.NodeTree:
+    """A new geometry-nodes tree for a modifier, with nothing but its geometry in and out."""
+    tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    tree.is_modifier = True
+    for way in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    return tree
+
+
 def add(tree: bpy.types.NodeTree, kind: str, inputs: dict | None = None, **properties) -> bpy.types.Node:
     """Add a node. `inputs` maps a socket's name or index to what feeds it: another node's output, or a value."""
     node = tree.nodes.new(kind)

@@ -2,7 +2,7 @@
 
 import bpy
 
-from . import add, out
+from . import add, modifier_tree, out
 
 NAME = "RefGS Edit"  # of the tree, and the beginning of the names of modifiers that use it
 FOLLOW = "RefGS Follow"  # of the mesh's tree and modifier
@@ -23,11 +23,8 @@ def edit_tree() -> bpy.types.NodeTree:
     """
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]
-    tree = bpy.data.node_groups.new(NAME, "GeometryNodeTree")
-    tree.is_modifier = True
+    tree = modifier_tree(NAME)
     interface = tree.interface
-    interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
-    interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     where = interface.new_socket("Where", in_out="INPUT", socket_type="NodeSocketMenu")
     where.description = (
         "Which splats: all, those in a box or a ball, or those of a material like the one that the region stands at"
@@ -148,10 +145,7 @@ def follow_tree() -> bpy.types.NodeTree:
     """The tree `RefGS Follow`: each corner of a mesh takes the edits of the splat nearest to it, both being in the run's frame."""
     if FOLLOW in bpy.data.node_groups:
         return bpy.data.node_groups[FOLLOW]
-    tree = bpy.data.node_groups.new(FOLLOW, "GeometryNodeTree")
-    tree.is_modifier = True
-    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
-    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    tree = modifier_tree(FOLLOW)
     tree.interface.new_socket("Splats", in_out="INPUT", socket_type="NodeSocketObject")
     group = add(tree, "NodeGroupInput").outputs
     splats = add(tree, "GeometryNodeObjectInfo", {"Object": group["Splats"]}, transform_space="ORIGINAL")

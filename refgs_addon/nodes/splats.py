@@ -2,7 +2,7 @@
 
 import bpy
 
-from . import add, out
+from . import add, modifier_tree, out
 
 NAME = "RefGS Splats"  # of the tree, and of the modifier that uses it
 # The quad reaches three standard deviations: the Gaussian is exp(-4.5) = 1.1 % of its peak there.
@@ -20,11 +20,8 @@ def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
     """
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]
-    tree = bpy.data.node_groups.new(NAME, "GeometryNodeTree")
-    tree.is_modifier = True
+    tree = modifier_tree(NAME)
     interface = tree.interface
-    interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
-    interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     size = interface.new_socket("Size", in_out="INPUT", socket_type="NodeSocketFloat")
     size.default_value, size.min_value, size.max_value = 1.0, 0.0, 4.0
     size.description = "Scale of every splat: small values show how the surface is covered"

@@ -7,15 +7,7 @@ import pytest
 
 from refgs_addon import jobs
 from refgs_addon.errors import InputError
-
-
-def until(condition, seconds=30):
-    """Poll until it holds."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, [(job.name, job.state, job.line) for job in jobs.JOBS]
-        jobs.poll()
-        time.sleep(0.005)
+from tests.addon.waiting import until
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """Training from Blender: the scene's settings, the buttons, and what a file remembers, with a trainer that only speaks as one."""
 
 import json
-import time
 
 import bpy
 import pytest
@@ -9,6 +8,7 @@ import pytest
 from refgs_addon import jobs, preferences, ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene import training
+from tests.addon.waiting import until
 
 
 @pytest.fixture
@@ -29,14 +29,6 @@ def capture(addon, tmp_path):
     folder.mkdir()
     addon.refgs.capture = f"{folder}/"
     return folder
-
-
-def until(condition, seconds=30):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, [(job.name, job.state, job.line) for job in jobs.JOBS]
-        jobs.poll()
-        time.sleep(0.005)
 
 
 def test_the_trainer_is_asked_when_it_is_chosen(addon):
