@@ -119,7 +119,10 @@ def demo(
 def bench(
     context: typer.Context,
     what: Annotated[
-        str, typer.Argument(help="kernels, iteration, scaling, threads, gpu, splitsum, ablations or paper")
+        str,
+        typer.Argument(
+            help="kernels, iteration, scaling, threads, gpu, splitsum, truth, ablations, importing or paper"
+        ),
     ] = "kernels",
 ) -> None:
     """Measure the parts, in milliseconds or errors; `paper --data DIR [--out DIR] [--preset NAME]`: the whole on the paper's data."""
