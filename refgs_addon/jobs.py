@@ -43,6 +43,7 @@ class Job:
     results: dict[str, dict] = field(default_factory=dict)  # "done" events by their jobs
     curve: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR
     _stopped: bool = False
+    _asked_only: bool = False
     _process: subprocess.Popen | None = None
     _heard: queue.SimpleQueue = field(default_factory=queue.SimpleQueue)
 
@@ -76,6 +77,7 @@ class Job:
         if self.commands:
             self._next()
         else:
+            self._asked_only = True
             self._close()
 
     def tell(self, command: str, **facts) -> None:
@@ -92,7 +94,10 @@ class Job:
             if event is None:
                 self._gone()
             elif not self.ended:
-                self._take(event)
+                try:
+                    self._take(event)
+                except (KeyError, TypeError, AttributeError):  # from a program that speaks otherwise
+                    self.warnings.append(f"not an event: {event}")
         return heard
 
     def _take(self, event: dict) -> None:
@@ -142,9 +147,9 @@ class Job:
                 self._process.stdin.close()
 
     def _gone(self) -> None:
-        """The process has ended, or said something that is no event."""
+        """The process has ended."""
         status = self._process.wait()
-        if self.ready and not self.commands and self.state == "starting":
+        if self.ready and self._asked_only and not self.ended:
             self.state, self.line = "done", ""
         elif self._stopped and not self.ended:
             self.state, self.line = "cancelled", "Stopped"

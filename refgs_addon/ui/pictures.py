@@ -12,6 +12,7 @@ GROUND, LINE = (0.0, 0.0, 0.0, 0.25), (0.35, 0.65, 1.0, 1.0)
 
 _pictures: bpy.utils.previews.ImagePreviewCollection | None = None
 _newest: dict[int, str] = {}  # by a job's id, the key of its newest picture
+_drawn: dict[int, int] = {}  # by a job's id, how many points its curve was drawn with
 
 
 def picture(job: jobs.Job) -> int:
@@ -34,9 +35,10 @@ def curve(job: jobs.Job) -> int:
         return 0
     key = f"{id(job)} curve"
     shown = _pictures[key] if key in _pictures else _pictures.new(key)
-    if tuple(shown.image_size) != CURVE:
+    if _drawn.get(id(job)) != len(job.curve):  # the panel is drawn far more often than there is news
+        _drawn[id(job)] = len(job.curve)
         shown.image_size = CURVE
-    shown.image_pixels_float = _plot(job.curve)
+        shown.image_pixels_float = _plot(job.curve)
     return shown.icon_id
 
 
@@ -72,3 +74,4 @@ def unregister() -> None:
     bpy.utils.previews.remove(_pictures)
     _pictures = None
     _newest.clear()
+    _drawn.clear()

@@ -74,7 +74,7 @@ def main():
             say("started", job=command["command"])
             if command["command"] == "train":
                 if "noise" in command["capture"]:
-                    print("this is no JSON", flush=True)
+                    print('this is no JSON\n5\n{"event": "progress"}', flush=True)
                 train(command, asked)
             elif command["command"] == "check":
                 say("done", job="check", lines=["Views: 3", "Warning: they are dark"])
