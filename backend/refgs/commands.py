@@ -65,7 +65,7 @@ def train(
 
         before = signal.signal(signal.SIGINT, stop)
         try:
-            trainer = jobs.train(
+            trainer, quality = jobs.train(
                 capture_folder, out, preset, device, minutes, changes, resume, report, lambda _: bool(stopped)
             )
         finally:
@@ -75,7 +75,6 @@ def train(
             f"stopped at iteration {trainer.iteration}; go on with: refgs train {capture_folder} --out {out} --resume"
         )
         raise KeyboardInterrupt
-    quality = trainer.test_psnr(most=len(trainer.test))
     held_out = "" if quality is None else f", {quality:.2f} dB on {len(trainer.test)} held-out views"
     console.print(f"trained {trainer.iteration} iterations in {trainer.seconds:.0f} s{held_out}: {out}")
 

@@ -42,11 +42,12 @@ def train(
     resume: bool,
     report: Report,
     attend: Callable[[Trainer], bool],
-) -> Trainer:
+) -> tuple[Trainer, float | None]:
     """Train a capture into a run folder; its asset is written when the training has ended.
 
     `attend` is called before each iteration and stops it by True; the checkpoint then written is what `resume` goes on from.
-    The trainer that is returned says by `ended` which it was.
+    The trainer that is returned says by `ended` which it was. With it comes the mean PSNR of the held-out views, if there are any and
+    the training has ended.
     """
     from refgs.train.asset import write_asset
 
@@ -80,7 +81,7 @@ def train(
             (out / "log.txt").write_text(traceback.format_exc(), encoding="utf-8")
         raise
     if not trainer.ended:
-        return trainer
+        return trainer, None
     facts = {"training_seconds": trainer.seconds}
     if peak := peak_memory():
         facts["peak_memory_bytes"] = peak
@@ -89,10 +90,11 @@ def train(
     update_metrics(out, facts)
     try:
         write_asset(trainer)
+        quality = trainer.test_psnr(most=len(trainer.test))
     except torch.OutOfMemoryError:
         again = f"refgs train {capture_folder} --out {out} --resume --device cpu"
         raise InputError(f"the card's memory is full; nothing is lost, go on with: {again}") from None
-    return trainer
+    return trainer, quality
 
 
 def export(

@@ -136,7 +136,7 @@ class Worker:
 
     def _train(self, command: Train) -> tuple[str, dict]:
         out = Path(command.out)
-        trainer = jobs.train(
+        trainer, quality = jobs.train(
             Path(command.capture),
             out,
             command.preset,
@@ -151,7 +151,7 @@ class Worker:
         if not trainer.ended:
             return "cancelled", facts
         left_out = json.loads((out / "needs.json").read_text(encoding="utf-8"))
-        return "done", facts | {"psnr": trainer.test_psnr(), "left_out": left_out}
+        return "done", facts | {"psnr": quality, "left_out": left_out}
 
     def _attend(self, trainer: Trainer) -> bool:
         """Do what was asked since the last iteration; True to stop here."""
