@@ -32,3 +32,8 @@ def add(tree: bpy.types.NodeTree, kind: str, inputs: dict | None = None, **prope
 def out(node: bpy.types.Node, name: str | None = None) -> bpy.types.NodeSocket:
     """The output of this name that is in use; the first in use without a name."""
     return next(s for s in node.outputs if s.enabled and name in (None, s.name))
+
+
+def math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
+    """What a node of arithmetic makes of sockets and numbers."""
+    return out(add(tree, "ShaderNodeMath", dict(enumerate(inputs)), operation=operation))

@@ -2,7 +2,7 @@
 
 import bpy
 
-from . import add, modifier_tree, out
+from . import add, math, modifier_tree, out
 
 NAME = "RefGS Edit"  # of the tree, and the beginning of the names of modifiers that use it
 FOLLOW = "RefGS Follow"  # of the mesh's tree and modifier
@@ -51,7 +51,7 @@ def edit_tree() -> bpy.types.NodeTree:
     group = add(tree, "NodeGroupInput").outputs
     mask = _mask(tree, group)
     by_color, by_metallic, by_roughness = (
-        _math(tree, "MULTIPLY", mask, group[f"{name} Amount"]) for name in ("Color", "Metallic", "Roughness")
+        math(tree, "MULTIPLY", mask, group[f"{name} Amount"]) for name in ("Color", "Metallic", "Roughness")
     )
     surface = out(add(tree, "ShaderNodeCombineXYZ", {"X": group["Metallic"], "Y": group["Roughness"]}))
     surface_amount = out(add(tree, "ShaderNodeCombineXYZ", {"X": by_metallic, "Y": by_roughness}))
@@ -68,14 +68,9 @@ def edit_tree() -> bpy.types.NodeTree:
     # All are read before any is written: where the mask asks for similar splats, it is by what they were.
     values = {}
     for name, kind, mix, factor, value in changed:
-        node = add(tree, "ShaderNodeMix", data_type=mix, factor_mode="NON_UNIFORM" if mix == "VECTOR" else "UNIFORM")
-        sockets = {socket.name: socket for socket in node.inputs if socket.enabled}
-        for key, source in (("Factor", factor), ("A", _attribute(tree, name, kind)), ("B", value)):
-            if isinstance(source, bpy.types.NodeSocket):
-                tree.links.new(source, sockets[key])
-            else:
-                sockets[key].default_value = source
-        values[name] = kind, out(node)
+        mixed = {"Factor": factor, "A": _attribute(tree, name, kind), "B": value}
+        by = "NON_UNIFORM" if mix == "VECTOR" else "UNIFORM"
+        values[name] = kind, out(add(tree, "ShaderNodeMix", mixed, data_type=mix, factor_mode=by))
     geometry = add(tree, "GeometryNodeCaptureAttribute", {"Geometry": group["Geometry"]}, domain="POINT")
     for name, (kind, _) in values.items():
         geometry.capture_items.new({"FLOAT_COLOR": "RGBA", "FLOAT_VECTOR": "VECTOR", "FLOAT": "FLOAT"}[kind], name)
@@ -83,9 +78,8 @@ def edit_tree() -> bpy.types.NodeTree:
     for name, (_, value) in values.items():
         tree.links.new(value, geometry.inputs[name])
     for name, (kind, _) in values.items():
-        store = add(tree, "GeometryNodeStoreNamedAttribute", {"Geometry": stored, "Name": name}, data_type=kind)
-        tree.links.new(geometry.outputs[name], next(s for s in store.inputs if s.name == "Value" and s.enabled))
-        stored = out(store)
+        store = {"Geometry": stored, "Name": name, "Value": geometry.outputs[name]}
+        stored = out(add(tree, "GeometryNodeStoreNamedAttribute", store, data_type=kind))
     add(tree, "NodeGroupOutput", {"Geometry": stored})
     return tree
 
@@ -104,7 +98,7 @@ def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.N
     x, y, z = add(
         tree, "ShaderNodeSeparateXYZ", {0: out(add(tree, "ShaderNodeVectorMath", {0: inside}, operation="ABSOLUTE"))}
     ).outputs
-    box = _math(tree, "MAXIMUM", _math(tree, "MAXIMUM", x, y), z)
+    box = math(tree, "MAXIMUM", math(tree, "MAXIMUM", x, y), z)
     ball = add(tree, "ShaderNodeVectorMath", {0: inside}, operation="LENGTH").outputs["Value"]
     nearest = add(
         tree,
@@ -114,23 +108,22 @@ def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.N
     squares = []
     for name, kind in (("base_color", "FLOAT_VECTOR"), ("metallic", "FLOAT"), ("roughness", "FLOAT")):
         value = _attribute(tree, name, kind)
-        there = add(tree, "GeometryNodeSampleIndex", data_type=kind)
-        for key, source in (("Geometry", group["Geometry"]), ("Value", value), ("Index", out(nearest))):
-            tree.links.new(source, next(s for s in there.inputs if s.name == key and s.enabled))
+        sample = {"Geometry": group["Geometry"], "Value": value, "Index": out(nearest)}
+        there = add(tree, "GeometryNodeSampleIndex", sample, data_type=kind)
         if kind == "FLOAT":
-            squares.append(_math(tree, "POWER", _math(tree, "SUBTRACT", value, out(there)), 2.0))
+            squares.append(math(tree, "POWER", math(tree, "SUBTRACT", value, out(there)), 2.0))
         else:
             apart = out(add(tree, "ShaderNodeVectorMath", {0: value, 1: out(there)}, operation="SUBTRACT"))
             squares.append(
                 add(tree, "ShaderNodeVectorMath", {0: apart, 1: apart}, operation="DOT_PRODUCT").outputs["Value"]
             )
-    unlike = _math(tree, "SQRT", _math(tree, "ADD", _math(tree, "ADD", *squares[:2]), squares[2]))
-    unlike = _math(tree, "DIVIDE", unlike, _math(tree, "MAXIMUM", group["Tolerance"], 1e-6))
+    unlike = math(tree, "SQRT", math(tree, "ADD", math(tree, "ADD", *squares[:2]), squares[2]))
+    unlike = math(tree, "DIVIDE", unlike, math(tree, "MAXIMUM", group["Tolerance"], 1e-6))
     tree.links.new(box, menu.inputs["Box"])
     tree.links.new(ball, menu.inputs["Sphere"])
     tree.links.new(unlike, menu.inputs["Similar"])
     menu.inputs["Everywhere"].default_value = 0.0
-    begin = _math(tree, "SUBTRACT", 0.9999, group["Falloff"])
+    begin = math(tree, "SUBTRACT", 0.9999, group["Falloff"])
     falling = add(
         tree,
         "ShaderNodeMapRange",
@@ -155,10 +148,8 @@ def follow_tree() -> bpy.types.NodeTree:
     nearest = add(tree, "GeometryNodeSampleNearest", {"Geometry": centres, "Sample Position": position})
     stored = group["Geometry"]
     for name in (COLOR, SURFACE, AMOUNT):
-        value = add(tree, "GeometryNodeSampleIndex", data_type="FLOAT_VECTOR")
-        sources = {"Geometry": centres, "Value": _attribute(tree, name, "FLOAT_VECTOR"), "Index": out(nearest)}
-        for key, source in sources.items():
-            tree.links.new(source, next(s for s in value.inputs if s.name == key and s.enabled))
+        sample = {"Geometry": centres, "Value": _attribute(tree, name, "FLOAT_VECTOR"), "Index": out(nearest)}
+        value = add(tree, "GeometryNodeSampleIndex", sample, data_type="FLOAT_VECTOR")
         store = {"Geometry": stored, "Name": name, "Value": out(value)}
         stored = out(add(tree, "GeometryNodeStoreNamedAttribute", store, data_type="FLOAT_VECTOR"))
     add(tree, "NodeGroupOutput", {"Geometry": stored})
@@ -185,7 +176,7 @@ def show_edits(material: bpy.types.Material) -> None:
     ):
         socket = principled.inputs[key]
         learned = socket.links[0].from_socket if socket.links else socket.default_value
-        kept = _math(tree, "SUBTRACT", 1.0, amount)
+        kept = math(tree, "SUBTRACT", 1.0, amount)
         if key == "Base Color":
             learned = learned if socket.links else tuple(learned)[:3]
             scaled = out(add(tree, "ShaderNodeVectorMath", {0: learned, "Scale": kept}, operation="SCALE"))
@@ -197,7 +188,3 @@ def show_edits(material: bpy.types.Material) -> None:
 
 def _attribute(tree: bpy.types.NodeTree, name: str, kind: str) -> bpy.types.NodeSocket:
     return out(add(tree, "GeometryNodeInputNamedAttribute", {"Name": name}, data_type=kind))
-
-
-def _math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
-    return out(add(tree, "ShaderNodeMath", dict(enumerate(inputs)), operation=operation))

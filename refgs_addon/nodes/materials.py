@@ -3,7 +3,7 @@
 import bpy
 
 from ..compat import node_tree
-from . import add, out
+from . import add, math, out
 
 VALUES_NAME = "RefGS Splat Values"
 COLOR, VECTOR, FACTOR = 0, 1, 2  # the outputs of an Attribute node; the third is Fac up to 4.5 and Factor in 5.2
@@ -53,8 +53,8 @@ def _finish(material: bpy.types.Material, shader: bpy.types.NodeSocket) -> None:
     material.surface_render_method = "DITHERED"
     tree = material.node_tree
     gaussian = _attribute(tree, "gaussian", VECTOR)
-    exponent = _math(tree, "MULTIPLY", _dot(tree, gaussian, gaussian), -0.5)
-    alpha = _math(tree, "MULTIPLY", _attribute(tree, "opacity", FACTOR), _math(tree, "EXPONENT", exponent))
+    exponent = math(tree, "MULTIPLY", _dot(tree, gaussian, gaussian), -0.5)
+    alpha = math(tree, "MULTIPLY", _attribute(tree, "opacity", FACTOR), math(tree, "EXPONENT", exponent))
     clear = add(tree, "ShaderNodeBsdfTransparent")
     mixed = add(tree, "ShaderNodeMixShader", {0: alpha, 1: out(clear), 2: shader})
     add(tree, "ShaderNodeOutputMaterial", {"Surface": out(mixed)})
@@ -70,10 +70,6 @@ def _vector(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.Node
 
 def _scaled(tree: bpy.types.NodeTree, vector, factor) -> bpy.types.NodeSocket:
     return out(add(tree, "ShaderNodeVectorMath", {"Vector": vector, "Scale": factor}, operation="SCALE"))
-
-
-def _math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
-    return out(add(tree, "ShaderNodeMath", dict(enumerate(inputs)), operation=operation))
 
 
 def _dot(tree: bpy.types.NodeTree, a: bpy.types.NodeSocket, b: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
@@ -96,7 +92,7 @@ def _normal(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.N
         return out(add(tree, "ShaderNodeVectorTransform", {"Vector": vector}, **kind))
 
     viewer = add(tree, "ShaderNodeNewGeometry").outputs["Incoming"]
-    front = _math(tree, "GREATER_THAN", _dot(tree, to_world(centre), viewer), 0.0)
+    front = math(tree, "GREATER_THAN", _dot(tree, to_world(centre), viewer), 0.0)
     bent = _vector(tree, "NORMALIZE", to_world(bent))
-    away = _math(tree, "MINIMUM", _dot(tree, bent, viewer), 0.0)
+    away = math(tree, "MINIMUM", _dot(tree, bent, viewer), 0.0)
     return _vector(tree, "NORMALIZE", _vector(tree, "SUBTRACT", bent, _scaled(tree, viewer, away))), front
