@@ -58,7 +58,8 @@ class EnvironmentSettings(_Section):
     radiance: float = Field(gt=0, le=1e6, description="at the start")
     diffusion: float = Field(
         ge=0,
-        description="of texels into their neighbours, a part of the light's rate; keeps noise out of what photos hardly show",
+        description="of texels of 6×64² into their neighbours, a part of the light's rate, and as far on the sphere at other resolutions; "
+        "keeps noise out of what photos hardly show",
     )
 
 

@@ -1,9 +1,10 @@
 """What is done to each surfel's numbers before and after the rasteriser, against torch in float64."""
 
+import numpy as np
 import pytest
 import torch
 
-from refgs.model.surfels import activate
+from refgs.model.surfels import activate, initial_parameters
 from refgs.render.stack import stack
 from refgs.train.densify import ScreenGradient
 from tests.kernels import scenes
@@ -15,7 +16,7 @@ ACTIVATED = {"scale": (2,), "opacity": (), "albedo": (3,), "metallic": (), "roug
 def raw() -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     values = {name: 6 * torch.randn(COUNT, *shape, generator=generator) for name, shape in ACTIVATED.items()}
-    values["opacity"][:4] = torch.tensor([-90, 90, -1e4, 1e4])
+    values["opacity"][:4] = values["metallic"][:4] = torch.tensor([-90, 90, -1e4, 1e4])
     rest = {
         "position": (3,),
         "rotation": (4,),
@@ -36,10 +37,11 @@ def values(surfels) -> list[torch.Tensor]:
 def test_activations(device, constant):
     exact = {name: value.double().requires_grad_(name != constant) for name, value in raw().items()}
     expected = [exact["scale"].exp(), *(exact[name].sigmoid() for name in list(ACTIVATED)[1:])]
+    expected[3] = 3 * expected[3] ** 2 - 2 * expected[3] ** 3
     leaves = {name: value.to(device).requires_grad_(name != constant) for name, value in raw().items()}
     got = values(activate(leaves))
     for value, reference in zip(got, expected, strict=True):
-        assert ((value.cpu() - reference).abs() <= 3e-7 * reference + 1e-30).all()
+        assert ((value.cpu() - reference).abs() <= 7e-7 * reference + 1e-30).all()
     learned = [name for name in ACTIVATED if name != constant]
     upstream = [torch.randn(v.shape, generator=torch.Generator().manual_seed(i)) for i, v in enumerate(got)]
     moving = [i for i, name in enumerate(ACTIVATED) if name != constant]
@@ -52,6 +54,15 @@ def test_activations(device, constant):
     )
     for g, reference in zip(by, exact_by, strict=True):
         assert ((g.cpu() - reference).abs() <= 1e-6 * reference.abs() + 1e-6).all()
+
+
+@pytest.mark.parametrize("metallic", [0.001, 0.2, 0.5, 0.97])
+def test_a_start_has_the_material_that_is_asked_for(metallic):
+    points = np.zeros((2, 3))
+    look = {"opacity": 0.4, "sh_degree": 0, "albedo": 0.3, "metallic": metallic, "roughness": 0.6}
+    surfels = activate(initial_parameters(points, np.array([[0, 0, 1.0]] * 2), np.ones(2), None, **look))
+    got = [float(v[0].detach()) for v in (surfels.opacities, surfels.metallic, surfels.roughness, surfels.albedo[:, 0])]
+    assert got == pytest.approx([0.4, metallic, 0.6, 0.3], rel=1e-4)
 
 
 def test_side_by_side_and_apart(device):

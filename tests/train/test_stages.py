@@ -104,8 +104,9 @@ def test_all_grow_faint_and_mirrors_grow(ball_capture, tmp_path):
 
 @pytest.mark.parametrize("waves", [1, 5, 15])
 def test_the_light_diffuses_as_heat_does(ball_capture, tmp_path, waves):
-    """A cosine between insulated ends is an eigenvector of the discrete Laplacian: it fades by 1 − 4 c sin²(θ / 2) a step."""
-    changes = ["environment.diffusion=0.4", "rates.environment=0.5", "train.iterations=10"]
+    """A cosine between insulated ends is an eigenvector of the discrete Laplacian: it fades by 1 − 4 c sin²(θ / 2) a step. Here
+    c is 0.5 · 6.4 · (16 / 64)²."""
+    changes = ["environment.diffusion=6.4", "rates.environment=0.5", "train.iterations=10"]
     made = trainer(ball_capture, tmp_path / "run", "quick", *changes)
     made._set_rates(0.0)
     angle = torch.pi * waves / 16

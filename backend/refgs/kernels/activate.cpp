@@ -3,7 +3,7 @@
 
 namespace {
 
-enum Kind : int64_t { EXP, SIGMOID };
+enum Kind : int64_t { EXP, SIGMOID, SMOOTHSTEP };  // the last: 3 s² − 2 s³ of the second
 
 struct Activation {
   int64_t count, kind;
@@ -31,18 +31,21 @@ INLINE Vector exponential(Vector x) {
   return exp2(k) * exp2(r * LOG2_E);
 }
 
+INLINE Vector logistic(Vector x) { return 1.0f / (1.0f + exponential(-x)); }
+
 }  // namespace
 
 KERNEL(refgs_activate_forward, Activate, a) {
   share_vectors(a->shared, a->activations, a->tensors, [](const Activation& v, int64_t i, int64_t n) {
-    Vector raw = read(v.raw + i, n);
-    write(v.value + i, v.kind == EXP ? exponential(raw) : 1.0f / (1.0f + exponential(-raw)), n);
+    Vector raw = read(v.raw + i, n), s = v.kind == EXP ? exponential(raw) : logistic(raw);
+    write(v.value + i, v.kind == SMOOTHSTEP ? s * s * (3.0f - 2.0f * s) : s, n);
   });
 }
 
 KERNEL(refgs_activate_backward, Activate, a) {
   share_vectors(a->shared, a->activations, a->tensors, [](const Activation& v, int64_t i, int64_t n) {
-    Vector value = read(v.value + i, n), slope = v.kind == EXP ? value : value * (1.0f - value);
+    Vector s = v.kind == SMOOTHSTEP ? logistic(read(v.raw + i, n)) : read(v.value + i, n), change = s * (1.0f - s);
+    Vector slope = v.kind == EXP ? s : v.kind == SIGMOID ? change : 6.0f * change * change;
     write(v.by_raw + i, read(v.by_value + i, n) * slope, n);
   });
 }

@@ -14,11 +14,13 @@ from refgs.kernels.load import Shared, Work, run
 from refgs.model import harmonics
 
 FLAT = 0.3  # thickness of 3D Gaussians at the start, by their width
+_EXP, _SIGMOID, _SMOOTHSTEP = range(3)  # `enum Kind` of activate.cpp
+_KINDS = {"scale": _EXP, "opacity": _SIGMOID, "albedo": _SIGMOID, "metallic": _SMOOTHSTEP, "roughness": _SIGMOID}
 
 Parameters = dict[str, Tensor]
 """Raw leaf tensors, one row a surfel: position (N, 3), rotation (N, 4) wxyz, scale (N, 2) log, or (N, 3) of 3D
-Gaussians, opacity (N,) logit, sh_dc (N, 1, 3), sh_rest (N, K−1, 3), albedo (N, 3) logit, metallic (N,) logit, roughness
-(N,) logit, received (N, 3), which does not learn, indirect_dc and indirect_rest as the SH."""
+Gaussians, opacity (N,) logit, sh_dc (N, 1, 3), sh_rest (N, K−1, 3), albedo (N, 3) logit, metallic (N,) whose logistic s gives
+3 s² − 2 s³, roughness (N,) logit, received (N, 3), which does not learn, indirect_dc and indirect_rest as the SH."""
 
 
 def axes(rotations: Tensor) -> list[Tensor]:
@@ -84,28 +86,29 @@ class _Work(Work):
 
 
 class _Activate(torch.autograd.Function):
-    """exp of the first tensor, the logistic function of the others."""
+    """Each tensor by its kind."""
 
     @staticmethod
     def forward(ctx, *raw):
         raw = [tensor.contiguous() for tensor in raw]
         values, work = [torch.empty_like(tensor) for tensor in raw], _Work(tensors=len(raw))
-        for i, (tensor, value) in enumerate(zip(raw, values, strict=True)):
-            work.activations[i] = _Activation(tensor.numel(), i > 0, tensor.data_ptr(), value.data_ptr())
+        for i, (kind, tensor, value) in enumerate(zip(_KINDS.values(), raw, values, strict=True)):
+            work.activations[i] = _Activation(tensor.numel(), kind, tensor.data_ptr(), value.data_ptr())
         run("refgs_activate_forward", work, raw[0], items=sum(tensor.numel() for tensor in raw))
-        ctx.save_for_backward(*values)
+        ctx.save_for_backward(*raw, *values)
         ctx.mark_non_differentiable(*(v for v, needed in zip(values, ctx.needs_input_grad, strict=True) if not needed))
         return tuple(values)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *by_values):
-        values, work, by_raw = ctx.saved_tensors, _Work(), [None] * len(by_values)
+        raw, values = ctx.saved_tensors[: len(by_values)], ctx.saved_tensors[len(by_values) :]
+        work, by_raw = _Work(), [None] * len(by_values)
         by_values = [by.contiguous() for by in by_values]
-        for i, (value, by) in enumerate(zip(values, by_values, strict=True)):
+        for i, (kind, *tensors) in enumerate(zip(_KINDS.values(), raw, values, by_values, strict=True)):
             if ctx.needs_input_grad[i]:
-                by_raw[i] = torch.empty_like(value)
-                slot = _Activation(value.numel(), i > 0, None, value.data_ptr(), by.data_ptr(), by_raw[i].data_ptr())
+                by_raw[i] = torch.empty_like(values[i])
+                slot = _Activation(by_raw[i].numel(), kind, *(t.data_ptr() for t in (*tensors, by_raw[i])))
                 work.activations[work.tensors] = slot
                 work.tensors += 1
         run("refgs_activate_backward", work, values[0], items=sum(value.numel() for value in values))
@@ -113,9 +116,12 @@ class _Activate(torch.autograd.Function):
 
 
 def activate(p: Parameters) -> Surfels:
-    """Raw parameters → values."""
-    names = ("scale", "opacity", "albedo", "metallic", "roughness")
-    scales, opacities, albedo, metallic, roughness = _Activate.apply(*(p[name] for name in names))
+    """Raw parameters → values.
+
+    The metallic nears its ends as the square of how others do: a hundredth of matt white left in a black metal would be as bright as
+    what the metal mirrors, and the light would have to make up for it.
+    """
+    scales, opacities, albedo, metallic, roughness = _Activate.apply(*(p[name] for name in _KINDS))
     return Surfels(
         positions=p["position"],
         rotations=p["rotation"],
@@ -175,7 +181,7 @@ def initial_parameters(
         "sh_dc": ((colour - 0.5) / harmonics.DC)[:, None].contiguous(),
         "sh_rest": torch.zeros(n, rest, 3),
         "albedo": logit(albedo, n, 3),
-        "metallic": logit(metallic, n),
+        "metallic": logit(0.5 - math.sin(math.asin(1 - 2 * metallic) / 3), n),  # the smoothstep's inverse
         "roughness": logit(roughness, n),
         "received": torch.ones(n, 3),
         "indirect_dc": torch.zeros(n, 1, 3),

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.kernels.load import Shared, Work, check, run
-from refgs.model.surfels import Parameters, axes
+from refgs.model.surfels import Parameters, activate, axes
 from refgs.settings import DensifySettings, PropagationSettings
 
 RESET = 0.01  # opacity
@@ -100,8 +100,8 @@ def propagate_normals(parameters: Parameters, optimizer: torch.optim.Optimizer, 
     normals to the pixels around, and the others give way or follow."""
     parameters["opacity"].clamp_(min=math.log(settings.opacity / (1 - settings.opacity)))
     optimizer.state.pop(parameters["opacity"], None)
-    metallic, roughness = parameters["metallic"].sigmoid(), parameters["roughness"].sigmoid()
-    mirrors = (metallic >= settings.metallic) & (roughness <= settings.roughness)
+    surfels = activate(parameters)
+    mirrors = (surfels.metallic >= settings.metallic) & (surfels.roughness <= settings.roughness)
     parameters["scale"] += math.log(settings.growth) * mirrors[:, None]
 
 

@@ -46,6 +46,7 @@ EXPOSURES_ALIKE = (
 TRACED = 24  # views at the least for the mesh that inter-reflection is traced on; all where there are fewer
 LIGHT_REFINED = 0.2  # part of the training after which the light has all its texels
 LEAST_LIGHT = 16  # texels along a side
+DIFFUSED = 64  # texels along a side at which the light diffuses as fast as its setting says, and as far on the sphere at any other
 FEWER = 0.8  # of the surfels, where there is no memory for all
 LEAST_SURFELS = 1000
 MIRROR = 7.0  # logit of a mirror's base colour, and the negative of its roughness's
@@ -205,7 +206,8 @@ class Trainer:
         weight decay is (Loshchilov and Hutter 2019). What photos agree on moves by the whole rate, and stays sharp; what only
         noise moves evens out. The mean stays."""
         group = next(g for g in self.optimizer.param_groups if g["name"] == "environment")
-        side, part = math.isqrt(len(self.light) // 6), min(group["lr"] * self.settings.environment.diffusion, 0.25)
+        side = math.isqrt(len(self.light) // 6)
+        part = min(group["lr"] * self.settings.environment.diffusion * (side / DIFFUSED) ** 2, 0.25)
         if part == 0:
             return
         texels = self.light.view(6, side, side, 3)
