@@ -77,3 +77,12 @@ def get_modifier_input(modifier: bpy.types.NodesModifier, name: str):
         items = modifier.id_properties_ui(key).as_dict()["items"]
         return next((item[0] for item in items if item[4] == value), "")
     return value
+
+
+def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
+    """The curves of an object's keyframes."""
+    animation = item.animation_data
+    if hasattr(animation.action, "fcurves"):  # until 5.0
+        return list(animation.action.fcurves)
+    strips = [strip for layer in animation.action.layers for strip in layer.strips]
+    return [curve for strip in strips for curve in strip.channelbag(animation.action_slot).fcurves]

@@ -221,6 +221,11 @@ def train(
     return _add(Job(out.name, python, commands, log, out))
 
 
+def export(python: Path, run: Path, log: Path) -> Job:
+    """Make the mesh and the textures of a run, after the jobs that wait already."""
+    return _add(Job(run.name, python, [{"command": "export", "run": str(run)}], log, run))
+
+
 def _add(job: Job) -> Job:
     JOBS.append(job)
     poll()

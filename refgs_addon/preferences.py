@@ -26,6 +26,11 @@ class Preferences(bpy.types.AddonPreferences):
         subtype="FILE_PATH",
         update=_chosen,
     )
+    hdris: StringProperty(
+        name="HDRIs",
+        description="A folder of your own panoramas (EXR or HDR), shown beside those that come with Blender",
+        subtype="DIR_PATH",
+    )
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
@@ -35,6 +40,7 @@ class Preferences(bpy.types.AddonPreferences):
         row = layout.row()
         row.label(text=text, icon=icon)
         row.operator("refgs.ask_trainer", text="Ask Again", icon="FILE_REFRESH")
+        layout.prop(self, "hdris")
 
 
 _asked: list[jobs.Job] = []  # the newest question to the Python that is chosen
@@ -44,12 +50,24 @@ def preferences() -> Preferences:
     return bpy.context.preferences.addons[PACKAGE].preferences
 
 
+def is_set_up() -> bool:
+    """Whether a Python with the trainer is chosen."""
+    addon = bpy.context.preferences.addons.get(PACKAGE)
+    return addon is not None and bool(addon.preferences.python)
+
+
 def python() -> Path:
     """The Python that has the trainer. Raises InputError where none is chosen."""
     chosen = preferences().python
     if not chosen:
         raise InputError("no trainer is set up: choose its Python in the add-on's preferences")
     return Path(bpy.path.abspath(chosen))
+
+
+def hdri_folder() -> Path | None:
+    """The artist's folder of panoramas, if one is chosen."""
+    addon = bpy.context.preferences.addons.get(PACKAGE)
+    return Path(bpy.path.abspath(addon.preferences.hdris)) if addon and addon.preferences.hdris else None
 
 
 def log_file(name: str) -> Path:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import tomllib
 from pathlib import Path
 
 import bpy
@@ -10,10 +11,13 @@ from mathutils import Matrix
 from ..errors import InputError
 
 SENSOR_WIDTH = 36.0  # mm, Blender's own
+PHOTO = "refgs_photo"  # the custom property of a camera's data: its photo's file
 
 
 def read_cameras(path: Path) -> list[dict]:
-    """The frames of a run's cameras.json: camera-to-world matrices with OpenGL's axes, and pinhole intrinsics."""
+    """The frames of a run's cameras.json: camera-to-world matrices with OpenGL's axes, pinhole intrinsics, and under `photo` the file of
+    the photo where the run says which capture it is of."""
+    capture = _capture_of(path.with_name("run.toml"))
     try:
         frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
         for frame in frames:
@@ -22,11 +26,20 @@ def read_cameras(path: Path) -> list[dict]:
             if len(matrix) != 4 or not all(map(math.isfinite, [*numbers, *(x for row in matrix for x in row)])):
                 raise ValueError
             frame["name"] = Path(frame["file_path"]).stem
+            frame["photo"] = str(capture / frame["photo"]) if capture and "photo" in frame else ""
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{path} is not the cameras.json of a RefGS run: export the run again") from None
     return frames
+
+
+def _capture_of(run: Path) -> Path | None:
+    """The folder of the capture that a run.toml names."""
+    try:
+        return Path(tomllib.loads(run.read_text(encoding="utf-8"))["run"]["capture"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def light_of(path: Path) -> str:
@@ -51,6 +64,7 @@ def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Objec
     data.shift_y = (frame["cy"] - 0.5 * height) * aspect / width
     data["refgs_size"] = [int(width), int(height)]
     data["refgs_pixel_aspect"] = [max(1.0, 1.0 / aspect), max(1.0, aspect)]
+    data[PHOTO] = frame["photo"]
     camera = bpy.data.objects.new(frame["name"], data)
     camera.matrix_world = Matrix(frame["transform_matrix"])
     collection.objects.link(camera)
@@ -69,3 +83,47 @@ def frame_camera(scene: bpy.types.Scene, camera: bpy.types.Object, size: int | N
         render.resolution_x = max(1, round(render.resolution_x * size / longer))
         render.resolution_y = max(1, round(render.resolution_y * size / longer))
     render.resolution_percentage = 100
+
+
+def show_photo(camera: bpy.types.Object, amount: float = 1.0) -> None:
+    """Lay a camera's photo over what it sees, so much of it: 0 hides it. The photo is loaded the first time.
+
+    Raises InputError where the camera has no photo, or the photo is not where it was when the run was trained.
+    """
+    data = camera.data
+    if amount > 0 and not data.background_images:
+        path = Path(data.get(PHOTO, ""))
+        if not data.get(PHOTO):
+            raise InputError(f"{camera.name} has no photo: choose a camera of an imported run")
+        try:
+            image = bpy.data.images.load(str(path), check_existing=True)
+        except RuntimeError:
+            raise InputError(f"the photo {path} is not there: put the capture back where it was") from None
+        layer = data.background_images.new()
+        layer.image, layer.display_depth, layer.frame_method = image, "FRONT", "STRETCH"
+    data.show_background_images = amount > 0
+    if amount > 0:
+        data.background_images[0].alpha = amount
+
+
+def photo_shown(camera: bpy.types.Object | None) -> float:
+    """How much of a camera's photo lies over what it sees."""
+    layers = camera.data.background_images if camera is not None and camera.type == "CAMERA" else ()
+    return layers[0].alpha if layers and camera.data.show_background_images else 0.0
+
+
+def next_camera(scene: bpy.types.Scene, collection: bpy.types.Collection, steps: int = 1) -> bpy.types.Object:
+    """Look through another camera of a run, so many further in the photos' order; where a photo is shown, its photo is shown next.
+
+    Raises InputError where there are no cameras.
+    """
+    cameras = [item for item in collection.all_objects if item.type == "CAMERA"]
+    if not cameras:
+        raise InputError(f"{collection.name} has no cameras: its run folder had no cameras.json")
+    known = scene.camera in cameras
+    camera = cameras[(cameras.index(scene.camera) + steps) % len(cameras)] if known else cameras[0]
+    if amount := photo_shown(scene.camera):
+        show_photo(scene.camera, 0.0)
+        show_photo(camera, amount)
+    frame_camera(scene, camera)
+    return camera

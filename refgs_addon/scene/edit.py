@@ -32,7 +32,7 @@ def add_edit(
     """
     if where not in REGIONS or material not in MATERIALS:
         raise InputError(f"there is no region {where} or no material {material}")
-    splats = _splats(collection)
+    splats = splats_of(collection)
     edit = splats.modifiers.new(NAME, "NODES")
     edit.node_group = edit_tree()
     splats.modifiers.move(len(splats.modifiers) - 1, splats.modifiers.find(SPLATS))
@@ -73,7 +73,8 @@ def remove_edit(splats: bpy.types.Object, name: str) -> None:
         bpy.data.objects.remove(region)
 
 
-def _splats(collection: bpy.types.Collection) -> bpy.types.Object:
+def splats_of(collection: bpy.types.Collection) -> bpy.types.Object:
+    """The splats of a run's collection. Raises InputError where it has none."""
     found = parts(collection).get("splats", [])
     if not found or SPLATS not in found[0].modifiers:
         raise InputError(f"{collection.name} has no splats: import a RefGS run")

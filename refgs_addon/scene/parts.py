@@ -3,6 +3,7 @@
 import bpy
 
 KEY = "refgs_part"  # the custom property of an imported object: "splats" or "mesh"
+FOLDER = "refgs_folder"  # the custom property of a run's collection: where it was imported from
 
 
 def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]:

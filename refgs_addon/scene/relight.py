@@ -7,6 +7,16 @@ import bpy
 from ..errors import InputError
 from ..nodes.world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama, panorama_world
 
+ENDINGS = (".exr", ".hdr")
+
+
+def hdris(folder: Path | None = None) -> list[Path]:
+    """The panoramas that come with Blender, and those in a folder."""
+    own = bpy.utils.system_resource("DATAFILES", path="studiolights/world")
+    folders = [Path(path) for path in (own, folder) if path]
+    files = [file for path in folders if path.is_dir() for file in sorted(path.iterdir())]
+    return [file for file in files if file.suffix.lower() in ENDINGS]
+
 
 def load_panorama(path: Path) -> bpy.types.Image:
     """Load an equirectangular picture (EXR or HDR, linear). Raises InputError where there is none."""
@@ -49,3 +59,22 @@ def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, st
     nodes[IMAGE].image = image
     nodes[ROTATION].inputs["Rotation"].default_value = (0.0, 0.0, rotation)
     nodes[STRENGTH].inputs["Strength"].default_value = strength
+
+
+def match_light(scene: bpy.types.Scene) -> None:
+    """Turn and scale the HDRI of a scene so that it lights as the recovered light does, as far as it can: by the rotation at which
+    the logarithms of their luminance agree best, and by their mean radiance over the sphere.
+
+    Raises InputError where the scene has no recovered light, or shows it.
+    """
+    world = scene.world
+    if not is_panorama(world) or world.get(RECOVERED) is None:
+        raise InputError("this scene has no recovered light to match: import a RefGS run that has one")
+    nodes = world.node_tree.nodes
+    if nodes[IMAGE].image == world[RECOVERED]:
+        raise InputError("the scene is lit by the recovered light: choose an HDRI first, then match it")
+    from .panorama import turn_between  # numpy may be missing
+
+    turn, scale = turn_between(nodes[IMAGE].image, world[RECOVERED])
+    nodes[ROTATION].inputs["Rotation"].default_value = (0.0, 0.0, turn)
+    nodes[STRENGTH].inputs["Strength"].default_value = scale

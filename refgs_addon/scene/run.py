@@ -42,6 +42,7 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     before, world, camera = _data(), scene.world, scene.camera
     try:
         collection = bpy.data.collections.new(f"RefGS {name}")
+        collection[parts.FOLDER] = str(folder.resolve())
         scene.collection.children.link(collection)
         run = Run(collection, add_splats(f"{name} splats", splats, collection))
         run.splats[parts.KEY] = "splats"

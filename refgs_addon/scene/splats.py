@@ -58,7 +58,7 @@ def read_splats(path: Path) -> dict[str, np.ndarray]:
     unit quaternions wxyz, opacity (N,) 0..1, base_color (N, 3) linear, metallic (N,), roughness (N,). Raises InputError
     for any other file.
     """
-    rows = _vertices(path)
+    rows = read_rows(path)
     names = {
         "position": ["x", "y", "z"],
         "normal": ["nx", "ny", "nz"],
@@ -84,8 +84,8 @@ def read_splats(path: Path) -> dict[str, np.ndarray]:
     return splats
 
 
-def _vertices(path: Path) -> np.ndarray:
-    """The `vertex` element of a PLY file as a structured array."""
+def read_rows(path: Path) -> np.ndarray:
+    """The `vertex` element of a PLY file of floats (binary, little-endian) as a structured array. Raises InputError for any other."""
     try:
         data = path.read_bytes()
     except OSError as error:

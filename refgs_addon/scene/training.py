@@ -7,7 +7,8 @@ import bpy
 from .. import jobs
 from ..errors import InputError
 from ..follow import follow
-from ..preferences import log_file, python
+from ..preferences import is_set_up, log_file, python
+from .export import export_run
 
 
 def check(scene: bpy.types.Scene) -> jobs.Job:
@@ -29,9 +30,19 @@ def train(scene: bpy.types.Scene) -> jobs.Job:
     job = jobs.train(
         python(), capture, out, log_file(out.name), preset=settings.preset, minutes=minutes, mesh=settings.mesh
     )
-    if all(Path(known.folder) != out for known in settings.runs):
-        known = settings.runs.add()
-        known.folder, known.capture = str(out), str(capture)
+    _remember(scene, out, capture)
+    follow()
+    return job
+
+
+def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: Path) -> jobs.Job | None:
+    """Write a run with its edits as a new run folder, which the scene remembers; the trainer makes its mesh and textures, where there
+    is one, and the job is returned. Raises InputError."""
+    export_run(collection, out)
+    _remember(scene, out)
+    if (out / "mesh.glb").exists() or not is_set_up():
+        return None
+    job = jobs.export(python(), out, log_file(out.name))
     follow()
     return job
 
@@ -54,6 +65,12 @@ def forget(scene: bpy.types.Scene, folder: Path) -> None:
         if Path(runs[number].folder) == folder:
             runs.remove(number)
     jobs.JOBS[:] = [job for job in jobs.JOBS if not (job.ended and job.run == folder)]
+
+
+def _remember(scene: bpy.types.Scene, run: Path, capture: Path | None = None) -> None:
+    if all(Path(known.folder) != run for known in scene.refgs.runs):
+        known = scene.refgs.runs.add()
+        known.folder, known.capture = str(run), str(capture or "")
 
 
 def _capture(scene: bpy.types.Scene) -> Path:

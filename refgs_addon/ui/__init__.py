@@ -3,7 +3,7 @@
 import bpy
 
 from .. import follow, preferences, properties
-from . import materials, operators, panels, pictures, training
+from . import export, light, materials, operators, panels, pictures, training
 
 CLASSES = (
     *preferences.CLASSES,
@@ -12,6 +12,8 @@ CLASSES = (
     *training.CLASSES,
     *panels.CLASSES,
     *materials.CLASSES,
+    *light.CLASSES,
+    *export.CLASSES,
 )
 
 
@@ -20,12 +22,16 @@ def register() -> None:
         bpy.utils.register_class(cls)
     properties.register()
     pictures.register()
+    light.register()
+    export.register()
     training.register()
 
 
 def unregister() -> None:
     follow.unregister()
     training.unregister()
+    export.unregister()
+    light.unregister()
     pictures.unregister()
     properties.unregister()
     for cls in reversed(CLASSES):

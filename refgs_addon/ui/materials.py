@@ -7,7 +7,8 @@ from .. import compat
 from ..nodes.edit import REGIONS
 from ..scene.edit import MATERIALS, add_edit, edits, remove_edit, set_material
 from ..scene.parts import active_run, parts
-from .operators import Door
+from .export import ApplyEdits
+from .operators import Door, has_run
 from .panels import Tab
 
 _WHERE = {
@@ -30,11 +31,7 @@ class AddEdit(Door, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        run = active_run(context)
-        if run is None or not parts(run).get("splats"):
-            cls.poll_message_set("Import a run first")
-            return False
-        return True
+        return has_run(cls, context)
 
     def work(self, context: bpy.types.Context) -> None:
         edit = add_edit(active_run(context), self.where, self.material)
@@ -97,6 +94,8 @@ class MaterialPanel(Tab, bpy.types.Panel):
         for splats in parts(run).get("splats", []) if run else ():
             for edit in edits(splats):
                 self._edit(layout.box(), edit)
+            if edits(splats):
+                layout.operator(ApplyEdits.bl_idname, icon="CHECKMARK")
 
     def _edit(self, box: bpy.types.UILayout, edit: bpy.types.NodesModifier) -> None:
         row = box.row(align=True)

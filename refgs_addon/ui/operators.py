@@ -1,17 +1,17 @@
 """Operators: thin doors from a button to a function of `scene`."""
 
-import math
 from pathlib import Path
 from typing import ClassVar
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
-from bpy_extras.io_utils import ExportHelper, ImportHelper
+from bpy_extras.io_utils import ExportHelper
 
 from ..errors import InputError
-from ..scene.parts import show
+from ..scene.cameras import PHOTO, next_camera, photo_shown, show_photo
+from ..scene.parts import active_run, show
 from ..scene.preview import render_preview
-from ..scene.relight import relight
+from ..scene.turntable import add_turntable
 
 
 class Door:
@@ -26,6 +26,12 @@ class Door:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return {"FINISHED"}
+
+
+def has_run(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+    """Whether there is a run to work on; the button's tooltip says so where there is none."""
+    operator.poll_message_set("Import a run first")
+    return active_run(context) is not None
 
 
 def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> None:
@@ -69,29 +75,57 @@ class ShowPart(Door, bpy.types.Operator):
         show(bpy.data.collections[self.collection], self.part)
 
 
-class Relight(Door, ImportHelper, bpy.types.Operator):
-    bl_idname = "refgs.relight"
-    bl_label = "Relight with HDRI"
-    bl_description = "Light the scene with a panorama; the recovered light is kept"
+class NextCamera(Door, bpy.types.Operator):
+    bl_idname = "refgs.next_camera"
+    bl_label = "Next Camera"
+    bl_description = "Look through another of the photos' cameras"
 
-    filter_glob: StringProperty(default="*.exr;*.hdr", options={"HIDDEN"})
-    rotation: FloatProperty(
-        name="Rotation", description="Turn the light counter-clockwise, seen from above", subtype="ANGLE",
-        soft_min=-math.pi, soft_max=math.pi,
-    )  # fmt: skip
-    strength: FloatProperty(name="Strength", default=1.0, min=0.0, soft_max=10.0)
+    steps: IntProperty(name="Steps", default=1)
 
-    def work(self, context: bpy.types.Context) -> None:
-        relight(context.scene, Path(bpy.path.abspath(self.filepath)), self.rotation, self.strength)
-
-
-class RecoveredLight(Door, bpy.types.Operator):
-    bl_idname = "refgs.recovered_light"
-    bl_label = "Recovered Light"
-    bl_description = "Light the scene with the panorama that was recovered from the photos"
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return has_run(cls, context)
 
     def work(self, context: bpy.types.Context) -> None:
-        relight(context.scene, None)
+        next_camera(context.scene, active_run(context), self.steps)
+        look_through(context)
+
+
+class Photo(Door, bpy.types.Operator):
+    bl_idname = "refgs.photo"
+    bl_label = "Photo"
+    bl_description = "Lay the camera's photo over the view, to compare the two, or take it away"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("The scene has no camera of an imported run")
+        return context.scene.camera is not None and PHOTO in context.scene.camera.data
+
+    def work(self, context: bpy.types.Context) -> None:
+        camera = context.scene.camera
+        show_photo(camera, 0.0 if photo_shown(camera) else 1.0)
+        look_through(context)
+
+
+def look_through(context: bpy.types.Context) -> None:
+    """Turn the 3D view that a button is in to the scene's camera."""
+    if context.region_data is not None:
+        context.region_data.view_perspective = "CAMERA"
+
+
+class Turntable(Door, bpy.types.Operator):
+    bl_idname = "refgs.turntable"
+    bl_label = "Turntable"
+    bl_description = "Have the object turn once about itself; Render > Render Animation makes the film"
+
+    seconds: FloatProperty(name="Seconds", description="How long a turn takes", default=4.0, min=0.1, soft_max=20.0)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return has_run(cls, context)
+
+    def work(self, context: bpy.types.Context) -> None:
+        add_turntable(context.scene, active_run(context), self.seconds)
 
 
 class RenderPreview(Door, ExportHelper, bpy.types.Operator):
@@ -112,4 +146,4 @@ class RenderPreview(Door, ExportHelper, bpy.types.Operator):
         self.report({"INFO"}, f"Wrote {self.filepath}")
 
 
-CLASSES = (ImportRun, ShowPart, Relight, RecoveredLight, RenderPreview)
+CLASSES = (ImportRun, ShowPart, NextCamera, Photo, Turntable, RenderPreview)

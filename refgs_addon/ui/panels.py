@@ -4,7 +4,7 @@ import bpy
 
 from .. import compat
 from ..nodes.splats import NAME as MODIFIER
-from ..nodes.world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama
+from ..scene.cameras import photo_shown
 from ..scene.parts import parts
 from . import operators
 
@@ -44,28 +44,6 @@ class RunPanel(Tab, bpy.types.Panel):
             layout.label(text=f"{len(splats.data.points):,} splats")
 
 
-class LightPanel(Tab, bpy.types.Panel):
-    bl_idname = "REFGS_PT_light"
-    bl_label = "Light"
-    bl_order = 3
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout = self.layout
-        world = context.scene.world
-        column = layout.column(align=True)
-        column.operator(operators.Relight.bl_idname, icon="WORLD")
-        if not is_panorama(world):
-            return
-        if world.get(RECOVERED) is not None:
-            column.operator(operators.RecoveredLight.bl_idname, icon="LOOP_BACK")
-        nodes = world.node_tree.nodes
-        layout.label(text=nodes[IMAGE].image.name, icon="IMAGE_DATA")
-        column = layout.column()
-        column.use_property_split, column.use_property_decorate = True, False
-        column.prop(nodes[ROTATION].inputs["Rotation"], "default_value", index=2, text="Rotation")
-        column.prop(nodes[STRENGTH].inputs["Strength"], "default_value", text="Strength")
-
-
 class PreviewPanel(Tab, bpy.types.Panel):
     bl_idname = "REFGS_PT_preview"
     bl_label = "Preview"
@@ -74,8 +52,18 @@ class PreviewPanel(Tab, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         layout.use_property_split, layout.use_property_decorate = True, False
-        layout.prop(context.scene, "camera", text="Camera")
+        row = layout.row(align=True)
+        row.prop(context.scene, "camera", text="Camera")
+        row.operator(operators.NextCamera.bl_idname, text="", icon="TRIA_LEFT").steps = -1
+        row.operator(operators.NextCamera.bl_idname, text="", icon="TRIA_RIGHT").steps = 1
+        camera = context.scene.camera
+        shown = photo_shown(camera) > 0
+        row = layout.row(align=True)
+        row.operator(operators.Photo.bl_idname, icon="IMAGE_REFERENCE", depress=shown)
+        if shown:
+            row.prop(camera.data.background_images[0], "alpha", text="")
+        layout.operator(operators.Turntable.bl_idname, icon="FILE_REFRESH")
         layout.operator(operators.RenderPreview.bl_idname, icon="RENDER_STILL")
 
 
-CLASSES = (RunPanel, LightPanel, PreviewPanel)
+CLASSES = (RunPanel, PreviewPanel)

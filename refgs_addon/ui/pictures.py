@@ -1,4 +1,4 @@
-"""Pictures for the panel: a training's newest preview, and its curve."""
+"""Pictures for the panels: a training's newest preview, its curve, and thumbnails of files."""
 
 from pathlib import Path
 
@@ -27,6 +27,14 @@ def picture(job: jobs.Job) -> int:
         _forget(job)
         _newest[id(job)] = key
     return _pictures[key].icon_id
+
+
+def thumbnail(file: Path) -> int:
+    """The icon of a small picture of a file, which Blender makes beside; 0 where there is none."""
+    if _pictures is None:
+        return 0
+    key = str(file)
+    return (_pictures[key] if key in _pictures else _pictures.load(key, key, "IMAGE")).icon_id
 
 
 def curve(job: jobs.Job) -> int:

@@ -11,7 +11,7 @@ from mathutils import Vector
 from refgs_addon import compat
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.splats import EXTENT, NAME
-from refgs_addon.scene.cameras import frame_camera
+from refgs_addon.scene.cameras import frame_camera, next_camera, photo_shown, show_photo
 from refgs_addon.scene.parts import parts, show
 from refgs_addon.scene.run import import_run
 from refgs_addon.scene.splats import normal_slopes, read_splats
@@ -158,6 +158,49 @@ def test_cameras_project_as_the_photos_did(run_folder, scene):
         u, v = frame["cx"] - frame["fl_x"] * x / z, frame["cy"] + frame["fl_y"] * y / z  # from the top left corner
         seen = world_to_camera_view(scene, camera, Vector(point))
         np.testing.assert_allclose([seen.x * frame["w"], (1 - seen.y) * frame["h"], seen.z], [u, v, -z], atol=1e-3)
+
+
+def with_photos(run_folder, capture):
+    """Have a run folder say that it is of a capture with photos."""
+    file = run_folder / "cameras.json"
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        frame["photo"] = f"photos/{frame['file_path'].rpartition('/')[2]}.png"
+    file.write_text(json.dumps(content))
+    (run_folder / "run.toml").write_text(f"[run]\ncapture = {json.dumps(str(capture))}\n")
+    (capture / "photos").mkdir(parents=True)
+    picture = bpy.data.images.new("photo", 8, 8)
+    for name in ("front", "shifted"):
+        picture.save(filepath=str(capture / "photos" / f"{name}.png"))
+    bpy.data.images.remove(picture)
+
+
+def test_photos_lie_over_what_their_cameras_see(run_folder, scene, tmp_path):
+    with_photos(run_folder, tmp_path / "été 'photos'")
+    run = import_run(run_folder, scene)
+    front, shifted = run.cameras.values()
+    assert not bpy.data.images.get("front.png") and photo_shown(front) == 0
+    show_photo(front, 0.5)
+    (layer,) = front.data.background_images
+    assert layer.image.name == "front.png" and tuple(layer.image.size) == (8, 8) and photo_shown(front) == 0.5
+    assert next_camera(scene, run.collection) == shifted == scene.camera
+    assert (photo_shown(front), photo_shown(shifted)) == (0, 0.5)
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (SIZE, 40)
+    show_photo(shifted, 0)
+    assert next_camera(scene, run.collection, -1) == front and photo_shown(front) == 0
+    show_photo(front)
+    assert len(front.data.background_images) == 1 and photo_shown(front) == 1
+
+
+def test_a_photo_that_is_gone_is_said_in_one_line(run_folder, scene, tmp_path):
+    run = import_run(run_folder, scene)
+    with pytest.raises(InputError, match="front has no photo"):
+        show_photo(run.cameras["front"])
+    with_photos(run_folder, tmp_path / "capture")
+    run = import_run(run_folder, scene)
+    (tmp_path / "capture" / "photos" / "front.png").unlink()
+    with pytest.raises(InputError, match=r"front\.png is not there: put the capture back"):
+        show_photo(run.cameras["front.001"] if "front.001" in run.cameras else run.cameras["front"])
 
 
 def test_frame_camera_to_another_size(run_folder, scene):

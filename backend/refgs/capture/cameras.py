@@ -40,7 +40,8 @@ def read_cameras(file: Path) -> list[Camera]:
 def write_cameras(
     file: Path, capture: Capture, light: str = "world", exposures: dict[str, float] | None = None
 ) -> None:
-    """Writes the run folder's cameras.json: the capture's undistorted cameras in the run's frame, OpenGL axes.
+    """Writes the run folder's cameras.json: the capture's undistorted cameras in the run's frame, OpenGL axes; `photo` is the file of
+    each, from the capture's folder.
 
     With a light that stands with the "camera", `light_of` names the photo in which it is as environment.exr has it. The exposures
     of those training photos that were found to have one are what radiance is to be multiplied by to be as bright as the photo.
@@ -54,6 +55,7 @@ def write_cameras(
             frame
             | {
                 "file_path": f"images/{camera.name}",
+                "photo": _from(capture.folder, view.image_path).as_posix(),
                 "transform_matrix": (camera.camera_to_world @ OPENGL_TO_OPENCV).tolist(),
                 "fl_x": camera.fx,
                 "fl_y": camera.fy,
@@ -70,6 +72,10 @@ def write_cameras(
     text = json.dumps(facts, indent=1)
     with whole(file) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def _from(folder: Path, file: Path) -> Path:
+    return file.relative_to(folder) if file.is_relative_to(folder) else file
 
 
 def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float]]:

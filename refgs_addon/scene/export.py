@@ -1,0 +1,142 @@
+"""What leaves Blender: a run with its edits as a new run folder, its splats, its light."""
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ..errors import InputError
+from ..nodes.splats import NAME as SPLATS
+from .edit import edits, splats_of
+from .parts import FOLDER
+from .splats import read_rows
+
+SH_DC = 0.28209479177387814  # the constant spherical harmonic
+KEPT = ("environment.exr", "cameras.json", "needs.json", "occluder.ply", "run.toml")
+DARK = 0.02  # base colour below which it does not tell how much light there is
+
+
+def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
+    """What the edits make of splats: base_color (N, 3) linear Rec.709, metallic (N,), roughness (N,)."""
+    drawing = splats.modifiers[SPLATS]
+    before = drawing.show_viewport, splats.hide_viewport, splats.hide_get()
+    drawing.show_viewport = splats.hide_viewport = False  # what is hidden is not evaluated
+    splats.hide_set(False)
+    try:
+        bpy.context.view_layer.update()
+        cloud = splats.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+        found = {}
+        for name, field, width in (("base_color", "color", 4), ("metallic", "value", 1), ("roughness", "value", 1)):
+            values = np.empty(width * len(cloud.points), np.float32)
+            cloud.attributes[name].data.foreach_get(field, values)
+            found[name] = values.reshape(-1, 4)[:, :3] if width == 4 else values
+    finally:
+        drawing.show_viewport, splats.hide_viewport = before[:2]
+        splats.hide_set(before[2])
+    return found
+
+
+def export_splats(collection: bpy.types.Collection, path: Path) -> None:
+    """Write a run's splats with their edits as a splats.ply: that of the run, with other materials, and with them the colours that
+    viewers without lights show.
+
+    Raises InputError where the run's own file is not there or not the one that was imported, and where the new one cannot be written.
+    """
+    splats = splats_of(collection)
+    rows = read_rows(_folder(collection) / "splats.ply").copy()
+    if len(rows) != len(splats.data.points):
+        raise InputError(f"{_folder(collection)} has changed since it was imported: import it again")
+    new = edited_materials(splats)
+    for i, channel in enumerate("rgb"):
+        old, color, look = rows[f"albedo_{channel}"], new["base_color"][:, i], rows[f"f_dc_{i}"]
+        changed = np.abs(color - old) > 1e-6
+        light = _decoded(0.5 + SH_DC * look) / np.maximum(old, DARK)
+        rows[f"f_dc_{i}"] = np.where(changed, (_encoded(color * light) - 0.5) / SH_DC, look)
+        rows[f"albedo_{channel}"] = color
+    rows["metallic"], rows["roughness"] = new["metallic"], new["roughness"]
+    names = "".join(f"property float {name}\n" for name in rows.dtype.names)
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{names}end_header\n"
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        temporary.write_bytes(head.encode("ascii") + rows.tobytes())
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"cannot write {path}: {error.strerror}") from None
+
+
+def export_run(collection: bpy.types.Collection, folder: Path) -> None:
+    """Write a run with its edits as a new run folder, which must not be there; the run itself stays as it is.
+
+    It has no mesh, whose textures would be those of before; where there are no edits the run's is copied. `refgs export`, or the
+    trainer, makes one. Raises InputError.
+    """
+    original = _folder(collection)
+    if folder.exists():
+        raise InputError(f"{folder} exists: choose another name for the run")
+    temporary = None
+    try:
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        export_splats(collection, temporary / "splats.ply")
+        kept = [*KEPT] if edits(splats_of(collection)) else [*KEPT, "mesh.glb"]
+        for name in kept:
+            if (original / name).is_file():
+                shutil.copy2(original / name, temporary / name)
+        temporary.chmod(0o755)  # as folders are, where mkdtemp keeps others out
+        os.replace(temporary, folder)
+    except OSError as error:
+        raise InputError(f"cannot write {folder}: {error.strerror}") from None
+    finally:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def export_light(collection: bpy.types.Collection, path: Path) -> None:
+    """Copy a run's recovered light, an equirectangular EXR. Raises InputError."""
+    light = _folder(collection) / "environment.exr"
+    if not light.is_file():
+        raise InputError(f"{light} is not there: the run has no light")
+    _copy(light, path)
+
+
+def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
+    """Copy a run's mesh with its textures, a binary glTF. Raises InputError where it has none, and where edits would be lost."""
+    mesh = _folder(collection) / "mesh.glb"
+    if edits(splats_of(collection)):
+        raise InputError("the mesh would be without the edits: apply them to a new run, and export that one's mesh")
+    if not mesh.is_file():
+        raise InputError(f"{mesh} is not there: make the run's mesh first")
+    _copy(mesh, path)
+
+
+def _copy(file: Path, path: Path) -> None:
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        shutil.copyfile(file, temporary)
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"cannot write {path}: {error.strerror}") from None
+
+
+def _folder(collection: bpy.types.Collection) -> Path:
+    """The run folder that a collection was imported from."""
+    folder = Path(bpy.path.abspath(collection.get(FOLDER, "")))
+    if not collection.get(FOLDER) or not (folder / "splats.ply").is_file():
+        raise InputError(f"the run of {collection.name} is not at {folder}: import it again from where it is now")
+    return folder
+
+
+def _decoded(encoded: np.ndarray) -> np.ndarray:
+    """sRGB to linear."""
+    x = np.clip(encoded, 0, 1)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def _encoded(linear: np.ndarray) -> np.ndarray:
+    """Linear to sRGB."""
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)

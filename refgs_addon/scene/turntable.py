@@ -1,0 +1,51 @@
+"""A turntable: a run turns once about itself, before a camera and under a light that stand still."""
+
+import math
+
+import bpy
+
+from .. import compat
+from ..errors import InputError
+from .parts import parts
+
+KEY = "refgs_turntable"  # the custom property of the Empty that turns
+
+
+def add_turntable(scene: bpy.types.Scene, collection: bpy.types.Collection, seconds: float = 4.0) -> bpy.types.Object:
+    """Put a run's splats, mesh and regions on an Empty that turns once in the scene's frames, which become so many seconds.
+
+    The last frame is the one before the first, so that a loop does not stand still. Raises InputError where the run is on one already.
+    """
+    found = parts(collection)
+    if not found:
+        raise InputError(f"{collection.name} is no imported run: import one first")
+    if any(KEY in item for item in collection.objects):
+        raise InputError(f"{collection.name} is on a turntable already: delete its Empty to take it off")
+    items = [item for item in collection.objects if item.parent is None]
+    low, high = (
+        [f(corner[axis] for item in found["splats"] for corner in item.bound_box) for axis in range(3)]
+        for f in (min, max)
+    )
+    table = bpy.data.objects.new(f"{collection.name} turntable", None)
+    table[KEY] = True
+    table.empty_display_type, table.empty_display_size = (
+        "CIRCLE",
+        0.6 * max(b - a for a, b in zip(low, high, strict=True)),
+    )
+    table.location = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+    collection.objects.link(table)
+    frames = max(2, round(seconds * scene.render.fps / scene.render.fps_base))
+    scene.frame_start, scene.frame_end = 1, frames
+    for frame, turn in ((1, 0.0), (frames + 1, 2 * math.pi)):
+        table.rotation_euler = 0.0, 0.0, turn
+        table.keyframe_insert("rotation_euler", index=2, frame=frame)
+    for curve in compat.fcurves(table):
+        for key in curve.keyframe_points:
+            key.interpolation = "LINEAR"
+        curve.extrapolation = "LINEAR"
+    scene.frame_set(1)
+    table.rotation_euler = 0.0, 0.0, 0.0
+    bpy.context.view_layer.update()
+    for item in items:
+        item.parent, item.matrix_parent_inverse = table, table.matrix_world.inverted()
+    return table

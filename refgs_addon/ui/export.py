@@ -1,0 +1,101 @@
+"""Ways out of Blender, and the entries of the File menu."""
+
+from pathlib import Path
+from typing import ClassVar
+
+import bpy
+from bpy.props import StringProperty
+from bpy_extras.io_utils import ExportHelper
+
+from ..scene import training
+from ..scene.export import export_light, export_mesh, export_splats
+from ..scene.parts import FOLDER, active_run
+from .operators import Door, ImportRun, has_run
+
+
+class _Export(Door, ExportHelper):
+    """Writes something of the active run to a file."""
+
+    bl_options: ClassVar = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return has_run(cls, context)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        folder = Path(active_run(context).get(FOLDER, ""))
+        self.filepath = str(folder.with_name(f"{folder.name} {self.kind}{self.filename_ext}"))
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def work(self, context: bpy.types.Context) -> None:
+        self.write(active_run(context), Path(bpy.path.abspath(self.filepath)))
+        self.report({"INFO"}, f"Wrote {self.filepath}")
+
+
+class ExportSplats(_Export, bpy.types.Operator):
+    bl_idname = "refgs.export_splats"
+    bl_label = "RefGS Splats (.ply)"
+    bl_description = "Write the splats with their edited materials, as RefGS and viewers of Gaussian splats read them"
+
+    kind, filename_ext, write = "splats", ".ply", staticmethod(export_splats)
+    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+
+
+class ExportMesh(_Export, bpy.types.Operator):
+    bl_idname = "refgs.export_mesh"
+    bl_label = "RefGS Mesh with Textures (.glb)"
+    bl_description = "Write the mesh with its base colour, metallic, roughness and normal textures"
+
+    kind, filename_ext, write = "mesh", ".glb", staticmethod(export_mesh)
+    filter_glob: StringProperty(default="*.glb", options={"HIDDEN"})
+
+
+class ExportLight(_Export, bpy.types.Operator):
+    bl_idname = "refgs.export_light"
+    bl_label = "RefGS Recovered Light (.exr)"
+    bl_description = "Write the light that was recovered from the photos, as a panorama"
+
+    kind, filename_ext, write = "light", ".exr", staticmethod(export_light)
+    filter_glob: StringProperty(default="*.exr", options={"HIDDEN"})
+
+
+class ApplyEdits(_Export, bpy.types.Operator):
+    bl_idname = "refgs.apply_edits"
+    bl_label = "Apply to New Run"
+    bl_description = (
+        "Write the run with its edits as a new run folder, with a mesh and textures where the trainer is set up; "
+        "the run that was imported stays as it is"
+    )
+
+    kind, filename_ext = "edited", ""
+    check_extension = None
+
+    def work(self, context: bpy.types.Context) -> None:
+        out = Path(bpy.path.abspath(self.filepath))
+        job = training.apply_edits(context.scene, active_run(context), out)
+        mesh = "" if (out / "mesh.glb").exists() else "; set up the trainer in the preferences for a mesh of it"
+        self.report({"INFO"}, f"Wrote {out}" + ("; its mesh is being made" if job else mesh))
+
+
+CLASSES = (ExportSplats, ExportMesh, ExportLight, ApplyEdits)
+
+
+def _import_menu(self, context: bpy.types.Context) -> None:
+    self.layout.operator(ImportRun.bl_idname, text="RefGS Run (folder)")
+
+
+def _export_menu(self, context: bpy.types.Context) -> None:
+    for operator in (ExportSplats, ExportMesh, ExportLight):
+        self.layout.operator(operator.bl_idname)
+    self.layout.operator(ApplyEdits.bl_idname, text="RefGS Run with Edits (folder)")
+
+
+def register() -> None:
+    bpy.types.TOPBAR_MT_file_import.append(_import_menu)
+    bpy.types.TOPBAR_MT_file_export.append(_export_menu)
+
+
+def unregister() -> None:
+    bpy.types.TOPBAR_MT_file_export.remove(_export_menu)
+    bpy.types.TOPBAR_MT_file_import.remove(_import_menu)

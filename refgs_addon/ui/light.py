@@ -1,0 +1,147 @@
+"""The Light panel: which panorama lights the scene."""
+
+import math
+from pathlib import Path
+from zlib import crc32
+
+import bpy
+from bpy.props import EnumProperty, FloatProperty, StringProperty
+from bpy_extras.io_utils import ImportHelper
+
+from ..errors import InputError
+from ..nodes.world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama
+from ..preferences import hdri_folder
+from ..scene.relight import hdris, match_light, relight
+from . import pictures
+from .operators import Door
+from .panels import Tab
+
+OTHER = 1  # the number of a light that is none of those listed
+_listed: list[tuple[str, str, str, int, int]] = []  # Blender keeps no strings of a list that is made anew
+
+
+def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, int]]:
+    world = bpy.context.scene.world
+    shown = world.node_tree.nodes[IMAGE].image if is_panorama(world) else None
+    _listed.clear()
+    if is_panorama(world) and world.get(RECOVERED) is not None:
+        recovered = world[RECOVERED]
+        icon = pictures.thumbnail(Path(bpy.path.abspath(recovered.filepath)))
+        _listed.append(("RECOVERED", "Recovered", "The light that was recovered from the photos", icon, 0))
+    for file in hdris(hdri_folder()):
+        _listed.append((str(file), file.stem.capitalize(), str(file), pictures.thumbnail(file), _number(file)))
+    if _shown(world) == OTHER:
+        name = shown.name if shown else "None"
+        _listed.append(("OTHER", name, "What lights the scene now", 0, OTHER))
+    return _listed
+
+
+def _number(file: Path) -> int:
+    """A number for a file that stays, whatever else is in its folder; above OTHER."""
+    return 2 + crc32(str(file).encode()) % (1 << 30)
+
+
+def _shown(world: bpy.types.World | None) -> int:
+    image = world.node_tree.nodes[IMAGE].image if is_panorama(world) else None
+    if image is None:
+        return OTHER
+    if image == world.get(RECOVERED):
+        return 0
+    number = _number(Path(bpy.path.abspath(image.filepath)))
+    return number if any(_number(file) == number for file in hdris(hdri_folder())) else OTHER
+
+
+def _get(self) -> int:
+    return _shown(bpy.context.scene.world)
+
+
+def _set(self, number: int) -> None:
+    chosen = next((Path(item[0]) for item in _lights(self, bpy.context) if item[4] == number and number > OTHER), None)
+    if chosen is None and number != 0:
+        return
+    world = bpy.context.scene.world
+    nodes = world.node_tree.nodes if is_panorama(world) else None
+    turn = nodes[ROTATION].inputs["Rotation"].default_value[2] if nodes and number else 0.0
+    strength = nodes[STRENGTH].inputs["Strength"].default_value if nodes and number else 1.0
+    try:
+        relight(bpy.context.scene, chosen, turn, strength)
+    except InputError as error:
+        said = str(error)
+        bpy.context.window_manager.popup_menu(lambda menu, _: menu.layout.label(text=said), title="RefGS", icon="ERROR")
+
+
+class Relight(Door, ImportHelper, bpy.types.Operator):
+    bl_idname = "refgs.relight"
+    bl_label = "Open HDRI"
+    bl_description = "Light the scene with a panorama; the recovered light is kept"
+
+    filter_glob: StringProperty(default="*.exr;*.hdr", options={"HIDDEN"})
+    rotation: FloatProperty(
+        name="Rotation", description="Turn the light counter-clockwise, seen from above", subtype="ANGLE",
+        soft_min=-math.pi, soft_max=math.pi,
+    )  # fmt: skip
+    strength: FloatProperty(name="Strength", default=1.0, min=0.0, soft_max=10.0)
+
+    def work(self, context: bpy.types.Context) -> None:
+        relight(context.scene, Path(bpy.path.abspath(self.filepath)), self.rotation, self.strength)
+
+
+class RecoveredLight(Door, bpy.types.Operator):
+    bl_idname = "refgs.recovered_light"
+    bl_label = "Recovered Light"
+    bl_description = "Light the scene with the panorama that was recovered from the photos"
+
+    def work(self, context: bpy.types.Context) -> None:
+        relight(context.scene, None)
+
+
+class MatchLight(Door, bpy.types.Operator):
+    bl_idname = "refgs.match_light"
+    bl_label = "Match Recovered Light"
+    bl_description = "Turn and scale the HDRI so that it lights as the recovered light does, as far as it can"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        world = context.scene.world
+        cls.poll_message_set("Import a run with a light, and choose an HDRI in its place")
+        return is_panorama(world) and world.get(RECOVERED) not in (None, world.node_tree.nodes[IMAGE].image)
+
+    def work(self, context: bpy.types.Context) -> None:
+        match_light(context.scene)
+
+
+class LightPanel(Tab, bpy.types.Panel):
+    bl_idname = "REFGS_PT_light"
+    bl_label = "Light"
+    bl_order = 3
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, world = self.layout, context.scene.world
+        layout.template_icon_view(context.window_manager, "refgs_light", show_labels=True, scale=6, scale_popup=6)
+        column = layout.column(align=True)
+        column.operator(Relight.bl_idname, icon="FILE_FOLDER")
+        if not is_panorama(world):
+            return
+        nodes = world.node_tree.nodes
+        if nodes[IMAGE].image is not None:
+            column.label(text=nodes[IMAGE].image.name, icon="IMAGE_DATA")
+        if world.get(RECOVERED) is not None:
+            column.operator(RecoveredLight.bl_idname, icon="LOOP_BACK")
+            column.operator(MatchLight.bl_idname, icon="SNAP_ON")
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        column.prop(nodes[ROTATION].inputs["Rotation"], "default_value", index=2, text="Rotation")
+        column.prop(nodes[STRENGTH].inputs["Strength"], "default_value", text="Strength")
+
+
+CLASSES = (Relight, RecoveredLight, MatchLight, LightPanel)
+
+
+def register() -> None:
+    bpy.types.WindowManager.refgs_light = EnumProperty(
+        name="Light", description="What lights the scene", items=_lights, get=_get, set=_set
+    )
+
+
+def unregister() -> None:
+    del bpy.types.WindowManager.refgs_light

@@ -1,0 +1,122 @@
+"""What leaves Blender: the edits are in it, the run itself is as it was."""
+
+import json
+import shutil
+
+import bpy
+import numpy as np
+import pytest
+
+from refgs_addon import ui
+from refgs_addon.errors import InputError
+from refgs_addon.scene.edit import MATERIALS, add_edit
+from refgs_addon.scene.export import SH_DC, edited_materials, export_light, export_mesh, export_run, export_splats
+from refgs_addon.scene.parts import show
+from refgs_addon.scene.run import import_run
+from refgs_addon.scene.splats import read_rows
+
+
+@pytest.fixture
+def run(run_folder, scene):
+    return import_run(run_folder, scene)
+
+
+def test_splats_without_edits_are_those_of_the_run(run, run_folder, tmp_path):
+    export_splats(run.collection, tmp_path / "a.ply")
+    assert (tmp_path / "a.ply").read_bytes()[-40 * 84 :] == (run_folder / "splats.ply").read_bytes()[-40 * 84 :]
+    np.testing.assert_array_equal(read_rows(tmp_path / "a.ply"), read_rows(run_folder / "splats.ply"))
+
+
+@pytest.mark.parametrize("part", ["splats", "mesh"])
+def test_edits_are_written_and_nothing_else_changes(run, run_folder, tmp_path, part):
+    show(run.collection, part)  # hidden splats are not evaluated by Blender
+    before = read_rows(run_folder / "splats.ply").copy()
+    edit = add_edit(run.collection, "Box", "Gold")
+    export_splats(run.collection, tmp_path / "a.ply")
+    after = read_rows(tmp_path / "a.ply")
+    color, metallic, roughness = MATERIALS["Gold"]
+    inside = np.isclose(after["metallic"], metallic) & np.isclose(after["roughness"], roughness)
+    assert 0 < inside.sum() < len(after)
+    np.testing.assert_allclose(after["albedo_r"][inside], color[0], rtol=1e-5)
+    outside = after["metallic"] == before["metallic"]
+    assert outside.sum() > 0
+    for name in ("albedo_g", "roughness", "f_dc_1"):
+        np.testing.assert_allclose(after[name][outside], before[name][outside], atol=1e-6)
+    for name in ("x", "opacity", "rot_2", "scale_1"):
+        np.testing.assert_array_equal(after[name], before[name])
+    assert (run.splats.hide_viewport, run.mesh[0].hide_viewport) == (part == "mesh", part == "splats")
+    edit.show_viewport = False
+    np.testing.assert_allclose(edited_materials(run.splats)["metallic"], before["metallic"])
+
+
+def test_a_viewer_without_lights_shows_the_new_colour(run, run_folder, tmp_path):
+    """Half the base colour under the same light: half of what the matte part sends."""
+    rows = read_rows(run_folder / "splats.ply").copy()
+    edit = add_edit(run.collection)
+    splats = run.splats.data.attributes["base_color"].data
+    splats[0].color = (0.4, 0.4, 0.4, 1.0)
+    edit.show_viewport = False
+    export_splats(run.collection, tmp_path / "a.ply")
+    after = read_rows(tmp_path / "a.ply")
+
+    def light(row, i):
+        look = np.clip(0.5 + SH_DC * row[f"f_dc_{i}"], 0, 1)
+        linear = look / 12.92 if look <= 0.04045 else ((look + 0.055) / 1.055) ** 2.4
+        return linear / max(row[f"albedo_{'rgb'[i]}"], 0.02)
+
+    for i in range(3):
+        before = light(rows[0], i)
+        if before * 0.4 < 1:
+            assert light(after[0], i) == pytest.approx(before, rel=1e-3, abs=1e-6)
+
+
+def test_a_new_run_has_the_edits_and_can_be_imported(run, run_folder, scene, tmp_path):
+    listing = {file.name: file.read_bytes() for file in run_folder.iterdir()}
+    add_edit(run.collection, material="Chrome")
+    export_run(run.collection, tmp_path / "chrome été")
+    assert {file.name: file.read_bytes() for file in run_folder.iterdir()} == listing
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["chrome été", "pot"]
+    second = import_run(tmp_path / "chrome été", scene)
+    assert second.mesh == [] and list(second.cameras) == list(run.cameras)
+    assert edited_materials(second.splats)["metallic"] == pytest.approx(1.0)
+    with pytest.raises(InputError, match="exists: choose another name"):
+        export_run(run.collection, tmp_path / "chrome été")
+
+
+def test_without_edits_the_mesh_comes_along(run, tmp_path, scene):
+    export_run(run.collection, tmp_path / "copy")
+    assert (tmp_path / "copy" / "mesh.glb").is_file()
+    export_mesh(run.collection, tmp_path / "a.glb")
+    export_light(run.collection, tmp_path / "a.exr")
+    add_edit(run.collection)
+    with pytest.raises(InputError, match="without the edits"):
+        export_mesh(run.collection, tmp_path / "b.glb")
+
+
+def test_what_is_not_there_is_said_in_one_line(run, run_folder, tmp_path):
+    with pytest.raises(InputError, match=r"cannot write .*not there"):
+        export_splats(run.collection, tmp_path / "not there" / "a.ply")
+    with pytest.raises(InputError, match=r"cannot write .*not there"):
+        export_run(run.collection, tmp_path / "not there" / "run")
+    (run_folder / "environment.exr").unlink()
+    with pytest.raises(InputError, match="has no light"):
+        export_light(run.collection, tmp_path / "a.exr")
+    shutil.rmtree(run_folder)
+    with pytest.raises(InputError, match="import it again from where it is now"):
+        export_splats(run.collection, tmp_path / "a.ply")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_file_menu(run_folder, scene, tmp_path):
+    ui.register()
+    try:
+        bpy.ops.refgs.import_run(directory=f"{run_folder}/")
+        bpy.ops.refgs.add_edit(where="Everywhere", material="Rubber")
+        bpy.ops.refgs.export_splats(filepath=str(tmp_path / "a.ply"))
+        bpy.ops.refgs.apply_edits(filepath=str(tmp_path / "rubber"))
+        assert [known.folder for known in scene.refgs.runs] == [str(tmp_path / "rubber")]
+        assert np.allclose(read_rows(tmp_path / "rubber" / "splats.ply")["roughness"], 0.9)
+        assert (tmp_path / "a.ply").stat().st_size > 0
+        assert json.loads((tmp_path / "rubber" / "cameras.json").read_text())["frames"]
+    finally:
+        ui.unregister()

@@ -1,0 +1,47 @@
+"""A run on a turntable: one turn, and nothing moves that should not."""
+
+import math
+
+import bpy
+import numpy as np
+import pytest
+
+from refgs_addon.errors import InputError
+from refgs_addon.scene.edit import add_edit
+from refgs_addon.scene.run import import_run
+from refgs_addon.scene.turntable import add_turntable
+
+
+def matrix(item):
+    return np.array(item.matrix_world)
+
+
+def test_one_turn_about_the_upright(run_folder, scene):
+    run = import_run(run_folder, scene)
+    edit = add_edit(run.collection, "Box")
+    region = next(item for item in run.collection.objects if item.type == "EMPTY")
+    bpy.context.view_layer.update()
+    items = [run.splats, run.mesh[0], region]
+    before = [matrix(item) for item in items]
+    camera = matrix(scene.camera)
+    table = add_turntable(scene, run.collection, seconds=2)
+    assert (scene.frame_start, scene.frame_end) == (1, 48)
+    bpy.context.view_layer.update()
+    for item, was in zip(items, before, strict=True):
+        np.testing.assert_allclose(matrix(item), was, atol=1e-5)
+    angles = []
+    for frame in (1, 13, 25, 37, 49):
+        scene.frame_set(frame)
+        angles.append(table.matrix_world.to_euler().z % (2 * math.pi))
+    np.testing.assert_allclose(angles[:4], [0, math.pi / 2, math.pi, 3 * math.pi / 2], atol=1e-4)
+    scene.frame_set(13)
+    place = matrix(table)[:3, 3]
+    run.mesh[0].hide_viewport = False  # what is hidden does not move until it is seen
+    bpy.context.view_layer.update()
+    for item, was in zip(items, before, strict=True):
+        expected = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ (was[:3, 3] - place) + place
+        np.testing.assert_allclose(matrix(item)[:3, 3], expected, atol=1e-4)
+    np.testing.assert_array_equal(matrix(scene.camera), camera)
+    assert edit.node_group is not None
+    with pytest.raises(InputError, match="already"):
+        add_turntable(scene, run.collection)
