@@ -59,7 +59,8 @@ def set_modifier_input(modifier: bpy.types.NodesModifier, name: str, value) -> N
         owner.value = value
     else:
         key = path[2:-2]
-        if isinstance(value, str):  # before 5.2 a menu is kept as its item's number
+        if modifier.node_group.interface.items_tree[name].socket_type == "NodeSocketMenu":
+            # Before 5.2 it is kept as its item's number.
             items = modifier.id_properties_ui(key).as_dict()["items"]
             value = next(item[4] for item in items if item[0] == value)
         owner[key] = value

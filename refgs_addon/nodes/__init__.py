@@ -37,3 +37,18 @@ def out(node: bpy.types.Node, name: str | None = None) -> bpy.types.NodeSocket:
 def math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
     """What a node of arithmetic makes of sockets and numbers."""
     return out(add(tree, "ShaderNodeMath", dict(enumerate(inputs)), operation=operation))
+
+
+def seen_from(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[bpy.types.Node, bpy.types.NodeSocket]:
+    """The Object Info of an object, and where points are in its own frame."""
+    info = add(tree, "GeometryNodeObjectInfo", {"Object": item}, transform_space="RELATIVE")
+    inverse = add(tree, "FunctionNodeInvertMatrix", {"Matrix": info.outputs["Transform"]}).outputs["Matrix"]
+    position = out(add(tree, "GeometryNodeInputPosition"))
+    return info, out(add(tree, "FunctionNodeTransformPoint", {"Vector": position, "Transform": inverse}))
+
+
+def largest(tree: bpy.types.NodeTree, vector: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """The largest of a vector's absolute components: at most 1 in a cube of radius 1."""
+    absolute = out(add(tree, "ShaderNodeVectorMath", {0: vector}, operation="ABSOLUTE"))
+    x, y, z = add(tree, "ShaderNodeSeparateXYZ", {0: absolute}).outputs
+    return math(tree, "MAXIMUM", math(tree, "MAXIMUM", x, y), z)

@@ -2,11 +2,11 @@
 
 import bpy
 
-from . import add, math, modifier_tree, out
+from . import add, largest, math, modifier_tree, out, seen_from
 
 NAME = "RefGS Edit"  # of the tree, and the beginning of the names of modifiers that use it
 FOLLOW = "RefGS Follow"  # of the mesh's tree and modifier
-REGIONS = ("Everywhere", "Box", "Sphere", "Similar")
+REGIONS = ("Everywhere", "Box", "Sphere", "Similar", "Painted")
 # What the edits so far have made of a point: values times how much of them there is, as in alpha compositing, and how much that is, of
 # the colour, of the metallic and of the roughness.
 COLOR, SURFACE, AMOUNT = "edit_color", "edit_surface", "edit_amount"
@@ -19,7 +19,8 @@ def edit_tree() -> bpy.types.NodeTree:
     Where its mask is one the splats' base_color, metallic and roughness become its own, as far as the amounts say. The mask
     is one inside a box or a ball of the size of the object Region, an Empty of size 1, and falls to zero towards its border over the part
     Falloff; with "Similar" it is one where the material is that of the splat nearest to the object, and zero where it differs by more
-    than Tolerance.
+    than Tolerance; with "Painted" it is, as far as Falloff says, the weight of the vertex group Painted of the object, a mesh, where that
+    is nearest to the splat.
     """
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]
@@ -27,11 +28,15 @@ def edit_tree() -> bpy.types.NodeTree:
     interface = tree.interface
     where = interface.new_socket("Where", in_out="INPUT", socket_type="NodeSocketMenu")
     where.description = (
-        "Which splats: all, those in a box or a ball, or those of a material like the one that the region stands at"
+        "Which splats: all, those in a box or a ball, those of a material like the one that the region stands at, "
+        "or what is painted on a mesh"
     )
     interface.new_socket(
         "Region", in_out="INPUT", socket_type="NodeSocketObject"
     ).description = "Move, turn and scale it"
+    interface.new_socket(
+        "Painted", in_out="INPUT", socket_type="NodeSocketString"
+    ).description = "The vertex group of the region that is painted"
     factors = {
         "Falloff": (0.2, "How much of the region is its soft border"),
         "Tolerance": (0.2, "How much a material may differ from the one at the region and still be changed"),
@@ -91,14 +96,8 @@ def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.N
     for name in REGIONS:
         menu.enum_items.new(name)
     tree.links.new(group["Where"], menu.inputs["Menu"])
-    region = add(tree, "GeometryNodeObjectInfo", {"Object": group["Region"]}, transform_space="RELATIVE")
-    inverse = add(tree, "FunctionNodeInvertMatrix", {"Matrix": region.outputs["Transform"]})
-    position = out(add(tree, "GeometryNodeInputPosition"))
-    inside = out(add(tree, "FunctionNodeTransformPoint", {"Vector": position, "Transform": inverse.outputs["Matrix"]}))
-    x, y, z = add(
-        tree, "ShaderNodeSeparateXYZ", {0: out(add(tree, "ShaderNodeVectorMath", {0: inside}, operation="ABSOLUTE"))}
-    ).outputs
-    box = math(tree, "MAXIMUM", math(tree, "MAXIMUM", x, y), z)
+    region, inside = seen_from(tree, group["Region"])
+    box = largest(tree, inside)
     ball = add(tree, "ShaderNodeVectorMath", {0: inside}, operation="LENGTH").outputs["Value"]
     nearest = add(
         tree,
@@ -119,6 +118,13 @@ def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.N
             )
     unlike = math(tree, "SQRT", math(tree, "ADD", math(tree, "ADD", *squares[:2]), squares[2]))
     unlike = math(tree, "DIVIDE", unlike, math(tree, "MAXIMUM", group["Tolerance"], 1e-6))
+    position = out(add(tree, "GeometryNodeInputPosition"))
+    weight = {"Mesh": region.outputs["Geometry"], "Sample Position": position}
+    weight["Value"] = add(
+        tree, "GeometryNodeInputNamedAttribute", {"Name": group["Painted"]}, data_type="FLOAT"
+    ).outputs["Attribute"]
+    painted = out(add(tree, "GeometryNodeSampleNearestSurface", weight, data_type="FLOAT"))
+    tree.links.new(math(tree, "SUBTRACT", 1.0, painted), menu.inputs["Painted"])
     tree.links.new(box, menu.inputs["Box"])
     tree.links.new(ball, menu.inputs["Sphere"])
     tree.links.new(unlike, menu.inputs["Similar"])

@@ -2,7 +2,7 @@
 
 import bpy
 
-from . import add, modifier_tree, out
+from . import add, largest, modifier_tree, out, seen_from
 
 NAME = "RefGS Splats"  # of the tree, and of the modifier that uses it
 # The quad reaches three standard deviations: the Gaussian is exp(-4.5) = 1.1 % of its peak there.
@@ -28,6 +28,12 @@ def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
     cut = interface.new_socket("Opacity Cut", in_out="INPUT", socket_type="NodeSocketFloat")
     cut.default_value, cut.min_value, cut.max_value, cut.subtype = 0.0, 0.0, 1.0, "FACTOR"
     cut.description = "Hide splats fainter than this"
+    interface.new_socket(
+        "Crop", in_out="INPUT", socket_type="NodeSocketBool"
+    ).description = "Draw only the splats in a box"
+    interface.new_socket(
+        "Crop Box", in_out="INPUT", socket_type="NodeSocketObject"
+    ).description = "Move, turn and scale it"
     display = interface.new_socket("Display", in_out="INPUT", socket_type="NodeSocketMenu")
     display.description = "What the splats show: the material under the light, or one of its values as it is"
     interface.new_socket("Material", in_out="INPUT", socket_type="NodeSocketMaterial")
@@ -51,7 +57,15 @@ def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
         {"A": attribute("opacity", "FLOAT"), "B": group["Opacity Cut"]},
         operation="LESS_THAN",
     )
-    points = add(tree, "GeometryNodeDeleteGeometry", {"Geometry": group["Geometry"], "Selection": out(faint)})
+    outside = add(
+        tree,
+        "FunctionNodeCompare",
+        {"A": largest(tree, seen_from(tree, group["Crop Box"])[1]), "B": 1.0},
+        operation="GREATER_THAN",
+    )
+    away = add(tree, "FunctionNodeBooleanMath", {0: group["Crop"], 1: out(outside)}, operation="AND")
+    unseen = out(add(tree, "FunctionNodeBooleanMath", {0: out(faint), 1: out(away)}, operation="OR"))
+    points = add(tree, "GeometryNodeDeleteGeometry", {"Geometry": group["Geometry"], "Selection": unseen})
     normal = add(
         tree,
         "ShaderNodeVectorMath",

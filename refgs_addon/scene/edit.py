@@ -7,6 +7,7 @@ from ..errors import InputError
 from ..nodes.edit import FOLLOW, NAME, REGIONS, edit_tree, follow_tree, show_edits
 from ..nodes.splats import NAME as SPLATS
 from .parts import parts
+from .regions import REGION, add_region
 
 # Base colour (linear Rec.709), metallic, roughness; None leaves the base colour as it was learned.
 MATERIALS: dict[str, tuple[tuple[float, float, float] | None, float, float]] = {
@@ -28,17 +29,24 @@ def add_edit(
     """Add an edit to a run's collection, on top of those that are there; its mesh, if it has one, follows.
 
     `where` is one of REGIONS; all but "Everywhere" get an Empty in the middle of the splats, to move, turn and scale. `material` is one
-    of MATERIALS. Raises InputError where the collection has no splats.
+    of MATERIALS. "Painted" gets a copy of the mesh to paint weights on, all zero at first. Raises InputError where the collection has no
+    splats, or no mesh to paint on.
     """
     if where not in REGIONS or material not in MATERIALS:
         raise InputError(f"there is no region {where} or no material {material}")
     splats = splats_of(collection)
+    if where == "Painted" and not parts(collection).get("mesh"):
+        raise InputError(f"{collection.name} has no mesh to paint on: make the run's mesh, and import it again")
     edit = splats.modifiers.new(NAME, "NODES")
     edit.node_group = edit_tree()
     splats.modifiers.move(len(splats.modifiers) - 1, splats.modifiers.find(SPLATS))
     edit = splats.modifiers[edit.name]
     compat.set_modifier_input(edit, "Where", where)
-    if where != "Everywhere":
+    if where == "Painted":
+        canvas, group = _canvas(parts(collection)["mesh"][0], collection)
+        for name, value in (("Region", canvas), ("Painted", group), ("Falloff", 1.0)):
+            compat.set_modifier_input(edit, name, value)
+    elif where != "Everywhere":
         compat.set_modifier_input(edit, "Region", _region(splats, collection, where))
     set_material(edit, material)
     for mesh in parts(collection).get("mesh", []):
@@ -69,7 +77,7 @@ def remove_edit(splats: bpy.types.Object, name: str) -> None:
         raise InputError(f"{splats.name} has no edit {name}")
     region = compat.get_modifier_input(edit, "Region")
     splats.modifiers.remove(edit)
-    if region is not None and region.get("refgs_region") and region.users <= 1 + len(region.users_collection):
+    if region is not None and region.get(REGION) and region.users <= 1 + len(region.users_collection):
         bpy.data.objects.remove(region)
 
 
@@ -83,19 +91,26 @@ def splats_of(collection: bpy.types.Collection) -> bpy.types.Object:
 
 def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: str) -> bpy.types.Object:
     """An Empty in the middle of the splats, a third of their size; for "Similar" a small one, to be put on a splat."""
-    region = bpy.data.objects.new(f"{where} of {splats.name}", None)
-    region["refgs_region"] = True
-    region.empty_display_type = {"Box": "CUBE", "Sphere": "SPHERE", "Similar": "ARROWS"}[where]
-    cloud = splats.data
-    places = [0.0] * (3 * len(cloud.points))
-    cloud.attributes["position"].data.foreach_get("vector", places)
-    axes = [sorted(places[axis::3]) for axis in range(3)]
-    low, middle, high = ([axis[int(part * (len(axis) - 1))] for axis in axes] for part in (0.02, 0.5, 0.98))
-    region.location = splats.matrix_world @ type(splats.location)(middle)
-    size = max(b - a for a, b in zip(low, high, strict=True)) or 1.0
-    region.scale = [size / (12 if where == "Similar" else 6)] * 3
-    collection.objects.link(region)
+    shape = {"Box": "CUBE", "Sphere": "SPHERE", "Similar": "ARROWS"}[where]
+    region = add_region(splats, collection, f"{where} of {splats.name}", shape)
+    region.scale = [max(region.scale) * (1 / 6 if where == "Similar" else 1 / 3)] * 3
     return region
+
+
+def _canvas(mesh: bpy.types.Object, collection: bpy.types.Collection) -> tuple[bpy.types.Object, str]:
+    """What is painted on, and its new vertex group. It shares the mesh but not its modifiers: those follow the splats, which follow
+    what is painted."""
+    found = [item for item in collection.objects if item.get(REGION) and item.data == mesh.data]
+    if found:
+        canvas = found[0]
+    else:
+        canvas = bpy.data.objects.new(f"{mesh.name} to paint on", mesh.data)
+        canvas[REGION] = canvas.hide_render = True
+        canvas.matrix_world = mesh.matrix_world
+        collection.objects.link(canvas)
+    group = canvas.vertex_groups.new(name="RefGS Painted")
+    canvas.vertex_groups.active = group
+    return canvas, group.name
 
 
 def _follow(mesh: bpy.types.Object, splats: bpy.types.Object) -> None:

@@ -8,13 +8,14 @@ from ..nodes.edit import REGIONS
 from ..scene.edit import MATERIALS, add_edit, edits, remove_edit, set_material
 from ..scene.parts import active_run, parts
 from .export import ApplyEdits
-from .operators import Door, has_run
+from .operators import Door, choose, has_run
 from .panels import Tab
 
 _WHERE = {
     "Everywhere": ("Change all of the object", "WORLD"),
     "Box": ("Change what is in a box, which you move, turn and scale", "MESH_CUBE"),
     "Sphere": ("Change what is in a ball, which you move, turn and scale", "MESH_UVSPHERE"),
+    "Painted": ("Change what you paint on the mesh", "BRUSH_DATA"),
     "Similar": ("Change what has a material like the one at a point that you move", "EYEDROPPER"),
 }
 
@@ -37,10 +38,9 @@ class AddEdit(Door, bpy.types.Operator):
         edit = add_edit(active_run(context), self.where, self.material)
         region = compat.get_modifier_input(edit, "Region")
         if region is not None:
-            for item in context.selected_objects:
-                item.select_set(False)
-            region.select_set(True)
-            context.view_layer.objects.active = region
+            choose(context, region)
+        if self.where == "Painted" and context.area is not None:
+            bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
 
 
 class _OfEdit(Door):

@@ -11,6 +11,7 @@ from ..errors import InputError
 from ..scene.cameras import PHOTO, next_camera, photo_shown, show_photo
 from ..scene.parts import active_run, show
 from ..scene.preview import render_preview
+from ..scene.regions import crop
 from ..scene.turntable import add_turntable
 
 
@@ -73,6 +74,29 @@ class ShowPart(Door, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         show(bpy.data.collections[self.collection], self.part)
+
+
+class Crop(Door, bpy.types.Operator):
+    bl_idname = "refgs.crop"
+    bl_label = "Crop"
+    bl_description = "Draw only the splats in a box, which you move, turn and scale; or all of them again"
+
+    splats: StringProperty(name="Splats", description="The object")
+    on: BoolProperty(name="Crop", default=True)
+
+    def work(self, context: bpy.types.Context) -> None:
+        splats = bpy.data.objects[self.splats]
+        box = crop(splats, splats.users_collection[0], self.on)
+        if self.on:
+            choose(context, box)
+
+
+def choose(context: bpy.types.Context, item: bpy.types.Object) -> None:
+    """Make an object the only one that is selected, and the active one."""
+    for other in context.selected_objects:
+        other.select_set(False)
+    item.select_set(True)
+    context.view_layer.objects.active = item
 
 
 class NextCamera(Door, bpy.types.Operator):
@@ -146,4 +170,4 @@ class RenderPreview(Door, ExportHelper, bpy.types.Operator):
         self.report({"INFO"}, f"Wrote {self.filepath}")
 
 
-CLASSES = (ImportRun, ShowPart, NextCamera, Photo, Turntable, RenderPreview)
+CLASSES = (ImportRun, ShowPart, Crop, NextCamera, Photo, Turntable, RenderPreview)

@@ -38,9 +38,13 @@ class RunPanel(Tab, bpy.types.Panel):
                 continue
             column = layout.column()
             column.use_property_split, column.use_property_decorate = True, False
+            modifier = splats.modifiers[MODIFIER]
             for name in ("Display", "Size", "Opacity Cut"):
-                owner, path = compat.modifier_input(splats.modifiers[MODIFIER], name)
+                owner, path = compat.modifier_input(modifier, name)
                 column.prop(owner, path, text=name)
+            cropped = bool(compat.get_modifier_input(modifier, "Crop"))
+            button = column.operator(operators.Crop.bl_idname, icon="CUBE", depress=cropped)
+            button.splats, button.on = splats.name, not cropped
             layout.label(text=f"{len(splats.data.points):,} splats")
 
 

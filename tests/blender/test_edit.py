@@ -3,12 +3,14 @@
 import bpy
 import numpy as np
 import pytest
+from mathutils import Matrix
 
 from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.edit import AMOUNT, COLOR, SURFACE
 from refgs_addon.scene.edit import MATERIALS, add_edit, edits, remove_edit, set_material
 from refgs_addon.scene.parts import show
+from refgs_addon.scene.regions import crop
 from refgs_addon.scene.run import import_run
 
 
@@ -166,3 +168,47 @@ def test_the_buttons(run):
         assert not bpy.ops.refgs.add_edit.poll()
     finally:
         ui.unregister()
+
+
+def test_what_is_painted_on_the_mesh(run):
+    """Weights of 1 on the corners of one side of the mesh: the splats nearest to it change, and the mesh there."""
+    run.mesh[0].data.transform(Matrix.Translation((-1, 3, -2)))  # into the middle of the splats
+    add_edit(run.collection, "Painted", "Gold")
+    canvas = next(item for item in run.collection.objects if item.get("refgs_region"))
+    assert canvas.data == run.mesh[0].data and not canvas.modifiers and canvas.hide_render
+    np.testing.assert_allclose(drawn(run, "metallic"), learned(run, "metallic"))  # nothing is painted yet
+    height = np.array([v.co.z for v in canvas.data.vertices])
+    middle = float(height.mean())
+    canvas.vertex_groups.active.add([int(i) for i in np.flatnonzero(height > middle)], 1.0, "REPLACE")
+    metallic, before = drawn(run, "metallic"), learned(run, "metallic")
+    above = positions(run)[:, 2] > height.max()
+    below = positions(run)[:, 2] < height.min()
+    assert above.any() and below.any()
+    np.testing.assert_allclose(metallic[above], 1.0, atol=1e-5)
+    np.testing.assert_allclose(metallic[below], before[below], atol=1e-5)
+    second = add_edit(run.collection, "Painted", "Rubber")  # another layer, on the same copy of the mesh
+    assert len([item for item in run.collection.objects if item.get("refgs_region")]) == 1
+    np.testing.assert_allclose(drawn(run, "metallic")[above], 1.0, atol=1e-5)
+    for edit in (second, edits(run.splats)[0]):
+        remove_edit(run.splats, edit.name)
+    assert not [item for item in run.collection.objects if item.get("refgs_region")]
+
+
+def test_painting_needs_a_mesh(run_folder, scene):
+    (run_folder / "mesh.glb").unlink()
+    run = import_run(run_folder, scene)
+    with pytest.raises(InputError, match="no mesh to paint on"):
+        add_edit(run.collection, "Painted")
+    assert not edits(run.splats)
+
+
+def test_a_crop_hides_what_is_outside_of_its_box(run):
+    box = crop(run.splats, run.collection, True)
+    places = positions(run)
+    assert len(drawn(run, "metallic")) > 0.8 * len(places)  # it holds nearly all at first
+    box.location, box.scale = (0.5, 0, 0), (0.5, 2, 2)
+    inside = (np.abs(places - [0.5, 0, 0]) <= [0.5, 2, 2]).all(axis=1)
+    assert len(drawn(run, "metallic")) == inside.sum() > 0
+    assert crop(run.splats, run.collection, False) == box
+    assert len(drawn(run, "metallic")) == len(places)
+    assert crop(run.splats, run.collection, True) == box
