@@ -77,7 +77,8 @@ def remove_edit(splats: bpy.types.Object, name: str) -> None:
         raise InputError(f"{splats.name} has no edit {name}")
     region = compat.get_modifier_input(edit, "Region")
     splats.modifiers.remove(edit)
-    if region is not None and region.get(REGION) and region.users <= 1 + len(region.users_collection):
+    shared = any(compat.get_modifier_input(other, "Region") == region for other in edits(splats))
+    if region is not None and region.get(REGION) and not shared:
         bpy.data.objects.remove(region)
 
 
