@@ -3,7 +3,7 @@
 import bpy
 
 from .. import follow, preferences, properties
-from . import export, light, materials, operators, panels, pictures, training
+from . import drop, export, light, materials, operators, panels, pictures, training
 
 CLASSES = (
     *preferences.CLASSES,
@@ -14,6 +14,7 @@ CLASSES = (
     *materials.CLASSES,
     *light.CLASSES,
     *export.CLASSES,
+    *drop.CLASSES,
 )
 
 

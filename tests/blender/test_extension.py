@@ -62,6 +62,16 @@ def test_the_buttons(run_folder, addon, tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 0
 
 
+def test_dropped_files_stand_for_their_folders(run_folder, addon, tmp_path):
+    (run_folder / "run.toml").write_text("[run]\n")
+    bpy.ops.refgs.drop_run(filepath=str(run_folder / "run.toml"))
+    assert bpy.data.objects["pot splats"]
+    bpy.ops.refgs.drop_capture(filepath=str(tmp_path / "transforms_train.json"))
+    assert addon.refgs.capture == str(tmp_path)
+    with pytest.raises(RuntimeError, match=r"^Error: settings\.json is no transforms"):
+        bpy.ops.refgs.drop_capture(filepath=str(tmp_path / "settings.json"))
+
+
 def test_a_broken_folder_is_reported_in_one_line(run_folder, addon):
     (run_folder / "splats.ply").write_bytes(b"ply\n")
     with pytest.raises(RuntimeError, match=r"^Error: .*splats\.ply is not a binary little-endian PLY file[^\n]*\n?$"):

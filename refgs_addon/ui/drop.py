@@ -1,0 +1,69 @@
+"""Files dropped on the 3D view: the run.toml of a run, or the transforms.json of a capture, stand for the folder that they are in."""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import StringProperty
+
+from ..errors import InputError
+from ..preferences import is_set_up
+from ..scene import training
+from .operators import Door, import_run_folder
+
+
+class _Drop(Door):
+    """Takes a dropped file."""
+
+    filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
+
+    def folder(self, name: str) -> Path:
+        """The folder of the file. Raises InputError where it is not called NAME… ."""
+        file = Path(bpy.path.abspath(self.filepath))
+        if not file.name.startswith(name):
+            raise InputError(f"{file.name} is no {name}: drop the one in the folder of a RefGS run or capture")
+        return file.parent
+
+
+class DropRun(_Drop, bpy.types.Operator):
+    bl_idname = "refgs.drop_run"
+    bl_label = "Import RefGS Run"
+    bl_description = "Import the run that this run.toml belongs to"
+
+    def work(self, context: bpy.types.Context) -> None:
+        import_run_folder(self, context, self.folder("run"))
+
+
+class DropCapture(_Drop, bpy.types.Operator):
+    bl_idname = "refgs.drop_capture"
+    bl_label = "Choose RefGS Capture"
+    bl_description = "Choose the capture that this transforms.json belongs to, and check it"
+
+    def work(self, context: bpy.types.Context) -> None:
+        context.scene.refgs.capture = str(self.folder("transforms"))
+        if is_set_up():
+            training.check(context.scene)
+
+
+class _OnView:
+    """A file dropped on the 3D view."""
+
+    @classmethod
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+
+class RunFile(_OnView, bpy.types.FileHandler):
+    bl_idname = "REFGS_FH_run"
+    bl_label = "RefGS Run"
+    bl_import_operator = DropRun.bl_idname
+    bl_file_extensions = ".toml"
+
+
+class CaptureFile(_OnView, bpy.types.FileHandler):
+    bl_idname = "REFGS_FH_capture"
+    bl_label = "RefGS Capture"
+    bl_import_operator = DropCapture.bl_idname
+    bl_file_extensions = ".json"
+
+
+CLASSES = (DropRun, DropCapture, RunFile, CaptureFile)
