@@ -3,6 +3,7 @@
 import bpy
 
 from . import jobs
+from .scene import live
 
 EVERY = 0.2  # seconds between looks while there is a job, which cost microseconds when nothing was said
 LOOK = 4.0  # seconds between previews of a training
@@ -25,6 +26,7 @@ def _look() -> float | None:
         for job in jobs.JOBS:
             if job.state == "running" and job.progress and "train" not in job.results:
                 job.tell("preview")
+    live.update()
     if changed:
         redraw()
     return EVERY if any(not job.ended for job in jobs.JOBS) else None

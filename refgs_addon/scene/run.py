@@ -9,7 +9,7 @@ from ..errors import InputError
 from . import parts
 from .cameras import add_camera, frame_camera, light_of, read_cameras
 from .relight import light_with_recovered, load_panorama
-from .splats import add_splats, read_splats
+from .splats import add_splats, normal_slopes, point_cloud, read_splats, with_slopes
 
 
 @dataclass
@@ -44,7 +44,8 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         collection = bpy.data.collections.new(f"RefGS {name}")
         collection[parts.FOLDER] = str(folder.resolve())
         scene.collection.children.link(collection)
-        run = Run(collection, add_splats(f"{name} splats", splats, collection))
+        cloud = point_cloud(f"{name} splats", with_slopes(splats, *normal_slopes(splats)))
+        run = Run(collection, add_splats(cloud.name, cloud, collection))
         run.splats[parts.KEY] = "splats"
         if (folder / "mesh.glb").exists():
             run.mesh = _add_mesh(folder / "mesh.glb", f"{name} mesh", collection)

@@ -19,25 +19,8 @@ _SPREAD = (  # how to put two zeros between the bits of a number
 _TYPES = {"base_color": "FLOAT_COLOR", "rotation": "QUATERNION"}
 
 
-def add_splats(name: str, splats: dict[str, np.ndarray], collection: bpy.types.Collection) -> bpy.types.Object:
-    """A point cloud of splats in a collection, with the modifier that draws them. `splats` is from `read_splats`.
-
-    Its points have the attributes of `read_splats` (scale as a vector whose third component is 1, base_color with
-    alpha 1), and normal_u, normal_v: how the normal changes along the splat's axes, for one standard deviation.
-    """
-    count = len(splats["position"])
-    cloud = compat.new_point_cloud(name, count)
-    values = dict(splats)
-    values["scale"] = np.column_stack([splats["scale"], np.ones(count)])
-    values["base_color"] = np.column_stack([splats["base_color"], np.ones(count)])
-    values["normal_u"], values["normal_v"] = normal_slopes(splats)
-    values["radius"] = splats["scale"].mean(axis=1)  # what is drawn when the modifier is off
-    for key, value in values.items():
-        kind = _TYPES.get(key, "FLOAT" if value.ndim == 1 else "FLOAT_VECTOR")
-        attribute = cloud.attributes.get(key) or cloud.attributes.new(key, kind, "POINT")
-        field = {"FLOAT": "value", "FLOAT_VECTOR": "vector", "FLOAT_COLOR": "color", "QUATERNION": "value"}[kind]
-        attribute.data.foreach_set(field, np.ascontiguousarray(value, np.float32).ravel())
-
+def add_splats(name: str, cloud: bpy.types.PointCloud, collection: bpy.types.Collection) -> bpy.types.Object:
+    """An object of splats in a collection, with the modifier that draws them. `cloud` is from `point_cloud`."""
     result = bpy.data.objects.new(name, cloud)
     collection.objects.link(result)
     # Overlapping quads would shadow each other under a lamp, in specks, and take Eevee four times as long.
@@ -49,6 +32,30 @@ def add_splats(name: str, splats: dict[str, np.ndarray], collection: bpy.types.C
     bpy.context.view_layer.update()  # 5.2 makes the modifier's inputs here
     compat.set_modifier_input(modifier, "Material", material)
     return result
+
+
+def with_slopes(splats: dict[str, np.ndarray], normal_u: np.ndarray, normal_v: np.ndarray) -> dict[str, np.ndarray]:
+    """The attributes of a cloud's points: those of `read_splats` (scale as a vector whose third component is 1, base_color with alpha 1),
+    and normal_u, normal_v (N, 3): how the normal changes along the splat's axes, for one standard deviation."""
+    one = np.ones((len(splats["position"]), 1), np.float32)
+    return splats | {
+        "scale": np.hstack([splats["scale"], one]),
+        "base_color": np.hstack([splats["base_color"], one]),
+        "normal_u": normal_u,
+        "normal_v": normal_v,
+        "radius": splats["scale"].mean(axis=1),  # what is drawn when the modifier is off
+    }
+
+
+def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointCloud:
+    """A point cloud with these attributes on its points."""
+    cloud = compat.new_point_cloud(name, len(values["position"]))
+    for key, value in values.items():
+        kind = _TYPES.get(key, "FLOAT" if value.ndim == 1 else "FLOAT_VECTOR")
+        attribute = cloud.attributes.get(key) or cloud.attributes.new(key, kind, "POINT")
+        field = {"FLOAT": "value", "FLOAT_VECTOR": "vector", "FLOAT_COLOR": "color", "QUATERNION": "value"}[kind]
+        attribute.data.foreach_set(field, np.ascontiguousarray(value, np.float32).ravel())
+    return cloud
 
 
 def read_splats(path: Path) -> dict[str, np.ndarray]:

@@ -8,7 +8,6 @@ from .. import jobs
 from ..errors import InputError
 from ..follow import follow
 from ..preferences import is_set_up, log_file, python
-from .export import export_run
 
 
 def check(scene: bpy.types.Scene) -> jobs.Job:
@@ -38,6 +37,8 @@ def train(scene: bpy.types.Scene) -> jobs.Job:
 def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: Path) -> jobs.Job | None:
     """Write a run with its edits as a new run folder, which the scene remembers; the trainer makes its mesh and textures, where there
     is one, and the job is returned. Raises InputError."""
+    from .export import export_run
+
     export_run(collection, out)
     _remember(scene, out)
     if (out / "mesh.glb").exists() or not is_set_up():

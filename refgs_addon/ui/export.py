@@ -8,7 +8,6 @@ from bpy.props import StringProperty
 from bpy_extras.io_utils import ExportHelper
 
 from ..scene import training
-from ..scene.export import export_light, export_mesh, export_splats
 from ..scene.parts import FOLDER, active_run
 from .operators import Door, ImportRun, has_run
 
@@ -29,7 +28,10 @@ class _Export(Door, ExportHelper):
         return {"RUNNING_MODAL"}
 
     def work(self, context: bpy.types.Context) -> None:
-        self.write(active_run(context), Path(bpy.path.abspath(self.filepath)))
+        from ..scene import export
+
+        write = {"splats": export.export_splats, "mesh": export.export_mesh, "light": export.export_light}[self.kind]
+        write(active_run(context), Path(bpy.path.abspath(self.filepath)))
         self.report({"INFO"}, f"Wrote {self.filepath}")
 
 
@@ -38,7 +40,7 @@ class ExportSplats(_Export, bpy.types.Operator):
     bl_label = "RefGS Splats (.ply)"
     bl_description = "Write the splats with their edited materials, as RefGS and viewers of Gaussian splats read them"
 
-    kind, filename_ext, write = "splats", ".ply", staticmethod(export_splats)
+    kind, filename_ext = "splats", ".ply"
     filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
 
 
@@ -47,7 +49,7 @@ class ExportMesh(_Export, bpy.types.Operator):
     bl_label = "RefGS Mesh with Textures (.glb)"
     bl_description = "Write the mesh with its base colour, metallic, roughness and normal textures"
 
-    kind, filename_ext, write = "mesh", ".glb", staticmethod(export_mesh)
+    kind, filename_ext = "mesh", ".glb"
     filter_glob: StringProperty(default="*.glb", options={"HIDDEN"})
 
 
@@ -56,7 +58,7 @@ class ExportLight(_Export, bpy.types.Operator):
     bl_label = "RefGS Recovered Light (.exr)"
     bl_description = "Write the light that was recovered from the photos, as a panorama"
 
-    kind, filename_ext, write = "light", ".exr", staticmethod(export_light)
+    kind, filename_ext = "light", ".exr"
     filter_glob: StringProperty(default="*.exr", options={"HIDDEN"})
 
 

@@ -26,6 +26,10 @@ class Door:
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
+        except ModuleNotFoundError as error:  # Debian's Blender may come without numpy; what imports it, does so late
+            name = error.name
+            self.report({"ERROR"}, f"Blender's Python lacks {name}: install it (on Debian, python3-{name})")
+            return {"CANCELLED"}
         return {"FINISHED"}
 
 
@@ -37,10 +41,8 @@ def has_run(operator: type[bpy.types.Operator], context: bpy.types.Context) -> b
 
 def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> None:
     """Import a run, and report what came of it."""
-    try:
-        from ..scene.run import import_run
-    except ModuleNotFoundError as error:  # Debian's Blender may come without numpy; the rest works without
-        raise InputError(f"Blender's Python lacks {error.name}: install it (on Debian, python3-numpy)") from None
+    from ..scene.run import import_run
+
     run = import_run(folder, context.scene)
     operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
     if run.light_of:

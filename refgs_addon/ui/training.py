@@ -7,7 +7,7 @@ import bpy
 from bpy.props import IntProperty, StringProperty
 
 from .. import jobs, preferences
-from ..scene import training
+from ..scene import live, training
 from .operators import Door, import_run_folder
 from .panels import Tab
 from .pictures import curve, picture
@@ -88,6 +88,19 @@ class Tell(Door, bpy.types.Operator):
             job.stop()
         else:
             job.tell(self.command)
+
+
+class Watch(Door, bpy.types.Operator):
+    bl_idname = "refgs.watch"
+    bl_label = "Show Splats"
+    bl_description = "Show the surfels in the 3D view as they are by now, in their base colour; or no longer"
+    bl_options: ClassVar = {"REGISTER"}
+
+    number: IntProperty(name="Number", description="Of the job in the list")
+
+    def work(self, context: bpy.types.Context) -> None:
+        job = jobs.JOBS[self.number]
+        live.watch(job, context.scene, not live.is_watched(job))
 
 
 class PutAway(Door, bpy.types.Operator):
@@ -180,6 +193,9 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: float) -> N
         _tell(row, number, command, command.title(), "PLAY" if command == "resume" else "PAUSE")
         _tell(row, number, "stop", "Finish", "CHECKMARK")
         _tell(row, number, "cancel", "Stop", "CANCEL")
+        watched = live.is_watched(job)
+        icon = "HIDE_OFF" if watched else "HIDE_ON"
+        box.operator(Watch.bl_idname, icon=icon, depress=watched).number = number
     elif job.run and not job.ended:
         _tell(box, number, "cancel", "Stop", "CANCEL")
     if job.state == "failed":
@@ -248,7 +264,7 @@ def _lines(layout: bpy.types.UILayout, text: str, width: float, icon: str = "NON
         line = f"{line} {word}".strip()
 
 
-CLASSES = (AskTrainer, CheckCapture, Train, Resume, Forget, Tell, PutAway, ImportTrained, TrainPanel)
+CLASSES = (AskTrainer, CheckCapture, Train, Resume, Forget, Tell, Watch, PutAway, ImportTrained, TrainPanel)
 
 
 def register() -> None:

@@ -1,0 +1,72 @@
+"""A training's surfels in the 3D view while it runs."""
+
+import time
+
+import bpy
+import pytest
+
+from refgs_addon import jobs
+from refgs_addon.nodes.splats import NAME
+from refgs_addon.scene import live
+from tests.blender.runs import random_columns, write_ply
+
+
+@pytest.fixture
+def job(tmp_path):
+    """A training that has shown nothing yet."""
+    return jobs.Job("pot", tmp_path, [], tmp_path / "log.txt", run=tmp_path / "run", state="running")
+
+
+def preview(job, tmp_path, iteration, count):
+    write_ply(tmp_path / f"{iteration}.ply", random_columns(count))
+    job.preview = {"iteration": iteration, "splats": str(tmp_path / f"{iteration}.ply")}
+
+
+def until(condition):
+    end = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < end
+        live.update()
+        time.sleep(0.005)
+
+
+def clouds():
+    return [item for item in bpy.data.objects if item.type == "POINTCLOUD"]
+
+
+def test_the_surfels_come_change_and_go(job, scene, tmp_path):
+    live.watch(job, scene)
+    live.update()
+    assert live.is_watched(job) and not clouds()
+    preview(job, tmp_path, 10, 30)
+    until(clouds)
+    (item,) = clouds()
+    assert len(item.data.points) == 30 and item.modifiers[NAME].node_group
+    preview(job, tmp_path, 20, 50)
+    until(lambda: len(item.data.points) == 50)
+    assert clouds() == [item] and len(bpy.data.pointclouds) == 1 and len(item.data.materials) == 1
+    (tmp_path / "30.ply").write_bytes(b"half")  # a preview that cannot be read is left out
+    job.preview = {"iteration": 30, "splats": str(tmp_path / "30.ply")}
+    preview(job, tmp_path, 40, 20)
+    until(lambda: len(item.data.points) == 20)
+    job.state = "done"
+    live.update()
+    assert not clouds() and not bpy.data.pointclouds and not live.is_watched(job)
+
+
+def test_what_is_deleted_or_switched_off_stays_away(job, scene, tmp_path):
+    preview(job, tmp_path, 10, 30)
+    live.watch(job, scene)
+    until(clouds)
+    live.watch(job, scene, False)
+    assert not clouds() and not live.is_watched(job)
+    live.watch(job, scene)
+    until(clouds)
+    bpy.data.objects.remove(clouds()[0])
+    live.update()
+    assert not live.is_watched(job)
+    live.watch(job, scene)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.context.scene.name = "another file"
+    live.update()
+    assert not live.is_watched(job) and not clouds()
