@@ -83,13 +83,16 @@ def export(
     run: RunFolder,
     mesh: Annotated[Path | None, typer.Option(help="the mesh's file (default: RUN/mesh.glb)")] = None,
     texture: Annotated[int | None, typer.Option(min=64, max=8192, help="side of the textures, in pixels")] = None,
-    splats: Annotated[Path | None, typer.Option(help="also write the splats to this file")] = None,
+    splats: Annotated[Path | None, typer.Option(help="write the splats to this file")] = None,
+    display_splats: Annotated[
+        Path | None, typer.Option(help="write splats for viewers of 3D Gaussians, the light baked into their colours")
+    ] = None,
     overwrite: Annotated[bool, typer.Option(help="replace files that exist")] = False,
 ) -> None:
-    """Make the textured mesh: fuse depth, simplify, unwrap, bake."""
+    """Make the textured mesh: fuse depth, simplify, unwrap, bake. Where splats are asked for, the mesh only if its file is named."""
     from refgs import commands
 
-    commands.export(run, mesh, texture, splats, overwrite)
+    commands.export(run, mesh, texture, splats, display_splats, overwrite)
 
 
 @app.command()

@@ -144,10 +144,16 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
 
 
 def export(
-    folder: Path, mesh_file: Path | None, texture: int | None, splats_file: Path | None, overwrite: bool
+    folder: Path,
+    mesh_file: Path | None,
+    texture: int | None,
+    splats_file: Path | None,
+    display_file: Path | None,
+    overwrite: bool,
 ) -> None:
-    """Fuse, clean, unwrap, bake; write the mesh and its textures."""
-    console.print(f"mesh: {jobs.export(folder, mesh_file, texture, splats_file, overwrite, say)}")
+    """Write the mesh and its textures, or splats."""
+    for file in jobs.export(folder, mesh_file, texture, splats_file, display_file, overwrite, say):
+        console.print(f"wrote {file}")
 
 
 def bench(what: str, options: list[str]) -> None:

@@ -11,7 +11,7 @@ import torch
 
 from refgs.capture import read_capture
 from refgs.errors import InputError
-from refgs.export.splats import write_splats
+from refgs.export.splats import write_display_splats, write_splats
 from refgs.kernels import cuda
 from refgs.run import check_free, create_run, open_run, read_run_facts, write_text
 from refgs.settings import load_settings
@@ -98,22 +98,35 @@ def train(
 
 
 def export(
-    folder: Path, mesh_file: Path | None, texture: int | None, splats_file: Path | None, overwrite: bool, report: Report
-) -> Path:
-    """Fuse, clean, unwrap, bake; write the mesh and its textures. Returns the mesh's file."""
+    folder: Path,
+    mesh_file: Path | None,
+    texture: int | None,
+    splats_file: Path | None,
+    display_file: Path | None,
+    overwrite: bool,
+    report: Report,
+) -> list[Path]:
+    """Fuse, clean, unwrap, bake; write the mesh and its textures. Where splats are asked for, they alone, unless the mesh's file is named
+    too. Returns what was written."""
     from refgs.export.bake import bake, unwrap
+    from refgs.export.display import displayed
     from refgs.export.mesh import write_glb
     from refgs.geometry.extract import extract
     from refgs.geometry.mesh import clean, is_crumbs
 
     run = open_run(folder)
-    target = mesh_file or folder / "mesh.glb"
-    for file in (target, target.parent / "textures", splats_file):
-        if file is not None and file.exists() and not overwrite:
+    splats = [file for file in (splats_file, display_file) if file is not None]
+    target = mesh_file if mesh_file or splats else folder / "mesh.glb"
+    for file in [*splats, *([target, target.parent / "textures"] if target else [])]:
+        if file.exists() and not overwrite:
             raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
     if splats_file is not None:
         write_splats(splats_file, run.splats)
-        report("stage", {"what": f"splats: {splats_file}"})
+    if display_file is not None:
+        report("stage", {"what": "learning colours by direction"})
+        write_display_splats(display_file, displayed(run))
+    if target is None:
+        return splats
     settings = run.settings.mesh
     mesh = extract(run.render, run.training_cameras(), run.centre, run.radius, settings.resolution)
     report("stage", {"what": f"fused {len(mesh.faces):,} triangles"})
@@ -129,7 +142,7 @@ def export(
     report("stage", {"what": "baking the textures"})
     textures = bake(mesh, run.splats, texture or settings.texture)
     write_glb(target, mesh, textures)
-    return target
+    return [*splats, target]
 
 
 def update_metrics(folder: Path, facts: dict[str, Any]) -> None:

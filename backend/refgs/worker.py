@@ -50,6 +50,7 @@ class Export(_Command):
     command: Literal["export"]
     run: str
     texture: Annotated[int, Field(ge=64, le=8192)] | None = None
+    display_splats: str | None = None
 
 
 class During(_Command):
@@ -177,8 +178,10 @@ class Worker:
         return False
 
     def _export(self, command: Export) -> tuple[str, dict]:
-        mesh = jobs.export(Path(command.run), None, command.texture, None, overwrite=False, report=self.say)
-        return "done", {"mesh": str(mesh.resolve())}
+        display = None if command.display_splats is None else Path(command.display_splats)
+        run = Path(command.run)
+        files = jobs.export(run, None, command.texture, None, display, overwrite=display is not None, report=self.say)
+        return "done", {"mesh" if display is None else "display_splats": str(files[0].resolve())}
 
 
 def work() -> None:

@@ -41,6 +41,7 @@ class Splats:
 
 _HEAD = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 _TAIL = ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
+THIN = 0.05  # of a surfel's smaller scale: the third, for viewers of 3D Gaussians
 _RECEIVED = ["received_r", "received_g", "received_b"]
 _MATERIAL = ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
 
@@ -51,28 +52,45 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
     Opacity is stored as a logit and scales as logarithms, as 3DGS viewers expect; spherical harmonics of the first
     degree and above are channel-major; materials are stored as they are. Opacities are clipped to 1e-6 .. 1 - 1e-6.
     """
-    count, coefficients = splats.sh.shape[:2]
+    names, columns = _common(splats, splats.scales)
+    names += _MATERIAL
+    columns += [splats.albedo, splats.metallic, splats.roughness]
+    if splats.indirect.shape[1]:
+        names += [*_RECEIVED, *(f"ind_{i}" for i in range(3 * splats.indirect.shape[1]))]
+        columns += [splats.received, splats.indirect.transpose(0, 2, 1)]
+    _write(path, names, columns)
+
+
+def write_display_splats(path: str | os.PathLike, splats: Splats) -> None:
+    """Write a binary little-endian PLY as 3D Gaussian splatting's viewers expect it: harmonics, opacity, three scales, of which a
+    surfel's third is THIN of its smaller one (zero would hide it), rotation; no materials."""
+    scales = splats.scales
+    if scales.shape[1] == 2:
+        scales = np.column_stack([scales, THIN * scales.min(axis=1)])
+    _write(path, *_common(splats, scales))
+
+
+def _common(splats: Splats, scales: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
+    """The properties that all splats' files have, and their columns."""
     opacity = np.clip(splats.opacities.astype(np.float64), 1e-6, 1 - 1e-6)
+    rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1)
     columns = [
         splats.positions,
         splats.normals,
         splats.sh[:, 0],
-        splats.sh[:, 1:].transpose(0, 2, 1).reshape(count, -1),
+        rest,
         np.log(opacity / (1 - opacity)),
-        np.log(np.maximum(splats.scales.astype(np.float64), 1e-30)),
+        np.log(np.maximum(scales.astype(np.float64), 1e-30)),
         splats.rotations,
-        splats.albedo,
-        splats.metallic,
-        splats.roughness,
-        splats.indirect.transpose(0, 2, 1).reshape(count, -1),
     ]
-    names = [*_HEAD, *(f"f_rest_{i}" for i in range(3 * (coefficients - 1))), *_TAIL, *_MATERIAL]
-    if splats.scales.shape[1] == 3:
+    names = [*_HEAD, *(f"f_rest_{i}" for i in range(rest.shape[1])), *_TAIL]
+    if scales.shape[1] == 3:
         names.insert(names.index("scale_1") + 1, "scale_2")
-    if splats.indirect.shape[1]:
-        columns.insert(-1, splats.received)
-        names += [*_RECEIVED, *(f"ind_{i}" for i in range(3 * splats.indirect.shape[1]))]
-    table = np.concatenate([np.reshape(c, (count, -1)) for c in columns], axis=1).astype("<f4")
+    return names, columns
+
+
+def _write(path: str | os.PathLike, names: list[str], columns: list[np.ndarray]) -> None:
+    table = np.concatenate([np.reshape(c, (len(c), -1)) for c in columns], axis=1).astype("<f4")
     rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names])[:, 0]
     with whole(path) as temporary:
         PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))

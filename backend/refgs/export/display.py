@@ -1,0 +1,58 @@
+"""Splats for viewers that know no light: what the run shows, learned as colour by direction."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from refgs.camera import Camera
+from refgs.export.splats import Splats
+from refgs.render.renderer import render
+from refgs.run import Run
+
+ITERATIONS = 600
+VIEWS = 120  # rendered to learn from, at most
+SIDE = 400  # pixels
+RATE, RATE_OF_REST = 0.02, 2e-3  # of the constant and of the rest; they fall to a tenth
+DEGREE = 3
+
+
+def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Splats:
+    """The run's splats with spherical harmonics of the third degree that show, sRGB-encoded, what the run's training cameras see under
+    its light: mirrored light as far as such smooth functions can. Their geometry stays.
+
+    The harmonics are those that repeat renderings of the run with the least squared error, by Adam; `progress` hears how many
+    iterations of how many are done. Where colour was learned by direction they are there already.
+    """
+    splats = run.splats
+    if run.environment is None:
+        return splats
+    cameras = run.training_cameras()
+    cameras = [camera.fitted(SIDE) for camera in cameras[:: -(-len(cameras) // VIEWS)]]
+    shown: dict[int, torch.Tensor] = {}
+    constant = torch.from_numpy(splats.sh[:, :1].copy()).requires_grad_()
+    rest = torch.zeros(len(splats), (DEGREE + 1) ** 2 - 1, 3, requires_grad=True)
+    adam = torch.optim.Adam([{"params": [constant], "lr": RATE}, {"params": [rest], "lr": RATE_OF_REST}], eps=1e-15)
+    decay = torch.optim.lr_scheduler.ExponentialLR(adam, 0.1 ** (1 / ITERATIONS))
+    order = np.random.default_rng(0)
+    for iteration in range(ITERATIONS):
+        if iteration % len(cameras) == 0:
+            queue = order.permutation(len(cameras))
+        number = int(queue[iteration % len(cameras)])
+        if number not in shown:
+            shown[number] = run.render(cameras[number]).color.detach().clamp(0, 1)
+        loss = (_by_direction(run, constant, rest, cameras[number]) - shown[number]).square().mean()
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        decay.step()
+        progress(iteration + 1, ITERATIONS)
+    sh = torch.cat([constant, rest], dim=1).detach().numpy()
+    return Splats(**{**splats.__dict__, "sh": sh})
+
+
+def _by_direction(run: Run, constant: torch.Tensor, rest: torch.Tensor, camera: Camera) -> torch.Tensor:
+    surfels = run.surfels()._replace(sh_dc=constant, sh_rest=rest)
+    settings = run.settings.render.model_copy(update={"shading": "sh"})
+    background = torch.tensor(run.settings.image.background)
+    return render(surfels, None, camera, background, settings, run.near).color

@@ -1,0 +1,70 @@
+"""Splats for viewers that know no light: they show what the run shows, in the properties that such viewers read."""
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData
+
+from refgs.capture import read_capture
+from refgs.errors import InputError
+from refgs.export.display import displayed
+from refgs.export.splats import THIN, write_display_splats
+from refgs.jobs import export
+from refgs.model.surfels import from_splats
+from refgs.render.renderer import render
+from refgs.report.metrics import psnr
+from refgs.run import open_run
+from tests.report.test_evaluate import write_run
+
+
+@pytest.fixture(scope="module")
+def run(ball_capture, tmp_path_factory):
+    """A ball of metal, rough above and smooth below, under a sky."""
+    return open_run(write_run(tmp_path_factory.mktemp("display") / "run", read_capture(ball_capture)))
+
+
+def quality(run, splats, cameras):
+    """PSNR, in dB, of splats by their colours alone beside what the run shows."""
+    settings = run.settings.render.model_copy(update={"shading": "sh"})
+    background = torch.tensor(run.settings.image.background)
+    values = []
+    for camera in cameras:
+        shown = render(from_splats(splats), None, camera, background, settings, run.near).color
+        values.append(psnr(shown.clamp(0, 1).numpy(), run.render(camera).color.clamp(0, 1).numpy()))
+    return np.mean(values)
+
+
+def test_they_show_what_the_run_shows_from_new_views_too(run):
+    said = []
+    splats = displayed(run, lambda done, total: said.append((done, total)))
+    assert said[-1][0] == said[-1][1] == len(said)
+    unseen = [camera for camera, split in zip(run.cameras, run.splits, strict=True) if split == "test"]
+    flat = splats.__class__(**{**splats.__dict__, "sh": splats.sh[:, :1]})
+    assert splats.sh.shape == (3000, 16, 3)
+    assert quality(run, splats, unseen) > quality(run, flat, unseen) + 3
+    assert quality(run, splats, unseen) > 27
+    np.testing.assert_array_equal(splats.positions, run.splats.positions)
+
+
+def test_the_file_is_what_viewers_of_gaussians_read(run, tmp_path):
+    write_display_splats(tmp_path / "a.ply", run.splats)
+    vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    names = [p.name for p in vertex.properties]
+    assert names == [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+    scales = np.exp(np.stack([vertex[f"scale_{i}"] for i in range(3)], axis=1))
+    np.testing.assert_allclose(scales[:, 2], THIN * scales[:, :2].min(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-vertex["opacity"])), run.splats.opacities, rtol=1e-4)
+
+
+def test_splats_alone_are_exported_unless_the_mesh_is_named(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("refgs.export.display.ITERATIONS", 3)
+    before = sorted(run.folder.iterdir())
+    files = export(run.folder, None, None, tmp_path / "a.ply", tmp_path / "b.ply", False, lambda event, facts: None)
+    assert files == [tmp_path / "a.ply", tmp_path / "b.ply"] and all(file.exists() for file in files)
+    assert sorted(run.folder.iterdir()) == before
+    assert len(PlyData.read(str(tmp_path / "b.ply"))["vertex"].properties) == 17 + 45
+    with pytest.raises(InputError, match=r"b\.ply exists: add --overwrite"):
+        export(run.folder, None, None, None, tmp_path / "b.ply", False, lambda event, facts: None)
