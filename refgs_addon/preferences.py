@@ -30,20 +30,18 @@ class Preferences(bpy.types.AddonPreferences):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 20  # letters
+        width = int(context.region.width / (6.2 * context.preferences.system.ui_scale)) - 6  # letters
         icon, text = state()
-        row = layout.row()
-        _lines(row, text, width - 15, icon)
-        button = row.row()
-        button.enabled = set_up() and not installing()
-        button.operator("refgs.ask_trainer", text="Ask Again", icon="FILE_REFRESH")
+        _lines(layout, text, width, icon)
+        if set_up() and not installing():
+            layout.operator("refgs.ask_trainer", text="Ask Again", icon="FILE_REFRESH")
         if _asked and _asked[0].state == "failed":
             layout.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(_asked[0].log)
         _draw_installation(layout.box(), width)
         row = layout.row()
         row.enabled = not installing()
         row.use_property_split = True
-        row.prop(self, "python", text="Or Use a Python")
+        row.prop(self, "python", text="Or an Existing Python")
 
 
 _asked: list[jobs.Job] = []  # the newest question to the Python that is used, or the installation, which asks as well
@@ -115,6 +113,7 @@ def stop() -> None:
     """Stop the installation; it can be gone on with."""
     if job := installing():
         job.stop()
+        job.line = "Stopping …"
 
 
 def _forget() -> None:
@@ -146,7 +145,7 @@ def state() -> tuple[str, str]:
     if not set_up():
         return (
             "INFO",
-            "The trainer is not set up: install it, or choose a Python that has it, in the add-on's preferences",
+            "The trainer is not set up: install it, or choose a Python that has it",
         )
     if not job or not job.ready:
         return "QUESTION", "Not asked yet"
@@ -180,13 +179,17 @@ def _draw_installation(box: bpy.types.UILayout, width: int) -> None:
     there, brought = environment.installed(home()), environment.brought()
     begun = environment.begun(home())
     if there:
-        _lines(box, f"RefGS {there} is installed in {home()}", width)
-        if brought not in ("", there):
-            _lines(box, f"This add-on brings {brought}", width)
+        _lines(
+            box,
+            f"RefGS {there} is installed" + (f", this add-on brings {brought}" if brought not in ("", there) else ""),
+            width,
+        )
     elif begun:
-        _lines(box, f"An installation in {home()} was stopped halfway", width)
+        _lines(box, "An installation was stopped halfway, and can be gone on with", width)
     elif brought:
-        _lines(box, f"The trainer can be installed in {home()}: {environment.room(home())}", width)
+        _lines(box, f"The trainer can be installed: {environment.room(home())}", width)
+    if there or begun or brought:
+        _lines(box, str(home()), width, "FILE_FOLDER")
     row = box.row(align=True)
     if not there or brought not in ("", there):
         text = f"Update to {brought}" if there else "Go On Installing" if begun else "Install the Trainer"
@@ -199,7 +202,7 @@ def _draw_installation(box: bpy.types.UILayout, width: int) -> None:
 
 def _lines(layout: bpy.types.UILayout, text: str, width: int, icon: str = "NONE") -> None:
     column = layout.column(align=True)
-    for line in textwrap.wrap(text, max(width, 20)):
+    for line in textwrap.wrap(text, max(width, 20), break_long_words=False, break_on_hyphens=False):
         column.label(text=line, icon=icon)
         icon = "NONE" if icon == "NONE" else "BLANK1"
 
