@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from . import environment
 from .errors import InputError
 
 PROTOCOL = 1
@@ -34,8 +35,10 @@ class Job:
     commands: list[dict]
     log: Path
     run: Path | None = None  # the folder that is trained into; such jobs run one at a time
+    words: tuple[str, ...] = ("-E", "-m", "refgs.cli", "worker")  # that start it in that Python
     state: str = "waiting"
     line: str = ""  # what is being done; at the end, what was wrong
+    part: float = 0.0  # how much of it is done, where that is said with the line
     warnings: list[str] = field(default_factory=list)
     progress: dict = field(default_factory=dict)  # the newest event of its kind, as are the next
     preview: dict = field(default_factory=dict)
@@ -63,7 +66,7 @@ class Job:
             self.log.parent.mkdir(parents=True, exist_ok=True)
             with open(self.log, "wb") as log:
                 self._process = subprocess.Popen(
-                    [str(self.python), "-E", "-m", "refgs.cli", "worker"],
+                    [str(self.python), *self.words],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=log,
@@ -110,7 +113,7 @@ class Job:
             case "started":
                 self.state, self.line = "running", {"train": "Reading the photos"}.get(event["job"], "")
             case "stage":
-                self.line = event["what"]
+                self.line, self.part = event["what"], event.get("part", self.part)
             case "warning":
                 self.warnings.append(event["what"])
             case "progress":
@@ -187,6 +190,23 @@ def check(python: Path, capture: Path, log: Path) -> Job:
 def ask(python: Path, log: Path) -> Job:
     """Ask a Python whether RefGS's trainer is in it, which one, and what it would train on: `ready`, when the job is done."""
     return _add(Job("trainer", python, [], log))
+
+
+def install(home: Path, log: Path) -> Job:
+    """Install the trainer that the add-on brings into an environment of its own, or go on with that: `ready`, when the job is done."""
+    words = {"uv": str(environment.wheel("uv")), "trainer": str(environment.wheel("refgs"))}
+    return _keep("install", home, log, words)
+
+
+def remove(home: Path, log: Path) -> Job:
+    """Remove that environment, or what there is of it."""
+    return _keep("remove", home, log, {})
+
+
+def _keep(command: str, home: Path, log: Path, words: dict[str, str]) -> Job:
+    """By Blender's own Python, which needs nothing but its own library for it."""
+    told = {"command": command, "home": str(home)} | words
+    return _add(Job(command, Path(sys.executable), [told], log, words=("-I", environment.__file__)))
 
 
 def train(

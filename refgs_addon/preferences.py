@@ -1,11 +1,12 @@
-"""The add-on's preferences: which Python has the trainer."""
+"""The add-on's preferences: the trainer, installed from here or in a Python of the artist's, and what is known of it."""
 
+import textwrap
 from pathlib import Path
 
 import bpy
 from bpy.props import StringProperty
 
-from . import jobs
+from . import environment, jobs
 from .errors import InputError
 from .follow import follow
 
@@ -22,7 +23,7 @@ class Preferences(bpy.types.AddonPreferences):
     python: StringProperty(
         name="Python",
         description="The Python of an environment in which RefGS's trainer is installed, such as refgs/.venv/bin/python. "
-        "Viewing, relighting and rendering do without",
+        "Left empty, the trainer that is installed from here. Viewing, relighting and rendering do without",
         subtype="FILE_PATH",
         update=_chosen,
     )
@@ -34,34 +35,48 @@ class Preferences(bpy.types.AddonPreferences):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
-        layout.use_property_split = True
-        layout.prop(self, "python")
+        width = int(context.region.width / (6.2 * context.preferences.system.ui_scale)) - 6  # letters
         icon, text = state()
+        _lines(layout, text, width, icon)
+        if set_up() and not installing():
+            layout.operator("refgs.ask_trainer", text="Ask Again", icon="FILE_REFRESH")
+        if _asked and _asked[0].state == "failed":
+            layout.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(_asked[0].log)
+        _draw_installation(layout.box(), width)
         row = layout.row()
-        row.label(text=text, icon=icon)
-        row.operator("refgs.ask_trainer", text="Ask Again", icon="FILE_REFRESH")
-        layout.prop(self, "hdris")
+        row.enabled = not installing()
+        row.use_property_split = True
+        row.prop(self, "python", text="Or an Existing Python")
+        row = layout.row()
+        row.use_property_split = True
+        row.prop(self, "hdris")
 
 
-_asked: list[jobs.Job] = []  # the newest question to the Python that is chosen
+_asked: list[jobs.Job] = []  # the newest question to the Python that is used, or the installation, which asks as well
 
 
 def preferences() -> Preferences:
     return bpy.context.preferences.addons[PACKAGE].preferences
 
 
-def is_set_up() -> bool:
-    """Whether a Python with the trainer is chosen."""
+def set_up() -> bool:
+    """Whether there is a Python to ask."""
     addon = bpy.context.preferences.addons.get(PACKAGE)
-    return addon is not None and bool(addon.preferences.python)
+    return addon is not None and bool(addon.preferences.python or environment.installed(home()))
 
 
 def python() -> Path:
-    """The Python that has the trainer. Raises InputError where none is chosen."""
-    chosen = preferences().python
-    if not chosen:
-        raise InputError("no trainer is set up: choose its Python in the add-on's preferences")
-    return Path(bpy.path.abspath(chosen))
+    """The Python that has the trainer. Raises InputError where there is none."""
+    if preferences().python:
+        return Path(bpy.path.abspath(preferences().python))
+    if not set_up():
+        raise InputError("no trainer is set up: install it, or choose its Python, in the add-on's preferences")
+    return environment.python(home())
+
+
+def home() -> Path:
+    """Where the trainer is installed."""
+    return _folder("trainer")
 
 
 def hdri_folder() -> Path | None:
@@ -71,26 +86,57 @@ def hdri_folder() -> Path | None:
 
 
 def log_file(name: str) -> Path:
-    """Where a job's log is written, in the folder that Blender gives the add-on; temporary where it is no extension."""
+    """Where a job's log is written."""
+    return _folder("logs") / f"{name}.txt"
+
+
+def _folder(name: str) -> Path:
+    """In the folder that Blender gives the add-on, which stays as releases come and go; temporary where it is no extension."""
     try:
-        folder = bpy.utils.extension_path_user(PACKAGE, path="logs", create=True)
+        return Path(bpy.utils.extension_path_user(PACKAGE, path=name))
     except ValueError:
-        folder = bpy.app.tempdir
-    return Path(folder) / f"{name}.txt"
+        return Path(bpy.app.tempdir) / name
 
 
-def ask() -> jobs.Job | None:
-    """Ask the chosen Python for its trainer; `state` says what came of it."""
+def ask() -> None:
+    """Ask the Python that is used for its trainer; `state` says what came of it."""
+    _forget()
+    if set_up():
+        _asked.append(jobs.ask(python(), log_file("trainer")))
+        follow()
+
+
+def install() -> None:
+    """Install the trainer, or go on with that. Raises InputError where it cannot be."""
+    if reason := why_no_installation() or environment.too_full(home()):
+        raise InputError(reason)
+    _forget()
+    _asked.append(jobs.install(home(), log_file("installation")))
+    follow()
+
+
+def remove() -> None:
+    """Remove the trainer that was installed, or the half of it."""
+    if reason := _in_use():
+        raise InputError(reason)
+    _forget()
+    _asked.append(jobs.remove(home(), log_file("installation")))
+    follow()
+
+
+def stop() -> None:
+    """Stop the installation; it can be gone on with."""
+    if job := installing():
+        job.stop()
+        job.line = "Stopping …"
+
+
+def _forget() -> None:
     for job in _asked:
         job.stop()
         if job in jobs.JOBS:
             jobs.JOBS.remove(job)
     _asked.clear()
-    if not preferences().python:
-        return None
-    _asked.append(jobs.ask(python(), log_file("trainer")))
-    follow()
-    return _asked[0]
 
 
 def asked() -> list[jobs.Job]:
@@ -98,19 +144,82 @@ def asked() -> list[jobs.Job]:
     return _asked
 
 
+def installing() -> jobs.Job | None:
+    """The installation, or the removal, that is going on."""
+    return next((job for job in _asked if job.name in ("install", "remove") and not job.ended), None)
+
+
 def state() -> tuple[str, str]:
     """An icon and a line about the trainer."""
-    if not preferences().python:
-        return "INFO", "The trainer is not set up: choose the Python that it is installed in"
     job = _asked[0] if _asked else None
-    if job is None:
-        return "QUESTION", "Not asked yet"
-    if job.state == "failed":
+    if job and job.state == "failed":
         return "ERROR", job.line[0].upper() + job.line[1:]
-    if not job.ended:
-        return "SORTTIME", "Asking …"
+    if job and not job.ended:
+        what = {"install": "The trainer is being installed", "remove": "The trainer is being removed"}
+        return "SORTTIME", what.get(job.name, "Asking …")
+    if not set_up():
+        return (
+            "INFO",
+            "The trainer is not set up: install it, or choose a Python that has it",
+        )
+    if not job or not job.ready:
+        return "QUESTION", "Not asked yet"
     trains_on = job.ready["card"] or f"the processor: {job.ready['no_card']}"
     return "CHECKMARK", f"RefGS {job.ready['refgs']}, training on {trains_on}"
+
+
+def why_no_installation() -> str:
+    """Why the trainer cannot be installed now: a line for the artist, or ""."""
+    if not environment.brought():
+        return "This copy of the add-on brings no trainer to install: choose a Python that has it"
+    if preferences().python:
+        return "A Python is chosen: empty its field to install the trainer here"
+    if not bpy.app.online_access:
+        return "Installing needs the network: allow online access in Preferences > System > Network"
+    return _in_use()
+
+
+def _in_use() -> str:
+    busy = any(job not in _asked and not job.ended for job in jobs.JOBS)
+    return "The trainer is at work: wait for it, or stop it, first" if busy or installing() else ""
+
+
+def _draw_installation(box: bpy.types.UILayout, width: int) -> None:
+    if job := installing():
+        box.progress(factor=job.part, text=f"{job.part:.0%}")
+        _lines(box, job.line, width)
+        if job.name == "install":
+            box.operator("refgs.stop_installing", text="Stop", icon="CANCEL")
+        return
+    there, brought = environment.installed(home()), environment.brought()
+    begun = environment.begun(home())
+    if there:
+        _lines(
+            box,
+            f"RefGS {there} is installed" + (f", this add-on brings {brought}" if brought not in ("", there) else ""),
+            width,
+        )
+    elif begun:
+        _lines(box, "An installation was stopped halfway, and can be gone on with", width)
+    elif brought:
+        _lines(box, f"The trainer can be installed: {environment.room(home())}", width)
+    if there or begun or brought:
+        _lines(box, str(home()), width, "FILE_FOLDER")
+    row = box.row(align=True)
+    if not there or brought not in ("", there):
+        text = f"Update to {brought}" if there else "Go On Installing" if begun else "Install the Trainer"
+        row.operator("refgs.install_trainer", text=text, icon="IMPORT")
+        if reason := why_no_installation():
+            _lines(box, reason, width, "INFO")
+    if there or begun:
+        row.operator("refgs.remove_trainer", text="Remove", icon="TRASH")
+
+
+def _lines(layout: bpy.types.UILayout, text: str, width: int, icon: str = "NONE") -> None:
+    column = layout.column(align=True)
+    for line in textwrap.wrap(text, max(width, 20), break_long_words=False, break_on_hyphens=False):
+        column.label(text=line, icon=icon)
+        icon = "NONE" if icon == "NONE" else "BLANK1"
 
 
 CLASSES = (Preferences,)

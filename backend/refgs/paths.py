@@ -9,7 +9,7 @@ from refgs.errors import InputError
 
 PACKAGE = Path(__file__).resolve().parent
 ROOT = PACKAGE.parents[1]
-PRESETS = ROOT / "presets"
+PRESETS = PACKAGE / "presets" if (PACKAGE / "presets").is_dir() else ROOT / "presets"  # in a wheel, in a clone
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import bpy
 from .. import jobs
 from ..errors import InputError
 from ..follow import follow
-from ..preferences import is_set_up, log_file, python
+from ..preferences import log_file, python, set_up
 
 
 def check(scene: bpy.types.Scene) -> jobs.Job:
@@ -41,7 +41,7 @@ def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: P
 
     export_run(collection, out)
     _remember(scene, out)
-    if (out / "mesh.glb").exists() or not is_set_up():
+    if (out / "mesh.glb").exists() or not set_up():
         return None
     job = jobs.export(python(), out, log_file(out.name))
     follow()

@@ -3,12 +3,13 @@
 import bpy
 
 from .. import follow, preferences, properties
-from . import drop, export, light, materials, operators, panels, pictures, training
+from . import drop, export, light, materials, operators, panels, pictures, trainer, training
 
 CLASSES = (
     *preferences.CLASSES,
     *properties.CLASSES,
     *operators.CLASSES,
+    *trainer.CLASSES,
     *training.CLASSES,
     *panels.CLASSES,
     *materials.CLASSES,

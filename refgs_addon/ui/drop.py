@@ -6,7 +6,7 @@ import bpy
 from bpy.props import StringProperty
 
 from ..errors import InputError
-from ..preferences import is_set_up
+from ..preferences import set_up
 from ..scene import training
 from .operators import Door, import_run_folder
 
@@ -40,7 +40,7 @@ class DropCapture(_Drop, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         context.scene.refgs.capture = str(self.folder("transforms"))
-        if is_set_up():
+        if set_up():
             training.check(context.scene)
 
 

@@ -13,16 +13,6 @@ from .panels import Tab
 from .pictures import curve, picture
 
 
-class AskTrainer(Door, bpy.types.Operator):
-    bl_idname = "refgs.ask_trainer"
-    bl_label = "Ask the Trainer"
-    bl_description = "Ask the Python that is chosen in the preferences for RefGS's trainer"
-    bl_options: ClassVar = {"REGISTER"}
-
-    def work(self, context: bpy.types.Context) -> None:
-        preferences.ask()
-
-
 class CheckCapture(Door, bpy.types.Operator):
     bl_idname = "refgs.check_capture"
     bl_label = "Check"
@@ -135,7 +125,7 @@ class TrainPanel(Tab, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.refgs
         width = max(context.region.width / (7 * context.preferences.system.ui_scale) - 6, 20)  # letters
-        if not preferences.preferences().python:
+        if not preferences.set_up():
             _lines(layout.box(), preferences.state()[1], width, "INFO")
             layout.operator(
                 "preferences.addon_show", text="Preferences", icon="PREFERENCES"
@@ -152,7 +142,7 @@ class TrainPanel(Tab, bpy.types.Panel):
         column.prop(settings, "mesh")
         column.prop(settings, "out")
         row = layout.row(align=True)
-        row.enabled = bool(settings.capture and preferences.preferences().python)
+        row.enabled = bool(settings.capture and preferences.set_up())
         row.operator(CheckCapture.bl_idname, icon="VIEWZOOM")
         row.operator(Train.bl_idname, icon="PLAY")
         for number, job in enumerate(jobs.JOBS):
@@ -264,7 +254,7 @@ def _lines(layout: bpy.types.UILayout, text: str, width: float, icon: str = "NON
         line = f"{line} {word}".strip()
 
 
-CLASSES = (AskTrainer, CheckCapture, Train, Resume, Forget, Tell, Watch, PutAway, ImportTrained, TrainPanel)
+CLASSES = (CheckCapture, Train, Resume, Forget, Tell, Watch, PutAway, ImportTrained, TrainPanel)
 
 
 def register() -> None:

@@ -1,0 +1,94 @@
+"""Builds the extension as it is released: a zip a platform, with the trainer's wheel in it and uv's, which installs it.
+
+    python scripts/build_extension.py [FOLDER]      # into dist/
+
+Blender's own tool builds and validates; it is the one in Blender's Python module (`pip install -e ".[blender]"`). There is none for
+macOS on Intel, which torch is no longer built for: what `blender --command extension build` makes of the clone serves there, and
+anywhere else that the trainer is not to be installed from.
+"""
+
+import importlib.util
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+UV = "uv==0.13.9"
+PLATFORMS = {"linux-x64": "manylinux2014_x86_64", "windows-x64": "win_amd64", "macos-arm64": "macosx_11_0_arm64"}
+LARGEST = 60e6  # bytes that a zip may have
+
+
+def run(*words: str | Path) -> None:
+    """Run Python with these words, its output shown only where it fails."""
+    done = subprocess.run([sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    if done.returncode != 0:
+        sys.exit(f"{' '.join(map(str, words))}\n{done.stdout}")
+
+
+def blender_tool() -> Path:
+    """Blender's tool for extensions."""
+    bpy = importlib.util.find_spec("bpy")
+    if bpy is None:
+        sys.exit('Blender\'s Python module is missing: pip install -e ".[blender]"')
+    return next(Path(bpy.origin).parent.glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py"))
+
+
+def build_trainer(source: Path, wheels: Path) -> None:
+    """The trainer's wheel, from a copy, where no leftovers of another build are; it has the presets inside."""
+    shutil.copytree(ROOT / "backend", source / "backend", ignore=shutil.ignore_patterns("*.egg-info", "__pycache__"))
+    shutil.copytree(ROOT / "presets", source / "backend" / "refgs" / "presets")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    run("-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", wheels, source)
+
+
+def stage(folder: Path, wheels: Path) -> None:
+    """The extension as a folder: the clone's, with the wheels, which its manifest then tells of."""
+    shutil.copytree(ROOT / "refgs_addon", folder / "refgs_addon", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("__init__.py", "LICENSE"):
+        shutil.copy(ROOT / name, folder)
+    shutil.copytree(wheels, folder / "wheels")
+    # Blender unpacks the wheels that are listed into its own Python: uv's, not the trainer's, which needs torch.
+    listed = sorted(f"./wheels/{file.name}" for file in wheels.glob("uv-*.whl"))
+    manifest = (ROOT / "blender_manifest.toml").read_text(encoding="utf-8")
+    first_table = manifest.index("\n[") + 1
+    lines = f"platforms = {list(PLATFORMS)}\nwheels = {listed}\n\n"
+    manifest = manifest[:first_table] + lines + manifest[first_table:]
+    manifest = manifest.replace(
+        '    "!/refgs_addon/",\n', '    "!/refgs_addon/",\n    "!/wheels/",\n    "/wheels/uv-*",\n'
+    )
+    assert tomllib.loads(manifest)["wheels"] == listed
+    (folder / "blender_manifest.toml").write_text(manifest, encoding="utf-8")
+
+
+def main() -> None:
+    out = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "dist")
+    out.mkdir(parents=True, exist_ok=True)
+    tool = blender_tool()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        wheels = folder / "wheels"
+        for tag in PLATFORMS.values():
+            only = ("--only-binary", ":all:", "--platform", tag)
+            run("-m", "pip", "download", "--quiet", "--no-deps", *only, "--dest", wheels, UV)
+        build_trainer(folder / "trainer", wheels)
+        stage(folder / "extension", wheels)
+        built = folder / "built"
+        built.mkdir()
+        run(tool, "build", "--source-dir", folder / "extension", "--output-dir", built, "--split-platforms")
+        for archive in sorted(built.glob("*.zip")):
+            run(tool, "validate", archive)
+            size = archive.stat().st_size
+            if size > LARGEST:
+                sys.exit(
+                    f"{archive.name} has {size / 1e6:.1f} MB, more than the {LARGEST / 1e6:.0f} that a zip may have"
+                )
+            shutil.copy(archive, out)
+            print(f"{out / archive.name}: {size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,175 @@
+"""Installing the trainer and removing it, by a uv that only speaks as one."""
+
+import json
+import os
+import signal
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from refgs_addon import environment, jobs
+from tests.addon.bring import bring
+from tests.addon.waiting import until
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is a script that Windows does not start")
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    """Where to install, with an add-on that brings a trainer and the fake uv."""
+    monkeypatch.setattr(environment, "WHEELS", bring(tmp_path))
+    yield tmp_path / "user" / "trainer"
+    jobs.stop_all()
+
+
+def install(home):
+    return jobs.install(home, home.parent / "logs" / "installation.txt")
+
+
+def ended(job):
+    until(lambda: job.ended)
+    assert job._process.wait(timeout=20) is not None
+    return job.state, job.line
+
+
+def calls(home):
+    return [json.loads(line) for line in (home.parent / "uv calls").read_text().splitlines()]
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return "(zombie)" not in Path(f"/proc/{pid}/status").read_text() if Path("/proc").is_dir() else True
+
+
+def test_an_installation_to_its_end(home, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", "/nowhere")
+    monkeypatch.setenv("UV_DEFAULT_INDEX", "mirror")
+    assert environment.brought() == "9.9" and not environment.installed(home) and not environment.begun(home)
+    job = install(home)
+    assert ended(job)[0] == "done" and job.ready["refgs"] == "9.9"
+    assert environment.installed(home) == "9.9" and environment.python(home).is_file()
+    until(lambda: not (home / "cache").exists())
+    assert not (home / "uv").exists() and not environment.begun(home)
+    make, fill = calls(home)
+    assert make["words"][-4:] == ["venv", "--python", environment.PYTHONS, str(home / "env")]
+    assert fill["words"][-1].endswith("refgs-9.9-py3-none-any.whl") and "--no-build" in fill["words"]
+    variables = fill["variables"]
+    assert variables["UV_DEFAULT_INDEX"] == "mirror" and variables["UV_TORCH_BACKEND"] == "auto"
+    assert variables["UV_PYTHON_PREFERENCE"] == "only-managed" and "PYTHONPATH" not in variables
+    assert "torch==2.14.0" in job.log.read_text()
+    asked = jobs.ask(environment.python(home), home.parent / "logs" / "trainer.txt")
+    assert ended(asked)[0] == "done"
+
+
+def test_what_the_studio_has_set_stays(home, monkeypatch):
+    monkeypatch.setenv("UV_TORCH_BACKEND", "")
+    monkeypatch.setenv("UV_NO_MANAGED_PYTHON", "1")
+    ended(install(home))
+    variables = calls(home)[-1]["variables"]
+    assert "UV_TORCH_BACKEND" not in variables and "UV_PYTHON_PREFERENCE" not in variables
+
+
+def test_progress_stopping_and_going_on(home, monkeypatch):
+    monkeypatch.setenv("FAKE_UV", "hang")
+    job = install(home)
+    until(lambda: job.part > 0)
+    assert job.line.startswith("Fetching torch (850.5MiB) and 1 more: 0.1 of about ") and 0.005 < job.part < 0.03
+    job.stop()
+    assert ended(job) == ("cancelled", "Stopped")
+    until(lambda: not alive(calls(home)[-1]["pid"]))
+    assert environment.begun(home) and not environment.installed(home) and (home / "cache" / "torch").exists()
+    monkeypatch.delenv("FAKE_UV")
+    half = home / "env" / "half"
+    half.touch()
+    assert ended(install(home))[0] == "done" and environment.installed(home) == "9.9" and not half.exists()
+
+
+@pytest.mark.parametrize("how", ["Blender", "the process"])
+def test_killed_in_the_middle(home, monkeypatch, how):
+    monkeypatch.setenv("FAKE_UV", "hang")
+    job = install(home)
+    until(lambda: job.part > 0)
+    if how == "Blender":  # of whose end the process hears as its input ends
+        job._process.stdin.close()
+    else:
+        job._process.send_signal(signal.SIGKILL)
+    state, line = ended(job)
+    assert state == "failed" and "its log says more" in line
+    uv = calls(home)[-1]["pid"]
+    if how == "Blender":
+        until(lambda: not alive(uv))
+    else:
+        os.kill(uv, signal.SIGKILL)
+    assert environment.begun(home)
+    monkeypatch.delenv("FAKE_UV")
+    assert ended(install(home))[0] == "done"
+
+
+@pytest.mark.parametrize(
+    "fate, line",
+    [
+        (
+            "network",
+            "wheels.example cannot be reached: see to the connection, or have the firewall allow it, and go on",
+        ),
+        ("full", "the disk that {home} is on is full: free some of it and go on"),
+        ("mute", "all is installed, but the trainer does not start on this machine: the log says why"),
+    ],
+)
+def test_what_fails_is_said_in_one_line(home, monkeypatch, fate, line):
+    monkeypatch.setenv("FAKE_UV", fate)
+    job = install(home)
+    assert ended(job) == ("failed", line.format(home=home)) and job.log.stat().st_size > 0
+    assert environment.begun(home)
+
+
+def test_what_else_uv_may_say():
+    assert "none of for this machine" in environment.explain(
+        "error: No solution found when resolving\n cause: torch", "/a"
+    )
+    assert environment.explain("error: Access is denied. (os error 5)", "/a").startswith("/a cannot be written to")
+    assert environment.explain("error: something else", "/a") == ""
+
+
+def test_a_newer_release_goes_into_what_is_there(home, tmp_path, monkeypatch):
+    ended(install(home))
+    kept = home / "env" / "torch"
+    kept.touch()
+    monkeypatch.setattr(environment, "WHEELS", bring(tmp_path, "9.10"))
+    assert environment.installed(home) == "9.9" and environment.brought() == "9.10"
+    assert ended(install(home))[0] == "done" and environment.installed(home) == "9.10" and kept.exists()
+
+
+def test_removing(home):
+    ended(install(home))
+    job = jobs.remove(home, home.parent / "logs" / "installation.txt")
+    assert ended(job)[0] == "done" and not home.exists() and not environment.installed(home)
+    assert ended(jobs.remove(home, job.log))[0] == "done"
+
+
+def test_a_disk_that_is_too_full(home, monkeypatch):
+    assert environment.free(home) > 0  # of the folder above, while there is none yet
+    monkeypatch.setattr(environment, "free", lambda home: 1.2e9)
+    monkeypatch.setattr(environment.shutil, "which", lambda name: None)
+    said = environment.too_full(home)
+    assert str(home) in said and "it needs about 2 GB; 1 GB are free" in said
+    monkeypatch.setattr(environment, "size", lambda folder: 1e9)  # half of it is here already
+    assert environment.too_full(home) == ""
+    monkeypatch.setattr(environment.shutil, "which", lambda name: f"/bin/{name}")
+    assert "it needs about 7 GB" in environment.too_full(home)
+
+
+def test_a_clone_brings_no_trainer(monkeypatch, tmp_path):
+    monkeypatch.setattr(environment, "WHEELS", tmp_path)
+    assert environment.brought() == ""
+
+
+def test_the_pythons_are_those_of_the_package():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["requires-python"] == environment.PYTHONS

@@ -1,0 +1,93 @@
+"""The preferences: the trainer is installed, stopped, gone on with, used and removed by buttons, with a uv that only speaks as one."""
+
+import sys
+
+import bpy
+import pytest
+
+from refgs_addon import environment, jobs, preferences, ui
+from refgs_addon.errors import InputError
+from tests.addon.bring import bring
+from tests.addon.waiting import until
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is a script that Windows does not start")
+
+
+@pytest.fixture
+def online(scene, tmp_path, monkeypatch):
+    """The add-on, enabled, with a trainer to install, a folder of its own, and leave to use the network."""
+    monkeypatch.setattr(environment, "WHEELS", bring(tmp_path))
+    monkeypatch.setattr(preferences, "_folder", lambda name: tmp_path / name)
+    enabled = bpy.context.preferences.addons.new()
+    enabled.module = preferences.PACKAGE
+    ui.register()
+    bpy.context.preferences.system.use_online_access = True
+    yield
+    ui.unregister()
+    bpy.context.preferences.addons.remove(enabled)
+
+
+def test_installed_used_and_removed(online):
+    assert "not set up" in preferences.state()[1] and not preferences.set_up()
+    assert bpy.ops.refgs.install_trainer() == {"FINISHED"}
+    assert preferences.state() == ("SORTTIME", "The trainer is being installed")
+    assert not bpy.ops.refgs.install_trainer.poll()
+    job = preferences.installing()
+    until(lambda: job.ended)
+    assert preferences.state() == ("CHECKMARK", "RefGS 9.9, training on the processor: it is a fake")
+    assert preferences.set_up() and preferences.python() == environment.python(preferences.home())
+    bpy.ops.refgs.ask_trainer()
+    until(lambda: preferences.asked()[0].ended)
+    assert preferences.state()[0] == "CHECKMARK"
+    assert bpy.ops.refgs.remove_trainer() == {"FINISHED"}
+    until(lambda: not preferences.installing())
+    assert "not set up" in preferences.state()[1] and not preferences.home().exists()
+
+
+def test_stopped_and_gone_on_with(online, monkeypatch):
+    monkeypatch.setenv("FAKE_UV", "hang")
+    bpy.ops.refgs.install_trainer()
+    job = preferences.installing()
+    until(lambda: job.part > 0)
+    bpy.ops.refgs.stop_installing()
+    until(lambda: job.ended)
+    assert job.state == "cancelled" and environment.begun(preferences.home()) and "not set up" in preferences.state()[1]
+    monkeypatch.setenv("FAKE_UV", "network")
+    bpy.ops.refgs.install_trainer()
+    until(lambda: not preferences.installing())
+    assert preferences.state()[0] == "ERROR" and "Wheels.example cannot be reached" in preferences.state()[1]
+    monkeypatch.delenv("FAKE_UV")
+    bpy.ops.refgs.install_trainer()
+    until(lambda: not preferences.installing())
+    assert preferences.state()[0] == "CHECKMARK"
+
+
+def test_why_it_cannot_be_installed(online, python, monkeypatch, tmp_path):
+    assert bpy.ops.refgs.install_trainer.poll() and not preferences.why_no_installation()
+    bpy.context.preferences.system.use_online_access = False
+    assert not bpy.ops.refgs.install_trainer.poll() and "allow online access" in preferences.why_no_installation()
+    bpy.context.preferences.system.use_online_access = True
+    preferences.preferences().python = str(python)
+    assert not bpy.ops.refgs.install_trainer.poll() and "A Python is chosen" in preferences.why_no_installation()
+    preferences.preferences().python = ""
+    (tmp_path / "photos").mkdir()
+    jobs.train(python, tmp_path / "photos", tmp_path / "run", tmp_path / "log.txt")
+    assert not bpy.ops.refgs.install_trainer.poll() and "at work" in preferences.why_no_installation()
+    with pytest.raises(InputError, match="at work"):
+        preferences.remove()
+    jobs.stop_all()
+    monkeypatch.setattr(environment, "free", lambda home: 1e9)
+    with pytest.raises(RuntimeError, match=r"too full \(it needs about"):
+        bpy.ops.refgs.install_trainer()
+    monkeypatch.setattr(environment, "WHEELS", tmp_path)
+    assert not bpy.ops.refgs.install_trainer.poll() and "brings no trainer" in preferences.why_no_installation()
+
+
+def test_taken_away_while_it_installs(online, monkeypatch):
+    monkeypatch.setenv("FAKE_UV", "hang")
+    bpy.ops.refgs.install_trainer()
+    job = preferences.installing()
+    until(lambda: job.part > 0)
+    ui.unregister()
+    assert job._process.wait(timeout=20) == 1 and not environment.installed(preferences.home())
+    ui.register()

@@ -1,0 +1,76 @@
+"""What is released: zips that bring the trainer and what installs it, and that installation. It fetches gigabytes."""
+
+import platform
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from refgs_addon import environment, jobs
+from tests.addon.waiting import until
+
+pytest.importorskip("bpy", reason="the extension is built with the tool in Blender's Python module")
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).resolve().parents[1]
+NAMES = {("Linux", "x86_64"): "linux_x64", ("Windows", "AMD64"): "windows_x64", ("Darwin", "arm64"): "macos_arm64"}
+
+
+@pytest.fixture(scope="module")
+def archives(tmp_path_factory):
+    """The zips, built and validated, by their platforms."""
+    out = tmp_path_factory.mktemp("dist")
+    subprocess.run([sys.executable, ROOT / "scripts" / "build_extension.py", out], check=True)
+    return {archive.stem.split("-")[-1]: archive for archive in out.glob("*.zip")}
+
+
+@pytest.fixture
+def archive(archives):
+    """This platform's."""
+    name = NAMES.get((platform.system(), platform.machine()))
+    if name is None:
+        pytest.skip("there is no zip for this platform")
+    return archives[name]
+
+
+def test_the_zips(archives):
+    code = {str(path.relative_to(ROOT)) for path in (ROOT / "refgs_addon").rglob("*.py")}
+    assert set(archives) == set(NAMES.values())
+    for archive in archives.values():
+        names = set(zipfile.ZipFile(archive).namelist())
+        wheels = sorted(name.split("-")[0] for name in names if name.endswith(".whl"))
+        assert wheels == ["wheels/refgs", "wheels/uv"]
+        assert {name for name in names if not name.endswith(".whl")} == code | {
+            "__init__.py", "blender_manifest.toml", "LICENSE",
+        }  # fmt: skip
+
+
+@pytest.mark.timeout(3000)
+def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
+    """By the real uv, with a Python of this machine's and torch from the package index, which is all that a mirror may have."""
+    monkeypatch.setenv("UV_PYTHON_PREFERENCE", "only-system")
+    monkeypatch.setenv("UV_TORCH_BACKEND", "")
+    zipfile.ZipFile(archive).extractall(tmp_path / "extension")
+    monkeypatch.setattr(environment, "WHEELS", tmp_path / "extension" / "wheels")
+    home = tmp_path / "user folder" / "trainer"
+    job, lines = jobs.install(home, tmp_path / "log.txt"), []
+
+    def done():
+        if job.line and job.line not in lines:
+            lines.append(job.line)
+        return job.ended
+
+    until(done, seconds=2900)
+    assert job.state == "done", job.line + "\n" + job.log.read_text()[-3000:]
+    print("\n".join(lines), f"\n{environment.size(home) / environment.GB:.2f} GB")
+    assert job.ready["refgs"] == environment.brought() == environment.installed(home)
+    assert any(line.startswith("Fetching ") for line in lines)
+    asked = jobs.ask(environment.python(home), tmp_path / "asked.txt")
+    until(lambda: asked.ended, seconds=200)
+    assert asked.state == "done" and asked.ready == job.ready
+    program = "from refgs.settings import load_settings; print(load_settings('quick').train.iterations)"
+    subprocess.run([environment.python(home), "-E", "-c", program], check=True, cwd=tmp_path)
+    removed = jobs.remove(home, tmp_path / "removed.txt")
+    until(lambda: removed.ended, seconds=200)
+    assert removed.state == "done" and not home.exists()
