@@ -1,9 +1,6 @@
-"""A second Blender, without a window, that renders a copy of the file: it speaks as the trainer's process does (docs/job-protocol.md).
-
-    blender --background COPY.blend --python-expr "import sys; sys.path.insert(0, FOLDER); import refgs_addon.background as b; b.main()"
-
-takes one command, {"command": "render", "png": …, "hdris": […], "size": …, "samples": …}: a contact sheet under these lights, or
-the scene camera's view where there are none. It ends when its input does, so when the Blender that started it does.
+"""A second Blender, without a window, that renders a copy of the file; `scene.beside` starts it. It speaks as the trainer's process does
+(docs/job-protocol.md), and takes one command, {"command": "render", "png": …, "hdris": […], "size": …, "samples": …}: a contact sheet
+under these lights, or the scene camera's view where there are none. It ends when its input does, so when the Blender that started it does.
 """
 
 import json
@@ -63,10 +60,3 @@ def _render(command: dict, say) -> None:
 def _end_with_input() -> None:
     sys.stdin.read()
     os._exit(1)
-
-
-if __name__ == "__main__":  # with Blender as a Python module: python -m refgs_addon.background COPY.blend
-    import bpy
-
-    bpy.ops.wm.open_mainfile(filepath=sys.argv[1])
-    main()

@@ -19,6 +19,7 @@ from . import environment
 from .errors import InputError
 
 PROTOCOL = 1
+TRAINER, BLENDER = "the trainer", "Blender"  # the programs that jobs are done by
 ENDED = ("done", "cancelled", "failed")
 
 
@@ -36,6 +37,7 @@ class Job:
     log: Path
     run: Path | None = None  # the folder that is trained into; such jobs run one at a time
     words: tuple[str, ...] = ("-E", "-m", "refgs.cli", "worker")  # that start it in that Python
+    program: str = TRAINER
     state: str = "waiting"
     line: str = ""  # what is being done; at the end, what was wrong
     part: float = 0.0  # how much of it is done, where that is said with the line
@@ -157,7 +159,7 @@ class Job:
         elif self._stopped and not self.ended:
             self.state, self.line = "cancelled", "Stopped"
         elif not self.ended:
-            self._fail(f"the trainer ended unexpectedly (status {status}): its log says more")
+            self._fail(f"{self.program} ended unexpectedly (status {status}): its log says more")
 
     def stop(self) -> None:
         """End cleanly: a training with a checkpoint, after its iteration."""
@@ -244,6 +246,11 @@ def train(
 def export(python: Path, run: Path, log: Path) -> Job:
     """Make the mesh and the textures of a run, after the jobs that wait already."""
     return _add(Job(run.name, python, [{"command": "export", "run": str(run)}], log, run))
+
+
+def render(blender: Path, words: tuple[str, ...], command: Mapping[str, object], log: Path) -> Job:
+    """Have another Blender render, as `background.main` says, beside whatever else runs; the picture is `results["render"]["png"]`."""
+    return _add(Job(Path(command["png"]).name, blender, [dict(command)], log, words=words, program=BLENDER))
 
 
 def _add(job: Job) -> Job:

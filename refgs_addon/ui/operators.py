@@ -8,10 +8,13 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 from bpy_extras.io_utils import ExportHelper
 
 from ..errors import InputError
+from ..preferences import hdri_folder
+from ..scene.beside import render_beside
 from ..scene.cameras import PHOTO, next_camera, photo_shown, show_photo
 from ..scene.parts import active_run, show
 from ..scene.preview import render_preview
 from ..scene.regions import crop
+from ..scene.relight import hdris
 from ..scene.turntable import add_turntable
 
 
@@ -154,22 +157,52 @@ class Turntable(Door, bpy.types.Operator):
         add_turntable(context.scene, active_run(context), self.seconds)
 
 
-class RenderPreview(Door, ExportHelper, bpy.types.Operator):
-    bl_idname = "refgs.render_preview"
-    bl_label = "Render Preview"
-    bl_description = "Render the scene camera's view in Eevee to a PNG with a transparent background"
-    bl_options: ClassVar = {"REGISTER"}
+class _Render(Door, ExportHelper):
+    """Renders in another Blender; where this one has no window, in this one."""
 
+    bl_options: ClassVar = {"REGISTER"}
     filename_ext = ".png"
     filter_glob: StringProperty(default="*.png", options={"HIDDEN"})
-    size: IntProperty(name="Size", description="Longer side in pixels; 0 keeps the photo's", default=0, min=0, max=8192)
     samples: IntProperty(name="Samples", default=64, min=1, max=4096)
 
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("The scene has no camera: import a run, or add one")
+        return context.scene.camera is not None
+
+
+class RenderPreview(_Render, bpy.types.Operator):
+    bl_idname = "refgs.render_preview"
+    bl_label = "Render Preview"
+    bl_description = (
+        "Render the scene camera's view in Eevee to a PNG with a transparent background, while Blender stays free"
+    )
+
+    size: IntProperty(name="Size", description="Longer side in pixels; 0 keeps the photo's", default=0, min=0, max=8192)
+
     def work(self, context: bpy.types.Context) -> None:
-        render_preview(
-            context.scene, Path(bpy.path.abspath(self.filepath)), size=self.size or None, samples=self.samples
-        )
-        self.report({"INFO"}, f"Wrote {self.filepath}")
+        png, size = Path(bpy.path.abspath(self.filepath)), self.size or None
+        if bpy.app.background:
+            render_preview(context.scene, png, size=size, samples=self.samples)
+        else:
+            render_beside(context.scene, png, size=size, samples=self.samples)
 
 
-CLASSES = (ImportRun, ShowPart, Crop, NextCamera, Photo, Turntable, RenderPreview)
+class ContactSheet(_Render, bpy.types.Operator):
+    bl_idname = "refgs.contact_sheet"
+    bl_label = "Contact Sheet"
+    bl_description = "Render the view under the recovered light and all HDRIs at hand, side by side on one PNG"
+
+    size: IntProperty(name="Size", description="Longer side of each in pixels", default=256, min=16, max=2048)
+
+    def work(self, context: bpy.types.Context) -> None:
+        png, lights = Path(bpy.path.abspath(self.filepath)), hdris(hdri_folder())
+        if bpy.app.background:
+            from ..scene.sheet import contact_sheet
+
+            contact_sheet(context.scene, png, lights, self.size, self.samples)
+        else:
+            render_beside(context.scene, png, lights, self.size, self.samples)
+
+
+CLASSES = (ImportRun, ShowPart, Crop, NextCamera, Photo, Turntable, RenderPreview, ContactSheet)

@@ -1,12 +1,15 @@
 """The RefGS tab in the 3D viewport's sidebar."""
 
+from pathlib import Path
+
 import bpy
 
-from .. import compat
+from .. import compat, jobs
 from ..nodes.splats import NAME as MODIFIER
 from ..scene.cameras import photo_shown
 from ..scene.parts import parts
 from . import operators
+from .pictures import thumbnail
 
 
 class Tab:
@@ -68,6 +71,24 @@ class PreviewPanel(Tab, bpy.types.Panel):
             row.prop(camera.data.background_images[0], "alpha", text="")
         layout.operator(operators.Turntable.bl_idname, icon="FILE_REFRESH")
         layout.operator(operators.RenderPreview.bl_idname, icon="RENDER_STILL")
+        layout.operator(operators.ContactSheet.bl_idname, icon="IMGDISPLAY")
+        for number, job in enumerate(jobs.JOBS):
+            if job.program == jobs.BLENDER:
+                self._render(layout.box(), number, job)
+
+    def _render(self, box: bpy.types.UILayout, number: int, job: jobs.Job) -> None:
+        row = box.row()
+        row.label(text=job.name, icon={"done": "CHECKMARK", "failed": "ERROR"}.get(job.state, "SORTTIME"))
+        row.operator("refgs.put_away", text="", icon="X", emboss=False).number = number
+        if job.state == "done":
+            png = job.results["render"]["png"]
+            box.template_icon(icon_value=thumbnail(Path(png)), scale=10)
+            box.operator("wm.path_open", text="Open", icon="IMAGE_DATA").filepath = png
+        elif job.state == "failed":
+            box.label(text=job.line)
+            box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
+        else:
+            box.progress(factor=job.part, text=job.line)
 
 
 CLASSES = (RunPanel, PreviewPanel)

@@ -96,14 +96,17 @@ class Watch(Door, bpy.types.Operator):
 class PutAway(Door, bpy.types.Operator):
     bl_idname = "refgs.put_away"
     bl_label = "Put Away"
-    bl_description = "Do not show this any longer"
+    bl_description = "Do not show this any longer; what is still being done is stopped first"
     bl_options: ClassVar = {"REGISTER"}
 
     number: IntProperty(name="Number", description="Of the job in the list")
 
     def work(self, context: bpy.types.Context) -> None:
-        if jobs.JOBS[self.number].ended:
-            del jobs.JOBS[self.number]
+        job = jobs.JOBS[self.number]
+        if job.ended:
+            jobs.JOBS.remove(job)
+        else:
+            job.stop()
 
 
 class ImportTrained(Door, bpy.types.Operator):
@@ -146,7 +149,7 @@ class TrainPanel(Tab, bpy.types.Panel):
         row.operator(CheckCapture.bl_idname, icon="VIEWZOOM")
         row.operator(Train.bl_idname, icon="PLAY")
         for number, job in enumerate(jobs.JOBS):
-            if job not in preferences.asked():
+            if job.program == jobs.TRAINER and job not in preferences.asked():
                 _job(layout.box(), number, job, width)
         for known in settings.runs:
             if not any(job.run == Path(known.folder) for job in jobs.JOBS):
