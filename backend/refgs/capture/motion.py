@@ -25,12 +25,8 @@ from refgs.capture.images import read_header
 from refgs.errors import InputError
 
 SIDE = 1600  # pixels: photos are reduced to this for finding features; presets train on fewer
-ALL_PAIRS = (
-    150  # photos, of which each is compared with each other; of more only those that are near in order, and some
-)
-CAMERA_MODEL = (
-    "RADIAL"  # square pixels: with few photos, two focal lengths and more of the lens turn the cameras to fit noise
-)
+ALL_PAIRS = 150  # photos: up to so many, each is compared with each other
+CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential distortion only fit noise
 SEED = 1
 
 
@@ -53,7 +49,7 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
     work = folder / "sparse.tmp"
     work.mkdir(exist_ok=True)
     database = work / f"{_digest(photos)}.db"
-    for path in work.iterdir():  # of other photos, or half written
+    for path in list(work.iterdir()):  # of other photos, or half written
         if not path.name.startswith(database.name):
             _remove(path)
     model = work / "0"
@@ -68,7 +64,7 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
         names = ", ".join(missing[:5]) + (" …" if len(missing) > 5 else "")
         what = f"{len(missing)} of {len(photos)} photos could not be placed and are left out: {names}; more photos between them help"
         report("warning", {"what": what})
-    for path in work.glob(f"{database.name}*"):
+    for path in list(work.glob(f"{database.name}*")):
         _remove(path)
     work.rename(folder / "sparse")
     return {"placed": len(placed), "photos": len(photos), "error": error}
