@@ -24,7 +24,7 @@ def _look() -> float | None:
     if _since_look >= LOOK:
         _since_look = 0.0
         for job in jobs.JOBS:
-            if job.state == "running" and job.progress and "train" not in job.results:
+            if job.run and job.state == "running" and job.progress and "train" not in job.results:
                 job.tell("preview")
     live.update()
     if changed:

@@ -46,6 +46,7 @@ class Job:
     preview: dict = field(default_factory=dict)
     ready: dict = field(default_factory=dict)
     results: dict[str, dict] = field(default_factory=dict)  # "done" events by their jobs
+    no_cameras: bool = False  # it failed because the capture has photos but no cameras: `poses` finds them
     curve: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR
     _stopped: bool = False
     _asked_only: bool = False
@@ -120,7 +121,8 @@ class Job:
                 self.warnings.append(event["what"])
             case "progress":
                 self.progress, self.line = event, ""
-                self.curve.append((event["seconds"], event["psnr"]))
+                if "stage" not in event:  # of a training
+                    self.curve.append((event["seconds"], event["psnr"]))
             case "preview":
                 self.preview = event
             case "paused" | "resumed" as which:
@@ -136,6 +138,7 @@ class Job:
                 self.state, self.line = "cancelled", f"Stopped at iteration {event['iteration']:,}"
                 self._close()
             case "failed":
+                self.no_cameras = event.get("no_cameras", False)
                 self._fail(event["what"])
 
     def _next(self) -> None:
@@ -187,6 +190,12 @@ JOBS: list[Job] = []
 def check(python: Path, capture: Path, log: Path) -> Job:
     """Have a capture read, beside whatever else runs. The lines about it are in `results["check"]["lines"]`."""
     return _add(Job(capture.name, python, [{"command": "check", "capture": str(capture)}], log))
+
+
+def poses(python: Path, capture: Path, log: Path) -> Job:
+    """Have the cameras of a folder's photos found, then have it read as `check` does, beside whatever else runs."""
+    commands = [{"command": "poses", "capture": str(capture)}, {"command": "check", "capture": str(capture)}]
+    return _add(Job(capture.name, python, commands, log))
 
 
 def ask(python: Path, log: Path) -> Job:

@@ -14,7 +14,7 @@ class KnownRun(bpy.types.PropertyGroup):
 class Training(bpy.types.PropertyGroup):
     capture: StringProperty(
         name="Capture",
-        description="The folder with the photos and their cameras: NeRF-Blender, nerfstudio or COLMAP",
+        description="The folder with the photos, and their cameras if there are any: NeRF-Blender, nerfstudio or COLMAP",
         subtype="DIR_PATH",
     )
     out: StringProperty(

@@ -8,6 +8,8 @@ import threading
 import time
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 SMALL = [
@@ -77,7 +79,11 @@ def test_jobs_one_after_another(talk, ball_capture, tmp_path):
     assert any("28" in line for line in talk.until("done")["lines"])
     failed = talk.until("failed")
     assert (
-        failed["job"] == "check" and not failed["fault"] and "nothing" in failed["what"] and "\n" not in failed["what"]
+        failed["job"] == "check"
+        and not failed["no_cameras"]
+        and not failed["fault"]
+        and "nothing" in failed["what"]
+        and "\n" not in failed["what"]
     )
     assert talk.until("progress").keys() >= {"iteration", "total", "seconds_left", "loss", "psnr", "splats"}
     wrong = [event["what"] for event in talk.heard if event["event"] == "warning"]
@@ -120,6 +126,24 @@ def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture
     assert talk.end() == 0
     ended = talk.until("cancelled")
     assert (run / "checkpoints" / f"{ended['iteration']:08d}.toml").exists(), list((run / "checkpoints").iterdir())
+
+
+def test_photos_without_cameras(talk, tmp_path):
+    """They are told from a folder without photos; finding their cameras can be left, and begun again."""
+    for number in range(4):
+        cv2.imwrite(
+            str(tmp_path / f"{number}.png"), np.random.default_rng(number).integers(0, 255, (96, 128, 3), np.uint8)
+        )
+    talk.tell("check", capture=str(tmp_path))
+    assert talk.until("failed")["no_cameras"]
+    talk.tell("poses", capture=str(tmp_path))
+    assert talk.until("progress") == {"event": "progress", "stage": "features", "done": 0, "total": 4}
+    failed = talk.until("failed")
+    assert failed["job"] == "poses" and "0 of 4 photos" in failed["what"] and not failed["fault"]
+    talk.tell("poses", capture=str(tmp_path))
+    talk.until("progress")
+    talk.end()
+    assert not (tmp_path / "sparse").exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")

@@ -27,6 +27,14 @@ def check(capture: Annotated[Path, typer.Argument(help="a folder with photos and
 
 
 @app.command()
+def poses(photos: Annotated[Path, typer.Argument(help="a folder with photos, in it or in its images")]) -> None:
+    """Find where photos were taken from; writes PHOTOS/sparse/0, which makes them a capture."""
+    from refgs import commands
+
+    commands.poses(photos)
+
+
+@app.command()
 def train(
     capture: Annotated[Path, typer.Argument(help="a folder with photos and cameras")],
     out: Annotated[Path, typer.Option(help="the run folder to make")],

@@ -44,6 +44,24 @@ def say(event: str, facts: dict) -> None:
     console.print(("warning: " if event == "warning" else "") + facts["what"])
 
 
+def poses(folder: Path) -> None:
+    """Find the cameras of photos; what is interrupted goes on when it is started again."""
+    from refgs.capture.motion import find_cameras
+
+    with progress_bar("finding cameras", 1) as bar:
+
+        def report(event: str, facts: dict) -> None:
+            if event == "progress":
+                bar(facts["done"], facts["stage"], facts["total"])
+            else:
+                say(event, facts)
+
+        found = find_cameras(folder, report)
+    console.print(
+        f"{found['placed']} of {found['photos']} photos placed, to {found['error']:.2f} pixels: {folder / 'sparse' / '0'}"
+    )
+
+
 def train(
     capture_folder: Path, out: Path, preset: str, device: str, minutes: float | None, changes: list[str], resume: bool
 ) -> None:

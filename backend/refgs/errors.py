@@ -7,3 +7,7 @@ class InputError(Exception):
     The message is one line for the artist: what is wrong, where, what to do. The command line prints it alone and ends
     with exit status 2; any other exception is our fault and ends with status 1 and a traceback in log.txt.
     """
+
+
+class NoCameras(InputError):
+    """A folder holds photos, but nothing that says where they were taken from: `refgs.capture.motion` can find it."""

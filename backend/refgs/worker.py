@@ -18,7 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from refgs import __version__, jobs
 from refgs.capture import read_capture
 from refgs.capture.check import describe
-from refgs.errors import InputError
+from refgs.capture.motion import find_cameras
+from refgs.errors import InputError, NoCameras
 from refgs.kernels import cuda
 from refgs.train.preview import write_preview
 from refgs.train.trainer import Trainer
@@ -32,6 +33,11 @@ class _Command(BaseModel):
 
 class Check(_Command):
     command: Literal["check"]
+    capture: str
+
+
+class Poses(_Command):
+    command: Literal["poses"]
     capture: str
 
 
@@ -59,7 +65,7 @@ class During(_Command):
     command: Literal["preview", "pause", "resume", "stop", "cancel"]
 
 
-COMMANDS = TypeAdapter(Annotated[Check | Train | Export | During, Field(discriminator="command")])
+COMMANDS = TypeAdapter(Annotated[Check | Poses | Train | Export | During, Field(discriminator="command")])
 CLOSED = None  # in place of a command: there will be no more of them
 
 
@@ -107,7 +113,7 @@ class Worker:
         why = cuda.unusable()
         card = torch.cuda.get_device_name() if why is None else None
         self.say("ready", {"protocol": PROTOCOL, "refgs": __version__, "card": card, "no_card": why})
-        jobs_of = {Check: self._check, Train: self._train, Export: self._export}
+        jobs_of = {Check: self._check, Poses: self._poses, Train: self._train, Export: self._export}
         while self._open:
             command = self._waiting.pop(0) if self._waiting else self._commands.get()
             if command is CLOSED:
@@ -123,7 +129,7 @@ class Worker:
         try:
             event, facts = job(command)
         except InputError as error:
-            event, facts = "failed", {"what": str(error), "fault": False}
+            event, facts = "failed", {"what": str(error), "fault": False, "no_cameras": isinstance(error, NoCameras)}
         except Exception as error:
             traceback.print_exc()
             event, facts = "failed", {"what": f"a fault of ours: {type(error).__name__}: {error}", "fault": True}
@@ -134,6 +140,9 @@ class Worker:
     def _check(self, command: Check) -> tuple[str, dict]:
         lines = describe(read_capture(Path(command.capture)))
         return "done", {"lines": lines}
+
+    def _poses(self, command: Poses) -> tuple[str, dict]:
+        return "done", find_cameras(Path(command.capture), self.say)
 
     def _train(self, command: Train) -> tuple[str, dict]:
         out = Path(command.out)

@@ -18,6 +18,15 @@ def check(scene: bpy.types.Scene) -> jobs.Job:
     return job
 
 
+def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
+    """Have the cameras of the scene's photos found, in place of what said that they are missing; then the capture is read."""
+    capture = _capture(scene)
+    job = jobs.poses(python(), capture, log_file(f"cameras {capture.name}"))
+    jobs.JOBS[:] = [known for known in jobs.JOBS if not known.no_cameras]
+    follow()
+    return job
+
+
 def train(scene: bpy.types.Scene) -> jobs.Job:
     """Train the scene's capture as its settings say, after what is being trained already. The scene remembers the run folder.
 

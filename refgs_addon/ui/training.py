@@ -23,6 +23,16 @@ class CheckCapture(Door, bpy.types.Operator):
         training.check(context.scene)
 
 
+class FindCameras(Door, bpy.types.Operator):
+    bl_idname = "refgs.find_cameras"
+    bl_label = "Find Cameras"
+    bl_description = "Find where the photos were taken from, from the photos alone"
+    bl_options: ClassVar = {"REGISTER"}
+
+    def work(self, context: bpy.types.Context) -> None:
+        training.find_cameras(context.scene)
+
+
 class Train(Door, bpy.types.Operator):
     bl_idname = "refgs.train"
     bl_label = "Train"
@@ -162,7 +172,8 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: float) -> N
     head.label(text=job.name, icon=icon)
     if job.ended:
         head.operator(PutAway.bl_idname, text="", icon="X", emboss=False).number = number
-    if job.run and job.active:
+    finding = "stage" in job.progress and not job.results
+    if job.active and (job.run or finding):
         box.progress(factor=_part(job), text=_how_far(job).capitalize())
     if job.line:
         _lines(box, job.line[0].upper() + job.line[1:], width)
@@ -170,7 +181,7 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: float) -> N
         _lines(box, warning[0].upper() + warning[1:], width, "ERROR")
     for line in job.results.get("check", {}).get("lines", ()):
         _lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
-    if job.progress:
+    if job.curve:
         facts = job.progress
         row = box.row()
         row.label(text=f"{facts['psnr']:.1f} dB")
@@ -189,9 +200,11 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: float) -> N
         watched = live.is_watched(job)
         icon = "HIDE_OFF" if watched else "HIDE_ON"
         box.operator(Watch.bl_idname, icon=icon, depress=watched).number = number
-    elif job.run and not job.ended:
+    elif (job.run or finding) and not job.ended:
         _tell(box, number, "cancel", "Stop", "CANCEL")
-    if job.state == "failed":
+    if job.no_cameras:
+        box.operator(FindCameras.bl_idname, icon="OUTLINER_OB_CAMERA")
+    elif job.state == "failed":
         box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
     if job.run and job.ended:
         _run(box, job.run)
@@ -207,8 +220,9 @@ def draw_status(self, context: bpy.types.Context) -> None:
 
 
 def _part(job: jobs.Job) -> float:
-    """How much of the training is done, 0..1."""
-    return job.progress["iteration"] / max(job.progress["total"], 1) if job.progress else 0.0
+    """How much of the training, or of a stage of finding cameras, is done, 0..1."""
+    facts = job.progress
+    return facts["done" if "stage" in facts else "iteration"] / max(facts["total"], 1) if facts else 0.0
 
 
 def _how_far(job: jobs.Job) -> str:
@@ -219,6 +233,8 @@ def _how_far(job: jobs.Job) -> str:
         return "making the mesh"
     if not job.progress:
         return "waiting" if job.state == "waiting" else "starting"
+    if "stage" in job.progress:
+        return f"finding cameras: {job.progress['stage']}"
     return f"{_duration(job.progress['seconds_left'])} left"
 
 
@@ -257,7 +273,7 @@ def _lines(layout: bpy.types.UILayout, text: str, width: float, icon: str = "NON
         line = f"{line} {word}".strip()
 
 
-CLASSES = (CheckCapture, Train, Resume, Forget, Tell, Watch, PutAway, ImportTrained, TrainPanel)
+CLASSES = (CheckCapture, FindCameras, Train, Resume, Forget, Tell, Watch, PutAway, ImportTrained, TrainPanel)
 
 
 def register() -> None:

@@ -91,6 +91,19 @@ def test_a_capture_that_is_not_there(addon):
         training.check(addon)
 
 
+def test_photos_without_cameras(addon, tmp_path):
+    folder = tmp_path / "bare photos"
+    folder.mkdir()
+    addon.refgs.capture = str(folder)
+    checked = training.check(addon)
+    until(lambda: checked.ended)
+    assert checked.no_cameras
+    bpy.ops.refgs.find_cameras()
+    assert checked not in jobs.JOBS
+    until(lambda: jobs.JOBS[-1].ended)
+    assert jobs.JOBS[-1].state == "done" and "check" in jobs.JOBS[-1].results
+
+
 def test_taken_away_while_it_trains(addon, capture):
     """Disabling the add-on ends what it started."""
     training.train(addon)

@@ -26,8 +26,9 @@ def test_no_such_folder(tmp_path):
 
 
 def test_folder_without_a_capture(tmp_path):
-    write(tmp_path / "images" / "a.png", np.zeros((8, 8), np.uint8))
     refused(lambda: read_capture(tmp_path), "transforms_train.json", "transforms.json", "sparse/0")
+    write(tmp_path / "images" / "a.png", np.zeros((8, 8), np.uint8))
+    refused(lambda: read_capture(tmp_path), "no cameras", "refgs poses")
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import numpy as np
 
 from refgs.capture.cameras import read_cameras, read_run_cameras, write_cameras
 from refgs.capture.colmap import find_model, read_colmap
+from refgs.capture.files import find_photos
 from refgs.capture.images import LoadedView, load_view
 from refgs.capture.nerf_blender import published_normals, read_nerf_blender
 from refgs.capture.nerfstudio import read_nerfstudio
@@ -17,12 +18,13 @@ from refgs.capture.nero import read_nero
 from refgs.capture.poses import in_frame
 from refgs.capture.region import find_region, run_frame, sample_silhouettes, up_direction
 from refgs.capture.types import Capture, View
-from refgs.errors import InputError
+from refgs.errors import InputError, NoCameras
 
 __all__ = [
     "Capture",
     "LoadedView",
     "View",
+    "find_layout",
     "load_view",
     "published_normals",
     "read_cameras",
@@ -30,6 +32,17 @@ __all__ = [
     "read_run_cameras",
     "write_cameras",
 ]
+
+
+def find_layout(folder: Path) -> str | None:
+    """The layout of the cameras in a folder, by its name in `Capture.layout`; None where there are no cameras."""
+    if (folder / "transforms_train.json").is_file():
+        return "nerf-blender"
+    if (folder / "transforms.json").is_file():
+        return "nerfstudio"
+    if find_model(folder) is not None:
+        return "colmap"
+    return "nero" if (folder / "0-camera.pkl").is_file() else None
 
 
 def read_capture(folder: Path) -> Capture:
@@ -42,23 +55,25 @@ def read_capture(folder: Path) -> Capture:
         raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
     points = colors = None
     warnings = []
-    if (folder / "transforms_train.json").is_file():
-        layout, views = "nerf-blender", read_nerf_blender(folder)
-    elif (folder / "transforms.json").is_file():
-        layout = "nerfstudio"
-        views, points, colors, warnings = read_nerfstudio(folder)
-    elif (found := find_model(folder)) is not None:
-        layout = "colmap"
-        views, points, colors = read_colmap(*found)
-    elif (folder / "0-camera.pkl").is_file():
-        layout = "nero"
-        views, warnings = read_nero(folder)
-    else:
-        raise InputError(
-            f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender), transforms.json (nerfstudio, "
-            "instant-ngp), sparse/0 (COLMAP) and 0-camera.pkl (NeRO). Photos alone need camera poses first, from COLMAP "
-            "for instance."
-        )
+    layout = find_layout(folder)
+    match layout:
+        case "nerf-blender":
+            views = read_nerf_blender(folder)
+        case "nerfstudio":
+            views, points, colors, warnings = read_nerfstudio(folder)
+        case "colmap":
+            views, points, colors = read_colmap(*find_model(folder))
+        case "nero":
+            views, warnings = read_nero(folder)
+        case None:
+            if photos := find_photos(folder):
+                raise NoCameras(
+                    f"{folder}: {len(photos)} photos, but no cameras. Find them first: refgs poses {folder}"
+                )
+            raise InputError(
+                f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender), transforms.json (nerfstudio, "
+                "instant-ngp), sparse/0 (COLMAP), 0-camera.pkl (NeRO), and for photos, here and in images."
+            )
     photos = Counter((view.split, view.image_path) for view in views)
     for (_, path), count in photos.items():
         if count > 1:

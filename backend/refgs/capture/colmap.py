@@ -1,4 +1,4 @@
-"""COLMAP: a sparse model in `sparse/0` or `sparse`, binary or text, with the photos in `images`.
+"""COLMAP: a sparse model in `sparse/0` or `sparse`, binary or text, with the photos in `images` or beside it.
 
 Ref-NeRF's real scenes and mip-NeRF 360's have the photos reduced as well, in `images_2`, `images_4` and `images_8`:
 naming such a folder takes its photos, which may have another ending than those in the model.
@@ -61,6 +61,8 @@ def find_model(folder: Path) -> tuple[Path, Path] | None:
     """
     reduced = re.fullmatch(r"images_\d+", folder.name)
     root, photos = (folder.parent, folder) if reduced else (folder, folder / "images")
+    if not photos.is_dir():
+        photos = folder
     candidates = (root / "sparse" / "0", root / "sparse")
     names = ("cameras.bin", "cameras.txt", "images.bin", "images.txt")
     model = next((path for path in candidates if any((path / name).is_file() for name in names)), None)
@@ -81,7 +83,7 @@ def read_colmap(photos: Path, model: Path) -> tuple[list[View], np.ndarray | Non
 
     found = [(image, find_image(photos / image.name, any_suffix=True)) for image in images]
     report_missing(images_file, [f"{photos.name}/{i.name}" for i, path in found if path is None], len(found))
-    masks = Masks(photos.parent)
+    masks = Masks(photos if (photos / "sparse").is_dir() else photos.parent)
     views = []
     for image, path in found:
         where = f"{images_file}, image {image.name}"

@@ -22,6 +22,14 @@ def find_image(path: Path, any_suffix: bool = False) -> Path | None:
     return next((name for name in names if name.is_file()), None)
 
 
+def find_photos(folder: Path) -> list[Path]:
+    """The photos in `images`, or in the folder itself where there is no such folder, by name; without masks beside them."""
+    top = folder / "images" if (folder / "images").is_dir() else folder
+    found = {path.name: path for path in sorted(top.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES}
+    masks = {f"{path.stem}_alpha.png" for path in found.values()}
+    return [path for name, path in found.items() if name not in masks]
+
+
 def report_missing(source: Path, missing: list[str], total: int) -> None:
     """Raises InputError where `source` names photos that are not there."""
     if missing:

@@ -1,0 +1,227 @@
+"""Structure from motion: where photos were taken from, found from the photos alone, by COLMAP through pycolmap.
+
+COLMAP works in a process of its own: it brings another OpenMP than torch's, which not every system lets live beside it, it hears
+of nothing while it works, and where it gives up it takes its process with it.
+
+Masks are not used. Surroundings that stand still with the object say most about where the camera is. Behind a turntable they
+stand still with the camera instead and mislead; there they are told by being at one place in both photos of a pair, and such
+matches are dropped.
+"""
+
+import hashlib
+import multiprocessing
+import shutil
+import signal
+from collections.abc import Callable
+from itertools import combinations
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from refgs import CORES
+from refgs.capture import find_layout
+from refgs.capture.files import find_photos
+from refgs.capture.images import read_header
+from refgs.errors import InputError
+
+SIDE = 1600  # pixels: photos are reduced to this for finding features; presets train on fewer
+ALL_PAIRS = 150  # photos: up to so many, each is compared with each other
+CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential distortion only fit noise
+SEED = 1
+
+
+def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) -> dict[str, Any]:
+    """Find the cameras of a folder's photos, which lie in it or in its `images`, and write its `sparse/0`.
+
+    `report` is told "progress" with `stage` ("features", "matching" or "mapping"), `done` and `total`, and "warning" with `what`.
+    Returns `placed` and `photos`, counts, and `error`, the mean reprojection error in pixels. What is stopped on the way leaves
+    `sparse.tmp`, from which the same photos go on. Raises InputError where there are no photos, cameras already, or where fewer than half
+    of the photos could be placed.
+    """
+    folder = Path(folder)
+    photos = find_photos(folder)
+    if len(photos) < 3:
+        raise InputError(f"{folder}: {len(photos)} photos in it or in its images folder; thirty or more are good")
+    if find_layout(folder) is not None or (folder / "sparse").exists():
+        raise InputError(f"{folder}: it has cameras already; to find them anew remove them (sparse, transforms*.json)")
+    for photo in photos:
+        read_header(photo)
+    work = folder / "sparse.tmp"
+    work.mkdir(exist_ok=True)
+    database = work / f"{_digest(photos)}.db"
+    for path in list(work.iterdir()):  # of other photos, or half written
+        if not path.name.startswith(database.name):
+            _remove(path)
+    model = work / "0"
+    placed, error = _apart(photos, database, model, report)
+    if len(placed) < max(3, len(photos) / 2):
+        shutil.rmtree(work)
+        raise InputError(
+            f"{folder}: only {len(placed)} of {len(photos)} photos could be placed. Take more, each showing most of what the one "
+            "before it shows, sharp, in unchanging light; lay a patterned mat or newspaper under an object that is plain or shiny."
+        )
+    if missing := [photo.name for photo in photos if photo.name not in placed]:
+        names = ", ".join(missing[:5]) + (" …" if len(missing) > 5 else "")
+        what = f"{len(missing)} of {len(photos)} photos could not be placed and are left out: {names}; more photos between them help"
+        report("warning", {"what": what})
+    for path in list(work.glob(f"{database.name}*")):
+        _remove(path)
+    work.rename(folder / "sparse")
+    return {"placed": len(placed), "photos": len(photos), "error": error}
+
+
+def pairs(count: int) -> list[tuple[int, int]]:
+    """Which photos, by their numbers in the order of their names, are compared with each other: all up to ALL_PAIRS. Of more, each with
+    the ten that follow it and with some farther on, in a ring, as one walks around an object; and every tenth with every tenth, for
+    who walks around it again."""
+    if count <= ALL_PAIRS:
+        return list(combinations(range(count), 2))
+    steps = [*range(1, 11), *(2**k for k in range(4, count.bit_length() - 1))]
+    near = {tuple(sorted((i, (i + step) % count))) for i in range(count) for step in steps}
+    return sorted(near | set(combinations(range(0, count, 10), 2)))
+
+
+def _remove(path: Path) -> None:
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def _digest(photos: list[Path]) -> str:
+    """What tells these photos from others, and from themselves before they were edited."""
+    facts = [(photo.name, photo.stat().st_size, photo.stat().st_mtime_ns) for photo in photos]
+    return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
+
+
+def _apart(photos: list[Path], database: Path, model: Path, report: Callable) -> tuple[set[str], float]:
+    """`_place` in a process of its own, which ends with this call, however that ends."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_place, args=(photos, database, model, theirs), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        while True:
+            if ours.poll(0.2):  # no longer, for nothing else wakes it to be interrupted
+                event = ours.recv()
+                if isinstance(event, tuple):
+                    return event
+                report("progress", event)
+    except EOFError:
+        process.join()
+        raise RuntimeError(f"COLMAP ended with status {process.exitcode}") from None
+    finally:
+        process.kill()
+        process.join()
+
+
+def _place(photos: list[Path], database: Path, model: Path, events: Connection) -> None:
+    """Sends how it goes; at last the names of the photos that were placed and the mean reprojection error, in pixels."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who started this process ends it
+    import pycolmap
+
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    pycolmap.set_random_seed(SEED)
+
+    def tell(stage: str, done: int, total: int) -> None:
+        events.send({"stage": stage, "done": done, "total": total})
+
+    with pycolmap.Database.open(database) as known:
+        described = known.num_images() > 0 and not any(known.exists_image(photo.name) for photo in photos)
+    if not described:
+        _describe(photos, database, tell)
+    _match(len(photos), database, tell)
+    found = _map(photos, database, tell)
+    if found is None:
+        events.send((set(), 0.0))
+        return
+    for number in found.reg_image_ids():
+        found.image(number).name = photos[int(found.image(number).name)].name
+    found.extract_colors_for_all_images(photos[0].parent)
+    model.mkdir()
+    found.write_binary(model)
+    placed = {found.image(number).name for number in found.reg_image_ids()}
+    events.send((placed, found.compute_mean_reprojection_error()))
+
+
+def _describe(photos: list[Path], database: Path, tell: Callable) -> None:
+    """Features of all photos into the database; photos of one size and focal length (by EXIF) share a camera.
+
+    When all are there the photos go by their numbers: a list of pairs, in a file, cannot name one with a space in its name.
+    """
+    import pycolmap
+
+    reading = pycolmap.ImageReaderOptions()
+    reading.camera_model = CAMERA_MODEL
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size = SIDE
+    shared: dict[tuple, list[str]] = {}
+    with pycolmap.Database.open(database) as known:
+        cameras = {_lens(camera): camera.camera_id for camera in known.read_all_cameras()}
+        for photo in photos:
+            camera = pycolmap.infer_camera_from_image(photo, reading)
+            shared.setdefault(_lens(camera), []).append(photo.name)
+            if _lens(camera) not in cameras:
+                cameras[_lens(camera)] = known.write_camera(camera)
+    done = 0
+    for lens, names in shared.items():
+        reading.existing_camera_id = cameras[lens]
+        for start in range(0, len(names), 2 * CORES):
+            tell("features", done, len(photos))
+            some = names[start : start + 2 * CORES]
+            pycolmap.extract_features(
+                database, photos[0].parent, some, pycolmap.CameraMode.SINGLE, reading, extraction
+            )  # passes by what it has
+            done += len(some)
+    numbers = {photo.name: str(number) for number, photo in enumerate(photos)}
+    with pycolmap.Database.open(database) as known, pycolmap.DatabaseTransaction(known):
+        for image in known.read_all_images():
+            image.name = numbers[image.name]
+            known.update_image(image)
+
+
+def _lens(camera) -> tuple[int, int, float]:
+    return camera.width, camera.height, camera.mean_focal_length()
+
+
+def _match(count: int, database: Path, tell: Callable) -> None:
+    """Matches between pairs of photos into the database."""
+    import pycolmap
+
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.filter_stationary_matches = True
+    verification.ransac.random_seed = SEED
+    listed = database.with_name(database.name + ".pairs.txt")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(listed)
+    with pycolmap.Database.open(database) as known:
+        names = {image.name for image in known.read_all_images()}
+    all_pairs = [f"{a} {b}" for a, b in pairs(count) if str(a) in names and str(b) in names]
+    for start in range(0, len(all_pairs), 100):
+        tell("matching", start, len(all_pairs))
+        listed.write_text("\n".join(all_pairs[start : start + 100]), encoding="utf-8")
+        pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+
+
+def _map(photos: list[Path], database: Path, tell: Callable) -> Any:
+    """The model (a pycolmap.Reconstruction) that places most photos, None where none could be made."""
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = SEED
+    options.min_model_size = 3
+    options.extract_colors = False
+    placed = 0
+
+    def first() -> None:
+        nonlocal placed
+        placed = 2
+        tell("mapping", placed, len(photos))
+
+    def another() -> None:
+        nonlocal placed
+        placed = min(placed + 1, len(photos))
+        tell("mapping", placed, len(photos))
+
+    written = database.with_name(database.name + ".models")  # where it leaves all models, the small ones too
+    written.mkdir(exist_ok=True)
+    models = pycolmap.incremental_mapping(database, photos[0].parent, written, options, "", first, another)
+    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)

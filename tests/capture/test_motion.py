@@ -1,0 +1,131 @@
+"""Poses from photos alone, of a scene whose poses are known."""
+
+import multiprocessing
+
+import numpy as np
+import pytest
+from makers import look_at, write
+from scipy.ndimage import map_coordinates
+
+from refgs.capture import read_capture
+from refgs.capture.motion import ALL_PAIRS, find_cameras, pairs
+from refgs.capture.poses import OPENGL_TO_OPENCV
+from refgs.errors import InputError, NoCameras
+
+WIDTH, HEIGHT, FOCAL = 256, 192, 280.0
+POSES = [
+    look_at(np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.8 + 0.5 * np.sin(3 * angle)]), np.array([0, 0, 0.4]))
+    for angle in np.linspace(0, 1.4, 10)
+]
+
+
+def quiet(event: str, facts: dict) -> None:
+    pass
+
+
+def speckled(pose: np.ndarray) -> np.ndarray:
+    """A block on the floor, both of a speckled stone: RGB (H, W, 3) uint8, by ray casting."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
+    rays = np.stack([u / FOCAL, -v / FOCAL, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
+    eye, half, middle = pose[:3, 3], np.array([0.6, 0.5, 0.4]), np.array([0, 0, 0.4])
+    ends = np.stack([(middle - half - eye) / rays, (middle + half - eye) / rays])
+    near, far = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
+    floor = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], 1e3)
+    points = eye + rays * np.where(near < far, near, floor)[..., None]
+    lattice = np.random.default_rng(0).random((32, 32, 32, 3))
+    grains = sum(
+        np.stack(
+            [map_coordinates(lattice[..., c], size * points.reshape(-1, 3).T, order=1, mode="wrap") for c in range(3)]
+        )
+        for size in (4.0, 13.0)
+    )
+    return (127 * grains.T.reshape(HEIGHT, WIDTH, 3)).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return [speckled(pose) for pose in POSES]
+
+
+@pytest.fixture
+def photos(tmp_path, pictures):
+    """The photos alone, with a space in their names."""
+    for number, picture in enumerate(pictures):
+        write(tmp_path / f"stone {number:02d}.png", picture)
+    return tmp_path
+
+
+def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3) after the similarity that brings them nearest to others (Umeyama 1991), and its rotation."""
+    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    u, stretch, vt = np.linalg.svd(b.T @ a)
+    flip = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation = u * flip @ vt
+    return true.mean(axis=0) + (stretch @ flip) / (a**2).sum() * a @ rotation.T, rotation
+
+
+def test_photos_become_a_capture(photos):
+    write(photos / "masks" / "stone 00.png", np.tri(HEIGHT, WIDTH, dtype=np.uint8) * 255)
+    write(photos / "unlike the others.png", np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8))
+    with pytest.raises(NoCameras, match=r"11 photos, but no cameras.*refgs poses"):
+        read_capture(photos)
+    said = []
+    found = find_cameras(photos, lambda event, facts: said.append((event, facts)))
+    assert found["placed"] == 10 and found["photos"] == 11 and 0 < found["error"] < 1
+    stages = [facts["stage"] for event, facts in said if event == "progress"]
+    assert list(dict.fromkeys(stages)) == ["features", "matching", "mapping"]
+    assert all(facts["done"] <= facts["total"] for event, facts in said if event == "progress")
+    (warning,) = [facts["what"] for event, facts in said if event == "warning"]
+    assert "1 of 11" in warning and "unlike the others.png" in warning
+    assert {path.name for path in photos.iterdir() if path.is_dir()} == {"masks", "sparse"}
+    assert {path.name for path in (photos / "sparse").iterdir()} == {"0"}
+    capture = read_capture(photos)
+    assert capture.layout == "colmap" and len(capture.points) > 100 and np.ptp(capture.point_colors) > 0.1
+    views = sorted(capture.views, key=lambda view: view.camera.name)
+    assert views[0].masked and not views[1].masked
+    positions, rotation = aligned(np.array([view.camera.position for view in views]), np.array(POSES)[:, :3, 3])
+    assert np.linalg.norm(positions - np.array(POSES)[:, :3, 3], axis=1).max() < 0.02
+    for view, pose in zip(views, POSES, strict=True):
+        turned = view.camera.world_to_camera[:3, :3] @ rotation.T @ (pose @ OPENGL_TO_OPENCV)[:3, :3]
+        assert np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1))) < 1
+    with pytest.raises(InputError, match="cameras already"):
+        find_cameras(photos, quiet)
+
+
+def test_one_that_is_interrupted_goes_on(photos):
+    """What was ended in the middle is no capture; its features serve the next time, unless a photo was changed."""
+
+    def interrupt(event: str, facts: dict) -> None:
+        if facts.get("stage") == "matching":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        find_cameras(photos, interrupt)
+    assert not multiprocessing.active_children()
+    with pytest.raises(NoCameras):
+        read_capture(photos)
+    stages = []
+    find_cameras(photos, lambda event, facts: stages.append(facts.get("stage")))
+    assert "features" not in stages and "mapping" in stages
+    assert len(read_capture(photos).views) == 10
+
+
+def test_photos_that_have_nothing_in_common(tmp_path):
+    rng = np.random.default_rng(0)
+    for number in range(4):
+        write(tmp_path / "images" / f"{number}.png", rng.integers(0, 255, (96, 128, 3), np.uint8))
+    with pytest.raises(InputError, match=r"only 0 of 4 photos could be placed.*newspaper"):
+        find_cameras(tmp_path, quiet)
+    assert [path.name for path in tmp_path.iterdir()] == ["images"]
+
+
+def test_no_photos(tmp_path):
+    with pytest.raises(InputError, match="0 photos"):
+        find_cameras(tmp_path, quiet)
+
+
+def test_pairs():
+    assert len(pairs(ALL_PAIRS)) == ALL_PAIRS * (ALL_PAIRS - 1) // 2
+    many = pairs(400)
+    assert len(many) == len(set(many)) < 400 * 20 and all(a < b for a, b in many)
+    assert {(0, 1), (0, 399), (0, 10), (0, 200)} <= set(many) and (1, 200) not in many
