@@ -71,7 +71,8 @@ def test_the_tab_shows_in_a_window(tmp_path):
 
 @pytest.mark.window
 def test_an_artist_trains(tmp_path, ball_capture):
-    """With the real trainer: checked, trained, paused, stopped, gone on with, finished, imported."""
+    """With the real trainer: checked, trained, watched, paused, stopped, gone on with, finished, imported; then compared with a photo,
+    relit, edited, written anew, and rendered by a Blender beside."""
     capture = tmp_path / "ball photos"
     shutil.copytree(ball_capture, capture)
     report = in_window("train.py", tmp_path, sys.executable, capture)
@@ -81,10 +82,16 @@ def test_an_artist_trains(tmp_path, ball_capture):
     assert states == {
         "checked": "done", "training": "running", "paused": "paused", "stopped": "cancelled",
         "resumed": "running", "done": "done", "imported": "done",
-    }  # fmt: skip
+    } | dict.fromkeys(states.keys() & {"photo", "relit", "edited", "applied"}, "done") | (
+        {"live": "running", "previewed": "done"} if report["imported"] == ["FINISHED"] else {}
+    )  # fmt: skip
     run = Path(report["run"])
     assert run == tmp_path / "ball photos RefGS" and (run / "splats.ply").exists() and (run / "mesh.glb").exists()
     assert report["imported"] == ["FINISHED"] or "Blender's Python lacks numpy" in report["imported"]
+    if report["imported"] == ["FINISHED"]:
+        assert report["left"] == []  # what was shown while it learned
+        assert {"splats.ply", "mesh.glb", "textures", "environment.exr"} <= set(report["applied"])
+        assert report["preview"] == ["done", ""] and cv2.imread(str(tmp_path / "preview.png")).std() > 5
     for name in report["steps"]:
         assert cv2.imread(str(tmp_path / f"{name}.png")).std() > 5
     print("longest that the window was busy, in seconds:", report["longest"])

@@ -3,6 +3,7 @@
 blender --python train.py -- EXTENSION.zip PYTHON CAPTURE OUT
 """
 
+import importlib.util
 import json
 import shutil
 import subprocess
@@ -53,6 +54,9 @@ def artist():
     bpy.ops.refgs.put_away(number=len(jobs()) - 1)
     bpy.ops.refgs.train()
     yield lambda: len(jobs()[-1].curve) > 4 and jobs()[-1].preview, "training"
+    if numpy():
+        bpy.ops.refgs.watch(number=len(jobs()) - 1)
+        yield lambda: any(item.type == "POINTCLOUD" for item in bpy.data.objects), "live"
     tell("pause")
     yield last("paused"), "paused"
     tell("cancel")
@@ -69,6 +73,48 @@ def artist():
     except RuntimeError as error:
         report["imported"] = str(error)
     yield lambda: True, "imported"
+    if numpy():
+        yield from work_with_it(folder)
+
+
+def work_with_it(folder):
+    """What is done with a run: its light, its materials, its photos, and a picture of it all."""
+    report["left"] = [item.name for item in bpy.data.objects if "in training" in item.name]
+    scene, manager = bpy.context.scene, bpy.context.window_manager
+    area().spaces.active.shading.type = "MATERIAL"
+    area().spaces.active.shading.use_scene_world = True
+    with view():
+        bpy.ops.refgs.next_camera()
+        bpy.ops.refgs.photo()
+    yield lambda: True, "photo"
+    with view():
+        bpy.ops.refgs.photo()
+    manager.refgs_light = next(str(file) for file in addon("scene.relight").hdris() if file.stem == "city")
+    bpy.ops.refgs.match_light()
+    yield lambda: True, "relit"
+    bpy.ops.refgs.add_edit(where="Sphere", material="Gold")
+    yield lambda: True, "edited"
+    bpy.ops.refgs.apply_edits(filepath=str(OUT / "golden"))
+    yield last("done"), "applied"
+    report["applied"] = sorted(file.name for file in (OUT / "golden").iterdir())
+    bpy.ops.refgs.render_preview(filepath=str(OUT / "preview.png"), size=256, samples=16)
+    yield lambda: jobs()[-1].ended, "previewed"
+    report["preview"] = jobs()[-1].state, jobs()[-1].line
+    report["scene"] = scene.render.engine, scene.world.name
+
+
+def numpy():
+    return importlib.util.find_spec("numpy") is not None
+
+
+def addon(name):
+    return importlib.import_module(f"{MODULE}.refgs_addon.{name}")
+
+
+def view():
+    """The 3D view, as a button in its sidebar has it."""
+    region = next(region for region in area().regions if region.type == "WINDOW")
+    return bpy.context.temp_override(area=area(), region=region)
 
 
 def photograph(name):
