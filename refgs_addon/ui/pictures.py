@@ -53,15 +53,15 @@ def curve(job: jobs.Job) -> int:
 def _plot(points: list[tuple[float, float]]) -> list[float]:
     """RGBA of a line through the points, bottom row first."""
     width, height = CURVE
-    last, low, high = points[-1][0], min(p for _, p in points), max(p for _, p in points)
+    first, last, low, high = points[0][0], points[-1][0], min(p for _, p in points), max(p for _, p in points)
     pixels = list(GROUND) * (width * height)
     at, before = 0, None
     for column in range(width):
-        while at < len(points) - 1 and points[at][0] < last * column / (width - 1):
+        while at < len(points) - 1 and points[at][0] < first + (last - first) * column / (width - 1):
             at += 1
         row = round((height - 6) * (points[at][1] - low) / max(high - low, 1e-6)) + 2
-        first, second = sorted((row, row if before is None else before))
-        for y in range(first, second + 3):
+        bottom, top = sorted((row, row if before is None else before))
+        for y in range(bottom, top + 3):
             pixels[4 * (y * width + column) : 4 * (y * width + column) + 4] = LINE
         before = row
     return pixels

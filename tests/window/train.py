@@ -41,6 +41,7 @@ def artist():
     """Yields what to wait for, and the name of the picture then: each step is what a click does."""
     bpy.ops.extensions.package_install_files(filepath=str(ARCHIVE), repo="user_default", enable_on_install=True)
     area().spaces.active.show_region_ui = True
+    bpy.data.objects.remove(bpy.data.objects["Cube"])  # it stands where the object will
     yield lambda: True, None
     next(region for region in area().regions if region.type == "UI").active_panel_category = "RefGS"
     yield lambda: True, "empty"
