@@ -69,9 +69,13 @@ class Run:
             return self.surfels()
         with torch.no_grad():
             if "transport" not in self._traced:
-                self._traced["transport"] = Transport(self.surfels(), self.occluder, progress=progress)
+                surfels = self.surfels()
+                inward = (surfels.normals() * torch.from_numpy(self.splats.normals)).sum(dim=-1) < 0
+                self._traced["transport"] = Transport(surfels.turned(inward), self.occluder, progress=progress)
             if self._traced.get("light") is not light:
-                self._traced.update(light=light, surfels=relit(self._traced["transport"], light))
+                # Drawn as they were learned: near the horizon it matters which way a surfel's normal points.
+                found = relit(self._traced["transport"], light)._replace(rotations=self.surfels().rotations)
+                self._traced.update(light=light, surfels=found)
         return self._traced["surfels"]
 
     def render(self, camera: Camera, environment: Environment | None = None, exposure: float = 1.0) -> Rendering:

@@ -64,7 +64,7 @@ def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Objec
     data.shift_y = (frame["cy"] - 0.5 * height) * aspect / width
     data["refgs_size"] = [int(width), int(height)]
     data["refgs_pixel_aspect"] = [max(1.0, 1.0 / aspect), max(1.0, aspect)]
-    data[PHOTO] = frame["photo"]
+    data[PHOTO] = frame.get("photo", "")
     camera = bpy.data.objects.new(frame["name"], data)
     camera.matrix_world = Matrix(frame["transform_matrix"])
     collection.objects.link(camera)

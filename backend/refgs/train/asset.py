@@ -34,13 +34,16 @@ def write_asset(trainer: Trainer) -> None:
         display = settings.render.color_space == "display"
         write_environment(folder / "environment.exr", srgb_decode(panorama) if display else panorama)
         surfels = _with_relightable_albedo(surfels, environment, trainer)
-    surfels, unseen = _facing_outward(surfels, trainer)
-    write_splats(folder / "splats.ply", to_splats(surfels))
+    side = _seen_from(surfels, trainer)
+    surfels, outward = Surfels(*(value[side != 0] for value in surfels)), side[side != 0].sign()
+    splats = to_splats(surfels)
+    splats.normals *= outward.numpy(force=True)[:, None]
+    write_splats(folder / "splats.ply", splats)
     if trainer.exposures is not None:
         factors = trainer.exposures.detach().exp().tolist()
         exposures = {view.camera.name: factor for view, factor in zip(trainer.views, factors, strict=True)}
         write_cameras(folder / "cameras.json", trainer.capture, settings.light.frame, exposures)
-    write_text(folder / "needs.json", json.dumps(_left_out(trainer, unseen), indent=1))
+    write_text(folder / "needs.json", json.dumps(_left_out(trainer, int((side == 0).sum())), indent=1))
 
 
 def _with_relightable_albedo(surfels: Surfels, environment: Environment, trainer: Trainer) -> Surfels:
@@ -77,8 +80,9 @@ def _received(surfels: Surfels, environment: Environment, trainer: Trainer) -> T
     return (total / weights).clamp_min(1e-6)
 
 
-def _facing_outward(surfels: Surfels, trainer: Trainer) -> tuple[Surfels, int]:
-    """Turn each surfel's normal to the side it is seen from, and drop those that no training view sees.
+def _seen_from(surfels: Surfels, trainer: Trainer) -> Tensor:
+    """From which side of each surfel the training views see it (N,): positive where its normal points to that side, negative where
+    it points away, zero where none sees it; if none sees any, all count as seen.
 
     A surfel's weight in a view is the gradient of the sum of a constant feature.
     """
@@ -94,11 +98,8 @@ def _facing_outward(surfels: Surfels, trainer: Trainer) -> tuple[Surfels, int]:
         towards = torch.from_numpy(view.camera.position).float().to(trainer.device) - surfels.positions
         side += weight * torch.sign((normals * towards).sum(dim=-1))
         seen += weight
-    keep = seen > 0
-    if not keep.any():
-        keep[:] = True
-    surfels = Surfels(*(value[keep] for value in surfels.turned(side < 0)))
-    return surfels, int(count - keep.sum())
+    known = seen > 0 if (seen > 0).any() else torch.ones_like(seen, dtype=torch.bool)
+    return torch.where(side < 0, -1.0, 1.0) * known
 
 
 def _left_out(trainer: Trainer, unseen: int) -> list[dict[str, str]]:
