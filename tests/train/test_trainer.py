@@ -15,6 +15,7 @@ from benchmarks.scenes.analytic import F0, ONE, meet, sky
 from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.export.environment import directions
+from refgs.model.surfels import to_splats
 from refgs.run import create_run, open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset
@@ -77,6 +78,24 @@ def test_the_asset_renders_as_the_training_did(ball):
     view = ball.test[0]
     trained, asset = ball.render(view.camera), run.render(view.camera)
     assert float((trained.color - asset.color).abs().mean()) < 2e-3
+
+
+def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
+    """Near the horizon it matters which way a surfel's normal points: only the column of normals is turned outward."""
+    made = trainer(ball_capture, tmp_path / "run", total=10)
+    made.run()
+    with torch.no_grad():
+        w, x, y, z = made.parameters["rotation"][::2].unbind(-1)
+        made.parameters["rotation"][::2] = torch.stack([-x, w, z, -y], dim=-1)  # every other surfel the other way round
+    write_asset(made)
+    run, camera = open_run(made.folder), made.test[0].camera
+    learned = made.render(camera).normal
+    assert float((learned - run.render(camera).normal).abs().max()) < 1e-4
+    assert ((run.splats.normals * run.splats.positions).sum(axis=1) > 0).mean() > 0.9
+    inward = (run.surfels().normals() * torch.from_numpy(run.splats.normals)).sum(dim=-1) < 0
+    assert 0.3 < inward.float().mean() < 0.7
+    object.__setattr__(run, "splats", to_splats(run.surfels().turned(inward)))
+    assert float((learned - run.render(camera).normal).abs().max()) > 0.01  # what was shown when they were turned too
 
 
 def test_what_a_ball_does_without(ball):
