@@ -1,8 +1,10 @@
 """What leaves Blender: a run with its edits as a new run folder, its splats, its light."""
 
+import contextlib
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
@@ -59,13 +61,8 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     rows["metallic"], rows["roughness"] = new["metallic"], new["roughness"]
     names = "".join(f"property float {name}\n" for name in rows.dtype.names)
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{names}end_header\n"
-    temporary = path.with_name(f".{path.name}.part")
-    try:
+    with _whole(path) as temporary:
         temporary.write_bytes(head.encode("ascii") + rows.tobytes())
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"cannot write {path}: {error.strerror}") from None
 
 
 def export_run(collection: bpy.types.Collection, folder: Path) -> None:
@@ -112,14 +109,21 @@ def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
     _copy(mesh, path)
 
 
-def _copy(file: Path, path: Path) -> None:
+@contextlib.contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """A file beside, to be written, that then becomes the one that is meant."""
     temporary = path.with_name(f".{path.name}.part")
     try:
-        shutil.copyfile(file, temporary)
+        yield temporary
         os.replace(temporary, path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise InputError(f"cannot write {path}: {error.strerror}") from None
+
+
+def _copy(file: Path, path: Path) -> None:
+    with _whole(path) as temporary:
+        shutil.copyfile(file, temporary)
 
 
 def _folder(collection: bpy.types.Collection) -> Path:

@@ -28,9 +28,10 @@ def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, 
         recovered = world[RECOVERED]
         icon = pictures.thumbnail(Path(bpy.path.abspath(recovered.filepath)))
         _listed.append(("RECOVERED", "Recovered", "The light that was recovered from the photos", icon, 0))
-    for file in hdris(hdri_folder()):
+    files = hdris(hdri_folder())
+    for file in files:
         _listed.append((str(file), file.stem.capitalize(), str(file), pictures.thumbnail(file), _number(file)))
-    if _shown(world) == OTHER:
+    if _shown(world, files) == OTHER:
         name = shown.name if shown else "None"
         _listed.append(("OTHER", name, "What lights the scene now", 0, OTHER))
     return _listed
@@ -41,18 +42,18 @@ def _number(file: Path) -> int:
     return 2 + crc32(str(file).encode()) % (1 << 30)
 
 
-def _shown(world: bpy.types.World | None) -> int:
+def _shown(world: bpy.types.World | None, files: list[Path]) -> int:
     image = world.node_tree.nodes[IMAGE].image if is_panorama(world) else None
     if image is None:
         return OTHER
     if image == world.get(RECOVERED):
         return 0
     number = _number(Path(bpy.path.abspath(image.filepath)))
-    return number if any(_number(file) == number for file in hdris(hdri_folder())) else OTHER
+    return number if any(_number(file) == number for file in files) else OTHER
 
 
 def _get(self) -> int:
-    return _shown(bpy.context.scene.world)
+    return _shown(bpy.context.scene.world, hdris(hdri_folder()))
 
 
 def _set(self, number: int) -> None:

@@ -35,7 +35,7 @@ def write_asset(trainer: Trainer) -> None:
         write_environment(folder / "environment.exr", srgb_decode(panorama) if display else panorama)
         surfels = _with_relightable_albedo(surfels, environment, trainer)
     side = _seen_from(surfels, trainer)
-    surfels, outward = Surfels(*(value[side != 0] for value in surfels)), side[side != 0].sign()
+    surfels, outward = Surfels(*(value[side != 0] for value in surfels)), side[side != 0]
     splats = to_splats(surfels)
     splats.normals *= outward.numpy(force=True)[:, None]
     write_splats(folder / "splats.ply", splats)
@@ -81,8 +81,8 @@ def _received(surfels: Surfels, environment: Environment, trainer: Trainer) -> T
 
 
 def _seen_from(surfels: Surfels, trainer: Trainer) -> Tensor:
-    """From which side of each surfel the training views see it (N,): positive where its normal points to that side, negative where
-    it points away, zero where none sees it; if none sees any, all count as seen.
+    """From which side of each surfel the training views see it (N,): 1 where its normal points to that side, −1 where it points away,
+    0 where none sees it; if none sees any, all count as seen.
 
     A surfel's weight in a view is the gradient of the sum of a constant feature.
     """
