@@ -96,6 +96,12 @@ class IndirectSettings(_Section):
     least: float = Field(ge=0, le=1, description="part of the object that must mirror the object, else it is left out")
 
 
+class ResidualSettings(_Section):
+    """Colour by direction, sRGB-encoded, that adds to the picture what material and light leave over; gone under another light."""
+
+    start: float = Field(ge=0, le=1, description="part of the training after which it learns; 1 does without")
+
+
 class RateSettings(_Section):
     """Adam's learning rates, at the start; the decays are the factors reached at the end. Position is in scene radii."""
 
@@ -105,6 +111,7 @@ class RateSettings(_Section):
     opacity: float = Field(ge=0)
     sh_dc: float = Field(ge=0)
     sh_rest: float = Field(ge=0)
+    residual: float = Field(ge=0)
     albedo: float = Field(ge=0)
     metallic: float = Field(ge=0)
     roughness: float = Field(ge=0)
@@ -171,6 +178,7 @@ class Settings(_Section):
     train: TrainSettings
     initial: InitialSettings
     indirect: IndirectSettings
+    residual: ResidualSettings
     rates: RateSettings
     loss: LossSettings
     densify: DensifySettings

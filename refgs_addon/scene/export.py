@@ -52,13 +52,20 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     if len(rows) != len(splats.data.points):
         raise InputError(f"{_folder(collection)} has changed since it was imported: import it again")
     new = edited_materials(splats)
+    edited = np.zeros(len(rows), bool)
+    for name in ("metallic", "roughness"):
+        edited |= np.abs(new[name] - rows[name]) > 1e-6
     for i, channel in enumerate("rgb"):
         old, color, look = rows[f"albedo_{channel}"], new["base_color"][:, i], rows[f"f_dc_{i}"]
         changed = np.abs(color - old) > 1e-6
+        edited |= changed
         light = _decoded(0.5 + SH_DC * look) / np.maximum(old, DARK)
         rows[f"f_dc_{i}"] = np.where(changed, (_encoded(color * light) - 0.5) / SH_DC, look)
         rows[f"albedo_{channel}"] = color
     rows["metallic"], rows["roughness"] = new["metallic"], new["roughness"]
+    for name in rows.dtype.names:
+        if name.startswith("f_rest_"):
+            rows[name][edited] = 0  # how the colour depended on the direction was the old material's
     names = "".join(f"property float {name}\n" for name in rows.dtype.names)
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{names}end_header\n"
     with _whole(path) as temporary:

@@ -14,6 +14,7 @@ from refgs_addon.scene.export import SH_DC, edited_materials, export_light, expo
 from refgs_addon.scene.parts import show
 from refgs_addon.scene.run import import_run
 from refgs_addon.scene.splats import read_rows
+from tests.blender.runs import write_ply
 
 
 @pytest.fixture
@@ -120,3 +121,19 @@ def test_the_file_menu(run_folder, scene, tmp_path):
         assert json.loads((tmp_path / "rubber" / "cameras.json").read_text())["frames"]
     finally:
         ui.unregister()
+
+
+def test_colour_by_direction_goes_with_the_material_it_was_of(run_folder, scene, tmp_path):
+    folder = shutil.copytree(run_folder, tmp_path / "directional")
+    before = read_rows(folder / "splats.ply")
+    rest = {f"f_rest_{i}": np.full(len(before), 0.1 + i) for i in range(9)}
+    write_ply(folder / "splats.ply", {name: before[name] for name in before.dtype.names} | rest)
+    run = import_run(folder, scene)
+    add_edit(run.collection, "Box", "Gold")
+    export_splats(run.collection, tmp_path / "a.ply")
+    after = read_rows(tmp_path / "a.ply")
+    edited = after["metallic"] != before["metallic"]
+    assert 0 < edited.sum() < len(after)
+    for i in range(9):
+        np.testing.assert_array_equal(after[f"f_rest_{i}"][edited], 0)
+        np.testing.assert_allclose(after[f"f_rest_{i}"][~edited], 0.1 + i, rtol=1e-6)

@@ -22,6 +22,7 @@ from refgs.settings import RenderSettings
 
 NEAR = 0.01  # the nearest depth that is drawn, in scene radii
 COVERED = 1 / 255  # pixels with less alpha than this are background
+SIGNED = 1.0  # what is added to a colour that may be negative while it is blended
 
 
 @dataclass(frozen=True)
@@ -29,21 +30,30 @@ class Rendering:
     """What a camera sees. `color` (H, W, 3) is sRGB-encoded, over the background. The maps are alpha-weighted means over
     the splats of a pixel, linear, zero where nothing is: `normal` (H, W, 3) in world space, not normalised, towards the
     camera; `depth` (H, W) along the camera's axis, of which `blended_depth` is the sum that is divided by alpha. Where
-    there is a light there are two more: `material` (H, W, 5) is albedo, metallic, roughness; `radiance` (H, W, 3) is linear,
-    before exposure and background. With inter-reflection, `visibility` (H, W) is 0 where the object itself stands in the mirror direction,
-    else 1."""
+    there is a light, `material` (H, W, 5) is albedo, metallic, roughness. With inter-reflection, `visibility` (H, W) is 0
+    where the object itself stands in the mirror direction, else 1. `background` (3,) and `exposure`, a scalar, are what was
+    given."""
 
     color: Tensor
     alpha: Tensor
     blended_depth: Tensor
     normal: Tensor
     material: Tensor | None = None
-    radiance: Tensor | None = None
     visibility: Tensor | None = None
+    background: Tensor | None = None
+    exposure: Tensor | None = None
 
     @property
     def depth(self) -> Tensor:
         return self.blended_depth / self.alpha.clamp_min(COVERED)
+
+    @property
+    def radiance(self) -> Tensor:
+        """What the splats of a pixel send to the camera (H, W, 3), linear, before exposure; zero where nothing is."""
+        alpha = self.alpha[..., None]
+        mean = (self.color - (1 - alpha) * self.background) / alpha.clamp_min(COVERED)
+        radiance = srgb_decode(mean.clamp_min(0)) * (alpha > COVERED)
+        return radiance if self.exposure is None else radiance / self.exposure
 
     @property
     def albedo(self) -> Tensor:
@@ -117,6 +127,9 @@ def render(
     `occluder`, deferred shading takes the surfels' own light in place of the environment's where that is in the way of the
     mirror direction (paper Eq. 9). Radiance is multiplied by an `exposure`, a scalar, where there is one, before it is
     encoded. `settings.reflection` says what reflects, `settings.color_space` whether radiance is linear or a screen's numbers.
+
+    Deferred shading with a diffuse part from the environment leaves something over, normals being a pixel's mean and light being
+    traced once: harmonics that the surfels have beyond the constant are a colour by direction that is added to the picture, encoded.
     """
     deferred, display = settings.shading == "deferred", settings.color_space == "display"
     mirror = settings.reflection == "mirror"
@@ -125,18 +138,24 @@ def render(
         blended = [lit[0], shade_splats(stack(lit), environment, camera, mirror), *lit[1:4]]
     else:
         blended = lit if deferred else [lit[0], lit[4]]
+    adds = deferred and settings.diffuse == "irradiance" and surfels.sh_rest.shape[1] > 0
+    if adds:
+        none = torch.zeros_like(surfels.sh_dc)
+        blended = [directional(none, surfels.sh_rest, SIGNED, surfels.positions, camera), *blended]
     features, depth, alpha = rasterize(*discs(surfels, camera), stack(blended), camera, near=near)
     if deferred:
+        residual, features = features.split((3 * adds, features.shape[-1] - 3 * adds), dim=-1)
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
         how = display, mirror, settings.diffuse == "sh"
         shaded = shade(features, alpha, environment, camera, background, visibility, exposure, *how)
-        radiance = srgb_decode(shaded.radiance) if display else shaded.radiance
-        return Rendering(shaded.color, alpha, depth, shaded.normal, shaded.material, radiance, visibility)
+        color = shaded.color + (residual - SIGNED * alpha[..., None]) if adds else shaded.color
+        return Rendering(color, alpha, depth, shaded.normal, shaded.material, visibility, background, exposure)
     over = (1 - alpha[..., None]) * background
     if settings.shading == "sh":
         normal, color = features.split(3, dim=-1)
-        return Rendering(color + over, alpha, depth, normal / alpha.clamp_min(COVERED)[..., None])
+        mean = normal / alpha.clamp_min(COVERED)[..., None]
+        return Rendering(color + over, alpha, depth, mean, background=background)
     normal, mean, material = (features / alpha.clamp_min(COVERED)[..., None]).split((3, 3, 5), dim=-1)
     exposed = mean if exposure is None else exposure * mean
-    encoded, radiance = (exposed, srgb_decode(mean)) if display else (srgb_encode(exposed), mean)
-    return Rendering(encoded * alpha[..., None] + over, alpha, depth, normal, material, radiance.detach())
+    encoded = exposed if display else srgb_encode(exposed)
+    return Rendering(encoded * alpha[..., None] + over, alpha, depth, normal, material, None, background, exposure)

@@ -43,7 +43,7 @@ def write_asset(trainer: Trainer) -> None:
         factors = trainer.exposures.detach().exp().tolist()
         exposures = {view.camera.name: factor for view, factor in zip(trainer.views, factors, strict=True)}
         write_cameras(folder / "cameras.json", trainer.capture, settings.light.frame, exposures)
-    write_text(folder / "needs.json", json.dumps(_left_out(trainer, int((side == 0).sum())), indent=1))
+    write_text(folder / "needs.json", json.dumps(_left_out(trainer, surfels, int((side == 0).sum())), indent=1))
 
 
 def _with_relightable_albedo(surfels: Surfels, environment: Environment, trainer: Trainer) -> Surfels:
@@ -61,7 +61,7 @@ def _with_relightable_albedo(surfels: Surfels, environment: Environment, trainer
     look = (surfels.albedo * received).clamp(0, 1)
     if trainer.settings.render.color_space == "linear":
         look = srgb_encode(look)
-    return surfels._replace(sh_dc=((look - 0.5) / harmonics.DC)[:, None], sh_rest=surfels.sh_rest[:, :0])
+    return surfels._replace(sh_dc=((look - 0.5) / harmonics.DC)[:, None])
 
 
 def _received(surfels: Surfels, environment: Environment, trainer: Trainer) -> Tensor:
@@ -102,14 +102,14 @@ def _seen_from(surfels: Surfels, trainer: Trainer) -> Tensor:
     return torch.where(side < 0, -1.0, 1.0) * known
 
 
-def _left_out(trainer: Trainer, unseen: int) -> list[dict[str, str]]:
+def _left_out(trainer: Trainer, surfels: Surfels, unseen: int) -> list[dict[str, str]]:
     """What this run did without, why, and what that saved."""
     settings, left = trainer.settings, []
     if settings.render.shading == "sh":
         left.append(
             {"what": "materials and light", "why": "shading = sh", "saved": "shading and the light's prefilter"}
         )
-    elif settings.render.diffuse == "irradiance":
+    elif settings.render.diffuse == "irradiance" and surfels.sh_rest.shape[1] == 0:
         per = 3 * (settings.surfels.sh_degree + 1) ** 2
         saved = f"{per} parameters a surfel"
         left.append({"what": "spherical harmonics", "why": "diffuse light comes from the environment", "saved": saved})

@@ -116,6 +116,9 @@ class Trainer:
         self.initial = settings.render.shading == "deferred" and settings.initial.until > 0  # its stage is not over
 
     def _rate(self, name: str) -> float:
+        render = self.settings.render
+        if name == "sh_rest" and render.shading == "deferred" and render.diffuse == "irradiance":
+            name = "residual"
         rate = getattr(self.settings.rates, name, 0.0)  # what is traced does not learn
         return rate * self.capture.radius if name == "position" else rate
 
@@ -144,7 +147,7 @@ class Trainer:
         if render.shading == "sh":
             unused = ["albedo", "metallic", "roughness"]
         elif render.diffuse == "irradiance":
-            unused = ["sh_dc", "sh_rest"]
+            unused = ["sh_dc"] if self._residual_start() < 1 else ["sh_dc", "sh_rest"]
         if not self._reflects():
             unused += ["indirect_dc", "indirect_rest"]
         if not self._reflects() or render.diffuse == "sh":
@@ -153,6 +156,8 @@ class Trainer:
             {"albedo": MIRROR, "roughness": -MIRROR} if render.reflection == "mirror" and render.shading != "sh" else {}
         )
         self.constant = {name: self.parameters.pop(name).detach()[:1] for name in [*unused, *mirror]}
+        if "sh_rest" in unused:
+            self.constant["sh_rest"] = self.constant["sh_rest"][:, :0]
         for name, value in mirror.items():
             self.constant[name].fill_(value)
 
@@ -163,10 +168,16 @@ class Trainer:
         still = settings.render.shading == "deferred" and settings.light.frame != "camera"
         return self.from_hull and still and settings.indirect.start < 1
 
+    def _residual_start(self) -> float:
+        """The part of the training after which colour by direction learns what material and light leave over."""
+        return self.settings.residual.start if self.settings.render.shading == "deferred" else 1.0
+
     def surfels(self) -> Surfels:
         """The activated surfels, with what does not learn filled in."""
-        count = len(self.parameters["position"])
+        count, diffuse = len(self.parameters["position"]), self.settings.render.diffuse
         values = activate({**self.parameters, **self.constant})
+        if diffuse == "irradiance" and self.iteration < self._residual_start() * self.total:
+            values = values._replace(sh_rest=values.sh_rest[:, :0])
         return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
 
     def environment(self) -> Environment | None:

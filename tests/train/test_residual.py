@@ -1,0 +1,94 @@
+"""Colour by direction that adds to the picture what material and light leave over."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from refgs.capture import read_capture
+from refgs.color import srgb_encode
+from refgs.model import harmonics
+from refgs.render.rasterize import rasterize
+from refgs.render.volume import discs
+from refgs.run import create_run, open_run
+from refgs.settings import load_settings
+from refgs.train.asset import write_asset
+from refgs.train.trainer import Trainer
+
+SMALL = [
+    "surfels.start=1500",
+    "surfels.budget=1800",
+    "surfels.hull=64",
+    "environment.resolution=16",
+    "residual.start=0.5",
+    "rates.residual=0.02",
+]
+
+
+def trainer(capture_folder, folder, *changes):
+    capture = read_capture(capture_folder)
+    settings = load_settings("quick", [*SMALL, "train.iterations=60", *changes])
+    create_run(folder, capture, settings, "quick", "cpu")
+    return Trainer(capture, settings, folder, lambda event, facts: None)
+
+
+@pytest.fixture(scope="module")
+def learned(ball_capture, tmp_path_factory):
+    made = trainer(ball_capture, tmp_path_factory.mktemp("runs") / "ball")
+    made.run()
+    write_asset(made)
+    return made
+
+
+def test_it_learns_from_its_start_on(ball_capture, tmp_path):
+    made = trainer(ball_capture, tmp_path / "run")
+    rest = made.parameters["sh_rest"]
+    for _ in range(30):
+        made.step()
+        assert made.surfels().sh_rest.shape[1] == 0 or made.iteration == 30
+    assert not rest.any() and rest not in made.optimizer.state
+    made.step()
+    assert rest.any()
+
+
+def test_it_adds_its_blend_to_the_picture(learned):
+    """In float64: Σ_k c_k Y_k(d) of each surfel, d the direction from the camera."""
+    run, camera = open_run(learned.folder), learned.test[0].camera
+    surfels = run.surfels()
+    ways = surfels.positions.double() - torch.from_numpy(camera.position)
+    basis = harmonics.basis(torch.nn.functional.normalize(ways, dim=-1), 3)[:, 1:]
+    added = (basis[:, :, None] * surfels.sh_rest.double()).sum(dim=1)
+    blended = rasterize(*discs(surfels, camera), added.float().contiguous(), camera, near=run.near).features
+    whole = run.render(camera)
+    run.splats.sh = run.splats.sh[:, :1]
+    without = run.render(camera)
+    assert blended.abs().max() > 0.01
+    torch.testing.assert_close(whole.color - without.color, blended, atol=2e-5, rtol=0)
+    solid = whole.alpha > 0.9
+    encoded = srgb_encode(without.radiance) + blended / whole.alpha[..., None]
+    torch.testing.assert_close(srgb_encode(whole.radiance)[solid], encoded[solid].clamp_min(0), atol=1e-4, rtol=0)
+
+
+def test_another_light_is_without_it(learned):
+    run, camera = open_run(learned.folder), learned.test[0].camera
+    light = run.light(np.ones((16, 32, 3), np.float32))
+    with_it = run.render(camera, light).color
+    run.splats.sh = run.splats.sh[:, :1]
+    assert torch.equal(run.render(camera, light).color, with_it)
+
+
+def test_a_run_shows_what_was_learned(learned):
+    camera = learned.test[0].camera
+    shown = open_run(learned.folder).render(camera)
+    assert float((shown.color - learned.render(camera).color).abs().mean()) < 1e-3
+
+
+def test_without_it_no_harmonics_are_left(ball_capture, tmp_path):
+    made = trainer(ball_capture, tmp_path / "run", "residual.start=1", "train.iterations=10")
+    assert "sh_rest" not in made.parameters
+    made.run()
+    write_asset(made)
+    assert open_run(tmp_path / "run").splats.sh.shape[1] == 1
+    left = json.loads((tmp_path / "run" / "needs.json").read_text(encoding="utf-8"))
+    assert "spherical harmonics" in [one["what"] for one in left]
