@@ -40,6 +40,13 @@ class Training(bpy.types.PropertyGroup):
     mesh: BoolProperty(
         name="Make Mesh", description="Fuse a mesh and bake its textures when the training has ended", default=True
     )
+    region: PointerProperty(
+        name="Region",
+        description="A box, among the photos' cameras: only what lies in it comes out, and its own up, its Z axis, is the result's up. "
+        "Without one everything that the photos show does",
+        type=bpy.types.Object,
+        poll=lambda self, item: item.type == "EMPTY",
+    )
     runs: CollectionProperty(type=KnownRun)
 
 

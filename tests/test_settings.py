@@ -28,6 +28,11 @@ def test_set_changes_one_value():
         ("reflection=mirror", ["render", "diffuse = sh"]),
         ("iterations", ["section.key=value"]),
         ("rates.decay=2", ["rates.decay", "less than or equal to 1"]),
+        ("region.size=[1, -1, 1]", ["region.size.1", "greater than or equal to 0"]),
+        ("region.size=[1, 0, 1]", ["region", "[1.0, 0.0, 1.0]", "greater than 0"]),
+        ("region.size=1", ["region.size", "tuple"]),
+        ("region.centre=[0, 0]", ["region.centre.2"]),
+        ("region.up=[0, 0, nan]", ["region.up.2", "finite"]),
     ],
 )
 def test_a_wrong_change_is_named(change, words):

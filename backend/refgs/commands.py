@@ -146,7 +146,7 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     run = open_run(folder)
     if split not in ("test", "train"):
         raise InputError(f"--split {split}: take test or train")
-    capture = read_capture(run.capture_folder)
+    capture = read_capture(run.capture_folder, run.settings.region)
     if capture.fingerprint() != run.fingerprint:
         raise InputError(f"{run.capture_folder} was changed since {folder} was trained on it")
     views = capture.test_views if split == "test" else capture.train_views

@@ -61,7 +61,7 @@ def train(
     else:
         settings = load_settings(preset, changes)
         check_free(out)
-    capture = read_capture(capture_folder)
+    capture = read_capture(capture_folder, settings.region)
     if resume and capture.fingerprint() != facts["fingerprint"]:
         raise InputError(f"{capture_folder} is not the capture that {out} was trained on, or it was changed since")
     try:

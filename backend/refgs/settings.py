@@ -2,16 +2,40 @@
 
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from refgs.errors import InputError
 from refgs.paths import PRESETS
 
+Length = Annotated[FiniteFloat, Field(ge=0)]
+
 
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RegionSettings(_Section):
+    """What of a capture is wanted, a box, and which way is up: in the frame of the cameras.json of a run without (docs/run-folder.md)."""
+
+    centre: tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+    size: tuple[Length, Length, Length] = Field(description="the lengths of its edges; three zeros take all")
+    rotation: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = Field(
+        description="degrees about x, then about y, then about z, which stand still: Blender's XYZ Euler angles"
+    )
+    up: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = Field(
+        description="the direction that is to be the result's +Z, of any length; three zeros leave it to the cameras"
+    )
+
+    @model_validator(mode="after")
+    def _has_a_volume(self) -> "RegionSettings":
+        if any(self.size) and not all(self.size):
+            size = list(self.size)
+            raise ValueError(
+                f"size = {size}: each of the three must be greater than 0, or all must be 0, for no region"
+            )
+        return self
 
 
 class ImageSettings(_Section):
@@ -170,6 +194,7 @@ class MeshSettings(_Section):
 class Settings(_Section):
     """Every number of a run. All are in the preset; there are no defaults in the code."""
 
+    region: RegionSettings
     image: ImageSettings
     render: RenderSettings
     surfels: SurfelSettings

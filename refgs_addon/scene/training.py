@@ -8,6 +8,7 @@ from .. import jobs
 from ..errors import InputError
 from ..follow import follow
 from ..preferences import log_file, python, set_up
+from .regions import region_settings
 
 
 def check(scene: bpy.types.Scene) -> jobs.Job:
@@ -30,14 +31,13 @@ def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
 def train(scene: bpy.types.Scene) -> jobs.Job:
     """Train the scene's capture as its settings say, after what is being trained already. The scene remembers the run folder.
 
-    Raises InputError where the trainer, the capture or a free folder is missing.
+    Raises InputError where the trainer, the capture or a free folder is missing, or the region is flat.
     """
     settings, capture = scene.refgs, _capture(scene)
     out = Path(bpy.path.abspath(settings.out)) if settings.out else _free_folder(capture, scene)
     minutes = settings.minutes if settings.limited else None
-    job = jobs.train(
-        python(), capture, out, log_file(out.name), preset=settings.preset, minutes=minutes, mesh=settings.mesh
-    )
+    words = {"preset": settings.preset, "minutes": minutes, "mesh": settings.mesh, "settings": region_settings(scene)}
+    job = jobs.train(python(), capture, out, log_file(out.name), **words)
     _remember(scene, out, capture)
     follow()
     return job

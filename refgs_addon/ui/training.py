@@ -8,7 +8,8 @@ from bpy.props import IntProperty, StringProperty
 
 from .. import jobs, preferences
 from ..scene import live, training
-from .operators import Door, import_run_folder
+from ..scene.regions import add_training_region, training_region
+from .operators import Door, choose, import_run_folder
 from .panels import Tab
 from .pictures import curve, picture
 
@@ -31,6 +32,18 @@ class FindCameras(Door, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         training.find_cameras(context.scene)
+
+
+class AddTrainingRegion(Door, bpy.types.Operator):
+    bl_idname = "refgs.add_training_region"
+    bl_label = "Add Region"
+    bl_description = (
+        "Add a box, or select the one there is: move, turn and scale it until it stands with the object and holds it. "
+        "Only what lies in it comes out, and the box's own up, its Z axis, is the result's up"
+    )
+
+    def work(self, context: bpy.types.Context) -> None:
+        choose(context, add_training_region(context.scene))
 
 
 class Train(Door, bpy.types.Operator):
@@ -153,6 +166,11 @@ class TrainPanel(Tab, bpy.types.Panel):
         sub.active = settings.limited
         sub.prop(settings, "minutes", text="")
         column.prop(settings, "mesh")
+        row = column.row(align=True)
+        sub = row.row()
+        sub.active = training_region(context.scene) is not None
+        sub.prop(settings, "region")
+        row.operator(AddTrainingRegion.bl_idname, text="", icon="CUBE")
         column.prop(settings, "out")
         row = layout.row(align=True)
         row.enabled = bool(settings.capture and preferences.set_up())
@@ -273,7 +291,19 @@ def _lines(layout: bpy.types.UILayout, text: str, width: float, icon: str = "NON
         line = f"{line} {word}".strip()
 
 
-CLASSES = (CheckCapture, FindCameras, Train, Resume, Forget, Tell, Watch, PutAway, ImportTrained, TrainPanel)
+CLASSES = (
+    CheckCapture,
+    FindCameras,
+    AddTrainingRegion,
+    Train,
+    Resume,
+    Forget,
+    Tell,
+    Watch,
+    PutAway,
+    ImportTrained,
+    TrainPanel,
+)
 
 
 def register() -> None:

@@ -1,13 +1,15 @@
 """Training from Blender: the scene's settings, the buttons, and what a file remembers, with a trainer that only speaks as one."""
 
 import json
+import math
 
 import bpy
+import numpy as np
 import pytest
 
 from refgs_addon import jobs, preferences, ui
 from refgs_addon.errors import InputError
-from refgs_addon.scene import training
+from refgs_addon.scene import regions, training
 from tests.addon.waiting import until
 
 
@@ -112,3 +114,60 @@ def test_taken_away_while_it_trains(addon, capture):
     ui.unregister()
     assert job._process.wait(timeout=20) == 0 and not jobs.JOBS
     ui.register()
+
+
+def told(out):
+    """The settings that the trainer was told, by their names."""
+    until(lambda: (out / "started").is_file() and (out / "started").read_text())
+    words = json.loads((out / "started").read_text())["settings"]
+    return {key: json.loads(value) for key, _, value in (word.partition("=") for word in words)}
+
+
+def test_a_box_is_the_region_and_its_up_the_results(addon, capture):
+    assert bpy.ops.refgs.add_training_region() == {"FINISHED"}
+    box = addon.refgs.region
+    assert bpy.context.view_layer.objects.active == box and box.name in addon.objects
+    assert bpy.ops.refgs.add_training_region() == {"FINISHED"} and len(addon.objects) == 1
+    words = told(training.train(addon).run)
+    assert words["region.centre"] == [0, 0, 0] and words["region.size"] == [2, 2, 2]
+    assert words["region.rotation"] == [0, 0, 0] and words["region.up"] == [0, 0, 1]
+
+    box.location, box.scale, box.empty_display_size = (1, 2, 3), (1, -2, 0.5), 0.5
+    box.rotation_euler = [math.radians(angle) for angle in (90, 0, 90)]
+    matrix = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])  # x to y, y to z, z to x
+    words = told(training.train(addon).run)
+    assert words["region.centre"] == [1, 2, 3]
+    assert words["region.size"] == pytest.approx([1, 2, 0.5])
+    x, y, z = np.radians(words["region.rotation"])
+    about = [
+        np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]]),
+        np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]]),
+        np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]]),
+    ]
+    np.testing.assert_allclose(np.abs(about[2] @ about[1] @ about[0]), matrix, atol=1e-6)  # axes, either way round
+    assert words["region.up"] == pytest.approx([1, 0, 0], abs=1e-6)
+
+    box.scale.x = 0
+    with pytest.raises(InputError, match="RefGS Region is flat"):
+        training.train(addon)
+    bpy.data.objects.remove(box)
+    assert addon.refgs.region is None and told(training.train(addon).run) == {}
+
+
+def test_a_box_that_is_deleted_or_cleared_is_no_region(addon, capture):
+    bpy.ops.refgs.add_training_region()
+    box = addon.refgs.region
+    bpy.ops.object.delete()  # the settings still know of it
+    assert regions.training_region(addon) is None and regions.region_settings(addon) == {}
+    bpy.ops.refgs.add_training_region()
+    assert addon.refgs.region != box and regions.region_settings(addon)
+    addon.refgs.region = None
+    assert regions.region_settings(addon) == {}
+
+
+def test_the_box_holds_what_the_cameras_look_at(addon, capture):
+    checked = training.check(addon)
+    until(lambda: checked.ended)
+    checked.results["check"] |= {"capture": str(capture.resolve()), "centre": [1.0, 2.0, 3.0], "radius": 4.0}
+    box = regions.add_training_region(addon)
+    assert list(box.location) == [1, 2, 3] and list(box.scale) == [4, 4, 4]

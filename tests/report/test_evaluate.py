@@ -184,7 +184,7 @@ def test_normals_that_a_data_set_brings_are_the_truth_where_there_is_no_other(ma
     def published(view, max_side):
         asked.append(view.camera.name)
         images = maps(there.render(view.camera))
-        return np.where(images["alpha"][..., None] > 0.5, -images["normal"], 0), images["alpha"]
+        return np.where(images["alpha"][..., None] > 0.5, -images["normal"] @ TURN.T, 0), images["alpha"]
 
     monkeypatch.setattr("refgs.report.evaluate.published_normals", published)
     commands.evaluate(run, "test", None)

@@ -32,8 +32,8 @@ SMALL = [
 
 
 def trainer(capture_folder, folder, *changes, total=150):
-    capture = read_capture(capture_folder)
     settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
+    capture = read_capture(capture_folder, settings.region)
     made = Trainer(capture, settings, folder, lambda event, facts: None)
     if not folder.exists():
         create_run(folder, capture, settings, "quick", "cpu")
@@ -125,7 +125,10 @@ TURNING = ["light.frame=camera", "light.exposure=on"]
 STAGES = ["initial.until=0.5", "densify.reset_every=30", "propagation.every=20", "propagation.rest=15"]
 
 
-@pytest.mark.parametrize("changes", [[], ["shading=sh"], ["diffuse=sh"], INDIRECT, TURNING, STAGES])
+REGION = ["region.centre=[0.0, 0.0, 0.4]", "region.size=[2.5, 2.5, 1.2]", "region.up=[0.0, 1.0, 1.0]"]
+
+
+@pytest.mark.parametrize("changes", [[], ["shading=sh"], ["diffuse=sh"], INDIRECT, TURNING, STAGES, REGION])
 def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
     """Bit for bit, through densification."""
     changes = [*changes, "train.checkpoint_every=40", "densify.every=25"]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from refgs.capture.box import Box
 from refgs.capture.cameras import read_cameras, read_run_cameras, write_cameras
 from refgs.capture.colmap import find_model, read_colmap
 from refgs.capture.files import find_photos
@@ -16,11 +17,13 @@ from refgs.capture.nerf_blender import published_normals, read_nerf_blender
 from refgs.capture.nerfstudio import read_nerfstudio
 from refgs.capture.nero import read_nero
 from refgs.capture.poses import in_frame
-from refgs.capture.region import find_region, run_frame, sample_silhouettes, up_direction
+from refgs.capture.region import find_region, region_in, run_frame, sample_silhouettes, up_direction
 from refgs.capture.types import Capture, View
 from refgs.errors import InputError, NoCameras
+from refgs.settings import RegionSettings
 
 __all__ = [
+    "Box",
     "Capture",
     "LoadedView",
     "View",
@@ -45,10 +48,11 @@ def find_layout(folder: Path) -> str | None:
     return "nero" if (folder / "0-camera.pkl").is_file() else None
 
 
-def read_capture(folder: Path) -> Capture:
+def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
     """Reads the cameras of a capture, whatever its layout, and works out the run's frame.
 
-    Photos are not decoded, only their headers read, and some masks. Raises InputError, one line for the artist.
+    `wanted` is the part of it that is wanted and which way is up, if that was said, in the frame that it would have without. Photos
+    are not decoded, only their headers read, and some masks. Raises InputError, one line for the artist.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -91,13 +95,24 @@ def read_capture(folder: Path) -> Capture:
     up = up_direction(views)
     region = find_region(views, up, points, silhouettes)
     digest = _digest(folder, layout, views)
-    to_capture = np.eye(4)
-    if layout != "nerf-blender":
-        to_capture = run_frame(up, region)
+    # What is at the origin with radius 1: in NeRF-Blender captures whatever is.
+    origin, unit = (np.zeros(3), 1.0) if layout == "nerf-blender" else (region.centre, region.radius)
+    to_capture = np.eye(4) if layout == "nerf-blender" else run_frame(up, origin, unit)
+    box, reach = None, region.radius
+    if wanted is not None and any(wanted.size):
+        box, whole = Box.of(wanted).moved(to_capture), region
+        region = region_in(box, views, silhouettes)
+        reach = whole.radius + float(np.linalg.norm(whole.centre - region.centre))
+    turned = wanted is not None and any(wanted.up)
+    if turned:
+        to_capture = to_capture @ run_frame(np.array(wanted.up) / np.linalg.norm(wanted.up), np.zeros(3), 1.0)
+    if turned or layout != "nerf-blender":
         to_run = np.linalg.inv(to_capture)
         views = [replace(view, camera=in_frame(view.camera, to_run)) for view in views]
         points = None if points is None else points @ to_run[:3, :3].T + to_run[:3, 3]
-        region = replace(region, centre=np.zeros(3), radius=1.0)
+        box = None if box is None else box.moved(to_run)
+        centre = to_run[:3, :3] @ (region.centre - origin)
+        region, reach = replace(region, centre=centre, radius=region.radius / unit), reach / unit
     return Capture(
         folder=folder,
         layout=layout,
@@ -109,6 +124,8 @@ def read_capture(folder: Path) -> Capture:
         bounded_because=region.because,
         centre=region.centre,
         radius=region.radius,
+        reach=reach,
+        box=box,
         digest=digest,
         warnings=warnings,
     )

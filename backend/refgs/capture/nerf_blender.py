@@ -30,8 +30,8 @@ def read_nerf_blender(folder: Path) -> list[View]:
 def published_normals(view: View, max_side: int | None = None) -> tuple[np.ndarray, np.ndarray] | None:
     """The true normals that a data set brings for a view, and the object's coverage; None where it brings none.
 
-    Unit normals (H, W, 3) float32, zero where there is no surface, in the capture's frame, which in this layout is the
-    run's too; and alpha (H, W) float32 in 0..1; of the size that `load_view` gives. Raises InputError naming the file.
+    Unit normals (H, W, 3) float32, zero where there is no surface, in the capture's frame; and alpha (H, W) float32
+    in 0..1; of the size that `load_view` gives. Raises InputError naming the file.
     """
     if view.normal_path is None:
         return None

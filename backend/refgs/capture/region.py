@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from refgs.capture.box import Box
 from refgs.capture.images import read_alpha
 from refgs.capture.types import View
 from refgs.errors import InputError
+from refgs.geometry.project import inside, project
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,15 @@ def find_region(
     return Region(centre, radius, True, "the cameras surround one place they look at (no masks: a guess)")
 
 
+def region_in(box: Box, views: list[View], silhouettes: list[tuple[View, np.ndarray]]) -> Region:
+    """The region of interest where a box was asked for: what the masks show in it, else all of it. Raises InputError where no photo
+    shows the box."""
+    if not any(inside(view.camera, *project(view.camera, box.grid(5))).any() for view in views):
+        raise InputError("no photo shows the region: put its box where the cameras look")
+    carved = _carve(silhouettes, box.centre, box.radius, box) if silhouettes else None
+    return Region(*(carved or (box.centre, box.radius)), True, "a region was asked for")
+
+
 def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
     """The point nearest to all optical axes (least squares), the depth of each camera to it, and the axes' misses.
 
@@ -81,15 +92,15 @@ def up_direction(views: list[View]) -> np.ndarray:
     return result / np.linalg.norm(result)
 
 
-def run_frame(up: np.ndarray, region: Region) -> np.ndarray:
-    """run → capture, the 4×4 similarity that puts the region at the origin with radius 1 and `up` along +Z."""
+def run_frame(up: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    """run → capture, the 4×4 similarity that puts a ball at the origin with radius 1 and `up` along +Z."""
     # The horizontal axes: as near to the capture's x as can be.
     x = np.eye(3)[np.argmin(np.abs(up))] if abs(up[0]) > 0.9 else np.array([1.0, 0.0, 0.0])
     x = x - up * (up @ x)
     x /= np.linalg.norm(x)
     matrix = np.eye(4)
-    matrix[:3, :3] = region.radius * np.stack([x, np.cross(up, x), up], axis=1)
-    matrix[:3, 3] = region.centre
+    matrix[:3, :3] = radius * np.stack([x, np.cross(up, x), up], axis=1)
+    matrix[:3, 3] = centre
     return matrix
 
 
@@ -131,8 +142,11 @@ def _one_sided(views: list[View], centre: np.ndarray, up: np.ndarray) -> float:
     return float(np.linalg.norm((away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)).mean(axis=0)))
 
 
-def _carve(silhouettes: list[tuple[View, np.ndarray]], centre: np.ndarray, half: float) -> tuple | None:
-    """Centre and radius of a coarse visual hull inside the cube centre ± half; None where the masks carve all away.
+def _carve(
+    silhouettes: list[tuple[View, np.ndarray]], centre: np.ndarray, half: float, box: Box | None = None
+) -> tuple | None:
+    """Centre and radius of a coarse visual hull inside the cube centre ± half, of what is in the box if there is one; None where the
+    masks carve all away.
 
     Twice: over the cube, then over what was left of it. A cell may miss a tenth of the masks that see it.
     """
@@ -141,6 +155,7 @@ def _carve(silhouettes: list[tuple[View, np.ndarray]], centre: np.ndarray, half:
         axes = [np.linspace(low[i], high[i], 49) for i in range(3)]
         cell = np.array([axis[1] - axis[0] for axis in axes])
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        grid = grid if box is None else grid[box.contains(grid)]
         inside, seen = np.zeros(len(grid)), np.zeros(len(grid))
         for view, mask in silhouettes:
             camera = view.camera.resized(mask.shape[1], mask.shape[0])

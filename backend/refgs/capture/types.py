@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from refgs.camera import Camera
+from refgs.capture.box import Box
 from refgs.capture.lens import Lens
 
 Split = Literal["train", "test"]
@@ -42,11 +43,13 @@ class View:
 class Capture:
     """Photos with cameras in the run's frame: Z up, and the capture's own frame back through `to_capture`.
 
-    `to_capture` is a 4×4 float64 similarity, p_capture = to_capture @ p_run: the identity for NeRF-Blender; elsewhere
-    it puts the region of interest at the origin with radius 1. `points` (M, 3) are structure-from-motion points in
-    the run's frame with `point_colors` (M, 3) sRGB-encoded in 0..1, both None where the layout has none. `centre` (3,)
-    and `radius` are the region of interest: the object, or a room's foreground. `bounded` is a guess: the photos
-    surround one object (True) or look at a place (False); `bounded_because` is its reason in words.
+    `to_capture` is a 4×4 float64 similarity, p_capture = to_capture @ p_run: for NeRF-Blender the identity; elsewhere
+    it puts the region of interest at the origin with radius 1. Where a direction was named that is up, turned about the origin after that.
+    `points` (M, 3) are structure-from-motion points in the run's frame with `point_colors` (M, 3) sRGB-encoded in 0..1,
+    both None where the layout has none. `centre` (3,) and `radius` are the region of interest: the object, or a room's
+    foreground. `bounded` is a guess: the photos surround one object (True) or look at a place (False); `bounded_because` is
+    its reason in words. Where only what is in a `box`, in the run's frame, is wanted, it moves nothing, but the region of interest
+    lies in it then, and a ball of radius `reach` about `centre` holds what else the photos show; without one that is `radius`.
     `warnings` are lines about what was left out or looks wrong but does not stop the reading.
     """
 
@@ -60,6 +63,8 @@ class Capture:
     bounded_because: str
     centre: np.ndarray
     radius: float
+    reach: float
+    box: Box | None
     digest: str
     warnings: list[str]
 

@@ -160,7 +160,7 @@ def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor
     inward = np.einsum("na,na->n", surfels.normals().numpy(), outward) < 0
     surfels = surfels.turned(torch.from_numpy(inward))
     chosen = torch.randperm(len(positions), generator=torch.Generator().manual_seed(0))[:PROBES]
-    probes = Surfels(*(value[chosen] for value in surfels))
+    probes = surfels.chosen(chosen)
     traced = Transport(probes, occluder, PROBE_DIRECTIONS)
     found, _ = _gather(traced, light, BOUNCES)
     part = (found / light.diffuse(traced.normals).clamp_min(1e-6)).clamp_max(MOST_RECEIVED)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import torch
 
 from refgs.camera import Camera
 from refgs.capture import LoadedView, View, load_view, published_normals
+from refgs.capture.poses import split_similarity
 from refgs.color import srgb_encode
 from refgs.errors import InputError
 from refgs.export.environment import directions, read_environment, read_exr, sample
@@ -138,6 +140,9 @@ def _view(
     camera, background = loaded.camera, np.array(run.settings.image.background, dtype=np.float32)
     rendering = run.render(camera)
     color = np.clip(rendering.color.numpy(), 0, 1)
+    if any(run.settings.region.size):  # the photo shows more than is wanted: only what the run covers of it is compared
+        shown = np.rint(255 * rendering.alpha.numpy()).astype(np.uint8)
+        loaded = replace(loaded, alpha=shown if loaded.alpha is None else np.minimum(shown, loaded.alpha))
     photo = composite(loaded, torch.from_numpy(background)).numpy()
     figures = {measure.__name__: measure(color, photo) for measure in (metrics.psnr, metrics.ssim, metrics.flip)}
     if run.exposed and run.settings.render.color_space == "linear":
@@ -159,9 +164,9 @@ def _view(
         if name in images:
             write(name, picture(name, images[name], alpha))
     known, true_alpha = truth.maps(camera) if truth else ({}, np.zeros_like(alpha))
-    if not known:
-        published = published_normals(view, run.settings.image.max_side)
-        known, true_alpha = ({"normal": published[0]}, published[1]) if published else (known, true_alpha)
+    if not known and (published := published_normals(view, run.settings.image.max_side)):
+        turn = split_similarity(run.to_capture)[1].astype(np.float32)
+        known, true_alpha = {"normal": published[0] @ turn}, published[1]
     covered = true_alpha >= metrics.COVERED
     for name, true in known.items():
         write(f"true_{name}", picture(name, true, true_alpha))

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from refgs.capture import write_cameras
 from refgs.color import srgb_decode, srgb_encode
+from refgs.errors import InputError
 from refgs.export.environment import write_environment
 from refgs.export.splats import write_splats
 from refgs.geometry.mesh import write_mesh
@@ -34,16 +35,20 @@ def write_asset(trainer: Trainer) -> None:
         display = settings.render.color_space == "display"
         write_environment(folder / "environment.exr", srgb_decode(panorama) if display else panorama)
         surfels = _with_relightable_albedo(surfels, environment, trainer)
-    side = _seen_from(surfels, trainer)
-    surfels, outward = Surfels(*(value[side != 0] for value in surfels)), side[side != 0]
-    splats = to_splats(surfels)
-    splats.normals *= outward.numpy(force=True)[:, None]
+    side, wanted = _seen_from(surfels, trainer), trainer.wanted()
+    kept = wanted & (side != 0)
+    if not kept.any():
+        raise InputError(
+            "the photos show nothing in the region: move its box, or enlarge it, and train into a new folder"
+        )
+    splats = to_splats(surfels.chosen(kept))
+    splats.normals *= side[kept].numpy(force=True)[:, None]
     write_splats(folder / "splats.ply", splats)
     if trainer.exposures is not None:
         factors = trainer.exposures.detach().exp().tolist()
         exposures = {view.camera.name: factor for view, factor in zip(trainer.views, factors, strict=True)}
         write_cameras(folder / "cameras.json", trainer.capture, settings.light.frame, exposures)
-    write_text(folder / "needs.json", json.dumps(_left_out(trainer, surfels, int((side == 0).sum())), indent=1))
+    write_text(folder / "needs.json", json.dumps(_left_out(trainer, surfels, side, wanted), indent=1))
 
 
 def _with_relightable_albedo(surfels: Surfels, environment: Environment, trainer: Trainer) -> Surfels:
@@ -102,8 +107,9 @@ def _seen_from(surfels: Surfels, trainer: Trainer) -> Tensor:
     return torch.where(side < 0, -1.0, 1.0) * known
 
 
-def _left_out(trainer: Trainer, surfels: Surfels, unseen: int) -> list[dict[str, str]]:
-    """What this run did without, why, and what that saved."""
+def _left_out(trainer: Trainer, surfels: Surfels, side: Tensor, wanted: Tensor) -> list[dict[str, str]]:
+    """What this run did without, why, and what that saved. From which `side` (N,) surfels are seen, as `_seen_from` says, and which (N,)
+    are wanted."""
     settings, left = trainer.settings, []
     if settings.render.shading == "sh":
         left.append(
@@ -146,7 +152,10 @@ def _left_out(trainer: Trainer, surfels: Surfels, unseen: int) -> list[dict[str,
         )
     if any(view.alpha is None for view in trainer.views):
         left.append({"what": "the mask loss", "why": "not every photo has a mask", "saved": "one term of the loss"})
-    if unseen:
-        saved = f"{unseen} rows of splats.ply"
-        left.append({"what": f"{unseen} surfels", "why": "no training view sees them", "saved": saved})
+    for why, which in (
+        ("no training view sees them", wanted & (side == 0)),
+        ("they show what is outside the region", ~wanted),
+    ):
+        if count := int(which.sum()):
+            left.append({"what": f"{count} surfels", "why": why, "saved": f"{count} rows of splats.ply"})
     return left

@@ -17,10 +17,11 @@ def write_preview(trainer: Trainer) -> dict[str, str | int]:
     at all. Returns their names, and the iteration that they are of."""
     folder = trainer.folder / FOLDER
     view = (trainer.test or trainer.views)[0]
-    rendering = trainer.render(view.camera)
-    write_png(folder / "view.png", color_picture(rendering, np.array(trainer.settings.image.background)))
     with torch.no_grad():
-        write_splats(folder / "splats.ply", to_splats(with_normals_last(trainer.surfels())))
+        surfels = trainer.surfels().chosen(trainer.wanted())
+        rendering = trainer.render(view.camera, surfels)
+        write_png(folder / "view.png", color_picture(rendering, np.array(trainer.settings.image.background)))
+        write_splats(folder / "splats.ply", to_splats(with_normals_last(surfels)))
     return {
         "iteration": trainer.iteration,
         "view": str((folder / "view.png").resolve()),

@@ -5,48 +5,37 @@ import math
 import numpy as np
 from scipy.spatial import cKDTree
 
-from refgs.capture import Capture, LoadedView
+from refgs.capture import Box, Capture, LoadedView
+from refgs.errors import InputError
 from refgs.geometry.hull import visual_hull_points
 from refgs.model.surfels import Parameters, initial_parameters
 from refgs.settings import Settings, SurfelSettings
 
 GEOMETRY = ("position", "rotation", "scale", "opacity")
 FAINT = 0.1  # opacity, at the most, of points that may lie anywhere
+AROUND = 0.5  # part of the surfels, at the most, that show what is beside the region that is wanted
 
 
-def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings) -> tuple[Parameters, str]:
-    """Initial parameters and one line that says where they came from."""
+def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings) -> tuple[Parameters, int, str]:
+    """Initial parameters; how many of the surfels, the first ones, lie on what is known of the surface; and one line that says where they
+    came from. Those that follow start inside the visual hull, where it has hollows that no mask shows."""
     count, seed = min(settings.surfels.start, settings.surfels.budget), settings.train.seed
     colours, opacity, shown = None, settings.surfels.opacity, count
     if all(view.alpha is not None for view in views):
-        shown = on_hull(count, settings.surfels)
-        positions, normals, spacing = visual_hull_points(
-            [view.alpha for view in views],
-            [view.camera for view in views],
-            capture.centre,
-            capture.radius,
-            count,
-            resolution=settings.surfels.hull,
-            seed=seed,
-            on_hull=shown,
-        )
+        positions, normals, spacing, shown = _hull(capture, views, count, settings)
         source = "the visual hull of the masks"
-    elif capture.points is not None and len(capture.points) >= 100:
-        positions, colours = _thinned(capture.points, capture.point_colors, count, seed)
-        normals, spacing, opacity = _towards_cameras(positions, views), _spacing(positions), min(opacity, FAINT)
-        source = f"{len(positions)} structure-from-motion points"
     else:
-        positions = _random(capture, count, seed)
-        normals, spacing, opacity = _towards_cameras(positions, views), _spacing(positions), min(opacity, FAINT)
-        source = "random points (no masks and no structure-from-motion points)"
+        opacity = min(opacity, FAINT)
+        if _has_points(capture):
+            positions, colours = _thinned(capture, count, seed)
+            source = f"{len(positions)} structure-from-motion points"
+        else:
+            positions = _random(capture, count, seed)
+            source = "random points (no masks and no structure-from-motion points)"
+        normals, spacing = _towards_cameras(positions, views), _spacing(positions)
     parameters = _initial(positions, normals, spacing, colours, settings.surfels, opacity)
     parameters["opacity"].data[shown:].clamp_(max=math.log(FAINT / (1 - FAINT)))
-    return parameters, f"{len(positions)} surfels start on {source}"
-
-
-def on_hull(count: int, settings: SurfelSettings) -> int:
-    """How many of the surfels start on the visual hull; those that follow start inside, where it has hollows that no mask shows."""
-    return max(1, count - round(settings.inside * count))
+    return parameters, shown, f"{len(positions)} surfels start on {source}"
 
 
 def start_appearance(settings: Settings) -> Parameters:
@@ -70,22 +59,83 @@ def _initial(positions, normals, spacing, colours, surfels: SurfelSettings, opac
     )
 
 
-def _thinned(points: np.ndarray, colours: np.ndarray | None, count: int, seed: int):
-    if len(points) > count:
+def _hull(capture: Capture, views: list[LoadedView], count: int, settings: Settings):
+    """On the visual hull of the masks and inside it: positions, normals, spacing; how many are on it, which come first."""
+    alphas, cameras = [view.alpha for view in views], [view.camera for view in views]
+    surfels, seed = settings.surfels, settings.train.seed
+
+    def within(radius: float) -> tuple:
+        shown = max(1, count - round(surfels.inside * count))
+        found = visual_hull_points(
+            alphas, cameras, capture.centre, radius, count, resolution=surfels.hull, seed=seed, on_hull=shown
+        )
+        return *found, np.arange(count) < shown
+
+    if capture.box is None:
+        *found, on_it = within(capture.radius)
+        return *found, int(on_it.sum())
+    around = within(capture.reach)
+    try:
+        near = within(capture.radius)
+    except InputError as error:
+        raise InputError(
+            f"nothing that the masks show lies in the region: move its box, or enlarge it ({error})"
+        ) from None
+    chosen = _in_and_around(capture.box, near[0], around[0], count, seed)
+    positions, normals, _, on_it = (
+        np.concatenate([values[rows] for values, rows in zip(pair, chosen, strict=True)])
+        for pair in zip(near, around, strict=True)
+    )
+    order = np.argsort(~on_it, kind="stable")
+    return positions[order], normals[order], _spacing(positions[order]), int(on_it.sum())
+
+
+def _in_and_around(
+    box: Box, near: np.ndarray, around: np.ndarray, count: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which of the points `near` (N, 3) lie in the box, and which of those `around` (M, 3) do not: so many in all at the most, at random,
+    and AROUND of that of the latter. Raises InputError where none is in the box."""
+    rng = np.random.default_rng(seed)
+    inner, outer = np.flatnonzero(box.contains(near)), np.flatnonzero(~box.contains(around))
+    if len(inner) == 0:
+        raise InputError("nothing that the photos show lies in the region: move its box, or enlarge it")
+    outer = rng.permutation(outer)[: int(AROUND * count)]
+    return np.sort(rng.permutation(inner)[: count - len(outer)]), np.sort(outer)
+
+
+def _has_points(capture: Capture) -> bool:
+    """Whether there are enough points from structure from motion, of what is wanted, to start from."""
+    if capture.points is None:
+        return False
+    return len(capture.points if capture.box is None else capture.points[capture.box.contains(capture.points)]) >= 100
+
+
+def _thinned(capture: Capture, count: int, seed: int):
+    points, colours, chosen = capture.points, capture.point_colors, slice(None)
+    if capture.box is not None:
+        chosen = np.concatenate(_in_and_around(capture.box, points, points, count, seed))
+    elif len(points) > count:
         chosen = np.random.default_rng(seed).choice(len(points), count, replace=False)
-        points, colours = points[chosen], None if colours is None else colours[chosen]
-    return points, colours
+    return points[chosen], None if colours is None else colours[chosen]
 
 
 def _random(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """Uniform in the ball of interest; where the capture is a room, half of them beyond it, uniform in inverse distance."""
+    """Uniform in the ball of interest; where the capture is a room, half of them beyond it, uniform in inverse distance. Where a box is
+    wanted, uniform in that, and beyond it in the same way."""
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     distance = np.cbrt(rng.random(count))
-    if not capture.bounded:
-        distance[::2] = 1 / rng.uniform(0.1, 1, len(distance[::2]))
-    return capture.centre + capture.radius * distance[:, None] * direction
+    if capture.box is not None or not capture.bounded:
+        beyond = distance[:: 2 if capture.box is None else 1]
+        beyond[:] = 1 / rng.uniform(0.1, 1, len(beyond))
+    points = capture.centre + capture.radius * distance[:, None] * direction
+    if capture.box is None:
+        return points
+    matrix = capture.box.matrix
+    near = rng.uniform(-1, 1, (count, 3)) @ matrix[:3, :3].T + matrix[:3, 3]
+    inner, outer = _in_and_around(capture.box, near, points, count, seed)
+    return np.concatenate([near[inner], points[outer]])
 
 
 def _towards_cameras(positions: np.ndarray, views: list[LoadedView]) -> np.ndarray:

@@ -31,7 +31,7 @@ from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify, propagate_normals, reset_opacity, thin
 from refgs.train.light import light_frame, mirrored
 from refgs.train.losses import Photo, departure, objective
-from refgs.train.start import GEOMETRY, on_hull, start_appearance, start_parameters
+from refgs.train.start import AROUND, GEOMETRY, start_appearance, start_parameters
 
 Report = Callable[[str, dict[str, Any]], None]
 """Called with an event's name and its facts: "stage", "progress", "warning"."""
@@ -92,9 +92,9 @@ class Trainer:
         self.iteration, self.seconds = 0, 0.0
         self._order: tuple[int, list[int]] = (-1, [])
 
-        start, source = start_parameters(capture, self.views, settings)
+        start, shown, source = start_parameters(capture, self.views, settings)
         self.chosen: dict[str, str] = {}  # by a setting that asked for it: what was chosen, and why
-        self._choose_light_frame(start)
+        self._choose_light_frame(start, shown)
         self.parameters = {name: value.detach().to(self.device).requires_grad_() for name, value in start.items()}
         report("stage", {"what": source})
         self.light = torch.empty(6 * self._light_resolution(0) ** 2, 3, device=self.device)
@@ -122,8 +122,8 @@ class Trainer:
         rate = getattr(self.settings.rates, name, 0.0)  # what is traced does not learn
         return rate * self.capture.radius if name == "position" else rate
 
-    def _choose_light_frame(self, start: Parameters) -> None:
-        """Where the settings leave it to the photos. They say which it is from here on."""
+    def _choose_light_frame(self, start: Parameters, shown: int) -> None:
+        """Where the settings leave it to the photos. They say which it is from here on. So many of the first surfels are on the hull."""
         light, lit = self.settings.light, self.settings.render.shading != "sh"
         if light.frame != "auto":
             return
@@ -131,8 +131,7 @@ class Trainer:
         if lit and self.from_hull:
             with torch.no_grad():
                 points = activate(start)
-                shown = slice(on_hull(len(points.positions), self.settings.surfels))
-                found = points.positions[shown].numpy(), points.normals()[shown].numpy()
+                found = points.positions[:shown].numpy(), points.normals()[:shown].numpy()
             frame, why = light_frame(self.views, *found, self.capture.radius)
         self.settings = self.settings.model_copy(update={"light": light.model_copy(update={"frame": frame})})
         self.chosen["light.frame"] = f"{frame}: {why}"
@@ -179,6 +178,13 @@ class Trainer:
         if diffuse == "irradiance" and self.iteration < self._residual_start() * self.total:
             values = values._replace(sh_rest=values.sh_rest[:, :0])
         return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
+
+    def wanted(self) -> Tensor:
+        """Which surfels (N,) are in the region that is wanted, all where there is none. The others show what photos show beside it."""
+        position, box = self.parameters["position"], self.capture.box
+        if box is None:
+            return torch.ones(len(position), dtype=torch.bool, device=self.device)
+        return torch.from_numpy(box.contains(position.numpy(force=True))).to(self.device)
 
     def environment(self) -> Environment | None:
         """The light as it is now; none where nothing is lit."""
@@ -242,10 +248,10 @@ class Trainer:
         settings = self.settings.render
         return settings.model_copy(update={"shading": "splat"}) if self.initial else settings
 
-    def render(self, camera: Camera) -> Rendering:
-        """Render a camera without gradients."""
+    def render(self, camera: Camera, surfels: Surfels | None = None) -> Rendering:
+        """Render a camera without gradients: all surfels, or those given."""
         with torch.no_grad():
-            return self._render(self.surfels(), self.environment(), camera)
+            return self._render(self.surfels() if surfels is None else surfels, self.environment(), camera)
 
     def _render(
         self, surfels: Surfels, environment: Environment | None, camera: Camera, exposure: Tensor | None = None
@@ -349,10 +355,17 @@ class Trainer:
         settings = self.settings.densify
         if self.iteration % settings.every or progress < settings.start:
             return
+        gradient = self.motion.mean()
+        if self.capture.box is not None:  # what is beside it gets no more than its share
+            wanted = self.wanted()
+            ranked = torch.where(wanted, torch.inf, gradient).argsort(descending=True)
+            count = int(wanted.sum())
+            room = max(int(AROUND * self.budget) - (len(wanted) - count), 0)
+            gradient[ranked[count + room :]] = 0
         densify(
             self.parameters,
             self.optimizer,
-            self.motion.mean(),
+            gradient,
             settings,
             self.budget,
             divide=progress < settings.stop,
@@ -388,8 +401,9 @@ class Trainer:
         capture, settings = self.capture, self.settings.indirect
         cameras = [view.camera for view in self.views[:: max(1, len(self.views) // TRACED)]]
         surfels, environment, self.occluder = self.surfels(), self.environment(), None
+        inside = surfels.chosen(self.wanted())
         mesh = extract(
-            lambda camera: self._render(surfels, environment, camera),
+            lambda camera: self._render(inside, environment, camera),
             cameras,
             capture.centre,
             capture.radius,
@@ -401,7 +415,7 @@ class Trainer:
             return
         hidden, solid = 0.0, 1e-9
         for camera in cameras[::3]:
-            looked = self._render(surfels, environment, camera)
+            looked = self._render(inside, environment, camera)
             opaque = looked.alpha > 0.5
             hidden += float((1 - looked.visibility)[opaque].sum())
             solid += float(opaque.sum())

@@ -1,0 +1,137 @@
+"""A region of a capture: of two balls only the one in the box comes out; and the result stands as it was asked to."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from benchmarks.scenes.analytic import TWO, camera_matrix, photo, write_ball_capture
+from refgs import commands, jobs
+from refgs.capture import read_capture
+from refgs.errors import InputError
+from refgs.export.mesh import read_glb
+from refgs.export.splats import read_splats
+from refgs.run import open_run
+from refgs.settings import load_settings
+from refgs.train.preview import write_preview
+from refgs.train.start import AROUND, start_parameters
+from refgs.train.trainer import Trainer
+
+SMALL = [
+    "surfels.start=1500",
+    "surfels.budget=1800",
+    "surfels.hull=48",
+    "environment.resolution=16",
+    "train.light_first=20",
+    "train.iterations=150",
+    "mesh.resolution=48",
+]
+RIGHT = ["region.centre=[0.62, 0.0, 0.0]", "region.size=[1.2, 1.2, 1.2]"]
+
+
+@pytest.fixture(scope="module", params=["masks", "no masks"])
+def balls(request, tmp_path_factory):
+    """Two mirrors that show each other, each hiding the other in some photos; before nothing, or before grey."""
+    folder = tmp_path_factory.mktemp("balls")
+    write_ball_capture(folder, 48, TWO, samples=2)
+    if request.param == "no masks":
+        for file in folder.rglob("*.png"):
+            pixels = np.asarray(Image.open(file)).astype(float)
+            alpha = pixels[..., 3:] / 255
+            Image.fromarray(np.rint(pixels[..., :3] * alpha + 128 * (1 - alpha)).astype(np.uint8)).save(file)
+    return folder
+
+
+def train(capture, out, *changes):
+    return jobs.train(
+        capture, out, "quick", "cpu", None, [*SMALL, *changes], False, lambda *_: None, lambda trainer: False
+    )
+
+
+@pytest.fixture(scope="module")
+def right(balls, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "right"
+    return (*train(balls, folder, *RIGHT), folder)
+
+
+def test_only_what_is_in_the_box_comes_out(right, balls):
+    trainer, quality, folder = right
+    run = open_run(folder)
+    box = read_capture(balls, trainer.settings.region).box
+    assert box.contains(run.splats.positions).all()
+    beside = int((~trainer.wanted()).sum())
+    assert 0 < beside <= AROUND * trainer.budget, "something has to show the other ball"
+    said = {entry["why"]: entry["what"] for entry in json.loads((folder / "needs.json").read_text())}
+    assert said["they show what is outside the region"] == f"{beside} surfels"
+    assert quality > (20 if trainer.from_hull else 15)
+    # The silhouette is the one ball's, also where the other is before it.
+    shares = []
+    for view in trainer.test:
+        direction = view.camera.position @ trainer.capture.to_capture[:3, :3].T
+        true = photo(camera_matrix(direction), 48, TWO[1:])[..., 3] > 0.5
+        alpha = run.render(view.camera).alpha.numpy() > 0.5
+        shares.append((alpha & true).sum() / (alpha | true).sum())
+    assert np.mean(shares) > (0.85 if trainer.from_hull else 0.6)
+
+
+def test_mesh_figures_and_preview_are_of_the_box(right, balls):
+    trainer, _, folder = right
+    preview = write_preview(trainer)
+    assert trainer.capture.box.contains(read_splats(preview["splats"]).positions).all()
+    commands.evaluate(folder, "test", None)
+    assert json.loads((folder / "metrics.json").read_text())["psnr"] > 20
+    if trainer.from_hull:
+        commands.export(folder, None, 64, None, None, False)
+        mesh = read_glb(folder / "mesh.glb")
+        assert np.linalg.norm(mesh.vertices - TWO[1, :3], axis=1).max() < 0.7
+
+
+def test_surfels_start_in_the_box_and_around_it(balls):
+    settings = load_settings("quick", [*SMALL, *RIGHT])
+    capture = read_capture(balls, settings.region)
+    made = Trainer(capture, settings, balls / "none", lambda *_: None)
+    inside = made.wanted()
+    assert 0.5 <= inside.float().mean() < 1 and len(inside) <= 1500
+    if made.from_hull:
+        parameters, shown, _ = start_parameters(capture, made.views, settings)
+        faint = parameters["opacity"].sigmoid() < 0.2
+        assert faint[shown:].all() and not faint[:shown].any() and 0.3 < shown / len(faint) < 0.7
+
+
+def test_a_box_with_nothing_in_it_is_said_in_a_line(balls, tmp_path):
+    if not read_capture(balls).masked:
+        pytest.skip("without masks there may be something anywhere")
+    with pytest.raises(InputError, match="in the region") as error:
+        train(balls, tmp_path / "run", "region.centre=[0.0, 0.0, 1.0]", "region.size=[0.3, 0.3, 0.3]")
+    assert "\n" not in str(error.value) and not (tmp_path / "run").exists()
+
+
+def test_up_turns_the_result_and_nothing_else(ball_capture, tmp_path):
+    """Through each run's own cameras both look the same; so does the light, in Blender's axes."""
+    up = np.array([0.6, 0.0, 0.8])
+    folders = [tmp_path / "plain", tmp_path / "turned"]
+    for folder, words in zip(folders, ([], [f"region.up={up.tolist()}"]), strict=True):
+        train(ball_capture, folder, "train.iterations=300", "surfels.metallic=0.9", *words)
+    plain, turned = map(open_run, folders)
+    np.testing.assert_allclose(turned.to_capture[:3, :3] @ (0, 0, 1), up, atol=1e-12)
+    assert np.array_equal(plain.to_capture, np.eye(4))
+    turn = turned.to_capture[:3, :3]
+    for one, other in zip(plain.cameras[::9], turned.cameras[::9], strict=True):
+        np.testing.assert_allclose(turn @ other.position, one.position, atol=1e-9)
+        seen, again = plain.render(one.fitted(64)), turned.render(other.fitted(64))
+        assert float((seen.color - again.color).abs().mean()) < 0.01
+        assert float((seen.alpha - again.alpha).abs().mean()) < 0.01
+        solid = (seen.alpha > 0.9) & (again.alpha > 0.9)
+        cosine = torch.cosine_similarity(
+            seen.normal[solid], again.normal[solid] @ torch.from_numpy(turn.T).float(), dim=-1
+        )
+        assert float(cosine.mean()) > 0.99
+    directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    there = plain.environment.diffuse(directions @ torch.from_numpy(turn.T).float())
+    here = turned.environment.diffuse(directions)
+    assert float((there - here).abs().mean() / there.mean()) < 0.06
+    commands.evaluate(folders[1], "test", None)
+    figures = json.loads((folders[1] / "metrics.json").read_text())
+    assert figures["psnr"] > 25
