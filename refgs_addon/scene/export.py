@@ -1,10 +1,8 @@
 """What leaves Blender: a run with its edits as a new run folder, its splats, its light."""
 
-import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
@@ -13,6 +11,7 @@ import numpy as np
 from ..errors import InputError
 from ..nodes.splats import NAME as SPLATS
 from .edit import edits, splats_of
+from .files import whole
 from .parts import FOLDER
 from .splats import read_rows
 
@@ -61,7 +60,7 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     rows["metallic"], rows["roughness"] = new["metallic"], new["roughness"]
     names = "".join(f"property float {name}\n" for name in rows.dtype.names)
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{names}end_header\n"
-    with _whole(path) as temporary:
+    with whole(path) as temporary:
         temporary.write_bytes(head.encode("ascii") + rows.tobytes())
 
 
@@ -109,20 +108,8 @@ def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
     _copy(mesh, path)
 
 
-@contextlib.contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A file beside, to be written, that then becomes the one that is meant."""
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"cannot write {path}: {error.strerror}") from None
-
-
 def _copy(file: Path, path: Path) -> None:
-    with _whole(path) as temporary:
+    with whole(path) as temporary:
         shutil.copyfile(file, temporary)
 
 

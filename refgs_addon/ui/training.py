@@ -7,6 +7,7 @@ import bpy
 from bpy.props import IntProperty, StringProperty
 
 from .. import jobs, preferences
+from ..preferences import lines
 from ..scene import live, training
 from .operators import Door, import_run_folder
 from .panels import Tab
@@ -137,9 +138,9 @@ class TrainPanel(Tab, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.refgs
-        width = max(context.region.width / (7 * context.preferences.system.ui_scale) - 6, 20)  # letters
+        width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
         if not preferences.set_up():
-            _lines(layout.box(), preferences.state()[1], width, "INFO")
+            lines(layout.box(), preferences.state()[1], width, "INFO")
             layout.operator(
                 "preferences.addon_show", text="Preferences", icon="PREFERENCES"
             ).module = preferences.PACKAGE
@@ -166,7 +167,7 @@ class TrainPanel(Tab, bpy.types.Panel):
                 _run(layout.box(), Path(known.folder))
 
 
-def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: float) -> None:
+def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> None:
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE", "paused": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
@@ -176,11 +177,11 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: float) -> N
     if job.active and (job.run or finding):
         box.progress(factor=_part(job), text=_how_far(job).capitalize())
     if job.line:
-        _lines(box, job.line[0].upper() + job.line[1:], width)
+        lines(box, job.line[0].upper() + job.line[1:], width)
     for warning in job.warnings:
-        _lines(box, warning[0].upper() + warning[1:], width, "ERROR")
+        lines(box, warning[0].upper() + warning[1:], width, "ERROR")
     for line in job.results.get("check", {}).get("lines", ()):
-        _lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
+        lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
     if job.curve:
         facts = job.progress
         row = box.row()
@@ -260,17 +261,6 @@ def _run(box: bpy.types.UILayout, folder: Path) -> None:
     else:
         row.label(text=f"{folder.name} is not there", icon="GHOST_DISABLED")
     row.operator(Forget.bl_idname, text="", icon="X").folder = str(folder)
-
-
-def _lines(layout: bpy.types.UILayout, text: str, width: float, icon: str = "NONE") -> None:
-    """A text on as many lines as it takes."""
-    column, line = layout.column(align=True), ""
-    column.scale_y = 0.8
-    for word in [*text.split(), ""]:
-        if line and (not word or len(line) + len(word) >= width):
-            column.label(text=line, icon=icon)
-            line, icon = "", "NONE" if icon == "NONE" else "BLANK1"
-        line = f"{line} {word}".strip()
 
 
 CLASSES = (CheckCapture, FindCameras, Train, Resume, Forget, Tell, Watch, PutAway, ImportTrained, TrainPanel)
