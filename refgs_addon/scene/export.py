@@ -47,9 +47,9 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     Raises InputError where the run's own file is not there or not the one that was imported, and where the new one cannot be written.
     """
     splats = splats_of(collection)
-    rows = read_rows(_folder(collection) / "splats.ply").copy()
+    rows = read_rows(run_folder(collection) / "splats.ply").copy()
     if len(rows) != len(splats.data.points):
-        raise InputError(f"{_folder(collection)} has changed since it was imported: import it again")
+        raise InputError(f"{run_folder(collection)} has changed since it was imported: import it again")
     new = edited_materials(splats)
     for i, channel in enumerate("rgb"):
         old, color, look = rows[f"albedo_{channel}"], new["base_color"][:, i], rows[f"f_dc_{i}"]
@@ -70,7 +70,7 @@ def export_run(collection: bpy.types.Collection, folder: Path) -> None:
     It has no mesh, whose textures would be those of before; where there are no edits the run's is copied. `refgs export`, or the
     trainer, makes one. Raises InputError.
     """
-    original = _folder(collection)
+    original = run_folder(collection)
     if folder.exists():
         raise InputError(f"{folder} exists: choose another name for the run")
     temporary = None
@@ -92,7 +92,7 @@ def export_run(collection: bpy.types.Collection, folder: Path) -> None:
 
 def export_light(collection: bpy.types.Collection, path: Path) -> None:
     """Copy a run's recovered light, an equirectangular EXR. Raises InputError."""
-    light = _folder(collection) / "environment.exr"
+    light = run_folder(collection) / "environment.exr"
     if not light.is_file():
         raise InputError(f"{light} is not there: the run has no light")
     _copy(light, path)
@@ -100,7 +100,7 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
 
 def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
     """Copy a run's mesh with its textures, a binary glTF. Raises InputError where it has none, and where edits would be lost."""
-    mesh = _folder(collection) / "mesh.glb"
+    mesh = run_folder(collection) / "mesh.glb"
     if edits(splats_of(collection)):
         raise InputError("the mesh would be without the edits: apply them to a new run, and export that one's mesh")
     if not mesh.is_file():
@@ -113,8 +113,8 @@ def _copy(file: Path, path: Path) -> None:
         shutil.copyfile(file, temporary)
 
 
-def _folder(collection: bpy.types.Collection) -> Path:
-    """The run folder that a collection was imported from."""
+def run_folder(collection: bpy.types.Collection) -> Path:
+    """The run folder that a collection was imported from. Raises InputError where it is not there."""
     folder = Path(bpy.path.abspath(collection.get(FOLDER, "")))
     if not collection.get(FOLDER) or not (folder / "splats.ply").is_file():
         raise InputError(f"the run of {collection.name} is not at {folder}: import it again from where it is now")

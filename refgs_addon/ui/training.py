@@ -80,7 +80,7 @@ class Tell(Door, bpy.types.Operator):
             "pause": "Let the training rest, and the machine with it",
             "resume": "Let the training go on",
             "stop": "Good enough: take what has been learned so far as the result",
-            "cancel": "Stop here; the training can be gone on with later",
+            "cancel": "Stop here; a training can be gone on with later",
         }.get(properties.command, "")
 
     def work(self, context: bpy.types.Context) -> None:
@@ -173,8 +173,7 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> Non
     head.label(text=job.name, icon=icon)
     if job.ended:
         head.operator(PutAway.bl_idname, text="", icon="X", emboss=False).number = number
-    finding = "stage" in job.progress and not job.results
-    if job.active and (job.run or finding):
+    if job.active and (job.run or ("stage" in job.progress and not job.results)):
         box.progress(factor=_part(job), text=_how_far(job).capitalize())
     if job.line:
         lines(box, job.line[0].upper() + job.line[1:], width)
@@ -182,6 +181,8 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> Non
         lines(box, warning[0].upper() + warning[1:], width, "ERROR")
     for line in job.results.get("check", {}).get("lines", ()):
         lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
+    if file := job.results.get("export", {}).get("display_splats"):
+        lines(box, f"Wrote {file}", width)
     if job.curve:
         facts = job.progress
         row = box.row()
@@ -201,7 +202,7 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> Non
         watched = live.is_watched(job)
         icon = "HIDE_OFF" if watched else "HIDE_ON"
         box.operator(Watch.bl_idname, icon=icon, depress=watched).number = number
-    elif (job.run or finding) and not job.ended:
+    elif not job.ended:
         _tell(box, number, "cancel", "Stop", "CANCEL")
     if job.no_cameras:
         box.operator(FindCameras.bl_idname, icon="OUTLINER_OB_CAMERA")
@@ -221,7 +222,7 @@ def draw_status(self, context: bpy.types.Context) -> None:
 
 
 def _part(job: jobs.Job) -> float:
-    """How much of the training, or of a stage of finding cameras, is done, 0..1."""
+    """How much of the training, or of a stage of another job, is done, 0..1."""
     facts = job.progress
     return facts["done" if "stage" in facts else "iteration"] / max(facts["total"], 1) if facts else 0.0
 
@@ -235,7 +236,8 @@ def _how_far(job: jobs.Job) -> str:
     if not job.progress:
         return "waiting" if job.state == "waiting" else "starting"
     if "stage" in job.progress:
-        return f"finding cameras: {job.progress['stage']}"
+        stage = job.progress["stage"]
+        return "learning colours" if stage == "colours" else f"finding cameras: {stage}"
     return f"{_duration(job.progress['seconds_left'])} left"
 
 
