@@ -9,6 +9,7 @@ import sys
 import threading
 from pathlib import Path
 
+from .environment import end_with_input
 from .errors import InputError
 from .jobs import PROTOCOL
 
@@ -23,7 +24,7 @@ def main() -> None:
 
     say("ready", protocol=PROTOCOL, refgs="")
     command = json.loads(sys.stdin.readline())
-    threading.Thread(target=_end_with_input, daemon=True).start()
+    threading.Thread(target=end_with_input, daemon=True).start()
     say("started")
     try:
         _render(command, say)
@@ -55,8 +56,3 @@ def _render(command: dict, say) -> None:
         say("stage", what=f"Under {what}", part=done / (len(hdris) + 1))
 
     contact_sheet(bpy.context.scene, png, hdris, progress=progress, **look)
-
-
-def _end_with_input() -> None:
-    sys.stdin.read()
-    os._exit(1)

@@ -106,7 +106,7 @@ def work() -> None:
     command = json.loads(sys.stdin.readline() or "null")
     if command is None:
         return
-    threading.Thread(target=_end_with_input, daemon=True).start()
+    threading.Thread(target=end_with_input, daemon=True).start()
     job = command.pop("command")
     _say("started", job=job)
     try:
@@ -127,7 +127,8 @@ def _say(event: str, **facts) -> None:
         print(json.dumps({"event": event} | facts), flush=True)
 
 
-def _end_with_input() -> None:
+def end_with_input() -> None:
+    """End this process, with what it has started, when its input does: for a thread of its own."""
     sys.stdin.read()
     with _starting:  # nothing more is started after this
         if _child is not None:

@@ -257,6 +257,12 @@ def export(python: Path, run: Path, log: Path) -> Job:
     return _add(Job(run.name, python, [{"command": "export", "run": str(run)}], log, run))
 
 
+def display_splats(python: Path, run: Path, file: Path, log: Path) -> Job:
+    """Have a run written as splats for viewers that know no light, in place of what the file holds, beside whatever else runs."""
+    command = {"command": "export", "run": str(run), "display_splats": str(file)}
+    return _add(Job(file.name, python, [command], log))
+
+
 def render(blender: Path, words: tuple[str, ...], command: Mapping[str, object], log: Path) -> Job:
     """Have another Blender render, as `background.main` says, beside whatever else runs; the picture is `results["render"]["png"]`."""
     return _add(Job(Path(command["png"]).name, blender, [dict(command)], log, words=words, program=BLENDER))

@@ -37,7 +37,7 @@ class Preferences(bpy.types.AddonPreferences):
         layout = self.layout
         width = int(context.region.width / (6.2 * context.preferences.system.ui_scale)) - 6  # letters
         icon, text = state()
-        _lines(layout, text, width, icon)
+        lines(layout, text, width, icon)
         if set_up() and not installing():
             layout.operator("refgs.ask_trainer", text="Ask Again", icon="FILE_REFRESH")
         if _asked and _asked[0].state == "failed":
@@ -187,36 +187,38 @@ def _in_use() -> str:
 def _draw_installation(box: bpy.types.UILayout, width: int) -> None:
     if job := installing():
         box.progress(factor=job.part, text=f"{job.part:.0%}")
-        _lines(box, job.line, width)
+        lines(box, job.line, width)
         if job.name == "install":
             box.operator("refgs.stop_installing", text="Stop", icon="CANCEL")
         return
     there, brought = environment.installed(home()), environment.brought()
     begun = environment.begun(home())
     if there:
-        _lines(
+        lines(
             box,
             f"RefGS {there} is installed" + (f", this add-on brings {brought}" if brought not in ("", there) else ""),
             width,
         )
     elif begun:
-        _lines(box, "An installation was stopped halfway, and can be gone on with", width)
+        lines(box, "An installation was stopped halfway, and can be gone on with", width)
     elif brought:
-        _lines(box, f"The trainer can be installed: {environment.room(home())}", width)
+        lines(box, f"The trainer can be installed: {environment.room(home())}", width)
     if there or begun or brought:
-        _lines(box, str(home()), width, "FILE_FOLDER")
+        lines(box, str(home()), width, "FILE_FOLDER")
     row = box.row(align=True)
     if not there or brought not in ("", there):
         text = f"Update to {brought}" if there else "Go On Installing" if begun else "Install the Trainer"
         row.operator("refgs.install_trainer", text=text, icon="IMPORT")
         if reason := why_no_installation():
-            _lines(box, reason, width, "INFO")
+            lines(box, reason, width, "INFO")
     if there or begun:
         row.operator("refgs.remove_trainer", text="Remove", icon="TRASH")
 
 
-def _lines(layout: bpy.types.UILayout, text: str, width: int, icon: str = "NONE") -> None:
+def lines(layout: bpy.types.UILayout, text: str, width: int, icon: str = "NONE") -> None:
+    """A text on as many lines of so many letters as it takes."""
     column = layout.column(align=True)
+    column.scale_y = 0.8
     for line in textwrap.wrap(text, max(width, 20), break_long_words=False, break_on_hyphens=False):
         column.label(text=line, icon=icon)
         icon = "NONE" if icon == "NONE" else "BLANK1"

@@ -44,11 +44,10 @@ def say(event: str, facts: dict) -> None:
     console.print(("warning: " if event == "warning" else "") + facts["what"])
 
 
-def poses(folder: Path) -> None:
-    """Find the cameras of photos; what is interrupted goes on when it is started again."""
-    from refgs.capture.motion import find_cameras
-
-    with progress_bar("finding cameras", 1) as bar:
+@contextmanager
+def report_of(what: str):
+    """Yields what takes a job's events: stages with their progress, and lines."""
+    with progress_bar(what, 1) as bar:
 
         def report(event: str, facts: dict) -> None:
             if event == "progress":
@@ -56,6 +55,14 @@ def poses(folder: Path) -> None:
             else:
                 say(event, facts)
 
+        yield report
+
+
+def poses(folder: Path) -> None:
+    """Find the cameras of photos; what is interrupted goes on when it is started again."""
+    from refgs.capture.motion import find_cameras
+
+    with report_of("finding cameras") as report:
         found = find_cameras(folder, report)
     console.print(
         f"{found['placed']} of {found['photos']} photos placed, to {found['error']:.2f} pixels: {folder / 'sparse' / '0'}"
@@ -170,7 +177,9 @@ def export(
     overwrite: bool,
 ) -> None:
     """Write the mesh and its textures, or splats."""
-    for file in jobs.export(folder, mesh_file, texture, splats_file, display_file, overwrite, say):
+    with report_of("exporting") as report:
+        files = jobs.export(folder, mesh_file, texture, splats_file, display_file, overwrite, report)
+    for file in files:
         console.print(f"wrote {file}")
 
 

@@ -124,7 +124,12 @@ def export(
         write_splats(splats_file, run.splats)
     if display_file is not None:
         report("stage", {"what": "learning colours by direction"})
-        write_display_splats(display_file, displayed(run))
+
+        def learned(done: int, total: int) -> None:
+            if done % 10 == 0:
+                report("progress", {"stage": "colours", "done": done, "total": total})
+
+        write_display_splats(display_file, displayed(run, learned))
     if target is None:
         return splats
     settings = run.settings.mesh

@@ -6,21 +6,9 @@ from .. import compat
 from ..errors import InputError
 from ..nodes.edit import FOLLOW, NAME, REGIONS, edit_tree, follow_tree, show_edits
 from ..nodes.splats import NAME as SPLATS
+from .materials import give, read_material
 from .parts import parts
 from .regions import REGION, add_region
-
-# Base colour (linear Rec.709), metallic, roughness; None leaves the base colour as it was learned.
-MATERIALS: dict[str, tuple[tuple[float, float, float] | None, float, float]] = {
-    "Gold": ((1.0, 0.766, 0.336), 1.0, 0.15),
-    "Silver": ((0.972, 0.960, 0.915), 1.0, 0.1),
-    "Copper": ((0.955, 0.638, 0.538), 1.0, 0.2),
-    "Chrome": ((0.55, 0.556, 0.554), 1.0, 0.02),
-    "Brushed Steel": ((0.56, 0.57, 0.58), 1.0, 0.4),
-    "Rubber": ((0.02, 0.02, 0.02), 0.0, 0.9),
-    "Glazed Ceramic": ((0.8, 0.78, 0.72), 0.0, 0.08),
-    "Clay": (None, 0.0, 0.9),
-    "Polished": (None, 1.0, 0.05),
-}
 
 
 def add_edit(
@@ -28,12 +16,13 @@ def add_edit(
 ) -> bpy.types.NodesModifier:
     """Add an edit to a run's collection, on top of those that are there; its mesh, if it has one, follows.
 
-    `where` is one of REGIONS; all but "Everywhere" get an Empty in the middle of the splats, to move, turn and scale. `material` is one
-    of MATERIALS. "Painted" gets a copy of the mesh to paint weights on, all zero at first. Raises InputError where the collection has no
-    splats, or no mesh to paint on.
+    `where` is one of REGIONS; all but "Everywhere" get an Empty in the middle of the splats, to move, turn and scale.
+    `material` is the name of a preset. "Painted" gets a copy of the mesh to paint weights on, all zero at first. Raises InputError where
+    the collection has no splats, or no mesh to paint on.
     """
-    if where not in REGIONS or material not in MATERIALS:
-        raise InputError(f"there is no region {where} or no material {material}")
+    if where not in REGIONS:
+        raise InputError(f"there is no region {where}: take one of {', '.join(REGIONS)}")
+    values = read_material(material)
     splats = splats_of(collection)
     if where == "Painted" and not parts(collection).get("mesh"):
         raise InputError(f"{collection.name} has no mesh to paint on: make the run's mesh, and import it again")
@@ -48,21 +37,10 @@ def add_edit(
             compat.set_modifier_input(edit, name, value)
     elif where != "Everywhere":
         compat.set_modifier_input(edit, "Region", _region(splats, collection, where))
-    set_material(edit, material)
+    give(edit, values)
     for mesh in parts(collection).get("mesh", []):
         _follow(mesh, splats)
     return edit
-
-
-def set_material(edit: bpy.types.NodesModifier, material: str) -> None:
-    """Give an edit the values of one of MATERIALS."""
-    color, metallic, roughness = MATERIALS[material]
-    values = {"Metallic": metallic, "Roughness": roughness, "Color Amount": float(color is not None)}
-    values |= {"Metallic Amount": 1.0, "Roughness Amount": 1.0}
-    if color is not None:
-        values["Base Color"] = (*color, 1.0)
-    for name, value in values.items():
-        compat.set_modifier_input(edit, name, value)
 
 
 def edits(splats: bpy.types.Object) -> list[bpy.types.NodesModifier]:

@@ -1,10 +1,8 @@
 """What leaves Blender: a run with its edits as a new run folder, its splats, its light."""
 
-import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
@@ -13,6 +11,7 @@ import numpy as np
 from ..errors import InputError
 from ..nodes.splats import NAME as SPLATS
 from .edit import edits, splats_of
+from .files import whole
 from .parts import FOLDER
 from .splats import read_rows
 
@@ -48,9 +47,9 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     Raises InputError where the run's own file is not there or not the one that was imported, and where the new one cannot be written.
     """
     splats = splats_of(collection)
-    rows = read_rows(_folder(collection) / "splats.ply").copy()
+    rows = read_rows(run_folder(collection) / "splats.ply").copy()
     if len(rows) != len(splats.data.points):
-        raise InputError(f"{_folder(collection)} has changed since it was imported: import it again")
+        raise InputError(f"{run_folder(collection)} has changed since it was imported: import it again")
     new = edited_materials(splats)
     edited = np.zeros(len(rows), bool)
     for name in ("metallic", "roughness"):
@@ -68,7 +67,7 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
             rows[name][edited] = 0  # how the colour depended on the direction was the old material's
     names = "".join(f"property float {name}\n" for name in rows.dtype.names)
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{names}end_header\n"
-    with _whole(path) as temporary:
+    with whole(path) as temporary:
         temporary.write_bytes(head.encode("ascii") + rows.tobytes())
 
 
@@ -78,7 +77,7 @@ def export_run(collection: bpy.types.Collection, folder: Path) -> None:
     It has no mesh, whose textures would be those of before; where there are no edits the run's is copied. `refgs export`, or the
     trainer, makes one. Raises InputError.
     """
-    original = _folder(collection)
+    original = run_folder(collection)
     if folder.exists():
         raise InputError(f"{folder} exists: choose another name for the run")
     temporary = None
@@ -100,7 +99,7 @@ def export_run(collection: bpy.types.Collection, folder: Path) -> None:
 
 def export_light(collection: bpy.types.Collection, path: Path) -> None:
     """Copy a run's recovered light, an equirectangular EXR. Raises InputError."""
-    light = _folder(collection) / "environment.exr"
+    light = run_folder(collection) / "environment.exr"
     if not light.is_file():
         raise InputError(f"{light} is not there: the run has no light")
     _copy(light, path)
@@ -108,7 +107,7 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
 
 def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
     """Copy a run's mesh with its textures, a binary glTF. Raises InputError where it has none, and where edits would be lost."""
-    mesh = _folder(collection) / "mesh.glb"
+    mesh = run_folder(collection) / "mesh.glb"
     if edits(splats_of(collection)):
         raise InputError("the mesh would be without the edits: apply them to a new run, and export that one's mesh")
     if not mesh.is_file():
@@ -116,25 +115,13 @@ def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
     _copy(mesh, path)
 
 
-@contextlib.contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A file beside, to be written, that then becomes the one that is meant."""
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"cannot write {path}: {error.strerror}") from None
-
-
 def _copy(file: Path, path: Path) -> None:
-    with _whole(path) as temporary:
+    with whole(path) as temporary:
         shutil.copyfile(file, temporary)
 
 
-def _folder(collection: bpy.types.Collection) -> Path:
-    """The run folder that a collection was imported from."""
+def run_folder(collection: bpy.types.Collection) -> Path:
+    """The run folder that a collection was imported from. Raises InputError where it is not there."""
     folder = Path(bpy.path.abspath(collection.get(FOLDER, "")))
     if not collection.get(FOLDER) or not (folder / "splats.ply").is_file():
         raise InputError(f"the run of {collection.name} is not at {folder}: import it again from where it is now")

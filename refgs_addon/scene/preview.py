@@ -1,7 +1,6 @@
 """Previews: a picture in Eevee, whatever the scene's own render settings are."""
 
 import contextlib
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import bpy
 from .. import compat
 from ..errors import InputError
 from .cameras import frame_camera
+from .files import whole
 
 
 def render_preview(
@@ -47,16 +47,8 @@ def render_preview(
 
 def _save(picture: bpy.types.Image, scene: bpy.types.Scene, path: Path, kind: str, depth: str) -> None:
     compat.set_format(scene.render.image_settings, kind, depth)
-    # The ending stays last: Blender adds it where it does not see it.
-    temporary = path.with_name(f".{path.stem}.part{path.suffix}")
-    try:
+    with whole(path) as temporary:
         picture.save_render(str(temporary), scene=scene)
-        os.replace(temporary, path)
-    except (RuntimeError, OSError):
-        raise InputError(f"cannot write {path}: is its folder there, with room on the disk?") from None
-    finally:
-        with contextlib.suppress(OSError):  # as where its folder is no folder
-            temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -1,6 +1,5 @@
 """Contact sheets: one view under many lights, on one picture."""
 
-import os
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,6 +8,7 @@ import bpy
 
 from ..errors import InputError
 from ..nodes.world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama
+from .files import whole
 from .preview import render_preview
 from .relight import relight
 
@@ -98,13 +98,9 @@ def _write(pixels, png: Path) -> None:
     image.alpha_mode = "CHANNEL_PACKED"
     image.colorspace_settings.name = "Non-Color"
     image.file_format = "PNG"
-    temporary = png.with_name(f".{png.stem}.part.png")
     try:
         image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1]).ravel())
-        image.save(filepath=str(temporary))
-        os.replace(temporary, png)
-    except (RuntimeError, OSError):
-        raise InputError(f"cannot write {png}: is there room on the disk?") from None
+        with whole(png) as temporary:
+            image.save(filepath=str(temporary))
     finally:
-        temporary.unlink(missing_ok=True)
         bpy.data.images.remove(image)

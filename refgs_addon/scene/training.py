@@ -1,5 +1,6 @@
 """Training from a scene's settings: what the buttons of the Train panel do."""
 
+import tempfile
 from pathlib import Path
 
 import bpy
@@ -53,6 +54,24 @@ def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: P
     if (out / "mesh.glb").exists() or not set_up():
         return None
     job = jobs.export(python(), out, log_file(out.name))
+    follow()
+    return job
+
+
+def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.Job:
+    """Have the trainer write a run with its edits as splats for viewers that know no light: they show what the run shows under its
+    recovered light. What the file holds is replaced. Raises InputError where there is no trainer, no run or no folder to write to."""
+    from .edit import edits, splats_of
+    from .export import export_run, run_folder
+
+    trainer, folder = python(), run_folder(collection)
+    if not file.parent.is_dir():
+        raise InputError(f"cannot write {file}: its folder is not there")
+    if edits(splats_of(collection)):
+        edited = Path(tempfile.mkdtemp(dir=bpy.app.tempdir), folder.name)  # Blender removes it when it ends
+        export_run(collection, edited)
+        folder = edited
+    job = jobs.display_splats(trainer, folder, file, log_file(f"export {file.stem}"))
     follow()
     return job
 

@@ -24,6 +24,7 @@ def register() -> None:
         bpy.utils.register_class(cls)
     properties.register()
     pictures.register()
+    materials.register()
     light.register()
     export.register()
     training.register()
@@ -34,6 +35,7 @@ def unregister() -> None:
     training.unregister()
     export.unregister()
     light.unregister()
+    materials.unregister()
     pictures.unregister()
     properties.unregister()
     for cls in reversed(CLASSES):

@@ -7,6 +7,7 @@ import bpy
 from bpy.props import StringProperty
 from bpy_extras.io_utils import ExportHelper
 
+from ..preferences import set_up
 from ..scene import training
 from ..scene.parts import FOLDER, active_run
 from .operators import Door, ImportRun, has_run
@@ -42,6 +43,30 @@ class ExportSplats(_Export, bpy.types.Operator):
 
     kind, filename_ext = "splats", ".ply"
     filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+
+
+class ExportDisplaySplats(_Export, bpy.types.Operator):
+    bl_idname = "refgs.export_display_splats"
+    bl_label = "RefGS Display Splats (.ply)"
+    bl_description = (
+        "Have the trainer write splats for viewers that know no light, in the colours that the run with its edits shows "
+        "under the recovered light"
+    )
+
+    kind, filename_ext = "display splats", ".ply"
+    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not set_up():
+            cls.poll_message_set("Set up the trainer in the add-on's preferences first")
+            return False
+        return has_run(cls, context)
+
+    def work(self, context: bpy.types.Context) -> None:
+        file = Path(bpy.path.abspath(self.filepath))
+        training.export_display_splats(active_run(context), file)
+        self.report({"INFO"}, f"{file.name} is being made: the Train panel shows how far it is")
 
 
 class ExportMesh(_Export, bpy.types.Operator):
@@ -80,7 +105,7 @@ class ApplyEdits(_Export, bpy.types.Operator):
         self.report({"INFO"}, f"Wrote {out}" + ("; its mesh is being made" if job else mesh))
 
 
-CLASSES = (ExportSplats, ExportMesh, ExportLight, ApplyEdits)
+CLASSES = (ExportSplats, ExportDisplaySplats, ExportMesh, ExportLight, ApplyEdits)
 
 
 def _import_menu(self, context: bpy.types.Context) -> None:
@@ -88,7 +113,7 @@ def _import_menu(self, context: bpy.types.Context) -> None:
 
 
 def _export_menu(self, context: bpy.types.Context) -> None:
-    for operator in (ExportSplats, ExportMesh, ExportLight):
+    for operator in (ExportSplats, ExportDisplaySplats, ExportMesh, ExportLight):
         self.layout.operator(operator.bl_idname)
     self.layout.operator(ApplyEdits.bl_idname, text="RefGS Run with Edits (folder)")
 

@@ -1,11 +1,15 @@
 """The Materials panel: the edits of a run's materials."""
 
+from typing import ClassVar
+
 import bpy
-from bpy.props import EnumProperty, StringProperty
+from bl_ui.utils import PresetPanel
+from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from .. import compat
 from ..nodes.edit import REGIONS
-from ..scene.edit import MATERIALS, add_edit, edits, remove_edit, set_material
+from ..scene.edit import add_edit, edits, remove_edit
+from ..scene.materials import PRESETS, ROOT, materials, remove_material, save_material, set_material
 from ..scene.parts import active_run, parts
 from .export import ApplyEdits
 from .operators import Door, choose, has_run
@@ -28,7 +32,12 @@ class AddEdit(Door, bpy.types.Operator):
     where: EnumProperty(
         name="Where", items=[(name, name, _WHERE[name][0], _WHERE[name][1], i) for i, name in enumerate(REGIONS)]
     )
-    material: EnumProperty(name="Material", items=[(name, name, "") for name in MATERIALS])
+    material: StringProperty(
+        name="Material",
+        description="The preset to start from",
+        default="Gold",
+        search=lambda operator, context, text: [*materials()],
+    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -46,8 +55,8 @@ class AddEdit(Door, bpy.types.Operator):
 class _OfEdit(Door):
     """An operator on one edit."""
 
-    splats: StringProperty(name="Splats")
-    edit: StringProperty(name="Edit")
+    splats: StringProperty(name="Splats", options={"HIDDEN"})
+    edit: StringProperty(name="Edit", options={"HIDDEN"})
 
     def modifier(self) -> bpy.types.NodesModifier:
         return bpy.data.objects[self.splats].modifiers[self.edit]
@@ -63,24 +72,60 @@ class RemoveEdit(_OfEdit, bpy.types.Operator):
 
 
 class SetMaterial(_OfEdit, bpy.types.Operator):
+    """In place of Blender's own operator for presets, which cannot be undone."""
+
     bl_idname = "refgs.set_material"
     bl_label = "Set Material"
     bl_description = "Give this edit the values of a material"
 
-    material: EnumProperty(name="Material", items=[(name, name, "") for name in MATERIALS])
+    material: StringProperty(name="Material", description="A preset's name, or its file", options={"HIDDEN"})
 
     def work(self, context: bpy.types.Context) -> None:
-        set_material(self.modifier(), self.material)
+        set_material(self.modifier(), bpy.path.display_name(self.material, title_case=False))
 
 
-class MaterialMenu(bpy.types.Menu):
-    bl_idname = "REFGS_MT_materials"
-    bl_label = "Material"
+class KeepMaterial(_OfEdit, bpy.types.Operator):
+    """What Blender's list of presets has its + and − call. Its own operator for them writes over a preset of the same name (4.3), and
+    knows no modifier's inputs, which each Blender has elsewhere."""
+
+    bl_idname = "refgs.keep_material"
+    bl_label = "Save or Remove Material"
+    bl_options: ClassVar = {"INTERNAL"}
+
+    name: StringProperty(name="Name", description="The preset's")
+    remove_name: BoolProperty(name="Remove", description="Remove the preset of this name")
+
+    @classmethod
+    def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        if properties.remove_name:
+            return "Remove this preset; only those that you saved can be removed"
+        return "Save this edit's material as a preset of your own, under the name beside"
+
+    def work(self, context: bpy.types.Context) -> None:
+        if self.remove_name:
+            remove_material(self.name)
+        else:
+            save_material(self.modifier(), self.name)
+
+
+class MaterialPresets(PresetPanel, bpy.types.Panel):
+    bl_idname = "REFGS_PT_material_presets"
+    bl_label = "Materials"
 
     def draw(self, context: bpy.types.Context) -> None:
-        for name in MATERIALS:
-            button = self.layout.operator(SetMaterial.bl_idname, text=name)
-            button.splats, button.edit, button.material = context.refgs_edit.id_data.name, context.refgs_edit.name, name
+        edit = context.refgs_edit
+        which = {"splats": edit.id_data.name, "edit": edit.name}
+        self.layout.emboss, self.layout.operator_context = "PULLDOWN_MENU", "EXEC_DEFAULT"
+        self.path_menu(
+            bpy.utils.preset_paths(PRESETS),
+            SetMaterial.bl_idname,
+            props_default=which,
+            prop_filepath="material",
+            filter_ext=lambda ending: ending == ".py",
+            display_name=lambda file: bpy.path.display_name(file, title_case=False),
+            add_operator=KeepMaterial.bl_idname,
+            add_operator_props=which,
+        )
 
 
 class MaterialPanel(Tab, bpy.types.Panel):
@@ -101,7 +146,7 @@ class MaterialPanel(Tab, bpy.types.Panel):
         row = box.row(align=True)
         row.prop(edit, "name", text="")
         row.context_pointer_set("refgs_edit", edit)
-        row.menu(MaterialMenu.bl_idname, text="", icon="MATERIAL")
+        row.popover(MaterialPresets.bl_idname, text="", icon="PRESET")
         row.prop(edit, "show_viewport", text="")
         row.prop(edit, "show_render", text="")
         button = row.operator(RemoveEdit.bl_idname, text="", icon="X")
@@ -129,4 +174,12 @@ class MaterialPanel(Tab, bpy.types.Panel):
             layout.prop(owner, path, text=text)
 
 
-CLASSES = (AddEdit, RemoveEdit, SetMaterial, MaterialMenu, MaterialPanel)
+CLASSES = (AddEdit, RemoveEdit, SetMaterial, KeepMaterial, MaterialPresets, MaterialPanel)
+
+
+def register() -> None:
+    bpy.utils.register_preset_path(str(ROOT))
+
+
+def unregister() -> None:
+    bpy.utils.unregister_preset_path(str(ROOT))

@@ -7,6 +7,7 @@ import bpy
 from bpy.props import IntProperty, StringProperty
 
 from .. import jobs, preferences
+from ..preferences import lines
 from ..scene import live, training
 from ..scene.regions import add_training_region, training_region
 from .operators import Door, choose, import_run_folder
@@ -92,7 +93,7 @@ class Tell(Door, bpy.types.Operator):
             "pause": "Let the training rest, and the machine with it",
             "resume": "Let the training go on",
             "stop": "Good enough: take what has been learned so far as the result",
-            "cancel": "Stop here; the training can be gone on with later",
+            "cancel": "Stop here; a training can be gone on with later",
         }.get(properties.command, "")
 
     def work(self, context: bpy.types.Context) -> None:
@@ -150,9 +151,9 @@ class TrainPanel(Tab, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = self.layout, context.scene.refgs
-        width = max(context.region.width / (7 * context.preferences.system.ui_scale) - 6, 20)  # letters
+        width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
         if not preferences.set_up():
-            _lines(layout.box(), preferences.state()[1], width, "INFO")
+            lines(layout.box(), preferences.state()[1], width, "INFO")
             layout.operator(
                 "preferences.addon_show", text="Preferences", icon="PREFERENCES"
             ).module = preferences.PACKAGE
@@ -184,21 +185,22 @@ class TrainPanel(Tab, bpy.types.Panel):
                 _run(layout.box(), Path(known.folder))
 
 
-def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: float) -> None:
+def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> None:
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE", "paused": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
     if job.ended:
         head.operator(PutAway.bl_idname, text="", icon="X", emboss=False).number = number
-    finding = "stage" in job.progress and not job.results
-    if job.active and (job.run or finding):
+    if job.active and (job.run or ("stage" in job.progress and not job.results)):
         box.progress(factor=_part(job), text=_how_far(job).capitalize())
     if job.line:
-        _lines(box, job.line[0].upper() + job.line[1:], width)
+        lines(box, job.line[0].upper() + job.line[1:], width)
     for warning in job.warnings:
-        _lines(box, warning[0].upper() + warning[1:], width, "ERROR")
+        lines(box, warning[0].upper() + warning[1:], width, "ERROR")
     for line in job.results.get("check", {}).get("lines", ()):
-        _lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
+        lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
+    if file := job.results.get("export", {}).get("display_splats"):
+        lines(box, f"Wrote {file}", width)
     if job.curve:
         facts = job.progress
         row = box.row()
@@ -218,7 +220,7 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: float) -> N
         watched = live.is_watched(job)
         icon = "HIDE_OFF" if watched else "HIDE_ON"
         box.operator(Watch.bl_idname, icon=icon, depress=watched).number = number
-    elif (job.run or finding) and not job.ended:
+    elif not job.ended:
         _tell(box, number, "cancel", "Stop", "CANCEL")
     if job.no_cameras:
         box.operator(FindCameras.bl_idname, icon="OUTLINER_OB_CAMERA")
@@ -238,7 +240,7 @@ def draw_status(self, context: bpy.types.Context) -> None:
 
 
 def _part(job: jobs.Job) -> float:
-    """How much of the training, or of a stage of finding cameras, is done, 0..1."""
+    """How much of the training, or of a stage of another job, is done, 0..1."""
     facts = job.progress
     return facts["done" if "stage" in facts else "iteration"] / max(facts["total"], 1) if facts else 0.0
 
@@ -252,7 +254,8 @@ def _how_far(job: jobs.Job) -> str:
     if not job.progress:
         return "waiting" if job.state == "waiting" else "starting"
     if "stage" in job.progress:
-        return f"finding cameras: {job.progress['stage']}"
+        stage = job.progress["stage"]
+        return "learning colours" if stage == "colours" else f"finding cameras: {stage}"
     return f"{_duration(job.progress['seconds_left'])} left"
 
 
@@ -278,17 +281,6 @@ def _run(box: bpy.types.UILayout, folder: Path) -> None:
     else:
         row.label(text=f"{folder.name} is not there", icon="GHOST_DISABLED")
     row.operator(Forget.bl_idname, text="", icon="X").folder = str(folder)
-
-
-def _lines(layout: bpy.types.UILayout, text: str, width: float, icon: str = "NONE") -> None:
-    """A text on as many lines as it takes."""
-    column, line = layout.column(align=True), ""
-    column.scale_y = 0.8
-    for word in [*text.split(), ""]:
-        if line and (not word or len(line) + len(word) >= width):
-            column.label(text=line, icon=icon)
-            line, icon = "", "NONE" if icon == "NONE" else "BLANK1"
-        line = f"{line} {word}".strip()
 
 
 CLASSES = (

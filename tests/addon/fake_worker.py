@@ -87,6 +87,10 @@ def main():
                     say("failed", job="check", what="3 photos, but no cameras", fault=False, no_cameras=True)
                     continue
                 say("done", job="check", lines=["Views: 3", "Warning: they are dark"])
+            elif file := command.get("display_splats"):
+                say("progress", stage="colours", done=10, total=600)
+                Path(file).write_text(command["run"])
+                say("done", job="export", display_splats=file)
             else:
                 say("failed", job=command["command"], what="the mesh is crumbs", fault=False)
         time.sleep(0.002)

@@ -8,10 +8,14 @@ from mathutils import Matrix
 from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.edit import AMOUNT, COLOR, SURFACE
-from refgs_addon.scene.edit import MATERIALS, add_edit, edits, remove_edit, set_material
+from refgs_addon.scene.edit import add_edit, edits, remove_edit
+from refgs_addon.scene.materials import set_material
 from refgs_addon.scene.parts import show
 from refgs_addon.scene.regions import crop
 from refgs_addon.scene.run import import_run
+
+GOLD = (1.0, 0.766, 0.336), 1.0, 0.15  # base colour, metallic, roughness
+CHROME_ROUGHNESS = 0.02
 
 
 @pytest.fixture
@@ -45,7 +49,7 @@ def positions(run):
 def test_everything_becomes_gold_and_nothing_is_lost(run):
     before = learned(run, "metallic").copy(), learned(run, "base_color", "color", 4).copy()
     edit = add_edit(run.collection, material="Gold")
-    color, metallic, roughness = MATERIALS["Gold"]
+    color, metallic, roughness = GOLD
     assert drawn(run, "metallic") == pytest.approx(metallic) and drawn(run, "roughness") == pytest.approx(roughness)
     np.testing.assert_allclose(drawn(run, "base_color", "color", 4)[:, :3], np.tile(color, (40, 1)), rtol=1e-5)
     np.testing.assert_array_equal(learned(run, "metallic"), before[0])
@@ -77,7 +81,7 @@ def test_a_region_is_moved_turned_and_scaled(run, where, size):
     inverse = np.array(region.matrix_world.inverted())
     inside = size(positions(run) @ inverse[:3, :3].T + inverse[:3, 3]) < 1
     assert 3 < inside.sum() < 37
-    expected = np.where(inside, MATERIALS["Chrome"][2], learned(run, "roughness"))
+    expected = np.where(inside, CHROME_ROUGHNESS, learned(run, "roughness"))
     np.testing.assert_allclose(drawn(run, "roughness"), expected, atol=1e-5)
     # The splats' own place takes part: what is moved along keeps its edit.
     run.splats.location = region.location = (5, 0, 0)
@@ -94,7 +98,7 @@ def test_the_border_is_soft(run):
     t = np.clip((1 - distance) / 0.5, 0, 1)
     mask = t * t * (3 - 2 * t)
     assert ((mask > 0.1) & (mask < 0.9)).any()
-    expected = learned(run, "roughness") * (1 - mask) + MATERIALS["Chrome"][2] * mask
+    expected = learned(run, "roughness") * (1 - mask) + CHROME_ROUGHNESS * mask
     np.testing.assert_allclose(drawn(run, "roughness"), expected, atol=2e-3)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from refgs_addon import jobs, preferences, ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene import regions, training
+from refgs_addon.scene.splats import read_rows
 from tests.addon.waiting import until
 
 
@@ -104,6 +106,31 @@ def test_photos_without_cameras(addon, tmp_path):
     assert checked not in jobs.JOBS
     until(lambda: jobs.JOBS[-1].ended)
     assert jobs.JOBS[-1].state == "done" and "check" in jobs.JOBS[-1].results
+
+
+def test_display_splats_are_made_by_the_trainer(addon, run_folder, tmp_path):
+    bpy.ops.refgs.import_run(directory=f"{run_folder}/")
+    (tmp_path / "a.ply").write_text("of before")
+    bpy.ops.refgs.export_display_splats(filepath=str(tmp_path / "a.ply"))
+    job = jobs.JOBS[-1]
+    until(lambda: job.ended)
+    assert job.state == "done" and job.results["export"]["display_splats"] == str(tmp_path / "a.ply")
+    assert job.progress["stage"] == "colours" and (tmp_path / "a.ply").read_text() == str(run_folder)
+    # The edits are in what the trainer is given, and the run is as it was.
+    before = (run_folder / "splats.ply").read_bytes()
+    bpy.ops.refgs.add_edit(where="Everywhere", material="Rubber")
+    bpy.ops.refgs.export_display_splats(filepath=str(tmp_path / "a.ply"))
+    until(lambda: jobs.JOBS[-1].ended)
+    given = Path((tmp_path / "a.ply").read_text())
+    assert given != run_folder and (given / "cameras.json").is_file()
+    assert read_rows(given / "splats.ply")["roughness"] == pytest.approx(0.9)
+    assert (run_folder / "splats.ply").read_bytes() == before
+    with pytest.raises(RuntimeError, match="its folder is not there"):
+        bpy.ops.refgs.export_display_splats(filepath=str(tmp_path / "not there" / "a.ply"))
+    preferences.preferences().python = ""
+    assert not bpy.ops.refgs.export_display_splats.poll()
+    with pytest.raises(InputError, match="no trainer is set up"):
+        training.export_display_splats(bpy.data.collections["RefGS pot"], tmp_path / "b.ply")
 
 
 def test_taken_away_while_it_trains(addon, capture):

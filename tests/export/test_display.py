@@ -60,9 +60,12 @@ def test_the_file_is_what_viewers_of_gaussians_read(run, tmp_path):
 
 
 def test_splats_alone_are_exported_unless_the_mesh_is_named(run, tmp_path, monkeypatch):
-    monkeypatch.setattr("refgs.export.display.ITERATIONS", 3)
-    before = sorted(run.folder.iterdir())
-    files = export(run.folder, None, None, tmp_path / "a.ply", tmp_path / "b.ply", False, lambda event, facts: None)
+    monkeypatch.setattr("refgs.export.display.ITERATIONS", 10)
+    before, said = sorted(run.folder.iterdir()), []
+    files = export(
+        run.folder, None, None, tmp_path / "a.ply", tmp_path / "b.ply", False, lambda *event: said.append(event)
+    )
+    assert said[-1] == ("progress", {"stage": "colours", "done": 10, "total": 10})
     assert files == [tmp_path / "a.ply", tmp_path / "b.ply"] and all(file.exists() for file in files)
     assert sorted(run.folder.iterdir()) == before
     assert len(PlyData.read(str(tmp_path / "b.ply"))["vertex"].properties) == 17 + 45

@@ -1,0 +1,5 @@
+color_amount = 0.0
+metallic = 0.0
+metallic_amount = 1.0
+roughness = 0.9
+roughness_amount = 1.0

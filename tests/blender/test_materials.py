@@ -1,0 +1,114 @@
+"""Materials to start from: those of the add-on and those of the artist, in one list of presets."""
+
+import bpy
+import pytest
+
+from refgs_addon import compat, ui
+from refgs_addon.errors import InputError
+from refgs_addon.scene.edit import add_edit, edits
+from refgs_addon.scene.materials import INPUTS, materials, read_material, remove_material, save_material, set_material
+from refgs_addon.scene.run import import_run
+
+OURS = ["Brushed Steel", "Chrome", "Clay", "Copper", "Glazed Ceramic", "Gold", "Polished", "Rubber", "Silver"]
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """The artist's folder of presets, which is not there yet."""
+    (tmp_path / "scripts").mkdir()
+    monkeypatch.setenv("BLENDER_USER_SCRIPTS", str(tmp_path / "scripts"))
+    return tmp_path / "scripts" / "presets" / "refgs_material"
+
+
+@pytest.fixture
+def edit(run_folder, scene, own):
+    return add_edit(import_run(run_folder, scene).collection)
+
+
+def values(edit):
+    return {name: compat.get_modifier_input(edit, name) for name in INPUTS}
+
+
+def test_those_that_come_with_it(own):
+    assert list(materials()) == OURS and not own.exists()
+    assert read_material("Copper")["Base Color"] == (0.955, 0.638, 0.538, 1.0)
+    for name in OURS:
+        found = read_material(name)
+        assert {"Color Amount", "Metallic", "Metallic Amount", "Roughness", "Roughness Amount"} <= found.keys()
+        assert ("Base Color" in found) == (found["Color Amount"] == 1.0)
+
+
+def test_one_is_saved_used_and_removed(edit, own):
+    compat.set_modifier_input(edit, "Base Color", (0.9, 0.5, 0.4, 1.0))
+    compat.set_modifier_input(edit, "Roughness", 0.33)
+    compat.set_modifier_input(edit, "Color Amount", 0.7)
+    file = save_material(edit, "Rosé Gold 2/3")
+    assert [*own.iterdir()] == [file] and list(materials()) == sorted([*OURS, "Rosé Gold 2/3"])
+    set_material(edit, "Clay")
+    assert values(edit)["Roughness"] == pytest.approx(0.9)
+    set_material(edit, "Rosé Gold 2/3")
+    found = values(edit)
+    assert tuple(found["Base Color"]) == pytest.approx((0.9, 0.5, 0.4, 1.0))
+    assert (found["Roughness"], found["Color Amount"], found["Metallic"]) == pytest.approx((0.33, 0.7, 1.0))
+    remove_material("Rosé Gold 2/3")
+    assert list(materials()) == OURS and not [*own.iterdir()]
+
+
+def test_what_cannot_be_is_said_and_leaves_all_as_it_was(edit, own):
+    ours = read_material("Gold")
+    for name, said in (("gold", "gold already"), ("Brushed_Steel", "already"), (" ", "type one first")):
+        with pytest.raises(InputError, match=said):
+            save_material(edit, name)
+    for name in ("Gold", "Nothing"):
+        with pytest.raises(InputError, match="stays"):
+            remove_material(name)
+    assert read_material("Gold") == ours and not own.exists()
+    own.mkdir(parents=True)
+    (own / "Broken.py").write_text("metallic = 'very'\n")
+    count, before = len(edits(edit.id_data)), values(edit)["Metallic"]
+    for call in (
+        lambda: set_material(edit, "Broken"),
+        lambda: add_edit(edit.id_data.users_collection[0], "Box", "Broken"),
+    ):
+        with pytest.raises(InputError, match=r"Broken\.py cannot be read .*save it anew"):
+            call()
+    assert len(edits(edit.id_data)) == count and values(edit)["Metallic"] == before
+    with pytest.raises(InputError, match="there is no material Marble: take one of Broken"):
+        set_material(edit, "Marble")
+
+
+def test_it_can_be_undone(edit, own):
+    splats, which = edit.id_data.name, {"splats": edit.id_data.name, "edit": edit.name}
+    ui.register()
+    try:
+        bpy.ops.ed.undo_push(message="before")
+        bpy.ops.refgs.set_material("EXEC_DEFAULT", True, **which, material="Rubber")
+        (edit,) = edits(bpy.data.objects[splats])
+        assert values(edit)["Roughness"] == pytest.approx(0.9)
+        bpy.ops.ed.undo()
+        (edit,) = edits(bpy.data.objects[splats])
+        assert values(edit)["Roughness"] == pytest.approx(0.15)
+    finally:
+        ui.unregister()
+
+
+def test_the_buttons(edit, own):
+    ui.register()
+    try:
+        (folder,) = bpy.utils.preset_paths("refgs_material")
+        which = {"splats": edit.id_data.name, "edit": edit.name}
+        file = f"{folder}/Brushed_Steel.py"  # as Blender's list of presets says it
+        bpy.ops.refgs.set_material(**which, material=file)
+        assert values(edit)["Roughness"] == pytest.approx(0.4)
+        bpy.ops.refgs.keep_material(**which, name="Steel of mine")
+        assert bpy.utils.preset_paths("refgs_material") == [str(own), folder]
+        assert bpy.ops.refgs.add_edit(where="Everywhere", material="Steel of mine") == {"FINISHED"}
+        with pytest.raises(RuntimeError, match="already"):
+            bpy.ops.refgs.keep_material(**which, name="Steel of mine")
+        bpy.ops.refgs.keep_material(name="Steel of mine", remove_name=True)
+        with pytest.raises(RuntimeError, match="stays"):
+            bpy.ops.refgs.keep_material(name="Gold", remove_name=True)
+        assert list(materials()) == OURS
+    finally:
+        ui.unregister()
+    assert str(folder) not in bpy.utils.preset_paths("refgs_material")
