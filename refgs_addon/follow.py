@@ -1,4 +1,7 @@
-"""A timer that takes in what the jobs say, and has the window drawn anew where that changed anything."""
+"""Timers: one takes in what the jobs say, and has the window drawn anew where that changed anything; one looks after runs that other
+processes train."""
+
+from pathlib import Path
 
 import bpy
 
@@ -7,6 +10,7 @@ from .scene import live
 
 EVERY = 0.2  # seconds between looks while there is a job, which cost microseconds when nothing was said
 LOOK = 4.0  # seconds between previews of a training
+ELSEWHERE = 2.0  # seconds between looks at runs that others train
 
 _since_look = 0.0
 
@@ -32,6 +36,20 @@ def _look() -> float | None:
     return EVERY if any(not job.ended for job in jobs.JOBS) else None
 
 
+def follow_elsewhere() -> None:
+    """Draw the panel anew now and then, as long as a process that is not of this Blender trains a run that is listed."""
+    if not bpy.app.timers.is_registered(_look_elsewhere):
+        bpy.app.timers.register(_look_elsewhere, first_interval=ELSEWHERE, persistent=True)
+
+
+def _look_elsewhere() -> float | None:
+    listed = {Path(known.folder) for scene in bpy.data.scenes for known in scene.refgs.runs}
+    others = listed - {job.run for job in jobs.JOBS if not job.ended}
+    trained = any(jobs.run_state(folder) == "training" for folder in others)
+    redraw()
+    return ELSEWHERE if trained else None
+
+
 def redraw() -> None:
     """Draw the panel, the preferences and the status bar anew."""
     manager = bpy.context.window_manager
@@ -43,7 +61,8 @@ def redraw() -> None:
 
 
 def unregister() -> None:
-    """Follow no longer, and end the jobs cleanly."""
-    if bpy.app.timers.is_registered(_look):
-        bpy.app.timers.unregister(_look)
+    """Follow no longer, and end the jobs cleanly but those that are kept."""
+    for timer in (_look, _look_elsewhere):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
     jobs.stop_all()

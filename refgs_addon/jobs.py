@@ -1,7 +1,8 @@
 """The backend's processes: started, told and heard without the window ever waiting for them. Nothing here needs bpy.
 
 A job is a `refgs worker` (docs/job-protocol.md) of its own. A thread reads what it says into a queue; `poll`, called now and then,
-takes it from there. The process ends by itself when Blender does, for then its standard input closes.
+takes it from there. The process ends by itself when Blender does, for then its standard input closes; a job that is kept is one
+whose process was told to go on to its end. A run folder says by a lock whether any process works in it.
 """
 
 import contextlib
@@ -18,9 +19,15 @@ from pathlib import Path
 from . import environment
 from .errors import InputError
 
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
 PROTOCOL = 1
 TRAINER, BLENDER = "the trainer", "Blender"  # the programs that jobs are done by
 ENDED = ("done", "cancelled", "failed")
+LOCK, PROGRESS, STOP = "run.lock", "progress.json", "stop"  # in a run folder, as in backend/refgs/lock.py
 
 
 @dataclass
@@ -48,6 +55,7 @@ class Job:
     results: dict[str, dict] = field(default_factory=dict)  # "done" events by their jobs
     no_cameras: bool = False  # it failed because the capture has photos but no cameras: `poses` finds them
     curve: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR
+    kept: bool = False  # it goes on to its end when Blender closes
     _stopped: bool = False
     _asked_only: bool = False
     _process: subprocess.Popen | None = None
@@ -74,15 +82,18 @@ class Job:
                     stdout=subprocess.PIPE,
                     stderr=log,
                     cwd=self.log.parent,
+                    start_new_session=True,  # a terminal that Blender was started from takes it along by its input alone
                     creationflags=subprocess.CREATE_NO_WINDOW if sys.platform == "win32" else 0,
                 )
         except OSError as error:
             self._fail(f"{self.python} cannot be started ({error.strerror}): choose another Python in the preferences")
             return
         threading.Thread(target=_listen, args=(self._process, self._heard), daemon=True).start()
-        if self.commands:
-            self._next()
-        else:
+        if self.kept:
+            self.tell("keep", on=True)
+        for command in self.commands:  # all at once, for one that is kept has nobody to tell it the next
+            self.tell(**command)
+        if not self.commands:
             self._asked_only = True
             self._close()
 
@@ -91,6 +102,12 @@ class Job:
         with contextlib.suppress(OSError, ValueError):
             self._process.stdin.write(json.dumps({"command": command} | facts).encode() + b"\n")
             self._process.stdin.flush()
+
+    def keep(self, on: bool) -> None:
+        """Have it go on to its end, or no longer, when Blender closes or is killed. One that waits still has to be started by then."""
+        self.kept = on
+        if self.active:
+            self.tell("keep", on=on)
 
     def poll(self) -> bool:
         """Take in what was said since; whether that was anything."""
@@ -129,9 +146,7 @@ class Job:
                 self.state = "paused" if which == "paused" else "running"
             case "done":
                 self.results[event["job"]] = event
-                if self.commands:
-                    self._next()
-                else:
+                if len(self.results) == len(self.commands):
                     self.state, self.line = "done", ""
                     self._close()
             case "cancelled":
@@ -141,18 +156,21 @@ class Job:
                 self.no_cameras = event.get("no_cameras", False)
                 self._fail(event["what"])
 
-    def _next(self) -> None:
-        command = dict(self.commands.pop(0))
-        self.tell(command.pop("command"), **command)
-
     def _fail(self, what: str) -> None:
         self.state, self.line = "failed", what
         self._close()
 
     def _close(self) -> None:
+        """Have the process end."""
         if self._process is not None:
-            with contextlib.suppress(OSError):
-                self._process.stdin.close()
+            if self.kept:
+                self.tell("keep", on=False)
+            self.let_go()
+
+    def let_go(self) -> None:
+        """Say nothing more to the process, which ends unless the job is kept."""
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
 
     def _gone(self) -> None:
         """The process has ended."""
@@ -285,16 +303,76 @@ def poll() -> bool:
     return any(changed)
 
 
+def trainings() -> list[Job]:
+    """Jobs that work in a run folder, or wait to: those that can be kept."""
+    return [job for job in JOBS if job.run and not job.ended]
+
+
+def keep_all(on: bool) -> None:
+    """Have all trainings go on when Blender closes, or none. Those that wait for another by then have not begun, and do not."""
+    for job in trainings():
+        job.keep(on)
+
+
 def stop_all() -> None:
-    """End everything cleanly, and forget it."""
+    """End everything cleanly but what is kept, and forget it."""
     for job in JOBS:
-        job.stop()
+        if job.kept and job.active:
+            job.let_go()
+        else:
+            job.stop()
     JOBS.clear()
 
 
 def run_state(folder: Path) -> str:
-    """What a run folder holds: "finished", "stopped" (it can be gone on with), or "" where it is none."""
+    """What a run folder holds: "training" (a process works in it), "finished", "stopped" (it can be gone on with), or "" where it is
+    none."""
+    if _locked(folder / LOCK):
+        return "training"
     if (folder / "splats.ply").is_file():
         return "finished"
     notes = folder / "checkpoints"
     return "stopped" if notes.is_dir() and any(file.endswith(".toml") for file in os.listdir(notes)) else ""
+
+
+def run_progress(folder: Path) -> dict:
+    """How far the training in a folder is, whichever process trains: `iteration`, `total`, `seconds_left`. Empty where it says nothing
+    yet, or makes the mesh by now."""
+    try:
+        return json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def stop_run(folder: Path) -> None:
+    """Have the process that trains in a folder stop, whoever started it; the training can be gone on with. Raises InputError where
+    there is none."""
+    if run_state(folder) != "training":
+        raise InputError(f"{folder} is not being trained")
+    (folder / STOP).touch()
+
+
+def stops(folder: Path) -> bool:
+    """Whether the training in a folder has been asked to stop."""
+    return (folder / STOP).exists()
+
+
+def _locked(file: Path) -> bool:
+    """Whether a process holds a lock on the first byte of a file. It goes with the process, however that ends."""
+    try:
+        descriptor = os.open(file, os.O_RDONLY)
+    except OSError:  # mostly that there is none
+        return False
+    try:
+        if sys.platform == "win32":
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+            msvcrt.locking(descriptor, msvcrt.LK_UNLCK, 1)
+        else:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return True
+    except OSError:  # a file system without locks
+        return False
+    finally:
+        os.close(descriptor)
+    return False

@@ -12,6 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
+from refgs import jobs
+from refgs.errors import InputError
+from refgs.lock import LOCK, PROGRESS, STOP, RunLock
+
 SMALL = [
     "surfels.start=1000",
     "surfels.budget=1000",
@@ -154,3 +158,97 @@ def test_a_terminated_training_can_be_resumed(talk, ball_capture, tmp_path):
     talk.process.terminate()
     assert talk.until("cancelled")["iteration"] > 0
     assert talk.process.wait(timeout=PATIENCE) == 0
+
+
+def train(capture, run, *changes) -> dict:
+    return {"capture": str(capture), "out": str(run), "preset": "quick", "settings": [*SMALL, *changes]}
+
+
+def ended(talk) -> int:
+    return talk.process.wait(timeout=PATIENCE)
+
+
+def until(condition) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def free(run) -> bool:
+    """Whether no process works in a run."""
+    try:
+        with RunLock(run):
+            return True
+    except InputError:
+        return False
+
+
+def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
+    """Paused, then left with both pipes closed, it trains to its end and makes the mesh."""
+    run = tmp_path / "run"
+    commands = [
+        {"command": "train"}
+        | train(ball_capture, run, "train.iterations=60", "mesh.resolution=32", "mesh.triangles=500"),
+        {"command": "export", "run": str(run), "texture": 64},
+        {"command": "keep", "on": True},
+        {"command": "pause"},
+    ]
+    words = [sys.executable, "-m", "refgs.cli", "worker"]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdin.write("\n".join(map(json.dumps, [*commands, ""])).encode())
+        process.stdin.flush()
+        while json.loads(process.stdout.readline())["event"] != "paused":
+            pass
+        process.stdin.close()
+        process.stdout.close()
+        assert process.wait(timeout=PATIENCE) == 0
+    assert (run / "splats.ply").exists() and (run / "mesh.glb").exists() and free(run)
+    assert not any((run / name).exists() for name in (LOCK, PROGRESS, STOP))
+
+
+def test_a_training_that_is_kept_no_longer(talk, ball_capture, tmp_path):
+    run = tmp_path / "run"
+    talk.tell("train", **train(ball_capture, run))
+    talk.tell("export", run=str(run))
+    talk.tell("keep", on=True)
+    talk.tell("keep", on=False)
+    talk.until("progress")
+    assert talk.end() == 0
+    assert talk.until("cancelled")["iteration"] > 0 and talk.lines.get(timeout=PATIENCE) == ""
+    assert free(run) and any((run / "checkpoints").glob("*.toml"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")
+def test_a_training_that_was_left_ends_when_it_is_terminated(talk, ball_capture, tmp_path):
+    run = tmp_path / "run"
+    talk.tell("train", **train(ball_capture, run))
+    talk.tell("keep", on=True)
+    talk.until("progress")
+    talk.process.stdin.close()
+    iteration = talk.until("progress")["iteration"]
+    talk.process.terminate()
+    assert talk.until("cancelled")["iteration"] >= iteration and ended(talk) == 0
+
+
+def test_a_folder_that_is_trained_in(talk, ball_capture, tmp_path):
+    """No other process trains there; others see how far it is, and can stop it. One that is killed leaves the folder free."""
+    run = tmp_path / "run"
+    talk.tell("train", **train(ball_capture, run))
+    until((run / PROGRESS).exists)
+    assert json.loads((run / PROGRESS).read_text()).keys() == {"iteration", "total", "seconds_left"}
+    words = (ball_capture, run, "quick", "cpu", None, [], True, lambda event, facts: None, lambda trainer: True)
+    with pytest.raises(InputError, match="is in use: another process trains it") as refused:
+        jobs.train(*words)
+    assert "\n" not in str(refused.value)
+    (run / STOP).touch()
+    stopped = talk.until("cancelled")["iteration"]
+    assert not (run / STOP).exists() and free(run)
+    talk.tell("train", capture=str(ball_capture), out=str(run), resume=True)
+    talk.until("progress")
+    assert not free(run)
+    talk.process.kill()
+    talk.process.wait(timeout=PATIENCE)
+    assert free(run)
+    trainer, _ = jobs.train(*words)
+    assert trainer.iteration >= stopped

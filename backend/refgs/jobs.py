@@ -4,6 +4,7 @@ import json
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.export.splats import write_display_splats, write_splats
 from refgs.kernels import cuda
-from refgs.run import check_free, create_run, open_run, read_run_facts, write_text
+from refgs.lock import RunLock
+from refgs.run import Run, check_free, create_run, open_run, read_run_facts, write_text
 from refgs.settings import load_settings
 from refgs.train.trainer import Report, Trainer, full_card
 
@@ -45,56 +47,61 @@ def train(
 ) -> tuple[Trainer, float | None]:
     """Train a capture into a run folder; its asset is written when the training has ended.
 
-    `attend` is called before each iteration and stops it by True; the checkpoint then written is what `resume` goes on from.
-    The trainer that is returned says by `ended` which it was. With it comes the mean PSNR of the held-out views, if there are any and
-    the training has ended.
+    `attend` is called before each iteration and stops it by True, as another process can (`refgs.lock`); the checkpoint then written
+    is what `resume` goes on from. The trainer that is returned says by `ended` which it was. With it comes the mean PSNR of the
+    held-out views, if there are any and the training has ended.
     """
     from refgs.train.asset import write_asset
 
     device = choose_device(device, report)
+    lock = RunLock(out)
     if resume:
         facts, settings = read_run_facts(out)
         if changes:
             raise InputError("--set cannot change a run that is resumed: train into a new folder")
-        if (out / "splats.ply").exists():
-            raise InputError(f"{out}: this training has ended; there is nothing to resume")
     else:
         settings = load_settings(preset, changes)
         check_free(out)
-    capture = read_capture(capture_folder, settings.region)
-    if resume and capture.fingerprint() != facts["fingerprint"]:
-        raise InputError(f"{capture_folder} is not the capture that {out} was trained on, or it was changed since")
-    try:
-        trainer = Trainer(capture, settings, out, report, minutes, device)
+    with ExitStack() as held:
         if resume:
-            trainer.resume()
-            report("stage", {"what": f"going on from iteration {trainer.iteration}"})
-        else:
-            create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
-        trainer.run(lambda: attend(trainer))
-    except torch.OutOfMemoryError:
-        raise full_card() from None
-    except InputError:
-        raise
-    except Exception:
-        if out.is_dir():
-            (out / "log.txt").write_text(traceback.format_exc(), encoding="utf-8")
-        raise
-    if not trainer.ended:
-        return trainer, None
-    facts = {"training_seconds": trainer.seconds}
-    if peak := peak_memory():
-        facts["peak_memory_bytes"] = peak
-    if device == "cuda":
-        facts["peak_card_memory_bytes"] = torch.cuda.max_memory_allocated()
-    update_metrics(out, facts)
-    try:
-        write_asset(trainer)
-        quality = trainer.test_psnr(most=len(trainer.test))
-    except torch.OutOfMemoryError:
-        again = f"refgs train {capture_folder} --out {out} --resume --device cpu"
-        raise InputError(f"the card's memory is full; nothing is lost, go on with: {again}") from None
-    return trainer, quality
+            held.enter_context(lock)
+            if (out / "splats.ply").exists():
+                raise InputError(f"{out}: this training has ended; there is nothing to resume")
+        capture = read_capture(capture_folder, settings.region)
+        if resume and capture.fingerprint() != facts["fingerprint"]:
+            raise InputError(f"{capture_folder} is not the capture that {out} was trained on, or it was changed since")
+        try:
+            trainer = Trainer(capture, settings, out, report, minutes, device)
+            if resume:
+                trainer.resume()
+                report("stage", {"what": f"going on from iteration {trainer.iteration}"})
+            else:
+                create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
+                held.enter_context(lock)
+            trainer.run(lambda: attend(trainer) or lock.attend(trainer))
+        except torch.OutOfMemoryError:
+            raise full_card() from None
+        except InputError:
+            raise
+        except Exception:
+            if out.is_dir():
+                (out / "log.txt").write_text(traceback.format_exc(), encoding="utf-8")
+            raise
+        if not trainer.ended:
+            return trainer, None
+        facts = {"training_seconds": trainer.seconds}
+        if peak := peak_memory():
+            facts["peak_memory_bytes"] = peak
+        if device == "cuda":
+            facts["peak_card_memory_bytes"] = torch.cuda.max_memory_allocated()
+        update_metrics(out, facts)
+        try:
+            write_asset(trainer)
+            quality = trainer.test_psnr(most=len(trainer.test))
+        except torch.OutOfMemoryError:
+            again = f"refgs train {capture_folder} --out {out} --resume --device cpu"
+            raise InputError(f"the card's memory is full; nothing is lost, go on with: {again}") from None
+        return trainer, quality
 
 
 def export(
@@ -108,11 +115,7 @@ def export(
 ) -> list[Path]:
     """Fuse, clean, unwrap, bake; write the mesh and its textures. Where splats are asked for, they alone, unless the mesh's file is named
     too. Returns what was written."""
-    from refgs.export.bake import bake, unwrap
     from refgs.export.display import displayed
-    from refgs.export.mesh import write_glb
-    from refgs.geometry.extract import extract
-    from refgs.geometry.mesh import clean, is_crumbs
 
     run = open_run(folder)
     splats = [file for file in (splats_file, display_file) if file is not None]
@@ -132,6 +135,17 @@ def export(
         write_display_splats(display_file, displayed(run, learned))
     if target is None:
         return splats
+    with RunLock(folder) if target.parent == folder else nullcontext():
+        _write_mesh(run, target, texture, report)
+    return [*splats, target]
+
+
+def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> None:
+    from refgs.export.bake import bake, unwrap
+    from refgs.export.mesh import write_glb
+    from refgs.geometry.extract import extract
+    from refgs.geometry.mesh import clean, is_crumbs
+
     settings = run.settings.mesh
     mesh = extract(run.render, run.training_cameras(), run.centre, run.radius, settings.resolution)
     report("stage", {"what": f"fused {len(mesh.faces):,} triangles"})
@@ -147,7 +161,6 @@ def export(
     report("stage", {"what": "baking the textures"})
     textures = bake(mesh, run.splats, texture or settings.texture)
     write_glb(target, mesh, textures)
-    return [*splats, target]
 
 
 def update_metrics(folder: Path, facts: dict[str, Any]) -> None:

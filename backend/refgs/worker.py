@@ -65,7 +65,14 @@ class During(_Command):
     command: Literal["preview", "pause", "resume", "stop", "cancel"]
 
 
-COMMANDS = TypeAdapter(Annotated[Check | Poses | Train | Export | During, Field(discriminator="command")])
+class Keep(_Command):
+    """Whether the jobs that were asked for are done to their end when the input closes. Told at any time, and heard at once."""
+
+    command: Literal["keep"]
+    on: bool
+
+
+COMMANDS = TypeAdapter(Annotated[Check | Poses | Train | Export | During | Keep, Field(discriminator="command")])
 CLOSED = None  # in place of a command: there will be no more of them
 
 
@@ -76,18 +83,22 @@ class Worker:
         self._events = events
         self._commands: queue.SimpleQueue[_Command | None] = queue.SimpleQueue()  # a signal may put while it is read
         self._waiting: list[_Command] = []  # jobs that were asked for during a training
-        self._open, self._deaf = True, False
+        self._open, self._deaf, self._kept = True, False, False
 
     def listen(self, commands: IO[str]) -> None:
         """Take commands until there are no more; in a thread of its own."""
         for line in commands:
             try:
-                self._commands.put(COMMANDS.validate_json(line))
+                command = COMMANDS.validate_json(line)
+                if isinstance(command, Keep):
+                    self._kept = command.on
+                else:
+                    self._commands.put(command)
             except ValidationError as error:
                 what = "; ".join(f"{'.'.join(map(str, e['loc']))} {e['msg']}".strip() for e in error.errors())
                 self.say("warning", {"what": f"not a command of protocol {PROTOCOL}: {what}"})
         self.close()
-        if self._deaf:
+        if self._deaf and not self._kept:
             _thread.interrupt_main()
 
     def close(self) -> None:
@@ -96,17 +107,19 @@ class Worker:
 
     def interrupted(self, *_) -> None:
         """End: a training after its iteration, with a checkpoint; other jobs at once, for they leave nothing half done."""
+        self._kept = False
         self.close()
         if self._deaf:
             raise KeyboardInterrupt
 
     def say(self, event: str, facts: dict[str, Any]) -> None:
-        """Send an event. Where nobody listens any more it is time to end."""
+        """Send an event. Where nobody listens any more it is time to end, unless told to go on."""
         try:
             self._events.write(json.dumps({"event": event} | facts) + "\n")
             self._events.flush()
-        except (BrokenPipeError, ValueError):
-            self.close()
+        except (OSError, ValueError):  # a broken pipe, which Windows calls an invalid argument
+            if not self._kept:
+                self.close()
 
     def run(self) -> None:
         """Work until there are no more commands."""
@@ -114,7 +127,7 @@ class Worker:
         card = torch.cuda.get_device_name() if why is None else None
         self.say("ready", {"protocol": PROTOCOL, "refgs": __version__, "card": card, "no_card": why})
         jobs_of = {Check: self._check, Poses: self._poses, Train: self._train, Export: self._export}
-        while self._open:
+        while self._open or (self._kept and self._waiting):
             command = self._waiting.pop(0) if self._waiting else self._commands.get()
             if command is CLOSED:
                 break
@@ -170,7 +183,10 @@ class Worker:
             command = self._commands.get()
             if command is CLOSED:
                 self._open = False
-                return True
+                if not self._kept:
+                    return True
+                paused = False  # there is nobody to let it go on
+                continue
             match command.command:
                 case "pause" | "resume":
                     paused = command.command == "pause"

@@ -79,7 +79,10 @@ def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.
 def resume(scene: bpy.types.Scene, folder: Path) -> jobs.Job:
     """Go on with a run of the scene's that was stopped."""
     known = next((known for known in scene.refgs.runs if Path(known.folder) == folder), None)
-    if known is None or jobs.run_state(folder) != "stopped":
+    state = jobs.run_state(folder)
+    if state == "training":
+        raise InputError(f"{folder} is being trained already, by another process: stop that first, or wait for it")
+    if known is None or state != "stopped":
         raise InputError(f"{folder} holds no training that was stopped: start a new one")
     mesh = scene.refgs.mesh
     job = jobs.train(python(), Path(known.capture), folder, log_file(folder.name), mesh=mesh, resume=True)

@@ -3,7 +3,7 @@
 import bpy
 
 from .. import follow, preferences, properties
-from . import drop, export, light, materials, operators, panels, pictures, trainer, training
+from . import closing, drop, export, light, materials, operators, panels, pictures, trainer, training
 
 CLASSES = (
     *preferences.CLASSES,
@@ -11,6 +11,7 @@ CLASSES = (
     *operators.CLASSES,
     *trainer.CLASSES,
     *training.CLASSES,
+    *closing.CLASSES,
     *panels.CLASSES,
     *materials.CLASSES,
     *light.CLASSES,
@@ -28,10 +29,12 @@ def register() -> None:
     light.register()
     export.register()
     training.register()
+    closing.register()
 
 
 def unregister() -> None:
     follow.unregister()
+    closing.unregister()
     training.unregister()
     export.unregister()
     light.unregister()

@@ -7,9 +7,11 @@ import bpy
 from bpy.props import IntProperty, StringProperty
 
 from .. import jobs, preferences
+from ..follow import follow_elsewhere
 from ..preferences import lines
 from ..scene import live, training
 from ..scene.regions import add_training_region, training_region
+from .closing import Keep, StopRun
 from .operators import Door, choose, import_run_folder
 from .panels import Tab
 from .pictures import curve, picture
@@ -222,6 +224,9 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> Non
         box.operator(Watch.bl_idname, icon=icon, depress=watched).number = number
     elif not job.ended:
         _tell(box, number, "cancel", "Stop", "CANCEL")
+    if job.run and not job.ended:
+        icon = "CHECKBOX_HLT" if job.kept else "CHECKBOX_DEHLT"
+        box.operator(Keep.bl_idname, icon=icon, emboss=False).number = number
     if job.no_cameras:
         box.operator(FindCameras.bl_idname, icon="OUTLINER_OB_CAMERA")
     elif job.state == "failed":
@@ -278,9 +283,27 @@ def _run(box: bpy.types.UILayout, folder: Path) -> None:
         row.operator(ImportTrained.bl_idname, text=f"Import {folder.name}", icon="IMPORT").folder = str(folder)
     elif state == "stopped":
         row.operator(Resume.bl_idname, text=f"Go On with {folder.name}", icon="PLAY").folder = str(folder)
+    elif state == "training":
+        row.label(text=f"{folder.name} is being trained", icon="SORTTIME")
     else:
         row.label(text=f"{folder.name} is not there", icon="GHOST_DISABLED")
     row.operator(Forget.bl_idname, text="", icon="X").folder = str(folder)
+    if state == "training":
+        follow_elsewhere()
+        part, text = how_far_elsewhere(folder)
+        row = box.row(align=True)
+        row.progress(factor=part, text=text)
+        if jobs.run_progress(folder) and not jobs.stops(folder):
+            row.operator(StopRun.bl_idname, icon="CANCEL").folder = str(folder)
+
+
+def how_far_elsewhere(folder: Path) -> tuple[float, str]:
+    """How much of a run that a process which is not of this Blender trains is done, 0..1, and a few words on it."""
+    facts = jobs.run_progress(folder)
+    if not facts:
+        return (1.0, "Making the mesh") if (folder / "splats.ply").exists() else (0.0, "Starting")
+    part = facts["iteration"] / max(facts["total"], 1)
+    return part, "Stopping" if jobs.stops(folder) else f"{part:.0%}, {_duration(facts['seconds_left'])} left"
 
 
 CLASSES = (

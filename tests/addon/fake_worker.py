@@ -1,5 +1,5 @@
 """Speaks the job protocol without training anything. What it does is in the name of the capture: "good", "newer", "crash", "noise",
-"bare"."""
+"bare", "slow"."""
 
 import json
 import os
@@ -8,19 +8,41 @@ import threading
 import time
 from pathlib import Path
 
+from filelock import FileLock
+
+waiting, kept = [], False
+
 
 def say(event, **facts):
-    print(json.dumps({"event": event} | facts), flush=True)
+    try:
+        print(json.dumps({"event": event} | facts), flush=True)
+    except OSError:
+        if not kept:
+            raise
 
 
 def train(command, asked):
     out = Path(command["out"])
     (out / "checkpoints").mkdir(parents=True, exist_ok=True)
     (out / "started").write_text(json.dumps(command))
+    with FileLock(out / "run.lock"):
+        learn(command, asked, out)
+
+
+def learn(command, asked, out):
     paused, iteration = False, 0
     while iteration < 1000:
-        time.sleep(0.002)
-        for other in asked():
+        time.sleep(0.05 if "slow" in command["capture"] else 0.002)
+        facts = {"iteration": iteration, "total": 1000, "seconds_left": 10 - iteration / 100}
+        (out / "progress.tmp").write_text(json.dumps(facts))
+        (out / "progress.tmp").replace(out / "progress.json")
+        for other in [*asked(), *([{"command": "cancel"}] if (out / "stop").exists() else [])]:
+            if other is None and kept:
+                paused = False
+                continue
+            if other and other["command"] not in ("pause", "resume", "stop", "cancel", "preview"):
+                waiting.append(other)
+                continue
             if other is None or other["command"] == "cancel":
                 (out / "checkpoints" / "00000010.toml").touch()
                 return say("cancelled", job="train", run=str(out), iteration=iteration, seconds=1.0)
@@ -40,6 +62,7 @@ def train(command, asked):
                 "seconds_left": 10 - iteration / 100,
             }
             say("progress", **facts, loss=0.1, psnr=20 + iteration / 100, splats=10)
+    (out / "progress.json").unlink()
     (out / "splats.ply").touch()
     say("done", job="train", run=str(out), iteration=1000, seconds=10.0, psnr=30.0, left_out=[])
 
@@ -48,9 +71,14 @@ def main():
     heard, lock = [], threading.Lock()
 
     def listen():
+        global kept
         for line in sys.stdin:
+            command = json.loads(line)
+            if command["command"] == "keep":
+                kept = command["on"]
+                continue
             with lock:
-                heard.append(json.loads(line))
+                heard.append(command)
         with lock:
             heard.append(None)
 
@@ -69,7 +97,9 @@ def main():
         no_card="it is a fake",
     )
     while True:
-        for command in asked():
+        commands = waiting + asked()
+        waiting.clear()
+        for command in commands:
             if command is None:
                 return
             say("started", job=command["command"])
@@ -92,6 +122,7 @@ def main():
                 Path(file).write_text(command["run"])
                 say("done", job="export", display_splats=file)
             else:
+                (Path(command["run"]) / "mesh asked for").touch()
                 say("failed", job=command["command"], what="the mesh is crumbs", fault=False)
         time.sleep(0.002)
 

@@ -1,7 +1,10 @@
 """Following the trainer's processes, by one that only speaks as it does."""
 
 import json
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -69,6 +72,80 @@ def test_one_that_is_stopped_can_be_gone_on_with(start, tmp_path):
     again = start(resume=True, mesh=False)
     until(lambda: again.ended)
     assert again.state == "done" and json.loads((tmp_path / "run" / "started").read_text())["resume"]
+
+
+def test_one_that_is_kept_goes_on_when_blender_closes(start, tmp_path):
+    job, waiting = start(), start(out="waits")
+    until(lambda: job.progress)
+    assert jobs.trainings() == [job, waiting]
+    jobs.keep_all(True)
+    jobs.stop_all()
+    assert not jobs.JOBS and jobs.run_state(job.run) == "training"
+    assert job._process.wait(timeout=20) == 0
+    assert jobs.run_state(job.run) == "finished" and (job.run / "mesh asked for").exists()
+    assert not waiting.run.exists()
+
+
+def test_one_that_is_kept_no_longer(start):
+    job = start(mesh=False)
+    until(lambda: job.progress)
+    job.keep(True)
+    job.tell("pause")
+    until(lambda: job.state == "paused")
+    job.stop()
+    until(lambda: job.ended)
+    assert job.state == "cancelled" and job._process.wait(timeout=20) == 0
+    assert jobs.run_state(job.run) == "stopped"
+
+
+BLENDER = """
+import sys, time
+from pathlib import Path
+from refgs_addon import jobs
+python, capture, out, kept = sys.argv[1:]
+job = jobs.train(Path(python), Path(capture), Path(out), Path(out + ".txt"), mesh=False)
+job.keep(kept == "kept")
+while job.state != "paused":
+    if job.progress:
+        job.tell("pause")
+    jobs.poll()
+    time.sleep(0.05)
+print("paused", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture
+def killed(python, tmp_path):
+    """The run folder of a Blender that trained, and was killed."""
+
+    def killed(kept: str) -> Path:
+        capture, run = tmp_path / "slow photos", tmp_path / "run"
+        capture.mkdir()
+        words = [sys.executable, "-c", BLENDER, python, capture, run, kept]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, cwd=Path(__file__).resolve().parents[2]) as blender:
+            assert blender.stdout.readline() == b"paused\n"
+            blender.kill()
+        return run
+
+    return killed
+
+
+def test_a_blender_that_is_killed_leaves_nothing_running(killed):
+    run = killed("not kept")
+    until(lambda: jobs.run_state(run) == "stopped")
+    with pytest.raises(InputError, match="not being trained"):
+        jobs.stop_run(run)
+
+
+def test_a_training_that_a_killed_blender_left_is_found_and_stopped(killed):
+    run = killed("kept")
+    before = jobs.run_progress(run)["iteration"]
+    until(lambda: jobs.run_progress(run).get("iteration", 0) > before)
+    assert jobs.run_state(run) == "training" and not jobs.stops(run)
+    jobs.stop_run(run)
+    assert jobs.stops(run)
+    until(lambda: jobs.run_state(run) == "stopped")
 
 
 def test_the_same_folder_twice(start):

@@ -7,11 +7,14 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+from filelock import FileLock
 
-from refgs_addon import jobs, preferences, ui
+from refgs_addon import follow, jobs, preferences, ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene import regions, training
 from refgs_addon.scene.splats import read_rows
+from refgs_addon.ui.closing import question
+from refgs_addon.ui.training import how_far_elsewhere
 from tests.addon.waiting import until
 
 
@@ -198,3 +201,46 @@ def test_the_box_holds_what_the_cameras_look_at(addon, capture):
     checked.results["check"] |= {"capture": str(capture.resolve()), "centre": [1.0, 2.0, 3.0], "radius": 4.0}
     box = regions.add_training_region(addon)
     assert list(box.location) == [1, 2, 3] and list(box.scale) == [4, 4, 4]
+
+
+def test_closing_asks_only_while_something_trains(addon, capture):
+    assert not bpy.ops.refgs.quit.poll()
+    first, second = training.train(addon), training.train(addon)
+    until(lambda: first.progress)
+    assert bpy.ops.refgs.quit.poll() and question() == "2 trainings are running or waiting"
+    bpy.ops.refgs.keep(number=jobs.JOBS.index(first))
+    assert first.kept and not second.kept
+    bpy.ops.refgs.keep(number=jobs.JOBS.index(first))
+    assert not first.kept
+    jobs.keep_all(True)
+    assert first.kept and second.kept
+    second.stop()
+    assert question() == "A training is running"
+    # As when Blender closes, which takes its add-ons away: what is kept goes on.
+    ui.unregister()
+    assert not jobs.JOBS and first._process.wait(timeout=20) == 0
+    assert jobs.run_state(first.run) == "finished" and not second.run.exists()
+    ui.register()
+
+
+def test_a_run_that_another_process_trains(addon, capture, tmp_path):
+    job = training.train(addon)
+    until(lambda: job.progress)
+    job.stop()
+    until(lambda: job.ended)
+    run = job.run
+    jobs.JOBS.clear()
+    with FileLock(run / "run.lock"):
+        assert jobs.run_state(run) == "training" and follow._look_elsewhere() == follow.ELSEWHERE
+        (run / "progress.json").write_text('{"iteration": 250, "total": 1000, "seconds_left": 190.0}')
+        assert how_far_elsewhere(run) == (0.25, "25%, 3:10 left")
+        with pytest.raises(InputError, match="is being trained already"):
+            training.resume(addon, run)
+        bpy.ops.refgs.stop_run(folder=str(run))
+        assert (run / "stop").exists() and how_far_elsewhere(run)[1] == "Stopping"
+        (run / "progress.json").unlink()
+        (run / "splats.ply").touch()
+        assert how_far_elsewhere(run)[1] == "Making the mesh"
+    assert jobs.run_state(run) == "finished" and follow._look_elsewhere() is None
+    with pytest.raises(RuntimeError, match="is not being trained"):
+        bpy.ops.refgs.stop_run(folder=str(run))
