@@ -123,7 +123,11 @@ class IndirectSettings(_Section):
 class ResidualSettings(_Section):
     """Colour by direction, sRGB-encoded, that adds to the picture what material and light leave over; gone under another light."""
 
-    start: float = Field(ge=0, le=1, description="part of the training after which it learns; 1 does without")
+    start: float = Field(
+        gt=0,
+        le=1,
+        description="part of the training after which it learns, and material and light no longer do; 1 does without",
+    )
 
 
 class RateSettings(_Section):

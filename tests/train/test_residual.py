@@ -41,15 +41,18 @@ def learned(ball_capture, tmp_path_factory):
     return made
 
 
-def test_it_learns_from_its_start_on(ball_capture, tmp_path):
+def test_it_learns_when_material_and_light_have(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run")
     rest = made.parameters["sh_rest"]
     for _ in range(30):
         made.step()
         assert made.surfels().sh_rest.shape[1] == 0 or made.iteration == 30
     assert not rest.any() and rest not in made.optimizer.state
+    stays = [made.parameters[name] for name in ("albedo", "metallic", "roughness")] + [made.light]
+    before = [value.detach().clone() for value in (*stays, made.parameters["position"])]
     made.step()
-    assert rest.any()
+    assert rest.any() and not torch.equal(made.parameters["position"], before.pop())
+    assert all(torch.equal(value, was) for value, was in zip(stays, before, strict=True))
 
 
 def test_it_adds_its_blend_to_the_picture(learned):

@@ -100,7 +100,7 @@ def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
 
 def test_what_a_ball_does_without(ball):
     left_out = [entry["what"] for entry in json.loads((ball.folder / "needs.json").read_text())]
-    assert left_out == ["spherical harmonics", "inter-reflection", "exposures"]
+    assert left_out == ["inter-reflection", "exposures"]
     assert ball.occluder is None and not (ball.folder / "occluder.ply").exists()
     assert open_run(ball.folder).splats.indirect.shape[1] == 0
 

@@ -47,6 +47,7 @@ TRACED = 24  # views at the least for the mesh that inter-reflection is traced o
 LIGHT_REFINED = 0.2  # part of the training after which the light has all its texels
 LEAST_LIGHT = 16  # texels along a side
 DIFFUSED = 64  # texels along a side at which the light diffuses as fast as its setting says, and as far on the sphere at any other
+REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest", "environment", "exposure")
 FEWER = 0.8  # of the surfels, where there is no memory for all
 LEAST_SURFELS = 1000
 MIRROR = 7.0  # logit of a mirror's base colour, and the negative of its roughness's
@@ -309,11 +310,19 @@ class Trainer:
         since = self._since_propagation()
         if since is not None and since < settings.propagation.rest:
             frozen += ["opacity"]
+        # What material and light leave over is not taken from them: they have cooled by then, and stay.
+        late = self._residual_start() if settings.render.diffuse == "irradiance" else 1.0
+        if late < 1 and progress >= late:
+            frozen += REFLECTING
         for group in self.optimizer.param_groups:
-            decay = rates.decay**progress
-            if group["name"] == "position":
+            name, decay = group["name"], rates.decay**progress
+            if name == "position":
                 decay = rates.position_decay ** min(progress / rates.position_until, 1)
-            group["lr"] = 0.0 if group["name"] in frozen else group["rate"] * decay
+            elif name in REFLECTING:
+                decay = rates.decay ** min(progress / late, 1)
+            elif name == "sh_rest" and late < 1:
+                decay = rates.decay ** (max(progress - late, 0) / (1 - late))
+            group["lr"] = 0.0 if name in frozen else group["rate"] * decay
 
     def _since_propagation(self) -> int | None:
         """Iterations since normals were last propagated, if they are at this stage."""
