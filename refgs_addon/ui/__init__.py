@@ -3,13 +3,14 @@
 import bpy
 
 from .. import follow, preferences, properties
-from . import drop, export, light, materials, operators, panels, pictures, trainer, training
+from . import capture, drop, export, light, materials, operators, panels, pictures, trainer, training
 
 CLASSES = (
     *preferences.CLASSES,
     *properties.CLASSES,
     *operators.CLASSES,
     *trainer.CLASSES,
+    *capture.CLASSES,
     *training.CLASSES,
     *panels.CLASSES,
     *materials.CLASSES,

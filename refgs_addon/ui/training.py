@@ -8,6 +8,7 @@ from bpy.props import IntProperty, StringProperty
 
 from .. import jobs, preferences
 from ..scene import live, training
+from .capture import draw_capture
 from .operators import Door, import_run_folder
 from .panels import Tab
 from .pictures import curve, picture
@@ -160,13 +161,13 @@ class TrainPanel(Tab, bpy.types.Panel):
         row.operator(Train.bl_idname, icon="PLAY")
         for number, job in enumerate(jobs.JOBS):
             if job.program == jobs.TRAINER and job not in preferences.asked():
-                _job(layout.box(), number, job, width)
+                _job(layout.box(), context.scene, number, job, width)
         for known in settings.runs:
             if not any(job.run == Path(known.folder) for job in jobs.JOBS):
                 _run(layout.box(), Path(known.folder))
 
 
-def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: float) -> None:
+def _job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job, width: float) -> None:
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE", "paused": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
@@ -181,6 +182,7 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: float) -> N
         _lines(box, warning[0].upper() + warning[1:], width, "ERROR")
     for line in job.results.get("check", {}).get("lines", ()):
         _lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
+    draw_capture(box, scene, number, job)
     if job.curve:
         facts = job.progress
         row = box.row()
