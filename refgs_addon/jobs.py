@@ -205,15 +205,19 @@ JOBS: list[Job] = []
 """All jobs of this session that have not been put away, the oldest first. Of those that train one runs at a time."""
 
 
-def check(python: Path, capture: Path, log: Path) -> Job:
-    """Have a capture read, beside whatever else runs. The lines about it are in `results["check"]["lines"]`."""
-    return _add(Job(capture.name, python, [{"command": "check", "capture": str(capture)}], log))
+def check(python: Path, capture: Path, out: Path, log: Path) -> Job:
+    """Have a capture read, beside whatever else runs. `results["check"]` has `lines` about it, its `cameras` and `thumbnails`, which are
+    written into the folder `out`, and more: docs/job-protocol.md."""
+    return _add(Job(capture.name, python, [_check(capture, out)], log))
 
 
-def poses(python: Path, capture: Path, log: Path) -> Job:
+def poses(python: Path, capture: Path, out: Path, log: Path) -> Job:
     """Have the cameras of a folder's photos found, then have it read as `check` does, beside whatever else runs."""
-    commands = [{"command": "poses", "capture": str(capture)}, {"command": "check", "capture": str(capture)}]
-    return _add(Job(capture.name, python, commands, log))
+    return _add(Job(capture.name, python, [{"command": "poses", "capture": str(capture)}, _check(capture, out)], log))
+
+
+def _check(capture: Path, out: Path) -> dict:
+    return {"command": "check", "capture": str(capture), "out": str(out)}
 
 
 def ask(python: Path, log: Path) -> Job:

@@ -2,6 +2,7 @@
 
 import textwrap
 from pathlib import Path
+from zlib import crc32
 
 import bpy
 from bpy.props import StringProperty
@@ -88,6 +89,11 @@ def hdri_folder() -> Path | None:
 def log_file(name: str) -> Path:
     """Where a job's log is written."""
     return _folder("logs") / f"{name}.txt"
+
+
+def capture_folder(capture: Path) -> Path:
+    """Where a check writes what is shown of a capture."""
+    return _folder("captures") / f"{capture.name} {crc32(str(capture).encode()):08x}"
 
 
 def _folder(name: str) -> Path:

@@ -72,6 +72,7 @@ def test_jobs_one_after_another(talk, ball_capture, tmp_path):
     """What is asked is done in turn; what is wrong is said in one line, and the next job is none the worse."""
     run = tmp_path / "größe 'a'"
     talk.tell("check", capture=str(ball_capture))
+    talk.tell("check", capture=str(ball_capture), out=str(tmp_path / "found"))
     talk.tell("check", capture=str(tmp_path / "nothing"))
     talk.tell("train", capture=str(ball_capture), out=str(run), preset="quick", settings=SMALL)
     talk.tell("train", capture=str(ball_capture), out=str(run), preset="quick")
@@ -81,6 +82,8 @@ def test_jobs_one_after_another(talk, ball_capture, tmp_path):
     ready = talk.until("ready")
     assert ready["protocol"] == 1 and (ready["card"] is None) == bool(ready["no_card"])
     assert any("28" in line for line in talk.until("done")["lines"])
+    found = talk.until("done")
+    assert Path(found["cameras"]).is_file() and len(found["thumbnails"]) == 12 and found["radius"] > 0
     failed = talk.until("failed")
     assert (
         failed["job"] == "check"

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from refgs import __version__, jobs
 from refgs.capture import read_capture
-from refgs.capture.check import describe
+from refgs.capture.check import check, describe
 from refgs.capture.motion import find_cameras
 from refgs.errors import InputError, NoCameras
 from refgs.kernels import cuda
@@ -34,6 +34,7 @@ class _Command(BaseModel):
 class Check(_Command):
     command: Literal["check"]
     capture: str
+    out: str | None = None
 
 
 class Poses(_Command):
@@ -151,8 +152,10 @@ class Worker:
         self.say(event, {"job": name} | facts)
 
     def _check(self, command: Check) -> tuple[str, dict]:
-        lines = describe(read_capture(Path(command.capture)))
-        return "done", {"lines": lines}
+        capture = read_capture(Path(command.capture))
+        if command.out is None:
+            return "done", {"lines": describe(capture)}
+        return "done", check(capture, Path(command.out))
 
     def _poses(self, command: Poses) -> tuple[str, dict]:
         return "done", find_cameras(Path(command.capture), self.say)

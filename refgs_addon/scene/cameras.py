@@ -14,10 +14,9 @@ SENSOR_WIDTH = 36.0  # mm, Blender's own
 PHOTO = "refgs_photo"  # the custom property of a camera's data: its photo's file
 
 
-def read_cameras(path: Path) -> list[dict]:
-    """The frames of a run's cameras.json: camera-to-world matrices with OpenGL's axes, pinhole intrinsics, and under `photo` the file of
-    the photo where the run says which capture it is of."""
-    capture = _capture_of(path.with_name("run.toml"))
+def read_cameras(path: Path, capture: Path | None) -> list[dict]:
+    """The frames of a cameras.json, of a run or a check: camera-to-world matrices with OpenGL's axes, pinhole intrinsics, and under
+    `photo` the file of the photo where it is known which capture's folder it is in."""
     try:
         frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
         for frame in frames:
@@ -34,10 +33,10 @@ def read_cameras(path: Path) -> list[dict]:
     return frames
 
 
-def _capture_of(run: Path) -> Path | None:
-    """The folder of the capture that a run.toml names."""
+def capture_of(run: Path) -> Path | None:
+    """The folder of the capture that a run folder is of, where its run.toml says so."""
     try:
-        return Path(tomllib.loads(run.read_text(encoding="utf-8"))["run"]["capture"])
+        return Path(tomllib.loads((run / "run.toml").read_text(encoding="utf-8"))["run"]["capture"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -88,13 +87,13 @@ def frame_camera(scene: bpy.types.Scene, camera: bpy.types.Object, size: int | N
 def show_photo(camera: bpy.types.Object, amount: float = 1.0) -> None:
     """Lay a camera's photo over what it sees, so much of it: 0 hides it. The photo is loaded the first time.
 
-    Raises InputError where the camera has no photo, or the photo is not where it was when the run was trained.
+    Raises InputError where the camera has no photo, or the photo is not where it was when it was trained on or checked.
     """
     data = camera.data
     if amount > 0 and not data.background_images:
         path = Path(data.get(PHOTO, ""))
         if not data.get(PHOTO):
-            raise InputError(f"{camera.name} has no photo: choose a camera of an imported run")
+            raise InputError(f"{camera.name} has no photo: choose a camera of an imported run or of a checked capture")
         try:
             image = bpy.data.images.load(str(path), check_existing=True)
         except RuntimeError:
@@ -113,7 +112,8 @@ def photo_shown(camera: bpy.types.Object | None) -> float:
 
 
 def next_camera(scene: bpy.types.Scene, collection: bpy.types.Collection, steps: int = 1) -> bpy.types.Object:
-    """Look through another camera of a run, so many further in the photos' order; where a photo is shown, its photo is shown next.
+    """Look through another camera of a run or a capture, so many further in the photos' order; where a photo is shown, its photo is
+    shown next.
 
     Raises InputError where there are no cameras.
     """

@@ -7,7 +7,8 @@ import bpy
 
 from ..errors import InputError
 from . import parts
-from .cameras import add_camera, frame_camera, light_of, read_cameras
+from .cameras import add_camera, capture_of, frame_camera, light_of, read_cameras
+from .capture import hand_over
 from .relight import light_with_recovered, load_panorama
 from .splats import add_splats, normal_slopes, point_cloud, read_splats, with_slopes
 
@@ -30,15 +31,16 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     """Import a run folder into a scene, in a new collection `RefGS NAME`.
 
     splats.ply must be there; mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be
-    missing. The mesh is hidden at first, for it is where the splats are: see
-    `parts.show`. Raises InputError, and then leaves the file as it was.
+    missing. The mesh is hidden at first, for it is where the splats are: see `parts.show`. Cameras that `capture.show_cameras`
+    added of the same capture make way for the run's. Raises InputError, and then leaves the file as it was.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: choose the folder that a RefGS run wrote")
     name = folder.resolve().name
     splats = read_splats(folder / "splats.ply")
-    frames = read_cameras(folder / "cameras.json") if (folder / "cameras.json").exists() else []
+    capture = capture_of(folder)
+    frames = read_cameras(folder / "cameras.json", capture) if (folder / "cameras.json").exists() else []
     before, world, camera = _data(), scene.world, scene.camera
     try:
         collection = bpy.data.collections.new(f"RefGS {name}")
@@ -65,6 +67,8 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         scene.world, scene.camera = world, camera
         bpy.data.batch_remove(_data() - before)
         raise
+    if capture is not None and frames:
+        hand_over(scene, capture, run.cameras)
     return run
 
 

@@ -8,14 +8,14 @@ import bpy
 from .. import jobs
 from ..errors import InputError
 from ..follow import follow
-from ..preferences import log_file, python, set_up
+from ..preferences import capture_folder, log_file, python, set_up
 from .regions import region_settings
 
 
 def check(scene: bpy.types.Scene) -> jobs.Job:
-    """Have the scene's capture read; `results["check"]["lines"]` of the job say what was found."""
+    """Have the scene's capture read; `results["check"]` of the job has what was found."""
     capture = _capture(scene)
-    job = jobs.check(python(), capture, log_file(f"check {capture.name}"))
+    job = jobs.check(python(), capture, capture_folder(capture), log_file(f"check {capture.name}"))
     follow()
     return job
 
@@ -23,7 +23,7 @@ def check(scene: bpy.types.Scene) -> jobs.Job:
 def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
     """Have the cameras of the scene's photos found, in place of what said that they are missing; then the capture is read."""
     capture = _capture(scene)
-    job = jobs.poses(python(), capture, log_file(f"cameras {capture.name}"))
+    job = jobs.poses(python(), capture, capture_folder(capture), log_file(f"cameras {capture.name}"))
     jobs.JOBS[:] = [known for known in jobs.JOBS if not known.no_cameras]
     follow()
     return job

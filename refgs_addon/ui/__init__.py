@@ -3,13 +3,14 @@
 import bpy
 
 from .. import follow, preferences, properties
-from . import closing, drop, export, light, materials, operators, panels, pictures, trainer, training
+from . import capture, closing, drop, export, light, materials, operators, panels, pictures, trainer, training
 
 CLASSES = (
     *preferences.CLASSES,
     *properties.CLASSES,
     *operators.CLASSES,
     *trainer.CLASSES,
+    *capture.CLASSES,
     *training.CLASSES,
     *closing.CLASSES,
     *panels.CLASSES,

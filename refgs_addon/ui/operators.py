@@ -11,6 +11,7 @@ from ..errors import InputError
 from ..preferences import hdri_folder
 from ..scene.beside import render_beside
 from ..scene.cameras import PHOTO, next_camera, photo_shown, show_photo
+from ..scene.capture import active_cameras
 from ..scene.parts import active_run, show
 from ..scene.preview import render_preview
 from ..scene.regions import crop
@@ -113,10 +114,11 @@ class NextCamera(Door, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return has_run(cls, context)
+        cls.poll_message_set("Import a run, or show the cameras of a checked capture, first")
+        return active_cameras(context) is not None
 
     def work(self, context: bpy.types.Context) -> None:
-        next_camera(context.scene, active_run(context), self.steps)
+        next_camera(context.scene, active_cameras(context), self.steps)
         look_through(context)
 
 
@@ -127,7 +129,7 @@ class Photo(Door, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        cls.poll_message_set("The scene has no camera of an imported run")
+        cls.poll_message_set("The scene's camera is none of an imported run or a checked capture")
         return context.scene.camera is not None and PHOTO in context.scene.camera.data
 
     def work(self, context: bpy.types.Context) -> None:

@@ -29,12 +29,13 @@ def picture(job: jobs.Job) -> int:
     return _pictures[key].icon_id
 
 
-def thumbnail(file: Path) -> int:
-    """The icon of a small picture of a file, which Blender makes beside; 0 where there is none."""
+def thumbnail(file: Path, version: int = 0) -> int:
+    """The icon of a small picture of a file, which Blender makes beside; 0 where there is none. What is written anew under the same name
+    is of another version."""
     if _pictures is None:
         return 0
-    key = str(file)
-    return (_pictures[key] if key in _pictures else _pictures.load(key, key, "IMAGE")).icon_id
+    key = f"{file} {version}"
+    return (_pictures[key] if key in _pictures else _pictures.load(key, str(file), "IMAGE")).icon_id
 
 
 def curve(job: jobs.Job) -> int:

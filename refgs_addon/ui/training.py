@@ -11,6 +11,7 @@ from ..follow import follow_elsewhere
 from ..preferences import lines
 from ..scene import live, training
 from ..scene.regions import add_training_region, training_region
+from .capture import draw_capture
 from .closing import Keep, StopRun
 from .operators import Door, choose, import_run_folder
 from .panels import Tab
@@ -181,13 +182,13 @@ class TrainPanel(Tab, bpy.types.Panel):
         row.operator(Train.bl_idname, icon="PLAY")
         for number, job in enumerate(jobs.JOBS):
             if job.program == jobs.TRAINER and job not in preferences.asked():
-                _job(layout.box(), number, job, width)
+                _job(layout.box(), context.scene, number, job, width)
         for known in settings.runs:
             if not any(job.run == Path(known.folder) for job in jobs.JOBS):
                 _run(layout.box(), Path(known.folder))
 
 
-def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> None:
+def _job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job, width: int) -> None:
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE", "paused": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
@@ -201,6 +202,7 @@ def _job(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> Non
         lines(box, warning[0].upper() + warning[1:], width, "ERROR")
     for line in job.results.get("check", {}).get("lines", ()):
         lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
+    draw_capture(box, scene, number, job)
     if file := job.results.get("export", {}).get("display_splats"):
         lines(box, f"Wrote {file}", width)
     if job.curve:

@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 import time
+import zlib
 from pathlib import Path
 
 from filelock import FileLock
@@ -67,6 +68,37 @@ def learn(command, asked, out):
     say("done", job="train", run=str(out), iteration=1000, seconds=10.0, psnr=30.0, left_out=[])
 
 
+def png(grey):
+    """A picture of one pixel."""
+    chunks = (b"IHDR", b"\0\0\0\1\0\0\0\1\x08\0\0\0\0"), (b"IDAT", zlib.compress(bytes([0, grey]))), (b"IEND", b"")
+    parts = (
+        len(data).to_bytes(4, "big") + name + data + zlib.crc32(name + data).to_bytes(4, "big") for name, data in chunks
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+def check(command):
+    """Two cameras, four units from the origin on either side, and their photos."""
+    out, frames = Path(command["out"]), []
+    out.mkdir(parents=True, exist_ok=True)
+    for number, side in enumerate((1, -1)):
+        (out / f"{number:04d}.png").write_bytes(png(100 * number))
+        matrix = [[0, 0, side, 4 * side], [side, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
+        lens = {"fl_x": 90.0, "fl_y": 90.0, "cx": 32.0, "cy": 32.0, "w": 64, "h": 64}
+        frames.append({"file_path": f"images/{number}", "photo": f"{number}.png", "transform_matrix": matrix} | lens)
+    (out / "cameras.json").write_text(json.dumps({"frames": frames}))
+    say(
+        "done",
+        job="check",
+        capture=command["capture"],
+        cameras=str(out / "cameras.json"),
+        thumbnails=[str(out / "0000.png"), str(out / "0001.png")],
+        centre=[0.0, 0.0, 0.0],
+        radius=1.0,
+        lines=["Views: 3", "Warning: they are dark"],
+    )
+
+
 def main():
     heard, lock = [], threading.Lock()
 
@@ -116,7 +148,7 @@ def main():
                 if "bare" in command["capture"] and not (Path(command["capture"]) / "sparse").exists():
                     say("failed", job="check", what="3 photos, but no cameras", fault=False, no_cameras=True)
                     continue
-                say("done", job="check", lines=["Views: 3", "Warning: they are dark"])
+                check(command)
             elif file := command.get("display_splats"):
                 say("progress", stage="colours", done=10, total=600)
                 Path(file).write_text(command["run"])

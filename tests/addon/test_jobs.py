@@ -198,10 +198,10 @@ def test_a_python_without_the_trainer(tmp_path):
 def test_cameras_are_found_then_checked(python, tmp_path):
     capture = tmp_path / "bare photos"
     capture.mkdir()
-    checked = jobs.check(python, capture, tmp_path / "check.txt")
+    checked = jobs.check(python, capture, tmp_path / "found", tmp_path / "check.txt")
     until(lambda: checked.ended)
     assert checked.state == "failed" and checked.no_cameras
-    found = jobs.poses(python, capture, tmp_path / "poses.txt")
+    found = jobs.poses(python, capture, tmp_path / "found", tmp_path / "poses.txt")
     until(lambda: found.ended)
     assert found.state == "done" and found.progress["stage"] == "matching" and not found.curve
     assert found.results["poses"]["placed"] == 3 and found.results["check"]["lines"][0] == "Views: 3"
@@ -210,7 +210,7 @@ def test_cameras_are_found_then_checked(python, tmp_path):
 def test_asking_and_checking_run_beside_a_training(start, python, tmp_path):
     training = start()
     asked = jobs.ask(python, tmp_path / "log.txt")
-    checked = jobs.check(python, tmp_path, tmp_path / "check.txt")
+    checked = jobs.check(python, tmp_path, tmp_path / "found", tmp_path / "check.txt")
     until(lambda: asked.ended and checked.ended)
     assert asked.state == "done" and asked.ready["refgs"] == "9.9"
     assert checked.results["check"]["lines"] == ["Views: 3", "Warning: they are dark"]

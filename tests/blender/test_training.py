@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import bpy
@@ -12,7 +13,11 @@ from filelock import FileLock
 from refgs_addon import follow, jobs, preferences, ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene import regions, training
+from refgs_addon.scene.cameras import photo_shown
+from refgs_addon.scene.capture import cameras_of
+from refgs_addon.scene.run import import_run
 from refgs_addon.scene.splats import read_rows
+from refgs_addon.ui import capture as capture_ui
 from refgs_addon.ui.closing import question
 from refgs_addon.ui.training import how_far_elsewhere
 from tests.addon.waiting import until
@@ -96,6 +101,77 @@ def test_a_capture_that_is_not_there(addon):
     addon.refgs.capture = "/nowhere"
     with pytest.raises(InputError, match="/nowhere is not a folder"):
         training.check(addon)
+
+
+@pytest.fixture
+def checked(addon, capture):
+    """A capture that was checked, and the number of the job."""
+    job = training.check(addon)
+    until(lambda: job.ended)
+    for number in range(2):
+        shutil.copy(job.results["check"]["thumbnails"][number], capture / f"{number}.png")
+    return job, len(jobs.JOBS) - 1
+
+
+class Drawn:
+    """Stands for a layout: notes the icons that are drawn in it, and whether its buttons are pressed."""
+
+    def __init__(self):
+        self.pictures, self.icons, self.pressed = [], [], []
+
+    def thumbnail(self, file, version):
+        self.pictures.append((file.name, version))
+        return len(self.pictures)
+
+    def grid_flow(self, **_):
+        return self
+
+    def template_icon(self, icon_value, scale):
+        self.icons.append(icon_value)
+
+    def operator(self, name, icon, depress):
+        self.pressed.append(depress)
+        return self
+
+
+def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
+    job, number = checked
+    drawn = Drawn()
+    monkeypatch.setattr(capture_ui, "thumbnail", drawn.thumbnail)  # without a window Blender gives no icons
+    capture_ui.draw_capture(drawn, addon, number, job)
+    assert drawn.icons == [1, 2] and drawn.pressed == [False]
+    assert drawn.pictures == [("0000.png", id(job)), ("0001.png", id(job))]
+    assert bpy.ops.refgs.show_cameras(number=number) == {"FINISHED"}
+    cameras = cameras_of(addon, capture)
+    assert cameras.name == "good photos cameras" and [item.name for item in cameras.objects] == ["0", "1"]
+    assert tuple(cameras.objects[1].matrix_world.translation) == (-4, 0, 0) and addon.camera == cameras.objects[0]
+    assert bpy.ops.refgs.photo() == {"FINISHED"} and photo_shown(addon.camera) == 1
+    assert bpy.ops.refgs.next_camera() == {"FINISHED"}
+    assert addon.camera == cameras.objects[1] and photo_shown(addon.camera) == 1
+    assert addon.camera.data.background_images[0].image.filepath == str(capture / "1.png")
+    capture_ui.draw_capture(drawn, addon, number, job)
+    assert drawn.pressed == [False, True]
+    bpy.ops.refgs.show_cameras(number=number)
+    assert cameras_of(addon, capture) is None and not bpy.data.cameras and addon.camera is None
+    assert not bpy.ops.refgs.next_camera.poll()
+
+
+def test_a_run_brings_its_own_cameras(addon, checked, capture, run_folder):
+    """Those of the capture go; what was looked through stays."""
+    _, number = checked
+    file = run_folder / "cameras.json"
+    content = json.loads(file.read_text())
+    for frame, name in zip(content["frames"], ("1", "0"), strict=True):
+        frame["file_path"], frame["photo"] = f"images/{name}", f"{name}.png"
+    file.write_text(json.dumps(content))
+    bpy.ops.refgs.show_cameras(number=number)
+    other = import_run(run_folder, addon)
+    assert len(cameras_of(addon, capture).objects) == 2 and "1" not in [item.name for item in other.cameras.values()]
+    addon.camera = cameras_of(addon, capture).objects[1]
+    (run_folder / "run.toml").write_text(f"[run]\ncapture = {json.dumps(str(capture))}\n")
+    run = import_run(run_folder, addon)
+    assert cameras_of(addon, capture) is None and len(bpy.data.cameras) == 4
+    assert addon.camera == run.cameras["1"]
 
 
 def test_photos_without_cameras(addon, tmp_path):

@@ -1,11 +1,15 @@
 """What `refgs check` says."""
 
+import json
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
-from makers import ball, colmap, edit, nerf_blender, nerfstudio, ring, write
+from makers import CENTRE, ball, colmap, edit, nerf_blender, nerfstudio, ring, write
 
 from refgs.capture import read_capture
-from refgs.capture.check import describe
+from refgs.capture.check import check, describe
 from refgs.errors import InputError
 
 
@@ -46,14 +50,55 @@ def test_warnings_name_the_first_view(tmp_path):
     edit(folder / "transforms.json", lambda data: data["frames"][20].update(cx=400.0))
     said = text(folder)
     for part in (
-        "1 of 32 views have no mask, first 0003.png",
-        "1 of 32 views have an empty mask, first 0005.png",
-        "greyscale, first 0007.png",
-        "clipped to white over a tenth of the subject, first 0007.png",
+        "1 of 32 views have no mask, first 0003.png: make",
+        "1 of 32 views have an empty mask, first 0005.png: make",
+        "greyscale, first 0007.png: put",
+        "clipped to white over a tenth of the subject, first 0007.png: photograph",
         "exposure varies: 0007.png",
-        "1 of 32 views do not see the centre, first 0020.png",
+        "1 of 32 views do not see the centre, first 0020.png: where",
     ):
         assert f"{part}" in said, said
+
+
+def test_blurred_photos_are_named(tmp_path):
+    folder = nerfstudio(tmp_path, count=24)
+    rng = np.random.default_rng(0)
+    for i in range(24):
+        grains = cv2.GaussianBlur(rng.uniform(20, 120 + 5 * i, (48, 64, 3)), None, 0.7)  # of any contrast
+        write(folder / "images" / f"{i:04d}.png", grains.astype(np.uint8))
+    assert "blurred" not in text(folder)
+    for i in (4, 20):
+        file = folder / "images" / f"{i:04d}.png"
+        write(file, cv2.GaussianBlur(cv2.imread(str(file))[..., ::-1], None, 2.0))
+    assert "Warning: 2 of 24 views look blurred beside the others, first 0004.png: look" in text(folder)
+
+
+def test_what_is_shown_of_it(tmp_path):
+    """Cameras that read back as the capture's, and some of its photos, small and masked."""
+    capture = read_capture(nerf_blender(tmp_path / "capture", {"train": 24, "test": 6}))
+    found = check(capture, tmp_path / "new" / "out")
+    assert found["capture"] == str(tmp_path / "capture") and any(
+        "30, 24 to train on" in line for line in found["lines"]
+    )
+    frames = json.loads(Path(found["cameras"]).read_text())["frames"]
+    assert [frame["photo"] for frame in frames[22:26]] == [
+        "train/r_22.png",
+        "train/r_23.png",
+        "test/r_0.png",
+        "test/r_1.png",
+    ]
+    assert np.linalg.norm(np.subtract(found["centre"], CENTRE)) < 0.1 and 0.4 < found["radius"] < 0.7
+    assert len(set(found["thumbnails"])) == 12
+    picture = cv2.imread(found["thumbnails"][0], cv2.IMREAD_UNCHANGED)
+    assert picture.shape == (48, 64, 4) and 0 < (picture[..., 3] > 0).mean() < 0.5
+    assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir() if path.suffix != ".png") == [
+        "cameras.json"
+    ]
+    large = nerfstudio(tmp_path / "large", count=5)
+    for photo in (large / "images").iterdir():
+        write(photo, cv2.resize(cv2.imread(str(photo)), (640, 480)))
+    found = check(read_capture(large), tmp_path / "out")
+    assert [cv2.imread(file, -1).shape for file in found["thumbnails"]] == [(96, 128, 3)] * 5
 
 
 def test_every_image_is_decoded(tmp_path):

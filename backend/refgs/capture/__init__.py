@@ -76,7 +76,8 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
                 )
             raise InputError(
                 f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender), transforms.json (nerfstudio, "
-                "instant-ngp), sparse/0 (COLMAP), 0-camera.pkl (NeRO), and for photos, here and in images."
+                "instant-ngp), sparse/0 (COLMAP), 0-camera.pkl (NeRO), and for photos, here and in images. "
+                "Name the folder that holds them."
             )
     photos = Counter((view.split, view.image_path) for view in views)
     for (_, path), count in photos.items():
@@ -84,13 +85,16 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
             raise InputError(f"{path}: the capture names this photo {count} times. Remove all of its frames but one.")
     shared = {path for split, path in photos if split == "test"} & {path for split, path in photos if split == "train"}
     if shared:
-        warnings.append(f"{len(shared)} photos are both trained and tested on, first {min(shared).name}")
+        twice = f"{len(shared)} photos are both trained and tested on, first {min(shared).name}"
+        warnings.append(f"{twice}: the figures will be too good; name each in one of the two files")
     views = _hold_out(views)
     _check(folder, views)
     views = _unique_names(views)
     silhouettes = sample_silhouettes(views)
     if not silhouettes and any(view.masked for view in views):
-        warnings.append("the masks are white (opaque) everywhere, so they are not used")
+        warnings.append(
+            "the masks are white (opaque) everywhere, so they are not used: make them anew, the object white on black"
+        )
         views = [replace(view, mask_path=None, has_alpha=False) for view in views]
     up = up_direction(views)
     region = find_region(views, up, points, silhouettes)

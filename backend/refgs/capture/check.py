@@ -1,12 +1,21 @@
-"""What `refgs check` says about a capture."""
+"""What `refgs check` says about a capture, and shows of it."""
 
 from collections import Counter
+from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+from PIL import Image
 
+from refgs.capture.cameras import write_cameras
 from refgs.capture.images import LoadedView, load_view
 from refgs.capture.types import Capture, View
 from refgs.errors import InputError
+from refgs.paths import whole
+
+THUMBNAILS, THUMBNAIL_SIDE = 12, 128  # how many at most; pixels
+BLURRED = 0.4  # of a capture's median sharpness. Sharp photos have 0.6 of it at least; blurred by 2 pixels of 512, 0.2 at most
 
 LAYOUTS = {
     "nerf-blender": "NeRF-Blender",
@@ -16,12 +25,33 @@ LAYOUTS = {
 }
 
 
-def describe(capture: Capture) -> list[str]:
+def check(capture: Capture, out: Path) -> dict[str, Any]:
+    """Write what another program needs to show a capture into the folder `out`: its cameras.json, as a run's, and small PNGs of some
+    photos, masked, spread over the views. What is there of an earlier check is replaced.
+
+    Returns `capture`, `cameras` and `thumbnails`, the paths of the capture and of what was written; `centre` and `radius` of what the
+    cameras look at, in the frame of cameras.json; and `lines`, as `describe` does. Raises InputError as it does.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    lines = describe(capture, out)
+    write_cameras(out / "cameras.json", capture)
+    return {
+        "capture": str(capture.folder.resolve()),
+        "cameras": str((out / "cameras.json").resolve()),
+        "thumbnails": [str(_thumbnail(out, number).resolve()) for number in _spread(len(capture.views))],
+        "centre": capture.centre.tolist(),
+        "radius": float(capture.radius),
+        "lines": lines,
+    }
+
+
+def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
     """Lines about what the capture holds, then one `Warning: …` line for each thing that looks wrong.
 
-    Decodes every photo and mask. Raises InputError where any cannot be read: how many, and the first.
+    Decodes every photo and mask; small pictures of some are left in the folder `thumbnails`, where one is named. Raises InputError where
+    any cannot be read: how many, and the first.
     """
-    statistics = _decode_all(capture)
+    statistics = _decode_all(capture, thumbnails)
     return [
         f"Layout: {LAYOUTS[capture.layout]}",
         f"Views: {len(capture.views)}, {len(capture.train_views)} to train on, {len(capture.test_views)} to test on",
@@ -36,7 +66,7 @@ def describe(capture: Capture) -> list[str]:
 
 
 class _Statistics:
-    """What decoding one photo told: mask coverage (None without one), clipped share, mean code value, greyscale."""
+    """What decoding one photo told: mask coverage (None without one), clipped share, mean code value, greyscale, sharpness."""
 
     def __init__(self, loaded: LoadedView):
         inside = np.ones(loaded.image.shape[:2], bool) if loaded.alpha is None else loaded.alpha > 127
@@ -45,15 +75,48 @@ class _Statistics:
         self.clipped = float((pixels.max(axis=1) >= 254).mean())
         self.brightness = float(pixels.mean())
         self.grey = bool((pixels.max(axis=1) == pixels.min(axis=1)).all())
+        self.sharpness = _sharpness(loaded.image, inside)
 
 
-def _decode_all(capture: Capture) -> list[_Statistics]:
+def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
+    """How much of what varies in a picture varies from pixel to pixel: the energy of its Laplacian by that of its gradient, which no
+    contrast changes. Inside the mask alone, away from its edge; 0 where nothing varies."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    inside = cv2.erode(inside.astype(np.uint8), np.ones((7, 7), np.uint8), borderValue=0) > 0
+    across, down = (cv2.Sobel(grey, cv2.CV_32F, *axis, scale=1 / 8)[inside] for axis in ((1, 0), (0, 1)))
+    gradient = float((across**2 + down**2).sum())
+    return float((cv2.Laplacian(grey, cv2.CV_32F)[inside] ** 2).sum()) / gradient if gradient > 0 else 0.0
+
+
+def _spread(count: int) -> list[int]:
+    """The numbers of the views that thumbnails are made of."""
+    return sorted({round(number) for number in np.linspace(0, count - 1, THUMBNAILS)})
+
+
+def _thumbnail(folder: Path, number: int) -> Path:
+    return folder / f"{number:04d}.png"
+
+
+def _write_thumbnail(file: Path, loaded: LoadedView) -> None:
+    pixels = loaded.image if loaded.alpha is None else np.dstack([loaded.image, loaded.alpha])
+    picture = Image.fromarray(pixels)
+    picture.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
+    with whole(file) as temporary:
+        picture.save(temporary, "PNG")
+
+
+def _decode_all(capture: Capture, thumbnails: Path | None) -> list[_Statistics]:
     statistics, broken = [], []
-    for view in capture.views:
+    shown = _spread(len(capture.views)) if thumbnails else []
+    for number, view in enumerate(capture.views):
         try:
-            statistics.append(_Statistics(load_view(view, 512)))
+            loaded = load_view(view, 512)
         except InputError as error:
             broken.append(str(error))
+            continue
+        statistics.append(_Statistics(loaded))
+        if number in shown:
+            _write_thumbnail(_thumbnail(thumbnails, number), loaded)
     if broken:
         count = f"{len(broken)} of {len(capture.views)} views cannot be read, the first: " if len(broken) > 1 else ""
         raise InputError(count + broken[0])
@@ -107,27 +170,36 @@ def _extent(capture: Capture) -> str:
 def _warnings(capture: Capture, statistics: list[_Statistics]) -> list[str]:
     warnings = []
 
-    def count(what: str, views: list[View]) -> None:
+    def count(what: str, views: list[View], advice: str) -> None:
         if views:
-            warnings.append(f"{len(views)} of {len(capture.views)} views {what}, first {views[0].image_path.name}")
+            first = views[0].image_path.name
+            warnings.append(f"{len(views)} of {len(capture.views)} views {what}, first {first}: {advice}")
 
     pairs = list(zip(capture.views, statistics, strict=True))
     if any(view.masked for view in capture.views):
-        count("have no mask", [view for view in capture.views if not view.masked])
-    count("have an empty mask", [view for view, s in pairs if s.coverage == 0])
-    count("are greyscale", [view for view, s in pairs if s.grey and s.coverage != 0])
-    count("are clipped to white over a tenth of the subject", [view for view, s in pairs if s.clipped > 0.1])
-    count("do not see the centre", [view for view in capture.views if not _sees(view, capture.centre)])
+        unmasked = [view for view in capture.views if not view.masked]
+        count("have no mask", unmasked, "make them masks, or remove the photos")
+    empty = [view for view, s in pairs if s.coverage == 0]
+    count("have an empty mask", empty, "make the masks anew, or remove the photos")
+    grey = [view for view, s in pairs if s.grey and s.coverage != 0]
+    count("are greyscale", grey, "put the photos in colour in their place")
+    clipped = [view for view, s in pairs if s.clipped > 0.1]
+    count("are clipped to white over a tenth of the subject", clipped, "photograph it again, exposed less")
+    usual = np.median([s.sharpness for s in statistics if s.sharpness > 0] or [0])
+    blurred = [view for view, s in pairs if 0 < s.sharpness < BLURRED * usual]
+    count("look blurred beside the others", blurred, "look at them, and remove or retake those that are")
+    astray = [view for view in capture.views if not _sees(view, capture.centre)]
+    count("do not see the centre", astray, "where their cameras are wrong, or they show something else, remove them")
     brightness = [s.brightness for s in statistics if s.coverage != 0]
     if brightness and max(brightness) > 2 * max(1.0, np.median(brightness)):
         brightest = max(pairs, key=lambda pair: pair[1].brightness)[0].image_path.name
-        warnings.append(f"exposure varies: {brightest} is more than twice as bright as most")
+        what = f"exposure varies: {brightest} is more than twice as bright as most"
+        warnings.append(f"{what}: the training allows for it, but photos with the exposure locked are better")
     if not capture.masked and capture.bounded:
-        warnings.append("no masks: the surroundings will be reconstructed with the object")
+        what = "no masks: the surroundings will be reconstructed with the object"
+        warnings.append(f"{what}; an alpha channel, or a folder masks with files of the photos' names, leaves them out")
     if len(capture.train_views) < 20:
-        warnings.append(f"{len(capture.train_views)} training views are few; thirty or more are good")
-    if not capture.test_views:
-        warnings.append("no test views: the training cannot be measured")
+        warnings.append(f"{len(capture.train_views)} training views are few: take more, thirty or more are good")
     return warnings
 
 

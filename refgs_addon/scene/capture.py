@@ -1,0 +1,68 @@
+"""A capture's cameras in the scene before anything is trained, as the trainer's check wrote them down."""
+
+from pathlib import Path
+
+import bpy
+
+from .cameras import PHOTO, add_camera, frame_camera, read_cameras
+from .parts import active_run
+
+CAPTURE = "refgs_capture"  # the custom property of a collection of a capture's cameras: the capture's folder
+
+
+def show_cameras(scene: bpy.types.Scene, capture: Path, cameras: Path) -> bpy.types.Collection:
+    """Add a capture's cameras to a scene in a collection `NAME cameras`, in place of those that it has of them; `cameras` is the
+    cameras.json that a check wrote. Raises InputError."""
+    frames = read_cameras(cameras, capture)
+    remove_cameras(scene, capture)
+    collection = bpy.data.collections.new(f"{capture.name} cameras")
+    collection[CAPTURE] = str(capture)
+    scene.collection.children.link(collection)
+    added = [add_camera(frame, collection) for frame in frames]
+    if scene.camera is None and added:
+        frame_camera(scene, added[0])
+    return collection
+
+
+def cameras_of(scene: bpy.types.Scene, capture: Path) -> bpy.types.Collection | None:
+    """The collection of a capture's cameras that `show_cameras` added to a scene."""
+    return next((item for item in _captures(scene) if item[CAPTURE] == str(capture)), None)
+
+
+def remove_cameras(scene: bpy.types.Scene, capture: Path) -> None:
+    """Remove a capture's cameras from a scene, if it has them."""
+    collection = cameras_of(scene, capture)
+    if collection is not None:
+        cameras = list(collection.all_objects)
+        bpy.data.batch_remove([*cameras, *(camera.data for camera in cameras if camera.data), collection])
+
+
+def hand_over(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bpy.types.Object]) -> None:
+    """Remove a capture's cameras for those of a run of it, by their names, which they get; who looked through one goes on through
+    that of the same photo."""
+    known = cameras_of(scene, capture)
+    if known is None:
+        return
+    photo = scene.camera.data.get(PHOTO) if scene.camera and scene.camera.name in known.all_objects else None
+    remove_cameras(scene, capture)
+    for name, camera in cameras.items():
+        camera.name = camera.data.name = name
+    if photo is not None and cameras:
+        of_photo = [camera for camera in cameras.values() if camera.data[PHOTO] == photo]
+        frame_camera(scene, (of_photo or list(cameras.values()))[0])
+
+
+def active_cameras(context: bpy.types.Context) -> bpy.types.Collection | None:
+    """Whose cameras are stepped through: the run's or capture's that the active object is of, else that the scene's camera is of, else
+    the newest run's, else the newest capture's."""
+    captures = _captures(context.scene)
+    for item in (context.view_layer.objects.active, context.scene.camera):
+        for collection in context.scene.collection.children:
+            known = collection in captures or collection == active_run(context)
+            if item is not None and known and item.name in collection.all_objects:
+                return collection
+    return active_run(context) or (captures or [None])[-1]
+
+
+def _captures(scene: bpy.types.Scene) -> list[bpy.types.Collection]:
+    return [collection for collection in scene.collection.children if CAPTURE in collection]
