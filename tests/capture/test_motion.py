@@ -8,7 +8,7 @@ from makers import look_at, write
 from scipy.ndimage import map_coordinates
 
 from refgs.capture import read_capture
-from refgs.capture.motion import ALL_PAIRS, find_cameras, pairs
+from refgs.capture.motion import AGAINST, ALL_PAIRS, CONTRADICTED, against, find_cameras, pairs
 from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.errors import InputError, NoCameras
 
@@ -122,6 +122,35 @@ def test_photos_that_have_nothing_in_common(tmp_path):
 def test_no_photos(tmp_path):
     with pytest.raises(InputError, match="0 photos"):
         find_cameras(tmp_path, quiet)
+
+
+def test_what_stands_still_contradicts_what_turns():
+    """An object turns once before a room, the camera never quite at one place: cameras around the object contradict the matches of the
+    room, cameras in the room those of the object."""
+    rng, focal, count = np.random.default_rng(0), 1000, 36
+    block, room = rng.uniform(-0.8, 0.8, (100, 3)), np.add(rng.uniform(-2, 2, (50, 3)), [0, 6, 0])
+    places, around, inside = [], [], []
+    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        turn = np.eye(4)
+        turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        eye = look_at(np.array([0, -4, 1.5]) + rng.normal(0, 0.05, 3), np.zeros(3))
+        inside.append(np.linalg.inv(eye @ OPENGL_TO_OPENCV))
+        around.append(inside[-1] @ turn)
+        seen = np.concatenate([block @ turn[:3, :3].T, room]) @ inside[-1][:3, :3].T + inside[-1][:3, 3]
+        places.append(seen[:, :2] / seen[:, 2:])
+
+    def contradicted(poses: list[np.ndarray], reach: int, features: slice) -> np.ndarray:
+        """Of the matches of photos that are at most so far apart in the turn."""
+        near = [(a, b) for a, b in pairs(count) if min(b - a, count - b + a) <= reach]
+        ways = [(poses[b] @ np.linalg.inv(poses[a]))[:3] for a, b in near]
+        far = [against(places[a][features], places[b][features], way) for (a, b), way in zip(near, ways, strict=True)]
+        return np.concatenate(far) * focal > AGAINST
+
+    of_block, of_room = (6, slice(100)), (count, slice(100, None))  # the block's features are hidden six photos on
+    for poses in (around, inside):
+        both = [contradicted(poses, *of_block), contradicted(poses, *of_room)]
+        assert np.concatenate(both).mean() > CONTRADICTED
+        assert both[0 if poses is around else 1].mean() == 0
 
 
 def test_pairs():

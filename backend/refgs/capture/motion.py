@@ -6,7 +6,9 @@ of nothing while it works, and where it gives up it takes its process with it.
 Masks are not used: surroundings that stand still with the object say most about where the camera is, and a shiny object alone says
 too little (of 66 photos of a polished head, five were placed by what is inside its masks). Behind a turntable the surroundings stand
 still with the camera and mislead. Matches at one place in both photos are dropped for that, which is not enough where the camera was
-moved a little as well: all 66 photos of that head were placed, many of them wrongly.
+moved a little as well: cameras are found that agree with what turns in some photos, and with what stands still in others (all 66 of
+that head, 19° wrong in the mean). What betrays them is that they contradict many of the matches that they were found from. Without the
+features that hardly move over many photos eight of the 66 are placed, rightly: so the artist is warned, and told what to do.
 """
 
 import hashlib
@@ -19,6 +21,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from refgs import CORES
 from refgs.capture import find_layout
 from refgs.capture.files import find_photos
@@ -29,6 +33,12 @@ SIDE = 1600  # pixels: photos are reduced to this for finding features; presets 
 ALL_PAIRS = 150  # photos: up to so many, each is compared with each other
 CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential distortion only fit noise
 SEED = 1
+AGAINST = 8.0  # pixels from its epipolar line: a match contradicts the cameras; COLMAP itself allows 4
+CONTRADICTED = 0.2  # of the matches: cameras are not to be trusted
+DOUBTED = (
+    "as where an object turns before surroundings that stand still: look at them before you train (Show Cameras in Blender). If they are "
+    "wrong, put something plain behind the object, or walk around it, and take the photos anew"
+)
 
 
 def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) -> dict[str, Any]:
@@ -54,7 +64,7 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
         if not path.name.startswith(database.name):
             _remove(path)
     model = work / "0"
-    placed, error = _apart(photos, database, model, report)
+    placed, error, contradicted = _apart(photos, database, model, report)
     if len(placed) < max(3, len(photos) / 2):
         shutil.rmtree(work)
         raise InputError(
@@ -64,6 +74,9 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
     if missing := [photo.name for photo in photos if photo.name not in placed]:
         names = ", ".join(missing[:5]) + (" …" if len(missing) > 5 else "")
         what = f"{len(missing)} of {len(photos)} photos could not be placed and are left out: {names}; more photos between them help"
+        report("warning", {"what": what})
+    if contradicted > CONTRADICTED:
+        what = f"the cameras contradict {contradicted:.0%} of what the photos have in common, {DOUBTED}"
         report("warning", {"what": what})
     for path in list(work.glob(f"{database.name}*")):
         _remove(path)
@@ -82,6 +95,19 @@ def pairs(count: int) -> list[tuple[int, int]]:
     return sorted(near | set(combinations(range(0, count, 10), 2)))
 
 
+def against(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """How far matches are from where two cameras allow them, (M,), in the units of the rays: the Sampson distance.
+
+    `ours` and `theirs` (M, 2) are where the rays meet the plane at depth 1, `pose` (3, 4) brings points from our camera to theirs.
+    """
+    turn, shift = pose[:, :3], pose[:, 3]
+    x, y = (np.column_stack([rays, np.ones(len(rays))]) for rays in (ours, theirs))
+    essential = np.cross(shift / max(np.linalg.norm(shift), 1e-12), turn, axisb=0, axisc=0)
+    line, back = x @ essential.T, y @ essential
+    slope = (line[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
+    return np.abs((y * line).sum(axis=1)) / np.sqrt(np.maximum(slope, 1e-24))
+
+
 def _remove(path: Path) -> None:
     shutil.rmtree(path) if path.is_dir() else path.unlink()
 
@@ -92,7 +118,7 @@ def _digest(photos: list[Path]) -> str:
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
 
 
-def _apart(photos: list[Path], database: Path, model: Path, report: Callable) -> tuple[set[str], float]:
+def _apart(photos: list[Path], database: Path, model: Path, report: Callable) -> tuple[set[str], float, float]:
     """`_place` in a process of its own, which ends with this call, however that ends."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -115,7 +141,8 @@ def _apart(photos: list[Path], database: Path, model: Path, report: Callable) ->
 
 
 def _place(photos: list[Path], database: Path, model: Path, events: Connection) -> None:
-    """Sends how it goes; at last the names of the photos that were placed and the mean reprojection error, in pixels."""
+    """Sends how it goes; at last the names of the photos that were placed, the mean reprojection error, in pixels, and the part of
+    the matches that the cameras contradict."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # who started this process ends it
     import pycolmap
 
@@ -132,7 +159,7 @@ def _place(photos: list[Path], database: Path, model: Path, events: Connection) 
     _match(len(photos), database, tell)
     found = _map(photos, database, tell)
     if found is None:
-        events.send((set(), 0.0))
+        events.send((set(), 0.0, 0.0))
         return
     for number in found.reg_image_ids():
         found.image(number).name = photos[int(found.image(number).name)].name
@@ -140,7 +167,7 @@ def _place(photos: list[Path], database: Path, model: Path, events: Connection) 
     model.mkdir()
     found.write_binary(model)
     placed = {found.image(number).name for number in found.reg_image_ids()}
-    events.send((placed, found.compute_mean_reprojection_error()))
+    events.send((placed, found.compute_mean_reprojection_error(), _contradicted(found, database)))
 
 
 def _describe(photos: list[Path], database: Path, tell: Callable) -> None:
@@ -200,6 +227,26 @@ def _match(count: int, database: Path, tell: Callable) -> None:
         tell("matching", start, len(all_pairs))
         listed.write_text("\n".join(all_pairs[start : start + 100]), encoding="utf-8")
         pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+
+
+def _contradicted(found: Any, database: Path) -> float:
+    """The part of the matches between photos of a model (a pycolmap.Reconstruction) that its cameras do not allow."""
+    import pycolmap
+
+    placed = set(found.reg_image_ids())
+    with pycolmap.Database.open(database) as known:
+        places = {number: known.read_keypoints(number)[:, :2].astype(float) for number in placed}
+        verified = list(zip(*known.read_two_view_geometries(), strict=True))
+    rays = {number: found.image(number).camera.cam_from_img(places[number]) for number in placed}
+    wrong, total = 0, 0
+    for pair, geometry in verified:
+        (a, b), matches = pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches
+        if {a, b} <= placed:
+            ours, theirs = found.image(a), found.image(b)
+            pose = (theirs.cam_from_world() * ours.cam_from_world().inverse()).matrix()
+            far = against(rays[a][matches[:, 0]], rays[b][matches[:, 1]], pose) * ours.camera.mean_focal_length()
+            wrong, total = wrong + int((far > AGAINST).sum()), total + len(far)
+    return wrong / max(total, 1)
 
 
 def _map(photos: list[Path], database: Path, tell: Callable) -> Any:
