@@ -21,6 +21,7 @@ SMALL = [
     "surfels.budget=1800",
     "surfels.hull=64",
     "environment.resolution=16",
+    "train.light_first=0",
     "residual.start=0.5",
     "rates.residual=0.02",
 ]

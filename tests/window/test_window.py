@@ -47,7 +47,7 @@ def in_window(script, tmp_path, *words):
     subprocess.run([sys.executable, tool, "build", "--source-dir", ROOT, "--output-filepath", archive], check=True)
     words = [*command, "--python", Path(__file__).with_name(script), "--", archive, *words, tmp_path]
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
-    done = subprocess.run(list(map(str, words)), env=environment, capture_output=True, text=True, timeout=590)
+    done = subprocess.run(list(map(str, words)), env=environment, capture_output=True, text=True, timeout=1200)
     path = tmp_path / "report.json"
     assert path.exists(), done.stdout[-3000:] + done.stderr[-3000:]
     report = json.loads(path.read_text())
@@ -80,7 +80,7 @@ def test_an_artist_trains(tmp_path, ball_capture):
     assert report["stopped"] > 0
     states = {name: jobs[-1][1] for name, jobs in report["steps"].items() if jobs}
     assert states == {
-        "checked": "done", "training": "running", "paused": "paused", "stopped": "cancelled",
+        "checked": "done", "cameras": "done", "training": "running", "paused": "paused", "stopped": "cancelled",
         "resumed": "running", "done": "done", "imported": "done",
     } | dict.fromkeys(states.keys() & {"photo", "relit", "edited", "applied"}, "done") | (
         {"live": "running", "previewed": "done"} if report["imported"] == ["FINISHED"] else {}
@@ -94,4 +94,7 @@ def test_an_artist_trains(tmp_path, ball_capture):
         assert report["preview"] == ["done", ""] and cv2.imread(str(tmp_path / "preview.png")).std() > 5
     for name in report["steps"]:
         assert cv2.imread(str(tmp_path / f"{name}.png")).std() > 5
+    assert report["cameras"] == 28
     print("longest that the window was busy, in seconds:", report["longest"])
+    print("of that for the add-on's timer and panels:", report["ours"])
+    print("what buttons took:", report["clicks"])

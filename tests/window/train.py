@@ -18,7 +18,7 @@ ARCHIVE, PYTHON, CAPTURE, OUT = map(Path, sys.argv[sys.argv.index("--") + 1 :])
 MODULE = "bl_ext.user_default.refgs"
 PATIENCE = 180  # seconds, for a machine that is busy
 bpy.context.preferences.view.show_splash = False
-report = {"steps": {}, "longest": {}}
+report = {"steps": {}, "longest": {}, "ours": {}, "clicks": {}}
 
 
 def jobs():
@@ -45,6 +45,7 @@ def artist():
     yield lambda: True, None
     next(region for region in area().regions if region.type == "UI").active_panel_category = "RefGS"
     yield lambda: True, "empty"
+    measure_ours()
     bpy.context.preferences.addons[MODULE].preferences.python = str(PYTHON)
     settings = bpy.context.scene.refgs
     settings.capture, settings.preset, settings.limited, settings.minutes = str(CAPTURE), "quick", True, 2.0
@@ -52,6 +53,10 @@ def artist():
     bpy.ops.refgs.check_capture()
     yield last("done"), "checked"
     report["checked"] = jobs()[-1].results["check"]["lines"]
+    bpy.ops.refgs.show_cameras(number=len(jobs()) - 1)
+    bpy.ops.refgs.add_training_region()
+    yield lambda: True, "cameras"
+    report["cameras"] = sum(item.type == "CAMERA" for item in bpy.data.objects)
     bpy.ops.refgs.put_away(number=len(jobs()) - 1)
     bpy.ops.refgs.train()
     yield lambda: len(jobs()[-1].curve) > 4 and jobs()[-1].preview, "training"
@@ -104,6 +109,30 @@ def work_with_it(folder):
     report["scene"] = scene.render.engine, scene.world.name
 
 
+ours = 0.0  # seconds, the longest that the window waited for the add-on since the last step
+
+
+def measure_ours():
+    """Measure what the add-on does when no button was pressed: its timer, and its panels being drawn."""
+
+    def measured(function):
+        def wrapper(*words):
+            global ours
+            start = time.perf_counter()
+            try:
+                return function(*words)
+            finally:
+                ours = max(ours, time.perf_counter() - start)
+
+        return wrapper
+
+    follow = addon("follow")
+    follow._look = measured(follow._look)
+    for cls in addon("ui").CLASSES:
+        if issubclass(cls, bpy.types.Panel):
+            cls.draw = measured(cls.draw)
+
+
 def numpy():
     return importlib.util.find_spec("numpy") is not None
 
@@ -135,7 +164,7 @@ steps, waiting, due, longest = artist(), None, time.perf_counter() + 3.0, 0.0
 
 def tick() -> float | None:
     """Ten times a second: go on where what was waited for has come. How late it comes is how long the window was busy."""
-    global waiting, due, longest
+    global waiting, due, longest, ours
     now = time.perf_counter()
     longest = max(longest, now - due)
     due = now + 0.1
@@ -143,9 +172,12 @@ def tick() -> float | None:
         if waiting is None:
             with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
                 found = next(steps, None)
+            click = time.perf_counter() - now
             if found is None:
                 return finish()
             waiting = (*found, now + PATIENCE)
+            if found[1]:
+                report["clicks"][found[1]] = click
             due = time.perf_counter() + 3.0  # the click itself is not in the time, but what comes of it is
             return 3.0  # so that it is drawn
         condition, name, until = waiting
@@ -153,6 +185,7 @@ def tick() -> float | None:
             waiting = None
             if name:
                 report["longest"][name], longest = longest, 0.0
+                report["ours"][name], ours = ours, 0.0
                 photograph(name)
                 report["steps"][name] = [(job.name, job.state, job.line) for job in jobs()]
             due = time.perf_counter() + 0.1
