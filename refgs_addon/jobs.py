@@ -57,6 +57,7 @@ class Job:
     curve: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR
     kept: bool = False  # it goes on to its end when Blender closes
     _stopped: bool = False
+    _silent: bool = False  # the process says nothing more
     _asked_only: bool = False
     _process: subprocess.Popen | None = None
     _heard: queue.SimpleQueue = field(default_factory=queue.SimpleQueue)
@@ -115,12 +116,16 @@ class Job:
         while not self._heard.empty():
             heard, event = True, self._heard.get()
             if event is None:
-                self._gone()
+                self._silent = True
             elif not self.ended:
                 try:
                     self._take(event)
                 except (KeyError, TypeError, AttributeError):  # from a program that speaks otherwise
                     self.warnings.append(f"not an event: {event}")
+        # Silence comes a while before the end, torch being slow to go: the window does not wait for it.
+        if self._silent and (status := self._process.poll()) is not None:
+            heard, self._silent = True, False
+            self._gone(status)
         return heard
 
     def _take(self, event: dict) -> None:
@@ -172,9 +177,8 @@ class Job:
         with contextlib.suppress(OSError):
             self._process.stdin.close()
 
-    def _gone(self) -> None:
+    def _gone(self, status: int) -> None:
         """The process has ended."""
-        status = self._process.wait()
         if self.ready and self._asked_only and not self.ended:
             self.state, self.line = "done", ""
         elif self._stopped and not self.ended:

@@ -34,6 +34,18 @@ def test_a_training_to_its_end(start, tmp_path):
     assert job._process.wait(timeout=10) == 0
 
 
+def test_one_that_is_silent_is_not_waited_for(tmp_path):
+    """Between its last word and its end a process takes its time, in which the window must not stand still."""
+    ends_with_its_input = "import os, sys; print('{}', flush=True); os.close(1); sys.stdin.read(); os._exit(3)"
+    words = ("-c", ends_with_its_input)
+    job = jobs._add(jobs.Job("slow", Path(sys.executable), [{"command": "rest"}], tmp_path / "log.txt", words=words))
+    until(lambda: job._silent)
+    assert not jobs.poll() and not job.ended and job._process.poll() is None
+    job.let_go()
+    until(lambda: job.ended)
+    assert job.state == "failed" and "status 3" in job.line
+
+
 def test_it_rests_while_it_is_paused(start):
     job = start(mesh=False)
     until(lambda: job.progress)
