@@ -232,15 +232,15 @@ def ask(python: Path, log: Path) -> Job:
 def install(home: Path, log: Path) -> Job:
     """Install the trainer that the add-on brings into an environment of its own, or go on with that: `ready`, when the job is done."""
     words = {"uv": str(environment.wheel("uv")), "trainer": str(environment.wheel("refgs"))}
-    return _keep("install", home, log, words)
+    return _by_blender("install", home, log, words)
 
 
 def remove(home: Path, log: Path) -> Job:
     """Remove that environment, or what there is of it."""
-    return _keep("remove", home, log, {})
+    return _by_blender("remove", home, log, {})
 
 
-def _keep(command: str, home: Path, log: Path, words: dict[str, str]) -> Job:
+def _by_blender(command: str, home: Path, log: Path, words: dict[str, str]) -> Job:
     """By Blender's own Python, which needs nothing but its own library for it."""
     told = {"command": command, "home": str(home)} | words
     return _add(Job(command, Path(sys.executable), [told], log, words=("-I", environment.__file__)))

@@ -106,7 +106,7 @@ def _folder(name: str) -> Path:
 
 def ask() -> None:
     """Ask the Python that is used for its trainer; `state` says what came of it."""
-    _forget()
+    forget()
     if set_up():
         _asked.append(jobs.ask(python(), log_file("trainer")))
         follow()
@@ -116,7 +116,7 @@ def install() -> None:
     """Install the trainer, or go on with that. Raises InputError where it cannot be."""
     if reason := why_no_installation() or environment.too_full(home()):
         raise InputError(reason)
-    _forget()
+    forget()
     _asked.append(jobs.install(home(), log_file("installation")))
     follow()
 
@@ -125,7 +125,7 @@ def remove() -> None:
     """Remove the trainer that was installed, or the half of it."""
     if reason := _in_use():
         raise InputError(reason)
-    _forget()
+    forget()
     _asked.append(jobs.remove(home(), log_file("installation")))
     follow()
 
@@ -137,7 +137,8 @@ def stop() -> None:
         job.line = "Stopping …"
 
 
-def _forget() -> None:
+def forget() -> None:
+    """Ask no longer, and forget what was said."""
     for job in _asked:
         job.stop()
         if job in jobs.JOBS:
@@ -187,6 +188,8 @@ def why_no_installation() -> str:
 
 def _in_use() -> str:
     busy = any(job not in _asked and not job.ended for job in jobs.JOBS)
+    listed = (Path(known.folder) for scene in bpy.data.scenes for known in scene.refgs.runs)
+    busy = busy or any(jobs.run_state(folder) == "training" for folder in listed)  # without this Blender
     return "The trainer is at work: wait for it, or stop it, first" if busy or installing() else ""
 
 

@@ -210,6 +210,17 @@ def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
     assert not any((run / name).exists() for name in (LOCK, PROGRESS, STOP))
 
 
+def test_what_waits_goes_with_the_input(talk, ball_capture, tmp_path):
+    """Finished and left at once: the surfels are written, the mesh that was asked for as well is not begun."""
+    run = tmp_path / "run"
+    talk.tell("train", **train(ball_capture, run))
+    talk.tell("export", run=str(run), texture=64)
+    talk.until("progress")
+    talk.tell("stop")
+    assert talk.end() == 0
+    assert (run / "splats.ply").exists() and not (run / "mesh.glb").exists()
+
+
 def test_a_training_that_is_kept_no_longer(talk, ball_capture, tmp_path):
     run = tmp_path / "run"
     talk.tell("train", **train(ball_capture, run))

@@ -34,6 +34,8 @@ class RunLock:
         except Timeout:
             what = "another process trains it, or makes its mesh: wait until that has ended, or stop it"
             raise InputError(f"{self._folder} is in use: {what}") from None
+        except OSError:  # a file system without locks
+            pass
         self._tidy()
         return self
 

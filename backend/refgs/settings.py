@@ -245,7 +245,8 @@ def load_settings(preset: str, changes: list[str] = ()) -> Settings:
 
 def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
     """Settings that a run wrote down; what the program did not know of yet is as in the standard preset."""
-    still = {"light": {"frame": "world", "exposure": "off"}}  # all light was, and no photo had an exposure
+    # All light stood in the world, no photo had an exposure, and what was left over was not learned.
+    still = {"light": {"frame": "world", "exposure": "off"}, "residual": {"start": 1.0}}
     return validate(_merge(_merge(_read_preset("standard"), still), tables), source)
 
 

@@ -85,6 +85,7 @@ class Worker:
         self._commands: queue.SimpleQueue[_Command | None] = queue.SimpleQueue()  # a signal may put while it is read
         self._waiting: list[_Command] = []  # jobs that were asked for during a training
         self._open, self._deaf, self._kept = True, False, False
+        self._closed = False  # no more commands will come, though some may not have been read
 
     def listen(self, commands: IO[str]) -> None:
         """Take commands until there are no more; in a thread of its own."""
@@ -104,6 +105,7 @@ class Worker:
 
     def close(self) -> None:
         """No more commands will come."""
+        self._closed = True
         self._commands.put(CLOSED)
 
     def interrupted(self, *_) -> None:
@@ -129,6 +131,8 @@ class Worker:
         self.say("ready", {"protocol": PROTOCOL, "refgs": __version__, "card": card, "no_card": why})
         jobs_of = {Check: self._check, Poses: self._poses, Train: self._train, Export: self._export}
         while self._open or (self._kept and self._waiting):
+            if self._waiting and self._closed and not self._kept:
+                break  # what waited for the training goes with the input, wherever the training was then
             command = self._waiting.pop(0) if self._waiting else self._commands.get()
             if command is CLOSED:
                 break

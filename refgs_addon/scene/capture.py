@@ -33,8 +33,12 @@ def remove_cameras(scene: bpy.types.Scene, capture: Path) -> None:
     """Remove a capture's cameras from a scene, if it has them."""
     collection = cameras_of(scene, capture)
     if collection is not None:
-        cameras = list(collection.all_objects)
-        bpy.data.batch_remove([*cameras, *(camera.data for camera in cameras if camera.data), collection])
+        cameras = [item for item in collection.all_objects if item.type == "CAMERA" and PHOTO in item.data]
+        for item in set(collection.objects) - set(cameras) - set(scene.collection.objects):  # what the artist put there
+            scene.collection.objects.link(item)
+        for child in set(collection.children) - set(scene.collection.children):
+            scene.collection.children.link(child)
+        bpy.data.batch_remove([*cameras, *(camera.data for camera in cameras), collection])
 
 
 def hand_over(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bpy.types.Object]) -> None:

@@ -17,9 +17,14 @@ INPUTS = ("Base Color", "Color Amount", "Metallic", "Metallic Amount", "Roughnes
 
 def materials() -> dict[str, Path]:
     """The files of all materials, by their names."""
-    folders = {str(ROOT / "presets" / PRESETS), *bpy.utils.preset_paths(PRESETS)}
-    files = (file for folder in folders for file in Path(folder).glob("[!.]*.py"))
-    return dict(sorted((bpy.path.display_name(file.name, title_case=False), file) for file in files))
+    folders = [
+        ROOT / "presets" / PRESETS,
+        *map(Path, bpy.utils.preset_paths(PRESETS)),
+        _own(),
+    ]  # of two alike, the artist's
+    files = (file for folder in folders for file in folder.glob("[!.]*.py"))
+    found = {bpy.path.display_name(file.name, title_case=False): file for file in files}
+    return dict(sorted(found.items()))
 
 
 def read_material(name: str) -> dict[str, float | tuple[float, ...]]:

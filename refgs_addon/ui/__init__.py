@@ -34,6 +34,7 @@ def register() -> None:
 
 
 def unregister() -> None:
+    preferences.forget()
     follow.unregister()
     closing.unregister()
     training.unregister()

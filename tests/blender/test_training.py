@@ -174,6 +174,17 @@ def test_a_run_brings_its_own_cameras(addon, checked, capture, run_folder):
     assert addon.camera == run.cameras["1"]
 
 
+def test_what_else_is_among_the_cameras_stays(addon, checked):
+    _, number = checked
+    bpy.ops.refgs.show_cameras(number=number)
+    lamp = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "POINT"))
+    cameras = next(item for item in addon.collection.children if item.name.endswith("cameras"))
+    cameras.objects.link(lamp)
+    bpy.ops.refgs.show_cameras(number=number)
+    assert not any(item.name.endswith("cameras") for item in bpy.data.collections)
+    assert bpy.data.objects["lamp"] in list(addon.collection.objects) and not bpy.data.cameras
+
+
 def test_photos_without_cameras(addon, tmp_path):
     folder = tmp_path / "bare photos"
     folder.mkdir()

@@ -88,6 +88,15 @@ def test_a_run_shows_what_was_learned(learned):
     assert float((shown.color - learned.render(camera).color).abs().mean()) < 1e-3
 
 
+def test_one_that_ends_before_it_leaves_none(ball_capture, tmp_path):
+    made = trainer(ball_capture, tmp_path / "run")
+    for _ in range(3):
+        made.step()
+    made.total = made.iteration  # good enough: stop here
+    write_asset(made)
+    assert open_run(tmp_path / "run").splats.sh.shape[1] == 1
+
+
 def test_without_it_no_harmonics_are_left(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", "residual.start=1", "train.iterations=10")
     assert "sh_rest" not in made.parameters

@@ -1,5 +1,6 @@
 """What `refgs check` says about a capture, and shows of it."""
 
+import math
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -162,8 +163,8 @@ def _poses(capture: Capture) -> str:
 def _extent(capture: Capture) -> str:
     centre = capture.to_capture @ np.append(capture.centre, 1)
     radius = capture.radius * np.cbrt(np.linalg.det(capture.to_capture[:3, :3]))
-    x, y, z = centre[:3]
-    line = f"Extent: radius {radius:.3g} about ({x:.3g}, {y:.3g}, {z:.3g}) in the capture's frame"
+    x, y, z = np.round(centre[:3], 2 - math.floor(math.log10(radius))) + 0.0  # a hundredth of the radius; no −0
+    line = f"Extent: radius {radius:.3g} about ({x:.6g}, {y:.6g}, {z:.6g}) in the capture's frame"
     return line if capture.points is None else f"{line}, {len(capture.points):,} structure-from-motion points"
 
 

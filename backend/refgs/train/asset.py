@@ -25,6 +25,8 @@ def write_asset(trainer: Trainer) -> None:
     folder, settings = trainer.folder, trainer.settings
     with torch.no_grad():
         surfels, environment = with_normals_last(trainer.surfels()), trainer.environment()
+    if not surfels.sh_rest.any():  # it ended before they could learn
+        surfels = surfels._replace(sh_rest=surfels.sh_rest[:, :0])
     if trainer.occluder is None:
         nothing, whole = surfels.indirect_dc[:, :0], torch.ones_like(surfels.received)
         surfels = surfels._replace(indirect_dc=nothing, indirect_rest=nothing, received=whole)
@@ -136,7 +138,9 @@ def _left_out(trainer: Trainer, surfels: Surfels, side: Tensor, wanted: Tensor) 
             why = "indirect.start = 1"
         elif settings.light.frame == "camera":
             why = "the light turns with the camera: what the object mirrors of itself changes from photo to photo"
-        elif trainer.total <= max(indirect.every, max(indirect.start, settings.initial.until) * trainer.total):
+        elif trainer.total * trainer.residual_start <= max(
+            indirect.every, max(indirect.start, settings.initial.until) * trainer.total
+        ):
             why = "the training was over before its first mesh"
         else:
             why = "the object hardly mirrors itself"

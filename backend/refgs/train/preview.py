@@ -18,7 +18,8 @@ def write_preview(trainer: Trainer) -> dict[str, str | int]:
     folder = trainer.folder / FOLDER
     view = (trainer.test or trainer.views)[0]
     with torch.no_grad():
-        surfels = trainer.surfels().chosen(trainer.wanted())
+        wanted = trainer.wanted()
+        surfels = trainer.surfels().chosen(wanted if wanted.any() else ~wanted)  # all, where the region is empty by now
         rendering = trainer.render(view.camera, surfels)
         write_png(folder / "view.png", color_picture(rendering, np.array(trainer.settings.image.background)))
         write_splats(folder / "splats.ply", to_splats(with_normals_last(surfels)))

@@ -147,7 +147,7 @@ class Trainer:
         if render.shading == "sh":
             unused = ["albedo", "metallic", "roughness"]
         elif render.diffuse == "irradiance":
-            unused = ["sh_dc"] if self._residual_start() < 1 else ["sh_dc", "sh_rest"]
+            unused = ["sh_dc"] if self.residual_start < 1 else ["sh_dc", "sh_rest"]
         if not self._reflects():
             unused += ["indirect_dc", "indirect_rest"]
         if not self._reflects() or render.diffuse == "sh":
@@ -156,8 +156,6 @@ class Trainer:
             {"albedo": MIRROR, "roughness": -MIRROR} if render.reflection == "mirror" and render.shading != "sh" else {}
         )
         self.constant = {name: self.parameters.pop(name).detach()[:1] for name in [*unused, *mirror]}
-        if "sh_rest" in unused:
-            self.constant["sh_rest"] = self.constant["sh_rest"][:, :0]
         for name, value in mirror.items():
             self.constant[name].fill_(value)
 
@@ -168,15 +166,21 @@ class Trainer:
         still = settings.render.shading == "deferred" and settings.light.frame != "camera"
         return self.from_hull and still and settings.indirect.start < 1
 
-    def _residual_start(self) -> float:
-        """The part of the training after which colour by direction learns what material and light leave over."""
-        return self.settings.residual.start if self.settings.render.shading == "deferred" else 1.0
+    @property
+    def residual_start(self) -> float:
+        """The part of the training after which colour by direction learns what material and light leave over; 1 where it never does."""
+        render = self.settings.render
+        return self.settings.residual.start if render.shading == "deferred" and render.diffuse == "irradiance" else 1.0
 
     def surfels(self) -> Surfels:
         """The activated surfels, with what does not learn filled in."""
-        count, diffuse = len(self.parameters["position"]), self.settings.render.diffuse
+        count, render, late = len(self.parameters["position"]), self.settings.render, self.residual_start
         values = activate({**self.parameters, **self.constant})
-        if diffuse == "irradiance" and self.iteration < self._residual_start() * self.total:
+        if (
+            render.shading != "sh"
+            and render.diffuse == "irradiance"
+            and (late == 1 or self.iteration < late * self.total)
+        ):
             values = values._replace(sh_rest=values.sh_rest[:, :0])
         return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
 
@@ -295,7 +299,8 @@ class Trainer:
             self._diffuse_light()
         self._forget_gradients()
         self.iteration += 1
-        due = progress >= settings.indirect.start and self.iteration % settings.indirect.every == 0
+        learns = settings.indirect.start <= progress < self.residual_start  # later, materials would not make up for it
+        due = learns and self.iteration % settings.indirect.every == 0
         if self._reflects() and not self.initial and due and self.iteration < self.total:
             self._trace()  # before what may make all surfels faint, of which no mesh could be made
         self._densify(progress)
@@ -311,7 +316,7 @@ class Trainer:
         if since is not None and since < settings.propagation.rest:
             frozen += ["opacity"]
         # What material and light leave over is not taken from them: they have cooled by then, and stay.
-        late = self._residual_start() if settings.render.diffuse == "irradiance" else 1.0
+        late = self.residual_start
         if late < 1 and progress >= late:
             frozen += REFLECTING
         for group in self.optimizer.param_groups:
