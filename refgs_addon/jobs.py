@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 
 from . import environment
@@ -55,6 +56,7 @@ class Job:
     results: dict[str, dict] = field(default_factory=dict)  # "done" events by their jobs
     no_cameras: bool = False  # it failed because the capture has photos but no cameras: `poses` finds them
     curve: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR
+    serial: int = field(default_factory=count().__next__)  # no other job has it
     kept: bool = False  # it goes on to its end when Blender closes
     _stopped: bool = False
     _silent: bool = False  # the process says nothing more

@@ -36,7 +36,7 @@ def draw_capture(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, j
         return
     grid = box.grid_flow(row_major=True, columns=4, even_columns=True, even_rows=True, align=True)
     for file in checked["thumbnails"]:
-        grid.template_icon(icon_value=thumbnail(Path(file), id(job)), scale=3)
+        grid.template_icon(icon_value=thumbnail(Path(file), job.serial), scale=3)
     shown = cameras_of(scene, Path(checked["capture"])) is not None
     box.operator(ShowCameras.bl_idname, icon="OUTLINER_OB_CAMERA", depress=shown).number = number
 

@@ -19,13 +19,13 @@ def picture(job: jobs.Job) -> int:
     """The icon of a job's newest preview; 0 where there is none yet."""
     if not job.preview or _pictures is None:
         return 0
-    key = f"{id(job)} {job.preview['iteration']}"
+    key = f"{job.serial} {job.preview['iteration']}"
     if key not in _pictures:
         if not Path(job.preview["view"]).is_file():
             return 0
         _pictures.load(key, job.preview["view"], "IMAGE")
         _forget(job)
-        _newest[id(job)] = key
+        _newest[job.serial] = key
     return _pictures[key].icon_id
 
 
@@ -42,10 +42,10 @@ def curve(job: jobs.Job) -> int:
     """The icon of a picture of PSNR against seconds; 0 where there are too few points."""
     if len(job.curve) < 2 or _pictures is None:
         return 0
-    key = f"{id(job)} curve"
+    key = f"{job.serial} curve"
     shown = _pictures[key] if key in _pictures else _pictures.new(key)
-    if _drawn.get(id(job)) != len(job.curve):  # the panel is drawn far more often than there is news
-        _drawn[id(job)] = len(job.curve)
+    if _drawn.get(job.serial) != len(job.curve):  # the panel is drawn far more often than there is news
+        _drawn[job.serial] = len(job.curve)
         shown.image_size = CURVE
         shown.image_pixels_float = _plot(job.curve)
     return shown.icon_id
@@ -69,8 +69,8 @@ def _plot(points: list[tuple[float, float]]) -> list[float]:
 
 
 def _forget(job: jobs.Job) -> None:
-    if id(job) in _newest:
-        del _pictures[_newest.pop(id(job))]
+    if job.serial in _newest:
+        del _pictures[_newest.pop(job.serial)]
 
 
 def register() -> None:
