@@ -140,7 +140,7 @@ def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
     monkeypatch.setattr(capture_ui, "thumbnail", drawn.thumbnail)  # without a window Blender gives no icons
     capture_ui.draw_capture(drawn, addon, number, job)
     assert drawn.icons == [1, 2] and drawn.pressed == [False]
-    assert drawn.pictures == [("0000.png", id(job)), ("0001.png", id(job))]
+    assert drawn.pictures == [("0000.png", job.serial), ("0001.png", job.serial)]
     assert bpy.ops.refgs.show_cameras(number=number) == {"FINISHED"}
     cameras = cameras_of(addon, capture)
     assert cameras.name == "good photos cameras" and [item.name for item in cameras.objects] == ["0", "1"]
