@@ -29,7 +29,7 @@ def render_beside(
     if not png.parent.is_dir():
         raise InputError(f"cannot write {png}: its folder is not there")
     copy = str(Path(bpy.app.tempdir) / f"refgs {next(_numbers)}.blend")  # Blender removes the folder when it ends
-    bpy.ops.wm.save_as_mainfile(filepath=copy, copy=True, check_existing=False)
+    _save_copy(copy)
     start = _START.format(root=str(ROOT))
     program, words = bpy.app.binary_path, ("--factory-startup", "--background", copy, "--python-expr", start)
     if not program:  # Blender as a Python module
@@ -39,3 +39,14 @@ def render_beside(
     job = jobs.render(Path(program), words, command | look, log_file(f"render {png.stem}"))
     follow()
     return job
+
+
+def _save_copy(path: str) -> None:
+    """Save the file as it is now elsewhere, without the picture of it that Blender would render for its file browser."""
+    preferences = bpy.context.preferences
+    kind, changed = preferences.filepaths.file_preview_type, preferences.is_dirty
+    preferences.filepaths.file_preview_type = "NONE"
+    try:
+        bpy.ops.wm.save_as_mainfile(filepath=path, copy=True, check_existing=False)
+    finally:
+        preferences.filepaths.file_preview_type, preferences.is_dirty = kind, changed
