@@ -45,7 +45,7 @@ def artist():
     bpy.data.objects.remove(bpy.data.objects["Cube"])  # it stands where the object will
     yield lambda: True, None
     next(region for region in area().regions if region.type == "UI").active_panel_category = "RefGS"
-    yield lambda: True, None
+    area().tag_redraw()
     yield lambda: True, "empty"
     measure_ours()
     bpy.context.preferences.addons[MODULE].preferences.python = str(PYTHON)
