@@ -66,10 +66,7 @@ class Run:
         """The surfels under another light, with what they receive of each other where the run has a mesh to trace that on:
         seconds for the first light, less for others, nothing for the last one again. `progress` hears how much is traced."""
         if self.occluder is None:
-            surfels = self.surfels()
-            return surfels._replace(
-                sh_rest=surfels.sh_rest[:, :0]
-            )  # colour by direction was true under the recovered light
+            return self.surfels().without_directions()  # they were true under the recovered light
         with torch.no_grad():
             if "transport" not in self._traced:
                 surfels = self.surfels()

@@ -58,6 +58,10 @@ class Surfels(NamedTuple):
         """Unit normals t_u × t_v (N, 3): the third column of each rotation, if its axis is the shortest."""
         return axes(self.rotations)[2]
 
+    def without_directions(self) -> "Surfels":
+        """The same without harmonics beyond the constant."""
+        return self._replace(sh_rest=self.sh_rest[:, :0])
+
     def chosen(self, which: Tensor) -> "Surfels":
         """Some of them: by a mask (N,), or by their numbers."""
         return Surfels(*(value[which] for value in self))

@@ -144,7 +144,8 @@ def render(
         blended = [directional(none, surfels.sh_rest, SIGNED, surfels.positions, camera), *blended]
     features, depth, alpha = rasterize(*discs(surfels, camera), stack(blended), camera, near=near)
     if deferred:
-        residual, features = features.split((3 * adds, features.shape[-1] - 3 * adds), dim=-1)
+        if adds:
+            residual, features = features.split((3, features.shape[-1] - 3), dim=-1)
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
         how = display, mirror, settings.diffuse == "sh"
         shaded = shade(features, alpha, environment, camera, background, visibility, exposure, *how)

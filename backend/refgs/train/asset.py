@@ -26,7 +26,7 @@ def write_asset(trainer: Trainer) -> None:
     with torch.no_grad():
         surfels, environment = with_normals_last(trainer.surfels()), trainer.environment()
     if not surfels.sh_rest.any():  # it ended before they could learn
-        surfels = surfels._replace(sh_rest=surfels.sh_rest[:, :0])
+        surfels = surfels.without_directions()
     if trainer.occluder is None:
         nothing, whole = surfels.indirect_dc[:, :0], torch.ones_like(surfels.received)
         surfels = surfels._replace(indirect_dc=nothing, indirect_rest=nothing, received=whole)

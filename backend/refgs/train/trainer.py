@@ -117,8 +117,7 @@ class Trainer:
         self.initial = settings.render.shading == "deferred" and settings.initial.until > 0  # its stage is not over
 
     def _rate(self, name: str) -> float:
-        render = self.settings.render
-        if name == "sh_rest" and render.shading == "deferred" and render.diffuse == "irradiance":
+        if name == "sh_rest" and self.residual_start < 1:
             name = "residual"
         rate = getattr(self.settings.rates, name, 0.0)  # what is traced does not learn
         return rate * self.capture.radius if name == "position" else rate
@@ -181,7 +180,7 @@ class Trainer:
             and render.diffuse == "irradiance"
             and (late == 1 or self.iteration < late * self.total)
         ):
-            values = values._replace(sh_rest=values.sh_rest[:, :0])
+            values = values.without_directions()
         return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
 
     def wanted(self) -> Tensor:
