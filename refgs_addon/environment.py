@@ -15,7 +15,13 @@ import subprocess
 import sys
 import threading
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
 
 WHEELS = Path(__file__).resolve().parents[1] / "wheels"  # in a release's zip: the trainer's, and uv's for this platform
 PYTHONS = ">=3.11,<3.14"  # as in pyproject.toml
@@ -110,7 +116,8 @@ def work() -> None:
     job = command.pop("command")
     _say("started", job=job)
     try:
-        {"install": _install, "remove": _remove}[job](**{key: Path(path) for key, path in command.items()})
+        with _alone(Path(command["home"])):
+            {"install": _install, "remove": _remove}[job](**{key: Path(path) for key, path in command.items()})
     except _Failed as error:
         _say("failed", job=job, what=str(error))
     except OSError as error:
@@ -134,6 +141,23 @@ def end_with_input() -> None:
         if _child is not None:
             _child.kill()
         os._exit(1)
+
+
+@contextlib.contextmanager
+def _alone(home: Path) -> Iterator[None]:
+    """While no other Blender installs there. The lock is the system's: it goes with this process, however that ends."""
+    home.parent.mkdir(parents=True, exist_ok=True)
+    with open(home.with_name(f"{home.name}.lock"), "ab") as file:
+        try:
+            if sys.platform == "win32":
+                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+            else:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):
+            raise _Failed("another Blender installs the trainer, or removes it: wait until it has done so") from None
+        except OSError:  # a file system without locks
+            pass
+        yield
 
 
 def _install(home: Path, uv: Path, trainer: Path) -> None:

@@ -47,7 +47,7 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     Raises InputError where the run's own file is not there or not the one that was imported, and where the new one cannot be written.
     """
     splats = splats_of(collection)
-    rows = read_rows(run_folder(collection) / "splats.ply").copy()
+    rows = read_rows(run_folder(collection) / "splats.ply")
     if len(rows) != len(splats.data.points):
         raise InputError(f"{run_folder(collection)} has changed since it was imported: import it again")
     new = edited_materials(splats)
@@ -62,13 +62,14 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
         rows[f"f_dc_{i}"] = np.where(changed, (_encoded(color * light) - 0.5) / SH_DC, look)
         rows[f"albedo_{channel}"] = color
     rows["metallic"], rows["roughness"] = new["metallic"], new["roughness"]
-    for name in rows.dtype.names:
-        if name.startswith("f_rest_"):
-            rows[name][edited] = 0  # how the colour depended on the direction was the old material's
+    by_direction = [i for i, name in enumerate(rows.dtype.names) if name.startswith("f_rest_")]
+    numbers = rows.view("<f4").reshape(len(rows), -1)
+    numbers[np.ix_(edited, by_direction)] = 0  # how the colour depended on the direction was the old material's
     names = "".join(f"property float {name}\n" for name in rows.dtype.names)
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{names}end_header\n"
-    with whole(path) as temporary:
-        temporary.write_bytes(head.encode("ascii") + rows.tobytes())
+    with whole(path) as temporary, open(temporary, "wb") as file:
+        file.write(head.encode("ascii"))
+        file.write(rows)
 
 
 def export_run(collection: bpy.types.Collection, folder: Path) -> None:

@@ -50,8 +50,9 @@ def training_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
 
 
 def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
-    """The box of what is to be trained. It is made where there is none: about what the cameras look at, as the capture's last check found
-    it; else of 2 m about the origin, where the trainer puts that, with a radius of 1 m, but in captures of NeRF-Blender's layout."""
+    """The box of what is to be trained, shown. It is made where there is none: about what the cameras look at, as the capture's last
+    check found it; else of 2 m about the origin, where the trainer puts that, with a radius of 1 m, but in captures of NeRF-Blender's
+    layout."""
     box = training_region(scene)
     if box is None:
         box = bpy.data.objects.new("RefGS Region", None)
@@ -60,6 +61,7 @@ def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
         box.matrix_world = Matrix.LocRotScale(centre, None, Vector((radius,) * 3))
         scene.collection.objects.link(box)
         scene.refgs.region = box
+    box.hide_viewport = False
     return box
 
 

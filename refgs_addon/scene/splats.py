@@ -11,6 +11,7 @@ from ..errors import InputError
 from ..nodes.materials import splat_material, values_material
 from ..nodes.splats import NAME, splats_tree
 
+LONGEST_HEAD = 100_000  # bytes
 _STEPS = 1, 2, 4, 7, 11, 16  # along a curve, to either side: some of the next, for many splats lie on top of each other
 _SHIFTS = 0.0, 0.23
 _SPREAD = (  # how to put two zeros between the bits of a number
@@ -94,10 +95,11 @@ def read_splats(path: Path) -> dict[str, np.ndarray]:
 def read_rows(path: Path) -> np.ndarray:
     """The `vertex` element of a PLY file of floats (binary, little-endian) as a structured array. Raises InputError for any other."""
     try:
-        data = path.read_bytes()
+        with open(path, "rb") as file:
+            head, found, _ = file.read(LONGEST_HEAD).partition(b"end_header\n")
+        room = path.stat().st_size - len(head) - len(found)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
-    head, found, body = data.partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     if not found or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
         raise InputError(f"{path} is not a binary little-endian PLY file: export the run again")
@@ -108,9 +110,9 @@ def read_rows(path: Path) -> np.ndarray:
     ):
         raise InputError(f"{path} is not a PLY file of splats (one vertex element of floats): export the run again")
     count, kind = int(lines[0][2]), np.dtype([(p[2], "<f4") for p in properties])
-    if count == 0 or len(body) < count * kind.itemsize:
+    if count == 0 or room < count * kind.itemsize:
         raise InputError(f"{path} is cut short or empty: export the run again")
-    return np.frombuffer(body, kind, count)
+    return np.fromfile(path, kind, count, offset=len(head) + len(found))
 
 
 def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -10,11 +10,11 @@ from bpy_extras.io_utils import ExportHelper
 from ..errors import InputError
 from ..preferences import hdri_folder
 from ..scene.beside import render_beside
-from ..scene.cameras import PHOTO, next_camera, photo_shown, show_photo
+from ..scene.cameras import PHOTO, next_camera, photo_shown, show_photo, tilted
 from ..scene.capture import active_cameras
 from ..scene.parts import active_run, show
 from ..scene.preview import render_preview
-from ..scene.regions import crop
+from ..scene.regions import crop, training_region
 from ..scene.relight import hdris
 from ..scene.turntable import add_turntable
 
@@ -51,6 +51,11 @@ def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, 
     operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
     if run.light_of:
         said = f"The light turned with the camera: the world is as it was for {run.light_of}, and for no other photo"
+        operator.report({"WARNING"}, said)
+    box = training_region(context.scene)
+    if box is not None and tilted(folder):
+        box.hide_viewport = True
+        said = f"{box.name}, which stands with the photos' cameras, is hidden: the run stands as the box's Z axis says"
         operator.report({"WARNING"}, said)
 
 

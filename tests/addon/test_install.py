@@ -90,6 +90,16 @@ def test_progress_stopping_and_going_on(home, monkeypatch):
     assert ended(install(home))[0] == "done" and environment.installed(home) == "9.9" and not half.exists()
 
 
+def test_two_blenders_do_not_install_at_once(home, monkeypatch):
+    monkeypatch.setenv("FAKE_UV", "hang")
+    first = install(home)
+    until(lambda: first.part > 0)
+    for second in (install(home), jobs.remove(home, home.parent / "logs" / "removal.txt")):
+        state, line = ended(second)
+        assert state == "failed" and line.startswith("another Blender installs the trainer")
+    assert not first.ended and (home / "cache" / "torch").exists()
+
+
 @pytest.mark.parametrize("how", ["Blender", "the process"])
 def test_killed_in_the_middle(home, monkeypatch, how):
     monkeypatch.setenv("FAKE_UV", "hang")

@@ -271,6 +271,18 @@ def test_a_box_is_the_region_and_its_up_the_results(addon, capture):
     assert addon.refgs.region is None and told(training.train(addon).run) == {}
 
 
+@pytest.mark.parametrize(
+    ("up", "hidden"), [((0, 0, 0), False), ((0, 0, 2), False), ((0, 0, -1), True), ((0, 0.1, 1), True)]
+)
+def test_a_box_is_not_shown_beside_a_run_that_stands_otherwise(addon, run_folder, up, hidden):
+    (run_folder / "run.toml").write_text(f"[settings.region]\nup = {list(up)}\n")
+    bpy.ops.refgs.add_training_region()
+    assert bpy.ops.refgs.import_run(directory=str(run_folder)) == {"FINISHED"}
+    assert addon.refgs.region.hide_viewport == hidden
+    bpy.ops.refgs.add_training_region()
+    assert not addon.refgs.region.hide_viewport
+
+
 def test_a_box_that_is_deleted_or_cleared_is_no_region(addon, capture):
     bpy.ops.refgs.add_training_region()
     box = addon.refgs.region
