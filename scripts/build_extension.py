@@ -57,9 +57,6 @@ def stage(folder: Path, wheels: Path) -> None:
     first_table = manifest.index("\n[") + 1
     lines = f"platforms = {list(PLATFORMS)}\nwheels = {listed}\n\n"
     manifest = manifest[:first_table] + lines + manifest[first_table:]
-    manifest = manifest.replace(
-        '    "!/refgs_addon/",\n', '    "!/refgs_addon/",\n    "!/wheels/",\n    "/wheels/uv-*",\n'
-    )
     assert tomllib.loads(manifest)["wheels"] == listed
     (folder / "blender_manifest.toml").write_text(manifest, encoding="utf-8")
 

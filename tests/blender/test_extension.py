@@ -1,5 +1,6 @@
 """The extension: it registers cleanly, builds and validates with Blender's own tool, and its buttons work."""
 
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -34,9 +35,23 @@ def test_registers_and_unregisters_twice(scene):
 
 
 def test_builds_and_validates(tmp_path):
-    archive = tmp_path / "refgs.zip"
+    """From a clone that has been used, with runs and captures in it."""
+    clone, archive = tmp_path / "refgs", tmp_path / "refgs.zip"
+    shutil.copytree(ROOT / "refgs_addon", clone / "refgs_addon")
+    for name in ("__init__.py", "blender_manifest.toml", "LICENSE", "README.md"):
+        shutil.copy(ROOT / name, clone)
+    for left in (
+        "refgs_addon/__pycache__/jobs.pyc",
+        "refgs_addon/ui/__pycache__/a.pyc",
+        "run/splats.ply",
+        "refgs/a",
+        "wood/b",
+        ".venv/c",
+    ):
+        (clone / left).parent.mkdir(parents=True, exist_ok=True)
+        (clone / left).touch()
     for arguments in (
-        ["build", "--source-dir", ROOT, "--output-filepath", archive],
+        ["build", "--source-dir", clone, "--output-filepath", archive],
         ["validate", archive],
     ):
         done = subprocess.run([sys.executable, TOOL, *arguments], capture_output=True, text=True)
