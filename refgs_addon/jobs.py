@@ -50,6 +50,7 @@ class Job:
     line: str = ""  # what is being done; at the end, what was wrong
     part: float = 0.0  # how much of it is done, where that is said with the line
     warnings: list[str] = field(default_factory=list)
+    decided: list[str] = field(default_factory=list)  # what the settings left to the photos, and why it came out so
     progress: dict = field(default_factory=dict)  # the newest event of its kind, as are the next
     preview: dict = field(default_factory=dict)
     ready: dict = field(default_factory=dict)
@@ -143,6 +144,8 @@ class Job:
                 self.line, self.part = event["what"], event.get("part", self.part)
             case "warning":
                 self.warnings.append(event["what"])
+            case "decided":
+                self.decided.append(event["what"])
             case "progress":
                 self.progress, self.line = event, ""
                 if "stage" not in event:  # of a training

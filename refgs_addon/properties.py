@@ -1,7 +1,15 @@
 """What a .blend file keeps of RefGS: the capture, how to train it, and where its runs are."""
 
 import bpy
-from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, PointerProperty, StringProperty
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
 
 
 class KnownRun(bpy.types.PropertyGroup):
@@ -39,6 +47,38 @@ class Training(bpy.types.PropertyGroup):
     )
     mesh: BoolProperty(
         name="Make Mesh", description="Fuse a mesh and bake its textures when the training has ended", default=True
+    )
+    splats: IntProperty(
+        name="Splats at Most",
+        description="More of them show finer detail, and take as much longer and as much more memory. 0 leaves it to the quality",
+        min=0,
+        max=10_000_000,
+        soft_max=200_000,
+        step=1000,
+    )
+    light: EnumProperty(
+        name="Light",
+        items=[
+            ("auto", "Auto", "The photos tell which it is; what they told is shown while it trains"),
+            ("world", "Stands Still", "You walked around the object"),
+            ("camera", "Turns with the Camera", "The object stood on a turntable, or the lamp on the camera"),
+        ],
+    )
+    exposures: EnumProperty(
+        name="Exposure",
+        items=[
+            ("auto", "Auto", "Each photo's own is left out where they turn out to agree"),
+            ("on", "Each Photo's", "The camera chose an exposure for each photo"),
+            ("off", "One for All", "The exposure was locked"),
+        ],
+    )
+    reflections: EnumProperty(
+        name="Reflections",
+        description="Of the object in itself",
+        items=[
+            ("auto", "Auto", "Left out where the object turns out hardly to mirror itself"),
+            ("off", "Of the Light Only", "Leave the object's reflections in itself out: faster"),
+        ],
     )
     region: PointerProperty(
         name="Region",

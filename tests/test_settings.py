@@ -1,6 +1,9 @@
+import json
+
 import pytest
 
 from refgs.errors import InputError
+from refgs.run import read_run_facts
 from refgs.settings import load_settings, preset_names, recorded_settings
 
 
@@ -82,3 +85,20 @@ def test_a_run_of_before_a_setting_still_opens():
     assert opened.train == settings.train
     assert opened.mesh == load_settings("standard").mesh
     assert (opened.light.frame, opened.light.exposure) == ("world", "off")  # as it then was
+
+
+@pytest.mark.parametrize(
+    ("made_by", "says"),
+    [
+        ("0.9.0", "update RefGS"),
+        ("1.0.0", "update RefGS"),
+        ("0.2.9", "is broken"),
+        ("one", "is broken"),
+        (5, "is broken"),
+    ],
+)
+def test_a_run_of_a_newer_release_is_not_read(tmp_path, made_by, says):
+    """One that only mends is the same to this one, which then looks for what is not in this file."""
+    (tmp_path / "run.toml").write_text(f"[run]\nrefgs = {json.dumps(made_by)}\n")
+    with pytest.raises(InputError, match=says):
+        read_run_facts(tmp_path)

@@ -134,15 +134,24 @@ def check_free(folder: Path) -> None:
 
 
 def read_run_facts(folder: Path) -> tuple[dict, Settings]:
-    """What run.toml says: its [run] table and its settings."""
+    """What run.toml says: its [run] table and its settings. Raises InputError for none, and for that of a newer release."""
     file = folder / "run.toml"
     try:
         facts = tomllib.loads(file.read_text(encoding="utf-8"))
+        made_by = facts["run"]["refgs"]
+        if _release(made_by) > _release(__version__):
+            raise InputError(
+                f"{folder} was made by RefGS {made_by}, which is newer than this, {__version__}: update RefGS"
+            )
         return facts["run"], recorded_settings(facts["settings"], str(file))
     except FileNotFoundError:
         raise InputError(f"{folder} is not a run folder: there is no run.toml in it") from None
-    except (OSError, KeyError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, KeyError, TypeError, AttributeError, ValueError) as error:
         raise InputError(f"{file} is broken ({error}): train again") from None
+
+
+def _release(version: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in version.split(".")[:2])  # the third only mends
 
 
 def open_run(folder: Path) -> Run:

@@ -2,7 +2,6 @@
 
 import json
 import math
-import tomllib
 from pathlib import Path
 
 import bpy
@@ -31,27 +30,6 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{path} is not the cameras.json of a RefGS run: export the run again") from None
     return frames
-
-
-def capture_of(run: Path) -> Path | None:
-    """The folder of the capture that a run folder is of, where its run.toml says so."""
-    try:
-        return Path(_notes(run)["run"]["capture"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def tilted(run: Path) -> bool:
-    """Whether a run stands otherwise than its capture's cameras, another direction than theirs having been chosen as up."""
-    try:
-        x, y, z = _notes(run)["settings"]["region"]["up"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-    return math.hypot(x, y) > 1e-3 * z and any((x, y, z))
-
-
-def _notes(run: Path) -> dict:
-    return tomllib.loads((run / "run.toml").read_text(encoding="utf-8"))
 
 
 def light_of(path: Path) -> str:

@@ -7,8 +7,9 @@ import bpy
 
 from ..errors import InputError
 from . import parts
-from .cameras import add_camera, capture_of, frame_camera, light_of, read_cameras
+from .cameras import add_camera, frame_camera, light_of, read_cameras
 from .capture import hand_over
+from .notes import capture_of
 from .relight import light_with_recovered, load_panorama
 from .splats import add_splats, normal_slopes, point_cloud, read_splats, with_slopes
 

@@ -37,7 +37,12 @@ def train(scene: bpy.types.Scene) -> jobs.Job:
     settings, capture = scene.refgs, _capture(scene)
     out = Path(bpy.path.abspath(settings.out)) if settings.out else _free_folder(capture, scene)
     minutes = settings.minutes if settings.limited else None
-    words = {"preset": settings.preset, "minutes": minutes, "mesh": settings.mesh, "settings": region_settings(scene)}
+    words = {
+        "preset": settings.preset,
+        "minutes": minutes,
+        "mesh": settings.mesh,
+        "settings": region_settings(scene) | _choices(settings),
+    }
     job = jobs.train(python(), capture, out, log_file(out.name), **words)
     _remember(scene, out, capture)
     follow()
@@ -97,6 +102,17 @@ def forget(scene: bpy.types.Scene, folder: Path) -> None:
         if Path(runs[number].folder) == folder:
             runs.remove(number)
     jobs.JOBS[:] = [job for job in jobs.JOBS if not (job.ended and job.run == folder)]
+
+
+def _choices(settings: bpy.types.PropertyGroup) -> dict[str, object]:
+    """What a scene's settings have otherwise than the quality does, by the trainer's names."""
+    chosen = {
+        "surfels.budget": settings.splats or "auto",
+        "light.frame": settings.light,
+        "light.exposure": settings.exposures,
+        "indirect.start": {"auto": "auto", "off": 1}[settings.reflections],
+    }
+    return {name: value for name, value in chosen.items() if value != "auto"}
 
 
 def _remember(scene: bpy.types.Scene, run: Path, capture: Path | None = None) -> None:

@@ -10,8 +10,9 @@ from bpy_extras.io_utils import ExportHelper
 from ..errors import InputError
 from ..preferences import hdri_folder
 from ..scene.beside import render_beside
-from ..scene.cameras import PHOTO, next_camera, photo_shown, show_photo, tilted
+from ..scene.cameras import PHOTO, next_camera, photo_shown, show_photo
 from ..scene.capture import active_cameras
+from ..scene.notes import newer, tilted
 from ..scene.parts import active_run, show
 from ..scene.preview import render_preview
 from ..scene.regions import crop, training_region
@@ -51,6 +52,9 @@ def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, 
     operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
     if run.light_of:
         said = f"The light turned with the camera: the world is as it was for {run.light_of}, and for no other photo"
+        operator.report({"WARNING"}, said)
+    if made_by := newer(folder):
+        said = f"RefGS {made_by} made this run, which is newer than this add-on: what this one does not know of it is missing"
         operator.report({"WARNING"}, said)
     box = training_region(context.scene)
     if box is not None and tilted(folder):

@@ -176,6 +176,12 @@ class TrainPanel(Tab, bpy.types.Panel):
         sub.prop(settings, "region")
         row.operator(AddTrainingRegion.bl_idname, text="", icon="CUBE")
         column.prop(settings, "out")
+        head, body = layout.panel("refgs_learned", default_closed=True)
+        head.label(text="What to Learn")
+        if body is not None:
+            body.use_property_split, body.use_property_decorate = True, False
+            for name in ("splats", "light", "exposures", "reflections"):
+                body.prop(settings, name)
         row = layout.row(align=True)
         row.enabled = bool(settings.capture and preferences.set_up())
         row.operator(CheckCapture.bl_idname, icon="VIEWZOOM")
@@ -200,6 +206,8 @@ def _job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs
         lines(box, job.line[0].upper() + job.line[1:], width)
     for warning in job.warnings:
         lines(box, warning[0].upper() + warning[1:], width, "ERROR")
+    for decision in job.decided:
+        lines(box, decision[0].upper() + decision[1:], width, "DOT")
     for line in job.results.get("check", {}).get("lines", ()):
         lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
     draw_capture(box, scene, number, job)

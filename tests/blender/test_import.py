@@ -12,6 +12,7 @@ from refgs_addon import compat
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.splats import EXTENT, NAME
 from refgs_addon.scene.cameras import frame_camera, next_camera, photo_shown, show_photo
+from refgs_addon.scene.notes import newer
 from refgs_addon.scene.parts import parts, show
 from refgs_addon.scene.run import import_run
 from refgs_addon.scene.splats import normal_slopes, read_splats
@@ -45,6 +46,16 @@ def test_a_light_that_turned_is_said_to(run_folder, scene):
     run = import_run(run_folder, scene)
     assert run.light_of == run.world["refgs_light_of"] == "shifted"
     assert "shifted" in run.cameras
+
+
+@pytest.mark.parametrize(
+    ("made_by", "is_newer"), [('"0.2.9"', False), ('"0.10.0"', True), ('"99.0"', True), ("5", False), ('"x"', False)]
+)
+def test_a_run_of_a_newer_release(run_folder, made_by, is_newer):
+    (run_folder / "run.toml").write_text(f"[run]\nrefgs = {made_by}\n")
+    assert newer(run_folder) == (json.loads(made_by) if is_newer else "")
+    (run_folder / "run.toml").unlink()
+    assert newer(run_folder) == ""
 
 
 def test_points_hold_what_the_file_holds(run_folder, scene):

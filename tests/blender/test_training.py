@@ -85,6 +85,17 @@ def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
     assert not scene.refgs.runs and out.is_dir()
 
 
+def test_what_is_to_be_learned(addon, capture):
+    assert told(training.train(addon).run) == {}
+    settings = addon.refgs
+    settings.splats, settings.light, settings.exposures, settings.reflections = 5000, "camera", "off", "off"
+    job = training.train(addon)
+    changes = {"surfels.budget": 5000, "light.frame": "camera", "light.exposure": "off", "indirect.start": 1}
+    assert told(job.run) == changes
+    until(lambda: job.progress)
+    assert job.decided == ["the light stands still: it brightens so"]
+
+
 def test_runs_go_into_new_folders(addon, capture, tmp_path):
     (tmp_path / "good photos RefGS").mkdir()
     names = [training.train(addon).run.name for _ in range(2)]
@@ -236,8 +247,8 @@ def test_taken_away_while_it_trains(addon, capture):
 def told(out):
     """The settings that the trainer was told, by their names."""
     until(lambda: (out / "started").is_file() and (out / "started").read_text())
-    words = json.loads((out / "started").read_text())["settings"]
-    return {key: json.loads(value) for key, _, value in (word.partition("=") for word in words)}
+    words = dict(word.split("=", 1) for word in json.loads((out / "started").read_text())["settings"])
+    return {key: value if value.isalpha() else json.loads(value) for key, value in words.items()}
 
 
 def test_a_box_is_the_region_and_its_up_the_results(addon, capture):

@@ -31,10 +31,10 @@ def turntable(tmp_path_factory):
     return folder
 
 
-def made(capture, folder, *changes, total=ITERATIONS):
+def made(capture, folder, *changes, total=ITERATIONS, report=lambda *_: None):
     settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
     folder.mkdir(exist_ok=True)
-    return Trainer(read_capture(capture), settings, folder, lambda *_: None)
+    return Trainer(read_capture(capture), settings, folder, report)
 
 
 def camera(direction) -> Camera:
@@ -76,8 +76,11 @@ def test_without_masks_the_light_stands_still(turntable, tmp_path):
     write_ball_capture(tmp_path / "bare", 48, turning=True)
     for file in (tmp_path / "bare").glob("*/*.png"):
         Image.open(file).convert("RGB").save(file)
-    found = made(tmp_path / "bare", tmp_path / "run")
+    said = []
+    found = made(tmp_path / "bare", tmp_path / "run", report=lambda event, facts: said.append((event, facts["what"])))
     assert found.settings.light.frame == "world"
+    assert ("decided", "the light stands still: not every photo has a mask of the object") in said
+    assert ("decided", "no inter-reflection: not every photo has a mask of the object") in said
     assert "mask" in found.chosen["light.frame"]
 
 

@@ -132,18 +132,11 @@ def _left_out(trainer: Trainer, surfels: Surfels, side: Tensor, wanted: Tensor) 
         left.append({"what": "deferred shading and inter-reflection", "why": "shading = splat", "saved": saved})
     if settings.render.shading == "deferred" and trainer.occluder is None:
         indirect = settings.indirect
-        if not trainer.from_hull:
-            why = "not every photo has a mask of the object"
-        elif indirect.start >= 1:
-            why = "indirect.start = 1"
-        elif settings.light.frame == "camera":
-            why = "the light turns with the camera: what the object mirrors of itself changes from photo to photo"
-        elif trainer.total * trainer.residual_start <= max(
-            indirect.every, max(indirect.start, settings.initial.until) * trainer.total
-        ):
-            why = "the training was over before its first mesh"
-        else:
-            why = "the object hardly mirrors itself"
+        why = trainer.without_reflection()
+        if not why:
+            first = max(indirect.every, max(indirect.start, settings.initial.until) * trainer.total)
+            over = trainer.total * trainer.residual_start <= first
+            why = "the training was over before its first mesh" if over else "the object hardly mirrors itself"
         saved = "tracing rays, and harmonics of light from the object"
         left.append({"what": "inter-reflection", "why": why, "saved": saved})
     if settings.light.exposure == "auto" and settings.render.shading != "sh" and trainer.exposures is None:

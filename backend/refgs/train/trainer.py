@@ -34,7 +34,7 @@ from refgs.train.losses import Photo, departure, objective
 from refgs.train.start import AROUND, GEOMETRY, start_appearance, start_parameters
 
 Report = Callable[[str, dict[str, Any]], None]
-"""Called with an event's name and its facts: "stage", "progress", "warning"."""
+"""Called with an event's name and its facts: "stage", "decided", "progress", "warning"."""
 
 REPORT_EVERY = 10  # iterations
 HISTORY_EVERY = 100  # iterations
@@ -113,6 +113,7 @@ class Trainer:
         self.optimizer = Adam(groups)
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
         self.occluder: Occluder | None = None
+        self._mirrors_itself: bool | None = None  # not known before the first mesh
         self._mirrored: Tensor | None = None  # which part of the light the object shows
         self.initial = settings.render.shading == "deferred" and settings.initial.until > 0  # its stage is not over
 
@@ -137,7 +138,7 @@ class Trainer:
         self.chosen["light.frame"] = f"{frame}: {why}"
         if lit:
             where = "turns with the camera" if frame == "camera" else "stands still"
-            self.report("stage", {"what": f"the light {where}: {why}"})
+            self.report("decided", {"what": f"the light {where}: {why}"})
 
     def _drop_unused(self) -> None:
         """What this run's shading never reads does not learn."""
@@ -147,9 +148,11 @@ class Trainer:
             unused = ["albedo", "metallic", "roughness"]
         elif render.diffuse == "irradiance":
             unused = ["sh_dc"] if self.residual_start < 1 else ["sh_dc", "sh_rest"]
-        if not self._reflects():
+        if why := self.without_reflection():
             unused += ["indirect_dc", "indirect_rest"]
-        if not self._reflects() or render.diffuse == "sh":
+            if render.shading == "deferred":
+                self.report("decided", {"what": f"no inter-reflection: {why}"})
+        if why or render.diffuse == "sh":
             unused += ["received"]
         mirror = (
             {"albedo": MIRROR, "roughness": -MIRROR} if render.reflection == "mirror" and render.shading != "sh" else {}
@@ -158,12 +161,18 @@ class Trainer:
         for name, value in mirror.items():
             self.constant[name].fill_(value)
 
-    def _reflects(self) -> bool:
-        """Whether this run looks for inter-reflection: not without masks, where the mesh is of the surroundings too, nor under
-        a light that turns with the camera, under which surfels have no light of their own to show others."""
+    def without_reflection(self) -> str:
+        """Why this run looks for no inter-reflection, or ""."""
         settings = self.settings
-        still = settings.render.shading == "deferred" and settings.light.frame != "camera"
-        return self.from_hull and still and settings.indirect.start < 1
+        if settings.render.shading != "deferred":
+            return f"shading = {settings.render.shading}"
+        if settings.indirect.start >= 1:
+            return "its setting leaves it out (indirect.start = 1)"
+        if not self.from_hull:  # the mesh would be of the surroundings too
+            return "not every photo has a mask of the object"
+        if settings.light.frame == "camera":  # surfels have no light of their own to show others
+            return "the light turns with the camera: what the object mirrors of itself changes from photo to photo"
+        return ""
 
     @property
     def residual_start(self) -> float:
@@ -300,7 +309,7 @@ class Trainer:
         self.iteration += 1
         learns = settings.indirect.start <= progress < self.residual_start  # later, materials would not make up for it
         due = learns and self.iteration % settings.indirect.every == 0
-        if self._reflects() and not self.initial and due and self.iteration < self.total:
+        if not self.without_reflection() and not self.initial and due and self.iteration < self.total:
             self._trace()  # before what may make all surfels faint, of which no mesh could be made
         self._densify(progress)
         self._reshape()
@@ -406,7 +415,9 @@ class Trainer:
             self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
             self.optimizer.state.pop(self.exposures, None)
             self.exposures = None
-            self.report("stage", {"what": "the photos' exposures agree within a third of a stop"})
+            self.report(
+                "decided", {"what": "the photos have no exposures of their own: they agree within a third of a stop"}
+            )
 
     @torch.no_grad()
     def _trace(self) -> None:
@@ -432,10 +443,14 @@ class Trainer:
             opaque = looked.alpha > 0.5
             hidden += float((1 - looked.visibility)[opaque].sum())
             solid += float(opaque.sum())
-        if hidden < settings.least * solid:
+        mirrors = hidden >= settings.least * solid
+        if mirrors != self._mirrors_itself:
+            without = "" if mirrors else "no inter-reflection: "
+            self.report("decided", {"what": f"{without}the object mirrors itself on {hidden / solid:.1%} of it"})
+        self._mirrors_itself = mirrors
+        if not mirrors:
             self.occluder = None
         elif not self.optimizer.state.get(self.parameters["indirect_dc"]):
-            self.report("stage", {"what": f"the object mirrors itself on {hidden / solid:.0%} of it: tracing rays"})
             # What the surfels mirrored until now, so that the picture changes little.
             start, rest = environment.harmonics, self.parameters["indirect_rest"]
             self.parameters["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
