@@ -7,10 +7,9 @@ import bpy
 from bpy.props import StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..preferences import set_up
 from ..scene import training
 from ..scene.parts import FOLDER, active_run
-from .operators import Door, ImportRun, has_run
+from .operators import Door, ImportRun, has_run, has_trainer
 
 
 class _Export(Door, ExportHelper):
@@ -58,10 +57,7 @@ class ExportDisplaySplats(_Export, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not set_up():
-            cls.poll_message_set("Set up the trainer in the add-on's preferences first")
-            return False
-        return has_run(cls, context)
+        return has_trainer(cls) and has_run(cls, context)
 
     def work(self, context: bpy.types.Context) -> None:
         file = Path(bpy.path.abspath(self.filepath))

@@ -8,7 +8,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 from bpy_extras.io_utils import ExportHelper
 
 from ..errors import InputError
-from ..preferences import hdri_folder
+from ..preferences import hdri_folder, set_up
 from ..scene.beside import render_beside
 from ..scene.cameras import PHOTO, next_camera, photo_shown, show_photo
 from ..scene.capture import active_cameras
@@ -42,6 +42,12 @@ def has_run(operator: type[bpy.types.Operator], context: bpy.types.Context) -> b
     """Whether there is a run to work on; the button's tooltip says so where there is none."""
     operator.poll_message_set("Import a run first")
     return active_run(context) is not None
+
+
+def has_trainer(operator: type[bpy.types.Operator]) -> bool:
+    """Whether there is a trainer; the button's tooltip says so where there is none."""
+    operator.poll_message_set("Set up the trainer in the add-on's preferences first")
+    return set_up()
 
 
 def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> None:

@@ -13,9 +13,17 @@ from ..scene import live, training
 from ..scene.regions import add_training_region, training_region
 from .capture import draw_capture
 from .closing import Keep, StopRun
-from .operators import Door, choose, import_run_folder
+from .operators import Door, choose, has_trainer, import_run_folder
 from .panels import Tab
 from .pictures import curve, picture
+
+
+def has_capture(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
+    """Whether there is something to train, and a trainer; the button's tooltip says what is missing."""
+    if not has_trainer(operator):
+        return False
+    operator.poll_message_set("Choose the capture's folder first")
+    return bool(context.scene.refgs.capture)
 
 
 class CheckCapture(Door, bpy.types.Operator):
@@ -23,6 +31,10 @@ class CheckCapture(Door, bpy.types.Operator):
     bl_label = "Check"
     bl_description = "Read all of the capture's photos and cameras, and say what is wrong with them"
     bl_options: ClassVar = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return has_capture(cls, context)
 
     def work(self, context: bpy.types.Context) -> None:
         training.check(context.scene)
@@ -54,6 +66,10 @@ class Train(Door, bpy.types.Operator):
     bl_idname = "refgs.train"
     bl_label = "Train"
     bl_description = "Learn surfels, materials and light from the photos, in a process of its own: Blender stays yours"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return has_capture(cls, context)
 
     def work(self, context: bpy.types.Context) -> None:
         training.train(context.scene)
@@ -183,7 +199,6 @@ class TrainPanel(Tab, bpy.types.Panel):
             for name in ("splats", "light", "exposures", "reflections"):
                 body.prop(settings, name)
         row = layout.row(align=True)
-        row.enabled = bool(settings.capture and preferences.set_up())
         row.operator(CheckCapture.bl_idname, icon="VIEWZOOM")
         row.operator(Train.bl_idname, icon="PLAY")
         for number, job in enumerate(jobs.JOBS):

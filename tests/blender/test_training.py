@@ -106,6 +106,16 @@ def test_runs_go_into_new_folders(addon, capture, tmp_path):
         training.train(addon)
 
 
+def test_the_buttons_wait_for_what_they_need(addon, capture):
+    assert bpy.ops.refgs.train.poll() and bpy.ops.refgs.check_capture.poll()
+    with bpy.context.temp_override(scene=bpy.data.scenes.new("empty")):
+        assert not bpy.ops.refgs.train.poll()
+    preferences.preferences().python = ""
+    assert not bpy.ops.refgs.check_capture.poll()
+    with pytest.raises(RuntimeError, match="Set up the trainer"):
+        bpy.ops.refgs.train()
+
+
 def test_a_capture_that_is_not_there(addon):
     with pytest.raises(InputError, match="no capture is chosen"):
         training.check(addon)
