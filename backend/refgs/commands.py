@@ -170,11 +170,11 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
 
 def export(
     folder: Path,
-    mesh_file: Path | None,
-    texture: int | None,
-    splats_file: Path | None,
-    display_file: Path | None,
-    overwrite: bool,
+    mesh_file: Path | None = None,
+    texture: int | None = None,
+    splats_file: Path | None = None,
+    display_file: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write the mesh and its textures, or splats."""
     with report_of("exporting") as report:

@@ -44,7 +44,7 @@ def run(out: Path) -> None:
         commands.train(capture, folder, "quick", "auto", None, [], resume=(folder / "run.toml").exists())
     if not (folder / "mesh.glb").exists():
         stage("fusing and baking the mesh")
-        commands.export(folder, None, None, None, overwrite=False)
+        commands.export(folder)
     stage("measuring against the ground truth")
     commands.evaluate(folder, "test", capture / "ground_truth")
     stage("importing into Blender and relighting in Eevee")

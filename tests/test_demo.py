@@ -1,0 +1,42 @@
+"""The demo, every stage of it, on fewer and smaller photos and with a shorter training than it takes itself."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from refgs import commands, demo
+from refgs.errors import InputError
+from refgs.paths import clone_root
+
+pytest.importorskip("bpy", reason="the demo needs Blender's Python module")
+SMALL = [
+    "train.iterations=80",
+    "surfels.start=2000",
+    "surfels.budget=3000",
+    "surfels.hull=48",
+    "environment.resolution=16",
+]
+SMALL += ["indirect.every=30", "indirect.resolution=32", "mesh.resolution=48", "mesh.triangles=1000", "mesh.texture=64"]
+
+
+def test_from_photos_to_the_report(tmp_path, monkeypatch):
+    train, out = commands.train, tmp_path / "the demo"
+    monkeypatch.setattr(
+        commands,
+        "train",
+        lambda capture, run, preset, *words, resume: train(capture, run, preset, *words[:2], SMALL, resume),
+    )
+    monkeypatch.setattr(demo, "HDRIS", ("studio",))
+    monkeypatch.setattr(demo, "VIEWS", ("test_000",))
+    words = ("--size", "48", "--train", "10", "--test", "1", "--samples", "1", "--relight", "studio")
+    scene = [sys.executable, "-m", "benchmarks.scenes", demo.SCENE, "--out", out / "capture", *words]
+    subprocess.run(list(map(str, scene)), cwd=clone_root(), check=True, capture_output=True)
+    demo.run(out)
+    run = out / "run"
+    assert all((run / name).stat().st_size > 0 for name in ("mesh.glb", "jar.blend", "report.html"))
+    relit = json.loads((run / "metrics.json").read_text())["relight"]["studio"]
+    assert relit["splats"]["psnr_aligned"] > 5 and relit["mesh"]["psnr_aligned"] > 5
+    with pytest.raises(InputError, match="holds a finished demo"):
+        demo.run(out)
