@@ -50,7 +50,7 @@ class Job:
     line: str = ""  # what is being done; at the end, what was wrong
     part: float = 0.0  # how much of it is done, where that is said with the line
     warnings: list[str] = field(default_factory=list)
-    decided: list[str] = field(default_factory=list)  # what the settings left to the photos, and why it came out so
+    decided: dict[str, str] = field(default_factory=dict)  # how what was left to the photos came out, and why
     progress: dict = field(default_factory=dict)  # the newest event of its kind, as are the next
     preview: dict = field(default_factory=dict)
     ready: dict = field(default_factory=dict)
@@ -145,7 +145,7 @@ class Job:
             case "warning":
                 self.warnings.append(event["what"])
             case "decided":
-                self.decided.append(event["what"])
+                self.decided[event["about"]] = event["what"]
             case "progress":
                 self.progress, self.line = event, ""
                 if "stage" not in event:  # of a training

@@ -59,7 +59,11 @@ class Training(bpy.types.PropertyGroup):
     light: EnumProperty(
         name="Light",
         items=[
-            ("auto", "Auto", "The photos tell which it is; what they told is shown while it trains"),
+            (
+                "auto",
+                "Auto",
+                "The photos tell which it is, and what they told is shown while it trains; with Paper it stands still",
+            ),
             ("world", "Stands Still", "You walked around the object"),
             ("camera", "Turns with the Camera", "The object stood on a turntable, or the lamp on the camera"),
         ],
@@ -67,7 +71,7 @@ class Training(bpy.types.PropertyGroup):
     exposures: EnumProperty(
         name="Exposure",
         items=[
-            ("auto", "Auto", "Each photo's own is left out where they turn out to agree"),
+            ("auto", "Auto", "Each photo's own is left out where they turn out to agree; with Paper they all have one"),
             ("on", "Each Photo's", "The camera chose an exposure for each photo"),
             ("off", "One for All", "The exposure was locked"),
         ],
@@ -76,7 +80,7 @@ class Training(bpy.types.PropertyGroup):
         name="Reflections",
         description="Of the object in itself",
         items=[
-            ("auto", "Auto", "Left out where the object turns out hardly to mirror itself"),
+            ("auto", "Auto", "Left out where the object turns out hardly to mirror itself, but with Paper"),
             ("off", "Of the Light Only", "Leave the object's reflections in itself out: faster"),
         ],
     )

@@ -17,9 +17,9 @@ def tilted(run: Path) -> bool:
     """Whether a run stands otherwise than its capture's cameras, another direction than theirs having been chosen as up."""
     try:
         x, y, z = _table(run, "settings")["region"]["up"]
+        return math.hypot(x, y) > 1e-3 * z and any((x, y, z))
     except (KeyError, TypeError, ValueError):
         return False
-    return math.hypot(x, y) > 1e-3 * z and any((x, y, z))
 
 
 def newer(run: Path) -> str:

@@ -80,9 +80,12 @@ def region_settings(scene: bpy.types.Scene) -> dict[str, list[float]]:
     box = training_region(scene)
     if box is None:
         return {}
+    hidden, box.hide_viewport = box.hide_viewport, False  # what is hidden is not evaluated
     for layer in scene.view_layers:
         layer.update()  # what was moved a moment ago
-    centre, turn, scale = box.matrix_world.decompose()
+    matrix = box.matrix_world.copy()
+    box.hide_viewport = hidden
+    centre, turn, scale = matrix.decompose()
     size = [2 * abs(x) * box.empty_display_size for x in scale]
     if min(size) < 1e-6 * max(size) or not max(size):
         raise InputError(f"{box.name} is flat: scale it so that it holds what is to be trained")
@@ -90,5 +93,5 @@ def region_settings(scene: bpy.types.Scene) -> dict[str, list[float]]:
         "region.centre": list(centre),
         "region.size": size,
         "region.rotation": [math.degrees(angle) for angle in turn.to_euler("XYZ")],
-        "region.up": list(box.matrix_world.col[2].to_3d().normalized()),
+        "region.up": list(matrix.col[2].to_3d().normalized()),
     }

@@ -1,5 +1,6 @@
 """Splats: from splats.ply to a point cloud with a material's values on its points."""
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -97,22 +98,36 @@ def read_rows(path: Path) -> np.ndarray:
     try:
         with open(path, "rb") as file:
             head, found, _ = file.read(LONGEST_HEAD).partition(b"end_header\n")
-        room = path.stat().st_size - len(head) - len(found)
+            kind, count = _layout(head, found, path)
+            start = file.seek(len(head) + len(found))
+            # Before anything is reserved for it: a broken head may say any number.
+            whole = os.fstat(file.fileno()).st_size - start >= count * kind.itemsize
+            rows = np.fromfile(file, kind, count) if whole else ()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
+    if len(rows) < count:
+        raise InputError(f"{path} is cut short: export the run again")
+    return rows
+
+
+def _layout(head: bytes, found: bytes, path: Path) -> tuple[np.dtype, int]:
+    """What a row is, and how many there are, from a PLY file's head and the line that ends it."""
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     if not found or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
         raise InputError(f"{path} is not a binary little-endian PLY file: export the run again")
     lines = [line for line in lines[2:] if line and line[0] in ("element", "property")]
     properties = lines[1:]
-    if lines[0][:2] != ["element", "vertex"] or any(
+    if [line[:2] for line in lines[:1]] != [["element", "vertex"]] or any(
         p[:2] not in (["property", "float"], ["property", "float32"]) for p in properties
     ):
         raise InputError(f"{path} is not a PLY file of splats (one vertex element of floats): export the run again")
-    count, kind = int(lines[0][2]), np.dtype([(p[2], "<f4") for p in properties])
-    if count == 0 or room < count * kind.itemsize:
-        raise InputError(f"{path} is cut short or empty: export the run again")
-    return np.fromfile(path, kind, count, offset=len(head) + len(found))
+    try:
+        kind, count = np.dtype([(p[2], "<f4") for p in properties]), int(lines[0][2])
+    except (IndexError, ValueError):
+        raise InputError(f"{path} has a head that is broken: export the run again") from None
+    if count < 1 or not properties:
+        raise InputError(f"{path} is empty: export the run again")
+    return kind, count
 
 
 def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

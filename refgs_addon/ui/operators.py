@@ -12,7 +12,7 @@ from ..preferences import hdri_folder, set_up
 from ..scene.beside import render_beside
 from ..scene.cameras import PHOTO, next_camera, photo_shown, show_photo
 from ..scene.capture import active_cameras
-from ..scene.notes import newer, tilted
+from ..scene.notes import capture_of, newer, tilted
 from ..scene.parts import active_run, show
 from ..scene.preview import render_preview
 from ..scene.regions import crop, training_region
@@ -63,7 +63,8 @@ def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, 
         said = f"RefGS {made_by} made this run, which is newer than this add-on: what this one does not know of it is missing"
         operator.report({"WARNING"}, said)
     box = training_region(context.scene)
-    if box is not None and tilted(folder):
+    chosen = Path(bpy.path.abspath(context.scene.refgs.capture)).resolve()
+    if box is not None and tilted(folder) and capture_of(folder) == chosen:
         box.hide_viewport = True
         said = f"{box.name}, which stands with the photos' cameras, is hidden: the run stands as the box's Z axis says"
         operator.report({"WARNING"}, said)

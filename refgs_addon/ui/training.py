@@ -221,7 +221,7 @@ def _job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs
         lines(box, job.line[0].upper() + job.line[1:], width)
     for warning in job.warnings:
         lines(box, warning[0].upper() + warning[1:], width, "ERROR")
-    for decision in job.decided:
+    for decision in job.decided.values():
         lines(box, decision[0].upper() + decision[1:], width, "DOT")
     for line in job.results.get("check", {}).get("lines", ()):
         lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")

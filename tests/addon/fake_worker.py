@@ -32,7 +32,7 @@ def train(command, asked):
 
 def learn(command, asked, out):
     paused, iteration = False, 0
-    say("decided", what="the light stands still: it brightens so")
+    say("decided", about="light", what="the light stands still: it brightens so")
     while iteration < 1000:
         time.sleep(0.05 if "slow" in command["capture"] else 0.002)
         facts = {"iteration": iteration, "total": 1000, "seconds_left": 10 - iteration / 100}

@@ -257,6 +257,22 @@ def infinite(path):
     write_ply(path, {**random_columns(), "metallic": np.full(COUNT, np.nan)})
 
 
+def no_number(path):
+    path.write_bytes(path.read_bytes().replace(b"element vertex ", b"element vertex x"))
+
+
+def twice(path):
+    path.write_bytes(path.read_bytes().replace(b"property float y\n", b"property float x\n"))
+
+
+def negative(path):
+    path.write_bytes(path.read_bytes().replace(b"element vertex ", b"element vertex -"))
+
+
+def without_properties(path):
+    path.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nend_header\n")
+
+
 def without_materials(path):
     write_ply(path, {k: v for k, v in random_columns().items() if k not in ("metallic", "roughness")})
 
@@ -270,6 +286,10 @@ def bent_camera(path):
     [
         ("splats.ply", lambda path: path.unlink(), "cannot read"),
         ("splats.ply", cut, "cut short"),
+        ("splats.ply", no_number, "head that is broken"),
+        ("splats.ply", twice, "head that is broken"),
+        ("splats.ply", negative, "is empty"),
+        ("splats.ply", without_properties, "is empty"),
         ("splats.ply", not_json, "not a binary little-endian PLY"),
         ("splats.ply", infinite, "metallic that is not a finite number"),
         ("splats.ply", without_materials, "has no metallic, roughness"),

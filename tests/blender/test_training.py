@@ -93,7 +93,7 @@ def test_what_is_to_be_learned(addon, capture):
     changes = {"surfels.budget": 5000, "light.frame": "camera", "light.exposure": "off", "indirect.start": 1}
     assert told(job.run) == changes
     until(lambda: job.progress)
-    assert job.decided == ["the light stands still: it brightens so"]
+    assert job.decided == {"light": "the light stands still: it brightens so"}
 
 
 def test_runs_go_into_new_folders(addon, capture, tmp_path):
@@ -295,12 +295,31 @@ def test_a_box_is_the_region_and_its_up_the_results(addon, capture):
 @pytest.mark.parametrize(
     ("up", "hidden"), [((0, 0, 0), False), ((0, 0, 2), False), ((0, 0, -1), True), ((0, 0.1, 1), True)]
 )
-def test_a_box_is_not_shown_beside_a_run_that_stands_otherwise(addon, run_folder, up, hidden):
-    (run_folder / "run.toml").write_text(f"[settings.region]\nup = {list(up)}\n")
+def test_a_box_is_not_shown_beside_a_run_that_stands_otherwise(addon, capture, run_folder, up, hidden):
+    of = f"[run]\ncapture = {json.dumps(str(capture))}\n"
+    (run_folder / "run.toml").write_text(f"{of}[settings.region]\nup = {list(up)}\n")
     bpy.ops.refgs.add_training_region()
     assert bpy.ops.refgs.import_run(directory=str(run_folder)) == {"FINISHED"}
     assert addon.refgs.region.hide_viewport == hidden
     bpy.ops.refgs.add_training_region()
+    assert not addon.refgs.region.hide_viewport
+
+
+def test_a_hidden_box_is_the_same_when_the_file_is_opened_again(addon, capture, tmp_path):
+    bpy.ops.refgs.add_training_region()
+    addon.refgs.region.location = 1, 2, 3
+    addon.refgs.region.hide_viewport = True
+    before = regions.region_settings(addon)
+    assert before["region.centre"] == [1, 2, 3] and addon.refgs.region.hide_viewport
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
+    assert regions.region_settings(bpy.context.scene) == before
+
+
+def test_a_box_of_another_capture_stays(addon, capture, run_folder):
+    (run_folder / "run.toml").write_text('[run]\ncapture = "/another"\n[settings.region]\nup = [0, 1, 1]\n')
+    bpy.ops.refgs.add_training_region()
+    bpy.ops.refgs.import_run(directory=str(run_folder))
     assert not addon.refgs.region.hide_viewport
 
 

@@ -14,7 +14,9 @@ UP = np.array([0.6, 0.0, 0.8])
 
 
 def region(**numbers):
-    return load_settings("quick", [f"region.{key}={list(value)}" for key, value in numbers.items()]).region
+    return load_settings(
+        "quick", [f"region.{key}={[float(x) for x in value]}" for key, value in numbers.items()]
+    ).region
 
 
 def test_a_box_is_turned_as_blender_turns():

@@ -138,7 +138,7 @@ class Trainer:
         self.chosen["light.frame"] = f"{frame}: {why}"
         if lit:
             where = "turns with the camera" if frame == "camera" else "stands still"
-            self.report("decided", {"what": f"the light {where}: {why}"})
+            self.report("decided", {"about": "light", "what": f"the light {where}: {why}"})
 
     def _drop_unused(self) -> None:
         """What this run's shading never reads does not learn."""
@@ -150,8 +150,8 @@ class Trainer:
             unused = ["sh_dc"] if self.residual_start < 1 else ["sh_dc", "sh_rest"]
         if why := self.without_reflection():
             unused += ["indirect_dc", "indirect_rest"]
-            if render.shading == "deferred":
-                self.report("decided", {"what": f"no inter-reflection: {why}"})
+            if render.shading == "deferred" and self.settings.indirect.start < 1:
+                self.report("decided", {"about": "reflections", "what": f"no inter-reflection: {why}"})
         if why or render.diffuse == "sh":
             unused += ["received"]
         mirror = (
@@ -446,7 +446,10 @@ class Trainer:
         mirrors = hidden >= settings.least * solid
         if mirrors != self._mirrors_itself:
             without = "" if mirrors else "no inter-reflection: "
-            self.report("decided", {"what": f"{without}the object mirrors itself on {hidden / solid:.1%} of it"})
+            self.report(
+                "decided",
+                {"about": "reflections", "what": f"{without}the object mirrors itself on {hidden / solid:.1%} of it"},
+            )
         self._mirrors_itself = mirrors
         if not mirrors:
             self.occluder = None
