@@ -209,7 +209,9 @@ def _draw_installation(box: bpy.types.UILayout, width: int) -> None:
             width,
         )
     elif begun:
-        lines(box, "An installation was stopped halfway, and can be gone on with", width)
+        lines(
+            box, "An installation was stopped halfway, and can be gone on with, unless another Blender is at it", width
+        )
     elif brought:
         lines(box, f"The trainer can be installed: {environment.room(home())}", width)
     if there or begun or brought:
