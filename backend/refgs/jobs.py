@@ -1,10 +1,11 @@
 """Training and export, saying how they go: what the terminal (`commands`) and the job protocol (`worker`) have in common."""
 
+import errno
 import json
 import sys
 import traceback
-from collections.abc import Callable
-from contextlib import ExitStack, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,14 @@ from refgs.lock import RunLock
 from refgs.run import Run, check_free, create_run, open_run, read_run_facts, write_text
 from refgs.settings import load_settings
 from refgs.train.trainer import Report, Trainer, full_card
+
+DISKS = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EIO,
+    errno.EROFS,
+    errno.EACCES,
+)  # errors that are the disk's, not the program's
 
 
 def choose_device(device: str, report: Report) -> str:
@@ -78,6 +87,7 @@ def train(
             else:
                 create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
                 held.enter_context(lock)
+            held.enter_context(_on_disk(out, "go on with --resume"))
             trainer.run(lambda: attend(trainer) or lock.attend(trainer))
         except torch.OutOfMemoryError:
             raise full_card() from None
@@ -104,6 +114,22 @@ def train(
         return trainer, quality
 
 
+@contextmanager
+def _on_disk(folder: Path, again: str) -> Iterator[None]:
+    """Raise InputError where it is the disk that failed: full, not to be written, or taken out."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        if not folder.is_dir():
+            raise InputError(f"{folder} is no longer there: put its disk back, then {again}") from error
+        if isinstance(error, OSError) and error.errno in DISKS:
+            why = f"{error.filename or folder} cannot be written ({error.strerror})"
+            raise InputError(f"{why}: mend that, then {again}; what was written before is whole") from error
+        raise
+
+
 def export(
     folder: Path,
     mesh_file: Path | None,
@@ -123,20 +149,21 @@ def export(
     for file in [*splats, *([target, target.parent / "textures"] if target else [])]:
         if file.exists() and not overwrite:
             raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
-    if splats_file is not None:
-        write_splats(splats_file, run.splats)
-    if display_file is not None:
-        report("stage", {"what": "learning colours by direction"})
+    with _on_disk((target or splats[0]).parent, "export again"):
+        if splats_file is not None:
+            write_splats(splats_file, run.splats)
+        if display_file is not None:
+            report("stage", {"what": "learning colours by direction"})
 
-        def learned(done: int, total: int) -> None:
-            if done % 10 == 0:
-                report("progress", {"stage": "colours", "done": done, "total": total})
+            def learned(done: int, total: int) -> None:
+                if done % 10 == 0:
+                    report("progress", {"stage": "colours", "done": done, "total": total})
 
-        write_display_splats(display_file, displayed(run, learned))
-    if target is None:
-        return splats
-    with RunLock(folder) if target.parent == folder else nullcontext():
-        _write_mesh(run, target, texture, report)
+            write_display_splats(display_file, displayed(run, learned))
+        if target is None:
+            return splats
+        with RunLock(folder) if target.parent == folder else nullcontext():
+            _write_mesh(run, target, texture, report)
     return [*splats, target]
 
 

@@ -141,6 +141,7 @@ def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
     second.resume()
     assert second.iteration == 40
     second.run()
+    assert whole.decided == second.decided
     assert whole.parameters.keys() == second.parameters.keys()
     for name, value in whole.parameters.items():
         assert torch.equal(value, second.parameters[name]), name

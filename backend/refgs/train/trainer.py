@@ -95,6 +95,7 @@ class Trainer:
 
         start, shown, source = start_parameters(capture, self.views, settings)
         self.chosen: dict[str, str] = {}  # by a setting that asked for it: what was chosen, and why
+        self.decided: dict[str, str] = {}  # the same as lines for the artist: of the light, exposures, reflections
         self._choose_light_frame(start, shown)
         self.parameters = {name: value.detach().to(self.device).requires_grad_() for name, value in start.items()}
         report("stage", {"what": source})
@@ -113,7 +114,6 @@ class Trainer:
         self.optimizer = Adam(groups)
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
         self.occluder: Occluder | None = None
-        self._mirrors_itself: bool | None = None  # not known before the first mesh
         self._mirrored: Tensor | None = None  # which part of the light the object shows
         self.initial = settings.render.shading == "deferred" and settings.initial.until > 0  # its stage is not over
 
@@ -138,7 +138,12 @@ class Trainer:
         self.chosen["light.frame"] = f"{frame}: {why}"
         if lit:
             where = "turns with the camera" if frame == "camera" else "stands still"
-            self.report("decided", {"about": "light", "what": f"the light {where}: {why}"})
+            self._decide("light", f"the light {where}: {why}")
+
+    def _decide(self, about: str, what: str) -> None:
+        """Say how something came out that was left to the photos, and once more when the run is gone on with."""
+        self.decided[about] = what
+        self.report("decided", {"about": about, "what": what})
 
     def _drop_unused(self) -> None:
         """What this run's shading never reads does not learn."""
@@ -151,7 +156,7 @@ class Trainer:
         if why := self.without_reflection():
             unused += ["indirect_dc", "indirect_rest"]
             if render.shading == "deferred" and self.settings.indirect.start < 1:
-                self.report("decided", {"about": "reflections", "what": f"no inter-reflection: {why}"})
+                self._decide("reflections", f"no inter-reflection: {why}")
         if why or render.diffuse == "sh":
             unused += ["received"]
         mirror = (
@@ -415,9 +420,7 @@ class Trainer:
             self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
             self.optimizer.state.pop(self.exposures, None)
             self.exposures = None
-            self.report(
-                "decided", {"what": "the photos have no exposures of their own: they agree within a third of a stop"}
-            )
+            self._decide("exposures", "the photos have no exposures of their own: they agree within a third of a stop")
 
     @torch.no_grad()
     def _trace(self) -> None:
@@ -444,13 +447,8 @@ class Trainer:
             hidden += float((1 - looked.visibility)[opaque].sum())
             solid += float(opaque.sum())
         mirrors = hidden >= settings.least * solid
-        if mirrors != self._mirrors_itself:
-            without = "" if mirrors else "no inter-reflection: "
-            self.report(
-                "decided",
-                {"about": "reflections", "what": f"{without}the object mirrors itself on {hidden / solid:.1%} of it"},
-            )
-        self._mirrors_itself = mirrors
+        without = "" if mirrors else "no inter-reflection: "
+        self._decide("reflections", f"{without}the object mirrors itself on {hidden / solid:.1%} of it")
         if not mirrors:
             self.occluder = None
         elif not self.optimizer.state.get(self.parameters["indirect_dc"]):
@@ -554,7 +552,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             state = self.optimizer.state.get(group["params"][0], {})
             tensors |= {f"adam.{group['name']}.{key}": torch.as_tensor(value) for key, value in state.items()}
-        facts = {"seconds": self.seconds, "total": self.total, "initial": self.initial}
+        facts = {"seconds": self.seconds, "total": self.total, "initial": self.initial, "decided": self.decided}
         checkpoint.save(self.folder / "checkpoints", self.iteration, tensors, facts)
 
     def resume(self) -> None:
@@ -567,6 +565,8 @@ class Trainer:
         tensors = {name: value.to(self.device) for name, value in tensors.items()}
         self.iteration, self.seconds = facts["iteration"], facts["seconds"]
         self.total, self.initial = facts["total"], facts.get("initial", self.initial)
+        for about, what in facts.get("decided", {}).items():
+            self._decide(about, what)
         self.motion.total, self.motion.views = tensors["motion.total"], tensors["motion.views"]
         self.optimizer.state.clear()
         if "exposure" not in tensors:  # they have been left out since

@@ -1,0 +1,71 @@
+"""Disks that fill up, or are taken out, while a run is made on them."""
+
+import pytest
+
+from refgs import jobs
+from refgs.errors import InputError
+
+SMALL = ["surfels.start=500", "surfels.budget=500", "surfels.hull=48", "environment.resolution=16"]
+
+
+def train(capture, run, attend, *changes, resume=False):
+    return jobs.train(capture, run, "quick", "cpu", None, [*changes], resume, lambda event, facts: None, attend)
+
+
+def fill(file):
+    with pytest.raises(OSError), open(file, "wb", buffering=0) as opened:
+        while True:
+            opened.write(bytes(4096))
+
+
+def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
+    disk, away = tmp_path / "disk", tmp_path / "away"
+    disk.mkdir()
+
+    def take_out(trainer):
+        if trainer.iteration == 50:
+            disk.rename(away)
+        return False
+
+    words = [*SMALL, "train.iterations=80", "train.checkpoint_every=20"]
+    with pytest.raises(
+        InputError, match=r"run is no longer there: put its disk back, then go on with --resume"
+    ) as said:
+        train(ball_capture, disk / "run", take_out, *words)
+    assert "\n" not in str(said.value)
+    away.rename(disk)
+    trainer, _ = train(ball_capture, disk / "run", lambda trainer: trainer.iteration == 41, resume=True)
+    assert trainer.iteration == 41
+    trainer, _ = train(ball_capture, disk / "run", lambda trainer: False, resume=True)
+    assert trainer.ended and (disk / "run" / "splats.ply").exists()
+
+
+def test_a_disk_that_is_full(ball_capture, small_disk):
+    """While what is written is no checkpoint: those say so themselves."""
+    filler = small_disk / "filler"
+
+    def later(trainer):
+        if trainer.iteration == 99:
+            fill(filler)
+        return False
+
+    with pytest.raises(InputError, match=r"cannot be written \(No space left on device\): mend that") as said:
+        train(ball_capture, small_disk / "run", later, *SMALL, "train.iterations=120", "train.checkpoint_every=40")
+    assert "\n" not in str(said.value)
+    filler.unlink()
+    trainer, _ = train(ball_capture, small_disk / "run", lambda trainer: False, resume=True)
+    assert trainer.ended and (small_disk / "run" / "splats.ply").exists()
+
+
+def test_a_mesh_that_cannot_be_written(ball_capture, small_disk):
+    """The old files stay."""
+    run = small_disk / "run"
+    words = ["train.iterations=60", "mesh.resolution=32", "mesh.triangles=500"]
+    train(ball_capture, run, lambda trainer: False, *SMALL, *words)
+    export = [run, None, 64, None, None, True, lambda event, facts: None]
+    jobs.export(*export)
+    before = {file: file.read_bytes() for file in [run / "mesh.glb", *(run / "textures").iterdir()]}
+    fill(small_disk / "filler")
+    with pytest.raises(InputError, match=r"No space left on device\): mend that, then export again"):
+        jobs.export(*export)
+    assert before == {file: file.read_bytes() for file in [run / "mesh.glb", *(run / "textures").iterdir()]}
