@@ -11,11 +11,13 @@ import shlex
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
 import pytest
 
+from refgs_addon import jobs
 from tests.blender.runs import write_run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,7 +47,16 @@ def in_window(script, tmp_path, *words):
     tool = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg", "cli", "blender_ext.py")
     archive = tmp_path / "refgs.zip"
     subprocess.run([sys.executable, tool, "build", "--source-dir", ROOT, "--output-filepath", archive], check=True)
-    words = [*command, "--python", Path(__file__).with_name(script), "--", archive, *words, tmp_path]
+    words = [
+        *command,
+        "--enable-event-simulate",
+        "--python",
+        Path(__file__).with_name(script),
+        "--",
+        archive,
+        *words,
+        tmp_path,
+    ]
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
     done = subprocess.run(list(map(str, words)), env=environment, capture_output=True, text=True, timeout=1200)
     path = tmp_path / "report.json"
@@ -98,3 +109,20 @@ def test_an_artist_trains(tmp_path, ball_capture):
     print("longest that the window was busy, in seconds:", report["longest"])
     print("of that for the add-on's timer and panels:", report["ours"])
     print("what buttons took:", report["clicks"])
+
+
+@pytest.mark.window
+@pytest.mark.parametrize("letter", ["S", "L"])
+def test_closing_asks(tmp_path, ball_capture, letter):
+    """Ctrl-Q, then Cancel, Stop Cleanly or Leave Running, by their letters."""
+    capture = tmp_path / "photos"
+    shutil.copytree(ball_capture, capture)
+    report = in_window("close.py", tmp_path, sys.executable, capture, letter)
+    assert report["states"] == ["running"]  # after Cancel
+    run = Path(report["run"])
+    if letter == "S":
+        assert jobs.run_state(run) == "stopped"
+    else:
+        while jobs.run_state(run) == "training":
+            time.sleep(1)
+        assert (run / "splats.ply").exists() and (run / "mesh.glb").exists()
