@@ -174,7 +174,7 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
     from refgs.geometry.mesh import clean, is_crumbs
 
     settings = run.settings.mesh
-    mesh = extract(run.render, run.training_cameras(), run.centre, run.radius, settings.resolution)
+    mesh = extract(run.surfels(), run.training_cameras(), run.near, run.centre, run.radius, settings.resolution)
     report("stage", {"what": f"fused {len(mesh.faces):,} triangles"})
     mesh = clean(mesh, settings.triangles)
     report("stage", {"what": f"simplified to {len(mesh.faces):,} triangles; unwrapping"})

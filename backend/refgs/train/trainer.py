@@ -429,13 +429,7 @@ class Trainer:
         cameras = [view.camera for view in self.views[:: max(1, len(self.views) // TRACED)]]
         surfels, environment, self.occluder = self.surfels(), self.environment(), None
         inside = surfels.chosen(self.wanted())
-        mesh = extract(
-            lambda camera: self._render(inside, environment, camera),
-            cameras,
-            capture.centre,
-            capture.radius,
-            settings.resolution,
-        )
+        mesh = extract(inside, cameras, self.near, capture.centre, capture.radius, settings.resolution)
         try:
             self.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
         except InputError:  # there is no surface yet
