@@ -69,3 +69,18 @@ def test_smooth_normals_do_not_depend_on_the_triangulation():
     cube = trimesh.creation.box()
     normals = smooth_normals(cube.vertices, cube.faces)
     np.testing.assert_allclose(normals, cube.vertices / np.linalg.norm(cube.vertices, axis=1, keepdims=True), atol=1e-9)
+
+
+def test_no_edge_has_three_faces():
+    """Two balls that touch along an edge, as folds do that simplifying leaves, and two crossing sheets of nearly no thickness."""
+    rng = np.random.default_rng(0)
+    sheet = ball(level=6)
+    sheet.vertices[:, 2] *= 0.002
+    crossing = sheet.copy().apply_transform(trimesh.transformations.rotation_matrix(1.2, [1, 0, 0]))
+    for thin in (as_mesh(sheet), as_mesh(sheet, crossing)):
+        thin.vertices += 1e-4 * rng.normal(size=thin.vertices.shape)
+        mesh = clean(thin, 300)
+        _, faces = np.unique(
+            trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).edges_sorted, axis=0, return_counts=True
+        )
+        assert faces.max() == 2

@@ -45,7 +45,8 @@ def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
     """The mesh without what is not the object, with at most about `triangles` faces, and smooth normals.
 
     Keeps the connected parts with at least `keep` of the largest part's area: floaters go, the rings of a chain
-    stay. Faces keep their winding. Simplification is by quadric error (Garland and Heckbert 1997). Raises InputError where nothing is left.
+    stay. Faces keep their winding, and no edge has more than two. Simplification is by quadric error (Garland and Heckbert 1997). Raises
+    InputError where nothing is left.
     """
     work = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     work.update_faces(np.isfinite(work.triangles).all((1, 2)))
@@ -70,10 +71,23 @@ def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
                 break
         work = trimesh.Trimesh(vertices, faces, process=False)
         work.update_faces(work.nondegenerate_faces() & work.unique_faces())
+        work.update_faces(_manifold(work))
     used, faces = np.unique(work.faces, return_inverse=True)
     vertices = np.asarray(work.vertices)[used]
     faces = faces.reshape(-1, 3)
     return Mesh(vertices, faces, smooth_normals(vertices, faces))
+
+
+def _manifold(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Which faces (F,) to keep so that no edge has three: of each edge the two largest. Simplifying folds a few thin parts."""
+    _, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
+    edge, face = edge.reshape(-1), mesh.edges_face
+    order = np.lexsort((-mesh.area_faces[face], edge))
+    start = np.r_[0, np.flatnonzero(np.diff(edge[order])) + 1]
+    place = np.arange(len(order)) - np.repeat(start, np.diff(np.r_[start, len(order)]))
+    kept = np.ones(len(mesh.faces), bool)
+    kept[face[order[place > 1]]] = False
+    return kept
 
 
 def is_crumbs(mesh: Mesh, many: int = 5) -> bool:
