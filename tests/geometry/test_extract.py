@@ -51,3 +51,10 @@ def test_the_surface_lies_where_rays_come_in(monkeypatch):
 def test_what_is_hardly_there_has_no_surface():
     """What covers is as dense as it is, not as the surfels that tell the depth."""
     assert len(radii(ball(0.004, 0.1))) == 0
+
+
+def test_voxels_are_no_finer_than_pixels():
+    """96 of them show 3.3 units at the middle of the ball, 2.5 where it is nearest: 2.6 units have 78 to 104 of them across."""
+    layer = ball(0.95, 0.0)
+    fine, finer, coarse = (len(radii(layer, resolution)) for resolution in (120, 240, 75))
+    assert coarse < fine == finer == len(radii(layer, 104))

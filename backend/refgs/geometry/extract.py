@@ -21,11 +21,15 @@ COVERED = 1e-6  # alpha below which there is no depth
 def extract(
     surfels: Surfels, cameras: Sequence[Camera], near: float, centre: np.ndarray, radius: float, resolution: int
 ) -> Mesh:
-    """The surface that surfels show to cameras inside the cube of half-side `radius` about `centre`, in voxels of 2 `radius` /
-    `resolution`: as `refgs.geometry.tsdf.fuse` makes it, not cleaned. Surfels nearer than `near` (world units) are not seen."""
+    """The surface that surfels show to cameras inside the cube of half-side `radius` about `centre`: as `refgs.geometry.tsdf.fuse`
+    makes it, not cleaned. Voxels are 2 `radius` / `resolution` wide, but no finer than pixels are there, in the median. Surfels nearer
+    than `near` (world units) are not seen."""
     maps = [_depth_and_alpha(surfels, camera, near) for camera in cameras]
     depths, alphas = zip(*maps, strict=True)
-    return fuse(depths, alphas, cameras, centre, radius, resolution)
+    solid = [depth[alpha > 0.5] / camera.fx for depth, alpha, camera in zip(depths, alphas, cameras, strict=True)]
+    pixel = float(torch.cat(solid).median().nan_to_num(0.0)) if any(map(len, solid)) else 0.0
+    across = min(resolution, max(int(2 * radius / max(pixel, 1e-12)), 1))
+    return fuse(depths, alphas, cameras, centre, radius, across)
 
 
 def _depth_and_alpha(surfels: Surfels, camera: Camera, near: float) -> tuple[Tensor, Tensor]:
