@@ -37,7 +37,7 @@ def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
 
 
 def read_exr(path: str | os.PathLike) -> np.ndarray:
-    """Read the first part of an EXR as float32: (H, W, 4) RGBA, (H, W, 3) RGB, or (H, W) where it has one channel.
+    """Read an EXR as float32: (H, W, 4) RGBA, (H, W, 3) RGB, or (H, W) where it has one channel; of several parts the first in colour.
 
     Raises InputError for a file that is missing, broken, or has none of these.
     """
@@ -46,7 +46,9 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
         raise InputError(f"{path} is missing")
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: channel.pixels for name, channel in file.channels().items()}
+            parts = [file.channels(i) for i in range(len(file.parts))]
+            part = next((part for part in parts if {"R", "G", "B"} <= part.keys()), parts[0])
+            channels = {name: channel.pixels for name, channel in part.items()}
     except Exception:  # the binding raises RuntimeError, ValueError or its own, by what is broken
         raise InputError(f"{path} is not a whole OpenEXR file: write or copy it again") from None
     if {"R", "G", "B"} <= channels.keys():
