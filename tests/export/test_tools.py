@@ -106,10 +106,10 @@ def test_few_splats_open_too(tmp_path, count):
 
 
 def test_gltf_of_splats(tmp_path):
-    """KHR_gaussian_splatting as splat-transform writes it: activated values, quaternions xyzw."""
+    """KHR_gaussian_splatting as splat-transform writes it: activated values, and upright where docs/formats.md's turn is asked for."""
     splats = discs()
     write_display_splats(tmp_path / "a.ply", splats)
-    transform(tmp_path / "a.ply", tmp_path / "a.glb")
+    transform(tmp_path / "a.ply", tmp_path / "a.glb", "-r", "-90,0,0")
     data = (tmp_path / "a.glb").read_bytes()
     length = int.from_bytes(data[12:16], "little")
     gltf, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
@@ -128,6 +128,10 @@ def test_gltf_of_splats(tmp_path):
     scales = np.exp(np.stack([rows[f"scale_{i}"] for i in range(3)], axis=1))
     order = cKDTree(values("KHR_gaussian_splatting:SCALE", 3)).query(scales)[1]
     np.testing.assert_allclose(values("KHR_gaussian_splatting:SCALE", 3)[order], scales, rtol=1e-5)
+    x, y, z = splats.positions.T
+    np.testing.assert_allclose(
+        values("POSITION", 3)[order], np.stack([-x, z, y], axis=1), atol=1e-6
+    )  # +Y is up in glTF
     np.testing.assert_allclose(values("KHR_gaussian_splatting:OPACITY", 1)[order, 0], splats.opacities, atol=1e-5)
     np.testing.assert_allclose(
         values("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0", 3)[order], splats.sh[:, 0], atol=1e-6
