@@ -66,11 +66,11 @@ QUANTISED = {
     # 32-bit floats
     ".ply": (0, 1e-5, 0.02, 1e-5, 0, 0),
     # 11 bits of a chunk's 2 units; 10 and 11 of its log scales; quaternions of 10; 8 of opacity, colour and harmonics
-    ".compressed.ply": (2e-3, 8e-3, 0.3, 3e-3, 3e-3, 0.02),
+    ".compressed.ply": (1e-3, 1e-3, 0.2, 2e-3, 2e-3, 0.01),
     # 16 bits of log positions; 256 log scales and colours, and 256 kinds of harmonics for all; quaternions and opacity of 8 bits
-    ".sog": (1e-3, 0.05, 2.2, 4e-3, 0.02, 0.2),
+    ".sog": (5e-5, 0.02, 2.2, 4e-3, 5e-3, 0.05),
     # 12 bits of a unit; sixteenths of log scales; quaternions of 10 bits; 8 of opacity and colour; 4 and 5 of harmonics
-    ".spz": (2e-4, 1 / 32 + 1e-4, 0.3, 4e-3, 8e-3, 0.1),
+    ".spz": (1.25e-4, 0.032, 0.2, 2e-3, 4e-3, 0.05),
 }  # fmt: skip
 
 
