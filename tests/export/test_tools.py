@@ -23,7 +23,7 @@ COUNT = 600
 @pytest.fixture(scope="module", autouse=True)
 def installed():
     if NODE is None or not (TOOLS / "node_modules").is_dir():
-        pytest.skip("needs node, and `npm install --no-package-lock --prefix tests/tools`")
+        pytest.skip("needs node, and `npm install --no-package-lock --ignore-scripts --prefix tests/tools`")
 
 
 def said(*words, folder=TOOLS):
