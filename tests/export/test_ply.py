@@ -180,6 +180,8 @@ def in_head(old, new):
         (in_head(b"element vertex", b"element vertices"), "no element vertex"),
         (in_head(b"float x", b"floaty x"), "unknown type, floaty"),
         (in_head(b"property float x\n", b"property list uchar strange x\n"), "unknown type, strange"),
+        (in_head(b"property float x\n", b"property list x\n"), "unknown type, list"),
+        (in_head(b"property float x\n", b"property list uchar x\n"), "broken line in its head"),
         (in_head(b"property float x\n", b"property float y\n"), "two properties with same name"),
         (in_head(b"property float x\n", b"\n"), "lacks x|more rows|not a whole PLY"),
         (in_head(b"property float x\n", b"comment \xe9t\xe9\nproperty float x\n"), "not plain ASCII"),

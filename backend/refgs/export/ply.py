@@ -78,10 +78,13 @@ def _elements(lines: list[list[str]], path: Path) -> list[tuple[int, list[int]]]
         match line:
             case ["element", _, count] if count.isdecimal():
                 elements.append((int(count), []))
-            case ["property", kind, _] | ["property", "list", kind, _, _] if elements:
-                if wrong := {*line[1:-1]} - {*_BYTES, "list"}:
+            case ["property", *kinds, _] if elements and (
+                len(kinds) == 1 or (kinds[:1] == ["list"] and len(kinds) == 3)
+            ):
+                kinds = kinds[-2:]  # of a list its length's and its values'
+                if wrong := {*kinds} - {*_BYTES}:
                     raise InputError(f"{path} has properties of an unknown type, {wrong.pop()}: export it again")
-                elements[-1][1].append(_BYTES[kind])
+                elements[-1][1].append(_BYTES[kinds[0]])
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
