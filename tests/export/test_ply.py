@@ -14,6 +14,7 @@ from refgs.color import srgb_decode
 from refgs.errors import InputError, InputWarning
 from refgs.export.ply import read_ply
 from refgs.export.splats import read_splats, write_display_splats, write_splats
+from refgs.jobs import export
 from tests.export.test_splats import arrays, make
 
 COUNT = 50
@@ -266,19 +267,15 @@ def test_a_giant_count_reserves_nothing(tmp_path):
 def test_the_command_line_converts_them(tmp_path):
     rows = table(LAYOUTS["2DGS"])
     rows["x"][3] = np.nan
-    source = save(tmp_path / "d'un autre.ply", rows)
-
-    def refgs(*words):
-        command = [sys.executable, "-m", "refgs.cli", "export", str(source), *map(str, words)]
-        return subprocess.run(command, capture_output=True, text=True, timeout=120)
-
-    said = refgs("--display-splats", tmp_path / "shown.ply", "--splats", tmp_path / "ours.ply")
+    source, shown, ours = save(tmp_path / "d'un autre.ply", rows), tmp_path / "shown.ply", tmp_path / "ours.ply"
+    words = ["export", str(source), "--display-splats", str(shown), "--splats", str(ours)]
+    said = subprocess.run([sys.executable, "-m", "refgs.cli", *words], capture_output=True, text=True, timeout=300)
     assert said.returncode == 0
     assert said.stderr == f"refgs: warning: {source}: 1 of 50 splats have positions that are not finite: left out\n"
-    shown = PlyData.read(str(tmp_path / "shown.ply"))["vertex"]
-    assert shown.count == COUNT - 1 and "scale_2" in shown and "metallic" not in shown
-    assert len(read_splats(tmp_path / "ours.ply")) == COUNT - 1
-    said = refgs()
-    assert said.returncode == 2 and said.stderr.count("\n") == 1 and "add --splats" in said.stderr
-    said = refgs("--splats", tmp_path / "ours.ply")
-    assert said.returncode == 2 and "ours.ply exists" in said.stderr
+    vertex = PlyData.read(str(shown))["vertex"]
+    assert vertex.count == COUNT - 1 and "scale_2" in vertex and "metallic" not in vertex
+    assert len(read_splats(ours)) == COUNT - 1
+    with pytest.raises(InputError, match="is no run folder, so there is no mesh: add --splats"):
+        export(source, None, None, None, None, False, lambda event, facts: None)
+    with pytest.raises(InputError, match=r"ours\.ply exists"):
+        export(ours, None, None, ours, None, False, lambda event, facts: None)
