@@ -1,18 +1,19 @@
 """How long Blender takes to import splats: `refgs bench importing`. Needs Blender's Python module.
 
-A run of so many splats on a sphere, without mesh and light. Reading the file, how normals change across splats, and all of the import,
-in seconds; the least of three.
+A run of so many splats on a sphere, without mesh and light: Blender reading the file, how normals change across splats, and all of the
+import; then the trainer's side, writing and reading splats with harmonics of the third degree. In seconds; the least of three.
 """
 
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from rich.table import Table
 
 from benchmarks.runs import console
-from refgs.export.splats import Splats, write_splats
+from refgs.export.splats import Splats, read_splats, write_splats
 
 COUNTS = 24_000, 100_000, 1_000_000
 
@@ -55,24 +56,29 @@ def main() -> None:
     import bpy
 
     from refgs_addon.scene.run import import_run
-    from refgs_addon.scene.splats import normal_slopes, read_splats
+    from refgs_addon.scene.splats import normal_slopes
+    from refgs_addon.scene.splats import read_splats as read
 
-    table = Table("splats", "reading", "normals", "all of it", title="seconds to import")
+    heads = "splats", "reading", "normals", "all of it", "the trainer's writing", "and reading"
+    table = Table(*heads, title="seconds to import")
     with tempfile.TemporaryDirectory() as folder:
         for count in COUNTS:
             run = Path(folder) / str(count)
             run.mkdir()
             write_splats(run / "splats.ply", sphere(count))
-            splats = read_splats(run / "splats.ply")
+            splats = read(run / "splats.ply")
+            rich, file = replace(sphere(count), sh=np.zeros((count, 16, 3), np.float32)), run / "rich.ply"
 
             def whole(run: Path = run) -> None:
                 bpy.ops.wm.read_factory_settings(use_empty=True)
                 import_run(run, bpy.context.scene)
 
             parts = (
-                lambda run=run: read_splats(run / "splats.ply"),
+                lambda run=run: read(run / "splats.ply"),
                 lambda splats=splats: normal_slopes(splats),
                 whole,
+                lambda file=file, rich=rich: write_splats(file, rich),
+                lambda file=file: read_splats(file),
             )
             table.add_row(f"{count:,}", *(f"{timed(part):.2f}" for part in parts))
     console.print(table)

@@ -1,6 +1,8 @@
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
 
 import os
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -56,6 +58,19 @@ def python(tmp_path):
     file.chmod(0o755)
     yield file
     jobs.stop_all()
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A real file system of four megabytes; needs root to mount."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if os.name != "posix" or not shutil.which("mount") or os.geteuid() != 0:
+        pytest.skip("mounting a small file system needs root")
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", str(folder)], capture_output=True).returncode:
+        pytest.skip("this system does not let us mount a file system")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
 _status = 0

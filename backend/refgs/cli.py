@@ -3,12 +3,13 @@
 import signal
 import sys
 import traceback
+import warnings
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from refgs.errors import InputError
+from refgs.errors import InputError, InputWarning
 
 app = typer.Typer(
     help=__import__("refgs").__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
@@ -88,7 +89,7 @@ def evaluate(
 
 @app.command()
 def export(
-    run: RunFolder,
+    run: Annotated[Path, typer.Argument(help="a run folder, or a PLY file of splats by any program")],
     mesh: Annotated[Path | None, typer.Option(help="the mesh's file (default: RUN/mesh.glb)")] = None,
     texture: Annotated[int | None, typer.Option(min=64, max=8192, help="side of the textures, in pixels")] = None,
     splats: Annotated[Path | None, typer.Option(help="write the splats to this file")] = None,
@@ -154,8 +155,21 @@ def _end(*_) -> None:
     raise KeyboardInterrupt
 
 
+def _show(show):
+    """`show`, but for what the user is warned of: that is one line."""
+
+    def shown(message, category, *where) -> None:
+        if issubclass(category, InputWarning):
+            print(f"refgs: warning: {message}", file=sys.stderr)
+        else:
+            show(message, category, *where)
+
+    return shown
+
+
 def main() -> None:
     """Entry point: 0 done, 2 the input is wrong (one line), 1 our fault (a traceback), 130 interrupted."""
+    warnings.showwarning = _show(warnings.showwarning)
     signal.signal(signal.SIGTERM, _end)
     try:
         app(standalone_mode=True)

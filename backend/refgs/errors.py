@@ -11,3 +11,7 @@ class InputError(Exception):
 
 class NoCameras(InputError):
     """A folder holds photos, but nothing that says where they were taken from: `refgs.capture.motion` can find it."""
+
+
+class InputWarning(UserWarning):
+    """Something in the user's input is wrong, and what is right of it was taken. One line, as of an InputError."""

@@ -13,7 +13,7 @@ import torch
 
 from refgs.capture import read_capture
 from refgs.errors import InputError
-from refgs.export.splats import write_display_splats, write_splats
+from refgs.export.splats import read_splats, write_display_splats, write_splats
 from refgs.kernels import cuda
 from refgs.lock import RunLock
 from refgs.run import Run, check_free, create_run, open_run, read_run_facts, write_text
@@ -140,10 +140,16 @@ def export(
     report: Report,
 ) -> list[Path]:
     """Fuse, clean, unwrap, bake; write the mesh and its textures. Where splats are asked for, they alone, unless the mesh's file is named
-    too. Returns what was written."""
+    too. Of a PLY file in a run's place, splats only. Returns what was written."""
     from refgs.export.display import displayed
 
-    run = open_run(folder)
+    alone = folder.suffix.lower() == ".ply" and not folder.is_dir()
+    if alone and (mesh_file or not (splats_file or display_file)):
+        raise InputError(
+            f"{folder} is no run folder, so there is no mesh: add --splats FILE.ply or --display-splats FILE.ply"
+        )
+    run = None if alone else open_run(folder)
+    source = read_splats(folder) if run is None else run.splats
     splats = [file for file in (splats_file, display_file) if file is not None]
     target = mesh_file if mesh_file or splats else folder / "mesh.glb"
     for file in [*splats, *([target, target.parent / "textures"] if target else [])]:
@@ -151,8 +157,10 @@ def export(
             raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
     with _on_disk((target or splats[0]).parent, "export again"):
         if splats_file is not None:
-            write_splats(splats_file, run.splats)
-        if display_file is not None:
+            write_splats(splats_file, source)
+        if display_file is not None and run is None:
+            write_display_splats(display_file, source)  # their colours are there already
+        elif display_file is not None:
             report("stage", {"what": "learning colours by direction"})
 
             def learned(done: int, total: int) -> None:

@@ -13,9 +13,8 @@ from ..nodes.splats import NAME as SPLATS
 from .edit import edits, splats_of
 from .files import whole
 from .parts import FOLDER
-from .splats import read_rows
+from .splats import MATERIALS, SH_DC, read_rows
 
-SH_DC = 0.28209479177387814  # the constant spherical harmonic
 KEPT = ("environment.exr", "cameras.json", "needs.json", "occluder.ply", "run.toml")
 DARK = 0.02  # base colour below which it does not tell how much light there is
 
@@ -50,6 +49,11 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     rows = read_rows(run_folder(collection) / "splats.ply")
     if len(rows) != len(splats.data.points):
         raise InputError(f"{run_folder(collection)} has changed since it was imported: import it again")
+    if not {*MATERIALS} <= {*rows.dtype.names}:
+        mend = "make one that has with `refgs export FILE.ply --splats splats.ply`, and import that"
+        raise InputError(
+            f"{run_folder(collection) / 'splats.ply'} has no materials that edits could be written to: {mend}"
+        )
     new = edited_materials(splats)
     edited = np.zeros(len(rows), bool)
     for name in ("metallic", "roughness"):

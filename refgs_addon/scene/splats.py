@@ -12,6 +12,8 @@ from ..errors import InputError
 from ..nodes.materials import splat_material, values_material
 from ..nodes.splats import NAME, splats_tree
 
+MATERIALS = "albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"
+SH_DC = 0.28209479177387814  # the constant spherical harmonic
 LONGEST_HEAD = 100_000  # bytes
 _STEPS = 1, 2, 4, 7, 11, 16  # along a curve, to either side: some of the next, for many splats lie on top of each other
 _SHIFTS = 0.0, 0.23
@@ -61,36 +63,67 @@ def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointClou
 
 
 def read_splats(path: Path) -> dict[str, np.ndarray]:
-    """Read a run's splats.ply (binary, little-endian, float properties in 3DGS's names and RefGS's materials).
+    """Read a run's splats.ply, or the PLY of 3DGS or 2DGS (binary, little-endian, float properties in 3DGS's names).
 
     Returns float32 arrays: position (N, 3), normal (N, 3) unit, scale (N, 2) standard deviations, rotation (N, 4)
-    unit quaternions wxyz, opacity (N,) 0..1, base_color (N, 3) linear, metallic (N,), roughness (N,). Raises InputError
-    for any other file.
+    unit quaternions wxyz, opacity (N,) 0..1, base_color (N, 3) linear, metallic (N,), roughness (N,). What has no
+    materials is matte, in the colour that its constant harmonic shows; what has no normals, or zeros, has them along the
+    shortest axis. Raises InputError for any other file.
     """
     rows = read_rows(path)
+    found = set(rows.dtype.names)
     names = {
         "position": ["x", "y", "z"],
-        "normal": ["nx", "ny", "nz"],
-        "scale": ["scale_0", "scale_1"],
+        "scale": ["scale_0", "scale_1", *(["scale_2"] if "scale_2" in found else [])],
         "rotation": ["rot_0", "rot_1", "rot_2", "rot_3"],
         "opacity": ["opacity"],
-        "base_color": ["albedo_r", "albedo_g", "albedo_b"],
-        "metallic": ["metallic"],
-        "roughness": ["roughness"],
     }
-    missing = [name for group in names.values() for name in group if name not in rows.dtype.names]
+    if {"nx", "ny", "nz"} <= found:
+        names["normal"] = ["nx", "ny", "nz"]
+    if found.isdisjoint(MATERIALS):
+        names["look"] = ["f_dc_0", "f_dc_1", "f_dc_2"]
+    else:
+        names |= {"base_color": list(MATERIALS[:3]), "metallic": ["metallic"], "roughness": ["roughness"]}
+    missing = [name for group in names.values() for name in group if name not in found]
     if missing:
         raise InputError(f"{path} has no {', '.join(missing)}: it is not the splats.ply of a RefGS run")
     splats = {key: np.stack([rows[name] for name in group], axis=-1) for key, group in names.items()}
     splats = {key: value[:, 0] if value.shape[1] == 1 else value for key, value in splats.items()}
     for key, value in splats.items():
         if not np.isfinite(value).all():
-            raise InputError(f"{path} holds a {key} that is not a finite number: export the run again")
+            mend = "`refgs export FILE.ply --splats splats.ply` leaves such splats out"
+            raise InputError(f"{path} holds a {key} that is not a finite number: {mend}")
     splats["opacity"] = 1 / (1 + np.exp(-splats["opacity"]))
     splats["scale"] = np.exp(splats["scale"])
-    for key in ("rotation", "normal"):
-        splats[key] /= np.maximum(np.linalg.norm(splats[key], axis=1, keepdims=True), 1e-12)
+    splats["rotation"] /= np.maximum(np.linalg.norm(splats["rotation"], axis=1, keepdims=True), 1e-12)
+    if "look" in splats:
+        look = (0.5 + SH_DC * splats.pop("look")).clip(0, 1)
+        splats["base_color"] = np.where(look <= 0.04045, look / 12.92, ((look + 0.055) / 1.055) ** 2.4)
+        splats["metallic"], splats["roughness"] = np.zeros_like(look[:, 0]), np.ones_like(look[:, 0])
+    if "scale_2" in found:
+        splats["rotation"], splats["scale"] = _flat(splats["rotation"], splats["scale"])
+    normal = splats.setdefault("normal", np.zeros_like(splats["position"]))
+    none = ~normal.any(axis=1)
+    w, x, y, z = splats["rotation"][none].T
+    normal[none] = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     return splats
+
+
+def _flat(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """3D Gaussians as discs: quaternions wxyz (N, 4) whose third axis is the shortest of three scales (N, 3), and the two others."""
+    shortest = np.where(scale[:, 2] <= scale.min(axis=1), 2, scale.argmin(axis=1))
+    turns = np.array(
+        [(0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1, 0, 0, 0)], np.float32
+    )  # that bring an axis there
+    (w, x, y, z), (a, b, c, d) = rotation.T, turns[shortest].T
+    turned = [
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    ]
+    return np.stack(turned, axis=1), np.take_along_axis(scale, (shortest[:, None] + [1, 2]) % 3, axis=1)
 
 
 def read_rows(path: Path) -> np.ndarray:

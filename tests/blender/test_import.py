@@ -12,10 +12,11 @@ from refgs_addon import compat
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.splats import EXTENT, NAME
 from refgs_addon.scene.cameras import frame_camera, next_camera, photo_shown, show_photo
+from refgs_addon.scene.export import export_splats
 from refgs_addon.scene.notes import newer
 from refgs_addon.scene.parts import parts, show
 from refgs_addon.scene.run import import_run
-from refgs_addon.scene.splats import normal_slopes, read_splats
+from refgs_addon.scene.splats import MATERIALS, normal_slopes, read_splats
 from tests.blender.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
 
 
@@ -140,6 +141,57 @@ def test_normals_bend_as_a_sphere_does(tmp_path):
         expected = axes[:, :, axis] * np.exp(columns[scale])[:, None] / radius  # dn = dp / radius
         error = np.linalg.norm(slope - expected, axis=1) / np.linalg.norm(expected, axis=1)
         assert np.median(error) < 0.1 and error.max() < 0.3
+
+
+def others(scales, normals):
+    """The columns of splats as other programs train them: no materials, quaternions of any length, normals of zeros or none."""
+    rng = np.random.default_rng(4)
+    columns = {name: value for name, value in random_columns().items() if name not in MATERIALS}
+    for i in range(4):
+        columns[f"rot_{i}"] *= 3
+    columns |= {f"scale_{i}": rng.uniform(-4, -2, COUNT) for i in range(scales)}
+    for name in ("nx", "ny", "nz"):
+        columns[name] = np.zeros(COUNT)
+        if not normals:
+            del columns[name]
+    return columns | {f"f_rest_{i}": np.zeros(COUNT) for i in range(45)}
+
+
+@pytest.mark.parametrize("normals", [False, True])
+@pytest.mark.parametrize("scales", [2, 3])
+def test_other_programs_splats(scene, tmp_path, scales, normals):
+    """They lie as flat discs across their shortest axis, matte, in the colours that they show."""
+    columns = others(scales, normals)
+    folder = tmp_path / "d'un autre été"
+    folder.mkdir()
+    write_ply(folder / "splats.ply", columns)
+    cloud = import_run(folder, scene).splats.data
+    turn = quaternion_matrix(stacked(columns, "rot_0", "rot_1", "rot_2", "rot_3") / 3)
+    size = np.exp(np.stack([columns[f"scale_{i}"] for i in range(scales)], axis=1))
+    shortest = size.argmin(axis=1) if scales == 3 else np.full(COUNT, 2)
+    axis = np.take_along_axis(turn, shortest[:, None, None], axis=2)[:, :, 0]
+    np.testing.assert_allclose(values(cloud, "normal", 3, "vector"), axis, atol=1e-5)
+    found = quaternion_matrix(values(cloud, "rotation", 4))[:, :, :2] * values(cloud, "scale", 3, "vector")[:, None, :2]
+    flat = turn[:, :, :scales] * size[:, None] * (np.arange(scales) != shortest[:, None])[:, None]
+    np.testing.assert_allclose(
+        found @ found.transpose(0, 2, 1), flat @ flat.transpose(0, 2, 1), atol=1e-6
+    )  # their covariances
+    look = (0.5 + stacked(columns, "f_dc_0", "f_dc_1", "f_dc_2") / np.sqrt(4 * np.pi)).clip(0, 1)
+    np.testing.assert_allclose(
+        values(cloud, "base_color", 4, "color")[:, :3],
+        np.where(look <= 0.04045, look / 12.92, ((look + 0.055) / 1.055) ** 2.4),
+        atol=1e-5,
+    )
+    assert (values(cloud, "metallic") == 0).all() and (values(cloud, "roughness") == 1).all()
+
+
+def test_edits_of_what_has_no_materials_cannot_be_written(scene, tmp_path):
+    (tmp_path / "other").mkdir()
+    write_ply(tmp_path / "other" / "splats.ply", others(3, True))
+    run = import_run(tmp_path / "other", scene)
+    with pytest.raises(InputError, match=r"has no materials that edits could be written to: make one .* --splats"):
+        export_splats(run.collection, tmp_path / "edited.ply")
+    assert not (tmp_path / "edited.ply").exists()
 
 
 def test_one_splat_alone_is_flat(tmp_path):

@@ -8,12 +8,13 @@ from plyfile import PlyData
 from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.export.display import displayed
-from refgs.export.splats import THIN, write_display_splats
+from refgs.export.splats import THIN, read_splats, write_display_splats
 from refgs.jobs import export
 from refgs.model.surfels import from_splats
 from refgs.render.renderer import render
 from refgs.report.metrics import psnr
 from refgs.run import open_run
+from tests.export.test_splats import make
 from tests.report.test_evaluate import write_run
 
 
@@ -57,6 +58,14 @@ def test_the_file_is_what_viewers_of_gaussians_read(run, tmp_path):
     scales = np.exp(np.stack([vertex[f"scale_{i}"] for i in range(3)], axis=1))
     np.testing.assert_allclose(scales[:, 2], THIN * scales[:, :2].min(axis=1), rtol=1e-5)
     np.testing.assert_allclose(1 / (1 + np.exp(-vertex["opacity"])), run.splats.opacities, rtol=1e-4)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_few_splats_are_written_too(tmp_path, count):
+    write_display_splats(tmp_path / "un été.ply", make(count))
+    splats = read_splats(tmp_path / "un été.ply")
+    assert len(splats) == count and splats.scales.shape == (count, 3)
+    np.testing.assert_allclose(splats.scales[:, 2], THIN * splats.scales[:, :2].min(axis=1), rtol=1e-5)
 
 
 def test_splats_alone_are_exported_unless_the_mesh_is_named(run, tmp_path, monkeypatch):

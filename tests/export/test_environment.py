@@ -35,6 +35,23 @@ def test_the_file_says_what_it_is(tmp_path):
         )
 
 
+def test_of_several_parts_the_first_in_colour_is_read(tmp_path):
+    """As renderers write depth, and stereo cameras two eyes, beside each other."""
+
+    def part(name, channels):
+        header = {"name": name, "type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+        return OpenEXR.Part(header, channels, name)
+
+    left, right = (np.full((4, 8, 3), value, np.float32) for value in (1, 2))
+    depth = {name: np.ones((4, 8), np.float32) for name in "ZA"}
+    parts = [part("depth", depth), part("left", {"RGB": left}), part("right", {"RGB": right})]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    np.testing.assert_array_equal(read_exr(tmp_path / "parts.exr"), left)
+    OpenEXR.File(parts[:1]).write(str(tmp_path / "depth.exr"))
+    with pytest.raises(InputError, match="has the channels A, Z"):
+        read_exr(tmp_path / "depth.exr")
+
+
 def test_half_float_panoramas_are_read(tmp_path):
     pixels = np.ones((4, 8, 3), np.float16)
     pixels[0, 0] = [np.inf, np.nan, -1]
@@ -96,33 +113,53 @@ def test_sampling_is_smooth_across_the_seam_and_finite_at_the_poles():
     assert np.abs(sample(panorama, rays) - (1 + unit)).mean() < 2e-3
 
 
-def test_blender_sees_the_same_panorama(tmp_path):
+@pytest.fixture
+def seen(tmp_path):
+    """What a camera in Blender sees in a direction (x, y, z) of a panorama that is the world, by Cycles."""
     bpy = pytest.importorskip("bpy")
+    mathutils = pytest.importorskip("mathutils")
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    write_environment(tmp_path / "light.exr", 0.5 + 0.4 * directions(64, 128))
     scene = bpy.context.scene
     world = scene.world = bpy.data.worlds.new("light")
     world.use_nodes = True
+    world.cycles.sampling_method = "NONE"  # nothing stands in its light
     tree = world.node_tree
     texture = tree.nodes.new("ShaderNodeTexEnvironment")
-    texture.image = bpy.data.images.load(str(tmp_path / "light.exr"))
     tree.links.new(texture.outputs["Color"], tree.nodes["Background"].inputs["Color"])
     camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(camera)
     scene.camera = camera
     scene.render.engine = "CYCLES"
-    scene.cycles.samples = 1
-    scene.render.resolution_x = scene.render.resolution_y = 8
+    scene.cycles.samples, scene.cycles.use_denoising = 1, False
+    scene.render.resolution_x = scene.render.resolution_y = 4
     scene.render.image_settings.file_format = "OPEN_EXR"
     scene.render.image_settings.color_depth = "32"
-    # Looking along -z of the camera: at +x, +y and up.
-    for rotation, expected in [
-        ((np.pi / 2, 0, -np.pi / 2), (1, 0, 0)),
-        ((np.pi / 2, 0, 0), (0, 1, 0)),
-        ((np.pi, 0, 0), (0, 0, 1)),
-    ]:
-        camera.rotation_euler = rotation
-        scene.render.filepath = str(tmp_path / "view.exr")
+    scene.render.filepath = str(tmp_path / "view.exr")
+
+    def look(panorama, direction, degrees):
+        if texture.image is None:
+            write_environment(tmp_path / "une lumière.exr", panorama)
+            texture.image = bpy.data.images.load(str(tmp_path / "une lumière.exr"))
+            assert texture.image.colorspace_settings.name == "Linear Rec.709"
+        camera.data.angle = np.radians(degrees)
+        camera.rotation_euler = mathutils.Vector(direction).to_track_quat("-Z", "Y").to_euler()
         bpy.ops.render.render(write_still=True)
-        seen = read_exr(tmp_path / "view.exr")[3:5, 3:5, :3].mean((0, 1))
-        np.testing.assert_allclose(seen, 0.5 + 0.4 * np.array(expected), atol=0.03)
+        return read_exr(tmp_path / "view.exr")[..., :3].mean((0, 1))
+
+    return look
+
+
+def test_blender_sees_the_same_panorama(seen):
+    panorama = 0.5 + 0.4 * directions(64, 128)
+    for direction in np.concatenate([np.eye(3), -np.eye(3)]):
+        np.testing.assert_allclose(seen(panorama, direction, 10), 0.5 + 0.4 * direction, atol=2e-3)
+
+
+def test_blender_sees_a_lamp_where_it_is_and_nowhere_else(seen):
+    lamp = np.array([0.48, -0.6, 0.64])
+    near = np.exp(60 * (directions(128, 256) @ lamp - 1))[..., None]
+    panorama = np.float32(50) * near * (1, 0.5, 0.25)
+    for signs in np.ndindex(2, 2, 2):
+        direction = lamp * (1 - 2 * np.array(signs))
+        bright = np.array([50, 25, 12.5]) if signs == (0, 0, 0) else 0
+        np.testing.assert_allclose(seen(panorama, direction, 2), bright, rtol=0.02, atol=0.1)

@@ -2,23 +2,31 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from refgs.errors import InputError
 from refgs.export.splats import Splats, read_splats, write_splats
 
 
+def arrays(splats):
+    return {name: value for name, value in vars(splats).items() if name != "beside"}
+
+
 def make(count=7, coefficients=16, indirect=0):
+    """Splats with a value of their own in each place."""
     rng = np.random.default_rng(1)
 
     def f(*shape):
         return rng.random(shape).astype(np.float32)
 
+    def unit(width):
+        vectors = f(count, width)
+        return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
     return Splats(
         positions=f(count, 3) - 0.5,
-        normals=f(count, 3),
+        normals=unit(3),
         sh=f(count, coefficients, 3) - 0.5,
         opacities=0.02 + 0.96 * f(count),
         scales=1e-3 + f(count, 2),
-        rotations=f(count, 4),
+        rotations=unit(4),
         albedo=f(count, 3),
         metallic=f(count),
         roughness=f(count),
@@ -27,15 +35,17 @@ def make(count=7, coefficients=16, indirect=0):
     )
 
 
+@pytest.mark.parametrize("count", [0, 1, 7])
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 @pytest.mark.parametrize("indirect", [0, 16])
-def test_round_trip(tmp_path, coefficients, indirect):
-    splats = make(coefficients=coefficients, indirect=indirect)
+def test_round_trip(tmp_path, count, coefficients, indirect):
+    splats = make(count, coefficients, indirect)
     path = tmp_path / "a run, été.ply"
     write_splats(path, splats)
     again = read_splats(path)
     assert list(tmp_path.iterdir()) == [path]
-    for name, value in vars(splats).items():
+    assert again.beside == ()
+    for name, value in arrays(splats).items():
         read = getattr(again, name)
         assert read.dtype == np.float32 and read.shape == value.shape
         if name in ("opacities", "scales"):
@@ -64,26 +74,6 @@ def test_layout_is_what_other_programs_expect(tmp_path):
     opacity = splats.opacities[1:]
     np.testing.assert_allclose(vertex["opacity"][1:], np.log(opacity / (1 - opacity)), rtol=1e-4, atol=1e-5)
     assert np.isfinite(vertex["opacity"]).all()
-
-
-def test_broken_files_are_named(tmp_path):
-    path = tmp_path / "splats.ply"
-    with pytest.raises(InputError, match="cannot read"):
-        read_splats(path)
-    write_splats(path, make())
-    whole = path.read_bytes()
-    for broken in (whole[:-10], whole[:60], b"", b"not a ply file", b"\xff\xfe\x00" * 50):
-        path.write_bytes(broken)
-        with pytest.raises(InputError, match="not a whole PLY"):
-            read_splats(path)
-    path.write_bytes(whole.replace(b"property float roughness", b"property float roughmess"))
-    with pytest.raises(InputError, match="lacks roughness"):
-        read_splats(path)
-    splats = make()
-    splats.positions[2, 1] = np.nan
-    write_splats(path, splats)
-    with pytest.raises(InputError, match="not finite in its positions"):
-        read_splats(path)
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from refgs.color import srgb_encode
 from refgs.errors import InputError
 from refgs.export.bake import Textures
 from refgs.export.environment import write_exr
+from refgs.export.tangents import vertex_tangents
 from refgs.geometry.mesh import Mesh
 from refgs.paths import whole
 
@@ -22,8 +23,8 @@ _Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # glTF 2.0, 3.4: +Y is up
 def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     """Write the mesh (Z up; with normals and uv) as Y-up binary glTF with a metallic-roughness material.
 
-    Embedded: base colour (sRGB), roughness and metallic (G and B, linear) and the tangent-space normal map; tangents
-    are left to the reader, which makes them by MikkTSpace as `bake` assumed. Beside the file, in textures/, the same
+    Embedded: base colour (sRGB), roughness and metallic (G and B, linear), the tangent-space normal map and the tangents that `bake`
+    assumed, MikkTSpace's: not every reader makes these. Beside the file, in textures/, the same
     maps as 8-bit PNG and as linear float EXR (the normal mapped to 0..1 in both), for 8 bits are coarse on a mirror.
     Each file is written whole or not at all.
     """
@@ -64,10 +65,18 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
         visual=trimesh.visual.TextureVisuals(uv=mesh.uv, material=material),
         process=False,
     )
+    tangents, signs = vertex_tangents(mesh)
+    model.vertex_attributes["TANGENT"] = np.column_stack([tangents @ _Y_UP.T, signs]).astype(np.float32)
     scene = trimesh.Scene()
     scene.add_geometry(model, node_name="RefGS", geom_name="RefGS")
     with whole(path) as temporary:
-        temporary.write_bytes(scene.export(file_type="glb", include_normals=True))
+        temporary.write_bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=_named))
+
+
+def _named(tree: dict) -> None:
+    """trimesh takes tangents for an attribute of ours, and puts an underscore before it."""
+    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["TANGENT"] = attributes.pop("_TANGENT")
 
 
 def read_glb(path: str | os.PathLike) -> Mesh:

@@ -1,14 +1,18 @@
 """splats.ply: one row a splat, in the property names of 3D Gaussian splatting, with materials."""
 
 import os
-from dataclasses import dataclass, fields
+import re
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyParseError
+from numpy.lib.recfunctions import repack_fields, structured_to_unstructured
+from plyfile import PlyElement, PlyListProperty, PlyProperty
 
-from refgs.errors import InputError
-from refgs.paths import whole
+from refgs.color import srgb_decode
+from refgs.errors import InputError, InputWarning
+from refgs.export.ply import read_ply, write_ply
 
 
 @dataclass
@@ -21,6 +25,7 @@ class Splats:
     albedo (N, 3) linear Rec.709, metallic (N,) and perceptual roughness (N,) in 0..1, received (N, 3) the part of the recovered
     light's irradiance that reaches a surfel, with what comes from the object itself, indirect (N, K', 3) spherical harmonics
     of the linear radiance that comes from the object itself; K' is 0 where a scene does without, all of `received` is 1 then.
+    `beside` is what else a file held: its elements, `vertex` with the properties that are none of these.
     """
 
     positions: np.ndarray
@@ -34,6 +39,7 @@ class Splats:
     roughness: np.ndarray
     received: np.ndarray
     indirect: np.ndarray
+    beside: tuple[PlyElement, ...] = ()
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -42,12 +48,18 @@ class Splats:
 _HEAD = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 _TAIL = ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
 THIN = 0.05  # of a surfel's smaller scale: the third, for viewers of 3D Gaussians
+CHUNK = 4096  # rows, which the processor's cache holds
 _RECEIVED = ["received_r", "received_g", "received_b"]
 _MATERIAL = ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
+_REFERENCE = ["ori_color_0", "ori_color_1", "ori_color_2", "refl_strength", "roughness"]  # Ref-Gaussian's, as logits
+_DC = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
+MATTE = 0.0, 1.0  # metallic and roughness of splats that come without materials
+# Turns that bring axis 0, 1 or 2 to the third place, as quaternions wxyz.
+_TO_THIRD = np.array([(0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1, 0, 0, 0)], np.float32)
 
 
 def write_splats(path: str | os.PathLike, splats: Splats) -> None:
-    """Write a binary little-endian PLY with one `vertex` element; see docs for the properties.
+    """Write a binary little-endian PLY with one `vertex` element, and what `splats.beside` holds; see docs for the properties.
 
     Opacity is stored as a logit and scales as logarithms, as 3DGS viewers expect; spherical harmonics of the first
     degree and above are channel-major; materials are stored as they are. Opacities are clipped to 1e-6 .. 1 - 1e-6.
@@ -58,7 +70,7 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
     if splats.indirect.shape[1]:
         names += [*_RECEIVED, *(f"ind_{i}" for i in range(3 * splats.indirect.shape[1]))]
         columns += [splats.received, splats.indirect.transpose(0, 2, 1)]
-    _write(path, names, columns)
+    _write(path, names, columns, splats.beside)
 
 
 def write_display_splats(path: str | os.PathLike, splats: Splats) -> None:
@@ -73,7 +85,7 @@ def write_display_splats(path: str | os.PathLike, splats: Splats) -> None:
 def _common(splats: Splats, scales: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
     """The properties that all splats' files have, and their columns."""
     opacity = np.clip(splats.opacities.astype(np.float64), 1e-6, 1 - 1e-6)
-    rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1)
+    rest = splats.sh[:, 1:].transpose(0, 2, 1)
     columns = [
         splats.positions,
         splats.normals,
@@ -83,61 +95,164 @@ def _common(splats: Splats, scales: np.ndarray) -> tuple[list[str], list[np.ndar
         np.log(np.maximum(scales.astype(np.float64), 1e-30)),
         splats.rotations,
     ]
-    names = [*_HEAD, *(f"f_rest_{i}" for i in range(rest.shape[1])), *_TAIL]
+    names = [*_HEAD, *(f"f_rest_{i}" for i in range(3 * rest.shape[2])), *_TAIL]
     if scales.shape[1] == 3:
         names.insert(names.index("scale_1") + 1, "scale_2")
     return names, columns
 
 
-def _write(path: str | os.PathLike, names: list[str], columns: list[np.ndarray]) -> None:
-    table = np.concatenate([np.reshape(c, (len(c), -1)) for c in columns], axis=1).astype("<f4")
-    rows = np.ascontiguousarray(table).view([(name, "<f4") for name in names])[:, 0]
-    with whole(path) as temporary:
-        PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(temporary))
+def _write(
+    path: str | os.PathLike, names: list[str], columns: list[np.ndarray], beside: tuple[PlyElement, ...] = ()
+) -> None:
+    count = len(columns[0])
+    table = np.empty((count, len(names)), "<f4")
+    start = 0
+    for column in columns:
+        width = int(np.prod(column.shape[1:]))
+        for rows in range(0, count, CHUNK):
+            part = column[rows : rows + CHUNK]
+            table[rows : rows + CHUNK, start : start + width] = part.reshape(len(part), width)
+        start += width
+    rows = table.view([(name, "<f4") for name in names]).reshape(count)
+    properties = [PlyProperty(name, "float") for name in names]
+    unknown = next((element for element in beside if element.name == "vertex"), None)
+    if unknown is not None:
+        more = [p for p in unknown.properties if p.name not in names]
+        both = np.empty(count, [*rows.dtype.descr, *((p.name, p.dtype("<")) for p in more)])
+        for source, which in ((rows, names), (unknown.data, [p.name for p in more])):
+            for name in which:
+                both[name] = source[name]
+        rows, properties = both, [*properties, *more]
+    vertex = PlyElement("vertex", properties, count)
+    vertex.data = rows
+    write_ply(path, [vertex, *(element for element in beside if element.name != "vertex")])
 
 
 def read_splats(path: str | os.PathLike) -> Splats:
-    """Read what `write_splats` wrote. Raises InputError for a file that is missing, broken, or without materials."""
-    path = Path(path)
-    try:
-        vertex = PlyData.read(str(path))["vertex"]
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
-    except (PlyParseError, KeyError, ValueError, UnicodeDecodeError):
-        raise InputError(f"{path} is not a whole PLY file of splats: export it again") from None
-    names = {p.name for p in vertex.properties}
-    missing = [name for name in [*_HEAD, *_TAIL, *_MATERIAL] if name not in names]
+    """Read splats: what `write_splats` wrote, and the PLY files of 3DGS (three scales), 2DGS (two) and Ref-Gaussian.
+
+    Where there are no materials, base colour is the colour that the constant harmonic shows, and the rest is matte: MATTE. Where there
+    are no normals, they are the rotation's third axis, to either side; of three scales the least becomes the last. Rows with a value
+    that is not finite are left out, with an InputWarning. Raises InputError for a file that is missing, broken, or not of splats.
+    """
+    data = read_ply(path)
+    if "vertex" not in data:
+        raise InputError(f"{path} has no element vertex: it is not a PLY file of splats")
+    vertex = data["vertex"]
+    names = [p.name for p in vertex.properties if not isinstance(p, PlyListProperty)]
+    if "packed_position" in names:
+        raise InputError(f"{path} is a compressed PLY: make a plain one of it, with splat-transform or SuperSplat")
+    ours = not {*_MATERIAL[:4]}.isdisjoint(names)
+    normals = {*_HEAD[3:6]} <= {*names}
+    needed = [*_HEAD, *_TAIL, *(_MATERIAL if ours else [])]
+    missing = [name for name in needed if name not in names and (ours or name not in _HEAD[3:6])]
     if missing:
-        raise InputError(f"{path} lacks {', '.join(missing)}: it is not a splats.ply that RefGS wrote")
+        raise InputError(f"{path} lacks {', '.join(missing)}: it is not a PLY file of splats, or not a whole one")
+    rows, known = np.asarray(vertex.data), set()
 
     def columns(*wanted: str) -> np.ndarray:
-        return np.stack([np.asarray(vertex[name], np.float32) for name in wanted], axis=1)
+        known.update(wanted)
+        if not wanted:
+            return np.empty((vertex.count, 0), np.float32)
+        part = rows[[*wanted]]  # a view, which lists beside it would be in the way of
+        return structured_to_unstructured(repack_fields(part) if rows.dtype.hasobject else part, np.float32, copy=True)
 
-    def harmonics(prefix: str, *known: int) -> np.ndarray:
+    def harmonics(prefix: str, *degrees: int) -> np.ndarray:
         """(N, K, 3) from the channel-major values of a name, which must be as many as some degree has."""
-        values = sum(name.startswith(prefix) for name in names)
-        if values not in known:
-            numbers = ", ".join(map(str, known))
-            raise InputError(f"{path} has {values} {prefix} values a splat: spherical harmonics have {numbers}")
-        if values == 0:
-            return np.zeros((vertex.count, 0, 3), np.float32)
-        table = columns(*(f"{prefix}{i}" for i in range(values)))
-        return table.reshape(vertex.count, 3, values // 3).transpose(0, 2, 1)
+        found = sum(re.fullmatch(rf"{prefix}\d+", name) is not None for name in names)
+        wanted = [f"{prefix}{i}" for i in range(found)]
+        if found not in degrees or not {*wanted} <= {*names}:
+            numbers = ", ".join(map(str, degrees))
+            raise InputError(f"{path} has {found} {prefix} values a splat: spherical harmonics have {numbers}")
+        return columns(*wanted).reshape(vertex.count, 3, found // 3).transpose(0, 2, 1)
 
-    splats = Splats(
-        positions=columns("x", "y", "z"),
-        normals=columns("nx", "ny", "nz"),
-        sh=np.concatenate([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], harmonics("f_rest_", 0, 9, 24, 45)], axis=1),
-        opacities=1 / (1 + np.exp(-columns("opacity")[:, 0])),
-        scales=np.exp(columns(*(name for name in ("scale_0", "scale_1", "scale_2") if name in names))),
-        rotations=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-        albedo=columns("albedo_r", "albedo_g", "albedo_b"),
-        metallic=columns("metallic")[:, 0],
-        roughness=columns("roughness")[:, 0],
-        received=columns(*_RECEIVED) if {*_RECEIVED} <= names else np.ones((vertex.count, 3), np.float32),
-        indirect=harmonics("ind_", 0, 3, 12, 27, 48),
-    )
-    for field in fields(splats):
-        if not np.isfinite(getattr(splats, field.name)).all():
-            raise InputError(f"{path} holds values that are not finite in its {field.name}: export it again")
-    return splats
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        sh = np.concatenate(
+            [columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], harmonics("f_rest_", 0, 9, 24, 45)], axis=1
+        )
+        scales = np.exp(columns(*(name for name in ("scale_0", "scale_1", "scale_2") if name in names)))
+        rotations = columns("rot_0", "rot_1", "rot_2", "rot_3")
+        length = np.linalg.norm(rotations, axis=1, keepdims=True)
+        rotations = np.where(np.abs(length - 1) < 1e-4, rotations, rotations / length)  # to the last bit, if they are
+        if scales.shape[1] == 3:
+            rotations, scales = _shortest_last(rotations, scales)
+        if ours:
+            *albedo, metallic, roughness = columns(*_MATERIAL).T
+            albedo = np.stack(albedo, axis=1)
+        elif {*_REFERENCE} <= {*names}:
+            *albedo, metallic, roughness = _logistic(columns(*_REFERENCE)).T
+            albedo = srgb_decode(np.stack(albedo, axis=1))
+        else:
+            albedo = srgb_decode((0.5 + _DC * sh[:, 0]).clip(0, 1))
+            metallic, roughness = (np.full(vertex.count, value, np.float32) for value in MATTE)
+        splats = Splats(
+            positions=columns("x", "y", "z"),
+            normals=columns("nx", "ny", "nz") if normals else np.zeros((vertex.count, 3), np.float32),
+            sh=sh,
+            opacities=_logistic(columns("opacity")[:, 0]),
+            scales=scales,
+            rotations=rotations,
+            albedo=albedo,
+            metallic=metallic,
+            roughness=roughness,
+            received=columns(*_RECEIVED) if {*_RECEIVED} <= {*names} else np.ones((vertex.count, 3), np.float32),
+            indirect=harmonics("ind_", 0, 3, 12, 27, 48),
+        )
+    none = ~splats.normals.any(axis=1)  # 3DGS writes zeros
+    splats.normals[none] = _third_axis(rotations[none])
+    splats.beside = _beside(data.elements, known)
+    return _finite(splats, Path(path))
+
+
+def _logistic(values: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-values))
+
+
+def _third_axis(rotations: np.ndarray) -> np.ndarray:
+    w, x, y, z = rotations.T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+
+
+def _shortest_last(rotations: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same Gaussians with their shortest axis, which is their normal, in the third place."""
+    shortest = np.where(scales[:, 2] <= scales.min(axis=1), 2, scales.argmin(axis=1))
+    w, x, y, z = rotations.T
+    a, b, c, d = _TO_THIRD[shortest].T
+    turned = [
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    ]
+    return np.stack(turned, axis=1), np.take_along_axis(scales, (shortest[:, None] + [1, 2, 3]) % 3, axis=1)
+
+
+def _beside(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[PlyElement, ...]:
+    """A file's elements without the known properties of `vertex`, in memory of their own."""
+    left = []
+    for element in elements:
+        more = [p for p in element.properties if element.name != "vertex" or p.name not in known]
+        if more:
+            copy = PlyElement(element.name, more, element.count)
+            copy.data = np.array(element.data[[p.name for p in more]])
+            left.append(copy)
+    return tuple(left)
+
+
+def _finite(splats: Splats, path: Path) -> Splats:
+    """Those of the splats all of whose values are finite. A warning says how many others there were; further elements, which may
+    number the rows, go with them."""
+    values = {name: value for name, value in vars(splats).items() if name != "beside"}
+    wrong = [name for name, value in values.items() if not np.isfinite(value).all()]
+    if not wrong:
+        return splats
+    fine = np.logical_and.reduce([np.isfinite(v).reshape(len(splats), -1).all(axis=1) for v in values.values()])
+    what = f"{path}: {(~fine).sum():,} of {len(splats):,} splats have {', '.join(wrong)} that are not finite: left out"
+    warnings.warn(what, InputWarning, stacklevel=3)
+    beside = []
+    for element in splats.beside:
+        if element.name == "vertex":
+            copy = PlyElement(element.name, element.properties, int(fine.sum()))
+            copy.data = element.data[fine]
+            beside.append(copy)
+    return replace(splats, **{name: value[fine] for name, value in values.items()}, beside=tuple(beside))
