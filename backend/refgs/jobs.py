@@ -170,14 +170,17 @@ def export(
 def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> None:
     from refgs.export.bake import bake, unwrap
     from refgs.export.mesh import write_glb
+    from refgs.export.outline import bring_out
     from refgs.geometry.extract import extract
     from refgs.geometry.mesh import clean, is_crumbs
 
-    settings = run.settings.mesh
-    mesh = extract(run.render, run.training_cameras(), run.centre, run.radius, settings.resolution)
+    settings, cameras = run.settings.mesh, run.training_cameras()
+    mesh = extract(run.render, cameras, run.centre, run.radius, settings.resolution)
     report("stage", {"what": f"fused {len(mesh.faces):,} triangles"})
     mesh = clean(mesh, settings.triangles)
-    report("stage", {"what": f"simplified to {len(mesh.faces):,} triangles; unwrapping"})
+    report("stage", {"what": f"simplified to {len(mesh.faces):,} triangles; bringing it out to its outlines"})
+    mesh = bring_out(mesh, run.render, cameras, 2 * run.radius / settings.resolution)
+    report("stage", {"what": "unwrapping"})
     if is_crumbs(mesh):
         what = (
             "the mesh is in pieces, none of them half of it: the photos do not agree on a surface; "
