@@ -168,9 +168,10 @@ def export(
 
 
 def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> None:
-    from refgs.export.bake import bake, unwrap
+    from refgs.export.bake import bake
     from refgs.export.mesh import write_glb
     from refgs.export.outline import bring_out
+    from refgs.export.unwrap import unwrap
     from refgs.geometry.extract import extract
     from refgs.geometry.mesh import clean, is_crumbs
 
@@ -189,7 +190,12 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
         report("warning", {"what": what})
     mesh = unwrap(mesh)
     report("stage", {"what": "baking the textures"})
-    textures = bake(mesh, run.splats, texture or settings.texture)
+
+    def baked(done: int, total: int) -> None:
+        report("progress", {"stage": "baking", "done": done, "total": total})
+
+    textures = bake(mesh, run.splats, texture or settings.texture, baked)
+    report("stage", {"what": "writing"})
     write_glb(target, mesh, textures)
 
 
