@@ -206,10 +206,10 @@ def _print(console: Console, found: dict[str, dict[str, float]], exported: dict[
     console.print(table)
 
     for scene, facts in exported.items():
-        steps = "; ".join(f"{what} {seconds:.1f} s" for what, seconds in facts["steps"])
-        total = sum(seconds for _, seconds in facts["steps"])
+        steps = "; ".join(f"{what} {seconds:.1f} ({used:.1f})" for what, seconds, used in facts["steps"])
+        total, processor = (sum(step[i] for step in facts["steps"]) for i in (1, 2))
         memory = max(m or 0 for m in facts["memory"]) / 1e9
-        console.print(f"{scene}: {total:.0f} s, {memory:.2f} GB at most: {steps}")
+        console.print(f"{scene}: {total:.0f} s ({processor:.0f} s of the processor), {memory:.2f} GB at most: {steps}")
 
 
 if __name__ == "__main__":

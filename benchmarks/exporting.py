@@ -9,7 +9,7 @@ from refgs import jobs
 
 
 def export(folder: Path, target: Path, texture: int) -> dict:
-    """Export a run's mesh in a process of its own: seconds and gigabytes by stage, and what is known of its charts."""
+    """Export a run's mesh in a process of its own: by stage the seconds that it took, and those of the processor; bytes at most."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_export, args=(folder, target, texture, theirs))
@@ -24,14 +24,14 @@ def export(folder: Path, target: Path, texture: int) -> dict:
 
 
 def _export(folder: Path, target: Path, texture: int, results) -> None:
-    marks = [("read", time.perf_counter())]
+    marks = [("read", time.perf_counter(), time.process_time())]
 
     def report(event: str, facts: dict) -> None:
         if event == "stage":
-            marks.append((facts["what"], time.perf_counter()))
+            marks.append((facts["what"], time.perf_counter(), time.process_time()))
 
     jobs.export(folder, target, texture, None, None, True, report)
-    marks.append(("", time.perf_counter()))
-    steps = [(what, after - before) for (what, before), (_, after) in pairwise(marks)]
+    marks.append(("", time.perf_counter(), time.process_time()))
+    steps = [(what, after - before, used - had) for (what, before, had), (_, after, used) in pairwise(marks)]
     memory = [jobs.peak_memory(), jobs.peak_memory(children=True)]
     results.send({"steps": steps, "memory": memory})
