@@ -146,6 +146,8 @@ def export(
     run = open_run(folder)
     splats = [file for file in (splats_file, display_file) if file is not None]
     target = mesh_file if mesh_file or splats else folder / "mesh.glb"
+    if target is not None and target.suffix.lower() != ".glb":
+        raise InputError(f"{target}: the mesh is written as binary glTF; give it a name that ends in .glb")
     for file in [*splats, *([target, target.parent / "textures"] if target else [])]:
         if file.exists() and not overwrite:
             raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
