@@ -173,7 +173,7 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
     from refgs.export.bake import bake
     from refgs.export.mesh import write_glb
     from refgs.export.outline import bring_out
-    from refgs.export.unwrap import unwrap
+    from refgs.export.unwrap import layout, unwrap
     from refgs.geometry.extract import extract
     from refgs.geometry.mesh import clean, is_crumbs
 
@@ -191,7 +191,10 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
         )
         report("warning", {"what": what})
     mesh = unwrap(mesh)
-    report("stage", {"what": "baking the textures"})
+    charts = layout(mesh)
+    density = " to ".join(f"{value:.2f}" for value in charts.density)
+    what = f"{charts.used:.0%} of the texture used, density {density}, angles bent by {charts.bend:.1f}°; baking"
+    report("stage", {"what": what})
 
     def baked(done: int, total: int) -> None:
         report("progress", {"stage": "baking", "done": done, "total": total})

@@ -14,7 +14,7 @@ from refgs.export.splats import Splats
 from refgs.export.tangents import vertex_tangents
 from refgs.geometry.mesh import Mesh
 
-FINE = 4  # texels at least that a splat's standard deviation is long where splats are composited; between them textures are linear
+FINE = 3  # texels at least that a splat's standard deviation is long where splats are composited; between them textures are linear
 _ROWS = 64  # of texels at a time
 _BESIDE = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]
 
