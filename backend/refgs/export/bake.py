@@ -67,18 +67,16 @@ def _upsampled(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np.
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     covered = np.abs(_area(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0])).sum()
     texel = np.sqrt(area / max(covered, 1e-12)) / size
-    smallest = float(np.quantile(splats.scales[:, :2].min(axis=1), 0.25))
-    step = 1
-    while size % (2 * step) == 0 and 2 * step <= min(smallest / (FINE * texel), size / 256):  # charts are 1/128 apart
-        step *= 2
-    coarse = size // step
+    deviation = float(np.median(splats.scales[:, :2].min(axis=1)))
+    # Two charts, 1/128 apart, must not reach each other by the texel that each goes beyond its edge.
+    coarse = min(size, max(int(np.ceil(size * FINE * texel / deviation)), min(size, 256)))
     face, weights, points = _rasterise(mesh, _flat(mesh, coarse), coarse, slice(0, coarse))
     mask = face >= 0
     normals = _mean(weights[mask], mesh.normals[mesh.faces[face[mask]]])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     found = np.zeros((coarse, coarse, 9), np.float32)
     found[mask, :8] = composite(splats, points[mask], normals, progress)
-    if step == 1:
+    if coarse == size:
         return found
     found = found[tuple(distance_transform_edt(~mask, return_distances=False, return_indices=True))]
     parts = [cv2.resize(found[..., part], (size, size)) for part in (slice(0, 4), slice(4, 8), slice(8, 9))]
