@@ -146,6 +146,8 @@ class Job:
                 self.warnings.append(event["what"])
             case "decided":
                 self.decided[event["about"]] = event["what"]
+            case "progress" if self.curve and "stage" in event:  # of the mesh: what the training reached stays shown
+                self.line = ""
             case "progress":
                 self.progress, self.line = event, ""
                 if "stage" not in event:  # of a training

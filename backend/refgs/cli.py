@@ -133,7 +133,7 @@ def bench(
     what: Annotated[
         str,
         typer.Argument(
-            help="kernels, iteration, scaling, threads, gpu, splitsum, truth, ablations, importing or paper"
+            help="kernels, iteration, scaling, threads, gpu, splitsum, truth, meshing, bake, ablations, importing or paper"
         ),
     ] = "kernels",
 ) -> None:

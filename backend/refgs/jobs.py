@@ -152,6 +152,8 @@ def export(
     source = read_splats(folder) if run is None else run.splats
     splats = [file for file in (splats_file, display_file) if file is not None]
     target = mesh_file if mesh_file or splats else folder / "mesh.glb"
+    if target is not None and target.suffix.lower() != ".glb":
+        raise InputError(f"{target}: the mesh is written as binary glTF; give it a name that ends in .glb")
     for file in [*splats, *([target, target.parent / "textures"] if target else [])]:
         if file.exists() and not overwrite:
             raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
@@ -176,16 +178,20 @@ def export(
 
 
 def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> None:
-    from refgs.export.bake import bake, unwrap
+    from refgs.export.bake import bake
     from refgs.export.mesh import write_glb
+    from refgs.export.outline import bring_out
+    from refgs.export.unwrap import layout, unwrap
     from refgs.geometry.extract import extract
     from refgs.geometry.mesh import clean, is_crumbs
 
-    settings = run.settings.mesh
-    mesh = extract(run.surfels(), run.training_cameras(), run.near, run.centre, run.radius, settings.resolution)
+    settings, cameras = run.settings.mesh, run.training_cameras()
+    mesh = extract(run.surfels(), cameras, run.near, run.centre, run.radius, settings.resolution)
     report("stage", {"what": f"fused {len(mesh.faces):,} triangles"})
     mesh = clean(mesh, settings.triangles)
-    report("stage", {"what": f"simplified to {len(mesh.faces):,} triangles; unwrapping"})
+    report("stage", {"what": f"simplified to {len(mesh.faces):,} triangles; bringing it out to its outlines"})
+    mesh = bring_out(mesh, run.render, cameras, 2 * run.radius / settings.resolution)
+    report("stage", {"what": "unwrapping"})
     if is_crumbs(mesh):
         what = (
             "the mesh is in pieces, none of them half of it: the photos do not agree on a surface; "
@@ -193,8 +199,16 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
         )
         report("warning", {"what": what})
     mesh = unwrap(mesh)
-    report("stage", {"what": "baking the textures"})
-    textures = bake(mesh, run.splats, texture or settings.texture)
+    charts = layout(mesh)
+    density = " to ".join(f"{value:.2f}" for value in charts.density)
+    what = f"{charts.used:.0%} of the texture used, density {density}, angles bent by {charts.bend:.1f}°; baking"
+    report("stage", {"what": what})
+
+    def baked(done: int, total: int) -> None:
+        report("progress", {"stage": "baking", "done": done, "total": total})
+
+    textures = bake(mesh, run.splats, texture or settings.texture, baked)
+    report("stage", {"what": "writing"})
     write_glb(target, mesh, textures)
 
 

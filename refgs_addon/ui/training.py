@@ -285,7 +285,7 @@ def _how_far(job: jobs.Job) -> str:
         return "waiting" if job.state == "waiting" else "starting"
     if "stage" in job.progress:
         stage = job.progress["stage"]
-        return "learning colours" if stage == "colours" else f"finding cameras: {stage}"
+        return {"colours": "learning colours", "baking": "baking textures"}.get(stage, f"finding cameras: {stage}")
     return f"{_duration(job.progress['seconds_left'])} left"
 
 

@@ -170,6 +170,7 @@ def test_what_fails_is_said_and_what_was_done_before_it_stays(start):
     job = start(mesh=True)
     until(lambda: job.ended)
     assert job.state == "failed" and job.line == "the mesh is crumbs" and "train" in job.results
+    assert job.progress["psnr"] == 30  # the panel shows it beside the curve, the mesh's own progress notwithstanding
 
 
 def test_a_trainer_that_dies(start):

@@ -5,9 +5,11 @@ from scipy.ndimage import distance_transform_edt, label
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from refgs.export.bake import bake, unwrap
+from refgs.export.bake import bake
+from refgs.export.occlusion import openness
 from refgs.export.splats import Splats
 from refgs.export.tangents import vertex_tangents
+from refgs.export.unwrap import unwrap
 from refgs.geometry.mesh import Mesh, smooth_normals
 
 
@@ -71,14 +73,6 @@ def look_up(texture, uv):
     return (at(y0, x0) * (1 - s) + at(y0, x0 + 1) * s) * (1 - t) + (
         at(y0 + 1, x0) * (1 - s) + at(y0 + 1, x0 + 1) * s
     ) * t
-
-
-def test_unwrap_keeps_the_surface(unwrapped):
-    mesh = ball()
-    assert len(unwrapped.faces) == len(mesh.faces)
-    assert unwrapped.uv.min() >= 0 and unwrapped.uv.max() <= 1
-    np.testing.assert_allclose(unwrapped.vertices[unwrapped.faces], mesh.vertices[mesh.faces])
-    np.testing.assert_allclose(unwrapped.normals, unwrapped.vertices, atol=0.01)
 
 
 def test_materials_come_back_where_they_were(unwrapped):
@@ -153,3 +147,49 @@ def test_far_or_transparent_splats_still_give_colour(unwrapped):
     assert np.isfinite(textures.normal).all() and textures.base_color.std() > 0.1
     one = Splats(**{name: value[:1] for name, value in vars(splats).items()})
     np.testing.assert_allclose(bake(unwrapped, one, 64).base_color[0, 0], one.albedo[0], rtol=1e-5)
+
+
+def test_normals_are_those_of_the_point_not_of_the_splats_middle(unwrapped):
+    # Few and uneven: the mean of the splats that a ray meets lies beside it.
+    splats = sphere_of_splats(3000)
+    rng = np.random.default_rng(3)
+    some = rng.permutation(3000)[:1500]
+    splats = Splats(**{name: value[some] for name, value in vars(splats).items()})
+    splats.scales *= 1.5
+    textures = bake(unwrapped, splats, 256)
+    faces, weights, uv = on_surface(unwrapped)
+    points, n = (np.einsum("nk,nkc->nc", weights, a[faces]) for a in (unwrapped.vertices, unwrapped.normals))
+    tangents, signs = vertex_tangents(unwrapped)
+    t = np.einsum("nk,nkc->nc", weights, tangents[faces])
+    c = look_up(textures.normal, uv)
+    shaded = c[:, :1] * t + c[:, 1:2] * signs[faces[:, :1]] * np.cross(n, t) + c[:, 2:] * n
+    points, shaded = (a / np.linalg.norm(a, axis=1, keepdims=True) for a in (points, shaded))
+    assert np.degrees(np.arccos((points * shaded).sum(1).clip(-1, 1))).mean() < 0.6
+
+
+def test_the_nearer_layer_hides_the_farther(unwrapped):
+    """Both look outward; the one that lies a little inside is covered by the other, not blended with it."""
+    outer, inner = sphere_of_splats(), sphere_of_splats(radius=0.96)
+    outer.opacities[:], inner.opacities[:] = 0.95, 0.95
+    inner.albedo[:] = 0
+    both = Splats(**{name: np.concatenate([value, getattr(inner, name)]) for name, value in vars(outer).items()})
+    alone = bake(unwrapped, outer, 128)
+    assert np.abs(bake(unwrapped, both, 128).base_color - alone.base_color)[alone.mask].mean() < 0.02
+
+
+def test_what_stands_in_the_open_and_what_does_not():
+    """Beside a wall as high as wide is far, half of the light comes; on a sphere all of it."""
+    np.testing.assert_allclose(openness(ball()), 1)
+    corner = trimesh.util.concatenate(
+        [
+            trimesh.creation.box((8, 8, 0.1)).subdivide().subdivide().subdivide(),
+            trimesh.creation.box((0.1, 8, 8), trimesh.transformations.translation_matrix((-4, 0, 4))),
+        ]
+    )
+    mesh = Mesh(np.array(corner.vertices), np.array(corner.faces), np.array(corner.vertex_normals))
+    free = openness(mesh)
+    top = (mesh.vertices[:, 2] > 0) & (mesh.vertices[:, 2] < 0.1) & (np.abs(mesh.vertices[:, 1]) < 1)
+    near = top & (np.abs(mesh.vertices[:, 0] + 3) < 0.1)
+    far = top & (mesh.vertices[:, 0] > 2.9) & (mesh.vertices[:, 0] < 3.1)
+    assert near.any() and far.any()
+    assert 0.5 < free[near].mean() < 0.65 and free[far].mean() > 0.85

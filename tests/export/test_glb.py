@@ -9,10 +9,11 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from refgs.color import srgb_encode
-from refgs.export.bake import Textures, unwrap
+from refgs.export.bake import Textures
 from refgs.export.environment import read_exr
 from refgs.export.mesh import write_glb
 from refgs.export.tangents import vertex_tangents
+from refgs.export.unwrap import unwrap
 from refgs.geometry.mesh import Mesh, smooth_normals
 
 SIZE = 64
@@ -29,7 +30,7 @@ def make():
 
     ramp = np.broadcast_to(np.linspace(0, 1, SIZE, dtype=np.float32), (SIZE, SIZE))
     colour = np.dstack([ramp, full(0.2), ramp.T])
-    return mesh, Textures(colour, full(0.75), full(0.3), full(0.6, 0, 0.8), np.ones((SIZE, SIZE), bool))
+    return mesh, Textures(colour, full(0.75), full(0.3), full(0.9), full(0.6, 0, 0.8), np.ones((SIZE, SIZE), bool))
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def written(tmp_path_factory):
 
 def test_the_folder_holds_what_it_should(written):
     folder, _, textures = written
-    names = {"base_color", "metallic", "roughness", "normal"}
+    names = {"base_color", "metallic", "roughness", "occlusion", "normal"}
     files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     assert files == {"mesh.glb"} | {f"textures/{n}.{e}" for n in names for e in ("png", "exr")}
     np.testing.assert_array_equal(read_exr(folder / "textures" / "base_color.exr"), textures.base_color)
@@ -68,7 +69,7 @@ def test_gltf_is_y_up_and_routes_its_channels(written):
         return np.asarray(Image.open(io.BytesIO(binary[start : start + view["byteLength"]])))
 
     np.testing.assert_array_equal(
-        picture(surface["metallicRoughnessTexture"])[5, 5, 1:], [round(0.3 * 255), round(0.75 * 255)]
+        picture(surface["metallicRoughnessTexture"])[5, 5], [round(0.9 * 255), round(0.3 * 255), round(0.75 * 255)]
     )
     np.testing.assert_array_equal(picture(material["normalTexture"])[5, 5], [204, 128, 230])
     assert np.abs(picture(surface["baseColorTexture"]) / 255 - srgb_encode(textures.base_color)).max() < 0.51 / 255

@@ -23,9 +23,9 @@ _Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # glTF 2.0, 3.4: +Y is up
 def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     """Write the mesh (Z up; with normals and uv) as Y-up binary glTF with a metallic-roughness material.
 
-    Embedded: base colour (sRGB), roughness and metallic (G and B, linear), the tangent-space normal map and the tangents that `bake`
-    assumed, MikkTSpace's: not every reader makes these. Beside the file, in textures/, the same
-    maps as 8-bit PNG and as linear float EXR (the normal mapped to 0..1 in both), for 8 bits are coarse on a mirror.
+    Embedded: base colour (sRGB), occlusion, roughness and metallic (R, G and B, linear), the tangent-space normal map and the
+    tangents that `bake` assumed, MikkTSpace's: not every reader makes these. Beside the file, in textures/, the same maps as
+    8-bit PNG and as linear float EXR (the normal mapped to 0..1 in both), for 8 bits are coarse on a mirror.
     Each file is written whole or not at all.
     """
     path = Path(path)
@@ -33,6 +33,7 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
         "base_color": textures.base_color,
         "metallic": textures.metallic,
         "roughness": textures.roughness,
+        "occlusion": textures.occlusion,
         "normal": 0.5 + 0.5 * textures.normal,
     }
     folder = path.parent / "textures"
@@ -46,13 +47,12 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
             temporary.write_bytes(png.getvalue())
         write_exr(folder / f"{name}.exr", linear)
 
-    roughness, metallic = pictures["roughness"], pictures["metallic"]
+    packed = Image.fromarray(np.dstack([pictures[name] for name in ("occlusion", "roughness", "metallic")]))
     material = PBRMaterial(
         name="RefGS",
         baseColorTexture=Image.fromarray(pictures["base_color"]),
-        metallicRoughnessTexture=Image.fromarray(
-            np.dstack([np.full_like(roughness, 255), roughness, metallic])  # red is occlusion's, if a reader looks
-        ),
+        metallicRoughnessTexture=packed,
+        occlusionTexture=packed,
         normalTexture=Image.fromarray(pictures["normal"]),
         metallicFactor=1.0,
         roughnessFactor=1.0,

@@ -1,0 +1,96 @@
+"""Splats blended at points of a surface, as the renderer would in front of each."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from refgs.export.splats import Splats
+
+NEIGHBOURS = 64  # splats that a ray is tried against
+FADED = 1 / 255  # alpha that is nothing
+REACH = 3.0  # standard deviations of a splat: what lies farther before or behind the surface is not of it
+RIDGE = 0.1  # of the spread of the splats' positions: keeps the slope of the normals tame where they lie in a line
+_CHUNK = 1 << 13  # points at a time: about 100 MB
+
+Progress = Callable[[int, int], None]
+
+
+def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress: Progress) -> np.ndarray:
+    """Base colour, metallic, roughness and unit normal (N, 8), float32, of splats at points (N, 3) of a surface with unit normals
+    (N, 3).
+
+    Along the normal, from outside, the splats near the surface are composited front to back, each with its opacity times its Gaussian
+    where the ray meets its plane, those that look inwards left out; then divided by the sum of their weights. The blended normal
+    belongs to the mean of the positions, not to the point: it is taken there by the slope of the normals, by weighted least squares.
+    Where no splat reaches, the nearest ones decide. `progress` hears how many points are done.
+    """
+    table, values = _table(splats), _values(splats)
+    spread = float(np.median(splats.scales[:, :2].mean(axis=1))) or 1.0
+    count = min(NEIGHBOURS, len(splats))
+    # Points that share a cell of half a splat share neighbours.
+    cell = np.floor(points / (spread / 2)).astype(np.int64)
+    cell -= cell.min(axis=0)
+    _, first, cell = np.unique(np.ravel_multi_index(cell.T, cell.max(0) + 1), return_index=True, return_inverse=True)
+    near = cKDTree(splats.positions).query(points[first], k=np.arange(1, count + 1), workers=-1)[1].astype(np.int32)
+    result = np.empty((len(points), values.shape[1]), np.float32)
+    with torch.no_grad():
+        for start in range(0, len(points), _CHUNK):
+            at = slice(start, start + _CHUNK)
+            given = (torch.from_numpy(np.asarray(x[at], np.float32)) for x in (points, normals))
+            result[at] = _composite(table, values, torch.from_numpy(near[cell[at]]), *given, spread).numpy()
+            progress(min(start + _CHUNK, len(points)), len(points))
+    return result
+
+
+def _table(splats: Splats) -> Tensor:
+    """(N, 15): position, both axes over their standard deviations, plane's normal, outward normal, opacity, mean deviation."""
+    w, x, y, z = (splats.rotations / np.linalg.norm(splats.rotations, axis=1, keepdims=True)).T
+    u = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
+    v = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
+    scales = np.maximum(splats.scales[:, :2], 1e-12)
+    columns = [splats.positions, u / scales[:, :1], v / scales[:, 1:], np.cross(u, v), splats.normals]
+    columns += [splats.opacities[:, None], scales.mean(axis=1, keepdims=True)]
+    return torch.from_numpy(np.concatenate(columns, axis=1).astype(np.float32))
+
+
+def _values(splats: Splats) -> Tensor:
+    columns = [splats.albedo, splats.metallic[:, None], splats.roughness[:, None], splats.normals]
+    return torch.from_numpy(np.concatenate(columns, axis=1).astype(np.float32))
+
+
+def _composite(table: Tensor, values: Tensor, near: Tensor, points: Tensor, normals: Tensor, spread: float) -> Tensor:
+    rows = table[near.flatten()].view(*near.shape, -1)
+    center, u, v, plane, outward, opacity, deviation = rows.split((3, 3, 3, 3, 3, 1, 1), dim=-1)
+    offset, ray = center - points[:, None], normals[:, None]
+
+    slant = (plane * ray).sum(dim=-1)
+    slant = torch.where(slant.abs() < 1e-3, 1e-3, slant)
+    height = (plane * offset).sum(dim=-1) / slant  # of where the ray meets the splat, above the surface
+    met = height[..., None] * ray - offset
+    apart = (u * met).sum(dim=-1) ** 2 + (v * met).sum(dim=-1) ** 2
+    alpha = opacity[..., 0] * torch.exp(-0.5 * apart)
+    counts = (alpha > FADED) & ((outward * ray).sum(dim=-1) > 0) & (height.abs() < REACH * deviation[..., 0])
+    alpha = torch.where(counts, alpha, 0)
+    order = height.argsort(dim=1, descending=True)
+    passed = (1 - alpha.gather(1, order)).cumprod(dim=1)
+    before = torch.cat([torch.ones_like(passed[:, :1]), passed[:, :-1]], dim=1)
+    weight = alpha * torch.empty_like(alpha).scatter_(1, order, before)
+    covered = weight.sum(dim=1, keepdim=True)
+    # The last term decides only where no splat reaches.
+    weight = weight + 1e-5 / (1 + (offset * offset).sum(dim=-1) / spread**2) ** 4
+    weight = (weight / weight.sum(dim=1, keepdim=True))[:, None]
+
+    of_splats = values[near.flatten()].view(*near.shape, -1)
+    blended = (weight @ of_splats)[:, 0]
+    mean = weight @ offset  # (n, 1, 3)
+    across = (offset - mean) * weight.transpose(1, 2)
+    square = across.transpose(1, 2) @ (offset - mean)
+    square = square + (RIDGE * square.diagonal(dim1=1, dim2=2).sum(dim=1) + 1e-12)[:, None, None] * torch.eye(3)
+    slope = torch.linalg.solve(square, across.transpose(1, 2) @ (of_splats[..., 5:] - blended[:, None, 5:]))
+    along = mean[:, 0] - (mean[:, 0] * normals).sum(dim=1, keepdim=True) * normals
+    blended[:, 5:] -= covered * (along[:, None] @ slope)[:, 0]
+    blended[:, 5:] = torch.nn.functional.normalize(blended[:, 5:], dim=1)
+    return blended

@@ -1,0 +1,36 @@
+"""How open a mesh is to the light around it, vertex by vertex."""
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from refgs.geometry.mesh import Mesh
+
+RAYS = 64
+_LIFT = 1e-3  # of the mesh's size: rays start this far above it
+_CHUNK = 1 << 14  # vertices at a time
+
+
+def openness(mesh: Mesh) -> np.ndarray:
+    """The part (V,) of a uniform light that reaches each vertex past the mesh, by rays about its normal weighted by the cosine: glTF's
+    occlusion, 1 where nothing is in the way."""
+    middle = mesh.vertices.mean(axis=0)  # rays are traced in single precision
+    vertices = (mesh.vertices - middle).astype(np.float32)
+    scene = EmbreeScene()
+    TriangleMesh(scene, vertices, mesh.faces.astype(np.int32))
+    # A spiral over the disc, lifted to the hemisphere: its points are as dense as the cosine.
+    place = np.arange(RAYS) + 0.5
+    radius, turn = np.sqrt(place / RAYS), place * np.pi * (3 - 5**0.5)
+    ways = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - radius**2)], axis=1)
+    normals = mesh.normals
+    across = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
+    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
+    frames = np.stack([across, np.cross(normals, across), normals], axis=1)
+    lift = _LIFT * np.linalg.norm(np.ptp(vertices, axis=0))
+    free = np.empty(len(vertices), np.float32)
+    for start in range(0, len(vertices), _CHUNK):
+        at = slice(start, start + _CHUNK)
+        rays = (ways @ frames[at]).astype(np.float32)
+        origins = np.repeat(vertices[at] + (lift * normals[at]).astype(np.float32), RAYS, axis=0)
+        free[at] = (scene.run(origins, rays.reshape(-1, 3)) < 0).reshape(-1, RAYS).mean(axis=1)
+    return free

@@ -1,0 +1,85 @@
+"""A mesh laid out in a square, for textures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import xatlas
+
+from refgs.geometry.mesh import Mesh
+
+PART = (
+    800  # triangles: xatlas's time grows faster than linearly with those of a mesh, and it lays out meshes side by side
+)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How well charts are laid out: the part of the square that they fill; the texels that a unit of surface gets against the mean,
+    at the 5th and 95th percentile of the surface; the mean angle in degrees by which corners of triangles are bent, by surface."""
+
+    used: float
+    density: tuple[float, float]
+    bend: float
+
+
+def unwrap(mesh: Mesh) -> Mesh:
+    """The mesh cut into charts with uv, by xatlas; charts keep 1/128 of the texture's side from each other.
+
+    Vertices on seams are doubled; their normals are those of `mesh`. It is cut into parts of at most PART triangles first, halved where
+    they are longest, each of which has charts of its own; all are packed at once.
+    """
+    atlas, parts = xatlas.Atlas(), []
+    for part in _parts(mesh):
+        vertices, faces = np.unique(mesh.faces[part], return_inverse=True)
+        given = mesh.vertices[vertices], faces.reshape(-1, 3), mesh.normals[vertices]
+        atlas.add_mesh(*(x.astype(kind) for x, kind in zip(given, (np.float32, np.uint32, np.float32), strict=True)))
+        parts.append((part, vertices))
+    pack = xatlas.PackOptions()
+    pack.resolution = 1024
+    pack.padding = 8
+    atlas.generate(pack_options=pack)
+    side = np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)  # no longer one way than the other
+    sources, uvs, faces, count = [], [], np.empty_like(mesh.faces), 0
+    for i, (part, vertices) in enumerate(parts):
+        source, corners, uv = atlas[i]
+        faces[part] = corners.astype(np.int64) + count
+        sources.append(vertices[source])
+        uvs.append(uv * side)
+        count += len(source)
+    source = np.concatenate(sources)
+    return Mesh(mesh.vertices[source], faces, mesh.normals[source], np.concatenate(uvs))
+
+
+def _parts(mesh: Mesh) -> list[np.ndarray]:
+    """The numbers of the faces of each part."""
+    middle, done, left = mesh.vertices[mesh.faces].mean(axis=1), [], [np.arange(len(mesh.faces))]
+    while left:
+        part = left.pop()
+        if len(part) <= PART:
+            done.append(part)
+            continue
+        axis = np.ptp(middle[part], axis=0).argmax()
+        order = part[np.argsort(middle[part, axis], kind="stable")]
+        left += [order[len(order) // 2 :], order[: len(order) // 2]]
+    return done
+
+
+def layout(mesh: Mesh) -> Layout:
+    """What `Layout` says of a mesh with uv."""
+    corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    laid = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
+    density = laid / np.maximum(area, 1e-30) * area.sum() / laid.sum()
+    order = np.argsort(density)
+    share = np.cumsum(area[order]) / area.sum()
+    low, high = (float(density[order][np.searchsorted(share, s)]) for s in (0.05, 0.95))
+    bend = np.abs(_angles(corners) - _angles(uv)).mean(axis=1)
+    return Layout(float(laid.sum()), (low, high), float(np.degrees((bend * area).sum() / area.sum())))
+
+
+def _angles(corners: np.ndarray) -> np.ndarray:
+    """The angles (F, 3) of triangles (F, 3, 2 or 3), radians."""
+    after, before = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    lengths = np.linalg.norm(after, axis=-1) * np.linalg.norm(before, axis=-1)
+    return np.arccos(np.clip((after * before).sum(axis=-1) / np.maximum(lengths, 1e-30), -1, 1))
