@@ -90,7 +90,7 @@ def evaluate(
 @app.command()
 def export(
     run: Annotated[Path, typer.Argument(help="a run folder, or a PLY file of splats by any program")],
-    mesh: Annotated[Path | None, typer.Option(help="the mesh's file (default: RUN/mesh.glb)")] = None,
+    mesh: Annotated[Path | None, typer.Option(help="the mesh's file, .glb or .obj (default: RUN/mesh.glb)")] = None,
     texture: Annotated[int | None, typer.Option(min=64, max=8192, help="side of the textures, in pixels")] = None,
     splats: Annotated[Path | None, typer.Option(help="write the splats to this file")] = None,
     display_splats: Annotated[

@@ -152,9 +152,12 @@ def export(
     source = read_splats(folder) if run is None else run.splats
     splats = [file for file in (splats_file, display_file) if file is not None]
     target = mesh_file if mesh_file or splats else folder / "mesh.glb"
-    if target is not None and target.suffix.lower() != ".glb":
-        raise InputError(f"{target}: the mesh is written as binary glTF; give it a name that ends in .glb")
-    for file in [*splats, *([target, target.parent / "textures"] if target else [])]:
+    if target is not None and target.suffix.lower() not in (".glb", ".obj"):
+        raise InputError(f"{target}: a mesh is written as .glb or .obj; give it a name that ends so")
+    beside = [target, target.parent / "textures"] if target else []
+    if target is not None and target.suffix.lower() == ".obj":
+        beside.append(target.with_suffix(".mtl"))
+    for file in [*splats, *beside]:
         if file.exists() and not overwrite:
             raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
     with _on_disk((target or splats[0]).parent, "export again"):
@@ -179,7 +182,7 @@ def export(
 
 def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> None:
     from refgs.export.bake import bake
-    from refgs.export.mesh import write_glb
+    from refgs.export.mesh import write_glb, write_obj
     from refgs.export.outline import bring_out
     from refgs.export.unwrap import layout, unwrap
     from refgs.geometry.extract import extract
@@ -209,7 +212,8 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
 
     textures = bake(mesh, run.splats, texture or settings.texture, baked)
     report("stage", {"what": "writing"})
-    write_glb(target, mesh, textures)
+    write = write_obj if target.suffix.lower() == ".obj" else write_glb
+    write(target, mesh, textures)
 
 
 def update_metrics(folder: Path, facts: dict[str, Any]) -> None:

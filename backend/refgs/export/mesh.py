@@ -1,4 +1,4 @@
-"""mesh.glb: the textured mesh as binary glTF 2.0, with its textures beside it."""
+"""The textured mesh as binary glTF 2.0 or as Wavefront OBJ, with its textures beside it."""
 
 import io
 import os
@@ -20,33 +20,17 @@ from refgs.paths import whole
 _Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # glTF 2.0, 3.4: +Y is up
 
 
+FOLDER = "textures"  # beside the mesh
+
+
 def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     """Write the mesh (Z up; with normals and uv) as Y-up binary glTF with a metallic-roughness material.
 
     Embedded: base colour (sRGB), occlusion, roughness and metallic (R, G and B, linear), the tangent-space normal map and the
-    tangents that `bake` assumed, MikkTSpace's: not every reader makes these. Beside the file, in textures/, the same maps as
-    8-bit PNG and as linear float EXR (the normal mapped to 0..1 in both), for 8 bits are coarse on a mirror.
-    Each file is written whole or not at all.
+    tangents that `bake` assumed, MikkTSpace's: not every reader makes these. Beside the file what `write_textures` writes.
     """
     path = Path(path)
-    maps = {
-        "base_color": textures.base_color,
-        "metallic": textures.metallic,
-        "roughness": textures.roughness,
-        "occlusion": textures.occlusion,
-        "normal": 0.5 + 0.5 * textures.normal,
-    }
-    folder = path.parent / "textures"
-    folder.mkdir(parents=True, exist_ok=True)
-    pictures = {}
-    for name, linear in maps.items():
-        pictures[name] = _bytes(srgb_encode(linear.clip(0, 1)) if name == "base_color" else linear)
-        png = io.BytesIO()
-        Image.fromarray(pictures[name]).save(png, "PNG")
-        with whole(folder / f"{name}.png") as temporary:
-            temporary.write_bytes(png.getvalue())
-        write_exr(folder / f"{name}.exr", linear)
-
+    pictures = write_textures(path.parent / FOLDER, textures)
     packed = Image.fromarray(np.dstack([pictures[name] for name in ("occlusion", "roughness", "metallic")]))
     material = PBRMaterial(
         name="RefGS",
@@ -71,6 +55,47 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     scene.add_geometry(model, node_name="RefGS", geom_name="RefGS")
     with whole(path) as temporary:
         temporary.write_bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=_named))
+
+
+def write_obj(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
+    """Write the mesh (Z up; with normals and uv) as Y-up Wavefront OBJ, its material beside it as MTL with what is customary for
+    metallic and roughness (map_Pm, map_Pr, norm), which name the pictures that `write_textures` writes."""
+    path = Path(path)
+    write_textures(path.parent / FOLDER, textures)
+    maps = {"map_Kd": "base_color", "map_Pr": "roughness", "map_Pm": "metallic", "norm": "normal"}
+    lines = ["newmtl RefGS", "Kd 1 1 1", "Pr 1", "Pm 1", *(f"{key} {FOLDER}/{name}.png" for key, name in maps.items())]
+    with whole(path.with_suffix(".mtl")) as temporary:
+        temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    corner = (mesh.faces + 1).repeat(3, axis=1).reshape(-1, 9)  # one number for place, uv and normal
+    with whole(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        file.write(f"mtllib {path.with_suffix('.mtl').name}\no RefGS\n")
+        np.savetxt(file, mesh.vertices @ _Y_UP.T, "v %.9g %.9g %.9g")
+        np.savetxt(file, mesh.uv, "vt %.9g %.9g")
+        np.savetxt(file, mesh.normals @ _Y_UP.T, "vn %.6g %.6g %.6g")
+        file.write("usemtl RefGS\n")
+        np.savetxt(file, corner, "f" + " %d/%d/%d" * 3)
+
+
+def write_textures(folder: Path, textures: Textures) -> dict[str, np.ndarray]:
+    """Write the maps as 8-bit PNG and as linear float EXR (the normal mapped to 0..1 in both), for 8 bits are coarse on a mirror; each
+    file whole or not at all. Returns the 8-bit ones by their names, base colour sRGB-encoded."""
+    maps = {
+        "base_color": textures.base_color,
+        "metallic": textures.metallic,
+        "roughness": textures.roughness,
+        "occlusion": textures.occlusion,
+        "normal": 0.5 + 0.5 * textures.normal,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = {}
+    for name, linear in maps.items():
+        pictures[name] = _bytes(srgb_encode(linear.clip(0, 1)) if name == "base_color" else linear)
+        png = io.BytesIO()
+        Image.fromarray(pictures[name]).save(png, "PNG")
+        with whole(folder / f"{name}.png") as temporary:
+            temporary.write_bytes(png.getvalue())
+        write_exr(folder / f"{name}.exr", linear)
+    return pictures
 
 
 def _named(tree: dict) -> None:
