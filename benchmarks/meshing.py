@@ -48,7 +48,7 @@ def measure(folder: Path, truth: Path, resolution: int) -> list[str]:
     cameras, true = run.training_cameras(), GroundTruth(truth, run.to_capture).mesh()
     surfels = run.surfels()
     before, begun = peak_memory(), perf_counter()
-    mesh = extract(surfels, cameras, run.near, run.centre, run.radius, resolution)
+    mesh, _ = extract(surfels, cameras, run.near, run.centre, run.radius, resolution)
     fused = perf_counter()
     small = clean(mesh, run.settings.mesh.triangles)
     ended, memory = perf_counter(), peak_memory() - before

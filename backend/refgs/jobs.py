@@ -4,15 +4,16 @@ import errno
 import json
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from refgs.capture import read_capture
-from refgs.errors import InputError
+from refgs.errors import InputError, InputWarning
 from refgs.export.splats import read_splats, write_display_splats, write_splats
 from refgs.kernels import cuda
 from refgs.lock import RunLock
@@ -85,16 +86,17 @@ def train(
                 trainer.resume()
                 report("stage", {"what": f"going on from iteration {trainer.iteration}"})
             else:
-                create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
+                with _on_disk([out], "train again"):
+                    create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
                 held.enter_context(lock)
-            held.enter_context(_on_disk(out, "go on with --resume"))
+            held.enter_context(_on_disk([out], "go on with --resume"))
             trainer.run(lambda: attend(trainer) or lock.attend(trainer))
         except torch.OutOfMemoryError:
             raise full_card() from None
         except InputError:
             raise
         except Exception:
-            if out.is_dir():
+            with suppress(OSError):
                 (out / "log.txt").write_text(traceback.format_exc(), encoding="utf-8")
             raise
         if not trainer.ended:
@@ -115,17 +117,17 @@ def train(
 
 
 @contextmanager
-def _on_disk(folder: Path, again: str) -> Iterator[None]:
-    """Raise InputError where it is the disk that failed: full, not to be written, or taken out."""
+def _on_disk(folders: list[Path], again: str) -> Iterator[None]:
+    """Raise InputError where it is the disk that failed which the folders are on: full, not to be written, or taken out."""
     try:
         yield
     except InputError:
         raise
     except Exception as error:
-        if not folder.is_dir():
-            raise InputError(f"{folder} is no longer there: put its disk back, then {again}") from error
+        if gone := next((folder for folder in folders if not folder.is_dir()), None):
+            raise InputError(f"{gone} is no longer there: put its disk back, then {again}") from error
         if isinstance(error, OSError) and error.errno in DISKS:
-            why = f"{error.filename or folder} cannot be written ({error.strerror})"
+            why = f"{error.filename or folders[0]} cannot be written ({error.strerror})"
             raise InputError(f"{why}: mend that, then {again}; what was written before is whole") from error
         raise
 
@@ -148,19 +150,32 @@ def export(
         raise InputError(
             f"{folder} is no run folder, so there is no mesh: add --splats FILE.ply or --display-splats FILE.ply"
         )
-    run = None if alone else open_run(folder)
-    source = read_splats(folder) if run is None else run.splats
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", InputWarning)
+        run = None if alone else open_run(folder)
+        source = read_splats(folder) if run is None else run.splats
+    for warning in said:
+        report("warning", {"what": str(warning.message)})
     splats = [file for file in (splats_file, display_file) if file is not None]
     target = mesh_file if mesh_file or splats else folder / "mesh.glb"
     if target is not None and target.suffix.lower() not in (".glb", ".obj"):
         raise InputError(f"{target}: a mesh is written as .glb or .obj; give it a name that ends so")
+    for file in splats:
+        if file.suffix.lower() != ".ply" or splats.count(file) > 1:
+            raise InputError(f"{file}: splats are written as .ply, each to a file of its own")
     beside = [target, target.parent / "textures"] if target else []
     if target is not None and target.suffix.lower() == ".obj":
         beside.append(target.with_suffix(".mtl"))
     for file in [*splats, *beside]:
         if file.exists() and not overwrite:
             raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
-    with _on_disk((target or splats[0]).parent, "export again"):
+    folders = [file.parent for file in [*splats, *beside[:1]]]
+    try:
+        for out in folders:
+            out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: the folder cannot be made ({error.strerror}): choose another") from None
+    with _on_disk(folders, "export again"):
         if splats_file is not None:
             write_splats(splats_file, source)
         if display_file is not None and run is None:
@@ -189,11 +204,11 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
     from refgs.geometry.mesh import clean, is_crumbs
 
     settings, cameras = run.settings.mesh, run.training_cameras()
-    mesh = extract(run.surfels(), cameras, run.near, run.centre, run.radius, settings.resolution)
+    mesh, voxel = extract(run.surfels(), cameras, run.near, run.centre, run.radius, settings.resolution)
     report("stage", {"what": f"fused {len(mesh.faces):,} triangles"})
     mesh = clean(mesh, settings.triangles)
     report("stage", {"what": f"simplified to {len(mesh.faces):,} triangles; bringing it out to its outlines"})
-    mesh = bring_out(mesh, run.render, cameras, 2 * run.radius / settings.resolution)
+    mesh = bring_out(mesh, run.render, cameras, voxel)
     report("stage", {"what": "unwrapping"})
     if is_crumbs(mesh):
         what = (

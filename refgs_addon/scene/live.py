@@ -15,7 +15,7 @@ from ..nodes.splats import NAME
 class _Live:
     job: jobs.Job
     scene: str
-    item: str = ""  # the object's name, for undo makes another object of it
+    item: str  # the object's name, for undo makes another object of it
     iteration: int = -1
     coming: Future | None = None
 
@@ -25,11 +25,17 @@ _reader = ThreadPoolExecutor(1)
 
 
 def watch(job: jobs.Job, scene: bpy.types.Scene, on: bool = True) -> None:
-    """Show a job's surfels in a scene whenever there is a new preview of them, or no longer."""
+    """Show a job's surfels in a scene whenever there is a new preview of them, or no longer. The object is there at once, without points,
+    for making its nodes takes longer than a timer should."""
     for live in [live for live in _shown if live.job is job]:
         _take_away(live)
     if on and not job.ended:
-        _shown.append(_Live(job, scene.name))
+        from .splats import add_splats
+
+        name = f"{job.name} in training"
+        item = add_splats(name, compat.new_point_cloud(name, 0), scene.collection)
+        compat.set_modifier_input(item.modifiers[NAME], "Display", "Base Color")  # there is no light yet
+        _shown.append(_Live(job, scene.name, item.name))
 
 
 def is_watched(job: jobs.Job) -> bool:
@@ -39,7 +45,7 @@ def is_watched(job: jobs.Job) -> bool:
 def update() -> None:
     """Put what has been read into the scene, and have what is new read, in a thread."""
     for live in list(_shown):
-        deleted = live.item and live.item not in bpy.data.objects
+        deleted = live.item not in bpy.data.objects
         if live.job.ended or deleted or live.scene not in bpy.data.scenes:
             _take_away(live)
         elif live.coming is not None and live.coming.done():
@@ -66,19 +72,12 @@ def _read(path: Path) -> dict | None:
 
 
 def _put(live: _Live, values: dict) -> None:
-    from .splats import add_splats, point_cloud
+    from .splats import point_cloud
 
-    name = f"{live.job.name} in training"
-    cloud = point_cloud(name, values)
-    if not live.item:
-        item = add_splats(name, cloud, bpy.data.scenes[live.scene].collection)
-        compat.set_modifier_input(item.modifiers[NAME], "Display", "Base Color")  # there is no light yet
-        live.item = item.name
-        return
     item = bpy.data.objects[live.item]
-    before, item.data = item.data, cloud
+    before, item.data = item.data, point_cloud(item.name, values)
     for material in before.materials:
-        cloud.materials.append(material)
+        item.data.materials.append(material)
     bpy.data.pointclouds.remove(before)
 
 

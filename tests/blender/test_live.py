@@ -37,11 +37,10 @@ def clouds():
 def test_the_surfels_come_change_and_go(job, scene, tmp_path):
     live.watch(job, scene)
     live.update()
-    assert live.is_watched(job) and not clouds()
-    preview(job, tmp_path, 10, 30)
-    until(clouds)
     (item,) = clouds()
-    assert len(item.data.points) == 30 and item.modifiers[NAME].node_group
+    assert live.is_watched(job) and len(item.data.points) == 0 and item.modifiers[NAME].node_group
+    preview(job, tmp_path, 10, 30)
+    until(lambda: len(item.data.points) == 30)
     preview(job, tmp_path, 20, 50)
     until(lambda: len(item.data.points) == 50)
     assert clouds() == [item] and len(bpy.data.pointclouds) == 1 and len(item.data.materials) == 1
@@ -57,11 +56,10 @@ def test_the_surfels_come_change_and_go(job, scene, tmp_path):
 def test_what_is_deleted_or_switched_off_stays_away(job, scene, tmp_path):
     preview(job, tmp_path, 10, 30)
     live.watch(job, scene)
-    until(clouds)
+    until(lambda: len(clouds()[0].data.points) == 30)
     live.watch(job, scene, False)
     assert not clouds() and not live.is_watched(job)
     live.watch(job, scene)
-    until(clouds)
     bpy.data.objects.remove(clouds()[0])
     live.update()
     assert not live.is_watched(job)

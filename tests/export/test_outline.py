@@ -63,5 +63,11 @@ def test_without_a_background_nothing_moves():
     def full(camera):
         return Rendering(None, torch.ones(SIDE, SIDE), None, None)
 
+    def with_a_gap(camera):
+        alpha = torch.ones(SIDE, SIDE)
+        alpha[:6, :6] = 0
+        return Rendering(None, alpha, None, None)
+
     mesh = ball(0.9)
     assert bring_out(mesh, full, cameras(3), VOXEL) is mesh
+    assert bring_out(mesh, with_a_gap, cameras(3), VOXEL) is mesh

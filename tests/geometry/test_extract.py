@@ -29,7 +29,7 @@ def ball(opacity, thickness, count=12000):
 
 
 def radii(surfels, resolution=64):
-    mesh = extract(surfels, VIEWS, NEAR, np.zeros(3), 1.3, resolution)
+    mesh, _ = extract(surfels, VIEWS, NEAR, np.zeros(3), 1.3, resolution)
     return np.linalg.norm(mesh.vertices, axis=1)
 
 

@@ -64,7 +64,7 @@ def artist():
     yield lambda: len(jobs()[-1].curve) > 4 and jobs()[-1].preview, "training"
     if numpy():
         bpy.ops.refgs.watch(number=len(jobs()) - 1)
-        yield lambda: any(item.type == "POINTCLOUD" for item in bpy.data.objects), "live"
+        yield lambda: any(item.type == "POINTCLOUD" and len(item.data.points) for item in bpy.data.objects), "live"
     tell("pause")
     yield last("paused"), "paused"
     tell("cancel")

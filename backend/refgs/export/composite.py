@@ -34,7 +34,10 @@ def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress:
     cell = np.floor(points / (spread / 2)).astype(np.int64)
     cell -= cell.min(axis=0)
     _, first, cell = np.unique(np.ravel_multi_index(cell.T, cell.max(0) + 1), return_index=True, return_inverse=True)
-    near = cKDTree(splats.positions).query(points[first], k=np.arange(1, count + 1), workers=-1)[1].astype(np.int32)
+    tree, near = cKDTree(splats.positions), np.empty((len(first), count), np.int32)
+    for start in range(0, len(first), _CHUNK):  # of distances and places it would be four times as much
+        at = slice(start, start + _CHUNK)
+        near[at] = tree.query(points[first[at]], k=np.arange(1, count + 1), workers=-1)[1]
     result = np.empty((len(points), values.shape[1]), np.float32)
     with torch.no_grad():
         for start in range(0, len(points), _CHUNK):

@@ -26,8 +26,8 @@ PRIOR = 0.05  # pixels of an outline that what is not on one counts as
 
 def bring_out(mesh: Mesh, render: Callable[[Camera], Rendering], cameras: Sequence[Camera], voxel: float) -> Mesh:
     """A mesh with its vertices moved along their normals: all by what its outlines lack in the median, those along outlines by what is
-    lacking there, and none out of an outline. As it was where pictures show no background. `voxel`, in world units, is how fine
-    it was fused: none moves by more than three."""
+    lacking there, and none out of an outline. As it was where pictures do not show the object before a background. `voxel`, in world
+    units, is how fine it was fused: none moves by more than three."""
     chosen = [cameras[i] for i in np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).astype(int)]
     views = [(camera, _inside(render(camera).alpha.numpy())) for camera in chosen]
     views = [(camera, inside) for camera, inside in views if (inside < 0).any() and (inside > 0).any()]
@@ -39,6 +39,10 @@ def bring_out(mesh: Mesh, render: Callable[[Camera], Rendering], cameras: Sequen
         if not found or not sum(len(vertex) for vertex, _ in found):
             return mesh
         vertex, lacking = (np.concatenate(part) for part in zip(*found, strict=True))
+        near = np.abs(lacking) <= most + voxel  # farther is an outline of something else: a gap in the background
+        if near.mean() < 0.5:
+            return mesh
+        vertex, lacking = vertex[near], lacking[near]
         if turn == 0:
             step += np.clip(np.median(lacking), 0, most)
         else:

@@ -20,16 +20,20 @@ COVERED = 1e-6  # alpha below which there is no depth
 @torch.no_grad()
 def extract(
     surfels: Surfels, cameras: Sequence[Camera], near: float, centre: np.ndarray, radius: float, resolution: int
-) -> Mesh:
+) -> tuple[Mesh, float]:
     """The surface that surfels show to cameras inside the cube of half-side `radius` about `centre`: as `refgs.geometry.tsdf.fuse`
-    makes it, not cleaned. Voxels are 2 `radius` / `resolution` wide, but no finer than pixels are there, in the median. Surfels nearer
-    than `near` (world units) are not seen."""
+    makes it, not cleaned. Voxels are 2 `radius` / `resolution` wide, but no finer than pixels are there, in the median; how wide comes with
+    it. Surfels nearer than `near` (world units) are not seen."""
     maps = [_depth_and_alpha(surfels, camera, near) for camera in cameras]
     depths, alphas = zip(*maps, strict=True)
-    solid = [depth[alpha > 0.5] / camera.fx for depth, alpha, camera in zip(depths, alphas, cameras, strict=True)]
-    pixel = float(torch.cat(solid).median().nan_to_num(0.0)) if any(map(len, solid)) else 0.0
-    across = min(resolution, max(int(2 * radius / max(pixel, 1e-12)), 1))
-    return fuse(depths, alphas, cameras, centre, radius, across)
+    pixels = []
+    for depth, alpha, camera in zip(depths, alphas, cameras, strict=True):
+        middle = float(camera.world_to_camera[2, :3] @ centre + camera.world_to_camera[2, 3])
+        solid = depth[(alpha > 0.5) & ((depth - middle).abs() < radius)]
+        if len(solid):
+            pixels.append(float(solid.median()) / camera.fx)
+    across = min(resolution, max(int(2 * radius / float(np.median(pixels))), 1)) if pixels else resolution
+    return fuse(depths, alphas, cameras, centre, radius, across), 2 * radius / across
 
 
 def _depth_and_alpha(surfels: Surfels, camera: Camera, near: float) -> tuple[Tensor, Tensor]:

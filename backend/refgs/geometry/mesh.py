@@ -71,7 +71,7 @@ def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
                 break
         work = trimesh.Trimesh(vertices, faces, process=False)
         work.update_faces(work.nondegenerate_faces() & work.unique_faces())
-        work.update_faces(_manifold(work))
+    work.update_faces(_manifold(work))
     used, faces = np.unique(work.faces, return_inverse=True)
     vertices = np.asarray(work.vertices)[used]
     faces = faces.reshape(-1, 3)

@@ -141,9 +141,10 @@ class Trainer:
             self._decide("light", f"the light {where}: {why}")
 
     def _decide(self, about: str, what: str) -> None:
-        """Say how something came out that was left to the photos, and once more when the run is gone on with."""
-        self.decided[about] = what
-        self.report("decided", {"about": about, "what": what})
+        """Say how something came out that was left to the photos, where that is new; a run that is gone on with says it again."""
+        if self.decided.get(about) != what:
+            self.decided[about] = what
+            self.report("decided", {"about": about, "what": what})
 
     def _drop_unused(self) -> None:
         """What this run's shading never reads does not learn."""
@@ -429,7 +430,7 @@ class Trainer:
         cameras = [view.camera for view in self.views[:: max(1, len(self.views) // TRACED)]]
         surfels, environment, self.occluder = self.surfels(), self.environment(), None
         inside = surfels.chosen(self.wanted())
-        mesh = extract(inside, cameras, self.near, capture.centre, capture.radius, settings.resolution)
+        mesh, _ = extract(inside, cameras, self.near, capture.centre, capture.radius, settings.resolution)
         try:
             self.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
         except InputError:  # there is no surface yet
