@@ -33,7 +33,7 @@ def watch(job: jobs.Job, scene: bpy.types.Scene, on: bool = True) -> None:
         from .splats import add_splats
 
         name = f"{job.name} in training"
-        item = add_splats(name, compat.new_point_cloud(name, 0), scene.collection)
+        item = add_splats(name, bpy.data.pointclouds.new(name), scene.collection)
         compat.set_modifier_input(item.modifiers[NAME], "Display", "Base Color")  # there is no light yet
         _shown.append(_Live(job, scene.name, item.name))
 
