@@ -132,16 +132,17 @@ def test_charts_keep_a_128th_of_the_side_apart(unwrapped):
         assert others[charts == chart].min() >= 4
 
 
+def together(one, other):
+    parts = {
+        name: np.concatenate([value, getattr(other, name)]) for name, value in vars(one).items() if name != "beside"
+    }
+    return Splats(**parts)
+
+
 def test_the_inside_of_a_shell_does_not_show_outside(unwrapped):
     outer, inner = sphere_of_splats(), sphere_of_splats(radius=0.97, outward=-1)
     inner.albedo[:] = 0
-    both = Splats(
-        **{
-            name: np.concatenate([value, getattr(inner, name)])
-            for name, value in vars(outer).items()
-            if name != "beside"
-        }
-    )
+    both = together(outer, inner)
     textures = bake(unwrapped, both, 128)
     assert np.abs(textures.base_color - bake(unwrapped, outer, 128).base_color)[textures.mask].max() < 0.02
 
@@ -178,13 +179,7 @@ def test_the_nearer_layer_hides_the_farther(unwrapped):
     outer, inner = sphere_of_splats(), sphere_of_splats(radius=0.96)
     outer.opacities[:], inner.opacities[:] = 0.95, 0.95
     inner.albedo[:] = 0
-    both = Splats(
-        **{
-            name: np.concatenate([value, getattr(inner, name)])
-            for name, value in vars(outer).items()
-            if name != "beside"
-        }
-    )
+    both = together(outer, inner)
     alone = bake(unwrapped, outer, 128)
     assert np.abs(bake(unwrapped, both, 128).base_color - alone.base_color)[alone.mask].mean() < 0.02
 

@@ -13,6 +13,7 @@ from plyfile import PlyElement, PlyListProperty, PlyProperty
 from refgs.color import srgb_decode
 from refgs.errors import InputError, InputWarning
 from refgs.export.ply import read_ply, write_ply
+from refgs.model.harmonics import DC
 
 
 @dataclass
@@ -52,7 +53,6 @@ CHUNK = 4096  # rows, which the processor's cache holds
 _RECEIVED = ["received_r", "received_g", "received_b"]
 _MATERIAL = ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
 _REFERENCE = ["ori_color_0", "ori_color_1", "ori_color_2", "refl_strength", "roughness"]  # Ref-Gaussian's, as logits
-_DC = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 √π)
 MATTE = 0.0, 1.0  # metallic and roughness of splats that come without materials
 # Turns that bring axis 0, 1 or 2 to the third place, as quaternions wxyz.
 _TO_THIRD = np.array([(0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1, 0, 0, 0)], np.float32)
@@ -183,7 +183,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
             *albedo, metallic, roughness = _logistic(columns(*_REFERENCE)).T
             albedo = srgb_decode(np.stack(albedo, axis=1))
         else:
-            albedo = srgb_decode((0.5 + _DC * sh[:, 0]).clip(0, 1))
+            albedo = srgb_decode((0.5 + DC * sh[:, 0]).clip(0, 1))
             metallic, roughness = (np.full(vertex.count, value, np.float32) for value in MATTE)
         splats = Splats(
             positions=columns("x", "y", "z"),
