@@ -28,8 +28,8 @@ from refgs.errors import InputError
 from refgs.paths import clone_root
 from refgs.render.renderer import render
 from refgs.report import metrics
-from refgs.report.evaluate import GroundTruth, read_relit
 from refgs.report.pictures import as_bytes, maps, over_white, write_png
+from refgs.report.truth import GroundTruth, read_relit
 from refgs.run import Run, open_run
 
 SAMPLES = 16  # of Cycles, denoised; see `Renderer`

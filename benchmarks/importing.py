@@ -66,7 +66,7 @@ def main() -> None:
             run = Path(folder) / str(count)
             run.mkdir()
             write_splats(run / "splats.ply", sphere(count))
-            splats = read(run / "splats.ply")
+            splats, _ = read(run / "splats.ply")
             rich, file = replace(sphere(count), sh=np.zeros((count, 16, 3), np.float32)), run / "rich.ply"
 
             def whole(run: Path = run) -> None:

@@ -40,8 +40,8 @@ def measure(folder: Path, truth: Path, resolution: int) -> list[str]:
     from refgs.geometry.extract import extract
     from refgs.geometry.mesh import clean
     from refgs.jobs import peak_memory
-    from refgs.report.evaluate import GroundTruth
     from refgs.report.surface import compare
+    from refgs.report.truth import GroundTruth
     from refgs.run import open_run
 
     run = open_run(folder)

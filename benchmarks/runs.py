@@ -49,6 +49,13 @@ def figures(run: Path) -> dict | None:
     return found if "psnr" in found and found.get("split") == "test" else None
 
 
+def say_failed(failed: list[Path]) -> None:
+    """End a benchmark that could not do all of its runs with status 1."""
+    if failed:
+        console.print(f"not measured, see above: {', '.join(map(str, failed))}")
+        raise SystemExit(1)
+
+
 def mean(values: list[float | None]) -> float | None:
     """None unless all are known: a mean over other scenes than those beside it would mislead."""
     return None if None in values or not values else sum(values) / len(values)

@@ -80,6 +80,19 @@ class Reflected(NamedTuple):
         return cls(scale, dielectric * scale, (1 - dielectric * scale) * material.albedo)
 
 
+def half_vectors(sine, cosine, alpha: float, u: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    """Of microfacets (..., 3) about +z, by the distribution of those that a view sees (Heitz 2018), from numbers of 0..1 and azimuths.
+    The view (sine, 0, cosine) has as many, or is one."""
+    length = np.hypot(alpha * sine, cosine)
+    x, z = alpha * sine / length, cosine / length
+    t1, t2 = np.sqrt(u) * np.cos(phi), np.sqrt(u) * np.sin(phi)
+    s = (1 + z) / 2
+    t2 = (1 - s) * np.sqrt(1 - t1**2) + s * t2
+    up = np.sqrt(np.maximum(1 - t1**2 - t2**2, 0))
+    half = np.stack([alpha * (up * x - t2 * z), alpha * t1, up * z + t2 * x], -1)
+    return half / np.linalg.norm(half, axis=-1, keepdims=True)
+
+
 def monte_carlo(
     light: Radiance, sun: np.ndarray, view: View, roughness: float, material: Material, samples: int, seed: int = 0
 ) -> tuple[float, float]:
@@ -89,15 +102,7 @@ def monte_carlo(
     n = samples // 3
     u, phi = rng.random((3, n)), 2 * np.pi * rng.random((3, n))
 
-    stretched = np.array([alpha * v[0], 0, v[2]]) / np.hypot(alpha * v[0], v[2])
-    t1, t2 = np.sqrt(u[0]) * np.cos(phi[0]), np.sqrt(u[0]) * np.sin(phi[0])
-    s = (1 + stretched[2]) / 2
-    t2 = (1 - s) * np.sqrt(1 - t1**2) + s * t2
-    up = np.sqrt(np.maximum(1 - t1**2 - t2**2, 0))
-    half = np.stack(
-        [alpha * (up * stretched[0] - t2 * stretched[2]), alpha * t1, up * stretched[2] + t2 * stretched[0]], -1
-    )
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    half = half_vectors(v[0], v[2], alpha, u[0], phi[0])
     by_lobe = 2 * (half @ v)[:, None] * half - v
 
     by_cosine = np.stack([np.sqrt(u[1]) * np.cos(phi[1]), np.sqrt(u[1]) * np.sin(phi[1]), np.sqrt(1 - u[1])], -1)
@@ -126,26 +131,37 @@ def monte_carlo(
     return float(share.mean(axis=1).sum()), float(np.sqrt(share.var(axis=1).sum() / n))
 
 
+def lobe_mean(light: Radiance, axes: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """Radiance (P,) as lobes of these roughnesses (P,) about unit axes (P, 3) see it (Eq. 8), exactly."""
+    x, weight = np.polynomial.legendre.leggauss(200)
+    psi, alpha = np.pi / 4 * (x + 1), roughness[:, None] ** 2
+    tangent = alpha * np.tan(psi)  # of half the angle from the axis
+    cosine, sine = (1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2)
+    weight = weight * ggx_lobe(cosine, roughness[:, None]) * sine * (1 + np.tan(psi) ** 2) / (1 + tangent**2)
+    azimuth = 2 * np.pi * np.arange(64) / 64
+    side = np.stack([axes[:, 2], 0 * axes[:, 0], -axes[:, 0]], axis=1)
+    flat = np.hypot(axes[:, 0], axes[:, 2]) < 1e-6
+    side[flat] = [1, 0, 0]
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    ring = np.cos(azimuth)[:, None] * side[:, None] + np.sin(azimuth)[:, None] * np.cross(axes, side)[:, None]
+    means = np.empty(len(axes))
+    for i in range(len(axes)):
+        d = cosine[i, :, None, None] * axes[i] + sine[i, :, None, None] * ring[i]
+        means[i] = weight[i] @ light(d.reshape(-1, 3)).reshape(200, 64).mean(axis=1) / weight[i].sum()
+    return means
+
+
 def split_sum(light: Radiance, view: View, roughness: float, material: Material) -> float:
     """Outgoing radiance by the split sum, both factors exact (Eq. 7 and 8), and by Lambert's law."""
-    x, weight = np.polynomial.legendre.leggauss(200)
-    psi = np.pi / 4 * (x + 1)
-    tangent = roughness**2 * np.tan(psi)  # of half the angle from the mirrored view
-    cosine, sine = (1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2)
-    weight = weight * ggx_lobe(cosine, roughness) * sine * (1 + (tangent / roughness**2) ** 2) / (1 + tangent**2)
-    azimuth = 2 * np.pi * np.arange(64) / 64
-    r, side = view.mirrored, np.array([view.mirrored[2], 0, -view.mirrored[0]])
-    d = cosine[:, None, None] * r + (sine[:, None] * np.cos(azimuth))[..., None] * side
-    d[..., 1] += sine[:, None] * np.sin(azimuth)
-    filtered = weight @ light(d.reshape(-1, 3)).reshape(200, 64).mean(axis=1) / weight.sum()
+    filtered = lobe_mean(light, view.mirrored[None], np.array([roughness]))[0]
     d, area = (v.numpy() for v in (cubemap.texel_directions(128), cubemap.texel_solid_angles(128)))
     received = (light(d) * np.maximum(d[:, 2], 0)) @ area / np.pi
     reflected = Reflected.of(material, view.way[2], roughness)
     return float(filtered * reflected.specular + received * reflected.base)
 
 
-def shaded(light: Radiance, view: View, materials: list[tuple[float, Material]]) -> Tensor:
-    """Outgoing radiance (P,) by this program's kernels: a pixel each."""
+def pixels(view: View, materials: list[tuple[float, Material]]) -> tuple[Tensor, Camera]:
+    """What `shade` takes of a surface of these roughnesses and materials, a pixel each, and the camera."""
     count = len(materials)
     right, up = np.array([0.0, 1.0, 0.0]), np.cross(view.way, [0.0, 1.0, 0.0])
     pose = np.eye(4)
@@ -158,9 +174,19 @@ def shaded(light: Radiance, view: View, materials: list[tuple[float, Material]])
     for i, (roughness, material) in enumerate(materials):
         features[0, i, 3:6], features[0, i, 6], features[0, i, 7] = material.albedo, material.metallic, roughness
     features[0, :, 8:] = (across[:, None] * torch.from_numpy(right)).float()
-    radiance = torch.from_numpy(light(cubemap.texel_directions(RESOLUTION).numpy())).float()
-    environment = Environment(radiance[:, None].expand(-1, 3).contiguous())
-    return shade(features, torch.ones(1, count), environment, camera, torch.zeros(3)).radiance[0, :, 0]
+    return features, camera
+
+
+def environment(light: Radiance, resolution: int = RESOLUTION) -> Environment:
+    """A light without colour as a cubemap: its radiance at the texels' centres."""
+    radiance = torch.from_numpy(light(cubemap.texel_directions(resolution).numpy())).float()
+    return Environment(radiance[:, None].expand(-1, 3).contiguous())
+
+
+def shaded(light: Radiance, view: View, materials: list[tuple[float, Material]]) -> Tensor:
+    """Outgoing radiance (P,) by this program's kernels: a pixel each."""
+    features, camera = pixels(view, materials)
+    return shade(features, torch.ones(1, len(materials)), environment(light), camera, torch.zeros(3)).radiance[0, :, 0]
 
 
 def main() -> None:

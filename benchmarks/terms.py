@@ -18,8 +18,8 @@ from refgs.render.shade import shade
 from refgs.render.stack import stack
 from refgs.render.volume import discs
 from refgs.report import metrics
-from refgs.report.evaluate import GroundTruth, read_relit
 from refgs.report.pictures import over_white
+from refgs.report.truth import GroundTruth, read_relit
 from refgs.run import Run, open_run
 
 PARTS = ("normals", "materials", "light", "visibility")
@@ -40,6 +40,7 @@ def terms(folder: Path, truth: Path) -> dict[str, float]:
 @torch.no_grad()
 def _view(run: Run, truth: GroundTruth, light: Environment, camera: Camera) -> dict[str, float]:
     rendering, surfels, inter_reflects = run.render(camera), run.surfels(), run.occluder is not None
+    matte = run.settings.render.reflection == "none"
     lit = channels(surfels, camera, run.settings.render, inter_reflects)
     features, _, alpha = rasterize(*discs(surfels, camera), stack(lit), camera, near=run.near)
     others = features[..., 8:-3] / alpha.clamp_min(1e-6)[..., None]  # colour by direction, light from the object
@@ -57,10 +58,11 @@ def _view(run: Run, truth: GroundTruth, light: Environment, camera: Camera) -> d
         normal = true["normal"] if "normals" in parts else rendering.normal
         material = true_materials if "materials" in parts else rendering.material
         visibility = true["visibility"] if "visibility" in parts else rendering.visibility
-        stacked = torch.cat([normal, material, others, points.float()], dim=-1)
+        dull = matte and "materials" not in parts
+        stacked = torch.cat([normal, material[..., :3] if dull else material, others, points.float()], dim=-1)
         given = opaque, light if "light" in parts else run.environment, camera, torch.ones(3)
         by_direction = run.settings.render.diffuse == "sh"
-        shaded = shade(stacked, *given, visibility if inter_reflects else None, by_direction=by_direction)
+        shaded = shade(stacked, *given, visibility if inter_reflects else None, by_direction=by_direction, matte=dull)
         return _fitted(shaded.radiance, photo)
 
     rows = {"as it is": decibels(())} | {name: decibels((name,)) for name in PARTS}

@@ -38,7 +38,7 @@ def measure(scene: Path, out: Path, preset: str) -> bool:
     truth, deferred, words = scene / "ground_truth", out / "deferred" / scene.name, ["--preset", preset]
     if not runs.measure(scene, deferred, words, truth=truth):
         return False
-    minutes = figures(deferred)["training_seconds"] / 60
+    minutes = figures(deferred)["total_seconds"] / 60
     return runs.measure(scene, out / "sh" / scene.name, [*words, "--set", "shading=sh"], minutes, truth)
 
 

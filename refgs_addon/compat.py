@@ -87,3 +87,9 @@ def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
         return list(animation.action.fcurves)
     strips = [strip for layer in animation.action.layers for strip in layer.strips]
     return [curve for strip in strips for curve in strip.channelbag(animation.action_slot).fcurves]
+
+
+def usd_keeps_textures() -> dict[str, str | bool]:
+    """What tells the USD exporter to name pictures where they lie. Raises KeyError where there is none: Debian's Blender has no USD."""
+    known = bpy.ops.wm.usd_export.get_rna_type().properties
+    return {"export_textures_mode": "KEEP"} if "export_textures_mode" in known else {"export_textures": False}

@@ -56,7 +56,8 @@ class Job:
     ready: dict = field(default_factory=dict)
     results: dict[str, dict] = field(default_factory=dict)  # "done" events by their jobs
     no_cameras: bool = False  # it failed because the capture has photos but no cameras: `poses` finds them
-    curve: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR
+    curve: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR of training views
+    held_out: list[tuple[float, float]] = field(default_factory=list)  # the same of views that are not trained on
     serial: int = field(default_factory=count().__next__)  # no other job has it
     kept: bool = False  # it goes on to its end when Blender closes
     _stopped: bool = False
@@ -152,6 +153,9 @@ class Job:
                 self.progress, self.line = event, ""
                 if "stage" not in event:  # of a training
                     self.curve.append((event["seconds"], event["psnr"]))
+            case "measured":
+                if "psnr_test" in event:
+                    self.held_out.append((event["seconds"], event["psnr_test"]))
             case "preview":
                 self.preview = event
             case "paused" | "resumed" as which:

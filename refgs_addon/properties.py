@@ -43,7 +43,12 @@ class Training(bpy.types.PropertyGroup):
         name="Limit Time", description="Train for so many minutes in place of the preset's iterations"
     )
     minutes: FloatProperty(
-        name="Minutes", description="How long to train", default=5.0, min=0.05, soft_min=1.0, soft_max=120.0
+        name="Minutes",
+        description="When all but the mesh is to be done",
+        default=5.0,
+        min=0.05,
+        soft_min=1.0,
+        soft_max=120.0,
     )
     mesh: BoolProperty(
         name="Make Mesh", description="Fuse a mesh and bake its textures when the training has ended", default=True
@@ -76,11 +81,21 @@ class Training(bpy.types.PropertyGroup):
             ("off", "One for All", "The exposure was locked"),
         ],
     )
+    specular: EnumProperty(
+        name="Gloss",
+        description="What surfaces mirror of the light",
+        items=[
+            ("auto", "Auto", "Left out where it explains nothing that the photos show, but with Paper"),
+            ("on", "Glossy", "Learn metallic and roughness, whatever the photos show"),
+            ("off", "Matte", "Nothing mirrors: faster, and the splats have a base colour alone"),
+        ],
+    )
     reflections: EnumProperty(
         name="Reflections",
         description="Of the object in itself",
         items=[
             ("auto", "Auto", "Left out where the object turns out hardly to mirror itself, but with Paper"),
+            ("on", "Of the Object Too", "Trace the object's reflections in itself, however few there are"),
             ("off", "Of the Light Only", "Leave the object's reflections in itself out: faster"),
         ],
     )

@@ -19,6 +19,14 @@ NO_CARD = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA card
 CARDS = ["emulated", pytest.param("cuda", marks=NO_CARD)]
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_package_of_the_clone() -> None:
+    """pytest takes the root for a package, for it has an __init__.py, Blender's, and has put its parent on the path by now: in a clone
+    named refgs, processes that tests spawn would find that where they look for the trainer."""
+    parent = str(Path(__file__).parents[2])
+    sys.path[:] = [folder for folder in sys.path if folder != parent]
+
+
 @pytest.fixture(params=CARDS)
 def card(request, monkeypatch) -> torch.device:
     """A CUDA card, emulated and real: for what the CPU does otherwise."""

@@ -52,6 +52,10 @@ class Camera:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
+    def cropped(self, left: int, top: int, width: int, height: int) -> "Camera":
+        """The same camera over a part of its image: so many pixels wide and high, from that column and row on."""
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
     def fitted(self, max_side: int) -> "Camera":
         """The same camera, its longer side brought down to `max_side` pixels; itself where it is not longer."""
         scale = max_side / max(self.width, self.height)

@@ -42,7 +42,8 @@ def train(
     preset: Annotated[str, typer.Option(help="quick, standard, paper, or a TOML file")] = "standard",
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
     minutes: Annotated[
-        float | None, typer.Option(min=0.05, help="train for this long instead of the preset's iterations")
+        float | None,
+        typer.Option(min=0.05, help="be done after this long, start and end included: as many iterations as fit"),
     ] = None,
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="section.key=value, e.g. train.iterations=2000")
@@ -133,7 +134,7 @@ def bench(
     what: Annotated[
         str,
         typer.Argument(
-            help="kernels, iteration, scaling, threads, gpu, splitsum, truth, meshing, bake, ablations, importing or paper"
+            help="kernels, iteration, scaling, threads, gpu, splitsum, approximations, truth, meshing, bake, ablations, importing or paper"
         ),
     ] = "kernels",
 ) -> None:
@@ -141,6 +142,16 @@ def bench(
     from refgs import commands
 
     commands.bench(what, context.args)
+
+
+@app.command()
+def stability(
+    only: Annotated[str, typer.Option(help="cases whose name holds this word, or a group of them")] = "",
+) -> None:
+    """Run stiff and extreme cases through every kernel and through training, and print their table; exit status 1 where one fails."""
+    from refgs import commands
+
+    commands.stability(only)
 
 
 @app.command()

@@ -80,7 +80,7 @@ def train(
             if event == "progress":
                 note = f"loss {facts['loss']:.4f}  {facts['psnr']:.2f} dB  {facts['splats']:,} surfels"
                 bar(facts["iteration"], note, facts["total"])
-            else:
+            elif event != "measured":
                 say(event, facts)
 
         def stop(*_) -> None:
@@ -147,8 +147,8 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
 
 def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     """Compare renderings with held-out photos, and with ground truth where there is some; write metrics.json and pictures."""
-    from refgs.report.evaluate import GroundTruth
     from refgs.report.evaluate import evaluate as measure
+    from refgs.report.truth import GroundTruth
 
     run = open_run(folder)
     if split not in ("test", "train"):
@@ -185,13 +185,25 @@ def export(
 
 def bench(what: str, options: list[str]) -> None:
     """Run a benchmark of the repository, with the options that are its own."""
-    files = (clone_root() / "benchmarks").glob("*.py")
-    texts = {file.stem: file.read_text(encoding="utf-8") for file in sorted(files)}
+    folder = clone_root() / "benchmarks"
+    files = {file.stem: file for file in folder.glob("*.py")}
+    files["approximations"] = folder / "approximations" / "__main__.py"
+    texts = {name: file.read_text(encoding="utf-8") for name, file in sorted(files.items())}
     names = [name for name, text in texts.items() if "__main__" in text]
     if what not in names:
         raise InputError(f"no benchmark {what}: take one of {', '.join(names)}")
     if options and "argparse" not in texts[what]:
         raise InputError(f"{' '.join(options)}: the benchmark {what} has no options; leave them out")
+    _run_module(f"benchmarks.{what}", options)
+
+
+def stability(only: str) -> None:
+    """Run the repository's stiff and extreme cases."""
+    _run_module("benchmarks.stability", ["--only", only])
+
+
+def _run_module(name: str, options: list[str]) -> None:
+    """A program of the repository, with words for its command line."""
     sys.path.insert(0, str(clone_root()))
     sys.argv[1:] = options
-    runpy.run_module(f"benchmarks.{what}", run_name="__main__")
+    runpy.run_module(name, run_name="__main__")

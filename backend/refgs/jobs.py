@@ -19,6 +19,7 @@ from refgs.kernels import cuda
 from refgs.lock import RunLock
 from refgs.run import Run, check_free, create_run, open_run, read_run_facts, write_text
 from refgs.settings import load_settings
+from refgs.train.plan import Plan
 from refgs.train.trainer import Report, Trainer, full_card
 
 DISKS = (
@@ -57,12 +58,15 @@ def train(
 ) -> tuple[Trainer, float | None]:
     """Train a capture into a run folder; its asset is written when the training has ended.
 
+    Where `minutes` are given it makes as many iterations as fit, and all is written by then; what it is paused for is not counted.
     `attend` is called before each iteration and stops it by True, as another process can (`refgs.lock`); the checkpoint then written
     is what `resume` goes on from. The trainer that is returned says by `ended` which it was. With it comes the mean PSNR of the
     held-out views, if there are any and the training has ended.
     """
+    from refgs.train.ambiguity import ambiguities
     from refgs.train.asset import write_asset
 
+    plan = Plan(minutes)
     device = choose_device(device, report)
     lock = RunLock(out)
     if resume:
@@ -81,7 +85,7 @@ def train(
         if resume and capture.fingerprint() != facts["fingerprint"]:
             raise InputError(f"{capture_folder} is not the capture that {out} was trained on, or it was changed since")
         try:
-            trainer = Trainer(capture, settings, out, report, minutes, device)
+            trainer = Trainer(capture, settings, out, report, plan, device)
             if resume:
                 trainer.resume()
                 report("stage", {"what": f"going on from iteration {trainer.iteration}"})
@@ -101,7 +105,8 @@ def train(
             raise
         if not trainer.ended:
             return trainer, None
-        facts = {"training_seconds": trainer.seconds}
+        facts = {"training_seconds": trainer.seconds, "processor_seconds": trainer.processor_seconds}
+        facts["steps_left_out"] = trainer.guard.left_out
         if peak := peak_memory():
             facts["peak_memory_bytes"] = peak
         if device == "cuda":
@@ -110,9 +115,14 @@ def train(
         try:
             write_asset(trainer)
             quality = trainer.test_psnr(most=len(trainer.test))
+            trades = ambiguities(trainer)
         except torch.OutOfMemoryError:
             again = f"refgs train {capture_folder} --out {out} --resume --device cpu"
             raise InputError(f"the card's memory is full; nothing is lost, go on with: {again}") from None
+        update_metrics(out, {"ambiguities": trades, "total_seconds": plan.spent})
+        for facts in trades.values():
+            if "what" in facts:
+                report("stage", {"what": facts["what"]})
         return trainer, quality
 
 
@@ -144,6 +154,7 @@ def export(
     """Fuse, clean, unwrap, bake; write the mesh and its textures. Where splats are asked for, they alone, unless the mesh's file is named
     too. Of a PLY file in a run's place, splats only. Returns what was written."""
     from refgs.export.display import displayed
+    from refgs.export.mesh import FOLDER
 
     alone = folder.suffix.lower() == ".ply" and not folder.is_dir()
     if alone and (mesh_file or not (splats_file or display_file)):
@@ -163,7 +174,7 @@ def export(
     for file in splats:
         if file.suffix.lower() != ".ply" or splats.count(file) > 1:
             raise InputError(f"{file}: splats are written as .ply, each to a file of its own")
-    beside = [target, target.parent / "textures"] if target else []
+    beside = [target, target.parent / FOLDER] if target else []
     if target is not None and target.suffix.lower() == ".obj":
         beside.append(target.with_suffix(".mtl"))
     for file in [*splats, *beside]:

@@ -60,7 +60,7 @@ class Run:
 
     def light(self, panorama: np.ndarray) -> Environment:
         """Another light for `render`: an equirectangular picture (H, W, 3) of linear radiance, in Blender's orientation."""
-        return _light(panorama, self.settings)
+        return light_of(panorama, self.settings)
 
     def relit(self, light: Environment, progress: Progress = lambda done, total: None) -> Surfels:
         """The surfels under another light, with what they receive of each other where the run has a mesh to trace that on:
@@ -84,7 +84,8 @@ class Run:
         if environment is not None:
             surfels = self.relit(environment)
             diffuse = "irradiance" if self.occluder is None else "sh"
-            settings = settings.model_copy(update={"diffuse": diffuse, "reflection": "microfacet"})
+            reflection = "none" if settings.reflection == "none" else "microfacet"
+            settings = settings.model_copy(update={"diffuse": diffuse, "reflection": reflection})
         light, background = environment or self.environment, torch.tensor(self.settings.image.background)
         with torch.no_grad():
             return render(
@@ -160,11 +161,16 @@ def open_run(folder: Path) -> Run:
     if not (folder / "splats.ply").exists():
         raise InputError(f"{folder}: the training has not ended: go on with `refgs train … --out {folder} --resume`")
     cameras, splits, to_capture, exposures = read_run_cameras(folder / "cameras.json")
-    environment = None
+    splats, environment = read_splats(folder / "splats.ply"), None
+    if (
+        settings.render.reflection != "mirror"
+    ):  # the splats say whether anything is mirrored: edits may have changed that
+        reflection = "none" if splats.constants.get("specular") == 0 else "microfacet"
+        settings = settings.model_copy(update={"render": settings.render.model_copy(update={"reflection": reflection})})
     if settings.render.shading != "sh":
         reference = next(c for c, split in zip(cameras, splits, strict=True) if split == "train")
         panorama = read_environment(folder / "environment.exr")
-        environment = _light(panorama, settings, reference if settings.light.frame == "camera" else None)
+        environment = light_of(panorama, settings, reference if settings.light.frame == "camera" else None)
     return Run(
         folder=folder,
         settings=settings,
@@ -178,13 +184,14 @@ def open_run(folder: Path) -> Run:
         splits=splits,
         to_capture=to_capture,
         exposed=any(exposure != 1 for exposure in exposures),
-        splats=read_splats(folder / "splats.ply"),
+        splats=splats,
         environment=environment,
         occluder=Occluder(read_mesh(folder / OCCLUDER)) if (folder / OCCLUDER).exists() else None,
     )
 
 
-def _light(panorama: np.ndarray, settings: Settings, reference: Camera | None = None) -> Environment:
+def light_of(panorama: np.ndarray, settings: Settings, reference: Camera | None = None) -> Environment:
+    """An equirectangular picture (H, W, 3) of linear radiance, in Blender's orientation, as the light of a run with these settings."""
     display = settings.render.color_space == "display"
     panorama = srgb_encode(panorama) if display else panorama
     return Environment.from_panorama(panorama, settings.environment.resolution, reference)

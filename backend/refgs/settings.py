@@ -10,6 +10,8 @@ from refgs.errors import InputError
 from refgs.paths import PRESETS
 
 Length = Annotated[FiniteFloat, Field(ge=0)]
+Part = Annotated[float, Field(ge=0, le=1)]
+Need = Literal["auto", "on", "off"]
 
 
 class _Section(BaseModel):
@@ -40,7 +42,7 @@ class RegionSettings(_Section):
 
 class ImageSettings(_Section):
     max_side: int = Field(ge=16, le=8192, description="photos are reduced to this many pixels on their longer side")
-    background: tuple[float, float, float] = Field(description="sRGB colour behind masked objects, 0..1")
+    background: tuple[Part, Part, Part] = Field(description="sRGB colour behind masked objects, 0..1")
 
 
 class RenderSettings(_Section):
@@ -48,8 +50,9 @@ class RenderSettings(_Section):
         description="split-sum materials, of what was blended or of each surfel before; or plain view-dependent colour"
     )
     diffuse: Literal["irradiance", "sh"] = Field(description="diffuse light: from the environment, or SH per surfel")
-    reflection: Literal["microfacet", "mirror"] = Field(
-        description="of metals and dielectrics, by roughness; or, to compare with, a mirror's before diffuse = sh, metallic its share"
+    reflection: Literal["microfacet", "mirror", "none"] = Field(
+        description="of metals and dielectrics, by roughness; none, of what is matte; or, to compare with, a mirror's before diffuse = sh, "
+        "metallic its share"
     )
     color_space: Literal["linear", "display"] = Field(
         description="radiance is linear, HDR, and encoded as sRGB at the end; or a screen's numbers, 0..1, as in the paper"
@@ -59,6 +62,8 @@ class RenderSettings(_Section):
     def _mirrors_have_colours_of_their_own(self) -> "RenderSettings":
         if self.reflection == "mirror" and self.diffuse != "sh":
             raise ValueError("reflection = mirror takes diffuse = sh; add --set diffuse=sh")
+        if self.reflection == "none" and self.diffuse != "irradiance":
+            raise ValueError("reflection = none takes diffuse = irradiance; add --set diffuse=irradiance")
         return self
 
 
@@ -166,6 +171,21 @@ class LossSettings(_Section):
     exposure: float = Field(ge=0, description="weight of a photo's being exposed as most are")
 
 
+class NeedsSettings(_Section):
+    """What a scene may do without. `auto` measures whether it does (refgs.train.needs), `on` keeps it, `off` leaves it out."""
+
+    views: Need = Field(description="photos that are another's twin, taken from where that was")
+    outside: Need = Field(description="pixels beyond the mask, but for some about it")
+    initial: Need = Field(description="the stage in which each surfel is shaded by itself")
+    specular: Need = Field(description="what surfaces mirror; without it they are matte")
+    reflections: Need = Field(description="of the object in itself: its mesh, rays, and harmonics of its light")
+    light: Need = Field(description="texels of the light finer than its blurred image on the object")
+    degrees: Need = Field(description="harmonics of the higher degrees, of what `residual` learns")
+    constants: Need = Field(
+        description="columns of splats.ply for metallic and roughness where all surfels have the same"
+    )
+
+
 class DensifySettings(_Section):
     start: float = Field(ge=0, le=1, description="part of the training after which surfels are added")
     stop: float = Field(ge=0, le=1, description="part of the training after which no more are")
@@ -212,6 +232,7 @@ class Settings(_Section):
     loss: LossSettings
     densify: DensifySettings
     propagation: PropagationSettings
+    needs: NeedsSettings
     mesh: MeshSettings
 
 
@@ -245,8 +266,9 @@ def load_settings(preset: str, changes: list[str] = ()) -> Settings:
 
 def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
     """Settings that a run wrote down; what the program did not know of yet is as in the standard preset."""
-    # All light stood in the world, no photo had an exposure, and what was left over was not learned.
+    # All light stood in the world, no photo had an exposure, what was left over was not learned, and all was held to be needed.
     still = {"light": {"frame": "world", "exposure": "off"}, "residual": {"start": 1.0}}
+    still["needs"] = dict.fromkeys(NeedsSettings.model_fields, "on")
     return validate(_merge(_merge(_read_preset("standard"), still), tables), source)
 
 

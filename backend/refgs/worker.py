@@ -180,7 +180,8 @@ class Worker:
         facts = {"run": str(out.resolve()), "iteration": trainer.iteration, "seconds": trainer.seconds}
         if not trainer.ended:
             return "cancelled", facts
-        left_out = json.loads((out / "needs.json").read_text(encoding="utf-8"))
+        needs = json.loads((out / "needs.json").read_text(encoding="utf-8"))
+        left_out = [need for need in needs if not need.get("needed", False)]
         return "done", facts | {"psnr": quality, "left_out": left_out}
 
     def _attend(self, trainer: Trainer) -> bool:

@@ -113,13 +113,15 @@ def photo(
     turning: bool = False,
     stops: float = 0.0,
     bands: bool = False,
+    angle: float = ANGLE,
+    matte: bool = False,
 ) -> np.ndarray:
-    """RGBA in 0..1 of balls (B, 4), centre and radius: mirrors with Schlick's Fresnel, or one of BANDS; alpha by `samples`² rays a
-    pixel.
+    """RGBA in 0..1 of balls (B, 4), centre and radius: mirrors with Schlick's Fresnel, one of BANDS, or a matte one with a pattern; alpha
+    by `samples`² rays a pixel.
 
     The mirrors' sky stands still, or turns with the camera, which is level, about z. Their photo is exposed so many stops more.
     """
-    focal = 0.5 * size / np.tan(ANGLE / 2)
+    focal = 0.5 * size / np.tan(angle / 2)
     grid = (np.arange(size * samples) + 0.5) / samples
     x, y = np.meshgrid(grid - size / 2, grid - size / 2)
     ray = np.stack([x / focal, -y / focal, -np.ones_like(x)], axis=-1).reshape(-1, 3) @ matrix[:3, :3].T
@@ -136,6 +138,8 @@ def photo(
     cosine, sine = np.cos(azimuth), np.sin(azimuth)
     ray = ray @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     color = np.where(seen[:, None], 2**stops * share * sky(ray), 0)
+    if matte:  # of a sky linear in the direction, a + b·d, irradiance / π is a + 2/3 b·n
+        color = np.where(seen[:, None], (0.5 + 0.3 * np.sin(6 * first_normal)) * sky(2 / 3 * first_normal), 0)
     blocks = (size, samples, size, samples)
     alpha = seen.reshape(blocks).mean(axis=(1, 3))
 
@@ -151,13 +155,13 @@ def photo(
     return np.dstack([srgb_encode(color).clip(0, 1), alpha])
 
 
-def camera_matrix(direction: np.ndarray) -> np.ndarray:
-    """OpenGL camera-to-world at DISTANCE along a direction, looking at the origin, +z up."""
+def camera_matrix(direction: np.ndarray, distance: float = DISTANCE) -> np.ndarray:
+    """OpenGL camera-to-world at a distance along a direction, looking at the origin, +z up."""
     back = direction / np.linalg.norm(direction)
     right = np.cross([0, 0, 1], back)
     right /= np.linalg.norm(right)
     matrix = np.eye(4)
-    matrix[:3] = np.stack([right, np.cross(back, right), back, DISTANCE * back], axis=1)
+    matrix[:3] = np.stack([right, np.cross(back, right), back, distance * back], axis=1)
     return matrix
 
 
@@ -169,8 +173,12 @@ def write_ball_capture(
     turning: bool = False,
     stops: tuple[float, ...] = (0.0,),
     bands: bool = False,
+    distance: float = DISTANCE,
+    matte: bool = False,
 ) -> None:
-    """A NeRF-Blender capture of balls, mirrors or with BANDS: 24 training and 4 test views. `stops` are the training views' by turns."""
+    """A NeRF-Blender capture of balls, mirrors, with BANDS, or matte: 24 training and 4 test views, as large whatever the cameras'
+    distance. `stops` are the training views' by turns."""
+    angle = ANGLE if distance == DISTANCE else 2 * np.arctan(np.tan(ANGLE / 2) * DISTANCE / distance)
     steps = np.arange(VIEWS + 4) + 0.5
     z = 0.9 - 1.5 * steps / len(steps)
     azimuth = steps * np.pi * (3 - np.sqrt(5))
@@ -178,12 +186,12 @@ def write_ball_capture(
     frames = {"train": [], "test": []}
     for i, direction in enumerate(directions):
         split = "test" if i % 7 == 3 else "train"
-        matrix = camera_matrix(direction)
+        matrix = camera_matrix(direction, distance)
         (folder / split).mkdir(exist_ok=True, parents=True)
         more = stops[i % len(stops)] if split == "train" else 0.0
-        pixels = np.rint(photo(matrix, size, balls, samples, turning, more, bands) * 255).astype(np.uint8)
+        pixels = np.rint(photo(matrix, size, balls, samples, turning, more, bands, angle, matte) * 255).astype(np.uint8)
         Image.fromarray(pixels).save(folder / split / f"r_{i}.png")
         frames[split].append({"file_path": f"./{split}/r_{i}", "transform_matrix": matrix.tolist()})
     for split, entries in frames.items():
-        text = json.dumps({"camera_angle_x": ANGLE, "frames": entries})
+        text = json.dumps({"camera_angle_x": angle, "frames": entries})
         (folder / f"transforms_{split}.json").write_text(text)

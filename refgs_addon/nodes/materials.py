@@ -4,13 +4,18 @@ import bpy
 
 from ..compat import node_tree
 from . import add, math, out
+from .edit import AMOUNT
 
 VALUES_NAME = "RefGS Splat Values"
 COLOR, VECTOR, FACTOR = 0, 1, 2  # the outputs of an Attribute node; the third is Fac up to 4.5 and Factor in 5.2
 
 
-def splat_material(name: str) -> bpy.types.Material:
-    """A new Principled material for the quads of `nodes.splats`: base colour, metallic and roughness of each splat.
+_SURFACE = {"metallic": "Metallic", "roughness": "Roughness", "specular": "Specular IOR Level"}
+
+
+def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material:
+    """A new Principled material for the quads of `nodes.splats`: base colour, metallic and roughness of each splat. What is constant, of
+    metallic, roughness and specular, no node reads.
 
     The back of a splat is black, as the inside of a solid is dark: lit, it would shine through where the splats in
     front of it leave a few per cent uncovered.
@@ -23,15 +28,32 @@ def splat_material(name: str) -> bpy.types.Material:
         "ShaderNodeBsdfPrincipled",
         {
             "Base Color": _attribute(tree, "base_color", COLOR),
-            "Metallic": _attribute(tree, "metallic", FACTOR),
-            "Roughness": _attribute(tree, "roughness", FACTOR),
+            **{socket: constants[key] for key, socket in _SURFACE.items() if key in constants},
             "Normal": normal,
         },
     )
+    for key in ("metallic", "roughness"):
+        if key not in constants:
+            tree.links.new(_attribute(tree, key, FACTOR), principled.inputs[_SURFACE[key]])
     black = add(tree, "ShaderNodeEmission", {"Strength": 0.0})
     shader = add(tree, "ShaderNodeMixShader", {0: front, 1: out(black), 2: out(principled)})
     _finish(material, out(shader))
     return material
+
+
+def read_edits(material: bpy.types.Material) -> None:
+    """Have a material of `splat_material` read all that edits change. What mirrors nothing does where an edit makes it of another
+    roughness."""
+    tree = material.node_tree
+    principled = next(node for node in tree.nodes if node.type == "BSDF_PRINCIPLED")
+    for key in ("metallic", "roughness"):
+        socket = principled.inputs[_SURFACE[key]]
+        if not socket.links:
+            tree.links.new(_attribute(tree, key, FACTOR), socket)
+    specular = principled.inputs[_SURFACE["specular"]]
+    if specular.default_value == 0 and not specular.links:
+        amount = add(tree, "ShaderNodeSeparateXYZ", {0: _attribute(tree, AMOUNT, VECTOR)}).outputs["Z"]
+        tree.links.new(math(tree, "MULTIPLY", amount, 0.5), specular)
 
 
 def values_material() -> bpy.types.Material:

@@ -5,6 +5,7 @@ import bpy
 from .. import compat
 from ..errors import InputError
 from ..nodes.edit import FOLLOW, NAME, REGIONS, edit_tree, follow_tree, show_edits
+from ..nodes.materials import read_edits
 from ..nodes.splats import NAME as SPLATS
 from .materials import give, read_material
 from .parts import parts
@@ -38,6 +39,7 @@ def add_edit(
     elif where != "Everywhere":
         compat.set_modifier_input(edit, "Region", _region(splats, collection, where))
     give(edit, values)
+    read_edits(splats.data.materials[0])
     for mesh in parts(collection).get("mesh", []):
         _follow(mesh, splats)
     return edit

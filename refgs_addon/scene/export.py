@@ -7,13 +7,15 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from numpy.lib.recfunctions import append_fields
 
 from ..errors import InputError
 from ..nodes.splats import NAME as SPLATS
 from .edit import edits, splats_of
+from .exchange import TEXTURES, write_mesh
 from .files import whole
 from .parts import FOLDER
-from .splats import MATERIALS, SH_DC, read_rows
+from .splats import MATERIALS, PLY_TYPES, SH_DC, finite, read_constants, read_rows
 
 KEPT = ("environment.exr", "cameras.json", "needs.json", "occluder.ply", "run.toml")
 DARK = 0.02  # base colour below which it does not tell how much light there is
@@ -46,18 +48,22 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     Raises InputError where the run's own file is not there or not the one that was imported, and where the new one cannot be written.
     """
     splats = splats_of(collection)
-    rows = read_rows(run_folder(collection) / "splats.ply")
+    source = run_folder(collection) / "splats.ply"
+    rows, constants = finite(read_rows(source)), read_constants(source)
     if len(rows) != len(splats.data.points):
         raise InputError(f"{run_folder(collection)} has changed since it was imported: import it again")
-    if not {*MATERIALS} <= {*rows.dtype.names}:
+    if not {*MATERIALS} <= {*rows.dtype.names, *constants}:
         mend = "make one that has with `refgs export FILE.ply --splats splats.ply`, and import that"
-        raise InputError(
-            f"{run_folder(collection) / 'splats.ply'} has no materials that edits could be written to: {mend}"
-        )
+        raise InputError(f"{source} has no materials that edits could be written to: {mend}")
     new = edited_materials(splats)
+    if edits(splats):  # not all splats have the same any more
+        columns = {name: np.full(len(rows), constants[name], "<f4") for name in MATERIALS[3:] if name in constants}
+        rows = append_fields(rows, [*columns], [*columns.values()], usemask=False) if columns else rows
+        constants = {}
     edited = np.zeros(len(rows), bool)
-    for name in ("metallic", "roughness"):
+    for name in {*MATERIALS[3:]} & {*rows.dtype.names}:
         edited |= np.abs(new[name] - rows[name]) > 1e-6
+        rows[name] = new[name]
     for i, channel in enumerate("rgb"):
         old, color, look = rows[f"albedo_{channel}"], new["base_color"][:, i], rows[f"f_dc_{i}"]
         changed = np.abs(color - old) > 1e-6
@@ -65,12 +71,13 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
         light = _decoded(0.5 + SH_DC * look) / np.maximum(old, DARK)
         rows[f"f_dc_{i}"] = np.where(changed, (_encoded(color * light) - 0.5) / SH_DC, look)
         rows[f"albedo_{channel}"] = color
-    rows["metallic"], rows["roughness"] = new["metallic"], new["roughness"]
-    by_direction = [i for i, name in enumerate(rows.dtype.names) if name.startswith("f_rest_")]
-    numbers = rows.view("<f4").reshape(len(rows), -1)
-    numbers[np.ix_(edited, by_direction)] = 0  # how the colour depended on the direction was the old material's
-    names = "".join(f"property float {name}\n" for name in rows.dtype.names)
-    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{names}end_header\n"
+    for name in rows.dtype.names:
+        if name.startswith("f_rest_"):
+            rows[name][edited] = 0  # how the colour depended on the direction was the old material's
+    types = {np.dtype(kind): name for name, kind in PLY_TYPES.items()}
+    names = "".join(f"property {types[rows.dtype[name]]} {name}\n" for name in rows.dtype.names)
+    said = "".join(f"comment constant {name} {value:g}\n" for name, value in constants.items())
+    head = f"ply\nformat binary_little_endian 1.0\n{said}element vertex {len(rows)}\n{names}end_header\n"
     with whole(path) as temporary, open(temporary, "wb") as file:
         file.write(head.encode("ascii"))
         file.write(rows)
@@ -93,6 +100,8 @@ def export_run(collection: bpy.types.Collection, folder: Path) -> None:
         for name in kept:
             if (original / name).is_file():
                 shutil.copy2(original / name, temporary / name)
+        if "mesh.glb" in kept and (original / TEXTURES).is_dir():
+            shutil.copytree(original / TEXTURES, temporary / TEXTURES)
         temporary.chmod(0o755)  # as folders are, where mkdtemp keeps others out
         os.replace(temporary, folder)
     except OSError as error:
@@ -111,13 +120,17 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
 
 
 def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
-    """Copy a run's mesh with its textures, a binary glTF. Raises InputError where it has none, and where edits would be lost."""
+    """Write a run's mesh with its textures: a .glb is the run's own, .usdc and .fbx are `exchange`'s. Raises InputError where it has
+    none, and where edits would be lost."""
     mesh = run_folder(collection) / "mesh.glb"
     if edits(splats_of(collection)):
         raise InputError("the mesh would be without the edits: apply them to a new run, and export that one's mesh")
     if not mesh.is_file():
         raise InputError(f"{mesh} is not there: make the run's mesh first")
-    _copy(mesh, path)
+    if path.suffix.lower() == ".glb":
+        _copy(mesh, path)
+    else:
+        write_mesh(mesh, path)
 
 
 def _copy(file: Path, path: Path) -> None:

@@ -64,7 +64,7 @@ def _read(path: Path) -> dict | None:
     from .splats import read_splats, with_slopes
 
     try:
-        splats = read_splats(path)
+        splats, _ = read_splats(path)
     except InputError:  # the next preview will do
         return None
     flat = np.zeros_like(splats["position"])

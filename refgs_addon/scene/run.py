@@ -11,7 +11,7 @@ from .cameras import add_camera, frame_camera, light_of, read_cameras
 from .capture import hand_over
 from .notes import capture_of
 from .relight import light_with_recovered, load_panorama
-from .splats import add_splats, normal_slopes, point_cloud, read_splats, with_slopes
+from .splats import add_splats, normal_slopes, point_cloud, read_constants, read_splats, with_slopes
 
 
 @dataclass
@@ -20,6 +20,8 @@ class Run:
 
     collection: bpy.types.Collection
     splats: bpy.types.Object
+    left_out: int
+    """How many splats are not there, for values that are not finite."""
     mesh: list[bpy.types.Object] = field(default_factory=list)
     world: bpy.types.World | None = None
     cameras: dict[str, bpy.types.Object] = field(default_factory=dict)
@@ -39,19 +41,20 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder: choose the folder that a RefGS run wrote")
     name = folder.resolve().name
-    splats = read_splats(folder / "splats.ply")
+    splats, left_out = read_splats(folder / "splats.ply")
     capture = capture_of(folder)
     frames = read_cameras(folder / "cameras.json", capture) if (folder / "cameras.json").exists() else []
-    before, world, camera = _data(), scene.world, scene.camera
+    before, world, camera = data_blocks(), scene.world, scene.camera
     try:
         collection = bpy.data.collections.new(f"RefGS {name}")
         collection[parts.FOLDER] = str(folder.resolve())
         scene.collection.children.link(collection)
         cloud = point_cloud(f"{name} splats", with_slopes(splats, *normal_slopes(splats)))
-        run = Run(collection, add_splats(cloud.name, cloud, collection))
+        drawn = add_splats(cloud.name, cloud, collection, read_constants(folder / "splats.ply"))
+        run = Run(collection, drawn, left_out)
         run.splats[parts.KEY] = "splats"
         if (folder / "mesh.glb").exists():
-            run.mesh = _add_mesh(folder / "mesh.glb", f"{name} mesh", collection)
+            run.mesh = add_mesh(folder / "mesh.glb", f"{name} mesh", collection)
         if (folder / "environment.exr").exists():
             run.world = light_with_recovered(scene, f"RefGS {name}", load_panorama(folder / "environment.exr"))
             run.light_of = light_of(folder / "cameras.json") if frames else ""
@@ -66,14 +69,14 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         parts.show(collection, "splats")
     except BaseException:
         scene.world, scene.camera = world, camera
-        bpy.data.batch_remove(_data() - before)
+        bpy.data.batch_remove(data_blocks() - before)
         raise
     if capture is not None and frames:
         hand_over(scene, capture, run.cameras)
     return run
 
 
-def _add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bpy.types.Object]:
+def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bpy.types.Object]:
     """A GLB through Blender's own importer, moved into the collection."""
     before = set(bpy.data.objects)
     try:
@@ -98,7 +101,7 @@ def _add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[b
     return meshes
 
 
-def _data() -> set[bpy.types.ID]:
+def data_blocks() -> set[bpy.types.ID]:
     """All of the file's data-blocks that an import can add to."""
     kinds = (
         "objects",
@@ -110,5 +113,6 @@ def _data() -> set[bpy.types.ID]:
         "worlds",
         "collections",
         "node_groups",
+        "scenes",
     )
     return {item for kind in kinds for item in getattr(bpy.data, kind)}

@@ -1,5 +1,6 @@
 """Splats: from splats.ply to a point cloud with a material's values on its points."""
 
+import itertools
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,6 +14,11 @@ from ..nodes.materials import splat_material, values_material
 from ..nodes.splats import NAME, splats_tree
 
 MATERIALS = "albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"
+SURFACE = {
+    "metallic": 0.0,
+    "roughness": 1.0,
+    "specular": 0.5,
+}  # what a file may say once for all; as it is where nothing is said
 SH_DC = 0.28209479177387814  # the constant spherical harmonic
 LONGEST_HEAD = 100_000  # bytes
 _STEPS = 1, 2, 4, 7, 11, 16  # along a curve, to either side: some of the next, for many splats lie on top of each other
@@ -21,15 +27,26 @@ _SPREAD = (  # how to put two zeros between the bits of a number
     (32, 0x001F00000000FFFF), (16, 0x001F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249),
 )  # fmt: skip
 _TYPES = {"base_color": "FLOAT_COLOR", "rotation": "QUATERNION"}
+PLY_TYPES = {  # numpy's by PLY's newer names, and by the older ones, which all readers know
+    "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4", "float32": "<f4", "float64": "<f8",
+    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4", "float": "<f4", "double": "<f8",
+}  # fmt: skip
+_ROWS = 4096  # at a time, which the processor's cache holds
 
 
-def add_splats(name: str, cloud: bpy.types.PointCloud, collection: bpy.types.Collection) -> bpy.types.Object:
-    """An object of splats in a collection, with the modifier that draws them. `cloud` is from `point_cloud`."""
+def add_splats(
+    name: str,
+    cloud: bpy.types.PointCloud,
+    collection: bpy.types.Collection,
+    constants: dict[str, float] | None = None,
+) -> bpy.types.Object:
+    """An object of splats in a collection, with the modifier that draws them. `cloud` is from `point_cloud`, `constants` from
+    `read_constants`: the material reads none of these from the points."""
     result = bpy.data.objects.new(name, cloud)
     collection.objects.link(result)
     # Overlapping quads would shadow each other under a lamp, in specks, and take Eevee four times as long.
     result.visible_shadow = False
-    material = splat_material(name)
+    material = splat_material(name, constants or {})
     cloud.materials.append(material)
     modifier = result.modifiers.new(NAME, "NODES")
     modifier.node_group = splats_tree(values_material())
@@ -62,16 +79,19 @@ def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointClou
     return cloud
 
 
-def read_splats(path: Path) -> dict[str, np.ndarray]:
-    """Read a run's splats.ply, or the PLY of 3DGS or 2DGS (binary, little-endian, float properties in 3DGS's names).
+def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
+    """Read a run's splats.ply, or the PLY of 3DGS or 2DGS (binary, little-endian, properties in 3DGS's names).
 
-    Returns float32 arrays: position (N, 3), normal (N, 3) unit, scale (N, 2) standard deviations, rotation (N, 4)
-    unit quaternions wxyz, opacity (N,) 0..1, base_color (N, 3) linear, metallic (N,), roughness (N,). What has no
-    materials is matte, in the colour that its constant harmonic shows; what has no normals, or zeros, has them along the
-    shortest axis. Raises InputError for any other file.
+    Returns float32 arrays, and how many splats were left out of them for values that are not finite: position (N, 3), normal (N, 3)
+    unit, scale (N, 2) standard deviations, rotation (N, 4) unit quaternions wxyz, opacity (N,) 0..1, base_color (N, 3) linear,
+    metallic (N,), roughness (N,). What has no materials is matte, in the colour that its constant harmonic shows; what has no normals,
+    or zeros, has them along the shortest axis. Raises InputError for any other file.
     """
-    rows = read_rows(path)
-    found = set(rows.dtype.names)
+    all_rows = read_rows(path)
+    rows = finite(all_rows)
+    if not len(rows):
+        raise InputError(f"{path} holds no splat whose numbers are all finite: export the run again")
+    found, constants = set(rows.dtype.names), read_constants(path)
     names = {
         "position": ["x", "y", "z"],
         "scale": ["scale_0", "scale_1", *(["scale_2"] if "scale_2" in found else [])],
@@ -83,23 +103,23 @@ def read_splats(path: Path) -> dict[str, np.ndarray]:
     if found.isdisjoint(MATERIALS):
         names["look"] = ["f_dc_0", "f_dc_1", "f_dc_2"]
     else:
-        names |= {"base_color": list(MATERIALS[:3]), "metallic": ["metallic"], "roughness": ["roughness"]}
+        names["base_color"] = list(MATERIALS[:3])
+        names |= {name: [name] for name in MATERIALS[3:] if name not in constants}
     missing = [name for group in names.values() for name in group if name not in found]
     if missing:
         raise InputError(f"{path} has no {', '.join(missing)}: it is not the splats.ply of a RefGS run")
     splats = {key: np.stack([rows[name] for name in group], axis=-1) for key, group in names.items()}
     splats = {key: value[:, 0] if value.shape[1] == 1 else value for key, value in splats.items()}
-    for key, value in splats.items():
-        if not np.isfinite(value).all():
-            mend = "`refgs export FILE.ply --splats splats.ply` leaves such splats out"
-            raise InputError(f"{path} holds a {key} that is not a finite number: {mend}")
+    splats = {key: value.astype(np.float32, copy=False) for key, value in splats.items()}
     splats["opacity"] = 1 / (1 + np.exp(-splats["opacity"]))
     splats["scale"] = np.exp(splats["scale"])
     splats["rotation"] /= np.maximum(np.linalg.norm(splats["rotation"], axis=1, keepdims=True), 1e-12)
+    for name in {*MATERIALS[3:]} & {*constants}:
+        splats[name] = np.full_like(splats["opacity"], constants[name])
     if "look" in splats:
         look = (0.5 + SH_DC * splats.pop("look")).clip(0, 1)
         splats["base_color"] = np.where(look <= 0.04045, look / 12.92, ((look + 0.055) / 1.055) ** 2.4)
-        splats["metallic"], splats["roughness"] = np.zeros_like(look[:, 0]), np.ones_like(look[:, 0])
+        splats |= {name: np.full_like(look[:, 0], SURFACE[name]) for name in MATERIALS[3:]}
     if "scale_2" in found:
         splats["rotation"], splats["scale"] = _flat(splats["rotation"], splats["scale"])
     normal = splats.setdefault("normal", np.zeros_like(splats["position"]))
@@ -107,7 +127,7 @@ def read_splats(path: Path) -> dict[str, np.ndarray]:
     w, x, y, z = splats["rotation"][none].T
     normal[none] = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    return splats
+    return splats, len(all_rows) - len(rows)
 
 
 def _flat(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -126,8 +146,20 @@ def _flat(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.stack(turned, axis=1), np.take_along_axis(scale, (shortest[:, None] + [1, 2]) % 3, axis=1)
 
 
+def finite(rows: np.ndarray) -> np.ndarray:
+    """Those of a PLY's rows all of whose numbers are finite, as `refgs` keeps them; but for the opacity, a logit, which is of 0 and 1."""
+    fine = np.ones(len(rows), bool)
+    floats = [name for name in rows.dtype.names if rows.dtype[name].kind == "f"]
+    for start in range(0, len(rows), _ROWS):
+        part, kept = rows[start : start + _ROWS], fine[start : start + _ROWS]
+        for name in floats:
+            kept &= ~np.isnan(part[name]) if name == "opacity" else np.isfinite(part[name])
+    return rows if fine.all() else rows[fine]
+
+
 def read_rows(path: Path) -> np.ndarray:
-    """The `vertex` element of a PLY file of floats (binary, little-endian) as a structured array. Raises InputError for any other."""
+    """The `vertex` element of a PLY file (binary, little-endian, that element first) as a structured array. Raises InputError for any
+    other."""
     try:
         with open(path, "rb") as file:
             head, found, _ = file.read(LONGEST_HEAD).partition(b"end_header\n")
@@ -143,20 +175,42 @@ def read_rows(path: Path) -> np.ndarray:
     return rows
 
 
+def read_constants(path: Path) -> dict[str, float]:
+    """What a run's splats.ply says of all splats at once, in comments of its head: of metallic, roughness and specular, the Principled
+    BSDF's Specular IOR Level, those that it has no columns for."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(LONGEST_HEAD).partition(b"end_header\n")[0]
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
+    columns = {line[2] for line in lines if line[:1] == ["property"] and len(line) == 3}
+    found = {}
+    for line in lines:
+        if line[:2] == ["comment", "constant"] and len(line) == 4 and line[2] in {*SURFACE} - columns:
+            try:
+                found[line[2]] = float(line[3])
+            except ValueError:
+                raise InputError(
+                    f"{path} says that {line[2]} is {line[3]}, which is no number: export the run again"
+                ) from None
+    return found
+
+
 def _layout(head: bytes, found: bytes, path: Path) -> tuple[np.dtype, int]:
     """What a row is, and how many there are, from a PLY file's head and the line that ends it."""
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     if not found or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
         raise InputError(f"{path} is not a binary little-endian PLY file: export the run again")
-    lines = [line for line in lines[2:] if line and line[0] in ("element", "property")]
-    properties = lines[1:]
-    if [line[:2] for line in lines[:1]] != [["element", "vertex"]] or any(
-        p[:2] not in (["property", "float"], ["property", "float32"]) for p in properties
-    ):
-        raise InputError(f"{path} is not a PLY file of splats (one vertex element of floats): export the run again")
+    first, *lines = [line for line in lines[2:] if line and line[0] in ("element", "property")] or [[]]
+    properties = list(itertools.takewhile(lambda line: line[0] == "property", lines))
+    if first[:2] != ["element", "vertex"] or any(line[1:2] == ["list"] for line in properties):
+        raise InputError(
+            f"{path} is not a PLY file of splats (an element vertex, first, without lists): export the run again"
+        )
     try:
-        kind, count = np.dtype([(p[2], "<f4") for p in properties]), int(lines[0][2])
-    except (IndexError, ValueError):
+        kind, count = np.dtype([(name, PLY_TYPES[kind]) for _, kind, name in properties]), int(first[2])
+    except (IndexError, KeyError, ValueError):
         raise InputError(f"{path} has a head that is broken: export the run again") from None
     if count < 1 or not properties:
         raise InputError(f"{path} is empty: export the run again")

@@ -110,7 +110,8 @@ def _choices(settings: bpy.types.PropertyGroup) -> dict[str, object]:
         "surfels.budget": settings.splats or "auto",
         "light.frame": settings.light,
         "light.exposure": settings.exposures,
-        "indirect.start": {"auto": "auto", "off": 1}[settings.reflections],
+        "needs.specular": settings.specular,
+        "needs.reflections": settings.reflections,
     }
     return {name: value for name, value in chosen.items() if value != "auto"}
 

@@ -74,6 +74,24 @@ class ExportMesh(_Export, bpy.types.Operator):
     filter_glob: StringProperty(default="*.glb", options={"HIDDEN"})
 
 
+class ExportMeshUsd(_Export, bpy.types.Operator):
+    bl_idname = "refgs.export_mesh_usd"
+    bl_label = "RefGS Mesh with Textures (.usdc)"
+    bl_description = "Write the mesh as USD, its textures in a folder beside it, whatever is hidden or selected"
+
+    kind, filename_ext = "mesh", ".usdc"
+    filter_glob: StringProperty(default="*.usdc", options={"HIDDEN"})
+
+
+class ExportMeshFbx(_Export, bpy.types.Operator):
+    bl_idname = "refgs.export_mesh_fbx"
+    bl_label = "RefGS Mesh with Textures (.fbx)"
+    bl_description = "Write the mesh as FBX, its textures in a folder beside it, whatever is hidden or selected"
+
+    kind, filename_ext = "mesh", ".fbx"
+    filter_glob: StringProperty(default="*.fbx", options={"HIDDEN"})
+
+
 class ExportLight(_Export, bpy.types.Operator):
     bl_idname = "refgs.export_light"
     bl_label = "RefGS Recovered Light (.exr)"
@@ -101,7 +119,7 @@ class ApplyEdits(_Export, bpy.types.Operator):
         self.report({"INFO"}, f"Wrote {out}" + ("; its mesh is being made" if job else mesh))
 
 
-CLASSES = (ExportSplats, ExportDisplaySplats, ExportMesh, ExportLight, ApplyEdits)
+CLASSES = (ExportSplats, ExportDisplaySplats, ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight, ApplyEdits)
 
 
 def _import_menu(self, context: bpy.types.Context) -> None:
@@ -109,7 +127,7 @@ def _import_menu(self, context: bpy.types.Context) -> None:
 
 
 def _export_menu(self, context: bpy.types.Context) -> None:
-    for operator in (ExportSplats, ExportDisplaySplats, ExportMesh, ExportLight):
+    for operator in (ExportSplats, ExportDisplaySplats, ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight):
         self.layout.operator(operator.bl_idname)
     self.layout.operator(ApplyEdits.bl_idname, text="RefGS Run with Edits (folder)")
 

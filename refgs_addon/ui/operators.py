@@ -56,6 +56,8 @@ def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, 
 
     run = import_run(folder, context.scene)
     operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
+    if run.left_out:
+        operator.report({"WARNING"}, f"{run.left_out:,} splats with numbers that are not finite are left out")
     if run.light_of:
         said = f"The light turned with the camera: the world is as it was for {run.light_of}, and for no other photo"
         operator.report({"WARNING"}, said)

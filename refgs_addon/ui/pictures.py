@@ -1,18 +1,21 @@
 """Pictures for the panels: a training's newest preview, its curve, and thumbnails of files."""
 
+import math
 from pathlib import Path
 
 import bpy
 import bpy.utils.previews
+import numpy as np
 
 from .. import jobs
 
 CURVE = 200, 130  # pixels
-GROUND, LINE = (0.0, 0.0, 0.0, 0.25), (0.35, 0.65, 1.0, 1.0)
+EDGE, DOT = 4, 3  # pixels: beside what is drawn; half a dot's side
+GROUND, GRID, LINE, DOTS = (0.0, 0.0, 0.0, 0.25), (1.0, 1.0, 1.0, 0.12), (0.35, 0.65, 1.0, 1.0), (1.0, 0.65, 0.25, 1.0)
 
 _pictures: bpy.utils.previews.ImagePreviewCollection | None = None
 _newest: dict[int, str] = {}  # by a job's id, the key of its newest picture
-_drawn: dict[int, int] = {}  # by a job's id, how many points its curve was drawn with
+_drawn: dict[int, tuple[int, int]] = {}  # by a job's id, how many points its curve was drawn with
 
 
 def picture(job: jobs.Job) -> int:
@@ -39,32 +42,45 @@ def thumbnail(file: Path, version: int = 0) -> int:
 
 
 def curve(job: jobs.Job) -> int:
-    """The icon of a picture of PSNR against seconds; 0 where there are too few points."""
+    """The icon of a picture of `plot`; 0 where there are too few points."""
     if len(job.curve) < 2 or _pictures is None:
         return 0
     key = f"{job.serial} curve"
     shown = _pictures[key] if key in _pictures else _pictures.new(key)
-    if _drawn.get(job.serial) != len(job.curve):  # the panel is drawn far more often than there is news
-        _drawn[job.serial] = len(job.curve)
+    count = len(job.curve), len(job.held_out)
+    if _drawn.get(job.serial) != count:  # the panel is drawn far more often than there is news
+        _drawn[job.serial] = count
         shown.image_size = CURVE
-        shown.image_pixels_float = _plot(job.curve)
+        shown.image_pixels_float = plot(job.curve, job.held_out).ravel().tolist()
     return shown.icon_id
 
 
-def _plot(points: list[tuple[float, float]]) -> list[float]:
-    """RGBA of a line through the points, bottom row first."""
+def plot(trained: list[tuple[float, float]], held_out: list[tuple[float, float]]) -> np.ndarray:
+    """RGBA (height, width, 4), bottom row first, of points (seconds, PSNR): a line through the training views', a dot for each of the views
+    that were held out. Time is logarithmic, as decibels are of the error; the grid is at 1, 10, 100 … seconds, and 5 dB apart."""
     width, height = CURVE
-    first, last, low, high = points[0][0], points[-1][0], min(p for _, p in points), max(p for _, p in points)
-    pixels = list(GROUND) * (width * height)
-    at, before = 0, None
-    for column in range(width):
-        while at < len(points) - 1 and points[at][0] < first + (last - first) * column / (width - 1):
-            at += 1
-        row = round((height - 6) * (points[at][1] - low) / max(high - low, 1e-6)) + 2
-        bottom, top = sorted((row, row if before is None else before))
-        for y in range(bottom, top + 3):
-            pixels[4 * (y * width + column) : 4 * (y * width + column) + 4] = LINE
-        before = row
+    points = np.array(trained + held_out)
+    points[:, 0] = np.log10(points[:, 0].clip(1e-3))
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = np.maximum(high - low, 1e-6)
+
+    def place(values: np.ndarray, axis: int) -> np.ndarray:
+        room = CURVE[axis] - 1 - 2 * EDGE
+        return np.rint(EDGE + room * (values - low[axis]) / size[axis]).astype(int)
+
+    pixels = np.empty((height, width, 4), np.float32)
+    pixels[:] = GROUND
+    pixels[:, place(np.arange(math.ceil(low[0]), math.floor(high[0]) + 1), 0)] = GRID
+    pixels[place(np.arange(5 * math.ceil(low[1] / 5), high[1] + 1e-6, 5), 1)] = GRID
+    line = points[: len(trained)]
+    columns = np.arange(EDGE, place(line[-1, 0], 0) + 1)
+    x = low[0] + size[0] * (columns - EDGE) / (width - 1 - 2 * EDGE)
+    columns, rows = columns[x >= line[0, 0]], place(np.interp(x, *line.T), 1)[x >= line[0, 0]]
+    for column, row, before in zip(columns, rows, [rows[0], *rows[:-1]], strict=True):
+        pixels[min(row, before) - 1 : max(row, before) + 2, column] = LINE
+    for x, y in points[len(trained) :]:
+        row, column = place(y, 1), place(x, 0)
+        pixels[row - DOT : row + DOT + 1, column - DOT : column + DOT + 1] = DOTS
     return pixels
 
 

@@ -196,7 +196,7 @@ class TrainPanel(Tab, bpy.types.Panel):
         head.label(text="What to Learn")
         if body is not None:
             body.use_property_split, body.use_property_decorate = True, False
-            for name in ("splats", "light", "exposures", "reflections"):
+            for name in ("splats", "light", "exposures", "specular", "reflections"):
                 body.prop(settings, name)
         row = layout.row(align=True)
         row.operator(CheckCapture.bl_idname, icon="VIEWZOOM")
@@ -231,11 +231,15 @@ def _job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs
     if job.curve:
         facts = job.progress
         row = box.row()
-        row.label(text=f"{facts['psnr']:.1f} dB")
+        row.label(text=f"{facts['psnr']:.1f} dB{f', held out {job.held_out[-1][1]:.1f}' if job.held_out else ''}")
         row.label(text=f"{facts['splats'] / 1000:.1f} k splats")
         row.label(text=f"after {_duration(facts['seconds'])}")
         if shown := curve(job):
             box.template_icon(icon_value=shown, scale=6)
+            ends = box.row()
+            ends.label(text=_duration(min(seconds for seconds, _ in job.curve + job.held_out)))
+            ends.label(text="time, logarithmic")
+            ends.label(text=_duration(job.curve[-1][0]))
     if shown := picture(job):
         box.template_icon(icon_value=shown, scale=10)
     if job.run and job.state in ("running", "paused") and "train" not in job.results:

@@ -64,6 +64,10 @@ def learn(command, asked, out):
                 "seconds_left": 10 - iteration / 100,
             }
             say("progress", **facts, loss=0.1, psnr=20 + iteration / 100, splats=10)
+            if iteration in (100, 1000):
+                say("measured", iteration=iteration, seconds=iteration / 100, psnr_test=19 + iteration / 100)
+            elif iteration == 500:  # no time to look at held-out views
+                say("measured", iteration=iteration, seconds=iteration / 100)
     (out / "progress.json").unlink()
     (out / "splats.ply").touch()
     say("done", job="train", run=str(out), iteration=1000, seconds=10.0, psnr=30.0, left_out=[])

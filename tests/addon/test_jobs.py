@@ -28,6 +28,7 @@ def test_a_training_to_its_end(start, tmp_path):
     until(lambda: job.ended)
     assert job.state == "done" and job.results["train"]["psnr"] == 30
     assert job.progress["iteration"] == 1000 and len(job.curve) == 100 and job.curve[-1] == (10.0, 30.0)
+    assert job.held_out == [(1.0, 20.0), (10.0, 29.0)]
     asked = json.loads((tmp_path / "run" / "started").read_text())
     assert asked["settings"] == ["train.seed=3"] and asked["minutes"] == 2.0 and asked["preset"] == "quick"
     assert jobs.run_state(tmp_path / "run") == "finished"

@@ -5,14 +5,19 @@ import json
 import bpy
 import numpy as np
 import pytest
+import trimesh
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
+from plyfile import PlyData, PlyElement
 
-from refgs_addon import compat
+from refgs.errors import InputWarning
+from refgs.export.splats import read_splats as read_by_refgs
+from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.splats import EXTENT, NAME
 from refgs_addon.scene.cameras import frame_camera, next_camera, photo_shown, show_photo
-from refgs_addon.scene.export import export_splats
+from refgs_addon.scene.edit import add_edit
+from refgs_addon.scene.export import export_mesh, export_splats
 from refgs_addon.scene.notes import newer
 from refgs_addon.scene.parts import parts, show
 from refgs_addon.scene.run import import_run
@@ -134,7 +139,7 @@ def test_normals_bend_as_a_sphere_does(tmp_path):
     for i in range(4):
         columns[f"rot_{i}"] = quaternion[:, i]
     write_ply(tmp_path / "splats.ply", columns)
-    splats = read_splats(tmp_path / "splats.ply")
+    splats, _ = read_splats(tmp_path / "splats.ply")
     along_u, along_v = normal_slopes(splats)
     axes = quaternion_matrix(quaternion)
     for slope, axis, scale in ((along_u, 0, "scale_0"), (along_v, 1, "scale_1")):
@@ -185,6 +190,48 @@ def test_other_programs_splats(scene, tmp_path, scales, normals):
     assert (values(cloud, "metallic") == 0).all() and (values(cloud, "roughness") == 1).all()
 
 
+def test_splats_that_are_not_finite_are_left_out(run_folder, scene, tmp_path, capfd):
+    """As many as `refgs` leaves out, and what RefGS does not know goes with its splat."""
+    columns = {**random_columns(), "semantic": np.arange(COUNT), "weight": np.linspace(0, 1, COUNT)}
+    columns |= {f"f_rest_{i}": np.zeros(COUNT) for i in range(9)}
+    columns["x"][3], columns["roughness"][[5, 6]], columns["f_rest_4"][7] = np.nan, np.inf, np.nan
+    columns["opacity"][8:11] = np.inf, -np.inf, np.nan
+    other = PlyElement.describe(np.array([(1, 2)], [("width", "<i4"), ("height", "<i4")]), "camera")
+    rows = np.zeros(COUNT, [(name, {"semantic": "u1", "weight": "<f8"}.get(name, "<f4")) for name in columns])
+    for name, value in columns.items():
+        rows[name] = value
+    PlyData([PlyElement.describe(rows, "vertex"), other], byte_order="<").write(str(run_folder / "splats.ply"))
+    kept = np.setdiff1d(np.arange(COUNT), [3, 5, 6, 7, 10])
+    with pytest.warns(InputWarning, match="5 of 40 splats"):
+        assert len(read_by_refgs(run_folder / "splats.ply")) == len(kept)
+
+    ui.register()
+    try:
+        bpy.ops.refgs.import_run(directory=f"{run_folder}/")
+        assert "5 splats with numbers that are not finite are left out" in capfd.readouterr().out
+    finally:
+        ui.unregister()
+    run = import_run(run_folder, scene)
+    assert run.left_out == 5
+    cloud = run.splats.data
+    np.testing.assert_array_equal(
+        values(cloud, "position", 3, "vector"), stacked(columns, "x", "y", "z")[kept].astype(np.float32)
+    )
+    np.testing.assert_array_equal(values(cloud, "opacity")[np.isin(kept, [8, 9])], [1, 0])
+    assert all(np.isfinite(values(cloud, name, 3, "vector")).all() for name in ("normal_u", "normal_v"))
+
+    add_edit(run.collection)
+    export_splats(run.collection, tmp_path / "edited.ply")
+    again = PlyData.read(str(tmp_path / "edited.ply"))["vertex"]
+    assert again["semantic"].tolist() == kept.tolist() and [again[n].dtype for n in ("semantic", "weight")] == [
+        "u1",
+        "f8",
+    ]
+    np.testing.assert_array_equal(again["weight"], columns["weight"][kept])
+    np.testing.assert_array_equal(again["x"], columns["x"][kept].astype(np.float32))
+    assert (again["metallic"] == 1).all() and (again["f_rest_4"] == 0).all()
+
+
 def test_edits_of_what_has_no_materials_cannot_be_written(scene, tmp_path):
     (tmp_path / "other").mkdir()
     write_ply(tmp_path / "other" / "splats.ply", others(3, True))
@@ -196,7 +243,27 @@ def test_edits_of_what_has_no_materials_cannot_be_written(scene, tmp_path):
 
 def test_one_splat_alone_is_flat(tmp_path):
     write_ply(tmp_path / "splats.ply", random_columns(1))
-    assert all((slope == 0).all() for slope in normal_slopes(read_splats(tmp_path / "splats.ply")))
+    assert all((slope == 0).all() for slope in normal_slopes(read_splats(tmp_path / "splats.ply")[0]))
+
+
+def test_one_splat_and_a_mesh_without_faces(run_folder, scene, tmp_path):
+    """They come in, are edited, and leave."""
+    write_ply(run_folder / "splats.ply", random_columns(1))
+    trimesh.Scene(trimesh.PointCloud(np.eye(3))).export(run_folder / "mesh.glb")
+    run = import_run(run_folder, scene)
+    assert len(run.splats.data.points) == 1 and len(evaluated_mesh(run.splats).polygons) == 1
+    assert [len(item.data.polygons) for item in run.mesh] == [0]
+    (run_folder / "textures").mkdir()
+    picture = bpy.data.images.new("picture", 4, 4)
+    for name in ("base_color", "metallic", "roughness", "normal", "occlusion"):
+        picture.save(filepath=str(run_folder / "textures" / f"{name}.png"))
+    for ending in (".glb", ".usdc", ".fbx"):
+        export_mesh(run.collection, tmp_path / f"un point{ending}")
+        assert (tmp_path / f"un point{ending}").stat().st_size
+    add_edit(run.collection)
+    show(run.collection, "mesh")
+    export_splats(run.collection, tmp_path / "one.ply")
+    assert PlyData.read(str(tmp_path / "one.ply"))["vertex"].count == 1
 
 
 def test_mesh_stands_where_the_splats_are(run_folder, scene):
@@ -329,6 +396,18 @@ def without_materials(path):
     write_ply(path, {k: v for k, v in random_columns().items() if k not in ("metallic", "roughness")})
 
 
+def listed(path):
+    path.write_bytes(path.read_bytes().replace(b"property float y\n", b"property list uchar float y\n"))
+
+
+def other_first(path):
+    path.write_bytes(path.read_bytes().replace(b"element vertex", b"element face 0\nelement vertex"))
+
+
+def unknown_type(path):
+    path.write_bytes(path.read_bytes().replace(b"property float y\n", b"property floaty y\n"))
+
+
 def bent_camera(path):
     path.write_text(json.dumps({"frames": [{**FRAMES[0], "transform_matrix": [[1, 2], [3, 4]]}]}))
 
@@ -342,8 +421,11 @@ def bent_camera(path):
         ("splats.ply", twice, "head that is broken"),
         ("splats.ply", negative, "is empty"),
         ("splats.ply", without_properties, "is empty"),
+        ("splats.ply", listed, "is not a PLY file of splats"),
+        ("splats.ply", other_first, "is not a PLY file of splats"),
+        ("splats.ply", unknown_type, "head that is broken"),
         ("splats.ply", not_json, "not a binary little-endian PLY"),
-        ("splats.ply", infinite, "metallic that is not a finite number"),
+        ("splats.ply", infinite, "holds no splat whose numbers are all finite"),
         ("splats.ply", without_materials, "has no metallic, roughness"),
         ("cameras.json", not_json, "not the cameras.json"),
         ("cameras.json", bent_camera, "not the cameras.json"),

@@ -19,6 +19,7 @@ from refgs_addon.scene.run import import_run
 from refgs_addon.scene.splats import read_rows
 from refgs_addon.ui import capture as capture_ui
 from refgs_addon.ui.closing import question
+from refgs_addon.ui.pictures import CURVE, DOTS, GRID, LINE, plot
 from refgs_addon.ui.training import how_far_elsewhere
 from tests.addon.waiting import until
 
@@ -90,7 +91,7 @@ def test_what_is_to_be_learned(addon, capture):
     settings = addon.refgs
     settings.splats, settings.light, settings.exposures, settings.reflections = 5000, "camera", "off", "off"
     job = training.train(addon)
-    changes = {"surfels.budget": 5000, "light.frame": "camera", "light.exposure": "off", "indirect.start": 1}
+    changes = {"surfels.budget": 5000, "light.frame": "camera", "light.exposure": "off", "needs.reflections": "off"}
     assert told(job.run) == changes
     until(lambda: job.progress)
     assert job.decided == {"light": "the light stands still: it brightens so"}
@@ -132,6 +133,26 @@ def checked(addon, capture):
     for number in range(2):
         shutil.copy(job.results["check"]["thumbnails"][number], capture / f"{number}.png")
     return job, len(jobs.JOBS) - 1
+
+
+def test_the_curve_in_the_panel():
+    """PSNR that grows as time's logarithm is a straight line, the views held out are dots on it; more of either is drawn as it comes."""
+    height, width = CURVE[1], CURVE[0]
+    seconds = np.geomspace(0.5, 200, 60)
+    trained = [(s, 20 + 5 * np.log10(s)) for s in seconds]
+    drawn = plot(trained, [(seconds[30], trained[30][1])])
+    assert drawn.shape == (height, width, 4)
+    line = (drawn == np.float32(LINE)).all(axis=2)
+    rows, columns = np.nonzero(line)
+    assert columns.max() - columns.min() > 0.9 * width and rows.max() - rows.min() > 0.9 * height
+    straight = np.polyval(np.polyfit(columns, rows, 1), columns)
+    assert np.abs(rows - straight).max() < 4
+    dots = np.argwhere((drawn == np.float32(DOTS)).all(axis=2))
+    assert len(dots) == 49 and np.abs(dots.mean(axis=0) - [rows.mean(), columns.mean()]).max() < 4
+    decades = np.flatnonzero((drawn[0] == np.float32(GRID)).all(axis=1))
+    assert len(decades) == 3 and abs(np.diff(decades)).max() - abs(np.diff(decades)).min() <= 1, "1, 10 and 100 seconds"
+    flat = plot([(1.0, 20.0), (2.0, 20.0)], [])
+    assert np.isfinite(flat).all() and (flat == np.float32(LINE)).all(axis=2).any()
 
 
 class Drawn:

@@ -3,76 +3,19 @@ import pytest
 import trimesh
 from scipy.ndimage import distance_transform_edt, label
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
+from benchmarks.approximations.textures import ball, look_up, on_surface, paint, sphere_of_splats
 from refgs.export.bake import bake
 from refgs.export.occlusion import openness
 from refgs.export.splats import Splats
 from refgs.export.tangents import vertex_tangents
 from refgs.export.unwrap import unwrap
-from refgs.geometry.mesh import Mesh, smooth_normals
-
-
-def paint(p):
-    """A colour that varies smoothly over the unit sphere."""
-    return 0.5 + 0.4 * np.sin(2 * p + [0, 1, 2])
-
-
-def sphere_of_splats(count=4000, radius=1.0, outward=1.0):
-    i = np.arange(count) + 0.5
-    z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
-    ring = np.sqrt(1 - z * z)
-    n = np.stack([np.cos(phi) * ring, np.sin(phi) * ring, z], axis=1)
-    u = np.cross(n, [0.3, 0.5, 0.8])
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    rotations = Rotation.from_matrix(np.stack([u, np.cross(n, u), n], axis=2)).as_quat()[:, [3, 0, 1, 2]]
-    f = np.float32
-    return Splats(
-        positions=(radius * n).astype(f),
-        normals=(outward * n).astype(f),
-        sh=np.zeros((count, 1, 3), f),
-        opacities=np.full(count, 0.8, f),
-        scales=np.full((count, 2), radius * np.sqrt(4 * np.pi / count), f),
-        rotations=rotations.astype(f),
-        albedo=paint(n).astype(f),
-        metallic=(0.5 + 0.5 * n[:, 2]).astype(f),
-        roughness=(0.5 - 0.4 * n[:, 0]).astype(f),
-        received=np.ones((count, 3), f),
-        indirect=np.zeros((count, 0, 3), f),
-    )
-
-
-def ball(level=3):
-    sphere = trimesh.creation.icosphere(level)
-    return Mesh(np.array(sphere.vertices), np.array(sphere.faces), smooth_normals(sphere.vertices, sphere.faces))
+from refgs.geometry.mesh import Mesh
 
 
 @pytest.fixture(scope="module")
 def unwrapped():
     return unwrap(ball())
-
-
-def on_surface(mesh, count=3000):
-    """Random faces and barycentric weights, and their uv."""
-    rng = np.random.default_rng(2)
-    faces = mesh.faces[rng.integers(len(mesh.faces), size=count)]
-    weights = rng.dirichlet([1, 1, 1], size=count)
-    return faces, weights, np.einsum("nk,nkc->nc", weights, mesh.uv[faces])
-
-
-def look_up(texture, uv):
-    """Bilinear, as a renderer does, v upward."""
-    size = len(texture)
-    x, y = uv[:, 0] * size - 0.5, (1 - uv[:, 1]) * size - 0.5
-    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
-    s, t = (x - x0).reshape(-1, *[1] * (texture.ndim - 2)), (y - y0).reshape(-1, *[1] * (texture.ndim - 2))
-
-    def at(row, column):
-        return texture[row.clip(0, size - 1), column.clip(0, size - 1)]
-
-    return (at(y0, x0) * (1 - s) + at(y0, x0 + 1) * s) * (1 - t) + (
-        at(y0 + 1, x0) * (1 - s) + at(y0 + 1, x0 + 1) * s
-    ) * t
 
 
 def test_materials_come_back_where_they_were(unwrapped):
@@ -112,6 +55,17 @@ def test_the_normal_map_mends_a_coarse_mesh():
     assert np.percentile(degrees(shaded), 99) < 4
 
 
+@pytest.mark.parametrize("size", [128, 320])
+def test_how_many_rows_are_baked_at_a_time_does_not_matter(unwrapped, monkeypatch, size):
+    """Where all texels are composited, and where fewer are and then enlarged."""
+    splats, found = sphere_of_splats(300), []
+    for rows in (37, size):
+        monkeypatch.setattr("refgs.export.bake._ROWS", rows)
+        found.append(bake(unwrapped, splats, size))
+    for name, value in vars(found[0]).items():
+        np.testing.assert_allclose(value, getattr(found[1], name), atol=1e-5, err_msg=name)
+
+
 def test_padding_repeats_the_nearest_texel(unwrapped):
     textures = bake(unwrapped, sphere_of_splats(500), 128)
     rows, columns = np.nonzero(textures.mask)
@@ -134,7 +88,9 @@ def test_charts_keep_a_128th_of_the_side_apart(unwrapped):
 
 def together(one, other):
     parts = {
-        name: np.concatenate([value, getattr(other, name)]) for name, value in vars(one).items() if name != "beside"
+        name: np.concatenate([value, getattr(other, name)])
+        for name, value in vars(one).items()
+        if isinstance(value, np.ndarray)
     }
     return Splats(**parts)
 
@@ -152,7 +108,7 @@ def test_far_or_transparent_splats_still_give_colour(unwrapped):
     splats.opacities[:] = 0
     textures = bake(unwrapped, splats, 64)
     assert np.isfinite(textures.normal).all() and textures.base_color.std() > 0.1
-    one = Splats(**{name: value[:1] for name, value in vars(splats).items() if name != "beside"})
+    one = Splats(**{name: value[:1] for name, value in vars(splats).items() if isinstance(value, np.ndarray)})
     np.testing.assert_allclose(bake(unwrapped, one, 64).base_color[0, 0], one.albedo[0], rtol=1e-5)
 
 
@@ -161,7 +117,7 @@ def test_normals_are_those_of_the_point_not_of_the_splats_middle(unwrapped):
     splats = sphere_of_splats(3000)
     rng = np.random.default_rng(3)
     some = rng.permutation(3000)[:1500]
-    splats = Splats(**{name: value[some] for name, value in vars(splats).items() if name != "beside"})
+    splats = Splats(**{name: value[some] for name, value in vars(splats).items() if isinstance(value, np.ndarray)})
     splats.scales *= 1.5
     textures = bake(unwrapped, splats, 256)
     faces, weights, uv = on_surface(unwrapped)

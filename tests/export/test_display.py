@@ -1,5 +1,7 @@
 """Splats for viewers that know no light: they show what the run shows, in the properties that such viewers read."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ from plyfile import PlyData
 from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.export.display import displayed
-from refgs.export.splats import THIN, read_splats, write_display_splats
+from refgs.export.splats import THIN, Splats, read_splats, write_display_splats, write_splats
 from refgs.jobs import export
 from refgs.model.surfels import from_splats
 from refgs.render.renderer import render
@@ -80,3 +82,24 @@ def test_splats_alone_are_exported_unless_the_mesh_is_named(run, tmp_path, monke
     assert len(PlyData.read(str(tmp_path / "b.ply"))["vertex"].properties) == 17 + 45
     with pytest.raises(InputError, match=r"b\.ply exists: add --overwrite"):
         export(run.folder, None, None, None, tmp_path / "b.ply", False, lambda event, facts: None)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_run_of_few_splats_leaves_in_every_format(run, tmp_path, monkeypatch, count):
+    """There is no mesh of none, nor of one disc, which those who look at its edge do not see; that is said."""
+    monkeypatch.setattr("refgs.export.display.ITERATIONS", 3)
+    folder = tmp_path / "des éclats, été"
+    shutil.copytree(run.folder, folder, ignore=shutil.ignore_patterns("mesh.glb"))
+    splats = {name: value[:count] for name, value in vars(run.splats).items() if isinstance(value, np.ndarray)}
+    splats |= {"positions": np.zeros((count, 3), np.float32), "scales": np.full((count, 2), 0.3, np.float32)}
+    write_splats(folder / "splats.ply", Splats(**splats))
+
+    def leave(mesh=None, ours=None, display=None):
+        return export(folder, mesh, 64, ours, display, False, lambda event, facts: None)
+
+    for file in leave(None, folder / "les nôtres.ply", folder / "à voir.ply"):
+        assert len(read_splats(file)) == count
+    for file in (folder / "mesh.glb", tmp_path / "à part" / "la forme.obj"):
+        with pytest.raises(InputError, match="there is no mesh"):
+            leave(file)
+        assert not file.exists()

@@ -6,7 +6,7 @@ from refgs.export.splats import Splats, read_splats, write_splats
 
 
 def arrays(splats):
-    return {name: value for name, value in vars(splats).items() if name != "beside"}
+    return {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
 
 
 def make(count=7, coefficients=16, indirect=0):

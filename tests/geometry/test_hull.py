@@ -2,8 +2,8 @@ import logging
 
 import numpy as np
 import pytest
-from analytic import around, gradient, look_at, mask, sphere, torus
 
+from benchmarks.distances import around, gradient, look_at, mask, sphere, torus
 from refgs.errors import InputError
 from refgs.geometry.hull import visual_hull_points
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from analytic import around, box, depth, gradient, look_at, sphere, torus
 
+from benchmarks.distances import around, box, depth, gradient, look_at, sphere, torus
 from refgs.geometry.tsdf import fuse
 
 VIEWS = around(24, 128)

@@ -3,6 +3,7 @@
 import functools
 import gc
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from refgs.kernels import load, reference
 from refgs.render import raster_cuda
-from refgs.render.rasterize import Raster, rasterize
+from refgs.render.rasterize import Raster, rasterize, trimmed_depth
 from tests.kernels import scenes
 from tests.kernels.emulate import emulate
 
@@ -78,6 +79,33 @@ def test_any_number_of_channels(channels, device):
 )
 def test_any_image(kind, size, centre, device):
     check(device, *case(kind, 3, size, centre))
+
+
+@pytest.mark.parametrize("kind", scenes.KINDS)
+@pytest.mark.parametrize("trim", [(0.75, 0.25), (1.0, 0.6)])
+def test_trimmed_depth_matches_reference(kind, trim, device):
+    camera, (*inputs, _) = scenes.camera(), scenes.surfels(kind, 0)
+    exact = [v.double() for v in inputs]
+    _, depth, alpha, margin = reference.rasterize(*exact, exact[-1][:, None], camera, scenes.NEAR, *trim)
+    found = [m.cpu() for m in trimmed_depth(*(v.to(device) for v in inputs), camera, scenes.NEAR, *trim)]
+    part = trim[0] - (1 - alpha).clamp(*trim[::-1])
+    safe = (margin > MARGIN) & ((part > 0.01) | (part == 0))  # of a small part float32 has few digits
+    assert safe.float().mean() > 0.85 and part[safe].max() > 0.05
+    expected = torch.where(part > 0, depth / part, 0)[safe]
+    assert (found[0][safe] - expected).abs().max() <= 1e-4 * expected.max()
+    assert (found[1] - alpha)[margin > MARGIN].abs().max() <= FORWARD
+
+
+def test_trimmed_depth_is_that_of_the_surface(device):
+    """Discs across the camera's axis: fog before the surface, and what shows through it a thousand times as far, move the mean."""
+    camera = replace(scenes.camera(9, 9, (4.5, 4.5)), world_to_camera=np.eye(4))
+    depths, opacities = torch.tensor([0.5, 0.7, 2.0, 2000.0]), torch.tensor([0.1, 0.1, 0.9, 0.9])
+    positions = torch.stack([0 * depths, 0 * depths, depths], dim=1)
+    flat, wide = torch.tensor([[1.0, 0, 0, 0]]).repeat(4, 1), 100 * depths[:, None].repeat(1, 2)
+    inputs = [v.to(device) for v in (positions, flat, wide, opacities)]
+    trimmed, alpha = trimmed_depth(*inputs, camera, scenes.NEAR, 0.75, 0.25)
+    mean = rasterize(*inputs, inputs[-1][:, None], camera, scenes.NEAR).depth / alpha
+    assert (trimmed.cpu() - 2).abs().max() < 1e-4 and mean.min() > 100
 
 
 def test_more_tiles_than_16_bits_number(monkeypatch):
@@ -190,7 +218,7 @@ def test_exactly_edge_on_is_a_dot(device):
     inputs = centre.float()[None], rotation[None], torch.full((1, 2), 0.3), torch.ones(1), torch.ones(1, 1)
     raster = Raster(*(m.cpu() for m in rasterize(*(v.to(device) for v in inputs), camera, near=0.1)))
     y, x = torch.meshgrid(torch.arange(9) - 4.0, torch.arange(9) - 4.0, indexing="ij")
-    expected = torch.exp(-(x**2 + y**2)).clamp_max(0.99)
+    expected = torch.exp(-4 * (x**2 + y**2)).clamp_max(0.99)  # a variance of 1/8
     off_the_line = y != 0
     expected = torch.where(expected >= 1 / 255, expected, 0)
     assert torch.allclose(raster.alpha[off_the_line], expected[off_the_line], atol=1e-5)

@@ -124,20 +124,27 @@ def test_matches_reference(indirect, appearance, size, device):
         assert error <= GRADIENT, (name, error.item())
 
 
-@pytest.mark.parametrize("how", ["display", "mirror"])
+def without_material(features: Tensor) -> Tensor:
+    """Normal, albedo and position alone."""
+    return torch.cat([features[..., :6], features[..., -3:]], dim=-1)
+
+
+@pytest.mark.parametrize("how", ["display", "mirror", "matte"])
 def test_other_ways_match_reference(how, device):
-    """A screen's colours, which are not encoded; a mirror's, of which metallic is the share."""
-    camera, (features, alpha), *_ = case(True, False, (45, 30))
+    """A screen's colours, which are not encoded; a mirror's, of which metallic is the share; what mirrors nothing."""
+    by_direction = how != "matte"
+    camera, (features, alpha), *_ = case(by_direction, False, (45, 30))
+    features = features if by_direction else without_material(features)
     inputs, light = (features, alpha), Light(torch.float64)
     exact = [*(v.double().requires_grad_() for v in inputs), light.levels]
     picture, *_, margin = reference.shade(
-        *exact, light.sides, camera, BACKGROUND.double(), turn=TURN, by_direction=True, **{how: True}
+        *exact, light.sides, camera, BACKGROUND.double(), turn=TURN, by_direction=by_direction, **{how: True}
     )
     upstream = torch.randn(picture.shape, generator=torch.Generator().manual_seed(5)) * (margin > MARGIN)[..., None]
     assert (margin > MARGIN).float().mean() > 0.9
     light = Light(torch.float32, device)
     leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels]
-    found = shade(*leaves[:2], light, camera, BACKGROUND, by_direction=True, **{how: True}).color
+    found = shade(*leaves[:2], light, camera, BACKGROUND, by_direction=by_direction, **{how: True}).color
     error = (found.detach().cpu() - picture).abs() * (margin > MARGIN)[..., None]
     assert error.max() <= FORWARD * picture.abs().max()
     wanted = torch.autograd.grad(picture, exact, upstream.double())
@@ -145,14 +152,14 @@ def test_other_ways_match_reference(how, device):
         assert (value.cpu() - expected).abs().max() <= GRADIENT * expected.abs().max()
 
 
-@pytest.mark.parametrize("appearance", [False, True])
+@pytest.mark.parametrize("more", [0, 5, 8], ids=["matte", "material", "and colour"])
 @pytest.mark.parametrize("count", [1, 1000])
-def test_surfels_match_reference(count, appearance, device):
+def test_surfels_match_reference(count, more, device):
     camera, generator = scenes.camera(20, 30), torch.Generator().manual_seed(6)
     position = torch.randn(count, 3, generator=generator)
     towards = torch.nn.functional.normalize(torch.from_numpy(camera.position).float() - position, dim=-1)
     normal = (towards + 0.4 * torch.randn(count, 3, generator=generator)) * 1.5
-    material = torch.rand(count, 8 if appearance else 5, generator=generator)
+    material = torch.rand(count, more or 3, generator=generator)
     features = torch.cat([normal, material, position], dim=1)
     light = Light(torch.float64)
     exact = [features.double().requires_grad_(), light.levels]

@@ -2,24 +2,10 @@
 
 import pytest
 import torch
-from torch import Tensor
 
+from refgs.kernels import reference
 from refgs.render.ssim import dssim
 from tests.kernels import scenes
-
-
-def reference(image: Tensor, target: Tensor) -> Tensor:
-    k = torch.arange(-5, 6, dtype=image.dtype)
-    window = torch.exp(-(k**2) / (2 * 1.5**2))
-    window = torch.outer(window, window) / window.sum() ** 2
-
-    def blur(v: Tensor) -> Tensor:
-        return torch.nn.functional.conv2d(v.permute(2, 0, 1)[:, None], window[None, None], padding=5)
-
-    x, y = blur(image), blur(target)
-    xx, yy, xy = blur(image**2) - x**2, blur(target**2) - y**2, blur(image * target) - x * y
-    ssim = (2 * x * y + 1e-4) * (2 * xy + 9e-4) / ((x**2 + y**2 + 1e-4) * (xx + yy + 9e-4))
-    return 1 - ssim.mean()
 
 
 @pytest.mark.parametrize("shape", [(40, 57), (64, 16), (3, 4), (1, 1), (11, 200)])
@@ -29,7 +15,7 @@ def test_matches_float64(shape, likeness, device):
     target = torch.rand(*shape, 3)
     image = likeness * target + (1 - likeness) * torch.rand(*shape, 3)
     exact = image.double().requires_grad_()
-    expected = reference(exact, target.double())
+    expected = reference.dssim(exact, target.double())
     found, gradient = dssim(image.to(device), target.to(device), 3)
     assert found.dtype == torch.float32 and found.shape == ()
     assert abs(found.item() - expected.item()) <= 1e-5 * max(expected.item(), 0.1)
@@ -41,7 +27,7 @@ def test_flat_images(device):
     """Where variances vanish beside C2, float32 computes them as small differences of squares: fewer digits are left."""
     image, target = torch.full((30, 30, 3), 0.9), torch.full((30, 30, 3), 0.8)
     exact = image.double().requires_grad_()
-    expected = reference(exact, target.double())
+    expected = reference.dssim(exact, target.double())
     found, gradient = dssim(image.to(device), target.to(device))
     assert abs(found.item() - expected.item()) < 1e-4
     (expected_gradient,) = torch.autograd.grad(expected, exact)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.approximations.prefiltering import errors
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
 
@@ -16,26 +17,6 @@ def light(side: int) -> torch.Tensor:
     )
     stripes = 0.3 + 0.2 * torch.sin(6 * d[:, 2])
     return torch.stack([stripes + 5 * sun, stripes + 3 * sun, stripes + sun], dim=-1).float()
-
-
-def errors(radiance: torch.Tensor, fine: torch.Tensor, rows: int) -> list[float]:
-    """Of each level's texels, `rows` of them at random, against the sum of the lobe over a finer cubemap: their RMS as a part
-    of the mean."""
-    side, fine_side = (math.isqrt(len(v) // 6) for v in (radiance, fine))
-    levels = prefilter.prefilter(radiance, side).cpu()
-    levels = cubemap.in_texel_order(levels, tuple(prefilter.level_sides(side))).numpy()
-    directions, area = cubemap.texel_directions(fine_side).numpy(), cubemap.texel_solid_angles(fine_side).numpy()
-    start, found, rng = 6 * side * side, [], np.random.default_rng(0)
-    for level_side, lobe in zip(prefilter.level_sides(side)[1:], prefilter.LOBES, strict=True):
-        axes = cubemap.texel_directions(level_side).numpy()
-        chosen = rng.choice(len(axes), rows, replace=False)
-        weight = lobe(axes[chosen] @ directions.T) * area
-        expected = weight @ fine.numpy() / weight.sum(axis=1, keepdims=True)
-        got = levels[start : start + len(axes)][chosen]
-        found.append(float(np.sqrt(((got - expected) ** 2).mean()) / expected.mean()))
-        start += len(axes)
-    print(f"6×{side}²:", ", ".join(f"{error:.2%}" for error in found))
-    return found
 
 
 def test_levels_match_direct_integration(device):

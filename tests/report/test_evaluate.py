@@ -22,8 +22,8 @@ from refgs.export.splats import read_splats, write_splats
 from refgs.model.environment import Environment
 from refgs.model.surfels import activate, initial_parameters, to_splats
 from refgs.report import surface
-from refgs.report.evaluate import GroundTruth
 from refgs.report.pictures import maps
+from refgs.report.truth import GroundTruth
 from refgs.run import create_run, open_run
 from refgs.settings import load_settings
 
@@ -186,7 +186,7 @@ def test_normals_that_a_data_set_brings_are_the_truth_where_there_is_no_other(ma
         images = maps(there.render(view.camera))
         return np.where(images["alpha"][..., None] > 0.5, -images["normal"] @ TURN.T, 0), images["alpha"]
 
-    monkeypatch.setattr("refgs.report.evaluate.published_normals", published)
+    monkeypatch.setattr("refgs.report.truth.published_normals", published)
     commands.evaluate(run, "test", None)
     assert len(asked) == 4 and figures(run)["normal_mae_degrees"] == pytest.approx(180, abs=0.1)
     commands.evaluate(run, "test", truth)

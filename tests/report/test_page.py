@@ -1,6 +1,7 @@
 """The report page: all that a run folder holds is on it, what is missing is said, and nothing is fetched."""
 
 import base64
+import csv
 import json
 import re
 from html.parser import HTMLParser
@@ -41,6 +42,10 @@ class Page(HTMLParser):
         return re.sub(r"\s+", " ", " ".join(self.words))
 
 
+def decibels(times):
+    return 20 * np.log10(times)
+
+
 def picture(path, value, side=24, channels=3):
     path.parent.mkdir(parents=True, exist_ok=True)
     shape = (side, side, channels) if channels > 1 else (side, side)
@@ -65,11 +70,20 @@ def run(tmp_path):
     figures |= {"peak_memory_bytes": 2**31, "relight": relight, "environment": {"log_rmse": 0.3125}, "split": "test"}
     (folder / "metrics.json").write_text(json.dumps(figures))
     lines = [
-        {"seconds": s, "iteration": 10 * s, "loss": 1 / s, "psnr_train": 20 + s, "psnr_test": 19 + s}
+        {
+            "seconds": s,
+            "iteration": 10 * s,
+            "loss": 1 / s,
+            "psnr_train": 22 + decibels(s),
+            "psnr_test": 20 + decibels(s),
+        }
         for s in range(1, 9)
     ]
+    lines[-1]["parts"] = {"raster": 6, "shading": 2, "measuring": 2}
     (folder / "history.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    (folder / "needs.json").write_text('[{"what": "412 surfels", "why": "no view sees them", "saved": "2 %"}]')
+    (folder / "needs.json").write_text(
+        '[{"what": "412 surfels", "why": "no view sees them", "saved": "2 %", "cost": "-0.125 dB"}]'
+    )
     (folder / "run.toml").write_text('[run]\ncapture = "/far/away/urn"\n\n[settings.train]\niterations = 4000\n')
     return folder
 
@@ -102,20 +116,58 @@ def test_everything_is_on_the_page_and_in_the_page(run):
     assert not {"script", "link", "iframe"} & set(page.tags)
     shown = cv2.imdecode(np.frombuffer(base64.b64decode(page.images[0][1].split(",")[1]), np.uint8), -1)
     assert shown.shape == (24, 24, 4) and (shown == 50).all()
-    assert [path.name for path in run.glob("report*")] == ["report.html"]
+    assert sorted(path.name for path in run.glob("report*")) == ["report.csv", "report.html"]
 
 
-def test_the_chart_draws_the_history(run):
+def charts(html):
+    return [html[at.start() : html.index("</svg>", at.start())] for at in re.finditer("<svg", html)]
+
+
+def places(svg, gid):
+    """Where the lines of this name have their points: [(x, y) (n, 2)], y down."""
+    paths = re.findall(rf'<g id="{gid}">\s*<path d="([^"]+)"', svg)
+    return [np.array(re.findall(r"[ML] (\S+) (\S+)", path), float) for path in paths]
+
+
+def test_the_charts_draw_the_history(run):
+    """Errors that fall as powers of time are straight lines, one below the other; the parts' bars are as long as their seconds."""
     write_report([run], run / "report.html")
-    html = (run / "report.html").read_text(encoding="utf-8")
-    svg = html[html.index("<svg") : html.index("</svg>")]
-    assert "PSNR, dB" in svg and "training loss" in svg and "currentColor" in svg
-    # A path of eight points for each of held-out PSNR, training PSNR and loss.
-    lines = [path for path in re.findall(r' d="([^"]+)"', svg) if path.count("L") == 7]
-    assert len(lines) == 3
-    heights = [[float(y) for y in re.findall(r"[ML] \S+ (\S+)", path)] for path in lines]
-    assert heights[0] == sorted(heights[0], reverse=True), "a growing PSNR rises on the page"
-    assert heights[2] == sorted(heights[2]), "a falling loss falls"
+    errors, parts = charts((run / "report.html").read_text(encoding="utf-8"))
+    for words in ("held-out views: RMS error", "training views: RMS error", "training loss", "seconds of training"):
+        assert words in errors
+    assert "currentColor" in errors and "knee" not in errors, "a power law has none"
+    test, train, loss = places(errors, "curve")
+    for line, slope in ((test, 1.0), (train, 1.0), (loss, 1.0)):
+        assert len(line) == 8
+        x, y = line.T
+        assert (np.diff(x) > 0).all() and (np.diff(y) > 0).all(), "a falling error falls on the page"
+        np.testing.assert_allclose(np.diff(y) / np.diff(x), slope * np.diff(y)[0] / np.diff(x)[0], rtol=1e-2)
+    bars = [re.findall(r"[ML] (\S+) \S+", path) for path in re.findall(r'<path d="([^"]+)" clip-path', parts)]
+    widths = [max(map(float, bar)) - min(map(float, bar)) for bar in bars if len(bar) >= 4]
+    assert widths[0] == pytest.approx(3 * widths[1], rel=1e-3), "raster took three times as long as shading"
+    text = Page((run / "report.html").read_text(encoding="utf-8")).text
+    assert "raster 6 s, 60.0%" in text and "measuring 2 s, 20.0%" in text
+
+
+def test_the_figures_are_beside_the_page(run):
+    write_report([run], run / "report.html")
+    with open(run / "report.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["run", "iteration", "seconds", "quantity", "value", "mark"]
+    test = [row for row in rows if row["quantity"] == "test_rmse" and row["mark"] != "reaches"]
+    assert [(row["iteration"], row["seconds"]) for row in test] == [(str(10 * s), str(s)) for s in range(1, 9)]
+    np.testing.assert_allclose([float(row["value"]) for row in test], [0.1 / s for s in range(1, 9)], rtol=1e-4)
+    assert {row["run"] for row in rows} == {"vases/first <run>"} and {row["mark"] for row in test} == {"front"}
+    spent = {row["quantity"]: float(row["value"]) for row in rows if row["quantity"].startswith("part: ")}
+    assert spent == {"part: raster": 6, "part: shading": 2, "part: measuring": 2}
+    reached = [
+        (float(row["value"]), float(row["seconds"]))
+        for row in rows
+        if row["quantity"] == "test_rmse" and row["mark"] == "reaches"
+    ]
+    assert len(reached) > 2
+    for error, seconds in reached:
+        assert seconds == pytest.approx(0.1 / error, rel=1e-3)
 
 
 def test_several_runs_stand_side_by_side_and_the_best_is_marked(run, tmp_path):

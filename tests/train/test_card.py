@@ -34,7 +34,9 @@ def make_trainer(capture, folder, *changes: str, device: str = "cpu") -> Trainer
     return Trainer(read_capture(capture), settings, folder, lambda *_: None, device=device)
 
 
-@pytest.mark.parametrize("changes", [["indirect.start=0"], ["render.shading=sh"], ["initial.until=0.99"]])
+@pytest.mark.parametrize(
+    "changes", [["indirect.start=0"], ["render.shading=sh"], ["initial.until=0.99", "needs.initial=on"]]
+)
 def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
     """The same steps with the kernels of both, the object in its own way, too."""
     figures, learned = [], []

@@ -6,10 +6,11 @@ import torch
 
 from benchmarks.scenes.analytic import TWO, meet, write_ball_capture
 from refgs.capture import read_capture
+from refgs.report.pictures import composite
 from refgs.run import create_run, open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset
-from refgs.train.trainer import Trainer, composite
+from refgs.train.trainer import Trainer
 from tests.kernels import scenes
 
 SMALL = ["surfels.start=3000", "surfels.budget=4000", "environment.resolution=16", "train.light_first=20"]

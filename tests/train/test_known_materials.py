@@ -14,7 +14,7 @@ from refgs.capture import load_view, read_capture
 from refgs.export.environment import directions
 from refgs.model.environment import Environment
 from refgs.render.shade import shade
-from refgs.train.trainer import composite
+from refgs.report.pictures import composite
 from tests.kernels import scenes
 
 STEPS, RESOLUTION = 500, 16

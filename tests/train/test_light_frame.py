@@ -80,7 +80,7 @@ def test_without_masks_the_light_stands_still(turntable, tmp_path):
     found = made(tmp_path / "bare", tmp_path / "run", report=lambda event, facts: said.append((event, facts["what"])))
     assert found.settings.light.frame == "world"
     assert ("decided", "the light stands still: not every photo has a mask of the object") in said
-    assert ("decided", "no inter-reflection: not every photo has a mask of the object") in said
+    assert ("decided", "without inter-reflection: not every photo has a mask of the object") in said
     assert "mask" in found.chosen["light.frame"]
 
 

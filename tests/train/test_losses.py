@@ -7,11 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from refgs.kernels import reference as oracle
 from refgs.kernels.reference import unit
 from refgs.render.renderer import COVERED, Rendering
 from refgs.settings import LossSettings
 from refgs.train.losses import Photo, objective
-from tests.kernels import scenes, test_ssim
+from tests.kernels import scenes
 from tests.kernels.emulate import emulate
 
 DARK, FLAT = 0.1, 0.01
@@ -30,7 +31,7 @@ def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress
         photo = photo * mask[..., None] + BACKGROUND.double() * (1 - mask[..., None])
     color = torch.where(photo >= 0.998, rendering.color.clamp_max(1), rendering.color)
     terms = {"l1": (1 - weights.dssim) * (color - photo).abs().mean()}
-    terms["dssim"] = weights.dssim * test_ssim.reference(color, photo)
+    terms["dssim"] = weights.dssim * oracle.dssim(color, photo)
 
     solid = rendering.alpha.detach() > 0.5
     if min(solid.shape) > 2:

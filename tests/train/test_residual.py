@@ -24,6 +24,8 @@ SMALL = [
     "train.light_first=0",
     "residual.start=0.5",
     "rates.residual=0.02",
+    "needs.specular=on",  # a few iterations do not tell
+    "needs.degrees=on",
 ]
 
 

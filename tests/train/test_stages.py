@@ -14,7 +14,7 @@ SMALL = ["surfels.start=1500", "surfels.budget=1800", "surfels.hull=64", "enviro
 
 
 def trainer(capture_folder, folder, preset, *changes):
-    capture, settings = read_capture(capture_folder), load_settings(preset, [*SMALL, *changes])
+    capture, settings = read_capture(capture_folder), load_settings(preset, [*SMALL, "needs.initial=on", *changes])
     create_run(folder, capture, settings, preset, "cpu")
     return Trainer(capture, settings, folder, lambda event, facts: None)
 

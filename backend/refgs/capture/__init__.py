@@ -17,7 +17,7 @@ from refgs.capture.nerf_blender import published_normals, read_nerf_blender
 from refgs.capture.nerfstudio import read_nerfstudio
 from refgs.capture.nero import read_nero
 from refgs.capture.poses import in_frame
-from refgs.capture.region import find_region, region_in, run_frame, sample_silhouettes, up_direction
+from refgs.capture.region import find_region, is_near, region_in, run_frame, sample_silhouettes, up_direction
 from refgs.capture.types import Capture, View
 from refgs.errors import InputError, NoCameras
 from refgs.settings import RegionSettings
@@ -99,9 +99,10 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
     up = up_direction(views)
     region = find_region(views, up, points, silhouettes)
     digest = _digest(folder, layout, views)
-    # What is at the origin with radius 1: in NeRF-Blender captures whatever is.
-    origin, unit = (np.zeros(3), 1.0) if layout == "nerf-blender" else (region.centre, region.radius)
-    to_capture = np.eye(4) if layout == "nerf-blender" else run_frame(up, origin, unit)
+    # What is at the origin with radius 1: in NeRF-Blender captures whatever is, if its size and place suit float32.
+    stays = layout == "nerf-blender" and is_near(region)
+    origin, unit = (np.zeros(3), 1.0) if stays else (region.centre, region.radius)
+    to_capture = run_frame(np.array([0.0, 0.0, 1.0]) if layout == "nerf-blender" else up, origin, unit)
     box, reach = None, region.radius
     if wanted is not None and any(wanted.size):
         box, whole = Box.of(wanted).moved(to_capture), region
@@ -110,7 +111,7 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
     turned = wanted is not None and any(wanted.up)
     if turned:
         to_capture = to_capture @ run_frame(np.array(wanted.up) / np.linalg.norm(wanted.up), np.zeros(3), 1.0)
-    if turned or layout != "nerf-blender":
+    if turned or not stays:
         to_run = np.linalg.inv(to_capture)
         views = [replace(view, camera=in_frame(view.camera, to_run)) for view in views]
         points = None if points is None else points @ to_run[:3, :3].T + to_run[:3, 3]
@@ -168,7 +169,7 @@ def _check(folder: Path, views: list[View]) -> None:
             "At least three are needed, thirty or more are good: add photos."
         )
     positions = np.array([view.camera.position for view in train])
-    if np.ptp(positions, axis=0).max() <= 1e-6 * max(1.0, np.abs(positions).max()):
+    if np.ptp(positions, axis=0).max() <= 1e-6 * np.abs(positions).max():
         raise InputError(f"{folder}: all cameras are in one place, so no depth can be seen. Photograph from around it.")
 
 

@@ -11,6 +11,8 @@ from refgs.capture.types import View
 from refgs.errors import InputError
 from refgs.geometry.project import inside, project
 
+NEAR = 100.0  # radii from the origin, and units that a radius may be or be a part of
+
 
 @dataclass(frozen=True, eq=False)
 class Region:
@@ -48,6 +50,11 @@ def find_region(
     if _one_sided(views, centre, up) > 0.6:
         return Region(centre, radius, False, "there are no masks and the cameras stand on one side")
     return Region(centre, radius, True, "the cameras surround one place they look at (no masks: a guess)")
+
+
+def is_near(region: Region) -> bool:
+    """Whether what is learned there, in float32, is as exact as in a ball of radius 1 about the origin, to a hundredth."""
+    return 1 / NEAR <= region.radius <= NEAR and float(np.linalg.norm(region.centre)) <= NEAR * region.radius
 
 
 def region_in(box: Box, views: list[View], silhouettes: list[tuple[View, np.ndarray]]) -> Region:

@@ -41,28 +41,28 @@ def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done
 
     `mesh` has normals and uv (`unwrap`). Texels that a chart covers in part have the point of the mesh's plane beyond its edge.
     """
-    blended = _upsampled(mesh, splats, size, progress)
+    coarse = _composited(mesh, splats, size, progress)
     tangents, signs = vertex_tangents(mesh)
     free, scene = openness(mesh), _flat(mesh, size)
+    widths = (3, 1, 1, 1, 3)
+    maps = [np.zeros((size, size, width) if width > 1 else (size, size), np.float32) for width in widths]
+    color, metallic, roughness, occlusion, normal = maps
     mask = np.zeros((size, size), bool)
-    for start in range(0, size, _ROWS):
-        rows = slice(start, min(start + _ROWS, size))
+    for rows in _blocks(size):
         face, weights, _ = _rasterise(mesh, scene, size, rows)
-        mask[rows] = face >= 0
-        corners, weights = mesh.faces[face[mask[rows]]], weights[mask[rows]]
-        normals, tangent, occlusion = (_mean(weights, x[corners]) for x in (mesh.normals, tangents, free[:, None]))
+        on = mask[rows] = face >= 0
+        corners, weights, texels = mesh.faces[face[on]], weights[on], _enlarged(coarse, size, rows)[on]
+        normals, tangent, open_ = (_mean(weights, x[corners]) for x in (mesh.normals, tangents, free[:, None]))
         bitangent = signs[corners[:, :1]].astype(np.float32) * np.cross(normals, tangent)
-        texels = blended[rows][mask[rows]]
-        texels[:, 5:8] = _in_tangent_space(texels[:, 5:8], tangent, bitangent, normals)
-        texels[:, 8:] = occlusion
-        blended[rows][mask[rows]] = texels
-    blended = blended[tuple(distance_transform_edt(~mask, return_distances=False, return_indices=True))]
-    channels = (blended[..., :3], blended[..., 3], blended[..., 4], blended[..., 8], blended[..., 5:8])
-    return Textures(*map(np.ascontiguousarray, channels), mask)
+        color[rows][on], metallic[rows][on], roughness[rows][on] = texels[:, :3], texels[:, 3], texels[:, 4]
+        occlusion[rows][on] = open_[:, 0]
+        normal[rows][on] = _in_tangent_space(texels[:, 5:], tangent, bitangent, normals)
+    _pad(maps, mask)
+    return Textures(*maps, mask)
 
 
-def _upsampled(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
-    """Base colour, metallic, roughness, normal, and room for one more (S, S, 9), on the charts and one texel beyond."""
+def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
+    """Base colour, metallic, roughness, normal (C, C, 8), of as many texels C up to `size` as the splats need."""
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     covered = np.abs(_area(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0])).sum()
@@ -70,17 +70,39 @@ def _upsampled(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np.
     deviation = float(np.median(splats.scales[:, :2].min(axis=1)))
     # Two charts, 1/128 apart, must not reach each other by the texel that each goes beyond its edge.
     coarse = min(size, max(int(np.ceil(size * FINE * texel / deviation)), min(size, 256)))
-    face, weights, points = _rasterise(mesh, _flat(mesh, coarse), coarse, slice(0, coarse))
-    mask = face >= 0
-    normals = _mean(weights[mask], mesh.normals[mesh.faces[face[mask]]])
+    scene, mask, found = _flat(mesh, coarse), np.zeros((coarse, coarse), bool), []
+    for rows in _blocks(coarse):
+        face, weights, points = _rasterise(mesh, scene, coarse, rows)
+        on = mask[rows] = face >= 0
+        found.append((points[on].astype(np.float32), _mean(weights[on], mesh.normals[mesh.faces[face[on]]])))
+    points, normals = map(np.concatenate, zip(*found, strict=True))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    found = np.zeros((coarse, coarse, 9), np.float32)
-    found[mask, :8] = composite(splats, points[mask], normals, progress)
-    if coarse == size:
-        return found
-    found = found[tuple(distance_transform_edt(~mask, return_distances=False, return_indices=True))]
-    parts = [cv2.resize(found[..., part], (size, size)) for part in (slice(0, 4), slice(4, 8), slice(8, 9))]
-    return np.dstack(parts)
+    blended = np.zeros((coarse, coarse, 8), np.float32)
+    blended[mask] = composite(splats, points, normals, progress)
+    _pad([blended], mask)
+    return blended
+
+
+def _blocks(size: int) -> list[slice]:
+    """All rows, some at a time."""
+    return [slice(start, min(start + _ROWS, size)) for start in range(0, size, _ROWS)]
+
+
+def _enlarged(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
+    """Rows of a square picture (C, C, 8) that is enlarged to `size`, bilinearly."""
+    place = ((np.arange(rows.start, rows.stop) + 0.5) * len(picture) / size - 0.5).clip(0, len(picture) - 1)
+    above = place.astype(int)
+    below, part = np.minimum(above + 1, len(picture) - 1), (place - above).astype(np.float32)[:, None, None]
+    lines = picture[above] * (1 - part) + picture[below] * part
+    return np.dstack([cv2.resize(lines[..., half], (size, len(lines))) for half in (slice(0, 4), slice(4, 8))])
+
+
+def _pad(maps: list[np.ndarray], mask: np.ndarray) -> None:
+    """Give each texel outside the mask the values of the nearest one in it."""
+    nearest = distance_transform_edt(~mask, return_distances=False, return_indices=True)
+    for rows in _blocks(len(mask)):
+        for values in maps:
+            values[rows] = values[tuple(nearest[:, rows])]
 
 
 def _mean(weights: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from refgs.export.splats import Splats
+from refgs.model.surfels import axes
 
 NEIGHBOURS = 64  # splats that a ray is tried against
 FADED = 1 / 255  # alpha that is nothing
@@ -50,11 +51,9 @@ def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress:
 
 def _table(splats: Splats) -> Tensor:
     """(N, 15): position, both axes over their standard deviations, plane's normal, outward normal, opacity, mean deviation."""
-    w, x, y, z = (splats.rotations / np.linalg.norm(splats.rotations, axis=1, keepdims=True)).T
-    u = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
-    v = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
+    u, v, normal = (axis.numpy() for axis in axes(torch.from_numpy(splats.rotations)))
     scales = np.maximum(splats.scales[:, :2], 1e-12)
-    columns = [splats.positions, u / scales[:, :1], v / scales[:, 1:], np.cross(u, v), splats.normals]
+    columns = [splats.positions, u / scales[:, :1], v / scales[:, 1:], normal, splats.normals]
     columns += [splats.opacities[:, None], scales.mean(axis=1, keepdims=True)]
     return torch.from_numpy(np.concatenate(columns, axis=1).astype(np.float32))
 

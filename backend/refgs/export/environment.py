@@ -2,12 +2,13 @@
 
 import errno
 import os
+import warnings
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 
-from refgs.errors import InputError
+from refgs.errors import InputError, InputWarning
 from refgs.paths import whole
 
 # Rec.709 / sRGB: x and y of red, green, blue and the D65 white (ITU-R BT.709-6, table 1).
@@ -69,7 +70,7 @@ def write_environment(path: str | os.PathLike, radiance: np.ndarray) -> None:
 def read_environment(path: str | os.PathLike) -> np.ndarray:
     """Read a panorama (H, W, 3), float32 linear radiance. Raises InputError where `path` does not hold one.
 
-    Overflown pixels (half-float suns) become the largest half float; NaN and negative radiance becomes 0.
+    Overflown pixels (half-float suns) become the largest half float; negative radiance becomes 0, and so do NaN, with an InputWarning.
     """
     pixels = read_exr(path)
     if pixels.ndim == 2:
@@ -77,6 +78,8 @@ def read_environment(path: str | os.PathLike) -> np.ndarray:
     height, width = pixels.shape[:2]
     if width != 2 * height:
         raise InputError(f"{path} is {width}×{height}: an equirectangular panorama is twice as wide as it is high")
+    if missing := int(np.isnan(pixels[..., :3]).any(axis=-1).sum()):
+        warnings.warn(InputWarning(f"{path}: {missing:,} pixels are no numbers; they give no light"), stacklevel=2)
     return np.nan_to_num(pixels[..., :3], nan=0, posinf=65504, neginf=0).clip(min=0)
 
 

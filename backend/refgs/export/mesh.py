@@ -89,7 +89,9 @@ def write_textures(folder: Path, textures: Textures) -> dict[str, np.ndarray]:
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {}
     for name, linear in maps.items():
-        pictures[name] = _bytes(srgb_encode(linear.clip(0, 1)) if name == "base_color" else linear)
+        pictures[name] = np.empty(linear.shape, np.uint8)
+        for row, values in zip(pictures[name], linear, strict=True):  # one at a time: of large maps copies are large
+            row[:] = np.rint(255 * (srgb_encode(values.clip(0, 1)) if name == "base_color" else values.clip(0, 1)))
         png = io.BytesIO()
         Image.fromarray(pictures[name]).save(png, "PNG")
         with whole(folder / f"{name}.png") as temporary:
@@ -112,7 +114,3 @@ def read_glb(path: str | os.PathLike) -> Mesh:
     except Exception as error:  # trimesh raises what its parsing ran into
         raise InputError(f"{path} is not a whole binary glTF file of a mesh ({error}): export it again") from None
     return Mesh(vertices @ _Y_UP, faces)
-
-
-def _bytes(values: np.ndarray) -> np.ndarray:
-    return np.rint(values.clip(0, 1) * 255).astype(np.uint8)

@@ -35,10 +35,10 @@ def read_ply(path: str | os.PathLike) -> PlyData:
         raise InputError(f"{path} is not a whole PLY file ({error}): copy or export it again") from None
 
 
-def write_ply(path: str | os.PathLike, elements: list[PlyElement]) -> None:
+def write_ply(path: str | os.PathLike, elements: list[PlyElement], comments: list[str] = ()) -> None:
     """Write a binary little-endian PLY file, whole or not at all."""
     with whole(path) as temporary:
-        PlyData(elements, byte_order="<").write(str(temporary))
+        PlyData(elements, byte_order="<", comments=list(comments)).write(str(temporary))
 
 
 def _check(file, path: Path) -> None:

@@ -3,7 +3,7 @@
 import os
 import re
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ class Splats:
     albedo (N, 3) linear Rec.709, metallic (N,) and perceptual roughness (N,) in 0..1, received (N, 3) the part of the recovered
     light's irradiance that reaches a surfel, with what comes from the object itself, indirect (N, K', 3) spherical harmonics
     of the linear radiance that comes from the object itself; K' is 0 where a scene does without, all of `received` is 1 then.
+    `constants` are those of CONSTANTS that all splats have alike: a file then has no column of them.
     `beside` is what else a file held: its elements, `vertex` with the properties that are none of these.
     """
 
@@ -40,6 +41,7 @@ class Splats:
     roughness: np.ndarray
     received: np.ndarray
     indirect: np.ndarray
+    constants: dict[str, float] = field(default_factory=dict)
     beside: tuple[PlyElement, ...] = ()
 
     def __len__(self) -> int:
@@ -52,6 +54,12 @@ THIN = 0.05  # of a surfel's smaller scale: the third, for viewers of 3D Gaussia
 CHUNK = 4096  # rows, which the processor's cache holds
 _RECEIVED = ["received_r", "received_g", "received_b"]
 _MATERIAL = ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
+CONSTANTS = (
+    "metallic",
+    "roughness",
+    "specular",
+)  # the last, the Principled BSDF's Specular IOR Level, is 0.5 where nothing is said
+_CONSTANT = re.compile(rf"constant ({'|'.join(CONSTANTS)}) ([0-9.e+-]+)")  # in a comment of the head
 _REFERENCE = ["ori_color_0", "ori_color_1", "ori_color_2", "refl_strength", "roughness"]  # Ref-Gaussian's, as logits
 MATTE = 0.0, 1.0  # metallic and roughness of splats that come without materials
 # Turns that bring axis 0, 1 or 2 to the third place, as quaternions wxyz.
@@ -65,12 +73,18 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
     degree and above are channel-major; materials are stored as they are. Opacities are clipped to 1e-6 .. 1 - 1e-6.
     """
     names, columns = _common(splats, splats.scales)
-    names += _MATERIAL
-    columns += [splats.albedo, splats.metallic, splats.roughness]
+    names += _MATERIAL[:3]
+    columns.append(splats.albedo)
+    for name in ("metallic", "roughness"):
+        if name not in splats.constants:
+            names.append(name)
+            columns.append(getattr(splats, name))
     if splats.indirect.shape[1]:
         names += [*_RECEIVED, *(f"ind_{i}" for i in range(3 * splats.indirect.shape[1]))]
         columns += [splats.received, splats.indirect.transpose(0, 2, 1)]
-    _write(path, names, columns, splats.beside)
+    _write(
+        path, names, columns, splats.beside, [f"constant {name} {value:g}" for name, value in splats.constants.items()]
+    )
 
 
 def write_display_splats(path: str | os.PathLike, splats: Splats) -> None:
@@ -102,7 +116,11 @@ def _common(splats: Splats, scales: np.ndarray) -> tuple[list[str], list[np.ndar
 
 
 def _write(
-    path: str | os.PathLike, names: list[str], columns: list[np.ndarray], beside: tuple[PlyElement, ...] = ()
+    path: str | os.PathLike,
+    names: list[str],
+    columns: list[np.ndarray],
+    beside: tuple[PlyElement, ...] = (),
+    comments: list[str] = (),
 ) -> None:
     count = len(columns[0])
     table = np.empty((count, len(names)), "<f4")
@@ -125,7 +143,7 @@ def _write(
         rows, properties = both, [*properties, *more]
     vertex = PlyElement("vertex", properties, count)
     vertex.data = rows
-    write_ply(path, [vertex, *(element for element in beside if element.name != "vertex")])
+    write_ply(path, [vertex, *(element for element in beside if element.name != "vertex")], comments)
 
 
 def read_splats(path: str | os.PathLike) -> Splats:
@@ -143,8 +161,11 @@ def read_splats(path: str | os.PathLike) -> Splats:
     if "packed_position" in names:
         raise InputError(f"{path} is a compressed PLY: make a plain one of it, with splat-transform or SuperSplat")
     ours = not {*_MATERIAL[:4]}.isdisjoint(names)
+    found = [_CONSTANT.fullmatch(comment.strip()) for comment in data.comments] if ours else []
+    constants = {match[1]: float(match[2]) for match in found if match and match[1] not in names}
+    material = [name for name in _MATERIAL if name not in constants]
     normals = {*_HEAD[3:6]} <= {*names}
-    needed = [*_HEAD, *_TAIL, *(_MATERIAL if ours else [])]
+    needed = [*_HEAD, *_TAIL, *(material if ours else [])]
     missing = [name for name in needed if name not in names and (ours or name not in _HEAD[3:6])]
     if missing:
         raise InputError(f"{path} lacks {', '.join(missing)}: it is not a PLY file of splats, or not a whole one")
@@ -177,8 +198,11 @@ def read_splats(path: str | os.PathLike) -> Splats:
         if scales.shape[1] == 3:
             rotations, scales = _shortest_last(rotations, scales)
         if ours:
-            *albedo, metallic, roughness = columns(*_MATERIAL).T
-            albedo = np.stack(albedo, axis=1)
+            albedo = columns(*_MATERIAL[:3])
+            metallic, roughness = (
+                np.full(vertex.count, constants[name], np.float32) if name in constants else columns(name)[:, 0]
+                for name in _MATERIAL[3:]
+            )
         elif {*_REFERENCE} <= {*names}:
             *albedo, metallic, roughness = _logistic(columns(*_REFERENCE)).T
             albedo = srgb_decode(np.stack(albedo, axis=1))
@@ -197,6 +221,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
             roughness=roughness,
             received=columns(*_RECEIVED) if {*_RECEIVED} <= {*names} else np.ones((vertex.count, 3), np.float32),
             indirect=harmonics("ind_", 0, 3, 12, 27, 48),
+            constants=constants,
         )
     none = ~splats.normals.any(axis=1)  # 3DGS writes zeros
     splats.normals[none] = _third_axis(rotations[none])
@@ -242,7 +267,7 @@ def _beside(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[PlyEleme
 def _finite(splats: Splats, path: Path) -> Splats:
     """Those of the splats all of whose values are finite. A warning says how many others there were; further elements, which may
     number the rows, go with them."""
-    values = {name: value for name, value in vars(splats).items() if name != "beside"}
+    values = {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
     wrong = [name for name, value in values.items() if not np.isfinite(value).all()]
     if not wrong:
         return splats

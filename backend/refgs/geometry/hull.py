@@ -95,7 +95,8 @@ def visual_hull_points(
     within = (solid + rng.uniform(-0.5, 0.5, solid.shape)) * voxel
     normals = np.concatenate([normals, normals[cKDTree(points).query(within)[1]]])
     points = np.concatenate([points, within])
-    spacing = cKDTree(points).query(points, k=min(4, count))[0][:, 1:].mean(1)
+    neighbours = [2, 3, 4][: count - 1]
+    spacing = cKDTree(points).query(points, k=neighbours)[0].mean(1) if neighbours else np.full(1, radius)
     positions = points + low + voxel * (0.5 - 3)
     return positions.astype(np.float32), normals.astype(np.float32), spacing.astype(np.float32)
 

@@ -24,9 +24,9 @@ struct Activate {
 
 constexpr float LOG2_E = 1.4426950f, LN_2_HIGH = 0.693359375f, LN_2_LOW = -2.1219444e-4f;  // their sum is ln 2; k LN_2_HIGH is exact
 
-// e^x = 2^k e^r, for |x| <= 87; beyond, the values there.
+// e^x = 2^k e^r, for |x| <= 87; beyond, the values there. What is no number stays none.
 INLINE Vector exponential(Vector x) {
-  x = clamp(x, -87, 87);
+  x = select(x == x, clamp(x, -87, 87), x);
   Vector k = round_down(x * LOG2_E + 0.5f), r = x - k * LN_2_HIGH - k * LN_2_LOW;
   return exp2(k) * exp2(r * LOG2_E);
 }

@@ -9,6 +9,7 @@ struct Learned {
   float *value, *mean, *square;  // running means of the gradient and of its square
   const float* gradient;
   double rate, square_scale;     // with the corrections of the means' start: α / (1 − β1^t), and 1 / √(1 − β2^t)
+  double low, high;              // what values are kept within
 };
 
 constexpr int MOST = 16;  // tensors
@@ -17,24 +18,28 @@ struct Adam {
   int64_t tensors;
   Learned learned[MOST];
   double beta1, beta2, epsilon;
+  const float* accepted;  // zero where the step is not to be taken; or null
   float* scratch;  // none is used
   mutable Shared shared;
 };
 
 INLINE void step(const Adam& a, const Learned& t, int64_t i, int64_t n) {
   Vector g = read(t.gradient + i, n);
-  Mask felt = (g < 0.0f) | (g > 0.0f);
+  Mask felt = ~(g == 0.0f);  // what is no number is felt, too
   if (!any(felt)) return;
   Vector m = read(t.mean + i, n), v = read(t.square + i, n), x = read(t.value + i, n);
   Vector mean = m + (float)(1 - a.beta1) * (g - m);
   Vector square = (float)a.beta2 * v + (float)(1 - a.beta2) * (g * g);
   Vector value = x - (float)t.rate * mean / ((float)t.square_scale * root(square) + (float)a.epsilon);
   write(t.mean + i, select(felt, mean, m), n), write(t.square + i, select(felt, square, v), n);
+  Vector low = Vector() + (float)t.low, high = Vector() + (float)t.high;
+  value = select(value < low, low, select(value > high, high, value));
   write(t.value + i, select(felt, value, x), n);
 }
 
 }  // namespace
 
 KERNEL(refgs_adam_step, Adam, a) {
+  if (a->accepted && !*a->accepted) return;
   share_vectors(a->shared, a->learned, a->tensors, [&](const Learned& l, int64_t i, int64_t n) { step(*a, l, i, n); });
 }

@@ -67,6 +67,7 @@ INLINE void see(const Splat& s, const Splat& t, Vector x, Vector y, Vector (&alp
   }
 }
 
+template <bool TRIMMED>
 void forward_tile(Raster& r, int64_t index, float* sums) {
   Tile t(r, (int32_t)index);
   alignas(64) float transmittance[PIXELS], depth[PIXELS] = {}, alpha[PIXELS] = {};
@@ -112,8 +113,9 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
           see<false>(s, next, x, y, a, z);
         for (int i = 0; i < 2 && k[i] < n; i++) {
           Vector w = a[i] * T;
-          T = unfinished(T * (1.0f - a[i]));
-          Z += w * z[i];
+          Vector after = unfinished(T * (1.0f - a[i]));
+          Z += (TRIMMED ? clamp(T, r.lower, r.upper) - clamp(after, r.lower, r.upper) : w) * z[i];
+          T = after;
           A += w;
           weights[used] = w;
           rows[used++] = features[k[i]];
@@ -265,7 +267,8 @@ EXPORT int64_t refgs_scratch_size(int64_t channels) { return PIXELS * padded(cha
 // parallel
 EXPORT void refgs_forward(Raster* r) {
   float* scratch = r->scratch + take(r->shared.thread, 1) * refgs_scratch_size(r->channels);
-  for (int64_t t; (t = take(r->shared.next, 1)) < tiles_x(*r) * tiles_y(*r);) forward_tile(*r, t, scratch);
+  for (int64_t t; (t = take(r->shared.next, 1)) < tiles_x(*r) * tiles_y(*r);)
+    trimmed(*r) ? forward_tile<true>(*r, t, scratch) : forward_tile<false>(*r, t, scratch);
 }
 
 // parallel

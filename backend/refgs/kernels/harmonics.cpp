@@ -66,14 +66,14 @@ KERNEL(refgs_harmonics_forward, Harmonics, h) {
     for (int c = 0; c < 3; c++) sum[c] = h->offset + y[0] * v[c];
     for (int64_t k = 1; k < h->coefficients; k++)
       for (int c = 0; c < 3; c++) sum[c] += y[k] * rest[3 * (k - 1) + c];
-    for (int c = 0; c < 3; c++) h->color[3 * i + c] = sum[c] > 0 ? sum[c] : 0;
+    for (int c = 0; c < 3; c++) h->color[3 * i + c] = sum[c] <= 0 ? 0 : sum[c];  // a NaN stays one
   });
 }
 
 KERNEL(refgs_harmonics_backward, Harmonics, h) {
   each(h, [&](int64_t i, const float* y) {
     float by[3], *rest = h->by_rest + 3 * (h->coefficients - 1) * i;
-    for (int c = 0; c < 3; c++) by[c] = h->color[3 * i + c] > 0 ? h->by_color[3 * i + c] : 0;
+    for (int c = 0; c < 3; c++) by[c] = h->color[3 * i + c] <= 0 ? 0 : h->by_color[3 * i + c];
     for (int c = 0; c < 3; c++) h->by_constant[3 * i + c] = y[0] * by[c];
     for (int64_t k = 1; k < h->coefficients; k++)
       for (int c = 0; c < 3; c++) rest[3 * (k - 1) + c] = y[k] * by[c];

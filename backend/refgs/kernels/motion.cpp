@@ -7,6 +7,7 @@ struct Motion {
   int64_t count;
   const float *positions, *gradients;  // (count, 3) in the world
   double view[12];                     // world to camera, 3x4, row-major
+  const float* accepted;               // zero where the gradients are not to be counted; or null
   double scale;                        // from the derivative by a unit across, at depth 1, to that by half an image's width
   float *total, *views;                // (count)
   float* scratch;                      // none is used
@@ -17,6 +18,7 @@ struct Motion {
 
 KERNEL(refgs_motion, Motion, m) {
   const int64_t BATCH = 1024;
+  if (m->accepted && !*m->accepted) return;
   share(m->shared, m->count, BATCH, [&](int64_t i) {
     const float *p = m->positions + 3 * i, *g = m->gradients + 3 * i;
     float across[2] = {}, depth = (float)m->view[11];

@@ -201,7 +201,7 @@ INLINE void carry(const Scene& r, int64_t first, const Sums& sums) {
   bool any_touched = false;
   for (int lane = 0; lane < BATCH; lane++) any_touched |= sums.touched[lane] != 0;
   auto put = [&](float* p, int stride, int k, Real v) {
-    v = sums.touched ? smaller(larger(v, Real() - 3.4028234e38), Real() + 3.4028234e38) : Real();
+    v = sums.touched ? smaller(Real() + 3.4028234e38, larger(Real() - 3.4028234e38, v)) : Real();  // in this order a NaN stays one
     for (int lane = 0; lane < BATCH && first + lane < r.splats; lane++) p[(first + lane) * stride + k] = (float)v[lane];
   };
   Disc d = {};

@@ -156,7 +156,7 @@ INLINE Vector unfinished(Vector T) { return select(T >= refgs::MIN_TRANSMITTANCE
 
 INLINE bool anywhere(Mask mask) { return __any_sync(~0u, any(mask)); }
 
-template <int N>
+template <int N, bool TRIMMED = false>
 INLINE void forward(const Raster& r) {
   constexpr int SIZE = 64;
   __shared__ Chunk<SIZE, N> chunk;
@@ -186,8 +186,9 @@ INLINE void forward(const Raster& r) {
           continue;
         }
         Vector a = select(covered, refgs::cap(refgs::uncapped_alpha(s, hit)), Vector()), w = a * T[h];
-        T[h] = unfinished(T[h] * (1 - a));
-        Z[h] += w * hit.z, A[h] += w;
+        Vector after = unfinished(T[h] * (1 - a));
+        Z[h] += (TRIMMED ? clamp(T[h], r.lower, r.upper) - clamp(after, r.lower, r.upper) : w) * hit.z, A[h] += w;
+        T[h] = after;
 #pragma unroll
         for (int c = 0; c < N / 4; c++) blended[h][c] += w.value * *(const Four*)&chunk.features[k][4 * c];
         mine = start + k + 1;
@@ -374,6 +375,7 @@ KERNEL(refgs_raster_forward_8, Raster, r, __launch_bounds__(THREADS, 5)) { forwa
 KERNEL(refgs_raster_forward_12, Raster, r, __launch_bounds__(THREADS, 5)) { forward<12>(*r); }
 KERNEL(refgs_raster_forward_16, Raster, r, __launch_bounds__(THREADS, 5)) { forward<16>(*r); }
 KERNEL(refgs_raster_forward_20, Raster, r, __launch_bounds__(THREADS, 5)) { forward<20>(*r); }
+KERNEL(refgs_raster_forward_trimmed, Raster, r, __launch_bounds__(THREADS, 5)) { forward<4, true>(*r); }
 
 KERNEL(refgs_raster_backward_4, Raster, r, __launch_bounds__(THREADS, 4)) { backward<4>(*r); }
 KERNEL(refgs_raster_backward_8, Raster, r, __launch_bounds__(THREADS, 4)) { backward<8>(*r); }

@@ -46,11 +46,15 @@ struct Scene {
   const float *positions, *rotations, *scales, *opacities, *features;
   double view[12];  // world to camera, 3x4, row-major
   double fx, fy, cx, cy, near;
+  double upper, lower;  // what a ray meets counts for its depth while the transmittance falls from the one to the other
   Projected* projected;  // (splats)
   float *out_features, *out_depth, *out_alpha;
   const float *by_features, *by_depth, *by_alpha;
   float *by_positions, *by_rotations, *by_scales, *by_opacities, *by_splat_features;
 };
+
+// Whether that is not all that a ray meets.
+INLINE bool trimmed(const Scene& r) { return r.upper < 1 || r.lower > 0; }
 
 INLINE int64_t tiles_x(const Scene& r) { return (r.width + TILE_X - 1) / TILE_X; }
 INLINE int64_t tiles_y(const Scene& r) { return (r.height + TILE_Y - 1) / TILE_Y; }

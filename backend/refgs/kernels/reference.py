@@ -10,7 +10,7 @@ from refgs.color import srgb_encode
 from refgs.model import cubemap, prefilter
 from refgs.render.brdf import LEAST_N_V, bounces, reflectance_table
 
-ALPHA_CUT, ALPHA_CAP, MIN_TRANSMITTANCE, LOW_PASS, FAR = 1 / 255, 0.99, 1e-4, 2.0, 1e12  # as in splat.h
+ALPHA_CUT, ALPHA_CAP, MIN_TRANSMITTANCE, LOW_PASS, FAR = 1 / 255, 0.99, 1e-4, 8.0, 1e12  # as in splat.h
 COVERED, SHIFT_LIMIT, SHIFT_ALPHA = 1 / 255, 8.0, 0.3  # as in shade.cpp
 
 
@@ -33,10 +33,13 @@ def rasterize(
     features: Tensor,
     camera: Camera,
     near: float,
+    upper: float = 1.0,
+    lower: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """As refgs.render.rasterize.rasterize, for float64 tensors; and how far each pixel (H, W) is from a decision that
-    rounding could turn: the smallest relative margin of all the comparisons that its value rests on."""
-    view = torch.from_numpy(camera.world_to_camera)
+    """As refgs.render.rasterize.rasterize, for float64 tensors, the depth being summed as `trimmed_depth` sums it; and how far each
+    pixel (H, W) is from a decision that rounding could turn: the smallest relative margin of all the comparisons that its value
+    rests on."""
+    view = torch.from_numpy(camera.world_to_camera).to(positions.dtype)
     centre = positions @ view[:3, :3].T + view[:3, 3]
     drawn = (centre[:, 2] >= near) & (centre[:, 2] <= FAR) & (opacities >= ALPHA_CUT)
     order = torch.argsort(centre[:, 2].float(), stable=True)
@@ -66,7 +69,9 @@ def rasterize(
     alpha = torch.where(raw >= ALPHA_CUT, raw.clamp_max(ALPHA_CAP), 0)
     before = torch.cumprod(torch.cat([torch.ones_like(x)[..., None], 1 - alpha], dim=-1), dim=-1)[..., :-1]
     weight = torch.where(before >= MIN_TRANSMITTANCE, alpha * before, 0)
-    maps = weight @ f, (weight * z).sum(dim=-1), weight.sum(dim=-1)
+    after = before - weight
+    part = before.clamp(lower, upper) - after.clamp(lower, upper)
+    maps = weight @ f, (part * z).sum(dim=-1), weight.sum(dim=-1)
 
     with torch.no_grad():  # in the order of the rules: on the plane or not, near or not, cut, capped, finished
         seen = before >= MIN_TRANSMITTANCE * 0.99
@@ -100,6 +105,7 @@ def shade(
     display: bool = False,
     mirror: bool = False,
     by_direction: bool = False,
+    matte: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """As refgs.render.shade.shade, for float64 tensors and a light that stands turned (3, 3) to the world; and how far each pixel
     (H, W) is from a kink of the derivatives, in the units of what has the kink. Bilinear look-ups have one at every texel."""
@@ -107,12 +113,14 @@ def shade(
     here, margins = alpha[pixels], []
     own = features[pixels] / here[:, None]
     maps = _displaced(features, alpha, own, pixels, camera, margins)
+    if matte:
+        maps = _with_matte_material(maps)
 
     row, column = (index + 0.5 for index in pixels)
     ray = torch.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, torch.ones_like(here)], dim=-1)
     towards = -unit(ray @ view[:3, :3])
     indirect = None if visibility is None else (visibility[pixels][:, None], maps[:, 11:])
-    given = levels, sides, indirect, margins, turn, mirror
+    given = levels, sides, indirect, margins, turn, mirror, matte
     radiance = radiance_towards(towards, maps, maps[:, 8:11] if by_direction else None, *given)
     exposed = exposure * radiance
     if not display:
@@ -136,9 +144,10 @@ def shade_splats(
     turn: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """As refgs.render.shade.shade_splats, for float64 tensors; and how far each surfel is from a kink."""
-    towards, margins = unit(torch.from_numpy(camera.position) - features[:, -3:]), []
+    towards, margins, matte = unit(torch.from_numpy(camera.position) - features[:, -3:]), [], features.shape[-1] == 9
+    features = _with_matte_material(features) if matte else features
     appearance = features[:, 8:11] if features.shape[-1] > 11 else None
-    radiance = radiance_towards(towards, features, appearance, levels, sides, None, margins, turn)
+    radiance = radiance_towards(towards, features, appearance, levels, sides, None, margins, turn, matte=matte)
     return radiance, torch.stack(margins).amin(dim=0)
 
 
@@ -152,11 +161,15 @@ def radiance_towards(
     margins: list[Tensor],
     turn: Tensor | None = None,
     mirror: bool = False,
+    matte: bool = False,
 ) -> Tensor:
     """The split sum (paper Eq. 5–10) of normals, albedo, metallic and roughness (P, 8 or more), towards unit vectors (P, 3)."""
     normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
     if turn is not None:
         normal, towards = normal @ turn.T, towards @ turn.T
+    if matte:
+        _cube_margins(normal, [torch.tensor(sides[-1])], margins)
+        return albedo * prefilter.irradiance(levels, sides, normal)
     dot = (normal * towards).sum(dim=-1)
     roughness = torch.zeros_like(roughness) if mirror else roughness
     light = specular(levels, sides, 2 * dot[:, None] * normal - towards, roughness, margins)
@@ -175,6 +188,11 @@ def radiance_towards(
         reaching = 1 if indirect is None else maps[:, 8:11]
         diffuse = (1 - share) * (1 - dielectric) * albedo * received * reaching
     return light * ((1 - share) * dielectric + share * metal) + diffuse
+
+
+def _with_matte_material(maps: Tensor) -> Tensor:
+    """Metallic 0 and roughness 1 after normal and albedo (P, 6 or more)."""
+    return torch.cat([maps[:, :6], maps.new_tensor([0.0, 1.0]).expand(len(maps), 2), maps[:, 6:]], dim=1)
 
 
 def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tensor]) -> Tensor:
@@ -244,3 +262,18 @@ def reflectance(n_v: Tensor, roughness: Tensor, albedo: Tensor, margins: list | 
     """What a metal (P, 3) and what a dielectric (P, 1) reflect of an even light, at N·V and roughness (P,)."""
     fg0, fg1, average, dielectric = table(n_v, roughness, margins).split(1, dim=-1)
     return (albedo * fg0 + fg1) * bounces((20 * albedo + 1) / 21, fg0 + fg1, average), dielectric
+
+
+def dssim(image: Tensor, target: Tensor) -> Tensor:
+    """As refgs.render.ssim.dssim."""
+    k = torch.arange(-5, 6, dtype=image.dtype)
+    window = torch.exp(-(k**2) / (2 * 1.5**2))
+    window = torch.outer(window, window) / window.sum() ** 2
+
+    def blur(v: Tensor) -> Tensor:
+        return torch.nn.functional.conv2d(v.permute(2, 0, 1)[:, None], window[None, None], padding=5)
+
+    x, y = blur(image), blur(target)
+    xx, yy, xy = blur(image**2) - x**2, blur(target**2) - y**2, blur(image * target) - x * y
+    ssim = (2 * x * y + 1e-4) * (2 * xy + 9e-4) / ((x**2 + y**2 + 1e-4) * (xx + yy + 9e-4))
+    return 1 - ssim.mean()

@@ -24,6 +24,7 @@ struct Shade {
   int64_t harmonics;              // whether there are channels of colour by direction
   int64_t splats, display;        // whether pixels are surfels; whether colours are blended and compared as they are, not encoded
   int64_t mirror;                 // whether the light that is mirrored is the sharp one, and metallic its share, as in 3DGS-DR
+  int64_t matte;                  // whether none is: there are no channels of metallic and roughness then
   const float *features, *alpha;  // (height, width, channels), (height, width): sums over a pixel's splats
   const float* visibility;        // (height, width): 0 where the object itself stands in the mirror direction; or null
   Levels levels;
@@ -430,6 +431,26 @@ INLINE Vectors mirror(Vectors normal, Vectors view, Vector& n_dot_v) {
   return 2.0f * n_dot_v * normal - view;
 }
 
+// From exposed radiance to what is blended over the background, and its derivative. Of surfels it is blended as it is.
+template <bool SPLATS>
+INLINE void encode(const Shade& s, Vector exposed, Vector& encoded, Vector& slope) {
+  if (SPLATS || s.display)
+    encoded = exposed, slope = Vector() + 1.0f;
+  else
+    encoded = srgb_encode(exposed, slope);
+}
+
+template <bool SPLATS, class Map>
+INLINE void write_pixels(const Shade& s, const Map& map, const Vector (&radiance)[3], const Vector (&encoded)[3], const Vector (&material)[5]) {
+  if (SPLATS) return scatter<3>(s.color, map.pixels, radiance);
+  Vector color[3];
+  for (int c = 0; c < 3; c++) color[c] = encoded[c] * map.alpha + (1.0f - map.alpha) * s.background[c];
+  scatter<3>(s.color, map.pixels, color);
+  scatter<3>(s.normal, map.pixels, {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]});
+  scatter<5>(s.material, map.pixels, material);
+  scatter<3>(s.radiance, map.pixels, radiance);
+}
+
 // The split sum over a metallic-roughness material, of LANES pixels. HARMONICS: colour by direction in place of the reflected
 // irradiance. INDIRECT: light from the object itself where it stands in the mirror direction (Eq. 9), and its shadow on the irradiance.
 // SPLATS: of surfels. Directions are those of the light's frame, for it may stand with the camera.
@@ -474,23 +495,13 @@ struct Shaded {
       Vector diffuse = (1.0f - metallic) * received[c];
       if (!HARMONICS) diffuse *= (1.0f - dielectric) * v[ALBEDO + c];
       radiance[c] = light[c] * reflected(s, Metal(table, v[ALBEDO + c])) + diffuse;
-      Vector exposed = exposure * radiance[c];
-      if (SPLATS || s.display)
-        encoded[c] = exposed, slope[c] = Vector() + 1.0f;
-      else
-        encoded[c] = srgb_encode(exposed, slope[c]);
+      encode<SPLATS>(s, exposure * radiance[c], encoded[c], slope[c]);
     }
   }
 
   MEMBER void write(const Shade& s) const {
-    if (SPLATS) return scatter<3>(s.color, map.pixels, radiance);
     const auto& v = map.value;
-    Vector color[3];
-    for (int c = 0; c < 3; c++) color[c] = encoded[c] * map.alpha + (1.0f - map.alpha) * s.background[c];
-    scatter<3>(s.color, map.pixels, color);
-    scatter<3>(s.normal, map.pixels, {v[NORMAL], v[NORMAL + 1], v[NORMAL + 2]});
-    scatter<5>(s.material, map.pixels, {v[ALBEDO], v[ALBEDO + 1], v[ALBEDO + 2], v[METALLIC], v[ROUGHNESS]});
-    scatter<3>(s.radiance, map.pixels, radiance);
+    write_pixels<SPLATS>(s, map, radiance, encoded, {v[ALBEDO], v[ALBEDO + 1], v[ALBEDO + 2], v[METALLIC], v[ROUGHNESS]});
   }
 
   template <class Sums>
@@ -581,6 +592,63 @@ struct Shaded {
   MEMBER Vectors mirrored() { return mirror(normal, view, n_dot_v); }
 };
 
+// A surface that mirrors nothing: its albedo times the irradiance, of LANES pixels or SPLATS.
+template <bool SPLATS, bool DERIVATIVES>
+struct Matte {
+  static constexpr int C = 9, S = C - 3;  // normal, albedo, position
+  Map<SPLATS, C, DERIVATIVES> map;
+  Vector inverse_length;
+  Vectors normal;
+  Lookup<1, DERIVATIVES> irradiance;
+  Vector radiance[3], encoded[3], slope[3];
+  float exposure;
+
+  MEMBER Matte(const Shade& s, const Pixels& pixels)
+      : map(s, pixels),
+        inverse_length(inverse_norm({map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
+        normal(inverse_length * turned(s.turn, {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
+        irradiance(s.levels, normal),
+        exposure(s.exposure[0]) {
+#pragma unroll
+    for (int c = 0; c < 3; c++) {
+      radiance[c] = map.value[ALBEDO + c] * irradiance.light[c];
+      encode<SPLATS>(s, exposure * radiance[c], encoded[c], slope[c]);
+    }
+  }
+
+  MEMBER void write(const Shade& s) const {
+    const auto& v = map.value;
+    write_pixels<SPLATS>(s, map, radiance, encoded, {v[ALBEDO], v[ALBEDO + 1], v[ALBEDO + 2], Vector(), Vector() + 1.0f});
+  }
+
+  template <class Sums>
+  MEMBER void backward(const Shade& s, Sums& sums) const {
+    Vector by_color[3], by_normal[3] = {}, by_material[5] = {}, by_alpha = {}, by_exposure = {}, by[S] = {}, by_irradiance[3];
+    gather<3>(s.by_color, map.pixels, by_color);
+    if (!SPLATS) gather<3>(s.by_normal, map.pixels, by_normal), gather<5>(s.by_material, map.pixels, by_material);
+#pragma unroll
+    for (int c = 0; c < 3; c++) {
+      if (!SPLATS) by_alpha += by_color[c] * (encoded[c] - s.background[c]);
+      Vector by_exposed = by_color[c] * map.alpha * slope[c], by_radiance = exposure * by_exposed;
+      by_exposure += by_exposed * radiance[c];
+      by[ALBEDO + c] = by_material[c] + by_radiance * irradiance.light[c];
+      by_irradiance[c] = by_radiance * map.value[ALBEDO + c];
+    }
+    sums.add_exposure(by_exposure);
+    sums.add_light(irradiance, map.pixels.count, by_irradiance);
+    Vectors by_n = irradiance.backward(by_irradiance);
+    by_n = turned_back(s.turn, inverse_length * (by_n - dot(by_n, normal) * normal));
+    by[NORMAL] = by_n.x + by_normal[0], by[NORMAL + 1] = by_n.y + by_normal[1], by[NORMAL + 2] = by_n.z + by_normal[2];
+    if constexpr (SPLATS) {
+      Vector by_own[C] = {};
+      for (int c = 0; c < S; c++) by_own[c] = by[c];
+      sums.add_own(map.pixels, by_own, by_alpha);
+    } else {
+      map.backward(s, by, by_alpha, sums);
+    }
+  }
+};
+
 void mirrored_pixels(const Shade& s, int64_t first, int64_t end) {
   for (int64_t i = 3 * first; i < 3 * end; i++) s.mirrored[i] = 0;
   each_covered(s, first, end, [&](const Pixels& pixels) {
@@ -592,7 +660,7 @@ void mirrored_pixels(const Shade& s, int64_t first, int64_t end) {
   });
 }
 
-template <bool HARMONICS, bool INDIRECT, bool SPLATS = false>
+template <bool SPLATS, class Shown, class Differentiated>
 struct Kind {
   static void forward(const Shade& s, int64_t first, int64_t end) {
     const float background[3] = {s.background[0], s.background[1], s.background[2]};
@@ -600,24 +668,30 @@ struct Kind {
       for (int c = 0; c < 3; c++) s.color[3 * i + c] = background[c], s.normal[3 * i + c] = s.radiance[3 * i + c] = 0;
       for (int c = 0; c < 5; c++) s.material[5 * i + c] = 0;
     }
-    each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, SPLATS, false>(s, pixels).write(s); });
+    each_covered(s, first, end, [&](const Pixels& pixels) { Shown(s, pixels).write(s); });
   }
 
   template <class Sums>
   static void backward(const Shade& s, int64_t first, int64_t end, Sums& sums) {
-    each_covered(s, first, end, [&](const Pixels& pixels) { Shaded<HARMONICS, INDIRECT, SPLATS, true>(s, pixels).backward(s, sums); });
+    each_covered(s, first, end, [&](const Pixels& pixels) { Differentiated(s, pixels).backward(s, sums); });
   }
 };
+template <bool HARMONICS, bool INDIRECT, bool SPLATS = false>
+using Glossy = Kind<SPLATS, Shaded<HARMONICS, INDIRECT, SPLATS, false>, Shaded<HARMONICS, INDIRECT, SPLATS, true>>;
+template <bool SPLATS = false>
+using Dull = Kind<SPLATS, Matte<SPLATS, false>, Matte<SPLATS, true>>;
 
 // body(kind) of what the pixels are.
 template <class Body>
 void by_kind(const Shade& s, Body body) {
-  if (s.splats)
-    s.harmonics ? body(Kind<true, false, true>()) : body(Kind<false, false, true>());
+  if (s.matte)
+    s.splats ? body(Dull<true>()) : body(Dull<>());
+  else if (s.splats)
+    s.harmonics ? body(Glossy<true, false, true>()) : body(Glossy<false, false, true>());
   else if (s.visibility)
-    s.harmonics ? body(Kind<true, true>()) : body(Kind<false, true>());
+    s.harmonics ? body(Glossy<true, true>()) : body(Glossy<false, true>());
   else
-    s.harmonics ? body(Kind<true, false>()) : body(Kind<false, false>());
+    s.harmonics ? body(Glossy<true, false>()) : body(Glossy<false, false>());
 }
 
 // body(first, end) for all pixels, some at a time.

@@ -18,6 +18,7 @@ from scipy import integrate, sparse
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from refgs.clock import timed
 from refgs.kernels.load import Shared, Work, check, run
 from refgs.model import cubemap
 from refgs.model.cubemap import SYMMETRIES
@@ -25,6 +26,7 @@ from refgs.model.cubemap import SYMMETRIES
 ROUGHNESS = (0.0, 0.08, 0.15, 0.25, 0.4, 0.65, 1.0)  # of the levels; level 0 is the cubemap itself
 DIVISOR = (1, 2, 2, 4, 4, 8, 8)  # a level's side is the cubemap's divided by this
 CELLS = 256  # a texel of the pyramid is split while it holds more than 1/CELLS of the lobe
+LEAST_SHARE = 1e-5  # of the lobe: a texel with less of it is left out
 LEAST_SIDE = 8  # of a level, where the cubemap is as fine
 IRRADIANCE_SIDE = 16  # of the last one: a sun's edge of shadow is as sharp as that
 COARSEST = 4  # side of the last pooled mip
@@ -83,7 +85,7 @@ def _level(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.nd
         area = cubemap.texel_solid_angles(n).numpy().reshape(6, n, n)[0, half:, half:]
         share = _lobe_over_texels(axes[axis], row, column, n, lobe) * area[row, column] / whole
         split = (share > 1 / CELLS) & (n < resolution)
-        kept = (share > 1e-5) & ~split
+        kept = (share > LEAST_SHARE) & ~split
         parts.append((start + row[kept] * half + column[kept], axis[kept], share[kept]))
         axis = np.repeat(axis[split], 4)
         row, column = (np.add.outer(2 * a[split], b).ravel() for a, b in ((row, (0, 0, 1, 1)), (column, (0, 1, 0, 1))))
@@ -193,6 +195,7 @@ def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tenso
     return out
 
 
+@timed("prefilter")
 class _Prefilter(torch.autograd.Function):
     @staticmethod
     def forward(ctx, radiance: Tensor, resolution: int) -> Tensor:

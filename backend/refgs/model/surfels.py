@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from refgs.clock import timed
 from refgs.export.splats import Splats
 from refgs.kernels.load import Shared, Work, run
 from refgs.model import harmonics
@@ -93,6 +94,7 @@ class _Work(Work):
     )
 
 
+@timed("surfels")
 class _Activate(torch.autograd.Function):
     """Each tensor by its kind."""
 

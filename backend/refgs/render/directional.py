@@ -7,6 +7,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
+from refgs.clock import timed
 from refgs.kernels.load import Shared, Work, run
 
 
@@ -22,6 +23,7 @@ class _Work(Work):
     )
 
 
+@timed("surfels")
 class _Directional(torch.autograd.Function):
     @staticmethod
     def forward(ctx, constant, rest, offset, positions, normals, camera):

@@ -16,17 +16,18 @@ class Scene(Work):
         [(n, ctypes.c_int64) for n in ("splats", "channels", "width", "height")]
         + [(n, ctypes.c_void_p) for n in ("positions", "rotations", "scales", "opacities", "features")]
         + [("view", ctypes.c_double * 12)]
-        + [(n, ctypes.c_double) for n in ("fx", "fy", "cx", "cy", "near")]
+        + [(n, ctypes.c_double) for n in ("fx", "fy", "cx", "cy", "near", "upper", "lower")]
         + [(n, ctypes.c_void_p) for n in ("projected", "out_features", "out_depth", "out_alpha")]
         + [(n, ctypes.c_void_p) for n in ("by_features", "by_depth", "by_alpha")]
         + [(n, ctypes.c_void_p) for n in ("by_positions", "by_rotations", "by_scales", "by_opacities")]
         + [("by_splat_features", ctypes.c_void_p)]
     )
 
-    def look(self, camera: Camera, near: float) -> None:
+    def look(self, camera: Camera, near: float, upper: float = 1.0, lower: float = 0.0) -> None:
         self.width, self.height = camera.width, camera.height
         self.view[:] = camera.world_to_camera[:3].reshape(-1).tolist()
         self.fx, self.fy, self.cx, self.cy, self.near = camera.fx, camera.fy, camera.cx, camera.cy, near
+        self.upper, self.lower = upper, lower
 
     def keep(self, **tensors: Tensor) -> None:
         """Point at tensors, and have them live as long as this."""

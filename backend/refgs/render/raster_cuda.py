@@ -61,7 +61,8 @@ class Raster(Scene):
 
     def blend(self) -> None:
         self.size = next(size for size in SIZES if size >= self.channels)
-        cuda.launch(f"refgs_raster_forward_{self.size}", self, self.kept["reach"].device, self.tiles, THREADS)
+        kernel = "trimmed" if self.upper < 1 or self.lower > 0 else self.size
+        cuda.launch(f"refgs_raster_forward_{kernel}", self, self.kept["reach"].device, self.tiles, THREADS)
 
     def differentiate(self) -> None:
         like = self.kept["reach"]

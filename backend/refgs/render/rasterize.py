@@ -7,8 +7,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
+from refgs.clock import timed
 from refgs.kernels import load
 from refgs.render import raster_cpu, raster_cuda
+from refgs.render.raster import Scene
 
 
 class Raster(NamedTuple):
@@ -23,6 +25,25 @@ class Raster(NamedTuple):
     alpha: Tensor
 
 
+def _draw(splats: dict[str, Tensor], camera: Camera, near: float, *trim: float) -> tuple[Scene, Raster]:
+    """What `rasterize` and `trimmed_depth` take; the maps, and the work that they came from, which points at all of them."""
+    features = splats["features"]
+    rasteriser = raster_cuda if load.on_gpu(features) else raster_cpu
+    work = rasteriser.Raster(splats=features.shape[0], channels=features.shape[1])
+    work.attach(**splats)
+    work.look(camera, near, *trim)
+    work.project(features.device)
+    maps = Raster(
+        features.new_empty(camera.height, camera.width, features.shape[1]),
+        features.new_empty(camera.height, camera.width),
+        features.new_empty(camera.height, camera.width),
+    )
+    work.attach(**{f"out_{name}": map for name, map in maps._asdict().items()})
+    work.blend()
+    return work, maps
+
+
+@timed("raster")
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx, positions, rotations, scales, opacities, features, camera, near):
@@ -33,21 +54,10 @@ class _Rasterize(torch.autograd.Function):
             "opacities": opacities.contiguous(),
             "features": features.contiguous(),
         }
-        rasteriser = raster_cuda if load.on_gpu(features) else raster_cpu
-        work = rasteriser.Raster(splats=features.shape[0], channels=features.shape[1])
-        work.attach(**inputs)
-        work.look(camera, near)
-        work.project(features.device)
-        outputs = {
-            "out_features": features.new_empty(camera.height, camera.width, features.shape[1]),
-            "out_depth": features.new_empty(camera.height, camera.width),
-            "out_alpha": features.new_empty(camera.height, camera.width),
-        }
-        work.attach(**outputs)
-        work.blend()
-        ctx.save_for_backward(*inputs.values(), *outputs.values())
+        work, maps = _draw(inputs, camera, near)
+        ctx.save_for_backward(*inputs.values(), *maps)
         ctx.work = work
-        return tuple(outputs.values())
+        return tuple(maps)
 
     @staticmethod
     @once_differentiable
@@ -87,7 +97,7 @@ def rasterize(
     the others, what the rays meet nearer than that is not. Returns maps (H, W, C), (H, W), (H, W).
 
     The constants of the blending (alpha below 1/255 is nothing, alpha is at most 0.99, a pixel is finished at
-    transmittance 1e-4, screen-space filter of σ = √2/2 pixels as in 2DGS) are in kernels/splat.h. The result does not depend
+    transmittance 1e-4, screen-space filter of σ = √2/4 pixels, half of 2DGS's) are in kernels/splat.h. The result does not depend
     on the number of threads, and a card's is the same each time.
     """
     n, channels = features.shape[0], features.shape[1:2]
@@ -107,3 +117,30 @@ def rasterize(
     maps = [_Rasterize.apply(positions, rotations, scales, opacities, part, camera, near) for part in parts]
     joined = maps[0][0] if len(maps) == 1 else torch.cat([features for features, *_ in maps], dim=-1)
     return Raster(joined, *maps[0][1:])
+
+
+@torch.no_grad()
+def trimmed_depth(
+    positions: Tensor,
+    rotations: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    camera: Camera,
+    near: float,
+    upper: float,
+    lower: float,
+) -> tuple[Tensor, Tensor]:
+    """Where surfels stop the rays (H, W), along the camera's axis, and their alpha (H, W); not differentiable.
+
+    A trimmed mean: the mean depth of what a ray meets while its transmittance falls from `upper` to `lower`, 1 ≥ upper > lower ≥ 0.
+    What is faint before the surface, and whatever shows through it, however far behind, has no part in it. It tends to the median
+    (2DGS's depth of unbounded scenes) as both near a half. Zero where the transmittance stays above `upper`.
+    Otherwise as `rasterize`.
+    """
+    splats = {"positions": positions, "rotations": rotations, "scales": scales, "opacities": opacities}
+    splats = {name: value.contiguous() for name, value in splats.items()} | {
+        "features": opacities.new_zeros(len(opacities), 1)
+    }
+    _, (_, depth, alpha) = _draw(splats, camera, near, upper, lower)
+    part = upper - (1 - alpha).clamp(lower, upper)
+    return torch.where(part > 0, depth / part.clamp_min(1e-6), 0), alpha

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
+from refgs.clock import timed
 from refgs.color import srgb_decode, srgb_encode
 from refgs.geometry.visibility import Occluder
 from refgs.kernels import load
@@ -77,6 +78,7 @@ def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.sqrt(np.einsum("pa,pa->p", v, v) + 1e-24)[:, None]
 
 
+@timed("visibility")
 def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, occluder: Occluder) -> Tensor:
     """1 where the mirror direction of a pixel is free of the object (H, W), else 0."""
     directions = mirror_directions(features, alpha, camera)
@@ -98,8 +100,10 @@ def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, 
 def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirect: bool) -> list[Tensor]:
     """What `shade` takes of surfels, as a camera sees them, (N, C) each: normals, albedo, metallic, roughness; colour by direction
     where there is any; with `indirect`, if not what part of the irradiance they receive, and radiance from the object itself;
-    positions."""
+    positions. Of what mirrors nothing normals, albedo and positions."""
     normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
+    if settings.shading != "sh" and settings.reflection == "none":
+        return [normals, surfels.albedo, surfels.positions]
     lit = [normals, surfels.albedo, surfels.metallic, surfels.roughness]
     if settings.shading == "sh" or settings.diffuse == "sh":
         lit.append(directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera))
@@ -132,10 +136,11 @@ def render(
     traced once: harmonics that the surfels have beyond the constant are a colour by direction that is added to the picture, encoded.
     """
     deferred, display = settings.shading == "deferred", settings.color_space == "display"
-    mirror = settings.reflection == "mirror"
+    mirror, matte = settings.reflection == "mirror", settings.reflection == "none"
+    occluder = None if matte else occluder
     lit = channels(surfels, camera, settings, deferred and occluder is not None)
     if settings.shading == "splat":
-        blended = [lit[0], shade_splats(stack(lit), environment, camera, mirror), *lit[1:4]]
+        blended = [lit[0], shade_splats(stack(lit), environment, camera, mirror), *lit[1 : 2 if matte else 4]]
     else:
         blended = lit if deferred else [lit[0], lit[4]]
     adds = deferred and settings.diffuse == "irradiance" and surfels.sh_rest.shape[1] > 0
@@ -147,7 +152,7 @@ def render(
         if adds:
             residual, features = features.split((3, features.shape[-1] - 3), dim=-1)
         visibility = None if occluder is None else _visibility(features, alpha, depth, camera, occluder)
-        how = display, mirror, settings.diffuse == "sh"
+        how = display, mirror, settings.diffuse == "sh", matte
         shaded = shade(features, alpha, environment, camera, background, visibility, exposure, *how)
         color = shaded.color + (residual - SIGNED * alpha[..., None]) if adds else shaded.color
         return Rendering(color, alpha, depth, shaded.normal, shaded.material, visibility, background, exposure)
@@ -156,7 +161,10 @@ def render(
         normal, color = features.split(3, dim=-1)
         mean = normal / alpha.clamp_min(COVERED)[..., None]
         return Rendering(color + over, alpha, depth, mean, background=background)
-    normal, mean, material = (features / alpha.clamp_min(COVERED)[..., None]).split((3, 3, 5), dim=-1)
+    normal, mean, *material = (features / alpha.clamp_min(COVERED)[..., None]).split((3, 3, 3 if matte else 5), dim=-1)
+    material = (
+        torch.cat([*material, alpha.new_tensor([0.0, 1.0]).expand(*alpha.shape, 2)], dim=-1) if matte else material[0]
+    )
     exposed = mean if exposure is None else exposure * mean
     encoded = exposed if display else srgb_encode(exposed)
     return Rendering(encoded * alpha[..., None] + over, alpha, depth, normal, material, None, background, exposure)

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
+from refgs.clock import timed
 from refgs.kernels import cuda, load
 from refgs.kernels.load import Shared, Work
 from refgs.model import cubemap, prefilter
@@ -17,6 +18,7 @@ from refgs.render.brdf import reflectance_table
 
 CHANNELS = 11  # normal, albedo, metallic, roughness, position; before the position those that not every scene has
 INDIRECT = 6  # more of them with inter-reflection
+MATTE = 9  # where nothing is mirrored: without metallic and roughness
 
 
 class Shaded(NamedTuple):
@@ -51,7 +53,7 @@ class _Work(Work):
         + [("view", ctypes.c_float * 12), ("turn", ctypes.c_float * 9)]
         + [(n, ctypes.c_float) for n in ("fx", "fy", "cx", "cy")]
         + [(n, ctypes.c_void_p) for n in ("background", "exposure")]
-        + [(n, ctypes.c_int64) for n in ("harmonics", "splats", "display", "mirror")]
+        + [(n, ctypes.c_int64) for n in ("harmonics", "splats", "display", "mirror", "matte")]
         + [(n, ctypes.c_void_p) for n in ("features", "alpha", "visibility")]
         + [("levels", _Levels)]
         + [(n, ctypes.c_int64) for n in ("texels", "cells", "lines")]
@@ -112,6 +114,7 @@ def _one(device: torch.device) -> Tensor:
     return torch.ones((), device=device)
 
 
+@timed("shading")
 class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(ctx, features, alpha, levels, exposure, sides, camera, turn, background, visibility, *how):
@@ -127,7 +130,7 @@ class _Shade(torch.autograd.Function):
         work.attach(texel=padding.texel, starts=padding.starts, cell=padding.cell)
         if visibility is not None:
             work.attach(visibility=visibility)
-        work.harmonics, work.display, work.mirror, work.splats = how
+        work.harmonics, work.display, work.mirror, work.matte, work.splats = how
         work.texels, work.cells, work.lines = len(light), cells, padding.lines
         work.levels.count, work.levels.cells = len(sides), padded.data_ptr()
         work.levels.side[: len(sides)] = sides
@@ -175,7 +178,7 @@ class _Shade(torch.autograd.Function):
             load.parallel(load.kernels().refgs_shade_backward, work)
         load.run("refgs_shade_gather", work, features, items=alpha.numel())
         load.run("refgs_shade_unpad", work, features, items=work.texels)
-        return by_features, by_alpha, by_light, by_exposure.sum(), *[None] * 9
+        return by_features, by_alpha, by_light, by_exposure.sum(), *[None] * 10
 
 
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
@@ -201,6 +204,7 @@ def shade(
     display: bool = False,
     mirror: bool = False,
     by_direction: bool = False,
+    matte: bool = False,
 ) -> Shaded:
     """Shade what the rasteriser blended by the split sum (paper Eq. 5–10), over a background (3,), sRGB-encoded.
 
@@ -212,15 +216,16 @@ def shade(
     `exposure`, a scalar, before it is encoded; 1 where there is none. float32, all on the CPU or on one card, differentiable
     in features, alpha, the light and the exposure. What the blend's mean position says of its bias towards the camera is
     undone first: shade.cpp has how. With `display` light and materials are of a screen's numbers, and nothing is encoded. With
-    `mirror` the sharp light is mirrored, and metallic is its share (Ye et al., 3DGS-DR, 2024).
+    `mirror` the sharp light is mirrored, and metallic is its share (Ye et al., 3DGS-DR, 2024). What is `matte` mirrors nothing,
+    albedo times irradiance: its features are normal, albedo and position; the material that comes out has metallic 0, roughness 1.
     The result does not depend on the number of threads, nor, on a card, does it differ from one call to the next. Where a
     derivative to hand back is not finite, on a card none is a number.
     """
-    expected = CHANNELS + (3 * by_direction if visibility is None else INDIRECT)
+    expected = MATTE if matte else CHANNELS + (3 * by_direction if visibility is None else INDIRECT)
     if features.shape != (*alpha.shape, expected):
         size = f"{alpha.shape[1]}×{alpha.shape[0]}"
         raise ValueError(f"expected {expected} features a pixel of {size}, got {tuple(features.shape)}")
-    how = by_direction, display, mirror, False
+    how = by_direction, display, mirror, matte, False
     return _shade(features, alpha, environment, camera, background, how, visibility, exposure)
 
 
@@ -228,13 +233,14 @@ def shade_splats(features: Tensor, environment: Environment, camera: Camera, mir
     """What surfels send to a camera, (N, 3): the split sum of each, before they are blended (paper §3.3, the initial stage).
 
     `features` (N, C) are, in this order: normal in world space, albedo, metallic, roughness; three of colour by direction,
-    where that takes the place of integrated diffuse light; position. Differentiable in features and the light.
+    where that takes the place of integrated diffuse light; position. Of what mirrors nothing, without metallic and roughness.
+    Differentiable in features and the light.
     """
     count, channels = features.shape
-    if channels not in (CHANNELS, CHANNELS + 3):
-        raise ValueError(f"expected {CHANNELS} or {CHANNELS + 3} features a surfel, got {channels}")
+    if channels not in (MATTE, CHANNELS, CHANNELS + 3):
+        raise ValueError(f"expected {MATTE}, {CHANNELS} or {CHANNELS + 3} features a surfel, got {channels}")
     features, alpha = features[:, None], features.new_ones(count, 1)
-    how = channels > CHANNELS, False, mirror, True
+    how = channels > CHANNELS, False, mirror, channels == MATTE, True
     return _shade(features, alpha, environment, camera, features.new_zeros(3), how).color[:, 0]
 
 
@@ -244,7 +250,7 @@ def _shade(
     light: Environment,
     camera: Camera,
     background: Tensor,
-    how: tuple[bool, bool, bool, bool],  # by direction, display, mirror, of surfels
+    how: tuple[bool, bool, bool, bool, bool],  # by direction, display, mirror, matte, of surfels
     visibility: Tensor | None = None,
     exposure: Tensor | None = None,
 ) -> Shaded:

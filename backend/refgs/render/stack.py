@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from refgs.clock import timed
 from refgs.kernels.load import Shared, Work, check, run
 
 MOST = 8  # parts
@@ -37,10 +38,11 @@ class _Work(Work):
         return work
 
 
+@timed("surfels")
 class _Stack(torch.autograd.Function):
     @staticmethod
     def forward(ctx, *parts):
-        ctx.widths = [part.numel() // max(len(part), 1) for part in parts]
+        ctx.widths = [part.shape[1:].numel() for part in parts]
         parts = [part.contiguous() for part in parts]
         stacked = parts[0].new_empty(len(parts[0]), sum(ctx.widths))
         run("refgs_stack", _Work.of(stacked, ctx.widths, parts), stacked, items=len(stacked))

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
+from refgs.clock import timed
 from refgs.model.surfels import Surfels, axes
 
 SIDE = 1.3  # in half pictures: beyond that the projection's derivative is that of the border, or it would grow without bound
@@ -49,6 +50,7 @@ def with_normals_last(surfels: Surfels) -> Surfels:
     return surfels._replace(rotations=rotations, scales=scales)
 
 
+@timed("surfels")
 class _Angle(torch.autograd.Function):
     """Half the angle of (x, y). Round Gaussians have none, and feel no turn: no derivative there."""
 

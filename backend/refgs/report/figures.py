@@ -21,7 +21,8 @@ class Quantity(NamedTuple):
     better: Callable[[Iterable[float]], float] | None
 
 
-def _time(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """A time in words."""
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
 
@@ -31,8 +32,9 @@ HEADLINE = [
     Quantity("ssim", "SSIM", "{:.4f}".format, max),
     Quantity("flip", "FLIP", "{:.4f}".format, min),
     Quantity("normal_mae_degrees", "normal error", "{:.2f}°".format, min),
-    Quantity("training_seconds", "training", _time, min),
-    Quantity("seconds", "all of it", _time, min),
+    Quantity("training_seconds", "training", duration, min),
+    Quantity("total_seconds", "with start and end", duration, min),
+    Quantity("seconds", "all of it", duration, min),
     Quantity("frames_per_second", "renders", "{:.3g} a second".format, max),
     Quantity("splats", "surfels", "{:,.0f}".format, None),
     Quantity("peak_memory_bytes", "peak memory", lambda x: f"{x / 2**30:.2f} GiB", min),

@@ -142,8 +142,11 @@ def aligned_psnr(views: list[np.ndarray]) -> dict[str, float | list[float]]:
     return {"psnr_raw": mean(np.ones(3)), "psnr_aligned": mean(scale), "scale": scale.tolist()}
 
 
-def relit(pairs: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]) -> dict[str, float]:
-    """PSNR and FLIP of views under another light, over white: psnr_raw, psnr_aligned, flip_raw, flip_aligned, scale.
+def relit(
+    pairs: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]],
+    measures: tuple[Callable[[np.ndarray, np.ndarray], float], ...] = (psnr, flip),
+) -> dict[str, float]:
+    """Of views under another light, over white: psnr_raw, psnr_aligned, flip_raw, flip_aligned or what else measures them, and scale.
 
     `pairs()` gives, as often as it is called, the picture and the truth of each view, premultiplied linear RGBA. Base
     colours and light share one free scale; "aligned" is after multiplying the pictures' radiance by the `scale` that fits
@@ -159,8 +162,8 @@ def relit(pairs: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]) -> dict[
     rows = []
     for image, reference in pairs():
         truth = over_white(reference)
-        rows.append([measure(over_white(image, s), truth) for measure in (psnr, flip) for s in (1.0, scale)])
-    names = ("psnr_raw", "psnr_aligned", "flip_raw", "flip_aligned")
+        rows.append([measure(over_white(image, s), truth) for measure in measures for s in (1.0, scale)])
+    names = [f"{measure.__name__}_{how}" for measure in measures for how in ("raw", "aligned")]
     return dict(zip(names, np.mean(rows, axis=0).tolist(), strict=True)) | {"scale": scale}
 
 

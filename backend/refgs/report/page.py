@@ -2,10 +2,10 @@
 
 What is read of a run folder, each part left out where it is absent:
 
-    metrics.json     numbers, nested at will; those of `refgs.report.figures` are named, and
+    metrics.json     numbers, nested at will; those of `refgs.report.figures` are named, ambiguities.NAME.what are words, and
                      relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}
-    history.jsonl    one object a line: seconds, iteration, loss, psnr_train, psnr_test, splats
-    needs.json       a list of {"what", "why", "saved"}
+    history.jsonl    one object a line: seconds, iteration, parts, and the quantities of `refgs.report.curves`
+    needs.json       a list of {"what", "why"}, and "saved", "cost", "needed" where they are known
     run.toml         the settings, and what was trained on
     pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png, and true_normal/VIEW.png … where it is known
     pictures/relight/{truth,refgs,splats,mesh}/HDRI_VIEW.png
@@ -13,7 +13,6 @@ What is read of a run folder, each part left out where it is absent:
 """
 
 import base64
-import io
 import json
 import tomllib
 from collections import Counter
@@ -22,15 +21,16 @@ from pathlib import Path
 
 import cv2
 import jinja2
-import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from refgs import __version__
 from refgs.errors import InputError
 from refgs.paths import whole
-from refgs.report.figures import DETAILS, HEADLINE, RELIT, Quantity, flatten, is_number, relit_pair
+from refgs.report.charts import PARTS, error_chart, parts_chart
+from refgs.report.curves import QUANTITIES, Curve, as_csv, curve, knee, levels, time_to
+from refgs.report.figures import DETAILS, HEADLINE, RELIT, Quantity, duration, flatten, is_number, relit_pair
+from refgs.report.labels import labels
+from refgs.train import history
 
 PASSES = {
     "photo": "photo",
@@ -46,18 +46,20 @@ PASSES = {
 }
 MOST_VIEWS, MOST_RELIT = 4, 8
 LARGEST_SIDE = 512  # pixels; a page of full-size photos would be too heavy to open
-INK = "#010203"  # stands for the page's own text colour in a chart, light or dark
 
 
 @dataclass
 class RunPage:
-    """What the page shows of one run."""
+    """What the page shows of one run. Its label is what it is called beside others."""
 
     name: str
+    label: str
     figures: dict[str, float]
     history: list[dict]
     left_out: list[dict]
+    untold: list[str]
     settings: str
+    facts: dict
     trained_on: str
     views: dict[str, dict[str, str]]
     relit: dict[str, dict[str, str]]
@@ -66,8 +68,14 @@ class RunPage:
 
 
 def write_report(runs: list[Path], out: Path) -> None:
-    """Write the page of these run folders to `out`, replacing it. Raises InputError where a folder isn't there."""
+    """Write the page of these run folders to `out`, and the figures of its charts beside it, as CSV; both are replaced. Raises InputError
+    where a folder isn't there."""
     pages = [_read_run(folder) for folder in runs]
+    if len(pages) > 1:
+        for page, label in zip(pages, labels([p.name for p in pages], [p.facts for p in pages]), strict=True):
+            page.label = label
+    groups = _curves(pages)
+    parts = {page.label: spent for page in pages if (spent := _parts(page))}
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
@@ -82,11 +90,17 @@ def write_report(runs: list[Path], out: Path) -> None:
         relit=_names(page.relit for page in pages),
         passes=PASSES,
         relit_kinds=RELIT,
-        chart=_chart(pages),
+        errors=error_chart(groups, [page.label for page in pages]),
+        times=_times(groups),
+        parts=parts_chart(parts),
+        timed=list(parts),
+        parts_table=_parts_table(parts),
     )
+    figures = as_csv({page.label: page.history for page in pages}, groups)
     out.parent.mkdir(parents=True, exist_ok=True)
-    with whole(out) as temporary:
-        temporary.write_text(html, encoding="utf-8")
+    for file, text in ((out, html), (out.with_suffix(".csv"), figures)):
+        with whole(file) as temporary:
+            temporary.write_text(text, encoding="utf-8")
 
 
 def _read_run(folder: Path) -> RunPage:
@@ -106,19 +120,24 @@ def _read_run(folder: Path) -> RunPage:
 
     settings = read("run.toml", str, "its settings are not shown") or ""
     try:
-        trained_on = Path(tomllib.loads(settings)["run"]["capture"]).name
+        facts = tomllib.loads(settings)
+        trained_on = Path(facts["run"]["capture"]).name
     except (KeyError, TypeError, tomllib.TOMLDecodeError):
-        trained_on = ""
+        facts, trained_on = {}, ""
     metrics = read("metrics.json", json.loads, "there are no figures") or {}
-    history = read("history.jsonl", _lines, "there is no chart of error against time") or []
+    lines = read("history.jsonl", _lines, "there is no chart of error against time") or []
     left_out = read("needs.json", json.loads, "what was left out of this scene is not known")
     pictures = folder / "pictures"
+    name = "/".join(folder.resolve().parts[-2:]).lstrip("/")
     page = RunPage(
-        name="/".join(folder.resolve().parts[-2:]).lstrip("/"),
+        name=name,
+        label=name,
         figures=dict(flatten(metrics)),
-        history=history,
+        history=lines,
         left_out=[item for item in left_out if isinstance(item, dict)] if isinstance(left_out, list) else [],
+        untold=_untold(metrics),
         settings=settings,
+        facts=facts,
         trained_on=trained_on,
         views=_pictures(pictures / "test", PASSES, MOST_VIEWS),
         relit=_pictures(pictures / "relight", RELIT, MOST_RELIT),
@@ -134,15 +153,16 @@ def _read_run(folder: Path) -> RunPage:
     return page
 
 
+def _untold(metrics: dict) -> list[str]:
+    """What the photos do not tell, in words."""
+    trades = metrics.get("ambiguities")
+    known = trades.values() if isinstance(trades, dict) else ()
+    return [facts["what"] for facts in known if isinstance(facts, dict) and "what" in facts]
+
+
 def _lines(text: str) -> list[dict]:
-    """The lines of history.jsonl that are whole: a training that was killed can leave half of one."""
-    found = []
-    for line in text.splitlines():
-        try:
-            found.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return [item for item in found if isinstance(item, dict) and is_number(item.get("seconds"))]
+    """The lines of history.jsonl that have a place on the axis of seconds."""
+    return [line for line in history.read(text) if is_number(line.get("seconds"))]
 
 
 def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[str, str]]:
@@ -212,45 +232,49 @@ def _rest(pages: list[RunPage]) -> list[dict]:
     return [{"key": key, "cells": ["–" if x is None else f"{x:.5g}" for x in row]} for key, row in texts.items()]
 
 
-def _chart(pages: list[RunPage]) -> str:
-    """PSNR and loss against seconds of training, as inline SVG; "" where no run has a history."""
-    drawn = [
-        page for page in pages if any(_series(page.history, key)[0] for key in ("psnr_test", "psnr_train", "loss"))
-    ]
-    if not drawn:
-        return ""
-    style = {"svg.fonttype": "none", "svg.hashsalt": "refgs", "font.family": "sans-serif", "font.size": 11}
-    style |= dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK)
-    with matplotlib.rc_context(style):
-        figure = Figure(figsize=(11, 3.8), layout="constrained")
-        quality, loss = figure.subplots(1, 2)
-        for index, page in enumerate(drawn):
-            color = matplotlib.colormaps["Set2"](index % 8)
-            for key, line, what in (("psnr_test", "-", "held-out views"), ("psnr_train", ":", "training views")):
-                seconds, values = _series(page.history, key)
-                if seconds:  # the error's logarithm: a decibel is the same step everywhere
-                    quality.plot(seconds, values, line, color=color, lw=2, label=f"{page.name}, {what}")
-            loss.plot(*_series(page.history, "loss"), color=color, lw=2, label=page.name)
-        loss.set_yscale("log")
-        quality.set_ylabel("PSNR, dB")
-        loss.set_ylabel("training loss")
-        for axes in (quality, loss):
-            axes.set(xscale="log", xlabel="seconds of training", facecolor="none")
-            axes.grid(alpha=0.25, color=INK, lw=0.5)
-            axes.spines[["top", "right"]].set_visible(False)
-            if len(axes.lines) > 1:
-                axes.legend(frameon=False, fontsize=9)
-        for axis in (quality.xaxis, loss.xaxis, loss.yaxis):  # plain numbers, also where there is less than a decade
-            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter(NullFormatter())
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
-    svg = buffer.getvalue()
-    return svg[svg.index("<svg") :].replace(INK, "currentColor")
+def _curves(pages: list[RunPage]) -> list[list[Curve]]:
+    """Of each quantity that some run has, the runs' curves."""
+    groups = []
+    for quantity in QUANTITIES:
+        curves = [curve(page.label, page.history, quantity) for page in pages]
+        if known := [found for found in curves if len(found.seconds)]:
+            groups.append(known)
+    return groups
 
 
-def _series(history: list[dict], key: str) -> tuple[list[float], list[float]]:
-    """Seconds and values of the lines that have this key."""
-    points = [(line["seconds"], line[key]) for line in history if is_number(line.get(key)) and line["seconds"] > 0]
-    return [x for x, _ in points], [y for _, y in points]
+def _times(groups: list[list[Curve]]) -> list[dict]:
+    """A table for each quantity of the times to given errors, and of the knees, with a row for every run that has it."""
+    tables = []
+    for curves in groups:
+        quantity, errors = curves[0].quantity, levels(curves)
+        cells = {found.run: [_said(time_to(found, error)) for error in errors] for found in curves}
+        heads, knees = [quantity.text(error) for error in errors], [knee(found) for found in curves]
+        if any(at is not None for at in knees):
+            heads.append("knee")
+            for found, at in zip(curves, knees, strict=True):
+                point = "–" if at is None else f"{_said(found.seconds[at])}: {quantity.text(found.errors[at])}"
+                cells[found.run].append(point)
+        if heads:
+            tables.append({"what": quantity.title, "levels": heads, "cells": cells})
+    return tables
+
+
+def _said(seconds: float | None) -> str:
+    return "–" if seconds is None else duration(seconds)
+
+
+def _parts(page: RunPage) -> dict[str, float]:
+    """Seconds by part when the run was last looked at."""
+    return next((dict(flatten(line["parts"])) for line in reversed(page.history) if line.get("parts")), {})
+
+
+def _parts_table(parts: dict[str, dict[str, float]]) -> list[dict]:
+    """Rows of parts, each with seconds and part of the whole for every run."""
+    rows = []
+    for name, title in PARTS.items():
+        seconds = [spent.get(name, 0.0) for spent in parts.values()]
+        if any(seconds):
+            wholes = [sum(spent.values()) for spent in parts.values()]
+            cells = [f"{s:.3g} s, {s / w:.1%}" for s, w in zip(seconds, wholes, strict=True)]
+            rows.append({"what": title, "cells": cells})
+    return rows

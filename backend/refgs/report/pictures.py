@@ -5,22 +5,33 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
+from refgs.capture import LoadedView
 from refgs.color import srgb_encode
 from refgs.paths import whole
 from refgs.render.renderer import Rendering
 
 
+def composite(view: LoadedView, background: Tensor) -> Tensor:
+    """The photo over the background, sRGB-encoded float (H, W, 3) in 0..1."""
+    image = torch.from_numpy(view.image).to(background.device).float() / 255
+    if view.alpha is None:
+        return image
+    alpha = torch.from_numpy(view.alpha).to(background.device).float()[..., None] / 255
+    return image * alpha + background * (1 - alpha)
+
+
 def maps(rendering: Rendering) -> dict[str, np.ndarray]:
     """A rendering's passes as float arrays: colours (H, W, 4) premultiplied, the rest (H, W, 3) or (H, W)."""
-    alpha = rendering.alpha.numpy()
-    normal = torch.nn.functional.normalize(rendering.normal, dim=-1).numpy()
-    images = {"normal": normal, "depth": rendering.depth.numpy(), "alpha": alpha}
+    alpha = rendering.alpha.numpy(force=True)
+    normal = torch.nn.functional.normalize(rendering.normal, dim=-1).numpy(force=True)
+    images = {"normal": normal, "depth": rendering.depth.numpy(force=True), "alpha": alpha}
     if rendering.material is not None:
-        images["color"] = np.dstack([rendering.radiance.numpy() * alpha[..., None], alpha])
-        images |= {name: getattr(rendering, name).numpy() for name in ("albedo", "metallic", "roughness")}
+        images["color"] = np.dstack([rendering.radiance.numpy(force=True) * alpha[..., None], alpha])
+        images |= {name: getattr(rendering, name).numpy(force=True) for name in ("albedo", "metallic", "roughness")}
     if rendering.visibility is not None:
-        images["visibility"] = rendering.visibility.numpy()
+        images["visibility"] = rendering.visibility.numpy(force=True)
     return images
 
 

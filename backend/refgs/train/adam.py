@@ -1,10 +1,12 @@
 """The optimiser."""
 
 import ctypes
+import math
 
 import torch
 from torch import Tensor
 
+from refgs.clock import timed
 from refgs.kernels.load import Shared, Work, run
 
 MOST = 16  # tensors
@@ -16,7 +18,7 @@ class _Learned(Work):
     _fields_ = (
         ("count", ctypes.c_int64),
         *((n, ctypes.c_void_p) for n in ("value", "mean", "square", "gradient")),
-        *((n, ctypes.c_double) for n in ("rate", "square_scale")),
+        *((n, ctypes.c_double) for n in ("rate", "square_scale", "low", "high")),
     )
 
 
@@ -27,6 +29,7 @@ class _Work(Work):
         ("tensors", ctypes.c_int64),
         ("learned", _Learned * MOST),
         *((n, ctypes.c_double) for n in ("beta1", "beta2", "epsilon")),
+        ("accepted", ctypes.c_void_p),
         ("scratch", ctypes.c_void_p),
         ("shared", Shared),
     )
@@ -36,18 +39,19 @@ class Adam(torch.optim.Optimizer):
     """Adam (Kingma and Ba 2015), of float32 tensors on one device, all of them in one go: torch's own takes them one by one.
 
     A number whose gradient is zero, as of a surfel that the view does not see, is left as it is, with its moments: these
-    neither fade nor move it on, as they would in Adam itself. So is a parameter without a gradient. Groups and state as in
-    `torch.optim.Adam`, the step a plain number.
+    neither fade nor move it on, as they would in Adam itself. So is a parameter without a gradient. A group's values are kept
+    within its `limits`, a pair. Groups and state as in `torch.optim.Adam` otherwise, the step a plain number.
     """
 
     BETAS, EPSILON = (0.9, 0.999), 1e-15
 
     def __init__(self, groups: list[dict]):
-        super().__init__(groups, {"lr": 0.0})
+        super().__init__(groups, {"lr": 0.0, "limits": (-math.inf, math.inf)})
 
+    @timed("optimiser")
     @torch.no_grad()
-    def step(self) -> None:
-        """Move every parameter by its group's rate `lr`."""
+    def step(self, accepted: Tensor | None = None) -> None:
+        """Move every parameter by its group's rate `lr`; none, nor its moments, where `accepted`, a float32 scalar, is zero."""
         (beta1, beta2), learned, kept = self.BETAS, [], []
         for group in self.param_groups:
             for value in group["params"]:
@@ -59,7 +63,7 @@ class Adam(torch.optim.Optimizer):
                 state["step"] += 1
                 t = state["step"]
                 work = _Learned(count=value.numel(), rate=group["lr"] / (1 - beta1**t))
-                work.square_scale = (1 - beta2**t) ** -0.5
+                work.square_scale, (work.low, work.high) = (1 - beta2**t) ** -0.5, group["limits"]
                 gradient: Tensor = value.grad.contiguous()
                 work.attach(value=value, mean=state["exp_avg"], square=state["exp_avg_sq"], gradient=gradient)
                 learned.append(work)
@@ -69,4 +73,6 @@ class Adam(torch.optim.Optimizer):
         work = _Work(tensors=len(learned))
         work.learned[: len(learned)] = learned
         work.beta1, work.beta2, work.epsilon = beta1, beta2, self.EPSILON
+        if accepted is not None:
+            work.attach(accepted=accepted)
         run("refgs_adam_step", work, kept[0], items=sum(gradient.numel() for gradient in kept))

@@ -1,6 +1,7 @@
 """What a training leaves when it has ended: surfels whose materials relight, and the light."""
 
 import json
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from refgs.model.surfels import Surfels, to_splats
 from refgs.render.rasterize import rasterize
 from refgs.render.volume import discs, with_normals_last
 from refgs.run import OCCLUDER, write_text
+from refgs.train import needs
 from refgs.train.trainer import Trainer
 
 
@@ -43,7 +45,11 @@ def write_asset(trainer: Trainer) -> None:
         raise InputError(
             "the photos show nothing in the region: move its box, or enlarge it, and train into a new folder"
         )
+    constants = needs.constants(trainer, surfels, kept)
+    for name in {*constants} & {*Surfels._fields}:
+        surfels = surfels._replace(**{name: torch.full_like(getattr(surfels, name), constants[name])})
     splats = to_splats(surfels.chosen(kept))
+    splats.constants = constants
     splats.normals *= side[kept].numpy(force=True)[:, None]
     write_splats(folder / "splats.ply", splats)
     if trainer.exposures is not None:
@@ -109,10 +115,10 @@ def _seen_from(surfels: Surfels, trainer: Trainer) -> Tensor:
     return torch.where(side < 0, -1.0, 1.0) * known
 
 
-def _left_out(trainer: Trainer, surfels: Surfels, side: Tensor, wanted: Tensor) -> list[dict[str, str]]:
-    """What this run did without, why, and what that saved. From which `side` (N,) surfels are seen, as `_seen_from` says, and which (N,)
-    are wanted."""
-    settings, left = trainer.settings, []
+def _left_out(trainer: Trainer, surfels: Surfels, side: Tensor, wanted: Tensor) -> list[dict[str, Any]]:
+    """What this run was found to need or not, with the figures that say so; what else it did without, why, and what that saved. From
+    which `side` (N,) surfels are seen, as `_seen_from` says, and which (N,) are wanted."""
+    settings, left = trainer.settings, needs.facts(trainer)
     if settings.render.shading == "sh":
         left.append(
             {"what": "materials and light", "why": "shading = sh", "saved": "shading and the light's prefilter"}
@@ -130,7 +136,7 @@ def _left_out(trainer: Trainer, surfels: Surfels, side: Tensor, wanted: Tensor) 
     if settings.render.shading == "splat":
         saved = "shading pixels; tracing rays"
         left.append({"what": "deferred shading and inter-reflection", "why": "shading = splat", "saved": saved})
-    if settings.render.shading == "deferred" and trainer.occluder is None:
+    if settings.render.shading == "deferred" and trainer.occluder is None and "reflections" not in trainer.needs:
         indirect = settings.indirect
         why = trainer.without_reflection()
         if not why:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
+from refgs.clock import timed
 from refgs.kernels.load import Shared, Work, check, run
 from refgs.model.surfels import Parameters, activate, axes
 from refgs.settings import DensifySettings, PropagationSettings
@@ -22,6 +23,7 @@ class _Work(Work):
         ("count", ctypes.c_int64),
         *((n, ctypes.c_void_p) for n in ("positions", "gradients")),
         ("view", ctypes.c_double * 12),
+        ("accepted", ctypes.c_void_p),
         ("scale", ctypes.c_double),
         *((n, ctypes.c_void_p) for n in ("total", "views", "scratch")),
         ("shared", Shared),
@@ -35,14 +37,17 @@ class ScreenGradient:
         self.total = torch.zeros(count, device=device)
         self.views = torch.zeros(count, device=device)
 
+    @timed("densification")
     @torch.no_grad()
-    def add(self, position: Tensor, gradient: Tensor, camera: Camera) -> None:
-        """Account for one view's gradient (N, 3) by the world position (N, 3)."""
+    def add(self, position: Tensor, gradient: Tensor, camera: Camera, accepted: Tensor | None = None) -> None:
+        """Account for one view's gradient (N, 3) by the world position (N, 3), unless `accepted`, a float32 scalar, is zero."""
         surfels = len(self.total)
         check(total=(self.total, (surfels,)), position=(position, (surfels, 3)), gradient=(gradient, (surfels, 3)))
         position, gradient, work = position.contiguous(), gradient.contiguous(), _Work(count=len(position))
         work.view[:], work.scale = camera.world_to_camera[:3].reshape(-1).tolist(), camera.width / 2 / camera.fx
         work.attach(positions=position, gradients=gradient, total=self.total, views=self.views)
+        if accepted is not None:
+            work.attach(accepted=accepted)
         run("refgs_motion", work, position, items=work.count)
 
     def mean(self) -> Tensor:
@@ -65,11 +70,9 @@ def densify(
     new ones are zero. Returns how many were divided. At least one surfel is kept.
     """
     opacity = parameters["opacity"].sigmoid()
-    keep = (opacity >= settings.prune_opacity) & torch.stack(
-        [p.flatten(1).isfinite().all(dim=1) if p.dim() > 1 else p.isfinite() for p in parameters.values()]
-    ).all(dim=0)
+    keep = ~(opacity < settings.prune_opacity)  # one that is no number is guard.py's to remove, and to say so
     if not keep.any():
-        keep[opacity.nan_to_num(-1).argmax()] = True
+        keep[opacity.argmax()] = True
     chosen = torch.zeros(0, dtype=torch.long, device=keep.device)
     if divide:
         candidates = torch.where(keep, gradient, -1.0)
@@ -81,7 +84,7 @@ def densify(
     if len(index) == len(keep) and len(chosen) == 0:
         return 0
     halves = torch.isin(kept, chosen).nonzero()[:, 0], torch.arange(len(kept), len(index), device=keep.device)
-    _take(parameters, optimizer, index, halves)
+    take(parameters, optimizer, index, halves)
     if len(chosen):
         _divide(parameters, *halves)
     return len(chosen)
@@ -92,6 +95,17 @@ def reset_opacity(parameters: Parameters, optimizer: torch.optim.Optimizer) -> N
     """Make all surfels faint: those that the picture needs come back, the others are removed later (Kerbl et al. 2023)."""
     parameters["opacity"].clamp_(max=math.log(RESET / (1 - RESET)))
     optimizer.state.pop(parameters["opacity"], None)
+
+
+def too_faint(settings: DensifySettings, rate: float, iteration: int, total: int) -> bool:
+    """Whether surfels were made faint so lately that, with opacity's rate, those that the picture needs may not be back: none are to be
+    removed then. Adam moves a logit by about its rate; they get twice as long as that takes."""
+    every = settings.reset_every
+    last = min(iteration, math.ceil(settings.stop * total)) - 1  # not what is done after this iteration's densification
+    if not every or last < every or settings.prune_opacity <= RESET:
+        return False
+    way = math.log(settings.prune_opacity / (1 - settings.prune_opacity) * (1 - RESET) / RESET)
+    return (iteration - last // every * every) * rate < 2 * way
 
 
 @torch.no_grad()
@@ -108,12 +122,10 @@ def propagate_normals(parameters: Parameters, optimizer: torch.optim.Optimizer, 
 @torch.no_grad()
 def thin(parameters: Parameters, optimizer: torch.optim.Optimizer, count: int) -> None:
     """Keep this many surfels, the most opaque."""
-    _take(parameters, optimizer, parameters["opacity"].topk(count).indices.sort().values)
+    take(parameters, optimizer, parameters["opacity"].topk(count).indices.sort().values)
 
 
-def _take(
-    parameters: Parameters, optimizer: torch.optim.Optimizer, index: Tensor, fresh: Sequence[Tensor] = ()
-) -> None:
+def take(parameters: Parameters, optimizer: torch.optim.Optimizer, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
     """Replace the surfels by those of an index, with their moments; those at `fresh` begin without. Adam's steps of these are then
     several times its rate for a while, which sets the picture back at first but finds them their places: a capture without masks
     ends better for it. All of them or, where there is no memory for that, none."""

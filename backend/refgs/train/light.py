@@ -41,6 +41,7 @@ def mirrored(
     """Which part of the light is seen mirrored by some camera: weights of its texels (6·R²,), their solid angles there and zero
     elsewhere, that sum to one. Where nothing is seen all of it counts."""
     seen = torch.zeros(6 * PART * PART, dtype=torch.bool)
+    settings = settings.model_copy(update={"reflection": "microfacet"})  # where a matte surface would, if it were not
     for camera in cameras:
         lit = stack(channels(surfels, camera, settings, indirect=True))
         features, _, alpha = rasterize(*discs(surfels, camera), lit, camera, near=near)

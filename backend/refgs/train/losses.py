@@ -9,6 +9,7 @@ from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
 from refgs.capture import LoadedView
+from refgs.clock import timed
 from refgs.kernels import cuda, load
 from refgs.kernels.load import Shared, Work, check, run
 from refgs.render.renderer import Rendering
@@ -22,20 +23,29 @@ SUMS = 3  # of a row or a block: of the loss, of the pixels with a surface, of s
 
 class Photo(NamedTuple):
     """What a view's rendering should look like: `image` (H, W, 3) uint8, sRGB-encoded, and its `mask` (H, W) uint8, or None,
-    where training is."""
+    where training is. They may be a part of a photo of the size `whole` (H, W), the rest of which is background."""
 
     image: Tensor
     mask: Tensor | None
     camera: Camera
+    whole: tuple[int, int] | None = None
 
     @classmethod
     def of(cls, view: LoadedView, device: torch.device | str = "cpu") -> "Photo":
         mask = None if view.alpha is None else torch.from_numpy(view.alpha).to(device)
         return cls(torch.from_numpy(view.image).to(device), mask, view.camera)
 
+    def part(self, rows: slice, columns: slice) -> "Photo":
+        """These rows and columns of it."""
+        image = self.image[rows, columns].contiguous()
+        mask = None if self.mask is None else self.mask[rows, columns].contiguous()
+        camera = self.camera.cropped(columns.start, rows.start, image.shape[1], image.shape[0])
+        return Photo(image, mask, camera, self.whole or self.image.shape[:2])
+
 
 class Objective(NamedTuple):
-    """The training loss of a view, a differentiable scalar; and the mean squared error of the picture, clipped to 0..1."""
+    """The training loss of a view, a differentiable scalar; and the mean squared error of the picture, clipped to 0..1. Means are over the
+    whole photo, where what is beyond the part of it that is compared is right."""
 
     loss: Tensor
     square: Tensor
@@ -63,6 +73,7 @@ class _Work(Work):
     )
 
 
+@timed("loss")
 class _Objective(torch.autograd.Function):
     """The derivatives are had with the value."""
 
@@ -99,23 +110,25 @@ class _Objective(torch.autograd.Function):
         work.rotation[:] = camera.world_to_camera[:3, :3].reshape(-1).tolist()
         work.across, work.left = 1 / camera.fx, (0.5 - camera.cx) / camera.fx
         work.down, work.top = 1 / camera.fy, (0.5 - camera.cy) / camera.fy
-        work.color_weight = (1 - weights.dssim) / color.numel()
-        work.normal_weight = weights.normal / max((height - 2) * (width - 2), 1)
-        across, down = max(height * (width - 1), 1), max((height - 1) * width, 1)
+        rows, columns = photo.whole or alpha.shape
+        pixels, across, down = rows * columns, max(rows * (columns - 1), 1), max((rows - 1) * columns, 1)
+        structure_weight = weights.dssim * alpha.numel() / pixels
+        work.color_weight = (1 - weights.dssim) / (3 * pixels)
+        work.normal_weight = weights.normal / max((rows - 2) * (columns - 2), 1)
         work.smooth_x_weight, work.smooth_y_weight = weights.smooth / across, weights.smooth / down
         if material is not None:
             work.even_x_weight, work.even_y_weight = weights.even / across, weights.even / down
-        work.alpha_weight = weights.alpha / alpha.numel()
+        work.alpha_weight = weights.alpha / pixels
         work.metallic_weight, work.dark_weight = weights.metallic * progress**2, weights.metallic
         work.matte_weight = weights.matte
-        work.dssim_weight, work.light_weight = weights.dssim, weights.light
+        work.dssim_weight, work.light_weight = structure_weight, weights.light
         by = {f"by_{name}": value for name, value in gradients.items()}
         work.attach(**inputs, **codes, **by, **buffers, sums=sums[0])
         run("refgs_losses_first", work, color, items=blocks * cuda.BLOCK)
 
         totals = [sums[0].sum(dim=0)]
         if weights.dssim > 0:
-            structure, by_clipped = dssim(buffers["clipped"], buffers["photo"], weights.dssim)
+            structure, by_clipped = dssim(buffers["clipped"], buffers["photo"], structure_weight)
         else:
             structure, by_clipped = None, torch.zeros_like(color)
         work.attach(by_clipped=by_clipped, first=totals[0], sums=sums[1])
@@ -128,6 +141,7 @@ class _Objective(torch.autograd.Function):
             work.attach(structure=structure)
         run("refgs_losses_total", work, color, items=1)
         ctx.gradients = [gradients.get(name) for name in _Objective.DIFFERENTIABLE]
+        square *= alpha.numel() / pixels
         ctx.mark_non_differentiable(square)
         return loss, square
 

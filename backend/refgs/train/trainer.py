@@ -1,6 +1,5 @@
 """The training loop: one view, one step, until the iterations are done."""
 
-import json
 import math
 import time
 from collections.abc import Callable
@@ -12,7 +11,8 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
-from refgs.capture import Capture, LoadedView, load_view
+from refgs.capture import Capture, load_view
+from refgs.clock import Clock, timed
 from refgs.errors import InputError
 from refgs.geometry.extract import extract
 from refgs.geometry.mesh import Mesh, clean
@@ -20,25 +20,27 @@ from refgs.geometry.visibility import Occluder
 from refgs.model import cubemap
 from refgs.model.environment import Environment
 from refgs.model.surfels import Parameters, Surfels, activate
-from refgs.paths import whole
 from refgs.render.relight import received
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.render.volume import with_normals_last
 from refgs.report.metrics import decibels, psnr
-from refgs.settings import RenderSettings, Settings
-from refgs.train import checkpoint
+from refgs.report.pictures import composite
+from refgs.settings import LossSettings, RenderSettings, Settings
+from refgs.train import checkpoint, history, needs
 from refgs.train.adam import Adam
-from refgs.train.densify import ScreenGradient, densify, propagate_normals, reset_opacity, thin
+from refgs.train.densify import ScreenGradient, densify, propagate_normals, reset_opacity, thin, too_faint
+from refgs.train.guard import Guard, limits, running
 from refgs.train.light import light_frame, mirrored
 from refgs.train.losses import Photo, departure, objective
+from refgs.train.measures import Measures
+from refgs.train.plan import Plan
+from refgs.train.probe import Way
 from refgs.train.start import AROUND, GEOMETRY, start_appearance, start_parameters
 
 Report = Callable[[str, dict[str, Any]], None]
-"""Called with an event's name and its facts: "stage", "decided", "progress", "warning"."""
+"""Called with an event's name and its facts: "stage", "decided", "progress", "measured", "warning"."""
 
 REPORT_EVERY = 10  # iterations
-HISTORY_EVERY = 100  # iterations
-PLAN_EVERY = 50  # iterations
 EXPOSURES_KNOWN = 0.3  # part of the training after which exposures are known well enough to say whether there are any
 EXPOSURES_ALIKE = (
     math.log(2) / 3
@@ -51,15 +53,6 @@ REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest",
 FEWER = 0.8  # of the surfels, where there is no memory for all
 LEAST_SURFELS = 1000
 MIRROR = 7.0  # logit of a mirror's base colour, and the negative of its roughness's
-
-
-def composite(view: LoadedView, background: Tensor) -> Tensor:
-    """The photo over the background, sRGB-encoded float (H, W, 3) in 0..1."""
-    image = torch.from_numpy(view.image).to(background.device).float() / 255
-    if view.alpha is None:
-        return image
-    alpha = torch.from_numpy(view.alpha).to(background.device).float()[..., None] / 255
-    return image * alpha + background * (1 - alpha)
 
 
 def full_card() -> InputError:
@@ -76,27 +69,36 @@ class Trainer:
         settings: Settings,
         folder: Path,
         report: Report,
-        minutes: float | None = None,
+        plan: Plan | None = None,
         device: str = "cpu",
     ):
         self.device = torch.device(device)
-        self.total, self.minutes = settings.train.iterations, minutes
+        self.total, self.plan = settings.train.iterations, plan or Plan(None)
         self.budget = settings.surfels.budget
         self.capture, self.settings, self.folder, self.report = capture, settings, folder, report
         side = settings.image.max_side
-        self.views = [load_view(view, side) for view in capture.train_views]
-        self.test = [load_view(view, side) for view in capture.test_views]
+        self.clock = Clock(self.device)
+        with self.clock.part("reading"):
+            self.views = [load_view(view, side) for view in capture.train_views]
+            self.test = [load_view(view, side) for view in capture.test_views]
         self.background = torch.tensor(settings.image.background, device=self.device)
         self.from_hull = all(view.alpha is not None for view in self.views)
+        self.chosen: dict[str, str] = {}  # by a setting that asked for it: what was chosen, and why
+        self.decided: dict[str, str] = {}  # the same as lines for the artist: of the light, exposures, what is needed
+        self.needs: dict[str, dict[str, Any]] = {}  # the decisions of `refgs.train.needs`
+        for view in reversed(needs.twins(self)):
+            del self.views[view]
         self.photos = [Photo.of(view, self.device) for view in self.views]
         self.near = near_plane(capture.radius)
         self.iteration, self.seconds = 0, 0.0
+        self.processor_seconds = 0.0  # of all threads: what other work on the machine hardly changes
         self._order: tuple[int, list[int]] = (-1, [])
 
-        start, shown, source = start_parameters(capture, self.views, settings)
-        self.chosen: dict[str, str] = {}  # by a setting that asked for it: what was chosen, and why
-        self.decided: dict[str, str] = {}  # the same as lines for the artist: of the light, exposures, reflections
+        with self.clock.part("start"):
+            start, shown, source = start_parameters(capture, self.views, settings)
         self._choose_light_frame(start, shown)
+        with self.clock.part("reading"):
+            self.measures = Measures(capture, self.test, self.settings, self.device, report)
         self.parameters = {name: value.detach().to(self.device).requires_grad_() for name, value in start.items()}
         report("stage", {"what": source})
         self.light = torch.empty(6 * self._light_resolution(0) ** 2, 3, device=self.device)
@@ -111,11 +113,15 @@ class Trainer:
         if settings.render.shading != "sh" and settings.light.exposure != "off":
             self.exposures = torch.zeros(len(self.views), device=self.device).requires_grad_()
             groups.append({"params": [self.exposures], "name": "exposure", "rate": settings.rates.exposure})
-        self.optimizer = Adam(groups)
+        display = settings.render.color_space == "display"
+        self.optimizer = Adam([g | {"limits": limits(g["name"], capture.radius, display)} for g in groups])
+        self.guard = Guard(self.device)
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
         self.occluder: Occluder | None = None
         self._mirrored: Tensor | None = None  # which part of the light the object shows
         self.initial = settings.render.shading == "deferred" and settings.initial.until > 0  # its stage is not over
+        self.crops: list[tuple[slice, slice]] | None = None  # the parts of the photos that training looks at
+        needs.before(self)
 
     def _rate(self, name: str) -> float:
         if name == "sh_rest" and self.residual_start < 1:
@@ -138,9 +144,9 @@ class Trainer:
         self.chosen["light.frame"] = f"{frame}: {why}"
         if lit:
             where = "turns with the camera" if frame == "camera" else "stands still"
-            self._decide("light", f"the light {where}: {why}")
+            self.decide("light", f"the light {where}: {why}")
 
-    def _decide(self, about: str, what: str) -> None:
+    def decide(self, about: str, what: str) -> None:
         """Say how something came out that was left to the photos, where that is new; a run that is gone on with says it again."""
         if self.decided.get(about) != what:
             self.decided[about] = what
@@ -157,7 +163,7 @@ class Trainer:
         if why := self.without_reflection():
             unused += ["indirect_dc", "indirect_rest"]
             if render.shading == "deferred" and self.settings.indirect.start < 1:
-                self._decide("reflections", f"no inter-reflection: {why}")
+                self.decide("reflections", f"without inter-reflection: {why}")
         if why or render.diffuse == "sh":
             unused += ["received"]
         mirror = (
@@ -167,6 +173,25 @@ class Trainer:
         for name, value in mirror.items():
             self.constant[name].fill_(value)
 
+    def leave_out(self, *names: str) -> None:
+        """From here on these do not learn; the first surfel's values stand for all."""
+        for name in names:
+            if name in self.parameters:
+                value = self.parameters.pop(name)
+                self.optimizer.state.pop(value, None)
+                self.constant[name] = value.detach()[:1].clone()
+        self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] not in names]
+
+    def shorten(self, name: str, count: int) -> None:
+        """Of harmonics learn only so many coefficients from here on."""
+        group = next(g for g in self.optimizer.param_groups if g["name"] == name)
+        old, new = self.parameters[name], self.parameters[name].detach()[:, :count].contiguous().requires_grad_()
+        state = self.optimizer.state.pop(old, {})
+        group["params"][0] = self.parameters[name] = new
+        if state:
+            moments = {key: state[key][:, :count].contiguous() for key in ("exp_avg", "exp_avg_sq")}
+            self.optimizer.state[new] = state | moments
+
     def without_reflection(self) -> str:
         """Why this run looks for no inter-reflection, or ""."""
         settings = self.settings
@@ -174,6 +199,10 @@ class Trainer:
             return f"shading = {settings.render.shading}"
         if settings.indirect.start >= 1:
             return "its setting leaves it out (indirect.start = 1)"
+        if not self.needs.get("reflections", {}).get("needed", True):
+            return self.needs["reflections"]["why"]
+        if settings.render.reflection == "none":
+            return "nothing is mirrored"
         if not self.from_hull:  # the mesh would be of the surroundings too
             return "not every photo has a mask of the object"
         if settings.light.frame == "camera":  # surfels have no light of their own to show others
@@ -232,10 +261,20 @@ class Trainer:
         side = math.isqrt(len(self.light) // 6)
         directions = cubemap.texel_directions(2 * side).float()
         finer = cubemap.sample(self.light.cpu(), (side,), directions, torch.zeros(len(directions)))
+        self._replace_light(finer.to(self.device))
+
+    @torch.no_grad()
+    def coarsen_light(self, side: int) -> None:
+        """Go on with so many texels along each side, means of those there are."""
+        fine = math.isqrt(len(self.light) // 6) // side
+        self._replace_light(self.light.view(6, side, fine, side, fine, 3).mean(dim=(2, 4)).reshape(-1, 3))
+
+    def _replace_light(self, texels: Tensor) -> None:
         self.optimizer.state.pop(self.light, None)
-        self.light = finer.to(self.device).requires_grad_()
+        self.light = texels.requires_grad_()
         next(g for g in self.optimizer.param_groups if g["name"] == "environment")["params"] = [self.light]
 
+    @timed("optimiser")
     @torch.no_grad()
     def _diffuse_light(self) -> None:
         """Let texels flow into their neighbours on the face, beside the optimiser's step and in proportion to its rate, as decoupled
@@ -267,6 +306,26 @@ class Trainer:
         settings = self.settings.render
         return settings.model_copy(update={"shading": "splat"}) if self.initial else settings
 
+    def way(self) -> Way:
+        """What pictures are made from, as it is now."""
+        return Way(self.surfels(), self.environment(), self._shading(), self.occluder)
+
+    @property
+    def losses(self) -> LossSettings:
+        """The weights of what training lowers."""
+        weights = self.settings.loss
+        if self.settings.render.reflection == "none":  # no surfel has a metallic or a roughness of its own
+            return weights.model_copy(update={"even": 0.0, "metallic": 0.0, "matte": 0.0})
+        return weights
+
+    def photo(self, view: int, whole: bool = False) -> Photo:
+        """What training looks at of a view, or all of it."""
+        return self.photos[view] if whole or self.crops is None else self.photos[view].part(*self.crops[view])
+
+    def exposure(self, view: int) -> Tensor | None:
+        """The factor of a photo's radiance; None where photos have none of their own."""
+        return None if self.exposures is None else self.exposures[view].exp()
+
     def render(self, camera: Camera, surfels: Surfels | None = None) -> Rendering:
         """Render a camera without gradients: all surfels, or those given."""
         with torch.no_grad():
@@ -290,7 +349,7 @@ class Trainer:
         """One iteration. Returns its loss and mean squared error, which are still being computed where there is a card."""
         settings = self.settings
         view = self._next_view()
-        photo = self.photos[view]
+        photo = self.photo(view, whole=self.iteration % needs.WHOLE_EVERY == 0)
         progress = min(self.iteration / self.total, 1.0)
         if self.initial and progress >= settings.initial.until:
             self._begin_deferred()
@@ -299,27 +358,30 @@ class Trainer:
             self._refine_light()
 
         surfels, environment = self.surfels(), self.environment()
-        exposure = None if self.exposures is None else self.exposures[view]
-        rendering = self._render(surfels, environment, photo.camera, None if exposure is None else exposure.exp())
+        rendering = self._render(surfels, environment, photo.camera, self.exposure(view))
         mean = None if environment is None else self.mean_light(environment)
-        loss, square = objective(rendering, mean, photo, self.background, settings.loss, progress)
-        if exposure is not None:
-            loss = loss + settings.loss.exposure * departure(exposure)
+        loss, square = objective(rendering, mean, photo, self.background, self.losses, progress)
+        if self.exposures is not None:
+            loss = loss + settings.loss.exposure * departure(self.exposures[view])
         loss.backward()
         position = self.parameters["position"]
-        self.motion.add(position.detach(), position.grad, photo.camera)
-        self.optimizer.step()
+        accepted = self.guard.judge(loss, self.optimizer)
+        self.motion.add(position.detach(), position.grad, self.photos[view].camera, accepted)
+        self.optimizer.step(accepted)
         if environment is not None:
             self._diffuse_light()
-        self._forget_gradients()
+        self.forget_gradients()
         self.iteration += 1
         learns = settings.indirect.start <= progress < self.residual_start  # later, materials would not make up for it
         due = learns and self.iteration % settings.indirect.every == 0
         if not self.without_reflection() and not self.initial and due and self.iteration < self.total:
-            self._trace()  # before what may make all surfels faint, of which no mesh could be made
+            with self.clock.part("visibility"):
+                self._trace()  # before what may make all surfels faint, of which no mesh could be made
         self._densify(progress)
         self._reshape()
         self._weigh_exposures(progress)
+        with self.clock.part("deciding"):
+            needs.weigh(self, progress)
         return {"loss": loss.detach(), "square": square}
 
     def _set_rates(self, progress: float) -> None:
@@ -367,7 +429,7 @@ class Trainer:
             self.optimizer.state.pop(self.exposures, None)
         self.report("stage", {"what": "shading what is blended: colour, material and light start anew"})
 
-    def _forget_gradients(self) -> None:
+    def forget_gradients(self) -> None:
         for group in self.optimizer.param_groups:
             group["params"][0].grad = None
 
@@ -383,6 +445,9 @@ class Trainer:
         settings = self.settings.densify
         if self.iteration % settings.every or progress < settings.start:
             return
+        rates = self.settings.rates
+        if too_faint(settings, rates.opacity * rates.decay**progress, self.iteration, self.total):
+            return
         gradient = self.motion.mean()
         if self.capture.box is not None:  # what is beside it gets no more than its share
             wanted = self.wanted()
@@ -390,21 +455,23 @@ class Trainer:
             count = int(wanted.sum())
             room = max(int(AROUND * self.budget) - (len(wanted) - count), 0)
             gradient[ranked[count + room :]] = 0
-        densify(
-            self.parameters,
-            self.optimizer,
-            gradient,
-            settings,
-            self.budget,
-            divide=progress < settings.stop,
-        )
+        with self.clock.part("densification"):
+            densify(
+                self.parameters,
+                self.optimizer,
+                gradient,
+                settings,
+                self.budget,
+                divide=progress < settings.stop,
+            )
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
 
     def _reshape(self) -> None:
         """What is done to all surfels now and then: mirrors' normals spread, or all grow faint."""
         densify, due = self.settings.densify, self.iteration % max(self.settings.densify.reset_every, 1) == 0
         if self._since_propagation() == 0:
-            propagate_normals(self.constant | self.parameters, self.optimizer, self.settings.propagation)
+            with self.clock.part("densification"):
+                propagate_normals(self.constant | self.parameters, self.optimizer, self.settings.propagation)
         elif densify.reset_every and due and self.iteration / self.total < densify.stop:
             reset_opacity(self.parameters, self.optimizer)
 
@@ -421,7 +488,7 @@ class Trainer:
             self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
             self.optimizer.state.pop(self.exposures, None)
             self.exposures = None
-            self._decide("exposures", "the photos have no exposures of their own: they agree within a third of a stop")
+            self.decide("exposures", "the photos have no exposures of their own: they agree within a third of a stop")
 
     @torch.no_grad()
     def _trace(self) -> None:
@@ -430,26 +497,24 @@ class Trainer:
         cameras = [view.camera for view in self.views[:: max(1, len(self.views) // TRACED)]]
         surfels, environment, self.occluder = self.surfels(), self.environment(), None
         inside = surfels.chosen(self.wanted())
-        mesh, _ = extract(inside, cameras, self.near, capture.centre, capture.radius, settings.resolution)
-        try:
-            self.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
-        except InputError:  # there is no surface yet
-            return
+        with self.clock.part("mesh"):
+            mesh, _ = extract(inside, cameras, self.near, capture.centre, capture.radius, settings.resolution)
+            try:
+                self.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
+            except InputError:  # there is no surface yet
+                return
         hidden, solid = 0.0, 1e-9
         for camera in cameras[::3]:
             looked = self._render(inside, environment, camera)
             opaque = looked.alpha > 0.5
             hidden += float((1 - looked.visibility)[opaque].sum())
             solid += float(opaque.sum())
-        mirrors = hidden >= settings.least * solid
-        without = "" if mirrors else "no inter-reflection: "
-        self._decide("reflections", f"{without}the object mirrors itself on {hidden / solid:.1%} of it")
-        if not mirrors:
-            self.occluder = None
-        elif not self.optimizer.state.get(self.parameters["indirect_dc"]):
+        if not self.optimizer.state.get(self.parameters["indirect_dc"]):
             # What the surfels mirrored until now, so that the picture changes little.
             start, rest = environment.harmonics, self.parameters["indirect_rest"]
             self.parameters["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
+        with self.clock.part("deciding"):
+            needs.reflections(self, hidden / solid)
         if self.occluder is not None and "received" in self.parameters:
             # Anew each time, for light and mesh are better known; until the next it stays.
             traced = Surfels(*(value.cpu() for value in with_normals_last(surfels)))
@@ -463,18 +528,20 @@ class Trainer:
     def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
         """Train to the end, or until `stop` says so; a checkpoint is written either way. True when the end was reached."""
         means, before, first = {}, self.seconds, self.iteration
-        while not self.ended and not stop():
-            begun = time.perf_counter()
+        self.plan.begin(self.iteration)
+        while not self.ended and not self._waited(stop):
+            begun, used = time.perf_counter(), time.process_time()
             figures = self._step_within_memory()
             self.seconds += time.perf_counter() - begun
-            self._plan()
-            # Running means, read now and then: a card need not wait. One that is not finite stays so.
-            means = {name: figure + 0.95 * (means.get(name, figure) - figure) for name, figure in figures.items()}
+            self.processor_seconds += time.process_time() - used
+            views = len(self.views) + len(self.test)
+            self.total = self.plan.total(self.iteration, views) or self.total
+            # Running means, read now and then: a card need not wait.
+            means = {name: running(means.get(name, figure), figure) for name, figure in figures.items()}
             if self.iteration % REPORT_EVERY == 0 or self.iteration == self.total:
+                self.guard.look(self, whole=self.ended)
                 loss, quality = float(means["loss"]), decibels(float(means["square"]))
-                if not math.isfinite(loss):
-                    raise FloatingPointError(f"the loss is {loss} at iteration {self.iteration}")
-                pace = (self.seconds - before) / (self.iteration - first)
+                pace = (self.seconds - before) / max(self.iteration - first, 1)  # it may have gone back
                 self.report(
                     "progress",
                     {
@@ -487,10 +554,12 @@ class Trainer:
                         "splats": len(self.parameters["position"]),
                     },
                 )
-            if self.iteration % HISTORY_EVERY == 0:
-                self._record(float(means["loss"]), decibels(float(means["square"])))
+            if history.due(self.iteration) and not self.ended:
+                history.record(self, float(means["loss"]), decibels(float(means["square"])))
             if self.iteration % self.settings.train.checkpoint_every == 0 and self.iteration < self.total:
                 self.save()
+        if self.ended and means:
+            history.record(self, float(means["loss"]), decibels(float(means["square"])))
         self.save()
         return self.ended
 
@@ -498,12 +567,13 @@ class Trainer:
         """One iteration; where the card's memory does not hold it, with fewer surfels from here on."""
         while True:
             try:
-                return self.step()
+                with self.clock.iteration(self.iteration):
+                    return self.step()
             except torch.OutOfMemoryError:
                 self.budget = int(FEWER * len(self.parameters["position"]))
                 if self.budget < LEAST_SURFELS:
                     raise full_card() from None
-            self._forget_gradients()
+            self.forget_gradients()
             torch.cuda.empty_cache()
             thin(self.parameters, self.optimizer, self.budget)
             self.motion = ScreenGradient(self.budget, self.device)
@@ -511,28 +581,16 @@ class Trainer:
                 "warning", {"what": f"the card's memory is full: going on with {self.budget:,} surfels at the most"}
             )
 
-    def _plan(self) -> None:
-        """Where minutes were given: as many iterations as the pace allows, looked at again now and then."""
-        if self.minutes is not None and self.iteration % PLAN_EVERY == 0:
-            left = 60 * self.minutes - self.seconds
-            self.total = self.iteration + max(0, int(left * self.iteration / self.seconds))
-
-    def _record(self, loss: float, quality: float) -> None:
-        facts = {
-            "iteration": self.iteration,
-            "seconds": round(self.seconds, 3),
-            "loss": loss,
-            "psnr_train": quality,
-            "psnr_test": self.test_psnr(),
-            "splats": len(self.parameters["position"]),
-        }
-        with open(self.folder / "history.jsonl", "a", encoding="utf-8") as file:
-            file.write(json.dumps(facts) + "\n")
+    def _waited(self, stop: Callable[[], bool]) -> bool:
+        """Ask `stop`, which may hold the training up."""
+        begun = time.perf_counter()
+        stopped = stop()
+        self.plan.wait(time.perf_counter() - begun)
+        return stopped
 
     def save(self) -> None:
-        """Write a checkpoint of everything that the next iteration depends on. Raises FloatingPointError where that is not finite."""
-        if not all(bool(value.isfinite().all()) for value in (self.parameters["position"], self.light)):
-            raise FloatingPointError(f"surfels or light are not finite at iteration {self.iteration}")
+        """Write a checkpoint of everything that the next iteration depends on, once all of it is finite."""
+        self.guard.look(self, whole=True)
         tensors = {f"parameter.{name}": value for name, value in self.parameters.items()}
         tensors |= {f"constant.{name}": value for name, value in self.constant.items()}
         tensors |= {"environment": self.light, "motion.total": self.motion.total, "motion.views": self.motion.views}
@@ -548,20 +606,34 @@ class Trainer:
             state = self.optimizer.state.get(group["params"][0], {})
             tensors |= {f"adam.{group['name']}.{key}": torch.as_tensor(value) for key, value in state.items()}
         facts = {"seconds": self.seconds, "total": self.total, "initial": self.initial, "decided": self.decided}
-        checkpoint.save(self.folder / "checkpoints", self.iteration, tensors, facts)
+        facts |= {"parts": self.clock.seconds, "spent": self.plan.spent}
+        facts |= {"processor_seconds": self.processor_seconds, "needs": self.needs}
+        with self.clock.part("writing"):
+            checkpoint.save(self.folder / "checkpoints", self.iteration, tensors, facts)
 
     def resume(self) -> None:
         """Go back to the last complete checkpoint."""
         tensors, facts = checkpoint.load(self.folder / "checkpoints")
+        self.needs = (
+            facts.get("needs", {}) | self.needs
+        )  # what was decided since, where the training has gone back, stays
+        for name in self.needs:
+            needs.apply(self, name)
+        for name in self.constant:  # left out since, where the training has gone back
+            if f"parameter.{name}" in tensors:
+                tensors[f"constant.{name}"] = tensors[f"parameter.{name}"][:1]
         needed = {f"parameter.{name}" for name in self.parameters} | {f"constant.{name}" for name in self.constant}
         if not needed <= tensors.keys():
             raise InputError(f"{self.folder} was begun by another release of RefGS: train again into a new folder")
         mesh = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("occluder.")}
         tensors = {name: value.to(self.device) for name, value in tensors.items()}
         self.iteration, self.seconds = facts["iteration"], facts["seconds"]
+        self.clock.resume(facts.get("parts", {}))
+        self.plan.before = facts.get("spent", self.seconds)
+        self.processor_seconds = facts.get("processor_seconds", 0.0)
         self.total, self.initial = facts["total"], facts.get("initial", self.initial)
         for about, what in facts.get("decided", {}).items():
-            self._decide(about, what)
+            self.decide(about, what)
         self.motion.total, self.motion.views = tensors["motion.total"], tensors["motion.views"]
         self.optimizer.state.clear()
         if "exposure" not in tensors:  # they have been left out since
@@ -584,14 +656,9 @@ class Trainer:
                 self.optimizer.state[value] = state | {"step": int(state["step"])}
         self._mirrored = tensors.get("mirrored")
         self.constant = {name: tensors[f"constant.{name}"] for name in self.constant}
-        self.occluder = Occluder(Mesh(mesh["occluder.vertices"], mesh["occluder.faces"])) if mesh else None
-        self._trim_history()
-
-    def _trim_history(self) -> None:
-        """Forget what was recorded after the checkpoint: it will be recorded again."""
-        file = self.folder / "history.jsonl"
-        if file.exists():
-            lines = file.read_text(encoding="utf-8").splitlines()
-            kept = [line for line in lines if json.loads(line)["iteration"] <= self.iteration]
-            with whole(file) as temporary:
-                temporary.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+        self.occluder = (
+            Occluder(Mesh(mesh["occluder.vertices"], mesh["occluder.faces"]))
+            if mesh and not self.without_reflection()
+            else None
+        )
+        history.trim(self.folder, self.iteration)

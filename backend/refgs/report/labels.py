@@ -1,0 +1,59 @@
+"""What runs side by side are called: by what differs between them."""
+
+from collections import Counter, defaultdict
+from collections.abc import Hashable
+
+MOST = 4  # settings that a label names
+BY_NAME = {  # in this order; the other settings come after, under their own names
+    "run.capture": "{}",
+    "run.preset": "{}",
+    "run.device": "{}",
+    "run.threads": "{} threads",
+    "run.refgs": "RefGS {}",
+    "image.max_side": "{} px",
+    "surfels.budget": "{:,} surfels",
+    "train.iterations": "{:,} iterations",
+    "train.seed": "seed {}",
+}
+
+
+def labels(names: list[str], facts: list[dict]) -> list[str]:
+    """A label for each run, no two alike, of its folder's name and the tables of its run.toml.
+
+    What runs of one preset have alike is not named where another preset has it otherwise: the preset's name says it. Settings are named
+    without their section where no other has a setting of that name.
+    """
+    known = [_settings(tables) for tables in facts]
+    groups = defaultdict(list)
+    for settings in known:
+        groups[settings.get("run.preset")].append(settings)
+    keys = [key for key in BY_NAME if key.startswith("run.")]
+    keys += [key for settings in known for key in settings if key not in keys]
+    keys = sorted(dict.fromkeys(keys), key=lambda key: list(BY_NAME).index(key) if key in BY_NAME else len(BY_NAME))
+
+    def differs(key: str, among: list[dict]) -> bool:
+        return len({settings.get(key) for settings in among}) > 1
+
+    both = "run.capture", "run.preset"
+    named = [k for k in keys if any(differs(k, group) for group in ([known] if k in both else groups.values()))]
+    last = Counter(key.rsplit(".", 1)[-1] for key in keys)
+    short = {key: key if last[key.rsplit(".", 1)[-1]] > 1 else key.rsplit(".", 1)[-1] for key in keys}
+    found = []
+    for name, settings in zip(names, known, strict=True):
+        words = [BY_NAME.get(key, f"{short[key]}={{}}").format(settings[key]) for key in named if key in settings]
+        more = [f"and {len(words) - MOST} more"] if len(words) > MOST else []
+        found.append(", ".join(words[:MOST] + more) or name)
+    count = Counter(found)
+    return [label if count[label] == 1 else f"{label} ({name})" for label, name in zip(found, names, strict=True)]
+
+
+def _settings(tables: dict) -> dict[str, Hashable]:
+    """By dotted names, what of run.toml may tell runs apart."""
+    found = {f"run.{key}": value for key, value in tables.get("run", {}).items() if f"run.{key}" in BY_NAME}
+    for name in ("run.capture", "run.preset"):  # the last part of a path says enough
+        if name in found:
+            found[name] = str(found[name]).replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
+    for section, values in tables.get("settings", {}).items():
+        for key, value in values.items() if isinstance(values, dict) else ():
+            found[f"{section}.{key}"] = tuple(value) if isinstance(value, list) else value
+    return found

@@ -1,0 +1,53 @@
+"""What a case is, and how its outcome is written."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+NEVER = -1
+
+
+class Found(NamedTuple):
+    """Whether all was finite; the error; iterations until a training was back on its course, or NEVER, where it was put off it."""
+
+    finite: bool
+    error: float
+    recovered: int | None = None
+
+
+class Case(NamedTuple):
+    """`run` is compared with what `against` says. The error may be `most`, `because` of that; `guard` is what is done about it."""
+
+    name: str
+    run: Callable[[], Found]
+    against: str
+    most: float
+    because: str
+    guard: str
+    unit: str = ""
+
+    def holds(self, found: Found) -> bool:
+        return found.finite and found.error <= self.most
+
+    def row(self, found: Found) -> list[str]:
+        error, most = (
+            f"{v:.2f} {self.unit}" if self.unit else f"{v:.0e}" if v else "0" for v in (found.error, self.most)
+        )
+        back = {None: "", NEVER: "not to the end"}.get(found.recovered, f"{found.recovered}")
+        fails = "" if self.holds(found) else "**fails** "
+        return [
+            fails + self.name,
+            "yes" if found.finite else "**no**",
+            error,
+            f"{most}: {self.because}",
+            self.against,
+            back,
+            self.guard or "nothing is needed",
+        ]
+
+
+HEADINGS = ["case", "finite", "error", "at most", "compared with", "back after, iterations", "what is done about it"]
+
+
+def line(cells: list[str]) -> str:
+    """A row of a table in Markdown."""
+    return f"| {' | '.join(cells)} |"

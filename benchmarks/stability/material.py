@@ -1,0 +1,238 @@
+"""Materials and lights beyond the usual, through shading, the light's prefilter, D-SSIM, activations, the optimiser and rays."""
+
+from functools import partial
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from benchmarks.stability import compare
+from benchmarks.stability.cases import Case, Found
+from refgs.camera import Camera
+from refgs.geometry.mesh import Mesh
+from refgs.geometry.visibility import Occluder
+from refgs.kernels import reference
+from refgs.model import cubemap
+from refgs.model.prefilter import prefilter
+from refgs.model.surfels import activate
+from refgs.render.ssim import dssim
+from refgs.train.adam import Adam
+from tests.kernels import scenes
+
+SIDE, RESOLUTION = 32, 16
+
+
+def ball(grazing: float | None = None) -> tuple[Tensor, Tensor, Camera]:
+    """What a far camera sees of a ball that fills its picture: normals and positions (H, W, 3), float64; or of a surface whose normals
+    are so far from being at right angles to the view, everywhere."""
+    view = Camera("far", SIDE, SIDE, 1e3, 1e3, SIDE / 2 + 0.13, SIDE / 2 - 0.17, np.eye(4))
+    y, x = torch.meshgrid(*[(torch.arange(SIDE, dtype=torch.float64) + 0.5) / SIDE * 1.2 - 0.6] * 2, indexing="ij")
+    normal = torch.stack([x, y, -torch.sqrt(1 - x**2 - y**2)], dim=-1)
+    ray = scenes.camera_rays(view).double()
+    if grazing is not None:
+        ray_unit = reference.unit(ray)
+        across = reference.unit(normal - (normal * ray_unit).sum(dim=-1, keepdim=True) * ray_unit)
+        normal = across - grazing * ray_unit
+    return (
+        normal,
+        ray + torch.tensor([0.31e-3, -0.27e-3, 0]).double(),
+        view,
+    )  # the look-up of normals is displaced by a third of a pixel
+
+
+def light(sun: float = 0.0, scale: float = 1.0) -> Tensor:
+    """Smooth radiance (6·R², 3), with a sun in one texel that the ball mirrors."""
+    way = cubemap.texel_directions(RESOLUTION)
+    radiance = scale * torch.exp(0.7 * way + 0.2 * torch.sin(5 * way[:, [1, 2, 0]]))
+    radiance[int((way @ torch.tensor([0.3, 0.4, -0.87], dtype=torch.float64)).argmax())] += sun
+    return radiance.float()
+
+
+def lit(
+    metallic: float | None = None,
+    roughness: float | None = None,
+    albedo: float | None = None,
+    grazing: float | None = None,
+    sun: float = 0.0,
+    scale: float = 1.0,
+    kink: bool = False,
+) -> Found:
+    """A ball whose material is as given, the rest of it anything."""
+    normal, position, view = ball(grazing)
+    generator = torch.Generator().manual_seed(0)
+    material = 0.05 + 0.9 * torch.rand(SIDE, SIDE, 5, generator=generator, dtype=torch.float64)
+    for place, value in ((slice(0, 3), albedo), (slice(3, 4), metallic), (slice(4, 5), roughness)):
+        if value is not None:
+            material[..., place] = value
+    alpha = 0.3 + 0.69 * torch.rand(SIDE, SIDE, generator=generator, dtype=torch.float64)
+    features = torch.cat([normal, material, position], dim=-1) * alpha[..., None]
+    return compare.shading(features.float(), alpha.float(), light(sun, scale), view, kink)
+
+
+def one_sun(radiance: float) -> Found:
+    """The prefilter is linear: of smooth light with a sun it is the sum of both, added up in float64. And back."""
+    smooth, texel = light(), light(sun=1.0) - light()
+    both = (smooth + radiance * texel).requires_grad_()
+    found = prefilter(both, RESOLUTION)
+    exact = prefilter(smooth, RESOLUTION).double() + radiance * prefilter(texel, RESOLUTION).double()
+    upstream = [torch.randn(found.shape, generator=torch.Generator().manual_seed(i)) for i in (0, 1)]
+    (by,) = torch.autograd.grad(found, both, upstream[0] + radiance * upstream[1])
+    by_each = [torch.autograd.grad(prefilter(both, RESOLUTION), both, u)[0].double() for u in upstream]
+    error = max(
+        compare.worst([found.detach()], [exact]), 0.1 * compare.worst([by], [by_each[0] + radiance * by_each[1]])
+    )
+    dim = exact < 1e-3 * radiance  # what the sun does not reach must not drown in it
+    error = max(error, float(((found.detach() - exact).abs() / exact)[dim].max()) / 10)
+    return Found(bool(found.isfinite().all() and by.isfinite().all()), error)
+
+
+def likeness(kind: str) -> Found:
+    """D-SSIM of constant pictures, of noise, of one and the same."""
+    generator = torch.Generator().manual_seed(0)
+    image, target = torch.rand(2, 30, 40, 3, generator=generator)
+    if kind == "constant":
+        image, target = torch.full((2, 30, 40, 3), 0.9)
+        image = image - 0.1
+    if kind == "black and white":
+        image, target = torch.zeros(30, 40, 3), torch.ones(30, 40, 3)
+    if kind == "over-exposed":
+        image = 1e4 * image
+    exact = image.double().requires_grad_()
+    expected = reference.dssim(exact, target.double())
+    (exact_by,) = torch.autograd.grad(expected, exact)
+    found, by = dssim(image, target)
+    finite = bool(found.isfinite() and by.isfinite().all())
+    return Found(finite, max(abs(float(found - expected.detach())), compare.worst([by], [exact_by]) / 50))
+
+
+def activations() -> Found:
+    """Raw values 0 … ±1e4, against float64: within the limits of training the slopes are no zeros."""
+    raw = torch.tensor([-1e4, -87, -12, -6, -1, 0, 1, 6, 12, 87, 1e4])
+    names = ("scale", "opacity", "albedo", "metallic", "roughness")
+    empty = {
+        n: torch.zeros(11, 1, 3)
+        for n in ("position", "rotation", "sh_dc", "sh_rest", "received", "indirect_dc", "indirect_rest")
+    }
+    leaves = {
+        name: (raw[:, None].expand(11, 3) if name == "albedo" else raw).clone().requires_grad_() for name in names
+    }
+    values = activate(empty | leaves)
+    found = [values.scales, values.opacities, values.albedo, values.metallic, values.roughness]
+    by = torch.autograd.grad([v.sum() for v in found], list(leaves.values()))
+    exact = {n: v.detach().double().clamp(-87, 87) for n, v in leaves.items()}
+    slopes = {n: torch.sigmoid(v) * torch.sigmoid(-v) for n, v in exact.items()}
+    expected = [exact["scale"].exp(), *(torch.sigmoid(exact[n]) for n in names[1:])]
+    expected[3] = 3 * expected[3] ** 2 - 2 * expected[3] ** 3
+    exact_by = [expected[0], slopes["opacity"], slopes["albedo"], 6 * slopes["metallic"] ** 2, slopes["roughness"]]
+    finite = all(bool(v.isfinite().all()) for v in (*found, *by))
+    within = [(0, raw.abs() <= 87), *((i, raw.abs() <= 12) for i in (1, 2, 4)), (3, raw.abs() <= 6)]
+    alive = all(bool((by[i][rows] > 0).all()) for i, rows in within)
+    error = max(
+        float(((f - e).abs() / e)[2:-2].max()) for f, e in zip((v.detach() for v in found), expected, strict=True)
+    )
+    error = max(error, *(float(((by[i] - exact_by[i]).abs() / exact_by[i])[rows].max()) / 1e3 for i, rows in within))
+    return Found(finite and alive, error)
+
+
+def steps(size: float) -> Found:
+    """A hundred steps of Adam on gradients of such a size, against torch's in float64."""
+    generator = torch.Generator().manual_seed(0)
+    start = torch.randn(1000, generator=generator)
+    gradients = size * torch.randn(100, 1000, generator=generator)
+    value, exact = start.clone().requires_grad_(), start.double().requires_grad_()
+    ours, torchs = Adam([{"params": [value], "lr": 1e-2}]), torch.optim.Adam([exact], lr=1e-2, eps=Adam.EPSILON)
+    for gradient in gradients:
+        value.grad, exact.grad = gradient, gradient.double()
+        ours.step(), torchs.step()
+    return Found(bool(value.isfinite().all()), compare.worst([value.detach()], [exact.detach()]))
+
+
+def rays(scale: float, offset: float) -> Found:
+    """Which mirror directions of a hollow are free, of it in another unit and elsewhere: the part that differs from the truth."""
+    shape = trimesh.creation.icosphere(4)
+    open_side = shape.triangles_center[:, 2] < 0.3
+    mesh = Mesh(shape.vertices * scale + offset, np.asarray(shape.faces)[open_side][:, ::-1])
+    rng = np.random.default_rng(0)
+    inner = shape.vertices[rng.choice(np.flatnonzero(shape.vertices[:, 2] < 0), 2000)] * 0.9
+    way = rng.normal(size=inner.shape)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    found = Occluder(mesh).visible(inner * scale + offset, -inner / 0.9, way)
+    # Out of a ball by its opening: where the ray leaves the ball of radius 1.
+    b = (inner * way).sum(axis=1)
+    leaves = inner + (-b + np.sqrt(b * b - (inner**2).sum(axis=1) + 1))[:, None] * way
+    clear = np.abs(leaves[:, 2] - 0.3) > 0.06  # not at the rim, which triangles make jagged
+    return Found(True, float((found != (leaves[:, 2] > 0.3))[clear].mean()))
+
+
+SHADE = "float64, same input"
+LOOKED_UP = "look-ups stay in the table and in the cubemap"
+GRAZING = "half-vectors of no length are bounded; N·V is at least 1e-4 in the table"
+
+
+def _case(name: str, guard: str, most: float = 1e-5, because: str = compare.FLOAT32, **how) -> Case:
+    return Case(f"shade: {name}", partial(lit, **how), SHADE, most, because, guard)
+
+
+CASES = [
+    *(_case(f"roughness {value:g}", LOOKED_UP, roughness=value, kink=value > 0) for value in (0.0, 1e-4, 1.0)),
+    *(_case(f"metallic {value:g}", "linear in it", metallic=value) for value in (0.0, 1.0)),
+    _case("black albedo", "linear in it", albedo=0.0),
+    *(
+        _case(f"grazing, N·V = {value:g}", GRAZING, grazing=value, kink=value == 1e-4)
+        for value in (1e-2, 1e-4, 1e-6, 0.0)
+    ),
+    _case("a sun of 1e6 in one texel", "radiance is linear, unclamped", sun=1e6),
+    _case("total darkness", "the curve is straight below 0.0031", scale=0.0),
+    _case("a light of 1e-30", "the curve is straight below 0.0031", scale=1e-30),
+    _case("a light of 1e6", "radiance is linear, unclamped", scale=1e6),
+    Case(
+        "prefilter: a sun of 1e6 in one texel",
+        partial(one_sun, 1e6),
+        "sum of parts, float64",
+        1e-5,
+        compare.FLOAT32,
+        "weights are positive and sum to one",
+    ),
+    *(
+        Case(
+            f"D-SSIM: {kind}",
+            partial(likeness, kind),
+            SHADE,
+            1e-4,
+            "variances are differences of squares",
+            "the constants C1 and C2",
+        )
+        for kind in ("constant", "black and white", "noise", "over-exposed")
+    ),
+    Case(
+        "activations: raw values to ±1e4",
+        activations,
+        "float64",
+        1e-5,
+        "1 − s near its end",
+        "raw values are kept where slopes count",
+    ),
+    *(
+        Case(
+            f"Adam: gradients of {size:g}",
+            partial(steps, size),
+            "torch, float64",
+            1e-5,
+            "rounding of a hundred steps",
+            guard,
+        )
+        for size, guard in ((1e-12, "ε = 1e-15"), (1.0, ""), (1e15, "steps whose squares overflow are not taken"))
+    ),
+    *(
+        Case(
+            f"rays: scaled by {scale:g}, moved by {offset:g}",
+            partial(rays, scale, offset),
+            "a ball's geometry",
+            0.01,
+            "facets",
+            guard,
+        )
+        for scale, offset, guard in ((1e-6, 0.0, "traced at the mesh's own size"), (1e6, 0.0, ""), (1.0, 1e5, ""))
+    ),
+]

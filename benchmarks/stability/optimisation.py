@@ -1,0 +1,266 @@
+"""What a training is put off its course by, and how it comes back; and whether it is the same training again."""
+
+import functools
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from benchmarks.stability.cases import Case, Found
+from benchmarks.stability.geometry import camera, surfels
+from benchmarks.stability.photos import NOISE
+from benchmarks.stability.training import TOTAL, ball, train, trainer, usual
+from refgs.errors import InputError
+from refgs.kernels import reference
+from refgs.render.rasterize import rasterize
+from refgs.train.adam import Adam
+from refgs.train.start import GEOMETRY
+from refgs.train.trainer import Trainer
+
+AT, UNTIL, LONG = 50, 90, 300  # iterations: from which on it is disturbed, until when, and all of it
+
+
+def disturbed(
+    start: Callable[[Trainer], None], end: Callable[[Trainer], None] | None = None, total: int = TOTAL
+) -> Found:
+    """By how many dB a training ends worse than an undisturbed one, and when it is back."""
+    course = train(ball(), total=total, disturb={AT: start} | ({UNTIL: end} if end else {}))
+    since = UNTIL if end else AT
+    return Found(course.finite, max(0.0, usual(total).end - course.end), course.back_after(since, usual(total)))
+
+
+def faster(factor: float, geometry: bool) -> Callable[[Trainer], None]:
+    """The rates of geometry, or those of light and materials."""
+
+    def change(made: Trainer) -> None:
+        for group in made.optimizer.param_groups:
+            if (group["name"] in GEOMETRY) == geometry:
+                group["rate"] *= factor
+
+    return change
+
+
+def heavier(factor: float) -> Callable[[Trainer], None]:
+    """All weights but that of D-SSIM, which is a share."""
+
+    def change(made: Trainer) -> None:
+        loss = made.settings.loss
+        weights = {name: factor * value for name, value in loss.model_dump().items() if name != "dssim"}
+        made.settings = made.settings.model_copy(update={"loss": loss.model_copy(update=weights)})
+
+    return change
+
+
+def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
+    """One number of a gradient, once or in each step from now on."""
+
+    def change(made: Trainer) -> None:
+        judge = made.guard.judge
+
+        def judged(loss: Tensor, optimizer) -> Tensor:
+            if not every:
+                made.guard.judge = judge
+            made.parameters[name].grad.view(-1)[7] = math.nan
+            return judge(loss, optimizer)
+
+        made.guard.judge = judged
+
+    return change
+
+
+def nan_value(name: str) -> Callable[[Trainer], None]:
+    def change(made: Trainer) -> None:
+        value = made.light if name == "light" else made.parameters[name]
+        value.data.view(-1)[10:13] = math.nan
+
+    return change
+
+
+def stopped() -> Found:
+    """Gradients that are never finite again: back to the checkpoint, and then an end, with one line."""
+    try:
+        train(ball(), disturb={AT: nan_gradient("albedo", every=True)})
+    except InputError as error:
+        return Found("again after going back" in str(error), 0.0)
+    return Found(False, 1.0)
+
+
+def with_settings(*changes: str, total: int = TOTAL) -> Found:
+    course = train(ball(), *changes, total=total)
+    return Found(course.finite, max(0.0, usual(total).end - course.end))
+
+
+def trajectories() -> Found:
+    """Thirty steps of Adam down the same loss: our kernels, and float64. How far the pictures are apart at the end, by what was learned."""
+    view = camera(size=(24, 18))
+    target = reference.rasterize(*(v.double() for v in surfels(view, 60)), view, 0.1)[0].float()
+    start = surfels(view, 60)
+    start[0] = start[0] + 0.02 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
+    start[4] = 0.5 * start[4]
+    pictures, first = [], None
+    for dtype in (torch.float32, torch.float64):
+        leaves = [v.to(dtype).clone().requires_grad_() for v in start]
+        rates = (1e-3, 1e-3, 1e-3, 1e-3, 1e-2)
+        groups = [{"params": [v], "lr": rate} for v, rate in zip(leaves, rates, strict=True)]
+        optimizer = Adam(groups) if dtype == torch.float32 else torch.optim.Adam(groups, eps=Adam.EPSILON)
+        draw = rasterize if dtype == torch.float32 else reference.rasterize
+        for _ in range(30):
+            picture = draw(*leaves, view, 0.1)[0]
+            first = picture.detach().double() if first is None else first
+            optimizer.zero_grad(set_to_none=True)
+            ((picture - target) ** 2).mean().backward()
+            optimizer.step()
+        pictures.append(draw(*leaves, view, 0.1)[0].detach().double())
+    error = float((pictures[0] - pictures[1]).norm() / (pictures[1] - first).norm())
+    return Found(bool(pictures[0].isfinite().all()), error)
+
+
+STAGES = ["initial.until=0.25", "indirect.start=0.3", "indirect.every=15", "indirect.least=0", "indirect.resolution=32"]
+STAGES += [
+    "densify.every=10",
+    "densify.reset_every=30",
+    "propagation.every=20",
+    "propagation.rest=15",
+    "light.exposure=on",
+]
+STAGES += ["train.checkpoint_every=1000", "residual.start=0.8"]
+CUTS = {
+    5: "light first",
+    20: "surfels one by one",
+    37: "deferred",
+    52: "inter-reflection, normals spread",
+    75: "densified",
+    90: "residual",
+}
+
+
+def bits(made: Trainer) -> list[Tensor]:
+    return [*(v.detach() for _, v in sorted(made.parameters.items())), made.light.detach(), made.exposures.detach()]
+
+
+def resumed() -> Found:
+    """A training cut in each of its stages and gone on with from there: the part of the numbers that come out otherwise."""
+    whole = trainer(ball(), *STAGES, total=100)
+    copies: dict[int, Path] = {}
+    for cut in CUTS:
+        whole.run(stop=lambda cut=cut: whole.iteration >= cut)
+        copies[cut] = whole.folder.with_name(f"{whole.folder.name} {cut}")
+        shutil.copytree(whole.folder, copies[cut])
+    whole.run()
+    others = []
+    for folder in copies.values():
+        made = trainer(ball(), *STAGES, total=100, folder=folder)
+        made.resume()
+        made.run()
+        others.append(made)
+    return same(whole, others)
+
+
+def same(whole: Trainer, others: list[Trainer]) -> Found:
+    differ = [
+        a.shape != b.shape or not torch.equal(a, b)
+        for made in others
+        for a, b in zip(bits(whole), bits(made), strict=True)
+    ]
+    return Found(all(bool(v.isfinite().all()) for v in bits(whole)), sum(differ) / len(differ))
+
+
+def threads() -> Found:
+    """The same training on one, two and three threads."""
+    before, made = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            made.append(trainer(ball(), *STAGES, total=60))
+            made[-1].run()
+    finally:
+        torch.set_num_threads(before)
+    return same(made[0], made[1:])
+
+
+REJECTED = "the step is not taken, and counted"
+REMOVED = "surfels that are not finite are removed, and that is said"
+SEED = "what another seed changes"
+
+
+def _case(name: str, run, guard: str, most: float = NOISE, because: str = SEED, against: str = "undisturbed") -> Case:
+    return Case(f"optimisation: {name}", run, against, most, because, guard, "dB")
+
+
+LATE = "it has cooled before all is found again"
+LOST = "positions fly off by radii: to be finite is all that is asked"
+RUINED = "Adam remembers large gradients: to be finite is all that is asked"
+LIMITED = "raw values are kept within limits where their slopes still count"
+CASES = [
+    *(
+        _case(
+            f"rates of {what} × {factor} for 40 iterations",
+            functools.partial(disturbed, faster(factor, geometry), faster(1 / factor, geometry), LONG),
+            LIMITED,
+            *most,
+        )
+        for factor, geometry, what, most in (
+            (10, False, "light and materials", (3.0, LATE)),
+            (100, False, "light and materials", (25.0, RUINED)),
+            (10, True, "geometry", (3.0, LATE)),
+            (100, True, "geometry", (25.0, LOST)),
+        )
+    ),
+    _case("loss weights × 100 for 40 iterations", lambda: disturbed(heavier(100), heavier(0.01), LONG), "", 2.0),
+    _case(
+        "opacity resets and densification in one step",
+        lambda: with_settings("densify.reset_every=50", "densify.every=50", "densify.stop=0.3", total=450),
+        "none are removed, or divided, until what was made faint can be back",
+        9.0,
+        LATE,
+    ),
+    _case(
+        "budget reached at once",
+        lambda: with_settings("surfels.start=600", "surfels.budget=600"),
+        "none are divided",
+    ),
+    *(
+        _case(f"a NaN in the gradient of {name}", functools.partial(disturbed, nan_gradient(name)), REJECTED)
+        for name in ("position", "albedo")
+    ),
+    *(
+        _case(f"NaN in {name} of surfels", functools.partial(disturbed, nan_value(name)), REMOVED)
+        for name in ("position", "scale", "opacity", "albedo", "roughness")
+    ),
+    _case("NaN in the light", lambda: disturbed(nan_value("light")), "back to the last checkpoint, and that is said"),
+    _case(
+        "gradients that are never finite again",
+        stopped,
+        "back to the last checkpoint; then an end",
+        0.0,
+        "it is so or not",
+        "one line",
+    ),
+    Case(
+        "optimisation: 30 steps in float32",
+        trajectories,
+        "float64 trajectory",
+        1e-2,
+        "Adam takes a gradient's sign at first, even of rounding",
+        "",
+    ),
+    Case(
+        f"optimisation: resumed in {len(CUTS)} stages",
+        resumed,
+        "the run in one go, bits",
+        0.0,
+        "the same bits",
+        "a checkpoint holds all that the next iteration depends on",
+    ),
+    Case(
+        "optimisation: on one, two and three threads",
+        threads,
+        "one another, bits",
+        0.0,
+        "the same bits",
+        "no sum depends on who adds",
+    ),
+]

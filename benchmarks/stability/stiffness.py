@@ -1,0 +1,170 @@
+"""Light against material, in float64: singular values of the Jacobian of pictures by two changes that may make up for each other, and
+what each weight of the loss does to that."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from benchmarks.scenes.analytic import sky, sunny
+from benchmarks.stability.cases import Case, Found
+from benchmarks.stability.material import RESOLUTION, SIDE, ball
+from benchmarks.stability.training import ball as capture
+from benchmarks.stability.training import train
+from refgs.camera import Camera
+from refgs.kernels import reference
+from refgs.model import cubemap, prefilter
+from refgs.settings import load_settings
+from refgs.train.ambiguity import ambiguities
+
+STEP = 1e-4
+RESIDUAL = 0.02  # of a picture that is trained: an L1 loss about residuals of such a deviation curves by 0.8 / RESIDUAL a pixel's square
+TURNS = ((0, 0, 0), (0, 2.1, 0), (0, 4.2, 0.5))  # of the views about the ball
+WARM, MATTE = torch.tensor([0.9, 0.6, 0.3]).double(), torch.tensor([0.2, 0.4, 0.5]).double()
+LIGHT, ALBEDO, LIGHT_TINT, TINT, ROUGHNESS, BLUR, METALLIC = range(7)
+TRADES = {
+    "light scale ↔ base colour": (LIGHT, ALBEDO),
+    "light tint ↔ base colour's": (LIGHT_TINT, TINT),
+    "roughness ↔ light's blur": (ROUGHNESS, BLUR),
+    "metallic ↔ base colour": (METALLIC, ALBEDO),
+}
+
+
+class Scene(NamedTuple):
+    """A ball under a light: base colour, metallic and roughness of its left half, then of its right."""
+
+    light: Callable
+    materials: tuple[tuple[Tensor, float, float], ...]
+
+    def radiance(self) -> tuple[Tensor, Tensor, Tensor]:
+        """That of the light, of its tint and of its blur by a sixteenth of a face, (6·R², 3) each."""
+        base = torch.from_numpy(self.light(cubemap.texel_directions(RESOLUTION).numpy())).float()
+        faces = torch.nn.functional.pad(
+            base.view(6, RESOLUTION, RESOLUTION, 3).permute(0, 3, 1, 2), (1,) * 4, mode="replicate"
+        )
+        mean = torch.nn.functional.avg_pool2d(faces, 3, stride=1).permute(0, 2, 3, 1).reshape(-1, 3)
+        return base, base * torch.tensor([1.0, 0.0, -1.0]), mean - base
+
+    def pictures(self, change: Tensor) -> Tensor:
+        """Of a change (7,), encoded, all numbers side by side."""
+        normal, position, view = ball()
+        base, tint, blur = (prefilter.prefilter(radiance, RESOLUTION).double() for radiance in self.radiance())
+        levels = (1 + change[LIGHT]) * base + change[LIGHT_TINT] * tint + change[BLUR] * blur
+        left = torch.arange(SIDE)[None, :, None] < SIDE / 2
+        rows = []
+        for albedo, metallic, roughness in self.materials:
+            tinted = albedo * (1 + change[ALBEDO] + change[TINT] * torch.tensor([1.0, 0, -1]).double())
+            others = metallic + change[METALLIC] * (1 - 2 * metallic), roughness + change[ROUGHNESS]
+            rows.append(torch.cat([tinted, torch.stack(others)]))
+        material = torch.where(left, rows[0], rows[-1]).expand(SIDE, SIDE, 5)
+        alpha, found = torch.ones(SIDE, SIDE).double(), []
+        inside = (normal[..., :2].norm(dim=-1) < 0.6).flatten()
+        for turn in TURNS:
+            rotation = reference.rotation_matrices(torch.tensor([[1.0, *turn]]).double())[0]
+            pose = view.world_to_camera.copy()
+            pose[:3, :3] = rotation.numpy()
+            turned = Camera("view", SIDE, SIDE, view.fx, view.fy, view.cx, view.cy, pose)
+            features = torch.cat([normal @ rotation, material, position @ rotation], dim=-1)
+            light = levels, tuple(prefilter.level_sides(RESOLUTION))
+            color = reference.shade(features, alpha, *light, turned, torch.zeros(3).double())[0]
+            found.append(color.reshape(-1, 3)[inside].flatten())
+        return torch.cat(found)
+
+    def jacobian(self) -> Tensor:
+        """Of the pictures by the seven changes (P, 7), by central differences, over the root of P."""
+        columns = [self.pictures(STEP * e) - self.pictures(-STEP * e) for e in torch.eye(7).double()]
+        return torch.stack(columns, dim=1) / (2 * STEP) / len(columns[0]) ** 0.5
+
+    def weights(self, change: Tensor) -> dict[str, Tensor]:
+        """What each weight of the loss costs, at the end of a training, by the numbers of the standard preset."""
+        loss = load_settings("standard").loss
+        base, tint, blur = (radiance.double().mean(dim=0) for radiance in self.radiance())
+        mean = (1 + change[LIGHT]) * base + change[LIGHT_TINT] * tint + change[BLUR] * blur
+        metallic = [m + change[METALLIC] * (1 - 2 * m) for _, m, _ in self.materials]
+        rough = [r + change[ROUGHNESS] for *_, r in self.materials]
+        return {
+            "loss.light": loss.light * ((mean / mean.mean() - 1) ** 2).mean(),
+            "loss.metallic": loss.metallic * sum(m * (1 - m) for m in metallic) / len(metallic),
+            "loss.matte": loss.matte * sum((r - 0.3).clamp_min(0) for r in rough) / len(rough),
+        }
+
+    def derivatives(self, weight: str) -> tuple[Tensor, Tensor]:
+        """First and second, of what a weight costs (7,), (7, 7)."""
+        at = torch.zeros(7).double()
+        return tuple(
+            derivative(lambda change: self.weights(change)[weight], at)
+            for derivative in (torch.autograd.functional.jacobian, torch.autograd.functional.hessian)
+        )
+
+
+METAL, DIELECTRIC = (
+    (WARM, 0.95, 0.2),
+    (MATTE, 0.05, 0.45),
+)  # of roughnesses between levels: at one derivatives have a kink
+SCENES = {
+    "metal, smooth sky": Scene(sky, (METAL,)),
+    "metal, suns": Scene(sunny, (METAL,)),
+    "dielectric, smooth sky": Scene(sky, (DIELECTRIC,)),
+    "dielectric, suns": Scene(sunny, (DIELECTRIC,)),
+    "half metal, half dielectric, suns": Scene(sunny, (METAL, DIELECTRIC)),
+}
+
+
+def condition(hessian: Tensor) -> str:
+    """The largest eigenvalue over the smallest; of one that is no minimum, so."""
+    low, high = torch.linalg.eigvalsh(hessian).tolist()
+    return f"{high / low:.0f}" if low > 0 else "no minimum"
+
+
+def tables() -> list[tuple[str, list[str], list[list[str]]]]:
+    """Title, headings, rows."""
+    weights, rows = ("loss.light", "loss.metallic", "loss.matte"), []
+    for name, scene in SCENES.items():
+        jacobian = scene.jacobian()
+        for trade, pair in TRADES.items():
+            pair = list(pair)
+            _, sigma, ways = torch.linalg.svd(jacobian[:, pair], full_matrices=False)
+            data = 0.8 * 0.8 / RESIDUAL * jacobian[:, pair].T @ jacobian[:, pair]  # 0.8 of the loss is L1
+            cells = []
+            for weight in weights:
+                slope, hessian = scene.derivatives(weight)
+                slope, hessian = slope[pair], hessian[pair][:, pair]
+                pull = (slope @ ways[1]).abs() / (ways[1] @ data @ ways[1])
+                moves = bool(hessian.abs().max() > 1e-12 or slope.abs().max() > 1e-12)
+                cells.append(f"{condition(data + hessian)}; {float(pull):.2f}" if moves else "–")
+            rows.append([name, trade, *(f"{s:.4f}" for s in sigma), condition(data), *cells])
+    headings = ["scene", "trade", "σ₁", "σ₂", "condition", *(f"with {name}; pull" for name in weights)]
+    return [("Which trades are stiff", headings, rows)]
+
+
+def by_autograd() -> Found:
+    """The Jacobian's columns of roughness and metallic, by differences and by the reference's own derivatives."""
+    scene = SCENES["half metal, half dielectric, suns"]
+    upstream = torch.randn(
+        len(scene.pictures(torch.zeros(7).double())), generator=torch.Generator().manual_seed(0)
+    ).double()
+    at = torch.zeros(7).double().requires_grad_()
+    (exact,) = torch.autograd.grad(scene.pictures(at) @ upstream, at)
+    found = scene.jacobian().T @ upstream * len(upstream) ** 0.5
+    return Found(bool(exact.isfinite().all()), float(((found - exact).abs() / exact.abs().max()).max()))
+
+
+def said() -> Found:
+    """A ball all of metal: the report says that the light's scale is not told, and does not say so of metal."""
+    trades = ambiguities(train(capture(), total=300).trainer)
+    right = "what" in trades["light_scale"] and "what" in trades["white_balance"] and "what" not in trades["metal"]
+    return Found(all(v["left"] <= v["alone"] for v in trades.values()), 0.0 if right else 1.0)
+
+
+CASES = [
+    Case("stiffness: the Jacobian", by_autograd, "autograd, float64", 1e-6, "differences of second order", ""),
+    Case(
+        "stiffness: a ball of metal",
+        said,
+        "what is known of it",
+        0.0,
+        "it is said or not",
+        "the report says what photos do not tell",
+    ),
+]

@@ -1,0 +1,125 @@
+"""Small trainings of a metal ball: what cases are run on, and compared with."""
+
+import atexit
+import functools
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from benchmarks.scenes.analytic import write_ball_capture
+from benchmarks.stability.cases import NEVER
+from refgs.capture import read_capture
+from refgs.settings import load_settings
+from refgs.train.trainer import Trainer
+
+SIZE, TOTAL, LOOK = 32, 150, 10  # pixels; iterations; iterations between looks at the held-out views
+SMALL = [
+    "surfels.start=500",
+    "surfels.budget=600",
+    "surfels.hull=48",
+    "environment.resolution=16",
+    "train.light_first=10",
+]
+SMALL += ["surfels.metallic=0.9", "densify.every=25", "train.checkpoint_every=20", "indirect.start=1"]
+BACK = 1.0  # dB to the undisturbed training, from which on one counts as back on its course
+
+
+@functools.cache
+def workspace() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="refgs-stability-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+@functools.cache
+def ball(**how) -> Path:
+    folder = workspace() / f"ball {how}".replace("/", " ")
+    write_ball_capture(folder, SIZE, samples=2, **how)
+    return folder
+
+
+def changed(
+    pose: Callable[[np.ndarray], np.ndarray] = lambda matrix: matrix,
+    photo: Callable[[np.ndarray, int], np.ndarray] = lambda pixels, index: pixels,
+    views: int | None = None,
+) -> Path:
+    """The ball's capture with other camera-to-world matrices, or other pixels (H, W, 4) in 0..1 of each of its photos."""
+    folder = Path(tempfile.mkdtemp(dir=workspace()))
+    for split in ("train", "test"):
+        frames = json.loads((ball() / f"transforms_{split}.json").read_text())
+        frames["frames"] = frames["frames"][: views if split == "train" else None]
+        (folder / split).mkdir()
+        for i, frame in enumerate(frames["frames"]):
+            frame["transform_matrix"] = pose(np.array(frame["transform_matrix"])).tolist()
+            pixels = np.asarray(Image.open(ball() / f"{frame['file_path']}.png")) / 255
+            made = np.rint(photo(pixels, i).clip(0, 1) * 255).astype(np.uint8)
+            Image.fromarray(made).save(folder / f"{frame['file_path']}.png")
+        (folder / f"transforms_{split}.json").write_text(json.dumps(frames))
+    return folder
+
+
+class Course(NamedTuple):
+    """PSNR of the held-out views, dB, at iterations; what was warned of; the trainer."""
+
+    psnr: dict[int, float]
+    said: list[str]
+    trainer: Trainer
+
+    @property
+    def end(self) -> float:
+        return max(self.psnr.items())[1]
+
+    @property
+    def finite(self) -> bool:
+        values = [
+            *self.trainer.parameters.values(),
+            self.trainer.light,
+            *(v.color for v in map(self._seen, self.trainer.test)),
+        ]
+        return all(bool(value.isfinite().all()) for value in values) and all(np.isfinite(list(self.psnr.values())))
+
+    def _seen(self, view):
+        return self.trainer.render(view.camera)
+
+    def back_after(self, start: int, undisturbed: "Course") -> int:
+        """Iterations from one on until all later looks are as good as the undisturbed training's, to BACK."""
+        late = [i for i in self.psnr if i > start and self.psnr[i] < undisturbed.psnr.get(i, undisturbed.end) - BACK]
+        return NEVER if late and max(late) == max(self.psnr) else max(late, default=start - LOOK) + LOOK - start
+
+
+def trainer(
+    capture: Path, *changes: str, total: int = TOTAL, said: list[str] | None = None, folder: Path | None = None
+) -> Trainer:
+    settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
+    folder = folder or Path(tempfile.mkdtemp(dir=workspace()))
+
+    def report(event: str, facts: dict) -> None:
+        if event == "warning" and said is not None:
+            said.append(facts["what"])
+
+    return Trainer(read_capture(capture), settings, folder, report)
+
+
+def train(
+    capture: Path, *changes: str, total: int = TOTAL, disturb: dict[int, Callable[[Trainer], None]] | None = None
+) -> Course:
+    """A whole training; before some of its iterations something is done to it."""
+    said: list[str] = []
+    made, psnr = trainer(capture, *changes, total=total, said=said), {}
+    for end in range(LOOK, total + 1, LOOK):
+        (disturb or {}).get(end - LOOK, lambda _: None)(made)
+        while made.iteration < end:  # it may have gone back
+            made.run(stop=lambda end=end: made.iteration >= end)
+        psnr[end] = made.test_psnr()
+    return Course(psnr, said, made)
+
+
+@functools.cache
+def usual(total: int = TOTAL) -> Course:
+    return train(ball(), total=total)

@@ -1,0 +1,79 @@
+"""A run's mesh for other programs, as USD or FBX through Blender's own exporters, with its pictures beside it."""
+
+import shutil
+from pathlib import Path
+
+import bpy
+
+from ..compat import node_tree, usd_keeps_textures
+from ..errors import InputError
+from ..nodes import add, out
+from .files import whole
+from .run import add_mesh, data_blocks
+
+TEXTURES = "textures"  # beside a run's mesh.glb
+_PICTURES = {"base_color": "Base Color", "metallic": "Metallic", "roughness": "Roughness", "normal": "Normal"}
+
+
+def write_mesh(mesh: Path, path: Path) -> None:
+    """Write a run's mesh.glb as `path`, a .usdc or .fbx, and the pictures of its textures into the folder `NAME textures` beside.
+
+    Blender's file is left as it was. Raises InputError where pictures are missing, and where something cannot be read or written.
+    """
+    sources = {name: mesh.parent / TEXTURES / f"{name}.png" for name in (*_PICTURES, "occlusion")}
+    for source in sources.values():
+        if not source.is_file():
+            raise InputError(f"{source} is not there: make the run's mesh again")
+    folder = path.with_name(f"{path.stem} {TEXTURES}")
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write {folder}: {error.strerror}") from None
+    for name, source in sources.items():
+        with whole(folder / f"{name}.png") as temporary:
+            shutil.copyfile(source, temporary)
+    before = data_blocks()
+    try:
+        scene = bpy.data.scenes.new(
+            path.stem
+        )  # of its own: what is selected, hidden or in work elsewhere does not matter
+        with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
+            material = _material(path.stem, folder)
+            for item in add_mesh(mesh, path.stem, scene.collection):
+                item.data.materials.clear()
+                item.data.materials.append(material)
+            with whole(path) as temporary:
+                _EXPORTERS[path.suffix.lower()](str(temporary))
+    finally:
+        bpy.data.batch_remove(data_blocks() - before)
+
+
+def _material(name: str, folder: Path) -> bpy.types.Material:
+    """A Principled BSDF with a picture an input: FBX knows no channels of pictures, and the exporters no other nodes."""
+    material = bpy.data.materials.new(name)
+    tree, inputs = node_tree(material), {}
+    for picture, socket in _PICTURES.items():
+        image = bpy.data.images.load(str(folder / f"{picture}.png"))
+        image.colorspace_settings.name = "sRGB" if picture == "base_color" else "Non-Color"
+        inputs[socket] = out(add(tree, "ShaderNodeTexImage", image=image))
+    inputs["Normal"] = out(add(tree, "ShaderNodeNormalMap", {"Color": inputs["Normal"]}))
+    add(tree, "ShaderNodeOutputMaterial", {"Surface": out(add(tree, "ShaderNodeBsdfPrincipled", inputs))})
+    return material
+
+
+def _usd(file: str) -> None:
+    try:
+        textures = usd_keeps_textures()
+    except KeyError:
+        raise InputError("this Blender was built without USD: use the one from blender.org, or write FBX") from None
+    bpy.ops.wm.usd_export(filepath=file, export_custom_properties=False, convert_world_material=False, **textures)
+
+
+def _fbx(file: str) -> None:
+    try:
+        bpy.ops.export_scene.fbx(filepath=file, path_mode="RELATIVE", use_tspace=True, bake_anim=False)
+    except AttributeError:  # the operator is not there
+        raise InputError("Blender's FBX add-on is off: switch it on in the preferences") from None
+
+
+_EXPORTERS = {".usdc": _usd, ".fbx": _fbx}

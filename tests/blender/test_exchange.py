@@ -1,0 +1,120 @@
+"""USD and FBX of a run's mesh: written, moved with their pictures, and read by Blender's own importers, they are what the run has."""
+
+import shutil
+
+import bpy
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial import cKDTree
+
+from refgs.export.mesh import write_glb
+from refgs_addon import ui
+from refgs_addon.errors import InputError
+from refgs_addon.scene.edit import add_edit
+from refgs_addon.scene.export import export_mesh, export_run
+from refgs_addon.scene.run import data_blocks, import_run
+from tests.export.test_glb import make
+
+IMPORTERS = [
+    (".usdc", lambda file: bpy.ops.wm.usd_import(filepath=file, import_textures_mode="IMPORT_NONE")),
+    (".fbx", lambda file: bpy.ops.import_scene.fbx(filepath=file)),
+    (".fbx", lambda file: bpy.ops.wm.fbx_import(filepath=file)),
+]
+
+
+@pytest.fixture
+def textured(run_folder):
+    mesh, textures = make()
+    write_glb(run_folder / "mesh.glb", mesh, textures)
+    return run_folder, mesh
+
+
+@pytest.mark.parametrize(("ending", "read"), IMPORTERS, ids=["usd", "fbx, in Python", "fbx"])
+def test_it_comes_back_as_it_was(textured, scene, tmp_path, ending, read):
+    folder, mesh = textured
+    run = import_run(folder, scene)
+    scene.view_layers[0].objects.active = run.splats
+    run.splats.select_set(True)
+    before = data_blocks()
+    there, moved = tmp_path / "là", tmp_path / "ailleurs, déplacé"
+    there.mkdir()
+    export_mesh(run.collection, there / f"le pot été{ending}")
+    assert data_blocks() == before and run.mesh[0].hide_viewport
+    assert bpy.context.view_layer.objects.active == run.splats and run.splats.select_get()
+    assert {file.name for file in there.iterdir()} == {f"le pot été{ending}", "le pot été textures"}
+
+    shutil.move(there, moved)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    read(str(moved / f"le pot été{ending}"))
+    bpy.context.view_layer.update()
+    (found,) = (item for item in bpy.data.objects if item.type == "MESH")
+    data, turn = found.data, np.array(found.matrix_world.to_3x3())
+    assert len(data.polygons) == len(mesh.faces) and np.allclose(turn, np.eye(3), atol=1e-6)
+    order = np.array([loop.vertex_index for loop in data.loops])
+    places = np.array([found.matrix_world @ vertex.co for vertex in data.vertices])[order]
+    normals = np.array([normal.vector for normal in data.corner_normals]) @ turn.T
+    corners = np.hstack([places, [loop.uv for loop in data.uv_layers.active.data], normals])
+    expected = np.hstack([mesh.vertices, mesh.uv, mesh.normals])
+    distance, _ = cKDTree(expected).query(corners)
+    assert distance.max() < 1e-3 and cKDTree(corners).query(expected)[0].max() < 1e-3
+
+    (material,) = data.materials
+    shader = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+    for name in ("Base Color", "Metallic", "Roughness", "Normal"):
+        node = shader.inputs[name].links[0].from_node
+        if node.type != "TEX_IMAGE":
+            assert node.type == {"Normal": "NORMAL_MAP"}.get(name, "SEPARATE_COLOR")
+            node = node.inputs["Color"].links[0].from_node
+        image, stem = node.image, name.lower().replace(" ", "_")
+        file = moved / "le pot été textures" / f"{stem}.png"
+        assert bpy.path.abspath(image.filepath) == str(file)
+        assert image.colorspace_settings.name == ("sRGB" if name == "Base Color" else "Non-Color")
+        shown = np.array(image.pixels).reshape(64, 64, 4)[::-1, :, :3]
+        truth = np.asarray(Image.open(folder / "textures" / f"{stem}.png").convert("RGB")) / 255
+        np.testing.assert_allclose(shown, truth, atol=1e-6)
+
+
+@pytest.mark.parametrize("ending", [".usdc", ".fbx"])
+def test_what_is_in_the_way_is_said_in_one_line(textured, scene, tmp_path, ending):
+    folder, _ = textured
+    run = import_run(folder, scene)
+    before = data_blocks()
+    with pytest.raises(InputError, match=r"cannot write .*not there"):
+        export_mesh(run.collection, tmp_path / "not there" / f"a{ending}")
+    (tmp_path / f"b{ending}").mkdir()
+    with pytest.raises(InputError, match=r"cannot write .*b\."):
+        export_mesh(run.collection, tmp_path / f"b{ending}")
+    (folder / "textures" / "metallic.png").unlink()
+    with pytest.raises(InputError, match=r"metallic\.png is not there: make the run's mesh again"):
+        export_mesh(run.collection, tmp_path / f"a{ending}")
+    (folder / "mesh.glb").unlink()
+    with pytest.raises(InputError, match="make the run's mesh first"):
+        export_mesh(run.collection, tmp_path / f"a{ending}")
+    assert data_blocks() == before
+    add_edit(run.collection)
+    with pytest.raises(InputError, match="without the edits"):
+        export_mesh(run.collection, tmp_path / f"a{ending}")
+    assert not (tmp_path / f"a{ending}").exists()
+
+
+def test_a_run_that_was_copied_has_its_pictures(textured, scene, tmp_path):
+    run = import_run(textured[0], scene)
+    export_run(run.collection, tmp_path / "copie")
+    copy = import_run(tmp_path / "copie", scene)
+    export_mesh(copy.collection, tmp_path / "a.usdc")
+    found, source = tmp_path / "a textures", textured[0] / "textures"
+    assert len(list(found.iterdir())) == 5
+    assert all(file.read_bytes() == (source / file.name).read_bytes() for file in found.iterdir())
+
+
+def test_the_file_menu_has_them(textured, tmp_path):
+    ui.register()
+    try:
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        bpy.ops.refgs.import_run(directory=f"{textured[0]}/")
+        bpy.ops.refgs.export_mesh_usd(filepath=str(tmp_path / "a.usdc"))
+        bpy.ops.refgs.export_mesh_fbx(filepath=str(tmp_path / "a.fbx"))
+        assert (tmp_path / "a.usdc").stat().st_size and (tmp_path / "a.fbx").stat().st_size
+    finally:
+        ui.unregister()

@@ -1,0 +1,34 @@
+"""Quick cases of the table that `refgs stability` prints, and the command."""
+
+import subprocess
+import sys
+
+import pytest
+
+from benchmarks.stability import geometry, material, stiffness
+from benchmarks.stability.cases import Case, Found
+
+QUICK = [*geometry.CASES, *material.CASES, stiffness.CASES[0]]
+
+
+@pytest.mark.parametrize("case", [c for c in QUICK if "million" not in c.name], ids=lambda case: case.name)
+def test_case(case):
+    found = case.run()
+    assert case.holds(found), found
+
+
+def test_a_case_can_fail():
+    case = Case("", lambda: Found(True, 0.0), "", 1e-3, "", "")
+    assert case.holds(Found(True, 1e-3)) and not case.holds(Found(True, 2e-3)) and not case.holds(Found(False, 0.0))
+    assert not case.holds(Found(True, float("nan")))
+
+
+def test_the_command():
+    done = subprocess.run(
+        [sys.executable, "-m", "refgs.cli", "stability", "--only", "depth ties"],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "depth ties" in done.stdout and "Adam" not in done.stdout

@@ -1,0 +1,268 @@
+"""What a training writes down of itself: when, what, at what cost; and that errors are what they are said to be."""
+
+import json
+import math
+import shutil
+
+import numpy as np
+import pytest
+
+from benchmarks.scenes.analytic import F0, ONE, meet, sky
+from refgs.capture import read_capture
+from refgs.export.environment import directions, write_environment, write_exr
+from refgs.run import create_run
+from refgs.settings import load_settings
+from refgs.train import history
+from refgs.train.trainer import Trainer
+from tests.kernels import scenes
+
+SMALL = [
+    "surfels.start=600",
+    "surfels.budget=800",
+    "surfels.hull=48",
+    "environment.resolution=16",
+    "train.light_first=0",
+]
+
+
+def make(capture, folder, *changes, total=40, report=lambda event, facts: None):
+    settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
+    read = read_capture(capture)
+    trainer = Trainer(read, settings, folder, report)
+    if not folder.exists():
+        create_run(folder, read, trainer.settings, "quick", "cpu")
+    return trainer
+
+
+def rows(folder):
+    return [json.loads(line) for line in (folder / history.FILE).read_text().splitlines()]
+
+
+def test_lines_are_evenly_spaced_by_logarithm():
+    found = [i for i in range(20_000) if history.due(i)]
+    assert found[0] == 10 and {100, 1000, 10_000} <= set(found)
+    assert sum(100 <= i < 1000 for i in found) == sum(1000 <= i < 10_000 for i in found) == 10
+    ratios = np.divide(found[5:], found[4:-1])
+    np.testing.assert_allclose(ratios, 10**0.1, rtol=0.06)
+
+
+@pytest.mark.parametrize(("cost", "lines"), [(0.1, 26), (2.0, 5), (100.0, 2)])
+def test_measuring_has_its_share(cost, lines):
+    """Of a training of 3,000 iterations, a tenth of a second each; where it is dear it is thinned out evenly."""
+    spent, at = 0.0, []
+    for i in [*filter(history.due, range(3000)), 3000]:
+        if i == 3000 or spent <= history.allowed(i, 3000, 0.1 * i):
+            spent += cost
+            at.append(i)
+    assert len(at) == lines and at[0] == 10 and at[-1] == 3000
+    assert spent <= history.SHARE * 300 + 2 * cost
+    if lines == 5:
+        gaps = np.diff(np.log(at))
+        assert gaps.max() < 2 * gaps.min()
+
+
+def test_measuring_is_not_in_the_seconds(ball_capture, tmp_path, monkeypatch):
+    """Where measuring takes a thousand seconds, and the rest of the world none but the clock's own ticks."""
+
+    class Time:
+        now = 0.0
+
+        def perf_counter(self):
+            self.now += 0.001
+            return self.now
+
+        process_time = perf_counter
+
+    time = Time()
+    monkeypatch.setattr("refgs.train.trainer.time", time)
+    monkeypatch.setattr("refgs.clock.time", time)
+    trainer = make(ball_capture, tmp_path / "run", total=20)
+
+    def slow(_):
+        time.now += 1000
+        return {"psnr_test": 20.0}
+
+    trainer.measures.errors = slow
+    trainer.run()
+    found = rows(tmp_path / "run")
+    assert [row["iteration"] for row in found] == [10, 13, 16, 20]
+    assert ["psnr_test" in row for row in found] == [True, False, False, True], (
+        "the first and the last, whatever it costs"
+    )
+    assert found[-1]["seconds"] < 10 and trainer.seconds < 10
+    assert trainer.clock.seconds["measuring"] == pytest.approx(2000, abs=1)
+    assert found[-1]["parts"]["measuring"] == pytest.approx(1000, abs=1), "what was spent before that line"
+
+
+def test_parts_add_up_to_the_seconds(ball_capture, tmp_path):
+    said = []
+    trainer = make(
+        ball_capture, tmp_path / "run", "densify.every=10", report=lambda event, facts: said.append((event, facts))
+    )
+    trainer.run()
+    last = rows(tmp_path / "run")[-1]
+    parts = last["parts"]
+    inside = {name: seconds for name, seconds in parts.items() if name not in history.BESIDE}
+    assert {"raster", "shading", "prefilter", "surfels", "loss", "optimiser", "densification"} < inside.keys()
+    assert sum(inside.values()) == pytest.approx(last["seconds"], abs=2e-3) and min(inside.values()) > 0
+    assert parts["raster"] > parts["optimiser"], "which takes a hundredth of its time"
+    heard = [facts for event, facts in said if event == "measured"]
+    assert [facts["iteration"] for facts in heard] == [row["iteration"] for row in rows(tmp_path / "run")]
+    assert "parts" not in heard[0] and heard[-1]["psnr_test"] == last["psnr_test"]
+
+
+def test_a_resumed_run_records_the_same(ball_capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(history, "SHARE", math.inf)  # whatever it costs
+    changes = ["train.checkpoint_every=20", "densify.every=15"]
+    make(ball_capture, tmp_path / "whole", *changes).run()
+    first = make(ball_capture, tmp_path / "cut", *changes)
+    first.run(stop=lambda: first.iteration >= 34)
+    assert rows(tmp_path / "cut")[-1]["iteration"] == 32
+    (tmp_path / "cut" / "checkpoints" / "00000034.toml").unlink()  # killed before that one was complete
+    second = make(ball_capture, tmp_path / "cut", *changes)
+    second.resume()
+    assert rows(tmp_path / "cut")[-1]["iteration"] == 20 == second.iteration
+    second.run()
+    whole, cut = (
+        [
+            {name: value for name, value in row.items() if name not in ("seconds", "parts", "loss", "psnr_train")}
+            for row in found
+        ]
+        for found in map(rows, (tmp_path / "whole", tmp_path / "cut"))
+    )  # the running means start anew
+    assert whole == cut and whole[-1]["iteration"] == 40 and "flip_test" in whole[3]
+    before, after = (row["parts"] for row in rows(tmp_path / "cut")[3:5])
+    assert all(after[name] >= before[name] - 1e-4 for name in before), "time is counted on"
+
+
+def test_a_training_that_is_ended_early_has_a_last_line(ball_capture, tmp_path):
+    trainer = make(ball_capture, tmp_path / "run")
+
+    def finish():
+        if trainer.iteration == 14:
+            trainer.total = 14
+        return trainer.ended
+
+    trainer.run(stop=finish)
+    assert [row["iteration"] for row in rows(tmp_path / "run")] == [10, 13, 14]
+    assert "flip_test" in rows(tmp_path / "run")[-1]
+
+
+def rays(camera):
+    """Unit rays (P, 3) of a camera's pixels; which meet the ball; where, and the normal there."""
+    ray = scenes.camera_rays(camera).double().numpy().reshape(-1, 3)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    return ray, *meet(np.broadcast_to(camera.position, ray.shape), ray, ONE)
+
+
+def dusk(direction):
+    return sky(direction[..., [1, 2, 0]]) * [1.0, 0.6, 0.3]
+
+
+def write_truth(capture):
+    """What the ball's formulas say of its held-out views, and of them under another light."""
+    truth = capture / "ground_truth"
+    for name in ("alpha", "normal", "albedo", "roughness", "metallic", "relight/dusk"):
+        (truth / name).mkdir(parents=True)
+    write_environment(truth / "light.exr", sky(directions(64, 128)))
+    write_environment(truth / "relight" / "dusk.exr", dusk(directions(64, 128)))
+    for view in read_capture(capture).test_views:
+        camera, name = view.camera, f"{view.camera.name}.exr"
+        size = camera.height, camera.width
+        ray, hit, _, normal = rays(camera)
+        cosine = -(ray * normal).sum(-1, keepdims=True)
+        fresnel = F0 + (1 - F0) * (1 - cosine.clip(0, 1)) ** 5
+        radiance = np.where(hit[:, None], fresnel * dusk(ray + 2 * cosine * normal), 0)
+        images = {
+            "alpha": hit,
+            "normal": normal * hit[:, None],
+            "albedo": hit[:, None] * F0,
+            "metallic": hit,
+            "roughness": 0 * hit,
+        }
+        images["relight/dusk"] = np.concatenate([radiance, hit[:, None]], axis=1)
+        for kind, pixels in images.items():
+            shape = size if pixels.ndim == 1 else (*size, pixels.shape[1])
+            write_exr(truth / kind / name, pixels.reshape(shape).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def known_capture(ball_capture, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("known") / "ball"
+    shutil.copytree(ball_capture, folder)
+    write_truth(folder)
+    return folder
+
+
+def test_errors_against_the_truth(known_capture, tmp_path):
+    """Each as another program would measure it, and all less when the ball has been learned."""
+    trainer = make(
+        known_capture, tmp_path / "run", "surfels.metallic=0.9", "surfels.budget=1500", "surfels.start=1500", total=250
+    )
+    start = trainer.measures.errors(trainer)
+    trainer.run()
+    found = rows(tmp_path / "run")[-1]
+    angles, roughness, metallic = [], [], []
+    for view in trainer.test:
+        _, hit, _, normal = rays(view.camera)
+        seen = trainer.render(view.camera)
+        shown = seen.normal.double().numpy().reshape(-1, 3)[hit]
+        there = (seen.alpha.numpy().reshape(-1)[hit] >= 0.1) & (np.linalg.norm(shown, axis=1) > 1e-6)
+        cosine = (shown * normal[hit]).sum(-1) / np.maximum(np.linalg.norm(shown, axis=1), 1e-6)
+        angles.append(np.degrees(np.where(there, np.arccos(cosine.clip(-1, 1)), np.pi / 2)).mean())
+        roughness.append(seen.roughness.numpy().reshape(-1)[hit].mean())
+        metallic.append(1 - seen.metallic.numpy().reshape(-1)[hit].mean())
+    assert found["normal_mae_degrees"] == pytest.approx(np.mean(angles), rel=1e-4)
+    assert found["roughness_mae"] == pytest.approx(np.mean(roughness), abs=1e-4)
+    assert found["metallic_mae"] == pytest.approx(np.mean(metallic), abs=1e-4)
+    light, true = (x(64) for x in (trainer.environment().panorama, lambda rows: sky(directions(rows, 2 * rows))))
+    weight = np.cos(np.pi * (0.5 - (np.arange(64) + 0.5) / 64))[:, None, None]
+    apart = np.log(light) - np.log(true)
+    apart -= (apart * weight).sum() / (weight.sum() * 128 * 3)
+    rmse = math.sqrt((apart**2 * weight).sum() / (weight.sum() * 128 * 3))
+    assert found["light_log_rmse"] == pytest.approx(rmse, rel=0.05)
+    assert found["light_log_rmse"] < 0.5 * start["light_log_rmse"]
+    assert found["relit_psnr"] > start["relit_psnr"] + 3 and found["psnr_test"] > start["psnr_test"] + 5
+    assert found["albedo_psnr"] > 15 and 0 < found["flip_test"] < 0.1
+
+
+def test_a_light_known_exactly_leaves_the_relit_picture_alone(known_capture, tmp_path):
+    """A surfel ball of the true metal under that light is nearly the truth, up to the ball's outline."""
+    trainer = make(known_capture, tmp_path / "run", "surfels.start=3000", "surfels.budget=3000", "surfels.hull=96")
+    logit = np.log(F0 / (1 - F0))
+    settings = {"albedo": logit, "metallic": 9.0, "roughness": -9.0}
+    for name, value in settings.items():
+        trainer.parameters[name].data[:] = trainer.parameters[name].new_tensor(value)
+    assert trainer.measures.errors(trainer)["relit_psnr"] > 20
+    trainer.parameters["albedo"].data[:] = trainer.parameters["albedo"].new_tensor(logit[::-1].copy())
+    assert trainer.measures.errors(trainer)["relit_psnr"] < 20, "of another metal"
+
+
+def test_without_colour_that_is_material_there_is_none_to_compare(known_capture, tmp_path):
+    sh = make(known_capture, tmp_path / "sh", "render.shading=sh")
+    assert sh.measures.errors(sh).keys() == {"psnr_test", "normal_mae_degrees"}
+    diffuse = make(known_capture, tmp_path / "diffuse", "render.diffuse=sh")
+    expected = {"psnr_test", "normal_mae_degrees", "roughness_mae", "metallic_mae", "light_log_rmse"}
+    assert diffuse.measures.errors(diffuse).keys() == expected
+
+
+def test_a_truth_that_does_not_fit_is_left_out_with_a_line(known_capture, tmp_path):
+    said = []
+    trainer = make(
+        known_capture, tmp_path / "run", "image.max_side=32", report=lambda event, facts: said.append((event, facts))
+    )
+    warnings = [facts["what"] for event, facts in said if event == "warning"]
+    assert len(warnings) == 1 and "its size is not the view's (32×32)" in warnings[0]
+    assert trainer.measures.errors(trainer).keys() == {"psnr_test"}
+
+
+def test_psnr_is_that_of_encoded_pictures(ball_capture, tmp_path):
+    trainer = make(ball_capture, tmp_path / "run")
+    square = []
+    for view in trainer.test:
+        alpha = view.alpha[..., None] / 255
+        photo = view.image / 255 * alpha + 1 - alpha
+        seen = trainer.render(view.camera)
+        square.append(((seen.color.double().numpy().clip(0, 1) - photo) ** 2).mean())
+    expected = np.mean([-10 * np.log10(s) for s in square])
+    assert trainer.measures.errors(trainer)["psnr_test"] == pytest.approx(expected, abs=1e-4)

@@ -1,0 +1,293 @@
+"""What a scene does without: each statistic on either side of its threshold, and what comes of it."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.scenes.analytic import write_ball_capture
+from refgs.capture import read_capture
+from refgs.export.splats import read_splats
+from refgs.geometry.mesh import Mesh
+from refgs.geometry.visibility import Occluder
+from refgs.model.environment import Environment
+from refgs.run import create_run, open_run
+from refgs.settings import load_settings
+from refgs.train import needs, probe
+from refgs.train.asset import write_asset
+from refgs.train.losses import Photo, objective
+from refgs.train.trainer import Trainer
+
+DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # at the start: few iterations have to do
+SMALL = [
+    "surfels.start=1500",
+    "surfels.budget=1800",
+    "surfels.hull=64",
+    "environment.resolution=32",
+    "train.light_first=20",
+    "indirect.every=100",
+    "indirect.resolution=32",
+]
+
+
+def trainer(capture, folder, *changes, total=150):
+    settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
+    made = Trainer(capture, settings, folder, lambda event, facts: None)
+    if not folder.exists():
+        create_run(folder, capture, settings, "quick", "cpu")
+    return made
+
+
+@pytest.fixture(scope="module")
+def mirror(ball_capture):
+    return read_capture(ball_capture)
+
+
+@pytest.fixture(scope="module")
+def matte(tmp_path_factory):
+    """The ball as white chalk would look: its irradiance, the same from everywhere."""
+    folder = tmp_path_factory.mktemp("matte")
+    write_ball_capture(folder, 64, matte=True)
+    return read_capture(folder)
+
+
+@pytest.fixture(scope="module")
+def chalk(matte, tmp_path_factory):
+    """Learned, with all that it wants, its asset written."""
+    made = trainer(matte, tmp_path_factory.mktemp("runs") / "chalk", *DULL, total=300)
+    made.run()
+    write_asset(made)
+    return made
+
+
+def test_what_is_matte_goes_without_specular(chalk):
+    found = chalk.needs["specular"]
+    assert not found["needed"] and found["statistic"] < found["threshold"] and found["megabytes"] > 0
+    assert chalk.settings.render.reflection == "none" and chalk.settings.environment.resolution == 16
+    left = {"metallic", "roughness", "indirect_dc", "indirect_rest", "received"}
+    assert not left & {*chalk.parameters} and not left & {g["name"] for g in chalk.optimizer.param_groups}
+    assert chalk.test_psnr() > 35
+
+
+def test_a_mirror_keeps_it(mirror, tmp_path):
+    made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
+    made.run(stop=lambda: made.iteration == 60)
+    found = made.needs["specular"]
+    assert found["needed"] and found["statistic"] > 1 and "metallic" in made.parameters
+    assert made.settings.render.reflection == "microfacet"
+
+
+@pytest.mark.parametrize("word", ["on", "off"])
+def test_forced_either_way(word, matte, mirror, tmp_path):
+    """Against what the photos say."""
+    made = trainer(matte if word == "on" else mirror, tmp_path / "run", f"needs.specular={word}", total=40)
+    made.run()
+    assert ("metallic" in made.parameters) == (word == "on")
+    write_asset(made)
+    rows = {row.get("need"): row for row in json.loads((tmp_path / "run" / "needs.json").read_text())}
+    assert (word == "off") == ("specular" in rows)
+    if word == "off":
+        assert rows["specular"]["why"] == "its setting leaves it out" and not rows["specular"]["needed"]
+
+
+def test_the_asset_says_so_once(chalk):
+    """No columns, and the pictures that were learned."""
+    splats, run = read_splats(chalk.folder / "splats.ply"), open_run(chalk.folder)
+    assert splats.constants == {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
+    assert (splats.metallic == 0).all() and (splats.roughness == 1).all()
+    head = (chalk.folder / "splats.ply").read_bytes().partition(b"end_header")[0]
+    assert b"property float metallic" not in head and b"property float albedo_r" in head
+    camera = chalk.test[0].camera
+    assert float((run.render(camera).color - chalk.render(camera).color).abs().mean()) < 2e-3
+    assert (run.render(camera).roughness[run.render(camera).alpha > 0.9] == 1).all()
+
+
+def test_needs_are_written_down(chalk):
+    rows = {row.get("need"): row for row in json.loads((chalk.folder / "needs.json").read_text())}
+    assert {"specular", "light"} <= {*rows}
+    for name in ("specular", "light"):
+        assert math.isfinite(rows[name]["decibels"]) and rows[name]["seconds"] >= 0
+        assert rows[name]["saved"] and rows[name]["cost"] and name in chalk.decided
+    assert rows["light"]["side"] == 16
+
+
+def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
+    """Bit for bit."""
+    more = [*DULL, "train.checkpoint_every=20", "densify.every=25", "train.light_first=0"]
+    whole = trainer(matte, tmp_path / "whole", *more, total=80)
+    whole.run()
+    first = trainer(matte, tmp_path / "cut", *more, total=80)
+    first.run(stop=lambda: first.iteration == 45)
+    second = trainer(matte, tmp_path / "cut", *more, total=80)
+    second.resume()
+    assert second.needs == first.needs and not second.needs["specular"]["needed"]
+    second.run()
+    assert {*whole.parameters} == {*second.parameters} and whole.decided == second.decided
+    for name, value in whole.parameters.items():
+        assert torch.equal(value, second.parameters[name]), name
+    assert torch.equal(whole.light, second.light)
+
+
+def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
+    """To a checkpoint of before they were made, as the guard has it."""
+    made = trainer(matte, tmp_path / "run", *DULL, "train.light_first=0", total=60)
+    made.run(stop=lambda: made.iteration == 4)
+    assert "specular" not in made.needs
+    for _ in range(10):
+        made.step()
+    decided = dict(made.needs)
+    assert not decided["specular"]["needed"]
+    made.resume()
+    assert made.iteration == 4 and made.needs == decided and "metallic" not in made.parameters
+    made.step()
+
+
+def test_a_convex_mirror_does_without_reflections(mirror, tmp_path):
+    made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
+    made.run(stop=lambda: made.iteration == 101)
+    found = made.needs["reflections"]
+    assert not found["needed"] and found["statistic"] < found["threshold"]
+    assert made.occluder is None and "received" not in made.parameters and made.without_reflection()
+
+
+def test_reflections_by_what_they_could_be_worth(mirror, tmp_path):
+    """A mirror of which a fifth is said to be hidden keeps them; a rough dielectric, which would hardly be darker, does not."""
+    made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
+    made.run(stop=lambda: made.iteration == 99)
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-3, 3, 61)] * 2))
+    at = np.arange(60 * 61).reshape(60, 61)[:, :-1].ravel()
+    faces = np.concatenate([np.stack([at, at + 61, at + 1], axis=1), np.stack([at + 1, at + 61, at + 62], axis=1)])
+    made.occluder = Occluder(Mesh(np.stack([x, y, np.full_like(x, 1.5)], axis=1), faces))  # a lid, which faces down
+    needs.reflections(made, 0.2)
+    assert made.needs["reflections"]["needed"] and made.needs["reflections"]["statistic"] > needs.LEAST_REFLECTIONS
+    del made.needs["reflections"]
+    with torch.no_grad():
+        made.parameters["metallic"][:], made.parameters["albedo"][:] = -10, 0
+        made.parameters["roughness"][:] = 5
+    needs.reflections(made, 0.2)
+    assert not made.needs["reflections"]["needed"]
+
+
+def test_views_that_show_the_same_from_the_same_place(mirror, tmp_path):
+    made = trainer(mirror, tmp_path / "run", total=10)
+    one = made.views[0]
+    noise = np.random.default_rng(0).normal(0, 1, one.image.shape)
+    again = replace(one, image=(one.image + noise.round()).clip(0, 255).astype(np.uint8))
+    other = replace(one, image=(one.image.astype(int) + 20).clip(0, 255).astype(np.uint8))
+    pose = one.camera.world_to_camera.copy()
+    pose[0, 3] += 4.0 * one.camera.position.dot(one.camera.position) ** 0.5 / one.camera.fx
+    aside = replace(one, camera=replace(one.camera, world_to_camera=pose))
+    limits = made.capture.radius, needs.TWINS_PIXELS, needs.TWINS_DECIBELS
+    assert probe.twins([one, again], *limits) == [1]
+    assert probe.twins([one, other], *limits) == []
+    assert probe.twins([one, aside], *limits) == []
+    assert probe.twins(made.views, *limits) == []
+
+
+def test_the_part_about_the_mask_is_all_that_counts(mirror, tmp_path):
+    """Loss and derivatives are the whole photo's where nothing is beyond it."""
+    made, generator = trainer(mirror, tmp_path / "run", total=10), torch.Generator().manual_seed(0)
+    camera = made.photos[0].camera
+    camera = replace(camera, fx=0.6 * camera.fx, fy=0.6 * camera.fy)
+    mask = (made.render(camera).alpha > 0).byte() * 255
+    whole = Photo(torch.randint(255, (64, 64, 3), dtype=torch.uint8, generator=generator), mask, camera)
+    part = whole.part(*needs.about(mask.numpy(), needs.MARGIN))
+    assert part.image.shape[0] < 64 and part.mask.sum() == mask.sum()
+    results = []
+    for photo in (whole, part):
+        found = objective(made._render(*made.way()[:2], photo.camera), None, photo, made.background, made.losses, 0.5)
+        found.loss.backward()
+        by = {name: value.grad.clone() for name, value in made.parameters.items() if value.grad is not None}
+        results.append((found, by))
+        made.forget_gradients()
+    (one, by_one), (other, by_other) = results
+    torch.testing.assert_close(one.loss, other.loss, rtol=1e-5, atol=0)
+    torch.testing.assert_close(one.square, other.square, rtol=1e-5, atol=0)
+    for name, value in by_one.items():
+        assert float((value - by_other[name]).abs().max()) <= 1e-3 * float(value.abs().max()) + 1e-12, name
+
+
+def test_a_photo_that_its_object_fills_stays_whole(mirror, tmp_path, monkeypatch):
+    monkeypatch.setattr(needs, "MARGIN", 5)  # of 64 pixels the ball has 45
+    made = trainer(mirror, tmp_path / "run", total=10)
+    assert made.crops is not None
+    for view in made.views:
+        view.alpha[:] = 255
+    made.photos, made.crops = [Photo.of(view) for view in made.views], None
+    needs._outside(made)
+    assert made.crops is None
+
+
+def test_texels_by_the_lobe():
+    """A quarter turn over so many texels is no more than half of the lobe's width, which is roughness squared."""
+    for roughness, side in ((1.0, 16), (0.5, 16), (0.4, 32), (0.2, 128), (0.05, 256)):
+        assert probe.resolvable(roughness, needs.LOBE, 256, 16) == side
+        assert side in (16, 256) or math.pi / 2 / side <= needs.LOBE * roughness**2 < math.pi / side
+    light = Environment(torch.rand(6 * 32**2, 3))
+    coarse = probe.pooled(light, 16)
+    assert coarse.resolution == 16
+    torch.testing.assert_close(coarse.radiance.mean(dim=0), light.radiance.mean(dim=0))
+
+
+def test_weighted_quantiles():
+    values, weight = torch.tensor([3.0, 1.0, 2.0]), torch.tensor([1.0, 8.0, 1.0])
+    assert [probe.quantile(values, weight, part) for part in (0.1, 0.79, 0.85, 1.0)] == [1.0, 1.0, 2.0, 3.0]
+
+
+def test_degrees_by_what_they_are_worth(mirror, tmp_path):
+    """Harmonics of the first degree alone are kept where the others are nothing, and all where the third is something."""
+    made = trainer(mirror, tmp_path / "run", "needs.specular=on", "residual.start=0.5", total=40)
+    made.run(stop=lambda: made.iteration == 30)
+    rest = made.parameters["sh_rest"]
+    with torch.no_grad():
+        rest[:, 3:] = 0
+        rest[:, :3] = 0.3 * torch.rand(len(rest), 3, 3, generator=torch.Generator().manual_seed(0))
+    errors = probe.lost(made, lambda way: way._replace(surfels=way.surfels.without_directions()))
+    assert abs(errors) > 0.01
+    made.needs.pop("degrees", None)
+    needs._degrees(made)
+    assert made.parameters["sh_rest"].shape[1] in (0, 3) and not made.needs["degrees"]["needed"]
+    made.step()
+
+
+def test_what_all_have_alike_is_said_once(mirror, tmp_path):
+    made = trainer(mirror, tmp_path / "run", "needs.specular=on", total=10)
+    made.run()
+    with torch.no_grad():
+        made.parameters["metallic"][:] = -20
+    write_asset(made)
+    splats = read_splats(tmp_path / "run" / "splats.ply")
+    assert {*splats.constants} == {"metallic"} and splats.roughness.std() > 0
+    assert made.needs["constants"]["statistic"] == 1 and abs(made.needs["constants"]["decibels"]) < 0.01
+    assert open_run(tmp_path / "run").settings.render.reflection == "microfacet"
+
+
+def test_specular_on_synthetic_surfels(mirror, tmp_path):
+    """Of pictures that the model itself made: a mirror's are lost without it, chalk's are not."""
+    made = trainer(mirror, tmp_path / "run", total=10)
+    light = torch.randn(made.light.shape, generator=torch.Generator().manual_seed(1))
+    for metallic, roughness, least, most in ((5.0, -3.0, 3.0, math.inf), (-20.0, 20.0, -math.inf, 0.3)):
+        with torch.no_grad():
+            made.light.copy_(light)
+            made.parameters["metallic"][:], made.parameters["roughness"][:] = metallic, roughness
+            for view, photo in enumerate(made.photos):
+                rendering = made.render(photo.camera)
+                noise = 0.01 * torch.randn(rendering.color.shape, generator=torch.Generator().manual_seed(view))
+                image = ((rendering.color + noise).clamp(0, 1) * 255).round().byte()
+                made.photos[view] = photo._replace(image=image, mask=torch.full_like(photo.mask, 255))
+        assert least < probe.specular_explains(made) < most
+
+
+def test_shares_are_weights(mirror, tmp_path):
+    """Those of all surfels make up the picture's alpha; means by them, of what is the same everywhere, are that."""
+    made = trainer(mirror, tmp_path / "run", total=10)
+    photo, surfels = made.photo(0), made.surfels()
+    alpha = made.render(photo.camera).alpha
+    torch.testing.assert_close(probe.blended_shares(surfels, [photo], made.near).sum(), alpha.sum(), rtol=1e-3, atol=0)
+    even = torch.full((*alpha.shape, 2), 0.3)
+    mean = probe.blended_shares(surfels, [photo], made.near, [even])
+    seen = probe.blended_shares(surfels, [photo], made.near)[0] > 1e-3
+    torch.testing.assert_close(mean[seen], torch.full_like(mean[seen], 0.3), rtol=1e-3, atol=0)

@@ -1,0 +1,68 @@
+"""A training that is given a time ends by it, whatever an iteration takes."""
+
+import pytest
+
+from refgs.train import plan
+from refgs.train.plan import END, END_A_VIEW, Plan
+
+VIEWS = 40
+
+
+class _Time:
+    now = 1000.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch) -> _Time:
+    clock = _Time()
+    monkeypatch.setattr(plan, "time", clock)
+    return clock
+
+
+def _train(
+    clock: _Time, made: Plan, pace, paused: float = 0.0, start: float = 12.0, first: int = 0
+) -> tuple[int, float]:
+    """Iterate as a trainer does: how many iterations, and the seconds to when the asset is written, but for what it was paused."""
+    begun = clock.now
+    clock.now += start
+    made.begin(first)
+    iteration, total = first, 100_000
+    while iteration < total:
+        if paused and iteration == 100:
+            clock.now += paused
+            made.wait(paused)
+        clock.now += pace(iteration)
+        iteration += 1
+        total = made.total(iteration, VIEWS) or total
+    clock.now += pace(iteration) * (END_A_VIEW * VIEWS + END)
+    return iteration, clock.now - begun - paused
+
+
+@pytest.mark.parametrize("minutes", [2, 5, 20])
+@pytest.mark.parametrize(
+    "pace", [lambda i: 0.1, lambda i: 0.05 + 0.1 * min(i / 1000, 1), lambda i: 0.2 if i < 300 else 0.1], ids=str
+)
+def test_it_ends_on_time_whatever_an_iteration_takes(clock, pace, minutes):
+    _, seconds = _train(clock, Plan(minutes), pace)
+    assert seconds == pytest.approx(60 * minutes, rel=0.1)
+
+
+def test_a_pause_is_not_counted(clock):
+    usual = _train(clock, Plan(2), lambda i: 0.1)
+    assert _train(clock, Plan(2), lambda i: 0.1, paused=500.0) == pytest.approx(usual)
+
+
+def test_what_was_spent_before_it_was_gone_on_with_is(clock):
+    made = Plan(5)
+    made.before = 60.0
+    _, seconds = _train(clock, made, lambda i: 0.1, first=400)
+    assert seconds == pytest.approx(240, rel=0.05)
+
+
+def test_a_time_that_is_over_ends_it_at_once_and_none_never(clock):
+    iterations, _ = _train(clock, Plan(0.05), lambda i: 0.1)
+    assert iterations == plan.FIRST
+    assert Plan(None).total(plan.EVERY, VIEWS) is None
