@@ -263,7 +263,7 @@ def train(
     out: Path,
     log: Path,
     *,
-    preset: str = "standard",
+    preset: str | None = None,
     minutes: float | None = None,
     settings: Mapping[str, object] | None = None,
     mesh: bool = True,
@@ -271,8 +271,8 @@ def train(
 ) -> Job:
     """Train a capture into a run folder, and make its mesh, after the jobs that wait already.
 
-    `settings` are those of a preset by their names, `{"train.iterations": 2000}`. Raises InputError where there is nothing to train
-    from, or a run in the folder already.
+    Without a preset all is chosen for the minutes; without either it is the standard one. `settings` are those of a preset by their
+    names, `{"train.iterations": 2000}`. Raises InputError where there is nothing to train from, or a run in the folder already.
     """
     if not capture.is_dir():
         raise InputError(f"{capture} is not a folder: choose the folder of a capture")

@@ -40,7 +40,8 @@ class Training(bpy.types.PropertyGroup):
         default="quick",
     )
     limited: BoolProperty(
-        name="Limit Time", description="Train for so many minutes in place of the preset's iterations"
+        name="Limit Time",
+        description="Be done after so many minutes: splats, the photos' size and iterations are chosen for that, in place of the quality",
     )
     minutes: FloatProperty(
         name="Minutes",

@@ -39,11 +39,14 @@ def poses(photos: Annotated[Path, typer.Argument(help="a folder with photos, in 
 def train(
     capture: Annotated[Path, typer.Argument(help="a folder with photos and cameras")],
     out: Annotated[Path, typer.Option(help="the run folder to make")],
-    preset: Annotated[str, typer.Option(help="quick, standard, paper, or a TOML file")] = "standard",
+    preset: Annotated[
+        str | None,
+        typer.Option(help="quick, standard, paper, or a TOML file", show_default="standard, or what --minutes allow"),
+    ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
     minutes: Annotated[
         float | None,
-        typer.Option(min=0.05, help="be done after this long, start and end included: as many iterations as fit"),
+        typer.Option(min=0.05, help="be done after this long, start and end included"),
     ] = None,
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="section.key=value, e.g. train.iterations=2000")

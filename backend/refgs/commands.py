@@ -70,7 +70,13 @@ def poses(folder: Path) -> None:
 
 
 def train(
-    capture_folder: Path, out: Path, preset: str, device: str, minutes: float | None, changes: list[str], resume: bool
+    capture_folder: Path,
+    out: Path,
+    preset: str | None,
+    device: str,
+    minutes: float | None,
+    changes: list[str],
+    resume: bool,
 ) -> None:
     """Train a capture into a run folder; Ctrl-C leaves a run that `--resume` goes on with, twice ends it at once."""
     stopped = []

@@ -48,7 +48,7 @@ def choose_device(device: str, report: Report) -> str:
 def train(
     capture_folder: Path,
     out: Path,
-    preset: str,
+    preset: str | None,
     device: str,
     minutes: float | None,
     changes: list[str],
@@ -58,13 +58,15 @@ def train(
 ) -> tuple[Trainer, float | None]:
     """Train a capture into a run folder; its asset is written when the training has ended.
 
-    Where `minutes` are given it makes as many iterations as fit, and all is written by then; what it is paused for is not counted.
+    Where `minutes` are given it makes as many iterations as fit, and all is written by then; what it is paused for is not counted. Without
+    a preset everything else is chosen for that time, too; without either it is the standard one.
     `attend` is called before each iteration and stops it by True, as another process can (`refgs.lock`); the checkpoint then written
     is what `resume` goes on from. The trainer that is returned says by `ended` which it was. With it comes the mean PSNR of the
     held-out views, if there are any and the training has ended.
     """
     from refgs.train.ambiguity import ambiguities
     from refgs.train.asset import write_asset
+    from refgs.train.fit import fitting
 
     plan = Plan(minutes)
     device = choose_device(device, report)
@@ -74,7 +76,7 @@ def train(
         if changes:
             raise InputError("--set cannot change a run that is resumed: train into a new folder")
     else:
-        settings = load_settings(preset, changes)
+        settings = load_settings(preset or "standard", changes)
         check_free(out)
     with ExitStack() as held:
         if resume:
@@ -85,13 +87,15 @@ def train(
         if resume and capture.fingerprint() != facts["fingerprint"]:
             raise InputError(f"{capture_folder} is not the capture that {out} was trained on, or it was changed since")
         try:
+            if not (resume or preset or minutes is None):
+                settings, preset = fitting(capture, changes, plan, device, report), f"{minutes:g} minutes"
             trainer = Trainer(capture, settings, out, report, plan, device)
             if resume:
                 trainer.resume()
                 report("stage", {"what": f"going on from iteration {trainer.iteration}"})
             else:
                 with _on_disk([out], "train again"):
-                    create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
+                    create_run(out, capture, trainer.settings, preset or "standard", device, trainer.chosen)
                 held.enter_context(lock)
             held.enter_context(_on_disk([out], "go on with --resume"))
             trainer.run(lambda: attend(trainer) or lock.attend(trainer))

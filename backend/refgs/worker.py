@@ -46,7 +46,7 @@ class Train(_Command):
     command: Literal["train"]
     capture: str
     out: str
-    preset: str = "standard"
+    preset: str | None = None
     device: str = "auto"
     minutes: Annotated[float, Field(ge=0.05)] | None = None
     settings: list[str] = []

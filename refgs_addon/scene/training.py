@@ -36,10 +36,9 @@ def train(scene: bpy.types.Scene) -> jobs.Job:
     """
     settings, capture = scene.refgs, _capture(scene)
     out = Path(bpy.path.abspath(settings.out)) if settings.out else _free_folder(capture, scene)
-    minutes = settings.minutes if settings.limited else None
     words = {
-        "preset": settings.preset,
-        "minutes": minutes,
+        "preset": None if settings.limited else settings.preset,
+        "minutes": settings.minutes if settings.limited else None,
         "mesh": settings.mesh,
         "settings": region_settings(scene) | _choices(settings),
     }

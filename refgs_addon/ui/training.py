@@ -179,7 +179,9 @@ class TrainPanel(Tab, bpy.types.Panel):
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
         column.prop(settings, "capture")
-        column.prop(settings, "preset")
+        sub = column.row()
+        sub.active = not settings.limited  # a time says it all
+        sub.prop(settings, "preset")
         row = column.row(heading="Limit Time", align=True)
         row.prop(settings, "limited", text="")
         sub = row.row()

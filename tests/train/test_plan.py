@@ -1,9 +1,10 @@
 """A training that is given a time ends by it, whatever an iteration takes."""
 
+import numpy as np
 import pytest
 
 from refgs.train import plan
-from refgs.train.plan import END, END_A_VIEW, Plan
+from refgs.train.plan import END, END_A_VIEW, Plan, iterations_time
 
 VIEWS = 40
 
@@ -23,12 +24,12 @@ def clock(monkeypatch) -> _Time:
 
 
 def _train(
-    clock: _Time, made: Plan, pace, paused: float = 0.0, start: float = 12.0, first: int = 0
+    clock: _Time, made: Plan, pace, paused: float = 0.0, start: float = 12.0, first: int = 0, growth: float = 1.5
 ) -> tuple[int, float]:
     """Iterate as a trainer does: how many iterations, and the seconds to when the asset is written, but for what it was paused."""
     begun = clock.now
     clock.now += start
-    made.begin(first)
+    made.begin(first, growth)
     iteration, total = first, 100_000
     while iteration < total:
         if paused and iteration == 100:
@@ -48,6 +49,24 @@ def _train(
 def test_it_ends_on_time_whatever_an_iteration_takes(clock, pace, minutes):
     _, seconds = _train(clock, Plan(minutes), pace)
     assert seconds == pytest.approx(60 * minutes, rel=0.1)
+
+
+def test_where_iterations_grow_slower_as_expected_their_number_is_known_at_once(clock):
+    """A schedule goes by the part of the iterations that are done: it must not move about."""
+    made, asked = Plan(5), []
+    whole = made.total
+
+    def total(iteration: int, views: int) -> int | None:
+        asked.append(whole(iteration, views))
+        return asked[-1]
+
+    made.total = total
+    mean = iterations_time(2.0, 1.0) * 0.05
+    count = 60 * 5 / mean
+    steps = np.diff([iterations_time(2.0, min(k / count, 1)) * count for k in range(int(count) + 2)])
+    done, _ = _train(clock, made, lambda i: 0.05 * steps[min(i, len(steps) - 1)], growth=2.0)
+    known = [value for value in asked if value]
+    assert len(known) > 50 and min(known) > 0.98 * done and max(known) < 1.02 * done
 
 
 def test_a_pause_is_not_counted(clock):

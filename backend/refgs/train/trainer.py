@@ -33,7 +33,7 @@ from refgs.train.guard import Guard, limits, running
 from refgs.train.light import light_frame, mirrored
 from refgs.train.losses import Photo, departure, objective
 from refgs.train.measures import Measures
-from refgs.train.plan import Plan
+from refgs.train.plan import Plan, growth
 from refgs.train.probe import Way
 from refgs.train.start import AROUND, GEOMETRY, start_appearance, start_parameters
 
@@ -528,7 +528,7 @@ class Trainer:
     def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
         """Train to the end, or until `stop` says so; a checkpoint is written either way. True when the end was reached."""
         means, before, first = {}, self.seconds, self.iteration
-        self.plan.begin(self.iteration)
+        self.plan.begin(self.iteration, growth(len(self.parameters["position"]), self.budget))
         while not self.ended and not self._waited(stop):
             begun, used = time.perf_counter(), time.process_time()
             figures = self._step_within_memory()

@@ -1,0 +1,88 @@
+"""Settings for a training that is given nothing but a time: as far from `quick` to `standard` as fits into it."""
+
+import math
+from pathlib import Path
+
+from refgs.capture import Capture
+from refgs.settings import Settings, load_settings, validate
+from refgs.train.plan import END, END_A_VIEW, Plan, growth, iterations_time
+from refgs.train.trainer import Report, Trainer
+
+WARM, REHEARSED = 5, 25  # iterations, from the first to the second of which the pace is taken
+# An iteration's time grows as the first surfels and the photos' pixels do, to these powers: three captures of 0.3 to 0.4 megapixels, of
+# which half the side was taken, and two of 0.07.
+BY_SURFELS, BY_PIXELS = 0.5, 0.8
+SCHEDULE = (
+    ("train", "light_first"),
+    ("densify", "every"),
+    ("indirect", "every"),
+)  # in iterations: they go with how many there are
+STEPS = 64  # in which settings are looked for between the presets
+
+
+def fitting(capture: Capture, changes: list[str], plan: Plan, device: str, report: Report) -> Settings:
+    """What to train a capture with in the time of a `plan`. Between the presets every number goes by their ratio; with less time than
+    `quick` takes, or more than `standard`, there are fewer iterations or more.
+
+    The pace is that of a rehearsal, some iterations by `quick`, which take a few seconds of the time.
+    """
+    quick, standard = (load_settings(preset, changes) for preset in ("quick", "standard"))
+    begun = plan.spent
+    trainer = Trainer(capture, quick, Path(), lambda event, facts: None, device=device)
+    started = plan.spent
+    for iteration in range(REHEARSED):
+        if iteration == WARM:
+            begun_steps = plan.spent
+        float(trainer.step()["loss"])  # a card is waited for
+    pace = (plan.spent - begun_steps) / (REHEARSED - WARM)
+    views, first = len(capture.train_views) + len(capture.test_views), len(trainer.parameters["position"])
+    pixels = _pixels(capture, quick)
+
+    def iterations(settings: Settings) -> float:
+        """How many of these fit."""
+        larger = _pixels(capture, settings) / pixels
+        surfels = min(settings.surfels.start / quick.surfels.start, settings.surfels.budget / first)
+        one = pace * surfels**BY_SURFELS * larger**BY_PIXELS
+        left = 60 * plan.minutes - plan.spent - (started - begun) * larger
+        more = growth(first, settings.surfels.budget)
+        return (left / one - more * (END_A_VIEW * views + END)) / iterations_time(more, 1.0)
+
+    found, count = quick, iterations(quick)
+    for step in range(1, STEPS + 1):
+        richer = between(quick, standard, step / STEPS)
+        fit = iterations(richer)
+        if fit < richer.train.iterations:
+            break
+        found, count = richer, fit
+    settings = _scheduled(found, max(count, 1.0) / found.train.iterations)
+    what = f"{settings.surfels.budget:,} surfels at most, photos of {settings.image.max_side} pixels"
+    report(
+        "stage",
+        {"what": f"planned for {plan.minutes:g} minutes: about {settings.train.iterations:,} iterations, {what}"},
+    )
+    return settings
+
+
+def between(quick: Settings, standard: Settings, part: float) -> Settings:
+    """Settings that so much of the way, 0..1, lies between; the light's texels, whose number along a side is a power of two, the fewer."""
+    tables, ends = quick.model_dump(), standard.model_dump()
+    for section, values in tables.items():
+        for name, value in values.items():
+            if value != ends[section][name]:
+                values[name] = round(value * (ends[section][name] / value) ** part)
+    texels = tables["environment"]
+    texels["resolution"] = 2 ** int(math.log2(texels["resolution"]))
+    return validate(tables, "between quick and standard")
+
+
+def _scheduled(settings: Settings, part: float) -> Settings:
+    """So many times the iterations, and what is done at some of them as much apart."""
+    tables = settings.model_dump()
+    for section, name in (("train", "iterations"), *SCHEDULE):
+        tables[section][name] = max(1, round(part * tables[section][name]))
+    return validate(tables, "a time")
+
+
+def _pixels(capture: Capture, settings: Settings) -> int:
+    cameras = [view.camera.fitted(settings.image.max_side) for view in capture.train_views]
+    return sum(camera.width * camera.height for camera in cameras)

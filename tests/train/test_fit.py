@@ -1,0 +1,50 @@
+"""Settings for a training that is given nothing but a time."""
+
+import json
+import tomllib
+from itertools import pairwise
+
+import pytest
+
+from refgs import jobs
+from refgs.capture import read_capture
+from refgs.settings import load_settings
+from refgs.train.fit import between, fitting
+from refgs.train.plan import Plan
+
+QUICK, STANDARD = load_settings("quick"), load_settings("standard")
+
+
+def test_it_lies_between_the_presets():
+    assert between(QUICK, STANDARD, 0.0) == QUICK and between(QUICK, STANDARD, 1.0) == STANDARD
+    half = between(QUICK, STANDARD, 0.5)
+    assert half.surfels.budget == pytest.approx((24000 * 60000) ** 0.5, abs=1)
+    assert half.environment.resolution == 64 and half.image.max_side == 566
+    assert half.loss == STANDARD.loss and half.rates == STANDARD.rates
+
+
+def test_more_time_brings_more_of_all(ball_capture):
+    """From less than `quick` needs to more than `standard` does: by the pace alone, for no training is as long as that."""
+    capture = read_capture(ball_capture)
+    said, found = [], []
+    for minutes in (0.2, 2, 6, 600):
+        report = lambda event, facts: said.append(facts["what"])  # noqa: E731
+        found.append(fitting(capture, ["surfels.hull=32"], Plan(minutes), "cpu", report))
+    short, *_, long = found
+    assert short.surfels.budget == QUICK.surfels.budget and short.train.iterations < QUICK.train.iterations
+    assert short.densify.every < QUICK.densify.every and short.indirect.every < QUICK.indirect.every
+    assert long.surfels.budget == STANDARD.surfels.budget and long.train.iterations > STANDARD.train.iterations
+    for less, more in pairwise(found):
+        assert less.surfels.budget <= more.surfels.budget and less.train.iterations < more.train.iterations
+    assert [line.split(" minutes")[0] for line in said] == [f"planned for {m}" for m in ("0.2", "2", "6", "600")]
+
+
+def test_a_training_with_nothing_but_a_time_is_planned(ball_capture, tmp_path):
+    said = []
+    report = lambda event, facts: said.append(facts.get("what", ""))  # noqa: E731
+    out, few = tmp_path / "run", ["surfels.hull=32", "surfels.start=800", "surfels.budget=1000"]
+    made, _ = jobs.train(ball_capture, out, None, "cpu", 0.15, few, False, report, lambda _: False)
+    assert made.ended and sum(line.startswith("planned for 0.15 minutes") for line in said) == 1
+    facts = tomllib.loads((out / "run.toml").read_text(encoding="utf-8"))
+    assert facts["run"]["preset"] == "0.15 minutes"
+    assert json.loads((out / "metrics.json").read_text(encoding="utf-8"))["total_seconds"] > 0
