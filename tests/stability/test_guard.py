@@ -109,7 +109,7 @@ def test_none_are_removed_until_what_was_made_faint_can_be_back():
 
 def test_broken_surfels_are_removed_and_that_is_said(ball_capture, tmp_path):
     said = []
-    made = trainer(ball_capture, "densify.every=1000", "needs.specular=on", total=60, said=said, folder=tmp_path)
+    made = trainer(ball_capture, "densify.every=1000", total=60, said=said, folder=tmp_path)
     made.run(stop=lambda: made.iteration >= 15)
     nan_value("roughness")(made)
     nan_value("position")(made)  # not drawn, and so not felt

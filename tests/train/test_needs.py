@@ -74,7 +74,7 @@ def test_what_is_matte_goes_without_specular(chalk):
 
 def test_a_mirror_keeps_it(mirror, tmp_path):
     made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
-    made.run(stop=lambda: made.iteration == 60)
+    made.run(stop=lambda: made.iteration == 110)
     found = made.needs["specular"]
     assert found["needed"] and found["statistic"] > 1 and "metallic" in made.parameters
     assert made.settings.render.reflection == "microfacet"
@@ -83,7 +83,7 @@ def test_a_mirror_keeps_it(mirror, tmp_path):
 @pytest.mark.parametrize("word", ["on", "off"])
 def test_forced_either_way(word, matte, mirror, tmp_path):
     """Against what the photos say."""
-    made = trainer(matte if word == "on" else mirror, tmp_path / "run", f"needs.specular={word}", total=40)
+    made = trainer(matte if word == "on" else mirror, tmp_path / "run", f"needs.specular={word}", total=120)
     made.run()
     assert ("metallic" in made.parameters) == (word == "on")
     write_asset(made)
@@ -117,11 +117,11 @@ def test_needs_are_written_down(chalk):
 def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
     """Bit for bit."""
     more = [*DULL, "train.checkpoint_every=20", "densify.every=25", "train.light_first=0"]
-    whole = trainer(matte, tmp_path / "whole", *more, total=80)
+    whole = trainer(matte, tmp_path / "whole", *more, total=150)
     whole.run()
-    first = trainer(matte, tmp_path / "cut", *more, total=80)
-    first.run(stop=lambda: first.iteration == 45)
-    second = trainer(matte, tmp_path / "cut", *more, total=80)
+    first = trainer(matte, tmp_path / "cut", *more, total=150)
+    first.run(stop=lambda: first.iteration == 115)
+    second = trainer(matte, tmp_path / "cut", *more, total=150)
     second.resume()
     assert second.needs == first.needs and not second.needs["specular"]["needed"]
     second.run()
@@ -133,15 +133,15 @@ def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
 
 def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
     """To a checkpoint of before they were made, as the guard has it."""
-    made = trainer(matte, tmp_path / "run", *DULL, "train.light_first=0", total=60)
-    made.run(stop=lambda: made.iteration == 4)
+    made = trainer(matte, tmp_path / "run", *DULL, "train.light_first=0", total=200)
+    made.run(stop=lambda: made.iteration == 96)
     assert "specular" not in made.needs
     for _ in range(10):
         made.step()
     decided = dict(made.needs)
     assert not decided["specular"]["needed"]
     made.resume()
-    assert made.iteration == 4 and made.needs == decided and "metallic" not in made.parameters
+    assert made.iteration == 96 and made.needs == decided and "metallic" not in made.parameters
     made.step()
 
 

@@ -27,6 +27,7 @@ LEAST_OUTSIDE = 0.1  # part of the pixels: what less takes could not be measured
 # What moves by less than so many pixels, and differs by no more than 8-bit photos' noise, in decibels.
 TWINS_PIXELS, TWINS_DECIBELS = 0.5, 40.0
 KNOWN = 0.1  # part of the training after which it is known what mirrors: materials learn faster than shapes
+SOONEST = 100  # iterations: a mirror of which less was learned looks dull
 # Decibels. At a tenth of a training matte clay has 0.1, which it makes up for and more; glossy paint has 4, a mirror 6.
 LEAST_SPECULAR = 0.3
 # Decibels between mirroring black and mirroring the light, which is more than what the object sends can be worth.
@@ -129,7 +130,12 @@ def weigh(trainer: "Trainer", progress: float) -> None:
     if trainer.initial or render.shading != "deferred" or render.diffuse != "irradiance":
         return
     learned = progress - trainer.settings.initial.until  # what came before starts anew
-    if learned >= KNOWN and _due(trainer, "specular") and render.reflection == "microfacet":
+    if (
+        learned >= KNOWN
+        and trainer.iteration >= SOONEST
+        and _due(trainer, "specular")
+        and render.reflection == "microfacet"
+    ):
         _specular(trainer)
     if learned >= SETTLED and _due(trainer, "light"):
         _light(trainer)
@@ -221,23 +227,24 @@ def _degrees(trainer: "Trainer") -> None:
     for field, name in (("sh_rest", "what is left over"), ("indirect_rest", "inter-reflection")):
         if field not in trainer.parameters:
             continue
-        whole = trainer.parameters[field].shape[1]
-        for degree in range(4):
-            count = (degree + 1) ** 2 - 1
+        count = whole = trainer.parameters[field].shape[1]
+        lost, errors = 0.0, probe.squares(trainer, trainer.way())
+        for degree in reversed(range(math.isqrt(whole + 1) - 1)):
 
-            def fewer(way: Way, field: str = field, count: int = count) -> Way:
+            def fewer(way: Way, field: str = field, count: int = (degree + 1) ** 2 - 1) -> Way:
                 return way._replace(surfels=way.surfels._replace(**{field: getattr(way.surfels, field)[:, :count]}))
 
-            lost = 0.0 if count >= whole else probe.lost(trainer, fewer)
-            if lost <= LEAST_DEGREES or count >= whole:
+            worse = probe.decibels_lost(errors, probe.squares(trainer, fewer(trainer.way())))
+            if worse > LEAST_DEGREES:
                 break
-        if count >= whole:
+            count, lost, shorter, last = (degree + 1) ** 2 - 1, worse, fewer, degree
+        if count == whole:
             continue
         with torch.enable_grad():
-            facts["seconds"] += probe.seconds_saved(trainer, fewer)
+            facts["seconds"] += probe.seconds_saved(trainer, shorter)
         numbers = len(trainer.parameters["position"]) * 3 * (whole - count)
         facts["megabytes"], facts["decibels"] = facts["megabytes"] + numbers * NUMBER / MEGA, facts["decibels"] + lost
-        why.append(f"of {name} degree {degree} is the last that is worth {LEAST_DEGREES} dB")
+        why.append(f"of {name} degree {last} is the last that is worth {LEAST_DEGREES} dB")
         trainer.shorten(field, count)
     note(
         trainer, "degrees", not why, "; ".join(why) or "the last degree is worth more", threshold=LEAST_DEGREES, **facts
