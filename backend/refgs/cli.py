@@ -137,7 +137,7 @@ def bench(
     what: Annotated[
         str,
         typer.Argument(
-            help="kernels, iteration, scaling, threads, gpu, splitsum, approximations, truth, meshing, bake, ablations, importing or paper"
+            help="kernels, iteration, truth, minutes, bake or another of benchmarks/; one that is none lists them"
         ),
     ] = "kernels",
 ) -> None:
