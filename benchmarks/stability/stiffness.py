@@ -17,17 +17,20 @@ from refgs.kernels import reference
 from refgs.model import cubemap, prefilter
 from refgs.settings import load_settings
 from refgs.train.ambiguity import ambiguities
+from refgs.train.losses import departure
 
 STEP = 1e-4
+ROUNDING = 1e-12  # of the largest eigenvalue: what is less is nothing
 RESIDUAL = 0.02  # of a picture that is trained: an L1 loss about residuals of such a deviation curves by 0.8 / RESIDUAL a pixel's square
 TURNS = ((0, 0, 0), (0, 2.1, 0), (0, 4.2, 0.5))  # of the views about the ball
 WARM, MATTE = torch.tensor([0.9, 0.6, 0.3]).double(), torch.tensor([0.2, 0.4, 0.5]).double()
-LIGHT, ALBEDO, LIGHT_TINT, TINT, ROUGHNESS, BLUR, METALLIC = range(7)
+LIGHT, ALBEDO, LIGHT_TINT, TINT, ROUGHNESS, BLUR, METALLIC, EXPOSURE = range(8)
 TRADES = {
     "light scale ↔ base colour": (LIGHT, ALBEDO),
     "light tint ↔ base colour's": (LIGHT_TINT, TINT),
     "roughness ↔ light's blur": (ROUGHNESS, BLUR),
     "metallic ↔ base colour": (METALLIC, ALBEDO),
+    "light scale ↔ all exposures": (LIGHT, EXPOSURE),
 }
 
 
@@ -47,7 +50,7 @@ class Scene(NamedTuple):
         return base, base * torch.tensor([1.0, 0.0, -1.0]), mean - base
 
     def pictures(self, change: Tensor) -> Tensor:
-        """Of a change (7,), encoded, all numbers side by side."""
+        """Of a change (8,), encoded, all numbers side by side."""
         normal, position, view = ball()
         base, tint, blur = (prefilter.prefilter(radiance, RESOLUTION).double() for radiance in self.radiance())
         levels = (1 + change[LIGHT]) * base + change[LIGHT_TINT] * tint + change[BLUR] * blur
@@ -67,13 +70,15 @@ class Scene(NamedTuple):
             turned = Camera("view", SIDE, SIDE, view.fx, view.fy, view.cx, view.cy, pose)
             features = torch.cat([normal @ rotation, material, position @ rotation], dim=-1)
             light = levels, tuple(prefilter.level_sides(RESOLUTION))
-            color = reference.shade(features, alpha, *light, turned, torch.zeros(3).double())[0]
+            color = reference.shade(
+                features, alpha, *light, turned, torch.zeros(3).double(), exposure=change[EXPOSURE].exp()
+            )[0]
             found.append(color.reshape(-1, 3)[inside].flatten())
         return torch.cat(found)
 
     def jacobian(self) -> Tensor:
-        """Of the pictures by the seven changes (P, 7), by central differences, over the root of P."""
-        columns = [self.pictures(STEP * e) - self.pictures(-STEP * e) for e in torch.eye(7).double()]
+        """Of the pictures by the eight changes (P, 8), by central differences, over the root of P."""
+        columns = [self.pictures(STEP * e) - self.pictures(-STEP * e) for e in torch.eye(8).double()]
         return torch.stack(columns, dim=1) / (2 * STEP) / len(columns[0]) ** 0.5
 
     def weights(self, change: Tensor) -> dict[str, Tensor]:
@@ -86,12 +91,13 @@ class Scene(NamedTuple):
         return {
             "loss.light": loss.light * ((mean / mean.mean() - 1) ** 2).mean(),
             "loss.metallic": loss.metallic * sum(m * (1 - m) for m in metallic) / len(metallic),
+            "loss.exposure": loss.exposure * departure(change[EXPOSURE]),
             "loss.matte": loss.matte * sum((r - 0.3).clamp_min(0) for r in rough) / len(rough),
         }
 
     def derivatives(self, weight: str) -> tuple[Tensor, Tensor]:
-        """First and second, of what a weight costs (7,), (7, 7)."""
-        at = torch.zeros(7).double()
+        """First and second, of what a weight costs (8,), (8, 8)."""
+        at = torch.zeros(8).double()
         return tuple(
             derivative(lambda change: self.weights(change)[weight], at)
             for derivative in (torch.autograd.functional.jacobian, torch.autograd.functional.hessian)
@@ -112,14 +118,16 @@ SCENES = {
 
 
 def condition(hessian: Tensor) -> str:
-    """The largest eigenvalue over the smallest; of one that is no minimum, so."""
+    """The largest eigenvalue over the smallest; of one that is no minimum, or is flat some way, so."""
     low, high = torch.linalg.eigvalsh(hessian).tolist()
+    if abs(low) < ROUNDING * high:
+        return "∞"
     return f"{high / low:.0f}" if low > 0 else "no minimum"
 
 
 def tables() -> list[tuple[str, list[str], list[list[str]]]]:
     """Title, headings, rows."""
-    weights, rows = ("loss.light", "loss.metallic", "loss.matte"), []
+    weights, rows = ("loss.light", "loss.metallic", "loss.matte", "loss.exposure"), []
     for name, scene in SCENES.items():
         jacobian = scene.jacobian()
         for trade, pair in TRADES.items():
@@ -142,9 +150,9 @@ def by_autograd() -> Found:
     """The Jacobian's columns of roughness and metallic, by differences and by the reference's own derivatives."""
     scene = SCENES["half metal, half dielectric, suns"]
     upstream = torch.randn(
-        len(scene.pictures(torch.zeros(7).double())), generator=torch.Generator().manual_seed(0)
+        len(scene.pictures(torch.zeros(8).double())), generator=torch.Generator().manual_seed(0)
     ).double()
-    at = torch.zeros(7).double().requires_grad_()
+    at = torch.zeros(8).double().requires_grad_()
     (exact,) = torch.autograd.grad(scene.pictures(at) @ upstream, at)
     found = scene.jacobian().T @ upstream * len(upstream) ** 0.5
     return Found(bool(exact.isfinite().all()), float(((found - exact).abs() / exact.abs().max()).max()))
