@@ -5,18 +5,12 @@ from pathlib import Path
 
 from refgs.capture import Capture
 from refgs.settings import Settings, load_settings, validate
-from refgs.train.plan import END, END_A_VIEW, Plan, growth, iterations_time
+from refgs.train.plan import END, END_A_VIEW, OTHERS, Plan, growth, iterations_time
 from refgs.train.trainer import Report, Trainer
 
 WARM, REHEARSED = 5, 25  # iterations, from the first to the second of which the pace is taken
-# An iteration's time grows as the first surfels and the photos' pixels do, to these powers: three captures of 0.3 to 0.4 megapixels, of
-# which half the side was taken, and two of 0.07.
-BY_SURFELS, BY_PIXELS = 0.5, 0.8
-SCHEDULE = (
-    ("train", "light_first"),
-    ("densify", "every"),
-    ("indirect", "every"),
-)  # in iterations: they go with how many there are
+BY_PIXELS = 0.8  # an iteration's time grows as the photos' pixels do, to this power: 0.7 to 0.9 on three captures
+SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")  # they go with the iterations
 STEPS = 64  # in which settings are looked for between the presets
 
 
@@ -41,10 +35,12 @@ def fitting(capture: Capture, changes: list[str], plan: Plan, device: str, repor
     def iterations(settings: Settings) -> float:
         """How many of these fit."""
         larger = _pixels(capture, settings) / pixels
-        surfels = min(settings.surfels.start / quick.surfels.start, settings.surfels.budget / first)
-        one = pace * surfels**BY_SURFELS * larger**BY_PIXELS
+        start = (
+            settings.surfels.start if first == quick.surfels.start else first
+        )  # there may be fewer points to start from
+        one = pace * (OTHERS + start) / (OTHERS + first) * larger**BY_PIXELS
         left = 60 * plan.minutes - plan.spent - (started - begun) * larger
-        more = growth(first, settings.surfels.budget)
+        more = growth(start, settings.surfels.budget)
         return (left / one - more * (END_A_VIEW * views + END)) / iterations_time(more, 1.0)
 
     found, count = quick, iterations(quick)
@@ -55,11 +51,9 @@ def fitting(capture: Capture, changes: list[str], plan: Plan, device: str, repor
             break
         found, count = richer, fit
     settings = _scheduled(found, max(count, 1.0) / found.train.iterations)
-    what = f"{settings.surfels.budget:,} surfels at most, photos of {settings.image.max_side} pixels"
-    report(
-        "stage",
-        {"what": f"planned for {plan.minutes:g} minutes: about {settings.train.iterations:,} iterations, {what}"},
-    )
+    found = f"{settings.train.iterations:,} iterations, {settings.surfels.budget:,} surfels at most"
+    what = f"planned for {plan.minutes:g} minutes: about {found}, photos of {settings.image.max_side} pixels at most"
+    report("stage", {"what": what})
     return settings
 
 

@@ -9,7 +9,8 @@ END_A_VIEW, END = 0.5, 20
 # An iteration takes longer while surfels are divided and what they mirror of each other is traced: from the first of these parts of a
 # training to the second, in a straight line.
 GROWS = 0.1, 0.3
-BY_GROWTH = 0.9  # it grows as the surfels do, to this power: 0.7 where nothing mirrors itself, 1.2 where much does
+OTHERS = 16_000  # surfels that take as long as what an iteration does besides
+MIRRORED = 1.2  # what iterations take longer for inter-reflection: 1 without, 1.4 where much mirrors itself
 
 
 def iterations_time(growth: float, progress: float) -> float:
@@ -22,8 +23,8 @@ def iterations_time(growth: float, progress: float) -> float:
 
 
 def growth(first: int, last: int) -> float:
-    """How many times as long an iteration is expected to take when there are so many surfels as at first."""
-    return max(last / first, 1.0) ** BY_GROWTH
+    """How many times as long an iteration is expected to take at the end, with so many surfels in place of those at first."""
+    return MIRRORED * (OTHERS + max(last, first)) / (OTHERS + first)
 
 
 class Plan:
