@@ -2,12 +2,15 @@
 
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 import bpy.utils.previews
-import numpy as np
 
 from .. import jobs
+
+if TYPE_CHECKING:
+    import numpy as np
 
 CURVE = 200, 130  # pixels
 EDGE, DOT = 4, 3  # pixels: beside what is drawn; half a dot's side
@@ -42,29 +45,35 @@ def thumbnail(file: Path, version: int = 0) -> int:
 
 
 def curve(job: jobs.Job) -> int:
-    """The icon of a picture of `plot`; 0 where there are too few points."""
+    """The icon of a picture of `plot`; 0 where there are too few points, or no numpy, without which Debian's Blender may come."""
     if len(job.curve) < 2 or _pictures is None:
         return 0
     key = f"{job.serial} curve"
     shown = _pictures[key] if key in _pictures else _pictures.new(key)
     count = len(job.curve), len(job.held_out)
     if _drawn.get(job.serial) != count:  # the panel is drawn far more often than there is news
+        try:
+            pixels = plot(job.curve, job.held_out)
+        except ModuleNotFoundError:
+            return 0
         _drawn[job.serial] = count
         shown.image_size = CURVE
-        shown.image_pixels_float = plot(job.curve, job.held_out).ravel().tolist()
+        shown.image_pixels_float = pixels.ravel().tolist()
     return shown.icon_id
 
 
-def plot(trained: list[tuple[float, float]], held_out: list[tuple[float, float]]) -> np.ndarray:
+def plot(trained: list[tuple[float, float]], held_out: list[tuple[float, float]]) -> "np.ndarray":
     """RGBA (height, width, 4), bottom row first, of points (seconds, PSNR): a line through the training views', a dot for each of the views
     that were held out. Time is logarithmic, as decibels are of the error; the grid is at 1, 10, 100 … seconds, and 5 dB apart."""
+    import numpy as np
+
     width, height = CURVE
     points = np.array(trained + held_out)
     points[:, 0] = np.log10(points[:, 0].clip(1e-3))
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(high - low, 1e-6)
 
-    def place(values: np.ndarray, axis: int) -> np.ndarray:
+    def place(values: "np.ndarray", axis: int) -> "np.ndarray":
         room = CURVE[axis] - 1 - 2 * EDGE
         return np.rint(EDGE + room * (values - low[axis]) / size[axis]).astype(int)
 

@@ -34,6 +34,25 @@ def test_registers_and_unregisters_twice(scene):
         assert after == before
 
 
+def test_registers_and_draws_without_numpy():
+    """As Debian's Blender comes: what needs it says so when it is pressed, and a training's curve is not drawn."""
+    code = """if True:
+        import sys
+        sys.modules["numpy"] = None
+        from types import SimpleNamespace
+        import bpy
+        from refgs_addon import ui
+        from refgs_addon.ui import pictures
+        ui.register()
+        job = SimpleNamespace(serial=1, curve=[(1.0, 20.0), (2.0, 21.0)], held_out=[])
+        assert pictures.curve(job) == 0
+        ui.unregister()
+        print("registered")
+    """
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert "registered" in done.stdout, done.stderr
+
+
 def test_builds_and_validates(tmp_path):
     """From a clone that has been used, with runs and captures in it."""
     clone, archive = tmp_path / "refgs", tmp_path / "refgs.zip"
