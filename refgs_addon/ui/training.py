@@ -223,8 +223,6 @@ def _job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs
         lines(box, job.line[0].upper() + job.line[1:], width)
     for warning in job.warnings:
         lines(box, warning[0].upper() + warning[1:], width, "ERROR")
-    for decision in job.decided.values():
-        lines(box, decision[0].upper() + decision[1:], width, "DOT")
     for line in job.results.get("check", {}).get("lines", ()):
         lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
     draw_capture(box, scene, number, job)
@@ -232,15 +230,13 @@ def _job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs
         lines(box, f"Wrote {file}", width)
     if job.curve:
         facts = job.progress
-        row = box.row()
-        row.label(text=f"{facts['psnr']:.1f} dB{f', held out {job.held_out[-1][1]:.1f}' if job.held_out else ''}")
-        row.label(text=f"{facts['splats'] / 1000:.1f} k splats")
-        row.label(text=f"after {_duration(facts['seconds'])}")
+        box.label(text=f"{facts['psnr']:.1f} dB{f', held out {job.held_out[-1][1]:.1f} dB' if job.held_out else ''}")
+        box.label(text=f"{facts['splats'] / 1000:.1f} k splats after {_duration(facts['seconds'])}")
         if shown := curve(job):
             box.template_icon(icon_value=shown, scale=6)
             ends = box.row()
             ends.label(text=_duration(min(seconds for seconds, _ in job.curve + job.held_out)))
-            ends.label(text="time, logarithmic")
+            ends.label(text="log time")
             ends.label(text=_duration(job.curve[-1][0]))
     if shown := picture(job):
         box.template_icon(icon_value=shown, scale=10)
@@ -262,6 +258,8 @@ def _job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs
         box.operator(FindCameras.bl_idname, icon="OUTLINER_OB_CAMERA")
     elif job.state == "failed":
         box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
+    for decision in job.decided.values():
+        lines(box, decision[0].upper() + decision[1:], width, "DOT")
     if job.run and job.ended:
         _run(box, job.run)
 
