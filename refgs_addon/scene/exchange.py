@@ -12,6 +12,7 @@ from .files import whole
 from .run import add_mesh, data_blocks
 
 TEXTURES = "textures"  # beside a run's mesh.glb
+SPECULAR = "Specular IOR Level"
 _PICTURES = {"base_color": "Base Color", "metallic": "Metallic", "roughness": "Roughness", "normal": "Normal"}
 
 
@@ -38,8 +39,9 @@ def write_mesh(mesh: Path, path: Path) -> None:
             path.stem
         )  # of its own: what is selected, hidden or in work elsewhere does not matter
         with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
-            material = _material(path.stem, folder)
+            material = None
             for item in add_mesh(mesh, path.stem, scene.collection):
+                material = material or _material(path.stem, folder, _specular(item))
                 item.data.materials.clear()
                 item.data.materials.append(material)
             with whole(path) as temporary:
@@ -48,10 +50,16 @@ def write_mesh(mesh: Path, path: Path) -> None:
         bpy.data.batch_remove(data_blocks() - before)
 
 
-def _material(name: str, folder: Path) -> bpy.types.Material:
+def _specular(item: bpy.types.Object) -> float:
+    """The Specular IOR Level that a mesh.glb came with: 0 where nothing is mirrored."""
+    nodes = item.data.materials[0].node_tree.nodes
+    return next(node for node in nodes if node.type == "BSDF_PRINCIPLED").inputs[SPECULAR].default_value
+
+
+def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:
     """A Principled BSDF with a picture an input: FBX knows no channels of pictures, and the exporters no other nodes."""
     material = bpy.data.materials.new(name)
-    tree, inputs = node_tree(material), {}
+    tree, inputs = node_tree(material), {SPECULAR: specular}
     for picture, socket in _PICTURES.items():
         image = bpy.data.images.load(str(folder / f"{picture}.png"))
         image.colorspace_settings.name = "sRGB" if picture == "base_color" else "Non-Color"

@@ -1,6 +1,7 @@
 """USD and FBX of a run's mesh: written, moved with their pictures, and read by Blender's own importers, they are what the run has."""
 
 import shutil
+from dataclasses import replace
 
 import bpy
 import numpy as np
@@ -73,6 +74,26 @@ def test_it_comes_back_as_it_was(textured, scene, tmp_path, ending, read):
         shown = np.array(image.pixels).reshape(64, 64, 4)[::-1, :, :3]
         truth = np.asarray(Image.open(folder / "textures" / f"{stem}.png").convert("RGB")) / 255
         np.testing.assert_allclose(shown, truth, atol=1e-6)
+
+
+def level(item):
+    """The Specular IOR Level of an object's material."""
+    nodes = item.data.materials[0].node_tree.nodes
+    return next(node for node in nodes if node.type == "BSDF_PRINCIPLED").inputs["Specular IOR Level"].default_value
+
+
+@pytest.mark.parametrize("specular", [1.0, 0.0])
+def test_what_mirrors_nothing_is_not_given_gloss(run_folder, scene, tmp_path, specular):
+    """Of the two importers of FBX the one in Python reads that."""
+    ending, read = IMPORTERS[1]
+    mesh, textures = make()
+    write_glb(run_folder / "mesh.glb", mesh, replace(textures, specular=specular))
+    run = import_run(run_folder, scene)
+    assert level(run.mesh[0]) == pytest.approx(0.5 * specular)
+    export_mesh(run.collection, tmp_path / f"pot{ending}")
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    read(str(tmp_path / f"pot{ending}"))
+    assert level(next(item for item in bpy.data.objects if item.type == "MESH")) == pytest.approx(0.5 * specular)
 
 
 @pytest.mark.parametrize("ending", [".usdc", ".fbx"])

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import bpy
 import numpy as np
 import pytest
@@ -41,3 +43,12 @@ def test_its_material_has_its_pictures(imported):
     for name in ("Base Color", "Roughness", "Metallic"):  # Blender knows no `norm`
         image = shader.inputs[name].links[0].from_node.image
         assert image.filepath.endswith(f"{name.lower().replace(' ', '_')}.png") and tuple(image.size) == (64, 64)
+
+
+def test_what_mirrors_nothing_is_not_given_gloss(tmp_path, scene):
+    mesh, textures = make()
+    write_obj(tmp_path / "a.obj", mesh, replace(textures, specular=0.0))
+    bpy.ops.wm.obj_import(filepath=str(tmp_path / "a.obj"))
+    (material,) = bpy.data.objects["RefGS"].data.materials
+    shader = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+    assert shader.inputs["Specular IOR Level"].default_value == 0

@@ -23,6 +23,7 @@ RNG = np.random.default_rng(2)
 def textured_box(path, side):
     mesh, textures = box()
     maps = {field.name: getattr(textures, field.name) for field in dataclasses.fields(textures)}
+    del maps["specular"]
     noise = {name: RNG.random((side, side, *value.shape[2:])).astype(np.float32) for name, value in maps.items()}
     write_glb(path, mesh, Textures(**noise))
 

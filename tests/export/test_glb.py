@@ -1,6 +1,7 @@
 import io
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,6 +40,15 @@ def written(tmp_path_factory):
     mesh, textures = make()
     write_glb(folder / "mesh.glb", mesh, textures)
     return folder, mesh, textures
+
+
+def test_what_mirrors_nothing_is_written_so(written, tmp_path):
+    _, mesh, textures = written
+    write_glb(tmp_path / "mesh.glb", mesh, replace(textures, specular=0.0))
+    data = (tmp_path / "mesh.glb").read_bytes()
+    gltf = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    assert gltf["materials"][0]["extensions"] == {"KHR_materials_specular": {"specularFactor": 0.0}}
+    assert gltf["extensionsUsed"] == ["KHR_materials_specular"] and "extensionsRequired" not in gltf
 
 
 def test_the_folder_holds_what_it_should(written):

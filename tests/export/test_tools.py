@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -138,9 +139,10 @@ def test_gltf_of_splats(tmp_path):
     )
 
 
-def test_the_mesh_is_valid_gltf(tmp_path):
+@pytest.mark.parametrize("specular", [1.0, 0.0])
+def test_the_mesh_is_valid_gltf(tmp_path, specular):
     mesh, textures = box()
-    write_glb(tmp_path / "un maillage.glb", mesh, textures)
+    write_glb(tmp_path / "un maillage.glb", mesh, replace(textures, specular=specular))
     report = json.loads(said("validate.js", tmp_path / "un maillage.glb"))
     issues = [(m["code"], m["message"], m.get("pointer")) for m in report["issues"]["messages"] if m["severity"] < 2]
     assert report["info"]["totalTriangleCount"] == len(mesh.faces) and not issues

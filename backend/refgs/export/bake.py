@@ -26,6 +26,7 @@ class Textures:
     base_color (S, S, 3) linear Rec.709; metallic, roughness and occlusion (S, S); normal (S, S, 3), unit vectors in MikkTSpace
     tangent space, y along v (OpenGL, glTF and Blender); mask (S, S), true where a texel's centre lies on the mesh or one
     beside it does, so that look-ups on the mesh read nothing else: the rest is padding that repeats the nearest such texel.
+    specular is 1, or 0 where nothing is mirrored anywhere.
     """
 
     base_color: np.ndarray
@@ -34,6 +35,7 @@ class Textures:
     occlusion: np.ndarray
     normal: np.ndarray
     mask: np.ndarray
+    specular: float = 1.0
 
 
 def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:
@@ -58,7 +60,7 @@ def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done
         occlusion[rows][on] = open_[:, 0]
         normal[rows][on] = _in_tangent_space(texels[:, 5:], tangent, bitangent, normals)
     _pad(maps, mask)
-    return Textures(*maps, mask)
+    return Textures(*maps, mask, specular=float(splats.constants.get("specular", 1.0) > 0))
 
 
 def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:

@@ -21,13 +21,15 @@ _Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # glTF 2.0, 3.4: +Y is up
 
 
 FOLDER = "textures"  # beside the mesh
+SPECULAR = "KHR_materials_specular"
 
 
 def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     """Write the mesh (Z up; with normals and uv) as Y-up binary glTF with a metallic-roughness material.
 
     Embedded: base colour (sRGB), occlusion, roughness and metallic (R, G and B, linear), the tangent-space normal map and the
-    tangents that `bake` assumed, MikkTSpace's: not every reader makes these. Beside the file what `write_textures` writes.
+    tangents that `bake` assumed, MikkTSpace's: not every reader makes these. What mirrors nothing says so by KHR_materials_specular.
+    Beside the file what `write_textures` writes.
     """
     path = Path(path)
     pictures = write_textures(path.parent / FOLDER, textures)
@@ -51,10 +53,19 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     )
     tangents, signs = vertex_tangents(mesh)
     model.vertex_attributes["TANGENT"] = np.column_stack([tangents @ _Y_UP.T, signs]).astype(np.float32)
+
+    def finish(tree: dict) -> None:
+        # trimesh takes tangents for an attribute of ours, and puts an underscore before it.
+        attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+        attributes["TANGENT"] = attributes.pop("_TANGENT")
+        if textures.specular < 1:
+            tree["materials"][0]["extensions"] = {SPECULAR: {"specularFactor": textures.specular}}
+            tree["extensionsUsed"] = [SPECULAR]
+
     scene = trimesh.Scene()
     scene.add_geometry(model, node_name="RefGS", geom_name="RefGS")
     with whole(path) as temporary:
-        temporary.write_bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=_named))
+        temporary.write_bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=finish))
 
 
 def write_obj(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
@@ -63,7 +74,15 @@ def write_obj(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     path = Path(path)
     write_textures(path.parent / FOLDER, textures)
     maps = {"map_Kd": "base_color", "map_Pr": "roughness", "map_Pm": "metallic", "norm": "normal"}
-    lines = ["newmtl RefGS", "Kd 1 1 1", "Pr 1", "Pm 1", *(f"{key} {FOLDER}/{name}.png" for key, name in maps.items())]
+    specular = [] if textures.specular == 1 else ["Ks 0 0 0"]
+    lines = [
+        "newmtl RefGS",
+        "Kd 1 1 1",
+        *specular,
+        "Pr 1",
+        "Pm 1",
+        *(f"{key} {FOLDER}/{name}.png" for key, name in maps.items()),
+    ]
     with whole(path.with_suffix(".mtl")) as temporary:
         temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")
     corner = (mesh.faces + 1).repeat(3, axis=1).reshape(-1, 9)  # one number for place, uv and normal
@@ -98,12 +117,6 @@ def write_textures(folder: Path, textures: Textures) -> dict[str, np.ndarray]:
             temporary.write_bytes(png.getvalue())
         write_exr(folder / f"{name}.exr", linear)
     return pictures
-
-
-def _named(tree: dict) -> None:
-    """trimesh takes tangents for an attribute of ours, and puts an underscore before it."""
-    attributes = tree["meshes"][0]["primitives"][0]["attributes"]
-    attributes["TANGENT"] = attributes.pop("_TANGENT")
 
 
 def read_glb(path: str | os.PathLike) -> Mesh:
