@@ -214,6 +214,7 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
     from refgs.export.bake import bake
     from refgs.export.mesh import write_glb, write_obj
     from refgs.export.outline import bring_out
+    from refgs.export.unshadowed import unshadowed
     from refgs.export.unwrap import layout, unwrap
     from refgs.geometry.extract import extract
     from refgs.geometry.mesh import clean, is_crumbs
@@ -240,7 +241,10 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
     def baked(done: int, total: int) -> None:
         report("progress", {"stage": "baking", "done": done, "total": total})
 
-    textures = bake(mesh, run.splats, texture or settings.texture, baked)
+    splats = run.splats
+    if run.occluder is None and run.environment is not None and run.environment.reference is None:
+        splats = unshadowed(splats, run.surfels(), mesh, run.environment)
+    textures = bake(mesh, splats, texture or settings.texture, baked)
     report("stage", {"what": "writing"})
     write = write_obj if target.suffix.lower() == ".obj" else write_glb
     write(target, mesh, textures)

@@ -1,0 +1,42 @@
+"""Base colours that a shadow is in, where the shadow is known."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from refgs.export.unshadowed import LEAST, unshadowed
+from refgs.geometry.mesh import Mesh
+from refgs.model.surfels import to_splats
+from tests.render.test_relight import bowl, even, mirrors, surfels  # noqa: F401
+
+
+@pytest.mark.parametrize("albedo", [0.1, 0.5, 0.8])
+def test_the_shadow_of_a_bowl_goes(bowl, albedo, monkeypatch):  # noqa: F811
+    """Any point of half a sphere receives x = 1/2 + albedo x / 2, and was learned to be albedo · x; metals have none in their colour."""
+    occluder, points, normals = bowl
+    mirrors(monkeypatch, 0.0)
+    seen = surfels(points, normals, albedo * 0.5 / (1 - albedo / 2))
+    found = unshadowed(to_splats(seen), seen, occluder.mesh, even(2.0))
+    assert np.abs(found.albedo / albedo - 1).mean() < 0.05
+    metal = seen._replace(metallic=torch.ones(len(points)))
+    same = unshadowed(to_splats(metal), metal, occluder.mesh, even(2.0))
+    np.testing.assert_allclose(same.albedo, metal.albedo.numpy(), rtol=1e-6)
+
+
+def test_what_is_convex_stays_as_it_is():
+    ball = trimesh.creation.icosphere(4)
+    seen = surfels(np.asarray(ball.vertices), np.asarray(ball.vertices), 0.6)
+    found = unshadowed(to_splats(seen), seen, Mesh(ball.vertices, np.asarray(ball.faces)), even())
+    assert np.abs(found.albedo - 0.6).max() < 0.01
+
+
+def test_the_dark_is_not_made_white():
+    """Between two plates that all but touch nothing says what is there."""
+    low, high = (trimesh.creation.box((2, 2, 0.1)) for _ in range(2))
+    low.apply_translation([0, 0, -0.05])
+    high.apply_translation([0, 0, 0.11])
+    both = trimesh.util.concatenate([low, high.subdivide()])
+    seen = surfels(np.zeros((4, 3)), np.tile([0.0, 0.0, 1.0], (4, 1)), 0.1)
+    found = unshadowed(to_splats(seen), seen, Mesh(both.vertices, np.asarray(both.faces)), even())
+    assert (found.albedo <= 0.1 / LEAST + 1e-6).all()
