@@ -241,9 +241,10 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
     def baked(done: int, total: int) -> None:
         report("progress", {"stage": "baking", "done": done, "total": total})
 
-    splats = run.splats
-    if run.occluder is None and run.environment is not None and run.environment.reference is None:
-        splats = unshadowed(splats, run.surfels(), mesh, run.environment)
+    splats, light = run.splats, run.environment
+    stands = light is not None and light.reference is None
+    if stands and run.occluder is None and run.settings.render.color_space == "linear":
+        splats = unshadowed(splats, run.surfels(), mesh, light)
     textures = bake(mesh, splats, texture or settings.texture, baked)
     report("stage", {"what": "writing"})
     write = write_obj if target.suffix.lower() == ".obj" else write_glb
