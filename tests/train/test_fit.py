@@ -21,6 +21,8 @@ def test_it_lies_between_the_presets():
     assert half.surfels.budget == pytest.approx((24000 * 60000) ** 0.5, abs=1)
     assert half.environment.resolution == 64 and half.image.max_side == 566
     assert half.loss == STANDARD.loss and half.rates == STANDARD.rates
+    beyond = between(QUICK, STANDARD, 2.0)
+    assert beyond.surfels.budget == 150_000 and beyond.environment.resolution == 256 and beyond.image.max_side == 1600
 
 
 def test_more_time_brings_more_of_all(ball_capture):
@@ -33,7 +35,7 @@ def test_more_time_brings_more_of_all(ball_capture):
     short, *_, long = found
     assert short.surfels.budget == QUICK.surfels.budget and short.train.iterations < QUICK.train.iterations
     assert short.densify.every < QUICK.densify.every and short.indirect.every < QUICK.indirect.every
-    assert long.surfels.budget == STANDARD.surfels.budget and long.train.iterations > STANDARD.train.iterations
+    assert long.surfels.budget == 150_000 and long.train.iterations > 2 * STANDARD.train.iterations
     for less, more in pairwise(found):
         assert less.surfels.budget <= more.surfels.budget and less.train.iterations < more.train.iterations
     assert [line.split(" minutes")[0] for line in said] == [f"planned for {m}" for m in ("0.2", "2", "6", "600")]

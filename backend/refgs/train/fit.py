@@ -1,4 +1,4 @@
-"""Settings for a training that is given nothing but a time: as far from `quick` to `standard` as fits into it."""
+"""Settings for a training that is given nothing but a time: as far from `quick` to `standard`, and on, as fits into it."""
 
 import math
 from pathlib import Path
@@ -11,12 +11,12 @@ from refgs.train.trainer import Report, Trainer
 WARM, REHEARSED = 5, 25  # iterations, from the first to the second of which the pace is taken
 BY_PIXELS = 0.8  # an iteration's time grows as the photos' pixels do, to this power: 0.7 to 0.9 on three captures
 SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")  # they go with the iterations
-STEPS = 64  # in which settings are looked for between the presets
+STEPS, MOST = 64, 2.0  # in which settings are looked for from quick on, how far: standard is one
 
 
 def fitting(capture: Capture, changes: list[str], plan: Plan, device: str, report: Report) -> Settings:
-    """What to train a capture with in the time of a `plan`. Between the presets every number goes by their ratio; with less time than
-    `quick` takes, or more than `standard`, there are fewer iterations or more.
+    """What to train a capture with in the time of a `plan`. Between the presets, and as far beyond `standard`, every number goes by
+    their ratio; with less time than `quick` takes, or more than that, there are fewer iterations or more.
 
     The pace is that of a rehearsal, some iterations by `quick`, which take a few seconds of the time.
     """
@@ -45,7 +45,7 @@ def fitting(capture: Capture, changes: list[str], plan: Plan, device: str, repor
 
     found, count = quick, iterations(quick)
     for step in range(1, STEPS + 1):
-        richer = between(quick, standard, step / STEPS)
+        richer = between(quick, standard, MOST * step / STEPS)
         fit = iterations(richer)
         if fit < richer.train.iterations:
             break
@@ -58,7 +58,7 @@ def fitting(capture: Capture, changes: list[str], plan: Plan, device: str, repor
 
 
 def between(quick: Settings, standard: Settings, part: float) -> Settings:
-    """Settings that so much of the way, 0..1, lies between; the light's texels, whose number along a side is a power of two, the fewer."""
+    """Settings so much of the way from the one to the other, or beyond; the light's texels, whose number along a side is a power of two, the fewer."""
     tables, ends = quick.model_dump(), standard.model_dump()
     for section, values in tables.items():
         for name, value in values.items():
@@ -66,7 +66,7 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
                 values[name] = round(value * (ends[section][name] / value) ** part)
     texels = tables["environment"]
     texels["resolution"] = 2 ** int(math.log2(texels["resolution"]))
-    return validate(tables, "between quick and standard")
+    return validate(tables, "a time")
 
 
 def _scheduled(settings: Settings, part: float) -> Settings:
