@@ -58,7 +58,7 @@ def fitting(capture: Capture, changes: list[str], plan: Plan, device: str, repor
 
 
 def between(quick: Settings, standard: Settings, part: float) -> Settings:
-    """Settings so much of the way from the one to the other, or beyond; the light's texels, whose number along a side is a power of two, the fewer."""
+    """Settings so much of the way from the one to the other, or beyond; the light's texels, a power of two along a side, the fewer."""
     tables, ends = quick.model_dump(), standard.model_dump()
     for section, values in tables.items():
         for name, value in values.items():
