@@ -37,7 +37,7 @@ def artist():
     bpy.ops.extensions.package_install_files(filepath=ARCHIVE, repo="user_default", enable_on_install=True)
     bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
     settings = bpy.context.scene.refgs
-    settings.capture, settings.preset, settings.limited, settings.minutes = CAPTURE, "quick", True, 0.5
+    settings.capture, settings.preset, settings.limited, settings.minutes = CAPTURE, "quick", True, 1.5
     yield lambda: True
     bpy.ops.refgs.train()
     bpy.ops.wm.save_as_mainfile(filepath=str(Path(OUT, "file.blend")))  # or Blender would ask whether to
