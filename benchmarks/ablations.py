@@ -53,12 +53,15 @@ PAPER = {
 }
 
 
-def find_scenes(folder: Path) -> list[Path]:
-    """The captures in a folder. Raises InputError where there are none."""
+def find_scenes(folder: Path, only: list[str] | None = None) -> list[Path]:
+    """The captures in a folder, or those of them that are named. Raises InputError where there are none."""
     found = [folder / name for name in NAMES if (folder / name / "ground_truth").is_dir()]
     if not found:
         raise InputError(f"{folder}: no scene is here: render them with python -m benchmarks.scenes all --out {folder}")
-    return found
+    chosen = [scene for scene in found if not only or scene.name in only]
+    if not chosen:
+        raise InputError(f"{folder} has none of {', '.join(only)}")
+    return chosen
 
 
 Found = dict[str, dict[str, dict[str, dict]]]

@@ -154,9 +154,7 @@ def main(arguments: list[str] | None = None) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Blender reports each sample
     out = options.out or clone_root() / "demo" / "bake"
     found, exported = {}, {}
-    for scene in find_scenes(options.scenes):
-        if options.only and scene.name not in options.only:
-            continue
+    for scene in find_scenes(options.scenes, options.only):
         run = open_run(options.runs / scene.name)
         if run.environment is None:
             raise InputError(f"{run.folder} was trained with shading = sh: it has no materials to bake")

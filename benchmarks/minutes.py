@@ -15,7 +15,6 @@ from rich.table import Table
 from benchmarks import runs
 from benchmarks.ablations import find_scenes
 from benchmarks.runs import console
-from refgs.errors import InputError
 from refgs.paths import clone_root
 from refgs.train import history
 
@@ -46,9 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--minutes", nargs="+", type=float, default=[2, 5, 10, 20])
     options = parser.parse_args(arguments)
     out = options.out or clone_root() / "demo" / "minutes"
-    scenes = [scene for scene in find_scenes(options.scenes) if not options.only or scene.name in options.only]
-    if not scenes:
-        raise InputError(f"{options.scenes} has none of {', '.join(options.only)}")
+    scenes = find_scenes(options.scenes, options.only)
     table, failed = Table(*HEADINGS, title="what a training makes of a given time"), []
     for scene in scenes:
         ways = {name: (["--preset", name], None) for name in PRESETS}

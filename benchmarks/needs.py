@@ -15,7 +15,6 @@ from rich.table import Table
 from benchmarks import runs
 from benchmarks.ablations import find_scenes
 from benchmarks.runs import console, text
-from refgs.errors import InputError
 from refgs.paths import clone_root
 from refgs.settings import NeedsSettings
 
@@ -68,9 +67,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=[*WAYS], help="all where none is named")
     options = parser.parse_args(arguments)
     out = (options.out or clone_root() / "demo" / "needs") / Path(options.preset).stem
-    scenes = [scene for scene in find_scenes(options.scenes) if not options.only or scene.name in options.only]
-    if not scenes:
-        raise InputError(f"{options.scenes} has none of {', '.join(options.only)}")
+    scenes = find_scenes(options.scenes, options.only)
     head = [
         "scene",
         "",

@@ -68,7 +68,8 @@ def train(
     from refgs.train.asset import write_asset
     from refgs.train.fit import fitting
 
-    plan = Plan(minutes)
+    plan, planned = Plan(minutes), preset is None and minutes is not None and not resume
+    preset = preset or "standard"
     device = choose_device(device, report)
     lock = RunLock(out)
     if resume:
@@ -76,7 +77,7 @@ def train(
         if changes:
             raise InputError("--set cannot change a run that is resumed: train into a new folder")
     else:
-        settings = load_settings(preset or "standard", changes)
+        settings = load_settings(preset, changes)
         check_free(out)
     with ExitStack() as held:
         if resume:
@@ -87,7 +88,7 @@ def train(
         if resume and capture.fingerprint() != facts["fingerprint"]:
             raise InputError(f"{capture_folder} is not the capture that {out} was trained on, or it was changed since")
         try:
-            if not (resume or preset or minutes is None):
+            if planned:
                 settings, preset = fitting(capture, changes, plan, device, report), f"{minutes:g} minutes"
             trainer = Trainer(capture, settings, out, report, plan, device)
             if resume:
@@ -95,7 +96,7 @@ def train(
                 report("stage", {"what": f"going on from iteration {trainer.iteration}"})
             else:
                 with _on_disk([out], "train again"):
-                    create_run(out, capture, trainer.settings, preset or "standard", device, trainer.chosen)
+                    create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
                 held.enter_context(lock)
             held.enter_context(_on_disk([out], "go on with --resume"))
             trainer.run(lambda: attend(trainer) or lock.attend(trainer))

@@ -10,7 +10,8 @@ VALUES_NAME = "RefGS Splat Values"
 COLOR, VECTOR, FACTOR = 0, 1, 2  # the outputs of an Attribute node; the third is Fac up to 4.5 and Factor in 5.2
 
 
-_SURFACE = {"metallic": "Metallic", "roughness": "Roughness", "specular": "Specular IOR Level"}
+SPECULAR = "Specular IOR Level"  # as the Principled BSDF calls it
+_SURFACE = {"metallic": "Metallic", "roughness": "Roughness", "specular": SPECULAR}
 
 
 def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material:
@@ -23,7 +24,7 @@ def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material
     material = bpy.data.materials.new(name)
     tree = node_tree(material)
     normal, front = _normal(tree)
-    principled = add(
+    surface = add(
         tree,
         "ShaderNodeBsdfPrincipled",
         {
@@ -34,23 +35,28 @@ def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material
     )
     for key in ("metallic", "roughness"):
         if key not in constants:
-            tree.links.new(_attribute(tree, key, FACTOR), principled.inputs[_SURFACE[key]])
+            tree.links.new(_attribute(tree, key, FACTOR), surface.inputs[_SURFACE[key]])
     black = add(tree, "ShaderNodeEmission", {"Strength": 0.0})
-    shader = add(tree, "ShaderNodeMixShader", {0: front, 1: out(black), 2: out(principled)})
+    shader = add(tree, "ShaderNodeMixShader", {0: front, 1: out(black), 2: out(surface)})
     _finish(material, out(shader))
     return material
+
+
+def principled(material: bpy.types.Material) -> bpy.types.ShaderNode:
+    """A material's Principled BSDF, the first if there are several."""
+    return next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
 
 
 def read_edits(material: bpy.types.Material) -> None:
     """Have a material of `splat_material` read all that edits change. What mirrors nothing does where an edit makes it of another
     roughness."""
     tree = material.node_tree
-    principled = next(node for node in tree.nodes if node.type == "BSDF_PRINCIPLED")
+    shader = principled(material)
     for key in ("metallic", "roughness"):
-        socket = principled.inputs[_SURFACE[key]]
+        socket = shader.inputs[_SURFACE[key]]
         if not socket.links:
             tree.links.new(_attribute(tree, key, FACTOR), socket)
-    specular = principled.inputs[_SURFACE["specular"]]
+    specular = shader.inputs[_SURFACE["specular"]]
     if specular.default_value == 0 and not specular.links:
         amount = add(tree, "ShaderNodeSeparateXYZ", {0: _attribute(tree, AMOUNT, VECTOR)}).outputs["Z"]
         tree.links.new(math(tree, "MULTIPLY", amount, 0.5), specular)

@@ -8,11 +8,11 @@ import bpy
 from ..compat import node_tree, usd_keeps_textures
 from ..errors import InputError
 from ..nodes import add, out
+from ..nodes.materials import SPECULAR, principled
 from .files import whole
 from .run import add_mesh, data_blocks
 
 TEXTURES = "textures"  # beside a run's mesh.glb
-SPECULAR = "Specular IOR Level"
 _PICTURES = {"base_color": "Base Color", "metallic": "Metallic", "roughness": "Roughness", "normal": "Normal"}
 
 
@@ -39,9 +39,9 @@ def write_mesh(mesh: Path, path: Path) -> None:
             path.stem
         )  # of its own: what is selected, hidden or in work elsewhere does not matter
         with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
-            material = None
-            for item in add_mesh(mesh, path.stem, scene.collection):
-                material = material or _material(path.stem, folder, _specular(item))
+            items = add_mesh(mesh, path.stem, scene.collection)
+            material = _material(path.stem, folder, _specular(items[0]))
+            for item in items:
                 item.data.materials.clear()
                 item.data.materials.append(material)
             with whole(path) as temporary:
@@ -52,8 +52,7 @@ def write_mesh(mesh: Path, path: Path) -> None:
 
 def _specular(item: bpy.types.Object) -> float:
     """The Specular IOR Level that a mesh.glb came with: 0 where nothing is mirrored."""
-    nodes = item.data.materials[0].node_tree.nodes
-    return next(node for node in nodes if node.type == "BSDF_PRINCIPLED").inputs[SPECULAR].default_value
+    return principled(item.data.materials[0]).inputs[SPECULAR].default_value
 
 
 def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:

@@ -119,7 +119,8 @@ class ApplyEdits(_Export, bpy.types.Operator):
         self.report({"INFO"}, f"Wrote {out}" + ("; its mesh is being made" if job else mesh))
 
 
-CLASSES = (ExportSplats, ExportDisplaySplats, ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight, ApplyEdits)
+FILES = (ExportSplats, ExportDisplaySplats, ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight)
+CLASSES = (*FILES, ApplyEdits)
 
 
 def _import_menu(self, context: bpy.types.Context) -> None:
@@ -127,7 +128,7 @@ def _import_menu(self, context: bpy.types.Context) -> None:
 
 
 def _export_menu(self, context: bpy.types.Context) -> None:
-    for operator in (ExportSplats, ExportDisplaySplats, ExportMesh, ExportMeshUsd, ExportMeshFbx, ExportLight):
+    for operator in FILES:
         self.layout.operator(operator.bl_idname)
     self.layout.operator(ApplyEdits.bl_idname, text="RefGS Run with Edits (folder)")
 

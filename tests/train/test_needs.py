@@ -14,31 +14,18 @@ from refgs.export.splats import read_splats
 from refgs.geometry.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
-from refgs.run import create_run, open_run
-from refgs.settings import load_settings
+from refgs.run import open_run
 from refgs.train import needs, probe
 from refgs.train.asset import write_asset
 from refgs.train.losses import Photo, objective
-from refgs.train.trainer import Trainer
+from tests.train.test_trainer import trainer as small
 
 DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # at the start: few iterations have to do
-SMALL = [
-    "surfels.start=1500",
-    "surfels.budget=1800",
-    "surfels.hull=64",
-    "environment.resolution=32",
-    "train.light_first=20",
-    "indirect.every=100",
-    "indirect.resolution=32",
-]
+SMALL = ["environment.resolution=32", "indirect.every=100", "indirect.resolution=32"]
 
 
 def trainer(capture, folder, *changes, total=150):
-    settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
-    made = Trainer(capture, settings, folder, lambda event, facts: None)
-    if not folder.exists():
-        create_run(folder, capture, settings, "quick", "cpu")
-    return made
+    return small(capture.folder, folder, *SMALL, *changes, total=total)
 
 
 @pytest.fixture(scope="module")

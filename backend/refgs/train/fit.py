@@ -24,11 +24,11 @@ def fitting(capture: Capture, changes: list[str], plan: Plan, device: str, repor
     begun = plan.spent
     trainer = Trainer(capture, quick, Path(), lambda event, facts: None, device=device)
     started = plan.spent
-    for iteration in range(REHEARSED):
-        if iteration == WARM:
-            begun_steps = plan.spent
+    marks = []
+    for _ in range(REHEARSED):
         float(trainer.step()["loss"])  # a card is waited for
-    pace = (plan.spent - begun_steps) / (REHEARSED - WARM)
+        marks.append(plan.spent)
+    pace = (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM)
     views, first = len(capture.train_views) + len(capture.test_views), len(trainer.parameters["position"])
     pixels = _pixels(capture, quick)
 
