@@ -148,18 +148,26 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
     }
 }
 
-// row[c] = sum over the pixels of some blocks of weight * by_features[pixel][c]; a block's plane is (channel, lane).
-void gather_features(float* row, const Vector* weights, const float* const* planes, int count, int64_t channels) {
-  for (int64_t c = 0; c < channels; c += LANES) {
-    Vector s[LANES] = {};
-    for (int k = 0; k < count; k++) {
-      Vector w = weights[k];
-      const float* plane = planes[k] + c * LANES;
+// row[c] = sum over the pixels of some blocks of weights * by_features[pixel][c], for N channels and zeros up to LANES; a block's plane is
+// (channel, lane).
+template <int N>
+void gather(float* row, const Vector* weights, const float* const* planes, int count, int64_t channel) {
+  Vector s[LANES] = {};
+  for (int k = 0; k < count; k++) {
+    Vector w = weights[k];
+    const float* plane = planes[k] + channel * LANES;
 #pragma unroll
-      for (int i = 0; i < LANES; i++) s[i] += w * load(plane + i * LANES);
-    }
-    store(row + c, sums(s));
+    for (int i = 0; i < N; i++) s[i] += w * load(plane + i * LANES);
   }
+  store(row + channel, sums(s));
+}
+
+void gather_all(float* row, const Vector* weights, const float* const* planes, int count, int64_t channels) {
+  constexpr int QUARTER = LANES / 4;
+  constexpr decltype(&gather<1>) REST[] = {gather<QUARTER>, gather<2 * QUARTER>, gather<3 * QUARTER>, gather<LANES>};
+  int64_t c = 0;
+  for (; c + LANES < channels; c += LANES) gather<LANES>(row, weights, planes, count, c);
+  if (c < channels) REST[(channels - c - 1) / QUARTER](row, weights, planes, count, c);
 }
 
 // Front to back again. What lies behind a splat is what is left of the pixel's total, so one scalar a pixel suffices.
@@ -250,7 +258,7 @@ void backward_tile(Raster& r, int64_t index, float* scratch) {
         px += by_x, py += by_y, depth += by_depth;
       }
     }
-    gather_features(row + GEOMETRY, weights, touched, used, C);
+    gather_all(row + GEOMETRY, weights, touched, used, channels);
     Vector geometry[] = {n0, n0x, n0y, n1, n1x, n1y, n2, n2x, n2y, determinant, px, py, depth, log_opacity, Vector(), Vector()};
     for (int i = 0; i < GEOMETRY; i += LANES) {
       Vector part[LANES];
