@@ -31,6 +31,7 @@ SIZES = {
 }
 
 
+@functools.cache
 def supported() -> list[str]:
     """The instruction sets this processor has kernels for, best first."""
     if MACHINES.get(platform.machine()) == "aarch64":

@@ -61,8 +61,11 @@ struct Pixels {
   }
   MEMBER void put(float* row, int stride, Vector v) const {
     row += x * stride;
-    for (int lane = 0; lane < LANES; lane++)
-      if (has(lane)) row[lane * stride] = v[lane];
+    if (whole())
+      for (int lane = 0; lane < LANES; lane++) row[lane * stride] = v[lane];
+    else
+      for (int lane = 0; lane < LANES; lane++)
+        if (has(lane)) row[lane * stride] = v[lane];
   }
 };
 
