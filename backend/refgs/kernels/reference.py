@@ -112,9 +112,7 @@ def shade(
     view, pixels = torch.from_numpy(camera.world_to_camera), torch.nonzero(alpha > COVERED, as_tuple=True)
     here, margins = alpha[pixels], []
     own = features[pixels] / here[:, None]
-    maps = _displaced(features, alpha, own, pixels, camera, margins)
-    if matte:
-        maps = _with_matte_material(maps)
+    maps = _with_matte_material(own) if matte else _displaced(features, alpha, own, pixels, camera, margins)
 
     row, column = (index + 0.5 for index in pixels)
     ray = torch.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, torch.ones_like(here)], dim=-1)
@@ -144,7 +142,7 @@ def shade_splats(
     turn: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """As refgs.render.shade.shade_splats, for float64 tensors; and how far each surfel is from a kink."""
-    towards, margins, matte = unit(torch.from_numpy(camera.position) - features[:, -3:]), [], features.shape[-1] == 9
+    towards, margins, matte = unit(torch.from_numpy(camera.position) - features[:, -3:]), [], features.shape[-1] == 6
     features = _with_matte_material(features) if matte else features
     appearance = features[:, 8:11] if features.shape[-1] > 11 else None
     radiance = radiance_towards(towards, features, appearance, levels, sides, None, margins, turn, matte=matte)
@@ -191,8 +189,8 @@ def radiance_towards(
 
 
 def _with_matte_material(maps: Tensor) -> Tensor:
-    """Metallic 0 and roughness 1 after normal and albedo (P, 6 or more)."""
-    return torch.cat([maps[:, :6], maps.new_tensor([0.0, 1.0]).expand(len(maps), 2), maps[:, 6:]], dim=1)
+    """Metallic 0 and roughness 1 after normal and albedo (P, 6)."""
+    return torch.cat([maps, maps.new_tensor([0.0, 1.0]).expand(len(maps), 2)], dim=1)
 
 
 def _displaced(features, alpha, own, pixels, camera: Camera, margins: list[Tensor]) -> Tensor:

@@ -26,7 +26,7 @@ struct Wide {
 // How N numbers of a pixel are moved: in blocks, of which the last begins early where N is no multiple of their width.
 template <int N>
 struct Blocks {
-  static constexpr int WIDTH = N >= LANES ? LANES : N > 8 ? 16 : N > 4 ? 8 : 4, COUNT = (N + WIDTH - 1) / WIDTH;
+  static constexpr int WIDTH = N >= LANES ? LANES : N > 8 ? 16 : N == 8 ? 8 : 4, COUNT = (N + WIDTH - 1) / WIDTH;
   static_assert(N >= WIDTH || WIDTH == LANES, "only whole vectors are read and written in part");
   typedef typename Wide<WIDTH>::type Numbers;
   static constexpr int at(int block) { return block * WIDTH + WIDTH <= N || N < WIDTH ? block * WIDTH : N - WIDTH; }

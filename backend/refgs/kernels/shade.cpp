@@ -592,11 +592,32 @@ struct Shaded {
   MEMBER Vectors mirrored() { return mirror(normal, view, n_dot_v); }
 };
 
-// A surface that mirrors nothing: its albedo times the irradiance, of LANES pixels or SPLATS.
+// What is blended, over alpha: C channels.
+template <int C>
+struct Mean {
+  const Pixels& pixels;
+  Vector alpha, inverse, value[C];
+
+  MEMBER Mean(const Shade& s, const Pixels& p) : pixels(p), alpha(load(p.alpha)), inverse(reciprocal(alpha)) {
+    to_lanes<C>([&](int k, int b) { return Blocks<C>::get(s.features + (int64_t)p.at[k] * C + Blocks<C>::at(b)); }, value);
+    for (int c = 0; c < C; c++) value[c] *= inverse;
+  }
+
+  // From the derivatives by `value` and by the pixel's own alpha.
+  template <class Sums>
+  MEMBER void backward(const Vector (&by_value)[C], Vector by_alpha, Sums& sums) const {
+    Vector by_own[C];
+    for (int c = 0; c < C; c++) by_own[c] = inverse * by_value[c], by_alpha -= by_own[c] * value[c];
+    sums.add_own(pixels, by_own, by_alpha);
+  }
+};
+
+// A surface that mirrors nothing: its albedo times the irradiance, of LANES pixels or SPLATS. Irradiance changes too slowly with the normal
+// for the way back that Displaced goes to show: without it normals and relit pictures were better, and the photos explained as well.
 template <bool SPLATS, bool DERIVATIVES>
 struct Matte {
-  static constexpr int C = 9, S = C - 3;  // normal, albedo, position
-  Map<SPLATS, C, DERIVATIVES> map;
+  static constexpr int C = 6;  // normal, albedo
+  Mean<C> map;
   Vector inverse_length;
   Vectors normal;
   Lookup<1, DERIVATIVES> irradiance;
@@ -623,7 +644,7 @@ struct Matte {
 
   template <class Sums>
   MEMBER void backward(const Shade& s, Sums& sums) const {
-    Vector by_color[3], by_normal[3] = {}, by_material[5] = {}, by_alpha = {}, by_exposure = {}, by[S] = {}, by_irradiance[3];
+    Vector by_color[3], by_normal[3] = {}, by_material[5] = {}, by_alpha = {}, by_exposure = {}, by[C] = {}, by_irradiance[3];
     gather<3>(s.by_color, map.pixels, by_color);
     if (!SPLATS) gather<3>(s.by_normal, map.pixels, by_normal), gather<5>(s.by_material, map.pixels, by_material);
 #pragma unroll
@@ -639,13 +660,7 @@ struct Matte {
     Vectors by_n = irradiance.backward(by_irradiance);
     by_n = turned_back(s.turn, inverse_length * (by_n - dot(by_n, normal) * normal));
     by[NORMAL] = by_n.x + by_normal[0], by[NORMAL + 1] = by_n.y + by_normal[1], by[NORMAL + 2] = by_n.z + by_normal[2];
-    if constexpr (SPLATS) {
-      Vector by_own[C] = {};
-      for (int c = 0; c < S; c++) by_own[c] = by[c];
-      sums.add_own(map.pixels, by_own, by_alpha);
-    } else {
-      map.backward(s, by, by_alpha, sums);
-    }
+    map.backward(by, by_alpha, sums);
   }
 };
 

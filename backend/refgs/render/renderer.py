@@ -100,10 +100,10 @@ def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, 
 def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirect: bool) -> list[Tensor]:
     """What `shade` takes of surfels, as a camera sees them, (N, C) each: normals, albedo, metallic, roughness; colour by direction
     where there is any; with `indirect`, if not what part of the irradiance they receive, and radiance from the object itself;
-    positions. Of what mirrors nothing normals, albedo and positions."""
+    positions. Of what mirrors nothing normals and albedo."""
     normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
     if settings.shading != "sh" and settings.reflection == "none":
-        return [normals, surfels.albedo, surfels.positions]
+        return [normals, surfels.albedo]
     lit = [normals, surfels.albedo, surfels.metallic, surfels.roughness]
     if settings.shading == "sh" or settings.diffuse == "sh":
         lit.append(directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera))

@@ -18,7 +18,7 @@ from refgs.render.brdf import reflectance_table
 
 CHANNELS = 11  # normal, albedo, metallic, roughness, position; before the position those that not every scene has
 INDIRECT = 6  # more of them with inter-reflection
-MATTE = 9  # where nothing is mirrored: without metallic and roughness
+MATTE = 6  # where nothing is mirrored: normal and albedo
 
 
 class Shaded(NamedTuple):
@@ -217,7 +217,7 @@ def shade(
     in features, alpha, the light and the exposure. What the blend's mean position says of its bias towards the camera is
     undone first: shade.cpp has how. With `display` light and materials are of a screen's numbers, and nothing is encoded. With
     `mirror` the sharp light is mirrored, and metallic is its share (Ye et al., 3DGS-DR, 2024). What is `matte` mirrors nothing,
-    albedo times irradiance: its features are normal, albedo and position; the material that comes out has metallic 0, roughness 1.
+    albedo times irradiance: its features are normal and albedo, and it is shaded as it was blended; the material that comes out has metallic 0, roughness 1.
     The result does not depend on the number of threads, nor, on a card, does it differ from one call to the next. Where a
     derivative to hand back is not finite, on a card none is a number.
     """
@@ -233,7 +233,7 @@ def shade_splats(features: Tensor, environment: Environment, camera: Camera, mir
     """What surfels send to a camera, (N, 3): the split sum of each, before they are blended (paper §3.3, the initial stage).
 
     `features` (N, C) are, in this order: normal in world space, albedo, metallic, roughness; three of colour by direction,
-    where that takes the place of integrated diffuse light; position. Of what mirrors nothing, without metallic and roughness.
+    where that takes the place of integrated diffuse light; position. Of what mirrors nothing, normal and albedo alone.
     Differentiable in features and the light.
     """
     count, channels = features.shape
