@@ -178,6 +178,7 @@ class NeedsSettings(_Section):
     outside: Need = Field(description="pixels beyond the mask, but for some about it")
     initial: Need = Field(description="the stage in which each surfel is shaded by itself")
     specular: Need = Field(description="what surfaces mirror; without it they are matte")
+    iterations: Need = Field(description="a fifth of them, where nothing is mirrored")
     reflections: Need = Field(description="of the object in itself: its mesh, rays, and harmonics of its light")
     light: Need = Field(description="texels of the light finer than its blurred image on the object")
     degrees: Need = Field(description="harmonics of the higher degrees, of what `residual` learns")

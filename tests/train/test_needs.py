@@ -18,6 +18,7 @@ from refgs.run import open_run
 from refgs.train import needs, probe
 from refgs.train.asset import write_asset
 from refgs.train.losses import Photo, objective
+from refgs.train.plan import Plan
 from tests.train.test_trainer import trainer as small
 
 DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # at the start: few iterations have to do
@@ -59,12 +60,26 @@ def test_what_is_matte_goes_without_specular(chalk):
     assert chalk.test_psnr() > 35
 
 
+def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
+    """By a fifth of what was left, unless all is wanted, or a time was given to be used."""
+    found = chalk.needs["iterations"]
+    assert not found["needed"] and found["statistic"] == chalk.needs["specular"]["statistic"] and found["seconds"] > 0
+    assert chalk.iteration == chalk.total == found["total"] == 100 + round(needs.ENOUGH * 200)
+    forced = trainer(matte, tmp_path / "off", "needs.specular=off", total=150)
+    assert forced.total == forced.needs["iterations"]["total"] == round(needs.ENOUGH * 150)
+    assert trainer(matte, tmp_path / "on", "needs.specular=off", "needs.iterations=on", total=150).total == 150
+    forced.needs.clear()
+    forced.plan = Plan(1.0)
+    needs.before(forced)
+    assert "iterations" not in forced.needs
+
+
 def test_a_mirror_keeps_it(mirror, tmp_path):
     made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
     made.run(stop=lambda: made.iteration == 110)
     found = made.needs["specular"]
     assert found["needed"] and found["statistic"] > 1 and "metallic" in made.parameters
-    assert made.settings.render.reflection == "microfacet"
+    assert made.settings.render.reflection == "microfacet" and made.total == 150
 
 
 @pytest.mark.parametrize("word", ["on", "off"])
@@ -94,7 +109,7 @@ def test_the_asset_says_so_once(chalk):
 
 def test_needs_are_written_down(chalk):
     rows = {row.get("need"): row for row in json.loads((chalk.folder / "needs.json").read_text())}
-    assert {"specular", "light"} <= {*rows}
+    assert {"specular", "iterations", "light"} <= {*rows}
     for name in ("specular", "light"):
         assert math.isfinite(rows[name]["decibels"]) and rows[name]["seconds"] >= 0
         assert rows[name]["saved"] and rows[name]["cost"] and name in chalk.decided
@@ -129,6 +144,7 @@ def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
     assert not decided["specular"]["needed"]
     made.resume()
     assert made.iteration == 96 and made.needs == decided and "metallic" not in made.parameters
+    assert made.total == decided["iterations"]["total"] < 200
     made.step()
 
 

@@ -26,10 +26,12 @@ WHOLE_EVERY = 8  # iterations: of these one sees all of its photo, so that nothi
 LEAST_OUTSIDE = 0.1  # part of the pixels: what less takes could not be measured
 # What moves by less than so many pixels, and differs by no more than 8-bit photos' noise, in decibels.
 TWINS_PIXELS, TWINS_DECIBELS = 0.5, 40.0
-KNOWN = 0.1  # part of the training after which it is known what mirrors: materials learn faster than shapes
+KNOWN = 0.05  # part of the training after which it is known what mirrors: materials learn faster than shapes
 SOONEST = 100  # iterations: a mirror of which less was learned looks dull
-# Decibels. At a tenth of a training matte clay has 0.1, which it makes up for and more; glossy paint has 4, a mirror 6.
+# Decibels. At a twentieth of a training matte clay has none; a polished plate has 1, glossy paint 2.6, a mirror 5.6.
 LEAST_SPECULAR = 0.3
+# Part of the iterations that are left, after which what mirrors nothing is as good as with everything after all: docs/measurements.md.
+ENOUGH = 0.8
 # Decibels between mirroring black and mirroring the light, which is more than what the object sends can be worth.
 LEAST_REFLECTIONS = 0.1
 SETTLED = 0.19  # part of the training after which roughness hardly changes; before the light has all its texels
@@ -60,6 +62,7 @@ WHAT = {
     "outside": "the pixels beyond the masks",
     "initial": "a first stage of surfels shaded one by one",
     "specular": "specular shading",
+    "iterations": "all iterations",
     "reflections": "inter-reflection",
     "light": "all of the light's texels",
     "degrees": "all degrees of harmonics",
@@ -84,6 +87,8 @@ def before(trainer: "Trainer") -> None:
             note(trainer, "initial", False, why)
     for name in ("specular", "reflections", "initial"):
         apply(trainer, name)
+    if _forced(trainer, "iterations") == "off" or "specular" in trainer.needs:
+        _fewer_iterations(trainer, asked)
     _outside(trainer)
 
 
@@ -159,7 +164,19 @@ def _specular(trainer: "Trainer") -> None:
     size = sum(trainer.parameters[name].numel() for name in names) * NUMBER / MEGA
     facts = {"statistic": explained, "threshold": LEAST_SPECULAR, "seconds": saved, "megabytes": size}
     note(trainer, "specular", False, why, **facts, decibels=explained)
+    one = trainer.seconds / trainer.iteration - saved / (trainer.total - trainer.iteration)
     apply(trainer, "specular")
+    _fewer_iterations(trainer, "what mirrors nothing has less to learn", one, statistic=explained, threshold=LEAST_SPECULAR)
+
+
+def _fewer_iterations(trainer: "Trainer", why: str, one: float = 0.0, **figures: float) -> None:
+    """End sooner, unless a time was given to be used; `one` are the seconds of an iteration."""
+    if "iterations" in trainer.needs or _forced(trainer, "iterations") == "on" or trainer.plan.minutes is not None:
+        return
+    total = trainer.iteration + round(ENOUGH * (trainer.total - trainer.iteration))
+    facts = {"total": total, "seconds": one * (trainer.total - total)}
+    note(trainer, "iterations", False, f"{why}: {total:,} in place of {trainer.total:,}", **figures, **facts)
+    apply(trainer, "iterations")
 
 
 @torch.no_grad()
@@ -294,6 +311,8 @@ def apply(trainer: "Trainer", name: str) -> None:
     elif name == "light":
         fewer = settings.environment.model_copy(update={"resolution": int(found["side"])})
         trainer.settings = settings.model_copy(update={"environment": fewer})
+    elif name == "iterations":
+        trainer.total = min(trainer.total, int(found["total"]))
     elif name == "initial":
         none = settings.initial.model_copy(update={"until": 0.0})
         trainer.settings, trainer.initial = settings.model_copy(update={"initial": none}), False

@@ -617,6 +617,7 @@ class Trainer:
         self.needs = (
             facts.get("needs", {}) | self.needs
         )  # what was decided since, where the training has gone back, stays
+        self.total = facts["total"]
         for name in self.needs:
             needs.apply(self, name)
         for name in self.constant:  # left out since, where the training has gone back
@@ -631,7 +632,7 @@ class Trainer:
         self.clock.resume(facts.get("parts", {}))
         self.plan.before = facts.get("spent", self.seconds)
         self.processor_seconds = facts.get("processor_seconds", 0.0)
-        self.total, self.initial = facts["total"], facts.get("initial", self.initial)
+        self.initial = facts.get("initial", self.initial)
         for about, what in facts.get("decided", {}).items():
             self.decide(about, what)
         self.motion.total, self.motion.views = tensors["motion.total"], tensors["motion.views"]
