@@ -30,14 +30,17 @@ SOURCES = (
     "stack.cpp",
 )
 HEADERS = (
+    "blended.h",
     "device.h",
     "lane.h",
     "library.h",
     "light.h",
+    "pixels.h",
     "project.h",
     "raster.h",
     "rows.h",
     "splat.h",
+    "sums.h",
     "vector.h",
 )
 # -ffp-contract=on: fused within an expression, never across, so that a formula rounds the same wherever it is inlined.

@@ -11,7 +11,7 @@ from refgs.model import cubemap, prefilter
 from refgs.render.brdf import LEAST_N_V, bounces, reflectance_table
 
 ALPHA_CUT, ALPHA_CAP, MIN_TRANSMITTANCE, LOW_PASS, FAR = 1 / 255, 0.99, 1e-4, 8.0, 1e12  # as in splat.h
-COVERED, SHIFT_LIMIT, SHIFT_ALPHA = 1 / 255, 8.0, 0.3  # as in shade.cpp
+COVERED, SHIFT_LIMIT, SHIFT_ALPHA = 1 / 255, 8.0, 0.3  # as in pixels.h
 
 
 def rotation_matrices(q: Tensor) -> Tensor:

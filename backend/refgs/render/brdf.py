@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 IOR = 1.5  # the Principled BSDF's and glTF's default
-LEAST_N_V = 1e-4  # as in shade.cpp
+LEAST_N_V = 1e-4  # as in light.h
 
 
 def fresnel(cosine: np.ndarray) -> np.ndarray:

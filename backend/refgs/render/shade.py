@@ -46,7 +46,7 @@ class _Levels(ctypes.Structure):
 
 
 class _Work(Work):
-    """`struct Shade` of shade.cpp."""
+    """`struct Shade` of pixels.h."""
 
     _fields_ = (
         [(n, ctypes.c_int64) for n in ("width", "height", "channels", "chunk_rows")]
@@ -215,11 +215,11 @@ def shade(
     to the environment's (Eq. 9); position. `alpha` (H, W). The picture's radiance is multiplied by the
     `exposure`, a scalar, before it is encoded; 1 where there is none. float32, all on the CPU or on one card, differentiable
     in features, alpha, the light and the exposure. What the blend's mean position says of its bias towards the camera is
-    undone first: shade.cpp has how. With `display` light and materials are of a screen's numbers, and nothing is encoded. With
+    undone first: blended.h has how. With `display` light and materials are of a screen's numbers, and nothing is encoded. With
     `mirror` the sharp light is mirrored, and metallic is its share (Ye et al., 3DGS-DR, 2024). What is `matte` mirrors nothing,
-    albedo times irradiance: its features are normal and albedo, and it is shaded as it was blended; the material that comes out has metallic 0, roughness 1.
-    The result does not depend on the number of threads, nor, on a card, does it differ from one call to the next. Where a
-    derivative to hand back is not finite, on a card none is a number.
+    albedo times irradiance: its features are normal and albedo, and it is shaded as it was blended; the material that comes out has
+    metallic 0, roughness 1. The result does not depend on the number of threads, nor, on a card, does it differ from one call to the
+    next. Where a derivative to hand back is not finite, on a card none is a number.
     """
     expected = MATTE if matte else CHANNELS + (3 * by_direction if visibility is None else INDIRECT)
     if features.shape != (*alpha.shape, expected):
