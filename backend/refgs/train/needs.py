@@ -51,8 +51,8 @@ def _forced(trainer: "Trainer", name: str) -> str:
 
 
 def note(trainer: "Trainer", name: str, needed: bool, why: str, **figures: float) -> None:
-    """Keep a decision: `statistic` and `threshold` that it was made by; what was saved, `seconds` and `megabytes`, and what it cost in
-    `decibels` are zero where nothing is said."""
+    """Keep a decision: `statistic` and `threshold` that it was made by; what was saved, `seconds` and `megabytes`, zero where nothing is
+    said; what it cost in `decibels`, where that could be measured."""
     trainer.needs[name] = {"needed": needed, "why": why, **{key: float(value) for key, value in figures.items()}}
     trainer.decide(name, f"{'with' if needed else 'without'} {WHAT[name]}: {why}")
 
@@ -166,7 +166,9 @@ def _specular(trainer: "Trainer") -> None:
     note(trainer, "specular", False, why, **facts, decibels=explained)
     one = trainer.seconds / trainer.iteration - saved / (trainer.total - trainer.iteration)
     apply(trainer, "specular")
-    _fewer_iterations(trainer, "what mirrors nothing has less to learn", one, statistic=explained, threshold=LEAST_SPECULAR)
+    _fewer_iterations(
+        trainer, "what mirrors nothing has less to learn", one, statistic=explained, threshold=LEAST_SPECULAR
+    )
 
 
 def _fewer_iterations(trainer: "Trainer", why: str, one: float = 0.0, **figures: float) -> None:
@@ -322,7 +324,10 @@ def facts(trainer: "Trainer") -> list[dict[str, Any]]:
     """The decisions, as needs.json lists them."""
     rows = []
     for name, found in trainer.needs.items():
-        saved = f"{found.get('seconds', 0):.1f} s, {found.get('megabytes', 0):.1f} MB"
-        cost = {"saved": saved, "cost": f"{found.get('decibels', 0):+.3f} dB"} if not found["needed"] else {}
-        rows.append({"need": name, "what": WHAT[name], **cost, **found})
+        row = {"need": name, "what": WHAT[name], **found}
+        if not found["needed"]:
+            row["saved"] = f"{found.get('seconds', 0):.1f} s, {found.get('megabytes', 0):.1f} MB"
+        if "decibels" in found:
+            row["cost"] = f"{found['decibels']:+.3f} dB"
+        rows.append(row)
     return rows
