@@ -59,10 +59,16 @@ def _view(run: Run, truth: GroundTruth, light: Environment, camera: Camera) -> d
         material = true_materials if "materials" in parts else rendering.material
         visibility = true["visibility"] if "visibility" in parts else rendering.visibility
         dull = matte and "materials" not in parts
-        stacked = torch.cat([normal, material[..., :3] if dull else material, others, points.float()], dim=-1)
+        maps = [normal, material[..., :3]] if dull else [normal, material, others, points.float()]
         given = opaque, light if "light" in parts else run.environment, camera, torch.ones(3)
         by_direction = run.settings.render.diffuse == "sh"
-        shaded = shade(stacked, *given, visibility if inter_reflects else None, by_direction=by_direction, matte=dull)
+        shaded = shade(
+            torch.cat(maps, dim=-1),
+            *given,
+            visibility if inter_reflects else None,
+            by_direction=by_direction,
+            matte=dull,
+        )
         return _fitted(shaded.radiance, photo)
 
     rows = {"as it is": decibels(())} | {name: decibels((name,)) for name in PARTS}

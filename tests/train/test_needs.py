@@ -114,6 +114,7 @@ def test_needs_are_written_down(chalk):
         assert math.isfinite(rows[name]["decibels"]) and rows[name]["seconds"] >= 0
         assert rows[name]["saved"] and rows[name]["cost"] and name in chalk.decided
     assert rows["light"]["side"] == 16
+    assert "cost" not in rows["iterations"]  # that could not be measured
 
 
 def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
@@ -222,6 +223,17 @@ def test_a_photo_that_its_object_fills_stays_whole(mirror, tmp_path, monkeypatch
     made.photos, made.crops = [Photo.of(view) for view in made.views], None
     needs._outside(made)
     assert made.crops is None
+
+
+def test_what_the_part_about_the_mask_saves_is_timed(mirror, tmp_path, monkeypatch):
+    monkeypatch.setattr(needs, "MARGIN", 5)
+    monkeypatch.setattr(needs, "SOONEST", 3)
+    made = trainer(mirror, tmp_path / "run", "needs.specular=on", total=20)
+    asked = []
+    monkeypatch.setattr(probe, "seconds_saved", lambda trainer, whole: asked.append(whole) or 8.0)
+    made.run(stop=lambda: made.iteration == 6)
+    assert asked == [True] and made.needs["outside"]["seconds"] == 7.0  # one iteration in eight sees the whole
+    assert next(row for row in needs.facts(made) if row["need"] == "outside")["saved"] == "7.0 s, 0.0 MB"
 
 
 def test_texels_by_the_lobe():

@@ -135,6 +135,8 @@ def weigh(trainer: "Trainer", progress: float) -> None:
     if trainer.initial or render.shading != "deferred" or render.diffuse != "irradiance":
         return
     learned = progress - trainer.settings.initial.until  # what came before starts anew
+    if trainer.crops is not None and trainer.iteration >= SOONEST and "seconds" not in trainer.needs["outside"]:
+        trainer.needs["outside"]["seconds"] = (1 - 1 / WHOLE_EVERY) * probe.seconds_saved(trainer, whole=True)
     if (
         learned >= KNOWN
         and trainer.iteration >= SOONEST
@@ -327,7 +329,6 @@ def facts(trainer: "Trainer") -> list[dict[str, Any]]:
         row = {"need": name, "what": WHAT[name], **found}
         if not found["needed"]:
             row["saved"] = f"{found.get('seconds', 0):.1f} s, {found.get('megabytes', 0):.1f} MB"
-        if "decibels" in found:
-            row["cost"] = f"{found['decibels']:+.3f} dB"
+            row |= {"cost": f"{found['decibels']:+.3f} dB"} if "decibels" in found else {}
         rows.append(row)
     return rows
