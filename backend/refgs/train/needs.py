@@ -28,7 +28,7 @@ LEAST_OUTSIDE = 0.1  # part of the pixels: what less takes could not be measured
 TWINS_PIXELS, TWINS_DECIBELS = 0.5, 40.0
 KNOWN = 0.05  # part of the training after which it is known what mirrors: materials learn faster than shapes
 SOONEST = 100  # iterations: a mirror of which less was learned looks dull
-# Decibels. At a twentieth of a training matte clay has none; a polished plate has 1, glossy paint 2.6, a mirror 5.6.
+# Decibels. At a twentieth of a training matte clay has none; a polished plate has 0.8, glossy paint 2.6, a mirror 5.6.
 LEAST_SPECULAR = 0.3
 # Part of the iterations that are left, after which what mirrors nothing is as good as with everything after all: docs/measurements.md.
 ENOUGH = 0.8
