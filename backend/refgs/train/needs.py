@@ -166,7 +166,7 @@ def _specular(trainer: "Trainer") -> None:
     size = sum(trainer.parameters[name].numel() for name in names) * NUMBER / MEGA
     facts = {"statistic": explained, "threshold": LEAST_SPECULAR, "seconds": saved, "megabytes": size}
     note(trainer, "specular", False, why, **facts, decibels=explained)
-    one = trainer.seconds / trainer.iteration - saved / (trainer.total - trainer.iteration)
+    one = trainer.seconds / trainer.iteration - saved / max(trainer.total - trainer.iteration, 1)
     apply(trainer, "specular")
     _fewer_iterations(
         trainer, "what mirrors nothing has less to learn", one, statistic=explained, threshold=LEAST_SPECULAR
@@ -178,7 +178,7 @@ def _fewer_iterations(trainer: "Trainer", why: str, one: float = 0.0, **figures:
     if "iterations" in trainer.needs or _forced(trainer, "iterations") == "on" or trainer.plan.minutes is not None:
         return
     total = trainer.iteration + round(ENOUGH * (trainer.total - trainer.iteration))
-    facts = {"total": total, "seconds": one * (trainer.total - total)}
+    facts = {"total": total, "seconds": max(one, 0.0) * (trainer.total - total)}
     note(trainer, "iterations", False, f"{why}: {total:,} in place of {trainer.total:,}", **figures, **facts)
     apply(trainer, "iterations")
 
