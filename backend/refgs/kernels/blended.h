@@ -7,6 +7,26 @@ namespace {
 
 INLINE Vector inverse_norm(Vectors n) { return inverse_root(dot(n, n) + 1e-24f); }
 
+// What is blended, over alpha: C channels.
+template <int C>
+struct Mean {
+  const Pixels& pixels;
+  Vector alpha, inverse, value[C];
+
+  MEMBER Mean(const Shade& s, const Pixels& p) : pixels(p), alpha(load(p.alpha)), inverse(reciprocal(alpha)) {
+    to_lanes<C>([&](int k, int b) { return Blocks<C>::get(s.features + (int64_t)p.at[k] * C + Blocks<C>::at(b)); }, value);
+    for (int c = 0; c < C; c++) value[c] *= inverse;
+  }
+
+  // From the derivatives by `value` and by the pixel's own alpha.
+  template <class Sums>
+  MEMBER void backward(const Vector (&by_value)[C], Vector by_alpha, Sums& sums) const {
+    Vector by_own[C];
+    for (int c = 0; c < C; c++) by_own[c] = inverse * by_value[c], by_alpha -= by_own[c] * value[c];
+    sums.add_own(pixels, by_own, by_alpha);
+  }
+};
+
 // Discs sorted and blended by their centres favour those in front: on a curved surface the blend at a pixel is that of a point
 // nearer to the camera, whose normal leans towards it. The blended position tells which point; the pixel whose blend is *this*
 // pixel's point lies the same way back, and the normal is read there. The other channels are this pixel's own: what a surface looks
@@ -15,17 +35,16 @@ template <int C, bool DERIVATIVES>
 struct Displaced {
   static constexpr int S = C - 3;
   const Pixels& pixels;
-  Vector alpha, inverse, own[C], value[S];
+  Mean<C> mean;
+  Vector alpha, value[S];
   Vector x, y, inverse_z, px, py;  // the blended point in camera space; where it projects
   Mask moves_x, moves_y;           // the derivative passes the limits
   Corners corners;
   Vector there, trust, scale, inverse_there;
   Vector sampled[4], by_x[4], by_y[4], there_by_x, there_by_y;  // normals blended over the four corners, and how that changes along x and y
 
-  MEMBER Displaced(const Shade& s, const Pixels& p) : pixels(p), alpha(load(p.alpha)), inverse(reciprocal(alpha)) {
-    to_lanes<C>([&](int k, int b) { return Blocks<C>::get(s.features + (int64_t)p.at[k] * C + Blocks<C>::at(b)); }, own);
-    for (int c = 0; c < C; c++) own[c] *= inverse;
-
+  MEMBER Displaced(const Shade& s, const Pixels& p) : pixels(p), mean(s, p), alpha(mean.alpha) {
+    const auto& own = mean.value;
     const float* m = s.view;
     auto row = [&](int i) { return m[i] * own[S] + m[i + 1] * own[S + 1] + m[i + 2] * own[S + 2] + m[i + 3]; };
     x = row(0), y = row(4);
@@ -98,29 +117,8 @@ struct Displaced {
     Vector by_z = -inverse_z * (px * by_px + py * by_py);
     for (int i = 0; i < 3; i++) by_own[S + i] = s.view[i] * by_camera_x + s.view[4 + i] * by_camera_y + s.view[8 + i] * by_z;
     for (int c = 0; c < S; c++) by_own[c] = c < ALBEDO ? (1.0f - trust) * by_value[c] : by_value[c];
-    for (int c = 0; c < C; c++) by_own[c] *= inverse, by_alpha -= by_own[c] * own[c];
-    sums.add_own(pixels, by_own, by_alpha);
+    mean.backward(by_own, by_alpha, sums);
     sums.add_sampled(corners, pixels.count, by_sampled);
-  }
-};
-
-// What is blended, over alpha: C channels.
-template <int C>
-struct Mean {
-  const Pixels& pixels;
-  Vector alpha, inverse, value[C];
-
-  MEMBER Mean(const Shade& s, const Pixels& p) : pixels(p), alpha(load(p.alpha)), inverse(reciprocal(alpha)) {
-    to_lanes<C>([&](int k, int b) { return Blocks<C>::get(s.features + (int64_t)p.at[k] * C + Blocks<C>::at(b)); }, value);
-    for (int c = 0; c < C; c++) value[c] *= inverse;
-  }
-
-  // From the derivatives by `value` and by the pixel's own alpha.
-  template <class Sums>
-  MEMBER void backward(const Vector (&by_value)[C], Vector by_alpha, Sums& sums) const {
-    Vector by_own[C];
-    for (int c = 0; c < C; c++) by_own[c] = inverse * by_value[c], by_alpha -= by_own[c] * value[c];
-    sums.add_own(pixels, by_own, by_alpha);
   }
 };
 
