@@ -86,7 +86,7 @@ def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
     at = record("losses", at)
     loss.backward()
     record("backward of all", at)
-    trainer.optimizer.zero_grad(set_to_none=True)
+    trainer.forget_gradients()
     at = clock()
     trainer.step()
     record("a whole iteration", at)

@@ -110,9 +110,10 @@ def trajectories() -> Found:
         for _ in range(30):
             picture = draw(*leaves, view, 0.1)[0]
             first = picture.detach().double() if first is None else first
-            optimizer.zero_grad(set_to_none=True)
             ((picture - target) ** 2).mean().backward()
             optimizer.step()
+            for leaf in leaves:
+                leaf.grad = None
         pictures.append(draw(*leaves, view, 0.1)[0].detach().double())
     error = float((pictures[0] - pictures[1]).norm() / (pictures[1] - first).norm())
     return Found(bool(pictures[0].isfinite().all()), error)

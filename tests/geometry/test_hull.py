@@ -5,7 +5,8 @@ import pytest
 
 from benchmarks.distances import around, gradient, look_at, mask, sphere, torus
 from refgs.errors import InputError
-from refgs.geometry.hull import visual_hull_points
+from refgs.geometry.hull import _carve, visual_hull_points
+from refgs.kernels.load import supported
 
 VIEWS = around(32, 128)
 DISCS = [mask(view, sphere) for view in VIEWS]
@@ -14,6 +15,58 @@ VOXEL = 2.2 / 48
 
 def degrees(a, b):
     return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
+
+
+def expected(masks, cameras, low, high, resolution):
+    """What is left of voxels, in float64 and with every view looked at: the smallest mask, the next, and how near to its border a view
+    sees a voxel, in pixels."""
+    grid = np.stack(np.meshgrid(*((np.arange(resolution) + 0.5) / resolution,) * 3, indexing="ij"), axis=-1)
+    points, values, border = low + grid * (high - low), [], np.full(3 * (resolution,), np.inf)
+    seen = np.zeros(border.shape, int)
+    for alpha, camera in zip(masks, cameras, strict=True):
+        height, width = alpha.shape
+        camera = camera.resized(width, height)
+        local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        x, y = (
+            f * local[..., a] / local[..., 2] + c for a, f, c in ((0, camera.fx, camera.cx), (1, camera.fy, camera.cy))
+        )
+        inside = (local[..., 2] > 0) & (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
+        column, row = np.clip(x - 0.5, 0, width - 1), np.clip(y - 0.5, 0, height - 1)
+        left, top = column.astype(int), row.astype(int)
+        right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+        u, v = column - left, row - top
+        found = (1 - v) * ((1 - u) * alpha[top, left] + u * alpha[top, right])
+        found += v * ((1 - u) * alpha[below, left] + u * alpha[below, right])
+        whole = max(alpha[0].max(), alpha[-1].max(), alpha[:, 0].max(), alpha[:, -1].max()) < 0.5
+        values.append(np.where(inside, found, 0.0 if whole else 1.0))
+        seen += inside | whole
+        ahead = np.minimum.reduce([np.abs(edge) for edge in (x, width - x, y, height - y)])
+        border = np.where(np.abs(local[..., 2]) < 0.01, 0, np.minimum(border, ahead))
+    least, second = np.sort(values, axis=0)[:2]
+    unseen = (seen < max(2, len(masks) // 8)) & (second > 0.01)
+    return np.where(unseen, 0, least), np.where(unseen, 0, second), np.stack(values), border
+
+
+@pytest.mark.parametrize("isa", supported())
+def test_carving_matches_float64(isa, monkeypatch):
+    """Masks of noise, of several sizes, seen from all sides, from within and in part; no voxel count that vectors divide."""
+    monkeypatch.setenv("REFGS_ISA", isa)
+    rng = np.random.default_rng(0)
+    cameras = [look_at(view.position * (0.2 if i % 5 == 0 else 0.7), 64, view.name) for i, view in enumerate(VIEWS)]
+    masks = [rng.uniform(0, 1, (40 + 3 * i, 50)).astype(np.float32) ** 0.1 for i in range(len(cameras))]
+    for alpha in masks[3::10]:
+        alpha[[0, -1]], alpha[:, [0, -1]], alpha[10:20, 5:30] = 0, 0, 0
+    masks[4] = masks[4][:, :1]
+    low, high = np.array([-1.0, -0.8, -1.1]), np.array([0.9, 1.0, 1.2])
+    least, second, carver = _carve(masks, cameras, low, high, 37)
+    exact, next_to, values, border = expected(masks, cameras, low, high, 37)
+    sure = border > 1e-3
+    alive = sure & (next_to > 0.01)
+    assert sure.mean() > 0.9 and 0.1 < alive.mean() < 0.9
+    assert np.abs(least - exact)[alive].max() < 1e-4 and np.abs(second - next_to)[alive].max() < 1e-4
+    assert (second[sure & (next_to <= 0.009)] <= 0.01).all()
+    chosen = np.take_along_axis(values, carver[None], axis=0)[0]
+    assert np.abs(chosen - exact)[alive & (exact > 0)].max() < 1e-4
 
 
 def test_points_lie_evenly_on_the_hull_of_a_sphere():

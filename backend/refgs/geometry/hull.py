@@ -1,5 +1,6 @@
 """The visual hull: the largest shape that fits inside every mask, and points spread on it and in it."""
 
+import ctypes
 import logging
 from collections.abc import Sequence
 
@@ -10,7 +11,7 @@ from skimage.measure import marching_cubes
 
 from refgs.camera import Camera
 from refgs.errors import InputError
-from refgs.geometry.project import inside, project, sample
+from refgs.kernels.load import Shared, Work, kernels, parallel
 
 # A view that alone removes more of the object than this, against the word of all the others, has a bad mask. Measured
 # with true masks of a sphere and a torus: at most 0.04 among 8 views, 0.015 among 12, 0.005 among 40.
@@ -109,37 +110,54 @@ def _unit(alpha: np.ndarray) -> np.ndarray:
     return alpha.astype(np.float32)
 
 
+class _Silhouette(ctypes.Structure):
+    """`struct Silhouette` of carve.cpp."""
+
+    _fields_ = (
+        ("first", ctypes.c_double * 3),
+        ("step", ctypes.c_double * 9),
+        ("mask", ctypes.c_void_p),
+        *((n, ctypes.c_int64) for n in ("width", "height", "whole")),
+    )
+
+
+class _Work(Work):
+    """`struct Carve` of carve.cpp."""
+
+    _fields_ = (
+        *((n, ctypes.c_int64) for n in ("resolution", "views")),
+        ("silhouettes", ctypes.POINTER(_Silhouette)),
+        *((n, ctypes.c_void_p) for n in ("least", "second", "carver", "seen", "scratch")),
+        ("shared", Shared),
+    )
+
+
+def _silhouette(mask: np.ndarray, camera: Camera, low: np.ndarray, voxel: np.ndarray) -> _Silhouette:
+    camera = camera.resized(mask.shape[1], mask.shape[0])
+    intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    matrix = intrinsics @ camera.world_to_camera[:3]
+    # Where the mask keeps clear of the picture's border the whole object is in the picture, and what lies outside it is empty;
+    # elsewhere nothing is known about it.
+    whole = max(mask[0].max(), mask[-1].max(), mask[:, 0].max(), mask[:, -1].max()) < 0.5
+    first, step = matrix[:, :3] @ (low + 0.5 * voxel) + matrix[:, 3], matrix[:, :3] * voxel
+    height, width = mask.shape
+    return _Silhouette(tuple(first), tuple(step.ravel()), mask.ctypes.data, width, height, int(whole))
+
+
 def _carve(masks, cameras, low, high, resolution):
     """Smallest and second smallest alpha over the views that see a voxel, and the view with the smallest; each
     (resolution,)³. Voxels that fewer than an eighth of the views see are empty: nothing speaks for them."""
-    axes = [low[a] + (np.arange(resolution) + 0.5) * (high[a] - low[a]) / resolution for a in range(3)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
-    first = np.ones(len(points), np.float32)
-    second = np.ones(len(points), np.float32)
-    carver = np.zeros(len(points), np.int32)
-    seen = np.zeros(len(points), np.int32)
-    alive = np.arange(len(points))
-    for index, (mask, camera) in enumerate(zip(masks, cameras, strict=True)):
-        camera = camera.resized(mask.shape[1], mask.shape[0])
-        pixels, depth = project(camera, points[alive])
-        visible = inside(camera, pixels, depth)
-        # Where the mask keeps clear of the picture's border the whole object is in the picture, and what lies outside
-        # it is empty; elsewhere nothing is known about it.
-        border = np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-        whole = border.max() < 0.5
-        value = np.where(visible, sample(mask, pixels, clamp=True), np.float32(0 if whole else 1))
-        seen[alive] += visible | whole
-        lowest = first[alive]
-        second[alive] = np.minimum(second[alive], np.maximum(lowest, value))
-        carver[alive[value < lowest]] = index
-        first[alive] = np.minimum(lowest, value)
-        alive = alive[second[alive] > 0.01]  # two views say empty: nothing later changes that
-    needed = max(2, len(cameras) // 8)
-    unseen = (seen < needed) & (second > 0.01)
-    first[unseen] = 0
-    second[unseen] = 0
-    shape = (resolution,) * 3
-    return first.reshape(shape), second.reshape(shape), carver.reshape(shape)
+    masks, voxel = [np.ascontiguousarray(mask, np.float32) for mask in masks], (high - low) / resolution
+    views = [_silhouette(mask, camera, low, voxel) for mask, camera in zip(masks, cameras, strict=True)]
+    least, second = (np.empty(3 * (resolution,), np.float32) for _ in range(2))
+    carver, seen = (np.empty(3 * (resolution,), np.int32) for _ in range(2))
+    work = _Work(resolution=resolution, views=len(views), silhouettes=(_Silhouette * len(views))(*views))
+    for name, values in (("least", least), ("second", second), ("carver", carver), ("seen", seen)):
+        setattr(work, name, values.ctypes.data)
+    parallel(kernels().refgs_carve, work)
+    unseen = (seen < max(2, len(cameras) // 8)) & (second > 0.01)
+    least[unseen] = second[unseen] = 0
+    return least, second, carver
 
 
 def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:

@@ -18,6 +18,7 @@ SOURCES = (
     "activate.cpp",
     "adam.cpp",
     "blend.cpp",
+    "carve.cpp",
     "harmonics.cpp",
     "losses.cpp",
     "motion.cpp",

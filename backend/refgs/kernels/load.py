@@ -146,8 +146,7 @@ def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most:
     They share the work through `work.shared`. Each thread gets `scratch` floats of `work.scratch`.
     """
     threads = max(1, min(torch.get_num_threads(), CORES, most))
-    memory = borrow("scratch", threads * scratch)
-    work.scratch = memory.data_ptr()
+    work.scratch = borrow("scratch", threads * scratch).data_ptr() if scratch else None
     work.shared = Shared()
     if threads == 1:
         function(ctypes.byref(work))

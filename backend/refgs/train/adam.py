@@ -2,6 +2,7 @@
 
 import ctypes
 import math
+from collections import defaultdict
 
 import torch
 from torch import Tensor
@@ -35,18 +36,20 @@ class _Work(Work):
     )
 
 
-class Adam(torch.optim.Optimizer):
+class Adam:
     """Adam (Kingma and Ba 2015), of float32 tensors on one device, all of them in one go: torch's own takes them one by one.
 
     A number whose gradient is zero, as of a surfel that the view does not see, is left as it is, with its moments: these
     neither fade nor move it on, as they would in Adam itself. So is a parameter without a gradient. A group's values are kept
-    within its `limits`, a pair. Groups and state as in `torch.optim.Adam` otherwise, the step a plain number.
+    within its `limits`, a pair. Groups, whose `params` are lists, and state are as in `torch.optim.Adam` otherwise, the step a
+    plain number. It is none of torch's own optimisers, whose first one loads torch's compiler: two seconds.
     """
 
     BETAS, EPSILON = (0.9, 0.999), 1e-15
 
     def __init__(self, groups: list[dict]):
-        super().__init__(groups, {"lr": 0.0, "limits": (-math.inf, math.inf)})
+        self.param_groups = [{"lr": 0.0, "limits": (-math.inf, math.inf)} | group for group in groups]
+        self.state: dict[Tensor, dict] = defaultdict(dict)
 
     @timed("optimiser")
     @torch.no_grad()

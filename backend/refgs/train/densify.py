@@ -12,6 +12,7 @@ from refgs.clock import timed
 from refgs.kernels.load import Shared, Work, check, run
 from refgs.model.surfels import Parameters, activate, axes
 from refgs.settings import DensifySettings, PropagationSettings
+from refgs.train.adam import Adam
 
 RESET = 0.01  # opacity
 
@@ -58,7 +59,7 @@ class ScreenGradient:
 @torch.no_grad()
 def densify(
     parameters: Parameters,
-    optimizer: torch.optim.Optimizer,
+    optimizer: Adam,
     gradient: Tensor,
     settings: DensifySettings,
     budget: int,
@@ -91,7 +92,7 @@ def densify(
 
 
 @torch.no_grad()
-def reset_opacity(parameters: Parameters, optimizer: torch.optim.Optimizer) -> None:
+def reset_opacity(parameters: Parameters, optimizer: Adam) -> None:
     """Make all surfels faint: those that the picture needs come back, the others are removed later (Kerbl et al. 2023)."""
     parameters["opacity"].clamp_(max=math.log(RESET / (1 - RESET)))
     optimizer.state.pop(parameters["opacity"], None)
@@ -109,7 +110,7 @@ def too_faint(settings: DensifySettings, rate: float, iteration: int, total: int
 
 
 @torch.no_grad()
-def propagate_normals(parameters: Parameters, optimizer: torch.optim.Optimizer, settings: PropagationSettings) -> None:
+def propagate_normals(parameters: Parameters, optimizer: Adam, settings: PropagationSettings) -> None:
     """Have what mirrors grow over what surrounds it, all of it being opaque (paper §3.3). The surfels in front then lend their
     normals to the pixels around, and the others give way or follow."""
     parameters["opacity"].clamp_(min=math.log(settings.opacity / (1 - settings.opacity)))
@@ -120,12 +121,12 @@ def propagate_normals(parameters: Parameters, optimizer: torch.optim.Optimizer, 
 
 
 @torch.no_grad()
-def thin(parameters: Parameters, optimizer: torch.optim.Optimizer, count: int) -> None:
+def thin(parameters: Parameters, optimizer: Adam, count: int) -> None:
     """Keep this many surfels, the most opaque."""
     take(parameters, optimizer, parameters["opacity"].topk(count).indices.sort().values)
 
 
-def take(parameters: Parameters, optimizer: torch.optim.Optimizer, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
+def take(parameters: Parameters, optimizer: Adam, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
     """Replace the surfels by those of an index, with their moments; those at `fresh` begin without. Adam's steps of these are then
     several times its rate for a while, which sets the picture back at first but finds them their places: a capture without masks
     ends better for it. All of them or, where there is no memory for that, none."""

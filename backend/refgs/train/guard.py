@@ -9,6 +9,7 @@ from torch import Tensor
 from refgs.errors import InputError
 from refgs.model.surfels import Parameters
 from refgs.train import checkpoint
+from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, take
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class Guard:
         self._seen, self._said, self._gone_back, self._taken = 0, 0, -1, -1
 
     @torch.no_grad()
-    def judge(self, loss: Tensor, optimizer: torch.optim.Optimizer) -> Tensor:
+    def judge(self, loss: Tensor, optimizer: Adam) -> Tensor:
         """1 where the loss and all gradients are finite, and their squares, which Adam sums up; else 0, and counted. A float32 scalar."""
         gradients = [
             value.grad for group in optimizer.param_groups for value in group["params"] if value.grad is not None
@@ -107,7 +108,7 @@ def _warn(trainer: "Trainer", what: str) -> None:
 
 
 @torch.no_grad()
-def remove_broken(parameters: Parameters, optimizer: torch.optim.Optimizer) -> int:
+def remove_broken(parameters: Parameters, optimizer: Adam) -> int:
     """Remove surfels with a number that is not finite; returns how many. Raises InputError where none would be left."""
     whole = torch.stack(
         [value.flatten(1).isfinite().all(dim=1) for value in (v[:, None] for v in parameters.values())]
