@@ -131,7 +131,7 @@ def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, ind
             tree._boxes, tree._triangles = (torch.empty(v.shape, device=CARD) for v in (tree._boxes, tree._triangles))
             trainer.occluder = occluder
         # Which part of the light the object shows is looked at when the training begins.
-        trainer._mirrored = torch.empty(len(trainer.light), device=CARD)
+        trainer.light_shown = torch.empty(len(trainer.light), device=CARD)
         figures = trainer.step()
         assert all(figure.device == CARD for figure in figures.values())
         assert all(value.grad is None and value.device == CARD for value in trainer.parameters.values())

@@ -15,7 +15,7 @@ from refgs.capture import Capture, load_view
 from refgs.clock import Clock, timed
 from refgs.errors import InputError
 from refgs.geometry.extract import extract
-from refgs.geometry.mesh import Mesh, clean
+from refgs.geometry.mesh import clean
 from refgs.geometry.visibility import Occluder
 from refgs.model import cubemap
 from refgs.model.environment import Environment
@@ -26,7 +26,7 @@ from refgs.render.volume import with_normals_last
 from refgs.report.metrics import decibels, psnr
 from refgs.report.pictures import composite
 from refgs.settings import LossSettings, RenderSettings, Settings
-from refgs.train import checkpoint, history, needs
+from refgs.train import history, needs, snapshot
 from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify, propagate_normals, reset_opacity, thin, too_faint
 from refgs.train.guard import Guard, limits, running
@@ -118,7 +118,7 @@ class Trainer:
         self.guard = Guard(self.device)
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
         self.occluder: Occluder | None = None
-        self._mirrored: Tensor | None = None  # which part of the light the object shows
+        self.light_shown: Tensor | None = None  # which part of the light the object shows
         self.initial = settings.render.shading == "deferred" and settings.initial.until > 0  # its stage is not over
         self.crops: list[tuple[slice, slice]] | None = None  # the parts of the photos that training looks at
         needs.before(self)
@@ -295,11 +295,11 @@ class Trainer:
         """The light's mean radiance (3,) over what the object mirrors of it, if that is held to be grey."""
         if self.settings.loss.light == 0:
             return None
-        if self._mirrored is None or len(self._mirrored) != len(light.radiance):
+        if self.light_shown is None or len(self.light_shown) != len(light.radiance):
             cameras = [view.camera for view in self.views[:: max(1, len(self.views) // TRACED)]]
             with torch.no_grad():
-                self._mirrored = mirrored(self.surfels(), cameras, light, self.settings.render, self.near)
-        return self._mirrored @ light.radiance
+                self.light_shown = mirrored(self.surfels(), cameras, light, self.settings.render, self.near)
+        return self.light_shown @ light.radiance
 
     def _shading(self) -> RenderSettings:
         """How pictures are made at this stage."""
@@ -591,75 +591,10 @@ class Trainer:
     def save(self) -> None:
         """Write a checkpoint of everything that the next iteration depends on, once all of it is finite."""
         self.guard.look(self, whole=True)
-        tensors = {f"parameter.{name}": value for name, value in self.parameters.items()}
-        tensors |= {f"constant.{name}": value for name, value in self.constant.items()}
-        tensors |= {"environment": self.light, "motion.total": self.motion.total, "motion.views": self.motion.views}
-        if self.exposures is not None:
-            tensors |= {"exposure": self.exposures}
-        if self._mirrored is not None:
-            tensors |= {"mirrored": self._mirrored}
-        if self.occluder is not None:
-            mesh = self.occluder.mesh
-            tensors |= {"occluder.vertices": torch.from_numpy(mesh.vertices)}
-            tensors |= {"occluder.faces": torch.from_numpy(mesh.faces.astype(np.int32))}
-        for group in self.optimizer.param_groups:
-            state = self.optimizer.state.get(group["params"][0], {})
-            tensors |= {f"adam.{group['name']}.{key}": torch.as_tensor(value) for key, value in state.items()}
-        facts = {"seconds": self.seconds, "total": self.total, "initial": self.initial, "decided": self.decided}
-        facts |= {"parts": self.clock.seconds, "spent": self.plan.spent}
-        facts |= {"processor_seconds": self.processor_seconds, "needs": self.needs}
         with self.clock.part("writing"):
-            checkpoint.save(self.folder / "checkpoints", self.iteration, tensors, facts)
+            snapshot.save(self)
 
     def resume(self) -> None:
         """Go back to the last complete checkpoint."""
-        tensors, facts = checkpoint.load(self.folder / "checkpoints")
-        self.needs = (
-            facts.get("needs", {}) | self.needs
-        )  # what was decided since, where the training has gone back, stays
-        self.total = facts["total"]
-        for name in self.needs:
-            needs.apply(self, name)
-        for name in self.constant:  # left out since, where the training has gone back
-            if f"parameter.{name}" in tensors:
-                tensors[f"constant.{name}"] = tensors[f"parameter.{name}"][:1]
-        needed = {f"parameter.{name}" for name in self.parameters} | {f"constant.{name}" for name in self.constant}
-        if not needed <= tensors.keys():
-            raise InputError(f"{self.folder} was begun by another release of RefGS: train again into a new folder")
-        mesh = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("occluder.")}
-        tensors = {name: value.to(self.device) for name, value in tensors.items()}
-        self.iteration, self.seconds = facts["iteration"], facts["seconds"]
-        self.clock.resume(facts.get("parts", {}))
-        self.plan.before = facts.get("spent", self.seconds)
-        self.processor_seconds = facts.get("processor_seconds", 0.0)
-        self.initial = facts.get("initial", self.initial)
-        for about, what in facts.get("decided", {}).items():
-            self.decide(about, what)
-        self.motion.total, self.motion.views = tensors["motion.total"], tensors["motion.views"]
-        self.optimizer.state.clear()
-        if "exposure" not in tensors:  # they have been left out since
-            self.exposures = None
-            self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
-        for group in self.optimizer.param_groups:
-            name = group["name"]
-            value = tensors[name if name in ("environment", "exposure") else f"parameter.{name}"]
-            value.requires_grad_()
-            group["params"][0] = value
-            if name == "environment":
-                self.light = value
-            elif name == "exposure":
-                self.exposures = value
-            else:
-                self.parameters[name] = value
-            prefix = f"adam.{name}."
-            state = {key.removeprefix(prefix): t for key, t in tensors.items() if key.startswith(prefix)}
-            if state:
-                self.optimizer.state[value] = state | {"step": int(state["step"])}
-        self._mirrored = tensors.get("mirrored")
-        self.constant = {name: tensors[f"constant.{name}"] for name in self.constant}
-        self.occluder = (
-            Occluder(Mesh(mesh["occluder.vertices"], mesh["occluder.faces"]))
-            if mesh and not self.without_reflection()
-            else None
-        )
+        snapshot.restore(self)
         history.trim(self.folder, self.iteration)
