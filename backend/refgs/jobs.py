@@ -89,8 +89,9 @@ def train(
             raise InputError(f"{capture_folder} is not the capture that {out} was trained on, or it was changed since")
         try:
             if planned:
-                settings, preset = fitting(capture, changes, plan, device, report), f"{minutes:g} minutes"
-            trainer = Trainer(capture, settings, out, report, plan, device)
+                trainer, preset = fitting(capture, changes, out, plan, device, report), f"{minutes:g} minutes"
+            else:
+                trainer = Trainer(capture, settings, out, report, plan, device)
             if resume:
                 trainer.resume()
                 report("stage", {"what": f"going on from iteration {trainer.iteration}"})

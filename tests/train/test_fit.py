@@ -9,7 +9,7 @@ import pytest
 from refgs import jobs
 from refgs.capture import read_capture
 from refgs.settings import load_settings
-from refgs.train.fit import between, fitting
+from refgs.train.fit import REHEARSED, between, fitting
 from refgs.train.plan import Plan
 
 QUICK, STANDARD = load_settings("quick"), load_settings("standard")
@@ -25,20 +25,28 @@ def test_it_lies_between_the_presets():
     assert beyond.surfels.budget == 150_000 and beyond.environment.resolution == 256 and beyond.image.max_side == 1600
 
 
-def test_more_time_brings_more_of_all(ball_capture):
+def test_more_time_brings_more_of_all(ball_capture, tmp_path):
     """From less than `quick` needs to more than `standard` does: by the pace alone, for no training is as long as that."""
     capture = read_capture(ball_capture)
     said, found = [], []
     for minutes in (0.2, 2, 6, 600):
         report = lambda event, facts: said.append(facts["what"])  # noqa: E731
-        found.append(fitting(capture, ["surfels.hull=32"], Plan(minutes), "cpu", report))
+        made = fitting(capture, ["surfels.hull=32"], tmp_path, Plan(minutes), "cpu", report)
+        found.append(made.settings)
+        assert made.total == made.settings.train.iterations and made.report is report
+        if made.settings.surfels.budget == QUICK.surfels.budget:  # the rehearsal was a part of it
+            assert made.iteration == REHEARSED and made.seconds > 0
+        else:
+            assert made.iteration == 0 and made.seconds == 0
     short, *_, long = found
     assert short.surfels.budget == QUICK.surfels.budget and short.train.iterations < QUICK.train.iterations
     assert short.densify.every < QUICK.densify.every and short.indirect.every < QUICK.indirect.every
     assert long.surfels.budget == 150_000 and long.train.iterations > 2 * STANDARD.train.iterations
     for less, more in pairwise(found):
         assert less.surfels.budget <= more.surfels.budget and less.train.iterations < more.train.iterations
-    assert [line.split(" minutes")[0] for line in said] == [f"planned for {m}" for m in ("0.2", "2", "6", "600")]
+    assert sum("surfels start on" in line for line in said) == 4
+    planned = [line for line in said if line.startswith("planned for")]
+    assert [line.split(" minutes")[0] for line in planned] == [f"planned for {m}" for m in ("0.2", "2", "6", "600")]
 
 
 def test_a_training_with_nothing_but_a_time_is_planned(ball_capture, tmp_path):

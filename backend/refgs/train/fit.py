@@ -1,4 +1,4 @@
-"""Settings for a training that is given nothing but a time: as far from `quick` to `standard`, and on, as fits into it."""
+"""A training that is given nothing but a time: its settings as far from `quick` to `standard`, and on, as fits into it."""
 
 import math
 from pathlib import Path
@@ -14,19 +14,20 @@ SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")
 STEPS, MOST = 64, 2.0  # in which settings are looked for from quick on, how far: standard is one
 
 
-def fitting(capture: Capture, changes: list[str], plan: Plan, device: str, report: Report) -> Settings:
-    """What to train a capture with in the time of a `plan`. Between the presets, and as far beyond `standard`, every number goes by
-    their ratio; with less time than `quick` takes, or more than that, there are fewer iterations or more.
+def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, device: str, report: Report) -> Trainer:
+    """What trains a capture into a run folder in the time of a `plan`. Between the presets, and as far beyond `standard`, every number
+    goes by their ratio; with less time than `quick` takes, or more than that, there are fewer iterations or more.
 
-    The pace is that of a rehearsal, some iterations by `quick`, which take a few seconds of the time.
+    The pace is that of a rehearsal, some iterations by `quick`, which take a few seconds of the time. Where nothing but their number is
+    to be another, these are the first ones.
     """
     quick, standard = (load_settings(preset, changes) for preset in ("quick", "standard"))
-    begun = plan.spent
-    trainer = Trainer(capture, quick, Path(), lambda event, facts: None, device=device)
+    begun, said = plan.spent, []
+    trainer = Trainer(capture, quick, folder, lambda *event: said.append(event), plan, device)
     started = plan.spent
     marks = []
     for _ in range(REHEARSED):
-        float(trainer.step()["loss"])  # a card is waited for
+        float(trainer.iterate()["loss"])  # a card is waited for
         marks.append(plan.spent)
     pace = (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM)
     views, first = len(capture.train_views) + len(capture.test_views), len(trainer.parameters["position"])
@@ -39,7 +40,9 @@ def fitting(capture: Capture, changes: list[str], plan: Plan, device: str, repor
             settings.surfels.start if first == quick.surfels.start else first
         )  # there may be fewer points to start from
         one = pace * (OTHERS + start) / (OTHERS + first) * larger**BY_PIXELS
-        left = 60 * plan.minutes - plan.spent - (started - begun) * larger
+        left = 60 * plan.minutes - plan.spent
+        if settings is not quick:
+            left -= (started - begun) * larger  # they have a start of their own
         more = growth(start, settings.surfels.budget)
         return (left / one - more * (END_A_VIEW * views + END)) / iterations_time(more, 1.0)
 
@@ -50,11 +53,21 @@ def fitting(capture: Capture, changes: list[str], plan: Plan, device: str, repor
         if fit < richer.train.iterations:
             break
         found, count = richer, fit
-    settings = _scheduled(found, max(count, 1.0) / found.train.iterations)
+    if found is quick:
+        trainer.report = report
+        for event in said:
+            report(*event)
+        trainer.settings = _scheduled(trainer.settings, (max(count, 1.0) + REHEARSED) / quick.train.iterations)
+        trainer.total = trainer.settings.train.iterations
+    else:
+        del trainer  # before there is another, for its memory
+        settings = _scheduled(found, count / found.train.iterations)
+        trainer = Trainer(capture, settings, folder, report, plan, device)
+    settings = trainer.settings
     found = f"{settings.train.iterations:,} iterations, {settings.surfels.budget:,} surfels at most"
     what = f"planned for {plan.minutes:g} minutes: about {found}, photos of {settings.image.max_side} pixels at most"
     report("stage", {"what": what})
-    return settings
+    return trainer
 
 
 def between(quick: Settings, standard: Settings, part: float) -> Settings:

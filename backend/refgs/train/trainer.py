@@ -530,10 +530,7 @@ class Trainer:
         means, before, first = {}, self.seconds, self.iteration
         self.plan.begin(self.iteration, growth(len(self.parameters["position"]), self.budget))
         while not self.ended and not self._waited(stop):
-            begun, used = time.perf_counter(), time.process_time()
-            figures = self._step_within_memory()
-            self.seconds += time.perf_counter() - begun
-            self.processor_seconds += time.process_time() - used
+            figures = self.iterate()
             views = len(self.views) + len(self.test)
             self.total = self.plan.total(self.iteration, views) or self.total
             # Running means, read now and then: a card need not wait.
@@ -562,6 +559,14 @@ class Trainer:
             history.record(self, float(means["loss"]), decibels(float(means["square"])))
         self.save()
         return self.ended
+
+    def iterate(self) -> dict[str, Tensor]:
+        """A `step` whose seconds are counted, within what memory a card has."""
+        begun, used = time.perf_counter(), time.process_time()
+        figures = self._step_within_memory()
+        self.seconds += time.perf_counter() - begun
+        self.processor_seconds += time.process_time() - used
+        return figures
 
     def _step_within_memory(self) -> dict[str, Tensor]:
         """One iteration; where the card's memory does not hold it, with fewer surfels from here on."""
