@@ -157,6 +157,10 @@ class RateSettings(_Section):
     position_until: float = Field(gt=0, le=1, description="part of the training after which it stays")
 
 
+RATES = tuple(name for name in RateSettings.model_fields if not name.startswith(("decay", "position_")))
+"""The rates among them."""
+
+
 class LossSettings(_Section):
     dssim: float = Field(ge=0, le=1, description="λ of (1 − λ) L1 + λ D-SSIM")
     normal: float = Field(ge=0, description="weight of normal consistency with the depth")

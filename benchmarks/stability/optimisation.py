@@ -16,6 +16,7 @@ from benchmarks.stability.training import TOTAL, ball, train, trainer, usual
 from refgs.errors import InputError
 from refgs.kernels import reference
 from refgs.render.rasterize import rasterize
+from refgs.settings import RATES
 from refgs.train.adam import Adam
 from refgs.train.start import GEOMETRY
 from refgs.train.trainer import Trainer
@@ -36,9 +37,9 @@ def faster(factor: float, geometry: bool) -> Callable[[Trainer], None]:
     """The rates of geometry, or those of light and materials."""
 
     def change(made: Trainer) -> None:
-        for group in made.optimizer.param_groups:
-            if (group["name"] in GEOMETRY) == geometry:
-                group["rate"] *= factor
+        rates = made.settings.rates
+        changed = {name: factor * getattr(rates, name) for name in RATES if (name in GEOMETRY) == geometry}
+        made.settings = made.settings.model_copy(update={"rates": rates.model_copy(update=changed)})
 
     return change
 

@@ -42,7 +42,11 @@ def test_more_time_brings_more_of_all(ball_capture, tmp_path):
     assert short.surfels.budget == QUICK.surfels.budget and short.train.iterations < QUICK.train.iterations
     assert short.densify.every < QUICK.densify.every and short.indirect.every < QUICK.indirect.every
     assert long.surfels.budget == 150_000 and long.train.iterations > 2 * STANDARD.train.iterations
+    assert short.rates.albedo == 2 * QUICK.rates.albedo and short.rates.decay == QUICK.rates.decay
+    ratio = long.train.iterations / STANDARD.train.iterations
+    assert long.rates.position == pytest.approx(STANDARD.rates.position / ratio**0.5, rel=1e-3)
     for less, more in pairwise(found):
+        assert less.rates.albedo >= more.rates.albedo
         assert less.surfels.budget <= more.surfels.budget and less.train.iterations < more.train.iterations
     assert sum("surfels start on" in line for line in said) == 4
     planned = [line for line in said if line.startswith("planned for")]

@@ -4,13 +4,14 @@ import math
 from pathlib import Path
 
 from refgs.capture import Capture
-from refgs.settings import Settings, load_settings, validate
+from refgs.settings import RATES, Settings, load_settings, validate
 from refgs.train.plan import END, END_A_VIEW, OTHERS, Plan, growth, iterations_time
 from refgs.train.trainer import Report, Trainer
 
 WARM, REHEARSED = 5, 25  # iterations, from the first to the second of which the pace is taken
 BY_PIXELS = 0.8  # an iteration's time grows as the photos' pixels do, to this power: 0.7 to 0.9 on three captures
 SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")  # they go with the iterations
+FASTEST = 2.0  # times a preset's rates
 STEPS, MOST = 64, 2.0  # in which settings are looked for from quick on, how far: standard is one
 
 
@@ -57,11 +58,11 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
         trainer.report = report
         for event in said:
             report(*event)
-        trainer.settings = _scheduled(trainer.settings, (max(count, 1.0) + REHEARSED) / quick.train.iterations)
+        trainer.settings = _scheduled(trainer.settings, max(count, 1.0) + REHEARSED, quick.train.iterations)
         trainer.total = trainer.settings.train.iterations
     else:
         del trainer  # before there is another, for its memory
-        settings = _scheduled(found, count / found.train.iterations)
+        settings = _scheduled(found, count, min(count, standard.train.iterations))
         trainer = Trainer(capture, settings, folder, report, plan, device)
     settings = trainer.settings
     found = f"{settings.train.iterations:,} iterations, {settings.surfels.budget:,} surfels at most"
@@ -82,11 +83,14 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
     return validate(tables, "a time")
 
 
-def _scheduled(settings: Settings, part: float) -> Settings:
-    """So many times the iterations, and what is done at some of them as much apart."""
-    tables = settings.model_dump()
+def _scheduled(settings: Settings, iterations: float, usual: float) -> Settings:
+    """So many iterations, and what is done at some of them as much apart. With more than are `usual`, or fewer, rates go by the inverse
+    root of how many: what is chance in all those steps, each of one view, then adds up to as much."""
+    tables, part = settings.model_dump(), iterations / settings.train.iterations
     for section, name in (("train", "iterations"), *SCHEDULE):
         tables[section][name] = max(1, round(part * tables[section][name]))
+    for name in RATES:
+        tables["rates"][name] *= min((usual / iterations) ** 0.5, FASTEST)
     return validate(tables, "a time")
 
 

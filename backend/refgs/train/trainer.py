@@ -104,15 +104,13 @@ class Trainer:
         self.light = torch.empty(6 * self._light_resolution(0) ** 2, 3, device=self.device)
         self.light.fill_(self._start_light()).requires_grad_()
         self._drop_unused()
-        groups = [
-            {"params": [value], "name": name, "rate": self._rate(name)} for name, value in self.parameters.items()
-        ]
+        groups = [{"params": [value], "name": name} for name, value in self.parameters.items()]
         if settings.render.shading != "sh":
-            groups.append({"params": [self.light], "name": "environment", "rate": settings.rates.environment})
+            groups.append({"params": [self.light], "name": "environment"})
         self.exposures: Tensor | None = None  # natural logarithms (views,), where photos have any of their own
         if settings.render.shading != "sh" and settings.light.exposure != "off":
             self.exposures = torch.zeros(len(self.views), device=self.device).requires_grad_()
-            groups.append({"params": [self.exposures], "name": "exposure", "rate": settings.rates.exposure})
+            groups.append({"params": [self.exposures], "name": "exposure"})
         display = settings.render.color_space == "display"
         self.optimizer = Adam([g | {"limits": limits(g["name"], capture.radius, display)} for g in groups])
         self.guard = Guard(self.device)
@@ -126,7 +124,7 @@ class Trainer:
     def _rate(self, name: str) -> float:
         if name == "sh_rest" and self.residual_start < 1:
             name = "residual"
-        rate = getattr(self.settings.rates, name, 0.0)  # what is traced does not learn
+        rate = getattr(self.settings.rates, name, 0.0)  # "received" is traced and does not learn
         return rate * self.capture.radius if name == "position" else rate
 
     def _choose_light_frame(self, start: Parameters, shown: int) -> None:
@@ -403,7 +401,7 @@ class Trainer:
                 decay = rates.decay ** min(progress / late, 1)
             elif name == "sh_rest" and late < 1:
                 decay = rates.decay ** (max(progress - late, 0) / (1 - late))
-            group["lr"] = 0.0 if name in frozen else group["rate"] * decay
+            group["lr"] = 0.0 if name in frozen else self._rate(name) * decay
 
     def _since_propagation(self) -> int | None:
         """Iterations since normals were last propagated, if they are at this stage."""
