@@ -38,6 +38,12 @@ class Camera:
         return self.camera_to_world[:3, 3]
 
     @cached_property
+    def projection(self) -> np.ndarray:
+        """3×4 matrix from a world point (x, y, z, 1) to its pixel's column and row times its depth, and that depth."""
+        intrinsics = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+        return intrinsics @ self.world_to_camera[:3]
+
+    @cached_property
     def heading(self) -> float:
         """How far the camera is turned about the world's z, in radians: the twist of its rotation's swing and twist, zero for
         a level camera that looks along +y. Tilting or rolling it, or lifting it as it goes on looking at a point below,

@@ -133,14 +133,12 @@ class _Work(Work):
 
 
 def _silhouette(mask: np.ndarray, camera: Camera, low: np.ndarray, voxel: np.ndarray) -> _Silhouette:
-    camera = camera.resized(mask.shape[1], mask.shape[0])
-    intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    matrix = intrinsics @ camera.world_to_camera[:3]
+    height, width = mask.shape
+    matrix = camera.resized(width, height).projection
     # Where the mask keeps clear of the picture's border the whole object is in the picture, and what lies outside it is empty;
     # elsewhere nothing is known about it.
     whole = max(mask[0].max(), mask[-1].max(), mask[:, 0].max(), mask[:, -1].max()) < 0.5
     first, step = matrix[:, :3] @ (low + 0.5 * voxel) + matrix[:, 3], matrix[:, :3] * voxel
-    height, width = mask.shape
     return _Silhouette(tuple(first), tuple(step.ravel()), mask.ctypes.data, width, height, int(whole))
 
 

@@ -13,8 +13,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
     Pixel positions of points with depth ≤ 0 mean nothing.
     """
-    intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    matrix = (intrinsics @ camera.world_to_camera[:3]).astype(np.float32)
+    matrix = camera.projection.astype(np.float32)
     x, y, z = matrix[:, :3] @ np.asarray(points, np.float32).T + matrix[:, 3:]
     inverse = 1 / np.where(np.abs(z) > 1e-12, z, np.float32(1e-12))
     return np.stack([x * inverse, y * inverse], axis=1), z

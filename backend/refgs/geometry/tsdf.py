@@ -105,8 +105,7 @@ class _View:
         self.camera = camera = camera.resized(*depth.shape[::-1])
         self.truncation = _TRUNCATION * voxel
         # From a voxel's index to a pixel's position times depth, and the depth.
-        intrinsics = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        matrix = intrinsics @ camera.world_to_camera[:3]
+        matrix = camera.projection
         self.first = _on(depth, matrix[:, :3] @ (low + 0.5 * voxel) + matrix[:, 3])
         self.step = _on(depth, matrix[:, :3] * voxel)
 
