@@ -45,9 +45,9 @@ def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest:
     few = inputs if nearest is None else _nearest(inputs, camera, nearest)
     exact = [v.double().requires_grad_() for v in few]
     *maps, margin = reference.rasterize(*exact, camera, near)
-    safe = margin > MARGIN
-    if safe.float().mean() < SAFE:
-        raise Undecided(f"only {float(safe.float().mean()):.0%} of the picture can be compared")
+    safe, drawn = margin > MARGIN, maps[2] > 0
+    if drawn.any() and safe[drawn].float().mean() < SAFE:
+        raise Undecided(f"only {float(safe[drawn].float().mean()):.0%} of what is drawn can be compared")
     generator = torch.Generator().manual_seed(1)
     upstream = [
         torch.randn(m.shape, generator=generator) * safe.reshape(safe.shape + (1,) * (m.ndim - 2)) for m in maps

@@ -133,16 +133,15 @@ def ties() -> Found:
 
 
 def one_pixel(count: int = 1_000_000) -> Found:
-    """All of them smaller than a pixel, and in the same one."""
+    """All of them smaller than a pixel, and in the same one: about its centre, not on it, where rounding decides between a surfel's own
+    distance and the screen filter's, both nothing."""
     view = camera(size=(3, 3))
-    position, rotation, scale, opacity, features = surfels(view, count, pixels=(0.01, 0.3), depth=(1.0, 3.0))
-    way = torch.from_numpy(
-        view.camera_to_world[:3, :3] @ [(1.5 - view.cx) / view.fx, (1.5 - view.cy) / view.fy, 1]
-    ).float()
-    depth = torch.cat(
-        [torch.linspace(1, 2, 20_000), torch.linspace(2, 3, count - 20_000)]
-    )  # in front, further apart than rounding
-    position = torch.from_numpy(view.position).float() + depth[:, None] * way
+    _, rotation, scale, opacity, features = surfels(view, count, pixels=(0.01, 0.38), depth=(1.0, 1.0))
+    depth = np.concatenate([np.linspace(1, 2, 20_000), np.linspace(2, 3, count - 20_000)])[:, None]
+    at = np.random.default_rng(1).uniform(1.4, 1.6, (count, 2))  # the front ones are further apart than rounding
+    way = np.concatenate([(at - [view.cx, view.cy]) / [view.fx, view.fy], np.ones((count, 1))], axis=1)
+    position = torch.from_numpy(view.position + depth * way @ view.world_to_camera[:3, :3]).float()
+    scale = (scale * torch.from_numpy(depth)).float()
     return compare.raster([position, rotation, scale, 0.05 * opacity, features], view, nearest=15_000)
 
 

@@ -76,9 +76,11 @@ def rasterize(
     with torch.no_grad():  # in the order of the rules: on the plane or not, near or not, cut, capped, finished
         seen = before >= MIN_TRANSMITTANCE * 0.99
         if_met = ahead & (on_plane <= 1.01 * on_screen)
+        # Where a pixel's centre is a surfel's, both are rounding's, and so is which of them depth takes its derivatives from.
+        nearer = (on_plane + 1e-6) / (on_screen + 1e-6)
         margins = [
             torch.where(if_met & (o * torch.exp(-on_plane / 2) > 0.99 * ALPHA_CUT), (z / near).log().abs(), math.inf),
-            torch.where(met & (raw > 0.99 * ALPHA_CUT), (on_plane / on_screen).log().abs(), math.inf),
+            torch.where(met & (raw > 0.99 * ALPHA_CUT), nearer.log().abs(), math.inf),
             (raw / ALPHA_CUT).log().abs(),
             (raw / ALPHA_CAP).log().abs(),
             (before / MIN_TRANSMITTANCE).log().abs(),
