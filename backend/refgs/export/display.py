@@ -9,6 +9,7 @@ from refgs.camera import Camera
 from refgs.export.splats import Splats
 from refgs.render.renderer import render
 from refgs.run import Run
+from refgs.train.adam import Adam
 
 ITERATIONS = 600
 VIEWS = 120  # rendered to learn from, at most
@@ -32,8 +33,7 @@ def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, tota
     shown: dict[int, torch.Tensor] = {}
     constant = torch.from_numpy(splats.sh[:, :1].copy()).requires_grad_()
     rest = torch.zeros(len(splats), (DEGREE + 1) ** 2 - 1, 3, requires_grad=True)
-    adam = torch.optim.Adam([{"params": [constant], "lr": RATE}, {"params": [rest], "lr": RATE_OF_REST}], eps=1e-15)
-    decay = torch.optim.lr_scheduler.ExponentialLR(adam, 0.1 ** (1 / ITERATIONS))
+    adam = Adam([{"params": [constant], "lr": RATE}, {"params": [rest], "lr": RATE_OF_REST}])
     order = np.random.default_rng(0)
     for iteration in range(ITERATIONS):
         if iteration % len(cameras) == 0:
@@ -42,10 +42,10 @@ def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, tota
         if number not in shown:
             shown[number] = run.render(cameras[number]).color.detach().clamp(0, 1)
         loss = (_by_direction(run, constant, rest, cameras[number]) - shown[number]).square().mean()
-        adam.zero_grad()
-        loss.backward()
+        constant.grad, rest.grad = torch.autograd.grad(loss, (constant, rest))
         adam.step()
-        decay.step()
+        for group in adam.param_groups:
+            group["lr"] *= 0.1 ** (1 / ITERATIONS)
         progress(iteration + 1, ITERATIONS)
     sh = torch.cat([constant, rest], dim=1).detach().numpy()
     return Splats(**{**splats.__dict__, "sh": sh})
