@@ -214,9 +214,9 @@ CASES = [
     _case("loss weights × 100 for 40 iterations", lambda: disturbed(heavier(100), heavier(0.01), LONG), "", 2.0),
     _case(
         "opacity resets and densification in one step",
-        lambda: with_settings("densify.reset_every=50", "densify.every=50", "densify.stop=0.3", total=450),
-        "none are removed, or divided, until what was made faint can be back",
-        9.0,
+        lambda: with_settings("densify.reset_every=50", "densify.every=50", "densify.stop=0.15", total=900),
+        "none are removed or divided, and no need is decided, until what was made faint can be back",
+        3.0,
         LATE,
     ),
     _case(

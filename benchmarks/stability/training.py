@@ -114,7 +114,7 @@ def train(
     made, psnr = trainer(capture, *changes, total=total, said=said), {}
     for end in range(LOOK, total + 1, LOOK):
         (disturb or {}).get(end - LOOK, lambda _: None)(made)
-        while made.iteration < end:  # it may have gone back
+        while made.iteration < end and not made.ended:  # it may have gone back, or be done with less than was planned
             made.run(stop=lambda end=end: made.iteration >= end)
         psnr[end] = made.test_psnr()
     return Course(psnr, said, made)

@@ -13,8 +13,9 @@ from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.render.directional import directional
 from refgs.render.rasterize import rasterize
+from refgs.settings import load_settings
 from refgs.train.adam import Adam
-from refgs.train.densify import ScreenGradient, too_faint
+from refgs.train.densify import ScreenGradient, faint
 from refgs.train.guard import MOST_IN_A_ROW, Guard, limits, remove_broken, running
 from tests.kernels import scenes
 
@@ -97,14 +98,21 @@ def test_a_mean_passes_over_what_is_no_number():
     assert float(running(mean, torch.tensor(3.0))) == pytest.approx(2.05)
 
 
-def test_none_are_removed_until_what_was_made_faint_can_be_back():
-    made = {"every": 10, "reset_every": 100, "stop": 0.5, "prune_opacity": 0.05, "gradient": 0.0, "start": 0.0}
-    settings = type("Settings", (), made)
-    faint = [i for i in range(1, 1000) if too_faint(settings, 0.05, i, 1000)]
-    way = 2 * math.log(0.05 / 0.95 * 0.99 / 0.01) / 0.05
-    assert faint == [i for last in (100, 200, 300, 400) for i in range(last + 1, last + math.ceil(way))]
-    settings.reset_every = 0
-    assert not any(too_faint(settings, 0.05, i, 1000) for i in range(1, 1000))
+@pytest.mark.parametrize(("decay", "opacity"), [(1.0, 0.05), (0.1, 0.2)])
+def test_surfels_are_faint_until_what_the_picture_needs_can_be_back(decay, opacity):
+    changes = ["densify.reset_every=100", "densify.stop=0.5", "rates.opacity=0.2", f"rates.decay={decay}"]
+    settings = load_settings("paper", changes)
+    moved = np.cumsum(0.2 * decay ** (np.arange(1000) / 1000))  # by Adam, at the most
+    way = 4 * math.log(opacity / (1 - opacity) * 0.99 / 0.01)
+
+    def found(opacity: float, settings=settings) -> list[int]:
+        return [i for i in range(1, 1000) if faint(settings.densify, settings.rates, i, 1000, opacity)]
+
+    for last in (100, 200, 300, 400):
+        those = [i for i in found(opacity) if last < i <= (last + 100 if last < 400 else 1000)]
+        end = min(int(np.searchsorted(moved, moved[last] + way)), last + 101 if last < 400 else 1000)
+        assert those == list(range(last + 1, last + 1 + len(those))) and those[-1] == pytest.approx(end, abs=6)
+    assert not found(0.0) and not found(opacity, load_settings("paper", [*changes, "densify.reset_every=0"]))
 
 
 def test_broken_surfels_are_removed_and_that_is_said(ball_capture, tmp_path):

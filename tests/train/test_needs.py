@@ -17,6 +17,7 @@ from refgs.model.environment import Environment
 from refgs.run import open_run
 from refgs.train import needs, probe
 from refgs.train.asset import write_asset
+from refgs.train.densify import RESET
 from refgs.train.losses import Photo, objective
 from refgs.train.plan import Plan
 from tests.train.test_trainer import trainer as small
@@ -223,6 +224,18 @@ def test_a_photo_that_its_object_fills_stays_whole(mirror, tmp_path, monkeypatch
     made.photos, made.crops = [Photo.of(view) for view in made.views], None
     needs._outside(made)
     assert made.crops is None
+
+
+def test_nothing_is_decided_of_surfels_that_are_faint(mirror, tmp_path, monkeypatch):
+    monkeypatch.setattr(needs, "SOONEST", 8)
+    monkeypatch.setattr(needs, "KNOWN", 0.0)
+    changes = ["densify.reset_every=5", "densify.stop=0.1", "rates.opacity=1.0", "rates.decay=1.0"]
+    made = trainer(mirror, tmp_path / "run", *changes, total=60)
+    way = 4 * math.log(needs.SEEN / (1 - needs.SEEN) * (1 - RESET) / RESET)  # in iterations, by a rate of one
+    made.run(stop=lambda: made.iteration >= 5 + math.floor(way))
+    assert not made.needs.keys() & {"specular", "light"} and made.faint(needs.SEEN)
+    made.run(stop=lambda: made.iteration >= 6 + math.floor(way))
+    assert not made.faint(needs.SEEN) and "specular" in made.needs
 
 
 def test_what_the_part_about_the_mask_saves_is_timed(mirror, tmp_path, monkeypatch):

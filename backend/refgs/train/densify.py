@@ -11,7 +11,7 @@ from refgs.camera import Camera
 from refgs.clock import timed
 from refgs.kernels.load import Shared, Work, check, run
 from refgs.model.surfels import Parameters, activate, axes
-from refgs.settings import DensifySettings, PropagationSettings
+from refgs.settings import DensifySettings, PropagationSettings, RateSettings
 from refgs.train.adam import Adam
 
 RESET = 0.01  # opacity
@@ -98,15 +98,17 @@ def reset_opacity(parameters: Parameters, optimizer: Adam) -> None:
     optimizer.state.pop(parameters["opacity"], None)
 
 
-def too_faint(settings: DensifySettings, rate: float, iteration: int, total: int) -> bool:
-    """Whether surfels were made faint so lately that, with opacity's rate, those that the picture needs may not be back: none are to be
-    removed then. Adam moves a logit by about its rate; they get twice as long as that takes."""
+def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total: int, opacity: float) -> bool:
+    """Whether surfels were made faint so lately that, with opacity's rate, those that the picture needs may not be back at an `opacity`.
+    Adam moves a logit by about its rate in an iteration that sees the surfel; they get four times as long as that takes."""
     every = settings.reset_every
-    last = min(iteration, math.ceil(settings.stop * total)) - 1  # not what is done after this iteration's densification
-    if not every or last < every or settings.prune_opacity <= RESET:
+    last = min(iteration, math.ceil(settings.stop * total)) - 1  # not what is done at the end of this iteration
+    if not every or last < every:
         return False
-    way = math.log(settings.prune_opacity / (1 - settings.prune_opacity) * (1 - RESET) / RESET)
-    return (iteration - last // every * every) * rate < 2 * way
+    since = last // every * every
+    rate = rates.opacity * (rates.decay ** (since / total) + rates.decay ** min(iteration / total, 1.0)) / 2
+    opacity = max(opacity, RESET)
+    return (iteration - since) * rate < 4 * math.log(opacity / (1 - opacity) * (1 - RESET) / RESET)
 
 
 @torch.no_grad()

@@ -28,6 +28,7 @@ LEAST_OUTSIDE = 0.1  # part of the pixels: what less takes could not be measured
 TWINS_PIXELS, TWINS_DECIBELS = 0.5, 40.0
 KNOWN = 0.05  # part of the training after which it is known what mirrors: materials learn faster than shapes
 SOONEST = 100  # iterations: a mirror of which less was learned looks dull
+SEEN = 0.2  # opacity that surfels must have had the time to be back at: of what is faint all explains little
 # Decibels. At a twentieth of a training matte clay has none; a polished plate has 0.8, glossy paint 2.6, a mirror 5.6.
 LEAST_SPECULAR = 0.3
 # Part of the iterations that are left, after which what mirrors nothing is as good as with everything after all: docs/measurements.md.
@@ -132,7 +133,7 @@ def about(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
 def weigh(trainer: "Trainer", progress: float) -> None:
     """Decide what is due at this progress, 0..1, and leave out what the scene does without."""
     render = trainer.settings.render
-    if trainer.initial or render.shading != "deferred" or render.diffuse != "irradiance":
+    if trainer.initial or render.shading != "deferred" or render.diffuse != "irradiance" or trainer.faint(SEEN):
         return
     learned = progress - trainer.settings.initial.until  # what came before starts anew
     if trainer.crops is not None and trainer.iteration >= SOONEST and "seconds" not in trainer.needs["outside"]:
@@ -187,6 +188,8 @@ def _fewer_iterations(trainer: "Trainer", why: str, one: float = 0.0, **figures:
 def reflections(trainer: "Trainer", hidden: float) -> None:
     """Decide, a mesh having been made, by the part of the object's pixels in whose mirror direction the object itself stands."""
     asked, least = _forced(trainer, "reflections"), trainer.settings.indirect.least
+    if trainer.faint(SEEN):
+        return
     said = f"the object mirrors itself on {hidden:.1%} of it"
     if asked == "on" or trainer.needs.get("reflections", {}).get("needed"):
         trainer.decide("reflections", f"with {WHAT['reflections']}: {said}")

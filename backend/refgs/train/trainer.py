@@ -28,7 +28,7 @@ from refgs.report.pictures import composite
 from refgs.settings import LossSettings, RenderSettings, Settings
 from refgs.train import history, needs, snapshot
 from refgs.train.adam import Adam
-from refgs.train.densify import ScreenGradient, densify, propagate_normals, reset_opacity, thin, too_faint
+from refgs.train.densify import ScreenGradient, densify, faint, propagate_normals, reset_opacity, thin
 from refgs.train.guard import Guard, limits, running
 from refgs.train.light import light_frame, mirrored
 from refgs.train.losses import Photo, departure, objective
@@ -372,14 +372,15 @@ class Trainer:
         self.iteration += 1
         learns = settings.indirect.start <= progress < self.residual_start  # later, materials would not make up for it
         due = learns and self.iteration % settings.indirect.every == 0
+        # A mesh, and decisions, come before what makes all surfels faint.
         if not self.without_reflection() and not self.initial and due and self.iteration < self.total:
             with self.clock.part("visibility"):
-                self._trace()  # before what may make all surfels faint, of which no mesh could be made
+                self._trace()
+        with self.clock.part("deciding"):
+            needs.weigh(self, progress)
         self._densify(progress)
         self._reshape()
         self._weigh_exposures(progress)
-        with self.clock.part("deciding"):
-            needs.weigh(self, progress)
         return {"loss": loss.detach(), "square": square}
 
     def _set_rates(self, progress: float) -> None:
@@ -439,12 +440,15 @@ class Trainer:
             self._order = epoch, torch.randperm(len(self.views), generator=generator).tolist()
         return self._order[1][place]
 
+    def faint(self, opacity: float) -> bool:
+        """Whether all surfels were made faint so lately that they may not be back at an opacity."""
+        return faint(self.settings.densify, self.settings.rates, self.iteration, self.total, opacity)
+
     def _densify(self, progress: float) -> None:
         settings = self.settings.densify
         if self.iteration % settings.every or progress < settings.start:
             return
-        rates = self.settings.rates
-        if too_faint(settings, rates.opacity * rates.decay**progress, self.iteration, self.total):
+        if self.faint(settings.prune_opacity):
             return
         gradient = self.motion.mean()
         if self.capture.box is not None:  # what is beside it gets no more than its share
