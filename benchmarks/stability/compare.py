@@ -14,7 +14,7 @@ from refgs.render.shade import shade
 
 MARGIN = 1e-4  # pixels nearer to a decision that rounding could turn are left out
 SMOOTH = 2e-5  # the same of kinks in derivatives: values have none
-SAFE = 0.5  # of the picture, at the least, must be left
+SAFE = 0.5  # of the picture, or of what is drawn of it, at the least, must be left
 FLOAT32 = "float32, sums of hundreds of terms"
 
 

@@ -17,6 +17,7 @@ from refgs.errors import InputError
 from refgs.kernels import reference
 from refgs.render.rasterize import rasterize
 from refgs.settings import RATES
+from refgs.train import needs
 from refgs.train.adam import Adam
 from refgs.train.start import GEOMETRY
 from refgs.train.trainer import Trainer
@@ -123,20 +124,22 @@ def trajectories() -> Found:
 STAGES = ["initial.until=0.25", "indirect.start=0.3", "indirect.every=15", "indirect.least=0", "indirect.resolution=32"]
 STAGES += [
     "densify.every=10",
-    "densify.reset_every=30",
+    "densify.reset_every=55",
     "propagation.every=20",
     "propagation.rest=15",
     "light.exposure=on",
 ]
-STAGES += ["train.checkpoint_every=1000", "residual.start=0.8"]
-CUTS = {
-    5: "light first",
-    20: "surfels one by one",
-    37: "deferred",
-    52: "inter-reflection, normals spread",
-    75: "densified",
-    90: "residual",
+STAGES += ["train.checkpoint_every=1000", "residual.start=0.8", "needs.initial=on", "needs.reflections=on"]
+CUTS: dict[int, Callable[[Trainer], bool]] = {
+    5: lambda made: made.initial and made.iteration < made.settings.train.light_first,
+    20: lambda made: made.initial,
+    37: lambda made: not made.initial and made.occluder is None,
+    52: lambda made: made.occluder is not None,
+    75: lambda made: made.faint(needs.SEEN),
+    90: lambda made: made.iteration > made.residual_start * made.total,
 }
+"""Iterations to cut at, and what tells that it is another stage: light first, surfels one by one, deferred, inter-reflection, faint after
+a reset, what is left over."""
 
 
 def bits(made: Trainer) -> list[Tensor]:
@@ -144,11 +147,12 @@ def bits(made: Trainer) -> list[Tensor]:
 
 
 def resumed() -> Found:
-    """A training cut in each of its stages and gone on with from there: the part of the numbers that come out otherwise."""
+    """A training cut in each of its stages and gone on with from there: the part of the tensors that come out otherwise."""
     whole = trainer(ball(), *STAGES, total=100)
     copies: dict[int, Path] = {}
-    for cut in CUTS:
+    for cut, in_stage in CUTS.items():
         whole.run(stop=lambda cut=cut: whole.iteration >= cut)
+        assert in_stage(whole), f"at {cut} the training is in another stage than it should be"
         copies[cut] = whole.folder.with_name(f"{whole.folder.name} {cut}")
         shutil.copytree(whole.folder, copies[cut])
     whole.run()
@@ -192,6 +196,7 @@ def _case(name: str, run, guard: str, most: float = NOISE, because: str = SEED, 
     return Case(f"optimisation: {name}", run, against, most, because, guard, "dB")
 
 
+RESETS = "densify.reset_every=50", "densify.every=50", "densify.start=0.05", "densify.stop=0.15"
 LATE = "it has cooled before all is found again"
 LOST = "positions fly off by radii: to be finite is all that is asked"
 RUINED = "Adam remembers large gradients: to be finite is all that is asked"
@@ -211,12 +216,12 @@ CASES = [
             (100, True, "geometry", (25.0, LOST)),
         )
     ),
-    _case("loss weights × 100 for 40 iterations", lambda: disturbed(heavier(100), heavier(0.01), LONG), "", 2.0),
+    _case("loss weights × 100 for 40 iterations", lambda: disturbed(heavier(100), heavier(0.01), LONG), "", 2.0, LATE),
     _case(
         "opacity resets and densification in one step",
-        lambda: with_settings("densify.reset_every=50", "densify.every=50", "densify.stop=0.15", total=900),
+        lambda: with_settings(*RESETS, total=900),
         "none are removed or divided, and no need is decided, until what was made faint can be back",
-        3.0,
+        4.0,
         LATE,
     ),
     _case(

@@ -111,7 +111,7 @@ def test_surfels_are_faint_until_what_the_picture_needs_can_be_back(decay, opaci
     for last in (100, 200, 300, 400):
         those = [i for i in found(opacity) if last < i <= (last + 100 if last < 400 else 1000)]
         end = min(int(np.searchsorted(moved, moved[last] + way)), last + 101 if last < 400 else 1000)
-        assert those == list(range(last + 1, last + 1 + len(those))) and those[-1] == pytest.approx(end, abs=6)
+        assert those == list(range(last + 1, last + 1 + len(those))) and those[-1] == pytest.approx(end, abs=2)
     assert not found(0.0) and not found(opacity, load_settings("paper", [*changes, "densify.reset_every=0"]))
 
 

@@ -226,16 +226,16 @@ def test_a_photo_that_its_object_fills_stays_whole(mirror, tmp_path, monkeypatch
     assert made.crops is None
 
 
-def test_nothing_is_decided_of_surfels_that_are_faint(mirror, tmp_path, monkeypatch):
-    monkeypatch.setattr(needs, "SOONEST", 8)
-    monkeypatch.setattr(needs, "KNOWN", 0.0)
+def test_surfels_that_are_faint_decide_nothing_and_are_no_mesh(mirror, tmp_path):
     changes = ["densify.reset_every=5", "densify.stop=0.1", "rates.opacity=1.0", "rates.decay=1.0"]
+    changes += ["needs.specular=on", "needs.reflections=on", "indirect.start=0", "indirect.every=8"]
     made = trainer(mirror, tmp_path / "run", *changes, total=60)
     way = 4 * math.log(needs.SEEN / (1 - needs.SEEN) * (1 - RESET) / RESET)  # in iterations, by a rate of one
     made.run(stop=lambda: made.iteration >= 5 + math.floor(way))
-    assert not made.needs.keys() & {"specular", "light"} and made.faint(needs.SEEN)
-    made.run(stop=lambda: made.iteration >= 6 + math.floor(way))
-    assert not made.faint(needs.SEEN) and "specular" in made.needs
+    assert made.faint(needs.SEEN) and made.iteration > 60 * needs.SETTLED
+    assert "light" not in made.needs and made.occluder is None
+    made.run(stop=lambda: made.iteration >= 24)
+    assert not made.faint(needs.SEEN) and "light" in made.needs and made.occluder is not None
 
 
 def test_what_the_part_about_the_mask_saves_is_timed(mirror, tmp_path, monkeypatch):

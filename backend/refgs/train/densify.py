@@ -100,15 +100,19 @@ def reset_opacity(parameters: Parameters, optimizer: Adam) -> None:
 
 def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total: int, opacity: float) -> bool:
     """Whether surfels were made faint so lately that, with opacity's rate, those that the picture needs may not be back at an `opacity`.
-    Adam moves a logit by about its rate in an iteration that sees the surfel; they get four times as long as that takes."""
+    Adam moves a logit by about its rate, which decays, in an iteration that sees the surfel; they get four times as long as that takes."""
     every = settings.reset_every
     last = min(iteration, math.ceil(settings.stop * total)) - 1  # not what is done at the end of this iteration
     if not every or last < every:
         return False
-    since = last // every * every
-    rate = rates.opacity * (rates.decay ** (since / total) + rates.decay ** min(iteration / total, 1.0)) / 2
+    since, decay = last // every * every, rates.decay
+    iterations = (
+        iteration - since
+        if decay == 1
+        else total * (decay ** (since / total) - decay ** (iteration / total)) / -math.log(decay)
+    )
     opacity = max(opacity, RESET)
-    return (iteration - since) * rate < 4 * math.log(opacity / (1 - opacity) * (1 - RESET) / RESET)
+    return iterations * rates.opacity < 4 * math.log(opacity / (1 - opacity) * (1 - RESET) / RESET)
 
 
 @torch.no_grad()

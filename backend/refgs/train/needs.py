@@ -188,8 +188,6 @@ def _fewer_iterations(trainer: "Trainer", why: str, one: float = 0.0, **figures:
 def reflections(trainer: "Trainer", hidden: float) -> None:
     """Decide, a mesh having been made, by the part of the object's pixels in whose mirror direction the object itself stands."""
     asked, least = _forced(trainer, "reflections"), trainer.settings.indirect.least
-    if trainer.faint(SEEN):
-        return
     said = f"the object mirrors itself on {hidden:.1%} of it"
     if asked == "on" or trainer.needs.get("reflections", {}).get("needed"):
         trainer.decide("reflections", f"with {WHAT['reflections']}: {said}")

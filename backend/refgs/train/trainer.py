@@ -371,7 +371,7 @@ class Trainer:
         self.forget_gradients()
         self.iteration += 1
         learns = settings.indirect.start <= progress < self.residual_start  # later, materials would not make up for it
-        due = learns and self.iteration % settings.indirect.every == 0
+        due = learns and self.iteration % settings.indirect.every == 0 and not self.faint(needs.SEEN)
         # A mesh, and decisions, come before what makes all surfels faint.
         if not self.without_reflection() and not self.initial and due and self.iteration < self.total:
             with self.clock.part("visibility"):
@@ -483,7 +483,7 @@ class Trainer:
         settings = self.settings
         if self.exposures is None or settings.light.exposure != "auto" or self.initial:
             return
-        if self.iteration % settings.densify.every or progress < EXPOSURES_KNOWN:
+        if self.iteration % settings.densify.every or progress < EXPOSURES_KNOWN or self.faint(needs.SEEN):
             return
         spread = float((self.exposures - self.exposures.median()).abs().max())  # a card waits here, once in a while
         if spread < EXPOSURES_ALIKE:
