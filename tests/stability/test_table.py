@@ -1,17 +1,20 @@
-"""Quick cases of the table that `refgs stability` prints, and the command."""
+"""The table that `refgs stability` prints, its trainings among the slow tests; and the command."""
 
 import subprocess
 import sys
 
 import pytest
 
-from benchmarks.stability import geometry, material, stiffness
+from benchmarks.stability import geometry, material, optimisation, photos, stiffness
 from benchmarks.stability.cases import Case, Found
 
 QUICK = [*geometry.CASES, *material.CASES, stiffness.CASES[0]]
+SLOW = [*photos.CASES, *optimisation.CASES, *stiffness.CASES[1:]]
 
 
-@pytest.mark.parametrize("case", [c for c in QUICK if "million" not in c.name], ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case", [*QUICK, *(pytest.param(c, marks=pytest.mark.slow) for c in SLOW)], ids=lambda c: c.name
+)
 def test_case(case):
     found = case.run()
     assert case.holds(found), found
