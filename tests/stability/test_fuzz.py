@@ -2,9 +2,10 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.stability import compare
@@ -20,6 +21,9 @@ FUZZ = settings(max_examples=40, **SETTINGS)
 FEW = settings(max_examples=12, **SETTINGS)
 EMULATED = settings(max_examples=4, **SETTINGS)
 MOST = 1e-5
+CANCELLED = (
+    2e-5  # of the rasteriser: a far too large disc's scale has a gradient a thousandth of the sums that it is made of
+)
 
 
 def powers(low: float, high: float) -> st.SearchStrategy[float]:
@@ -45,7 +49,8 @@ def drawn(focal, pixels, aspect, edge_on, least, depth, centre) -> None:
     view = camera(focal, centre, (19, 13))
     how = {"pixels": (pixels, 10 * pixels), "aspect": aspect, "edge_on": edge_on, "opacity": (least, 1.0)}
     try:
-        check(compare.raster(surfels(view, 25, depth=(0.5 * depth, 2 * depth), **how), view, near=0.1 / max(focal, 1)))
+        inputs = surfels(view, 25, depth=(0.5 * depth, 2 * depth), **how)
+        check(compare.raster(inputs, view, near=0.1 / max(focal, 1)), CANCELLED)
     except compare.Undecided:
         assume(False)
 
@@ -125,7 +130,11 @@ def test_rays(scale, offset):
     assert rays(scale, offset * min(scale, 1)).error < 0.01
 
 
+SSIM_C2 = 9e-4
+
+
 @FUZZ
+@example(1.0, 1.0, 1e-5, 0)  # nearly constant
 @given(st.floats(0, 1), st.floats(0, 1), powers(-6, 0), st.integers(0, 9))
 def test_dssim(one, other, spread, seed):
     generator = torch.Generator().manual_seed(seed)
@@ -135,10 +144,17 @@ def test_dssim(one, other, spread, seed):
     (exact_by,) = torch.autograd.grad(expected, exact)
     found, by = dssim(image, target)
     assert abs(float(found) - float(expected.detach())) < 1e-4  # variances are differences of squares
-    assert compare.worst([by], [exact_by]) < 2e-2 or float(exact_by.abs().max()) < 1e-5
+    rounding = 4 * torch.finfo(torch.float32).eps / (SSIM_C2 * image.numel())  # of these, in the derivative of a mean
+    assert float((by - exact_by).abs().max()) < 2e-2 * float(exact_by.abs().max()) + rounding
+
+
+CARDS_NAN = float(
+    np.uint32(0x7FFFFFFF).view(np.float32)
+)  # what a card's arithmetic makes; the processor's has no low bits
 
 
 @FUZZ
+@example([CARDS_NAN] * 20)
 @given(st.lists(st.floats(width=32), min_size=1, max_size=20))
 def test_activations(numbers):
     """What is no number stays none; all else is finite, in its range, and never falls as the raw value rises."""

@@ -11,8 +11,10 @@ from benchmarks.stability.optimisation import nan_gradient, nan_value, resumed
 from benchmarks.stability.training import trainer
 from refgs.capture import read_capture
 from refgs.errors import InputError
+from refgs.model.environment import Environment
 from refgs.render.directional import directional
 from refgs.render.rasterize import rasterize
+from refgs.render.shade import shade
 from refgs.settings import load_settings
 from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, faint
@@ -58,12 +60,20 @@ def test_a_loss_that_is_no_number_is_not_stepped_on():
 
 
 def test_no_kernel_hides_what_is_no_number(device):
-    """Colour by direction, activations, the rasteriser's derivatives: NaN in, NaN out."""
+    """Colour by direction, shading, the rasteriser's derivatives: NaN in, NaN out."""
     camera, nan = scenes.camera(20, 16), math.nan
     constant, rest, position = torch.ones(3, 1, 3), torch.ones(3, 3, 3), torch.rand(3, 3)
     constant[1, 0, 2] = rest[2, 1, 0] = nan
     color = directional(*(v.to(device) for v in (constant, rest)), 0.5, position.to(device), camera).cpu()
     assert color.isnan().tolist() == [[False] * 3, [False, False, True], [True, False, False]]
+
+    features, alpha = torch.full((16, 20, 11), 0.5), torch.ones(16, 20)
+    features[..., -3:] = torch.from_numpy(camera.position).float() + scenes.camera_rays(camera)
+    for channel in range(8):  # normal, base colour, metallic, roughness
+        features[channel, 10, channel] = nan
+    light = Environment(torch.ones(6 * 16**2, 3, device=device))
+    color = shade(features.to(device), alpha.to(device), light, camera, torch.zeros(3)).color.cpu()
+    assert color[range(8), 10].isnan().any(dim=-1).all() and color[8:].isfinite().all()
 
     inputs = [v.to(device).requires_grad_() for v in scenes.surfels("plain", 3)]
     maps = rasterize(*inputs, camera, near=0.1)

@@ -24,11 +24,10 @@ struct Activate {
 
 constexpr float LOG2_E = 1.4426950f, LN_2_HIGH = 0.693359375f, LN_2_LOW = -2.1219444e-4f;  // their sum is ln 2; k LN_2_HIGH is exact
 
-// e^x = 2^k e^r, for |x| <= 87; beyond, the values there. What is no number stays none.
+// e^x = 2^k e^r, for |x| <= 87; beyond, the values there. What is no number stays none: exp2 would make numbers of some of these.
 INLINE Vector exponential(Vector x) {
-  x = select(x == x, clamp(x, -87, 87), x);
-  Vector k = round_down(x * LOG2_E + 0.5f), r = x - k * LN_2_HIGH - k * LN_2_LOW;
-  return exp2(k) * exp2(r * LOG2_E);
+  Vector within = clamp(x, -87, 87), k = round_down(within * LOG2_E + 0.5f), r = within - k * LN_2_HIGH - k * LN_2_LOW;
+  return select(x == x, exp2(k) * exp2(r * LOG2_E), x);
 }
 
 INLINE Vector logistic(Vector x) { return 1.0f / (1.0f + exponential(-x)); }

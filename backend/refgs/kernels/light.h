@@ -206,7 +206,7 @@ struct Metal {
 // The sRGB curve (IEC 61966-2-1), unclamped as in refgs.color, and its derivative.
 INLINE Vector srgb_encode(Vector linear, Vector& derivative) {
   constexpr float LINEAR_END = 0.0031308f;
-  Vector x = larger(linear, Vector() + LINEAR_END), square_root = x * inverse_root(x);
+  Vector x = larger(Vector() + LINEAR_END, linear), square_root = x * inverse_root(x);
   // x^(5/12) = x x^(-1/4) x^(-1/3); y = (x^(1/2))^(-1/3) by Newton from an estimate in the exponent's bits.
   Vector third = convert<Vector>(bits(square_root)) * (1 / 3.0f);
   Vector y = from_bits((Mask() + 0x54a2fa8c) - convert<Mask>(third));
