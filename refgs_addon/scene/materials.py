@@ -1,5 +1,6 @@
 """Materials to start an edit from. They are Blender presets, a file each: the add-on's own, and those that the artist saves."""
 
+import runpy
 from pathlib import Path
 
 import bpy
@@ -33,7 +34,7 @@ def read_material(name: str) -> dict[str, float | tuple[float, ...]]:
     if file is None:
         raise InputError(f"there is no material {name}: take one of {', '.join(materials())}")
     try:
-        found = vars(bpy.utils.execfile(str(file)))
+        found = runpy.run_path(str(file))  # bpy.utils.execfile leaves its bytecode beside the file, and would go by it
         return {key: _checked(key, found[_variable(key)]) for key in INPUTS if _variable(key) in found}
     except Exception as error:  # a preset is a script, which may do anything
         raise InputError(f"the material {file} cannot be read ({error}): remove it, and save it anew") from None
