@@ -22,22 +22,27 @@ class Undecided(Exception):
     """Too much of a picture hangs on comparisons that rounding can turn."""
 
 
-def worst(found: Sequence[Tensor], expected: Sequence[Tensor], floor: float = 1e-30) -> float:
-    """The largest error of pairs of tensors, by the largest value of each. What is expected to be nothing has an error by itself."""
+def worst(found: Sequence[Tensor], expected: Sequence[Tensor], terms: Sequence[Tensor] | None = None) -> float:
+    """The largest error of pairs of tensors, by the largest value of each, or of the `terms` that it is a sum of where they are larger.
+    What is expected to be nothing has an error by itself."""
     errors = [0.0]
-    for value, exact in zip(found, expected, strict=True):
+    for value, exact, summed in zip(found, expected, terms or expected, strict=True):
         if exact.numel():
-            error, size = (value.double() - exact).abs().max(), exact.abs().max()
-            errors.append(float(error / size if size > floor else error))
+            error, size = (value.double() - exact).abs().max(), torch.maximum(exact.abs().max(), summed.abs().max())
+            errors.append(float(error / size if size > 1e-30 else error))
     return max(errors)
 
 
 def outcome(
-    found: Sequence[Tensor], expected: Sequence[Tensor], by: Sequence[Tensor], exact_by: Sequence[Tensor]
+    found: Sequence[Tensor],
+    expected: Sequence[Tensor],
+    by: Sequence[Tensor],
+    exact_by: Sequence[Tensor],
+    terms: Sequence[Tensor] | None = None,
 ) -> Found:
     """Of values and gradients; a gradient's error counts a tenth."""
     finite = all(bool(v.isfinite().all()) for v in (*found, *by))
-    return Found(finite, max(worst(found, expected), 0.1 * worst(by, exact_by)))
+    return Found(finite, max(worst(found, expected), 0.1 * worst(by, exact_by, terms)))
 
 
 def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest: int | None = None) -> Found:
@@ -52,16 +57,50 @@ def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest:
     upstream = [
         torch.randn(m.shape, generator=generator) * safe.reshape(safe.shape + (1,) * (m.ndim - 2)) for m in maps
     ]
-    exact_by = torch.autograd.grad(maps, exact, [u.double() for u in upstream])
+    exact_by = torch.autograd.grad(maps, exact, [u.double() for u in upstream], retain_graph=True)
+    exact_by = _learned(exact_by, few)
+    terms = _terms(maps, upstream, exact, exact_by, generator)
     leaves = [v.clone().requires_grad_() for v in inputs]
     found = rasterize(*leaves, camera, near)
-    by = torch.autograd.grad(found, leaves, upstream)
+    by = _learned(torch.autograd.grad(found, leaves, upstream), inputs)
     if nearest is not None:
         kept = _order(inputs, camera)[:nearest]
         hidden = [g[_order(inputs, camera)[nearest:]] for g in by]
         exact_by = [*exact_by, *(torch.zeros_like(g).double() for g in hidden)]
+        terms = [*terms, *exact_by[len(terms) :]]
         by = [*(g[kept] for g in by), *hidden]
-    return outcome([m.detach()[safe] for m in found], [m.detach()[safe] for m in maps], by, exact_by)
+    return outcome([m.detach()[safe] for m in found], [m.detach()[safe] for m in maps], by, exact_by, terms)
+
+
+def _learned(by: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
+    """Derivatives by positions, by turns and by scales' logarithms; and the rest."""
+    position, rotation, scale, *rest = by
+    return [position, rotation * inputs[1].double().norm(dim=-1, keepdim=True), scale * inputs[2].double(), *rest]
+
+
+def _terms(
+    maps: Sequence[Tensor],
+    upstream: Sequence[Tensor],
+    exact: Sequence[Tensor],
+    exact_by: Sequence[Tensor],
+    generator: torch.Generator,
+) -> list[Tensor]:
+    """What the derivatives by what is learned are small differences of.
+
+    By alpha it is one of what a surfel adds and what it hides. The latter is what the surfels in front leave of the pixel's total, over
+    1 - alpha: it rounds as the total does, however little it comes to. As the transmittance's derivative by alpha is over 1 - alpha, too,
+    totals of either sign are taken back by it. And a disc is turned and stretched about a centre that the same pixels move: these are
+    differences of what moving comes to, times the radius, and stretching one of what turning comes to."""
+    features, depth, alpha = (m.detach() for m in maps)
+    by_features, by_depth, by_alpha = upstream
+    total = (features * by_features).abs().sum(dim=-1) + (depth * by_depth).abs() + (alpha * by_alpha).abs()
+    by = torch.randn(total.shape, generator=generator) * total / (1 - alpha)
+    inputs = [v.detach() for v in exact]
+    terms = _learned(torch.autograd.grad(maps[2], exact, by, materialize_grads=True), inputs)
+    moved, turned = (v.norm(dim=-1, keepdim=True) for v in exact_by[:2])
+    moved = moved * inputs[2].amax(dim=-1, keepdim=True)
+    terms[1], terms[2] = terms[1].abs() + moved, terms[2].abs() + moved + turned
+    return terms
 
 
 def _order(inputs: Sequence[Tensor], camera: Camera) -> Tensor:

@@ -21,9 +21,6 @@ FUZZ = settings(max_examples=40, **SETTINGS)
 FEW = settings(max_examples=12, **SETTINGS)
 EMULATED = settings(max_examples=4, **SETTINGS)
 MOST = 1e-5
-CANCELLED = (
-    2e-5  # of the rasteriser: a far too large disc's scale has a gradient a thousandth of the sums that it is made of
-)
 
 
 def powers(low: float, high: float) -> st.SearchStrategy[float]:
@@ -50,7 +47,7 @@ def drawn(focal, pixels, aspect, edge_on, least, depth, centre) -> None:
     how = {"pixels": (pixels, 10 * pixels), "aspect": aspect, "edge_on": edge_on, "opacity": (least, 1.0)}
     try:
         inputs = surfels(view, 25, depth=(0.5 * depth, 2 * depth), **how)
-        check(compare.raster(inputs, view, near=0.1 / max(focal, 1)), CANCELLED)
+        check(compare.raster(inputs, view, near=0.1 / max(focal, 1)))
     except compare.Undecided:
         assume(False)
 
@@ -97,8 +94,9 @@ MATERIALS = {
 
 def shaded(light, **how) -> None:
     how |= {"sun": light[0], "scale": light[1]}
-    # Beside a sun of 1e6 the rounding of where it is looked up, 1e-6 of a texel, is as bright as the sky.
-    most = MOST if light[0] == 0 else 1e-3
+    # Beside a sun of 1e6 the rounding of where it is looked up, 1e-6 of a texel, is as bright as the sky; sRGB shows that as 3e-3 of it,
+    # and of the little that a black metal mirrors it is more. Of a light without a sun, too.
+    most = 3e-5 if light[0] == 0 else 3e-2
     try:
         check(lit(**how), most)
     except compare.Undecided:
