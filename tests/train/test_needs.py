@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -319,3 +321,18 @@ def test_shares_are_weights(mirror, tmp_path):
     mean = probe.blended_shares(surfels, [photo], made.near, [even])
     seen = probe.blended_shares(surfels, [photo], made.near)[0] > 1e-3
     torch.testing.assert_close(mean[seen], torch.full_like(mean[seen], 0.3), rtol=1e-3, atol=0)
+
+
+def test_deciding_does_not_load_what_it_does_not_use(mirror, tmp_path):
+    """sympy, which torch loads for a gradient that is given, takes half a second."""
+    program = """
+import sys
+from pathlib import Path
+from refgs.train import probe
+from tests.train.test_trainer import trainer
+made = trainer(Path(sys.argv[1]), Path(sys.argv[2]), total=10)
+made.run()
+probe.specular_explains(made), probe.seconds_saved(made)
+assert not {"sympy", "torch._dynamo"} & {*sys.modules}
+"""
+    subprocess.run([sys.executable, "-c", program, mirror.folder, tmp_path / "run"], check=True)

@@ -126,7 +126,10 @@ def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: lis
         with torch.enable_grad():
             blended = rasterize(*discs(surfels, photo.camera), feature, photo.camera, near=near).features
             one = torch.ones_like(blended[..., :1])
-            blended.backward(one if maps is None else torch.cat([maps[number], one], dim=-1))
+            weights = one if maps is None else torch.cat([maps[number], one], dim=-1)
+            (
+                blended * weights
+            ).sum().backward()  # of a sum: a gradient that is given has torch load sympy, which takes half a second
         rows.append(feature.grad if maps is not None else feature.grad[:, 0])
     if maps is None:
         return torch.stack(rows)
