@@ -9,7 +9,7 @@ import pytest
 from refgs import jobs
 from refgs.capture import read_capture
 from refgs.settings import load_settings
-from refgs.train.fit import REHEARSED, between, fitting
+from refgs.train.fit import FASTEST, REHEARSED, between, fitting
 from refgs.train.plan import Plan
 
 QUICK, STANDARD = load_settings("quick"), load_settings("standard")
@@ -42,7 +42,9 @@ def test_more_time_brings_more_of_all(ball_capture, tmp_path):
     assert short.surfels.budget == QUICK.surfels.budget and short.train.iterations < QUICK.train.iterations
     assert short.densify.every < QUICK.densify.every and short.indirect.every < QUICK.indirect.every
     assert long.surfels.budget == 150_000 and long.train.iterations > 2 * STANDARD.train.iterations
-    assert short.rates.albedo == 2 * QUICK.rates.albedo and short.rates.decay == QUICK.rates.decay
+    ratio = QUICK.train.iterations / short.train.iterations
+    assert short.rates.albedo == pytest.approx(min(ratio**0.5, FASTEST) * QUICK.rates.albedo, rel=1e-3)
+    assert short.rates.decay == QUICK.rates.decay
     ratio = long.train.iterations / STANDARD.train.iterations
     assert long.rates.position == pytest.approx(STANDARD.rates.position / ratio**0.5, rel=1e-3)
     for less, more in pairwise(found):
