@@ -47,7 +47,8 @@ def outcome(
 
 def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest: int | None = None) -> Found:
     """The rasteriser forward and backward. Of many surfels the reference may take the `nearest`, where these hide the rest."""
-    few = inputs if nearest is None else _nearest(inputs, camera, nearest)
+    order = None if nearest is None else _order(inputs, camera)
+    few = inputs if order is None else [v[order[:nearest]] for v in inputs]
     exact = [v.double().requires_grad_() for v in few]
     *maps, margin = reference.rasterize(*exact, camera, near)
     safe, drawn = margin > MARGIN, maps[2] > 0
@@ -57,18 +58,16 @@ def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest:
     upstream = [
         torch.randn(m.shape, generator=generator) * safe.reshape(safe.shape + (1,) * (m.ndim - 2)) for m in maps
     ]
-    exact_by = torch.autograd.grad(maps, exact, [u.double() for u in upstream], retain_graph=True)
-    exact_by = _learned(exact_by, few)
+    exact_by = _learned(torch.autograd.grad(maps, exact, [u.double() for u in upstream], retain_graph=True), few)
     terms = _terms(maps, upstream, exact, exact_by, generator)
     leaves = [v.clone().requires_grad_() for v in inputs]
     found = rasterize(*leaves, camera, near)
     by = _learned(torch.autograd.grad(found, leaves, upstream), inputs)
-    if nearest is not None:
-        kept = _order(inputs, camera)[:nearest]
-        hidden = [g[_order(inputs, camera)[nearest:]] for g in by]
-        exact_by = [*exact_by, *(torch.zeros_like(g).double() for g in hidden)]
-        terms = [*terms, *exact_by[len(terms) :]]
-        by = [*(g[kept] for g in by), *hidden]
+    if order is not None:
+        hidden = [g[order[nearest:]] for g in by]
+        nothing = [torch.zeros_like(g).double() for g in hidden]
+        exact_by, terms = [*exact_by, *nothing], [*terms, *nothing]
+        by = [*(g[order[:nearest]] for g in by), *hidden]
     return outcome([m.detach()[safe] for m in found], [m.detach()[safe] for m in maps], by, exact_by, terms)
 
 
@@ -106,11 +105,6 @@ def _terms(
 def _order(inputs: Sequence[Tensor], camera: Camera) -> Tensor:
     depth = inputs[0].double() @ torch.from_numpy(camera.world_to_camera[2, :3]) + camera.world_to_camera[2, 3]
     return torch.argsort(depth.float(), stable=True)
-
-
-def _nearest(inputs: Sequence[Tensor], camera: Camera, count: int) -> list[Tensor]:
-    kept = _order(inputs, camera)[:count]
-    return [v[kept] for v in inputs]
 
 
 def shading(features: Tensor, alpha: Tensor, radiance: Tensor, camera: Camera, kink: bool = False) -> Found:

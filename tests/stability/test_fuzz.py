@@ -46,8 +46,7 @@ def drawn(focal, pixels, aspect, edge_on, least, depth, centre) -> None:
     view = camera(focal, centre, (19, 13))
     how = {"pixels": (pixels, 10 * pixels), "aspect": aspect, "edge_on": edge_on, "opacity": (least, 1.0)}
     try:
-        inputs = surfels(view, 25, depth=(0.5 * depth, 2 * depth), **how)
-        check(compare.raster(inputs, view, near=0.1 / max(focal, 1)))
+        check(compare.raster(surfels(view, 25, depth=(0.5 * depth, 2 * depth), **how), view, near=0.1 / max(focal, 1)))
     except compare.Undecided:
         assume(False)
 
@@ -146,9 +145,8 @@ def test_dssim(one, other, spread, seed):
     assert float((by - exact_by).abs().max()) < 2e-2 * float(exact_by.abs().max()) + rounding
 
 
-CARDS_NAN = float(
-    np.uint32(0x7FFFFFFF).view(np.float32)
-)  # what a card's arithmetic makes; the processor's has no low bits
+# What a card's arithmetic makes; the processor's has no low bits.
+CARDS_NAN = float(np.uint32(0x7FFFFFFF).view(np.float32))
 
 
 @FUZZ

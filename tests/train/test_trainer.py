@@ -154,9 +154,8 @@ def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
     for name, value in whole.parameters.items():
         assert torch.equal(value, second.parameters[name]), name
     assert torch.equal(whole.light, second.light)
-    assert (second.exposures is not None) == (
-        changes[0] in (TURNING[0], STAGES[0])
-    )  # of faint surfels nothing is decided
+    # By the stages all surfels are faint when exposures would be judged.
+    assert (second.exposures is not None) == (changes[0] in (TURNING[0], STAGES[0]))
     if second.exposures is not None:
         assert torch.equal(whole.exposures, second.exposures) and whole.exposures.any()
     assert (second.occluder is not None) == (changes[0] == INDIRECT[0])

@@ -203,7 +203,8 @@ struct Metal {
   }
 };
 
-// The sRGB curve (IEC 61966-2-1), unclamped as in refgs.color, and its derivative.
+// The sRGB curve (IEC 61966-2-1), unclamped as in refgs.color, and its derivative. What is no number stays none: of two, `larger` takes
+// the second then.
 INLINE Vector srgb_encode(Vector linear, Vector& derivative) {
   constexpr float LINEAR_END = 0.0031308f;
   Vector x = larger(Vector() + LINEAR_END, linear), square_root = x * inverse_root(x);

@@ -125,11 +125,9 @@ def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: lis
         feature = torch.ones(count, width, device=surfels.positions.device, requires_grad=True)
         with torch.enable_grad():
             blended = rasterize(*discs(surfels, photo.camera), feature, photo.camera, near=near).features
-            one = torch.ones_like(blended[..., :1])
-            weights = one if maps is None else torch.cat([maps[number], one], dim=-1)
-            (
-                blended * weights
-            ).sum().backward()  # of a sum: a gradient that is given has torch load sympy, which takes half a second
+            if maps is not None:
+                blended = blended * torch.cat([maps[number], torch.ones_like(blended[..., :1])], dim=-1)
+            blended.sum().backward()  # for a gradient that is given, torch would load sympy: half a second
         rows.append(feature.grad if maps is not None else feature.grad[:, 0])
     if maps is None:
         return torch.stack(rows)
