@@ -18,7 +18,7 @@ from refgs.model.prefilter import prefilter
 from refgs.model.surfels import activate
 from refgs.render.ssim import dssim
 from refgs.train.adam import Adam
-from tests.kernels import scenes
+from tests.makers import scenes
 
 SIDE, RESOLUTION = 32, 16
 

@@ -15,7 +15,7 @@ from refgs.export.environment import directions
 from refgs.model.environment import Environment
 from refgs.render.shade import shade
 from refgs.report.pictures import composite
-from tests.kernels import scenes
+from tests.makers import scenes
 
 STEPS, RESOLUTION = 500, 16
 
