@@ -220,6 +220,7 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
     from refgs.export.unwrap import layout, unwrap
     from refgs.geometry.extract import extract
     from refgs.geometry.mesh import clean, is_crumbs
+    from refgs.render.comparison import method_of
 
     settings, cameras = run.settings.mesh, run.training_cameras()
     mesh, voxel = extract(run.surfels(), cameras, run.near, run.centre, run.radius, settings.resolution)
@@ -245,7 +246,7 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
 
     splats, light = run.splats, run.environment
     stands = light is not None and light.reference is None
-    if stands and run.occluder is None and run.settings.render.color_space == "linear":
+    if stands and run.occluder is None and not method_of(run.settings.render).light.display:
         splats = unshadowed(splats, run.surfels(), mesh, light)
     textures = bake(mesh, splats, texture or settings.texture, baked)
     report("stage", {"what": "writing"})

@@ -12,7 +12,6 @@ import torch
 from refgs import __version__
 from refgs.camera import Camera
 from refgs.capture import Capture, read_run_cameras, write_cameras
-from refgs.color import srgb_encode
 from refgs.errors import InputError
 from refgs.export.environment import read_environment
 from refgs.export.splats import Splats, read_splats
@@ -21,6 +20,7 @@ from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, from_splats
 from refgs.paths import whole
+from refgs.render.comparison import method_of
 from refgs.render.relight import Progress, Transport, relit
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.settings import Settings, recorded_settings
@@ -162,12 +162,11 @@ def open_run(folder: Path) -> Run:
         raise InputError(f"{folder}: the training has not ended: go on with `refgs train … --out {folder} --resume`")
     cameras, splits, to_capture, exposures = read_run_cameras(folder / "cameras.json")
     splats, environment = read_splats(folder / "splats.ply"), None
-    if (
-        settings.render.reflection != "mirror"
-    ):  # the splats say whether anything is mirrored: edits may have changed that
+    method = method_of(settings.render)
+    if not method.mirror:  # the splats say whether anything is mirrored: edits may have changed that
         reflection = "none" if splats.constants.get("specular") == 0 else "microfacet"
         settings = settings.model_copy(update={"render": settings.render.model_copy(update={"reflection": reflection})})
-    if settings.render.shading != "sh":
+    if method.lit:
         reference = next(c for c, split in zip(cameras, splits, strict=True) if split == "train")
         panorama = read_environment(folder / "environment.exr")
         environment = light_of(panorama, settings, reference if settings.light.frame == "camera" else None)
@@ -192,8 +191,7 @@ def open_run(folder: Path) -> Run:
 
 def light_of(panorama: np.ndarray, settings: Settings, reference: Camera | None = None) -> Environment:
     """An equirectangular picture (H, W, 3) of linear radiance, in Blender's orientation, as the light of a run with these settings."""
-    display = settings.render.color_space == "display"
-    panorama = srgb_encode(panorama) if display else panorama
+    panorama = method_of(settings.render).light.from_linear(panorama)
     return Environment.from_panorama(panorama, settings.environment.resolution, reference)
 
 
