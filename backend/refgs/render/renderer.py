@@ -25,7 +25,7 @@ SIGNED = 1.0  # added to the residual while it is blended: it may be negative, a
 
 
 def near_plane(radius: float) -> float:
-    """The nearest depth that is drawn in a scene of this radius, both in world units."""
+    """The nearest depth that is drawn in a scene of this radius, in world units."""
     return NEAR * radius
 
 
@@ -35,7 +35,7 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 @timed("visibility")
 def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, occluder: Occluder) -> Tensor:
-    """1 where the mirror direction of a pixel is free of the object (H, W), else 0."""
+    """Trace the mirror direction of each pixel: 0 where the object blocks it, else 1 (H, W)."""
     directions = mirror_directions(features, alpha, camera)
     if load.on_gpu(alpha):
         return occluder.tree(alpha.device).visible(directions, alpha, depth, camera)
