@@ -13,11 +13,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from refgs import jobs
 from refgs.capture import read_cameras, read_capture
 from refgs.capture.poses import in_frame
+from refgs.compare.pictures import color_picture, maps, picture, write_png
 from refgs.errors import InputError
-from refgs.export.environment import read_environment, write_exr
+from refgs.formats.exr import write_exr
+from refgs.formats.panorama import read_environment
 from refgs.paths import clone_root
 from refgs.report.figures import DETAILS, HEADLINE, in_words, relit_in_words
-from refgs.report.pictures import color_picture, maps, picture, write_png
 from refgs.run import open_run
 
 console = Console(highlight=False, soft_wrap=True)
@@ -153,8 +154,8 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
 
 def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     """Compare renderings with held-out photos, and with ground truth where there is some; write metrics.json and pictures."""
+    from refgs.compare.truth import GroundTruth
     from refgs.report.evaluate import evaluate as measure
-    from refgs.report.truth import GroundTruth
 
     run = open_run(folder)
     if split not in ("test", "train"):

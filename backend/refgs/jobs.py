@@ -14,7 +14,7 @@ import torch
 
 from refgs.capture import read_capture
 from refgs.errors import InputError, InputWarning
-from refgs.export.splats import read_splats, write_display_splats, write_splats
+from refgs.formats.splats import read_splats, write_display_splats, write_splats
 from refgs.kernels import cuda
 from refgs.lock import RunLock
 from refgs.run import Run, check_free, create_run, open_run, read_run_facts, write_text
@@ -100,7 +100,7 @@ def train(
                     create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
                 held.enter_context(lock)
             held.enter_context(_on_disk([out], "go on with --resume"))
-            trainer.run(lambda: attend(trainer) or lock.attend(trainer))
+            trainer.run(lambda: attend(trainer) or lock.attend(trainer.iteration, trainer.total, trainer.seconds))
         except torch.OutOfMemoryError:
             raise full_card() from None
         except InputError:
@@ -160,7 +160,7 @@ def export(
     """Fuse, clean, unwrap, bake; write the mesh and its textures. Where splats are asked for, they alone, unless the mesh's file is named
     too. Of a PLY file in a run's place, splats only. Returns what was written."""
     from refgs.export.display import displayed
-    from refgs.export.mesh import FOLDER
+    from refgs.formats.textures import FOLDER
 
     alone = folder.suffix.lower() == ".ply" and not folder.is_dir()
     if alone and (mesh_file or not (splats_file or display_file)):
@@ -214,13 +214,14 @@ def export(
 
 def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> None:
     from refgs.export.bake import bake
-    from refgs.export.mesh import write_glb, write_obj
     from refgs.export.outline import bring_out
     from refgs.export.unshadowed import unshadowed
     from refgs.export.unwrap import layout, unwrap
-    from refgs.geometry.extract import extract
+    from refgs.formats.gltf import write_glb
+    from refgs.formats.obj import write_obj
     from refgs.geometry.mesh import clean, is_crumbs
     from refgs.render.comparison import method_of
+    from refgs.render.extract import extract
 
     settings, cameras = run.settings.mesh, run.training_cameras()
     mesh, voxel = extract(run.surfels(), cameras, run.near, run.centre, run.radius, settings.resolution)

@@ -13,9 +13,9 @@ from refgs import __version__
 from refgs.camera import Camera
 from refgs.capture import Capture, read_run_cameras, write_cameras
 from refgs.errors import InputError
-from refgs.export.environment import read_environment
-from refgs.export.splats import Splats, read_splats
-from refgs.geometry.mesh import read_mesh
+from refgs.formats.mesh import read_mesh
+from refgs.formats.panorama import read_environment
+from refgs.formats.splats import Splats, read_splats
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, from_splats

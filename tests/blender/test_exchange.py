@@ -9,13 +9,13 @@ import pytest
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from refgs.export.mesh import write_glb
+from refgs.formats.gltf import write_glb
 from refgs_addon import ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export import export_mesh, export_run
 from refgs_addon.scene.run import data_blocks, import_run
-from tests.export.test_glb import make
+from tests.formats.test_glb import make
 
 IMPORTERS = [
     (".usdc", lambda file: bpy.ops.wm.usd_import(filepath=file, import_textures_mode="IMPORT_NONE")),

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from refgs.export.mesh import write_obj
-from tests.export.test_glb import make
+from refgs.formats.obj import write_obj
+from tests.formats.test_glb import make
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 
 FRAMES = [(1.0, 0.0), (1e-3, 0.0), (1e3, 0.0), (1.0, 1e4)]

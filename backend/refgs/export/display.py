@@ -6,10 +6,10 @@ import numpy as np
 import torch
 
 from refgs.camera import Camera
-from refgs.export.splats import Splats
+from refgs.formats.splats import Splats
+from refgs.model.adam import Adam
 from refgs.render.comparison import draw_colors
 from refgs.run import Run
-from refgs.train.adam import Adam
 
 ITERATIONS = 600
 VIEWS = 120  # rendered to learn from, at most

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
-from refgs.export.environment import directions as panorama_directions
-from refgs.export.environment import sample as sample_panorama
+from refgs.formats.panorama import directions as panorama_directions
+from refgs.formats.panorama import sample as sample_panorama
 from refgs.model import cubemap, harmonics, prefilter
 
 

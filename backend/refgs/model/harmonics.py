@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-DC = 0.5 / math.sqrt(math.pi)  # Y00
+from refgs.formats.splats import DC
 
 # Normalisation constants of the real harmonics (Sloan, "Stupid Spherical Harmonics Tricks", 2008, appendix A2).
 C1 = math.sqrt(3 / (4 * math.pi))

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.clock import timed
-from refgs.export.splats import Splats
+from refgs.formats.splats import Splats
 from refgs.kernels.load import Shared, Work, run
 from refgs.model import harmonics
 

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from refgs.geometry.mesh import smooth_normals
 from refgs.geometry.visibility import Occluder
-from refgs.kernels import reference
 from refgs.model import cubemap, harmonics, prefilter
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.render import reference
 
 DIRECTIONS = 1024  # over the whole sphere
 BOUNCES = 4  # between the object's parts

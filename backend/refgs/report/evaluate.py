@@ -12,16 +12,16 @@ import torch
 from refgs.camera import Camera
 from refgs.capture import LoadedView, View, load_view
 from refgs.color import srgb_encode
-from refgs.export.environment import read_environment
-from refgs.export.mesh import read_glb
+from refgs.compare import metrics, surface
+from refgs.compare.pictures import as_bytes, composite, maps, over_white, picture, write_png
+from refgs.compare.truth import PASSES, GroundTruth, errors, known_maps
+from refgs.formats.gltf import read_glb
+from refgs.formats.panorama import read_environment
 from refgs.kernels import cuda
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.comparison import method_of
 from refgs.render.renderer import render
-from refgs.report import metrics, surface
-from refgs.report.pictures import as_bytes, composite, maps, over_white, picture, write_png
-from refgs.report.truth import PASSES, GroundTruth, errors, known_maps
 from refgs.run import Run
 
 PANORAMA = 256  # rows of the pictures of the light

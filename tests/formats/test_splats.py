@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from refgs.export.splats import Splats, read_splats, write_splats
+from refgs.formats.splats import Splats, read_splats, write_splats
 
 
 def arrays(splats):

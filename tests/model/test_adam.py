@@ -6,7 +6,7 @@ import sys
 import torch
 from torch import Tensor
 
-from refgs.train.adam import Adam
+from refgs.model.adam import Adam
 from tests.kernels import scenes
 
 SHAPES = [(1,), (1000, 3), (20_000,), (777, 4), (5, 2, 3)]

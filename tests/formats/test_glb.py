@@ -10,12 +10,13 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from refgs.color import srgb_encode
-from refgs.export.bake import Textures
-from refgs.export.environment import read_exr
-from refgs.export.mesh import write_glb
-from refgs.export.tangents import vertex_tangents
 from refgs.export.unwrap import unwrap
-from refgs.geometry.mesh import Mesh, smooth_normals
+from refgs.formats.exr import read_exr
+from refgs.formats.gltf import write_glb
+from refgs.formats.mesh import Mesh
+from refgs.formats.tangents import vertex_tangents
+from refgs.formats.textures import Textures
+from refgs.geometry.mesh import smooth_normals
 
 SIZE = 64
 

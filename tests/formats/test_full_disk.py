@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from refgs.errors import InputError
-from refgs.export.bake import Textures
-from refgs.export.environment import write_environment
-from refgs.export.mesh import write_glb
-from refgs.export.splats import write_display_splats, write_splats
+from refgs.formats.gltf import write_glb
+from refgs.formats.panorama import write_environment
+from refgs.formats.splats import write_display_splats, write_splats
+from refgs.formats.textures import Textures
 from refgs.jobs import export
-from tests.export.test_glb import make as box
-from tests.export.test_splats import make
+from tests.formats.test_glb import make as box
+from tests.formats.test_splats import make
 from tests.train.test_disk import fill
 
 RNG = np.random.default_rng(2)

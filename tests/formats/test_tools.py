@@ -12,9 +12,9 @@ from plyfile import PlyData
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from refgs.export.mesh import write_glb
-from refgs.export.splats import Splats, read_splats, write_display_splats
-from tests.export.test_glb import make as box
+from refgs.formats.gltf import write_glb
+from refgs.formats.splats import Splats, read_splats, write_display_splats
+from tests.formats.test_glb import make as box
 
 TOOLS = Path(__file__).parents[1] / "tools"
 NODE = shutil.which("node")
