@@ -220,7 +220,7 @@ def _write_mesh(run: Run, target: Path, texture: int | None, report: Report) -> 
     from refgs.formats.gltf import write_glb
     from refgs.formats.obj import write_obj
     from refgs.geometry.mesh import clean, is_crumbs
-    from refgs.render.comparison import method_of
+    from refgs.render.baselines import method_of
     from refgs.render.extract import extract
 
     settings, cameras = run.settings.mesh, run.training_cameras()

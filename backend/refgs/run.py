@@ -20,7 +20,7 @@ from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, from_splats
 from refgs.paths import whole
-from refgs.render.comparison import method_of
+from refgs.render.baselines import method_of
 from refgs.render.relight import Progress, Transport, relit
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.settings import Settings, recorded_settings

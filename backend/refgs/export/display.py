@@ -8,7 +8,7 @@ import torch
 from refgs.camera import Camera
 from refgs.formats.splats import Splats
 from refgs.model.adam import Adam
-from refgs.render.comparison import draw_colors
+from refgs.render.baselines import draw_colors
 from refgs.run import Run
 
 ITERATIONS = 600

@@ -10,8 +10,8 @@ from refgs.geometry.visibility import Occluder
 from refgs.kernels import load
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.render.baselines import method_of
 from refgs.render.channels import channels
-from refgs.render.comparison import method_of
 from refgs.render.directional import directional
 from refgs.render.rasterize import rasterize
 from refgs.render.rendering import COVERED, Rendering

@@ -20,7 +20,7 @@ from refgs.formats.panorama import read_environment
 from refgs.kernels import cuda
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
-from refgs.render.comparison import method_of
+from refgs.render.baselines import method_of
 from refgs.render.renderer import render
 from refgs.run import Run
 
