@@ -16,7 +16,7 @@ from refgs.render import reference
 from refgs.render.directional import directional
 from refgs.render.facing import facing_normals
 from refgs.render.rasterize import rasterize
-from tests.kernels import scenes
+from tests.makers import scenes
 
 WIDTH, HEIGHT, COUNT = 40, 28, 90
 

@@ -18,7 +18,7 @@ from refgs.model.prefilter import prefilter
 from refgs.model.surfels import activate
 from refgs.render import reference
 from refgs.render.ssim import dssim
-from tests.kernels import scenes
+from tests.makers import scenes
 
 SIDE, RESOLUTION = 32, 16
 

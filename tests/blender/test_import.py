@@ -22,7 +22,7 @@ from refgs_addon.scene.notes import newer
 from refgs_addon.scene.parts import parts, show
 from refgs_addon.scene.run import import_run
 from refgs_addon.scene.splats import MATERIALS, normal_slopes, read_splats
-from tests.blender.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
+from tests.makers.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
 
 
 def values(data, name, width=1, field="value"):

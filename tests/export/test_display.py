@@ -16,8 +16,8 @@ from refgs.jobs import export
 from refgs.model.surfels import from_splats
 from refgs.render.renderer import render
 from refgs.run import open_run
-from tests.formats.test_splats import make
-from tests.report.test_evaluate import write_run
+from tests.makers.ball import write_run
+from tests.makers.splats import make
 
 
 @pytest.fixture(scope="module")

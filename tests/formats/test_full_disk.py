@@ -13,15 +13,15 @@ from refgs.formats.panorama import write_environment
 from refgs.formats.splats import write_display_splats, write_splats
 from refgs.formats.textures import Textures
 from refgs.jobs import export
-from tests.formats.test_glb import make as box
-from tests.formats.test_splats import make
-from tests.train.test_disk import fill
+from tests.makers.box import textured_box
+from tests.makers.disk import fill
+from tests.makers.splats import make
 
 RNG = np.random.default_rng(2)
 
 
-def textured_box(path, side):
-    mesh, textures = box()
+def noisy_box(path, side):
+    mesh, textures = textured_box()
     maps = {field.name: getattr(textures, field.name) for field in dataclasses.fields(textures)}
     del maps["specular"]
     noise = {name: RNG.random((side, side, *value.shape[2:])).astype(np.float32) for name, value in maps.items()}
@@ -32,7 +32,7 @@ WRITERS = {  # with a size, in some thousands of bytes at least
     "splats.ply": lambda path, size: write_splats(path, make(10 * size)),
     "display.ply": lambda path, size: write_display_splats(path, make(10 * size)),
     "environment.exr": lambda path, size: write_environment(path, RNG.random((2 * size, 4 * size, 3))),
-    "mesh.glb": lambda path, size: textured_box(path, 4 * size),
+    "mesh.glb": lambda path, size: noisy_box(path, 4 * size),
 }
 
 

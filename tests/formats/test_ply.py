@@ -15,7 +15,7 @@ from refgs.errors import InputError, InputWarning
 from refgs.formats.ply import read_ply
 from refgs.formats.splats import read_splats, write_display_splats, write_splats
 from refgs.jobs import export
-from tests.formats.test_splats import arrays, make
+from tests.makers.splats import arrays, make
 
 COUNT = 50
 GEOMETRY = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "rot_0", "rot_1", "rot_2", "rot_3"]

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from refgs.formats.gltf import write_glb
 from refgs.formats.splats import Splats, read_splats, write_display_splats
-from tests.formats.test_glb import make as box
+from tests.makers.box import textured_box
 
 TOOLS = Path(__file__).parents[1] / "tools"
 NODE = shutil.which("node")
@@ -141,7 +141,7 @@ def test_gltf_of_splats(tmp_path):
 
 @pytest.mark.parametrize("specular", [1.0, 0.0])
 def test_the_mesh_is_valid_gltf(tmp_path, specular):
-    mesh, textures = box()
+    mesh, textures = textured_box()
     write_glb(tmp_path / "un maillage.glb", mesh, replace(textures, specular=specular))
     report = json.loads(said("validate.js", tmp_path / "un maillage.glb"))
     issues = [(m["code"], m["message"], m.get("pointer")) for m in report["issues"]["messages"] if m["severity"] < 2]

@@ -8,7 +8,7 @@ import trimesh
 from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.render import renderer
-from tests.kernels import scenes
+from tests.makers import scenes
 
 
 def rings() -> trimesh.Trimesh:

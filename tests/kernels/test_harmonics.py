@@ -18,7 +18,7 @@ from refgs.render import reference
 from refgs.render.directional import directional
 from refgs.render.renderer import render
 from refgs.settings import load_settings
-from tests.kernels import scenes
+from tests.makers import scenes
 
 
 def surfels(coefficients: int, count: int = 1000):

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from refgs.render import reference
 from refgs.render.facing import facing_normals
-from tests.kernels import scenes
+from tests.makers import scenes
 
 
 def surfels(count: int = 1000) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from refgs.camera import Camera
 from refgs.model.environment import Environment
 from refgs.render import reference
 from refgs.render.shade import mirror_directions, shade, shade_splats
-from tests.kernels import scenes
+from tests.makers import scenes
 
 NAMES = ("features", "alpha", "levels", "exposure")
 # Pixels nearer to a kink of their derivatives than this are left out of the gradients; their share is checked.

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from refgs.model.adam import Adam
-from tests.kernels import scenes
+from tests.makers import scenes
 
 SHAPES = [(1,), (1000, 3), (20_000,), (777, 4), (5, 2, 3)]
 RATES = [1e-3, 0.0, 3e-2, 1e-4, 1.0]

@@ -15,7 +15,7 @@ from refgs.model import prefilter
 from refgs.render import raster_cuda, shade
 from refgs.settings import load_settings
 from refgs.train.trainer import Trainer
-from tests.kernels.emulate import emulate
+from tests.makers.emulate import emulate
 
 CARD = torch.device("cuda:0")
 

@@ -15,7 +15,7 @@ from refgs.run import create_run
 from refgs.settings import load_settings
 from refgs.train import history
 from refgs.train.trainer import Trainer
-from tests.kernels import scenes
+from tests.makers import scenes
 
 SMALL = [
     "surfels.start=600",

@@ -15,7 +15,7 @@ from refgs.compare.pictures import composite
 from refgs.formats.panorama import directions
 from refgs.model.environment import Environment
 from refgs.render.shade import shade
-from tests.kernels import scenes
+from tests.makers import scenes
 
 STEPS, RESOLUTION = 500, 16
 

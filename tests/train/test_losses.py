@@ -12,8 +12,8 @@ from refgs.render.reference import unit
 from refgs.render.renderer import COVERED, Rendering
 from refgs.settings import LossSettings
 from refgs.train.losses import Photo, objective
-from tests.kernels import scenes
-from tests.kernels.emulate import emulate
+from tests.makers import scenes
+from tests.makers.emulate import emulate
 
 DARK, FLAT = 0.1, 0.01
 ALL = LossSettings(

@@ -19,7 +19,7 @@ from refgs.render.shade import shade
 from refgs.settings import load_settings
 from refgs.train.densify import ScreenGradient, faint
 from refgs.train.guard import MOST_IN_A_ROW, Guard, limits, remove_broken, running
-from tests.kernels import scenes
+from tests.makers import scenes
 
 
 def learner(device):
