@@ -13,7 +13,7 @@ from refgs.geometry.visibility import Occluder
 from refgs.model import cubemap, harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
-from refgs.render import relight
+from refgs.render import reference, relight
 from refgs.render.directional import directional
 from tests.makers.occluders import bowl, even, mirrors, plate, surfels
 
