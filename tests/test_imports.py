@@ -24,7 +24,7 @@ def write(root, files):
         "backend/refgs/model/__init__.py": "",
         "backend/refgs/model/surfels.py": "import torch\nfrom refgs.camera import Camera",
         "backend/refgs/train/__init__.py": "",
-        "backend/refgs/train/loop.py": "from refgs.model import surfels\nfrom refgs.model.adam import Adam",
+        "backend/refgs/train/loop.py": "from refgs.model import surfels\nfrom refgs.train.adam import Adam",
         "backend/refgs/train/adam.py": "from refgs.model.surfels import Surfels",
         "refgs_addon/__init__.py": "import bpy",
         "refgs_addon/jobs.py": "from . import errors",
