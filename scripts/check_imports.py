@@ -23,7 +23,7 @@ FLOORS = (
     ("geometry",),
     ("render",),
     ("capture",),
-    ("lock", "run"),
+    ("lock", "run", "run_folder"),
     ("compare",),
     ("train",),
     ("export",),

@@ -24,7 +24,7 @@ def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
 
     words = [*SMALL, "train.iterations=80", "train.checkpoint_every=20"]
     with pytest.raises(
-        InputError, match=r"run is no longer there: put its disk back, then go on with --resume"
+        InputError, match=r"run is no longer there: put its disk back, then resume with --resume"
     ) as said:
         train(ball_capture, disk / "run", take_out, *words)
     assert "\n" not in str(said.value)

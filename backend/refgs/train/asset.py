@@ -15,9 +15,10 @@ from refgs.formats.splats import write_splats
 from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, to_splats
+from refgs.paths import write_text
 from refgs.render.rasterize import rasterize
 from refgs.render.volume import discs, with_normals_last
-from refgs.run import OCCLUDER, write_text
+from refgs.run import OCCLUDER
 from refgs.train import needs
 from refgs.train.trainer import Trainer
 
