@@ -149,7 +149,7 @@ class RateSettings(_Section):
     sh_rest: float = Field(ge=0, description="colour, SH degrees above 0")
     residual: float = Field(ge=0, description="residual colour (section residual)")
     albedo: float = Field(ge=0, description="logit of the albedo")
-    metallic: float = Field(ge=0, description="logit of the metallic")
+    metallic: float = Field(ge=0, description="metallic, as the logit of its inverse smoothstep")
     roughness: float = Field(ge=0, description="logit of the roughness")
     indirect_dc: float = Field(ge=0, description="indirect light, SH degree 0")
     indirect_rest: float = Field(ge=0, description="indirect light, SH degrees above 0")

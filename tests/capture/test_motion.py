@@ -8,7 +8,7 @@ from makers import look_at, write
 from scipy.ndimage import map_coordinates
 
 from refgs.capture import read_capture
-from refgs.capture.motion import AGAINST, ALL_PAIRS, CONTRADICTED, against, find_cameras, pairs
+from refgs.capture.motion import ALL_PAIRS, CONTRADICTED, MATCH_TOLERANCE, epipolar_distance, find_cameras, pairs
 from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.errors import InputError, NoCameras
 
@@ -143,8 +143,11 @@ def test_what_stands_still_contradicts_what_turns():
         """Of the matches of photos that are at most so far apart in the turn."""
         near = [(a, b) for a, b in pairs(count) if min(b - a, count - b + a) <= reach]
         ways = [(poses[b] @ np.linalg.inv(poses[a]))[:3] for a, b in near]
-        far = [against(places[a][features], places[b][features], way) for (a, b), way in zip(near, ways, strict=True)]
-        return np.concatenate(far) * focal > AGAINST
+        far = [
+            epipolar_distance(places[a][features], places[b][features], way)
+            for (a, b), way in zip(near, ways, strict=True)
+        ]
+        return np.concatenate(far) * focal > MATCH_TOLERANCE
 
     of_block, of_room = (6, slice(100)), (count, slice(100, None))  # the block's features are hidden six photos on
     for poses in (around, inside):

@@ -1,10 +1,10 @@
-"""COLMAP: a sparse model in `sparse/0` or `sparse`, binary or text, with the photos in `images` or beside it.
+"""Read COLMAP captures: a sparse model in `sparse/0` or `sparse`, binary or text, with photos in `images` or beside it.
 
-Ref-NeRF's real scenes and mip-NeRF 360's have the photos reduced as well, in `images_2`, `images_4` and `images_8`:
-naming such a folder takes its photos, which may have another ending than those in the model.
+Ref-NeRF's real scenes and mip-NeRF 360's also have reduced photos in `images_2`, `images_4` and `images_8`. Naming such a folder
+uses its photos; their suffix may differ from that in the model.
 
-The files are those of COLMAP's documentation, "Output Format". COLMAP's own reader is a large dependency that answers
-a file cut short with an unrelated message or a request for terabytes of memory; this one names the file.
+COLMAP's documentation describes the files under "Output Format". COLMAP's own reader answers a truncated file with an unrelated
+message, or asks for terabytes of memory; this one names the file.
 """
 
 import re
@@ -55,9 +55,9 @@ class _Image:
 
 
 def find_model(folder: Path) -> tuple[Path, Path] | None:
-    """The folders of a capture's photos and of its sparse model, None where there is no model.
+    """Return the folders of a capture's photos and of its sparse model; None without a model.
 
-    `folder` is the capture's, or that of its reduced photos.
+    `folder` is the capture's, or one with its reduced photos.
     """
     reduced = re.fullmatch(r"images_\d+", folder.name)
     root, photos = (folder.parent, folder) if reduced else (folder, folder / "images")
@@ -70,7 +70,7 @@ def find_model(folder: Path) -> tuple[Path, Path] | None:
 
 
 def read_colmap(photos: Path, model: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None]:
-    """The views, points (M, 3) and their colours (M, 3) in 0..1, in the model's frame. Raises InputError."""
+    """Read the views, points (M, 3) and their colours (M, 3) in 0..1, in the model's frame. Raises InputError."""
     suffix = ".bin" if (model / "images.bin").is_file() else ".txt"
     cameras_file, images_file, points_file = (model / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
     for file in (cameras_file, images_file):
@@ -116,7 +116,7 @@ def _camera(image: _Image, intrinsics: _Intrinsics, where: str) -> tuple[Camera,
         raise InputError(f"{where}: focal length or size is zero, negative or NaN. Export the sparse model again.")
     qw, qx, qy, qz, *translation = image.pose
     rotation = _rotation(np.array([qw, qx, qy, qz]))
-    # Through camera-to-world, so that the one check of poses sees it.
+    # Via camera-to-world, because `world_to_camera` checks poses.
     camera_to_world = np.column_stack([rotation.T, -rotation.T @ translation])
     pose = world_to_camera(camera_to_world, where)
     name = camera_name(image.name)
@@ -125,7 +125,7 @@ def _camera(image: _Image, intrinsics: _Intrinsics, where: str) -> tuple[Camera,
 
 
 def _rotation(q: np.ndarray) -> np.ndarray:
-    """The rotation matrix of a quaternion wxyz, normalised; NaN for a zero one."""
+    """Return the rotation matrix of a quaternion wxyz, which need not be normalised. A zero one gives NaN."""
     with np.errstate(invalid="ignore"):
         w, x, y, z = q / np.linalg.norm(q)
     return np.array(
@@ -141,11 +141,11 @@ def _parse(file: Path, parser):
     try:
         return parser(file)
     except (struct.error, ValueError, IndexError, OverflowError) as error:
-        raise InputError(f"{file}: the file is cut short or not COLMAP's. Export the sparse model again.") from error
+        raise InputError(f"{file}: the file is truncated or not COLMAP's. Export the sparse model again.") from error
 
 
 class _Bytes:
-    """A binary file read from front to back; struct.error where it ends too early."""
+    """Read a binary file from front to back. Raises struct.error if it is truncated."""
 
     def __init__(self, file: Path):
         self.data, self.at = file.read_bytes(), 0
@@ -165,7 +165,7 @@ class _Bytes:
     def skip(self, count: int) -> None:
         self.at += count
         if self.at > len(self.data):
-            raise ValueError("cut short")
+            raise ValueError("truncated")
 
 
 def _binary_cameras(file: Path) -> dict[int, _Intrinsics]:
@@ -203,7 +203,7 @@ def _points(rows: list) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _entries(file: Path, lines_each: int = 1) -> list[str]:
-    """The first line of each entry; ValueError where there are fewer than the file's own header counts."""
+    """Return the first line of each entry. Raises ValueError if there are fewer than the file's header counts."""
     lines = file.read_text(encoding="utf-8").splitlines()
     entries = [line for line in lines if not line.startswith("#") and (lines_each > 1 or line.strip())]
     while entries and not entries[-1].strip():  # an image's line of keypoints may be empty
