@@ -89,7 +89,7 @@ def test_a_run_of_before_a_setting_still_opens():
     opened = recorded_settings(recorded, "run.toml")
     assert opened.train == settings.train
     assert opened.mesh == load_settings("standard").mesh
-    assert (opened.light.frame, opened.light.exposure) == ("world", "off")  # as it then was
+    assert (opened.light.frame, opened.light.exposure) == ("world", "off")  # as in runs before these keys
 
 
 @pytest.mark.parametrize(

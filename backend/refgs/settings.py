@@ -96,7 +96,7 @@ class EnvironmentSettings(_Section):
 
 
 class LightSettings(_Section):
-    """How light and exposure vary between photos."""
+    """Light and exposure that vary between photos."""
 
     frame: Literal["auto", "world", "camera"] = Field(
         description="light fixed to the world, or to the camera as on a turntable; auto: found from the photos"

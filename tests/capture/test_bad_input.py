@@ -1,4 +1,4 @@
-"""What is wrong with a capture is said in one line that names the place."""
+"""Wrong captures are refused with one line that names the place."""
 
 import json
 import pickle
@@ -12,7 +12,7 @@ from refgs.errors import InputError
 
 
 def refused(read, *parts: str) -> None:
-    """`read` raises an InputError of one line that holds all `parts`."""
+    """Assert that `read` raises an InputError of one line that holds all `parts`."""
     with pytest.raises(InputError) as error:
         read()
     message = str(error.value)
