@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from refgs import jobs
 from refgs.capture import read_cameras, read_capture
 from refgs.capture.poses import in_frame
+from refgs.compare.pictures import color_picture, maps, picture, write_png
 from refgs.errors import InputError
 from refgs.paths import clone_root
 from refgs.run_folder import check_finished
@@ -115,8 +116,7 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
     if format not in ("png", "exr"):
         raise InputError(f"--format {format}: take png or exr")
     check_finished(folder)  # before torch is imported
-    from refgs.export.environment import write_exr
-    from refgs.report.pictures import color_picture, maps, picture, write_png
+    from refgs.formats.exr import write_exr
     from refgs.run import open_run
 
     run = open_run(folder)
@@ -154,7 +154,7 @@ def _check_passes(run, passes: list[str], format: str) -> None:
 
 def _relight(run, hdri: Path):
     """Return the light of a panorama; inter-reflection under it is traced here, where the run has any."""
-    from refgs.export.environment import read_environment
+    from refgs.formats.panorama import read_environment
 
     if run.environment is None:
         raise InputError("--hdri: a run with shading = sh has no materials to relight")
@@ -170,9 +170,9 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     if split not in ("test", "train"):
         raise InputError(f"--split {split}: take test or train")
     check_finished(folder)  # before torch is imported
+    from refgs.compare.truth import GroundTruth
     from refgs.report.evaluate import evaluate as measure
     from refgs.report.figures import DETAILS, HEADLINE, in_words, relit_in_words
-    from refgs.report.truth import GroundTruth
     from refgs.run import open_run
 
     run = open_run(folder)

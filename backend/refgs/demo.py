@@ -10,11 +10,11 @@ import time
 from pathlib import Path
 
 from refgs import commands, jobs
+from refgs.compare import metrics
+from refgs.compare.truth import read_relit
 from refgs.errors import InputError
 from refgs.paths import clone_root
-from refgs.report import metrics
 from refgs.report.page import write_report
-from refgs.report.truth import read_relit
 
 SCENE = "jar"
 HDRIS = ("studio", "courtyard")  # shipped with Blender; the capture is lit by another one

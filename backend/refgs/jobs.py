@@ -22,7 +22,7 @@ from refgs.settings import Settings, load_settings
 from refgs.train.plan import Plan
 
 if TYPE_CHECKING:
-    from refgs.export.splats import Splats
+    from refgs.formats.splats import Splats
     from refgs.run import Run
     from refgs.train.trainer import Trainer
 
@@ -267,7 +267,7 @@ def _check_names(target: Path | None, splats: list[Path]) -> None:
 
 def _mesh_files(target: Path | None) -> list[Path]:
     """Return the mesh's file and what is written beside it."""
-    from refgs.export.mesh import FOLDER
+    from refgs.formats.textures import FOLDER
 
     if target is None:
         return []
@@ -283,7 +283,7 @@ def _check_absent(files: list[Path], overwrite: bool) -> None:
 
 def _read_source(folder: Path, is_run: bool, report: Report) -> "tuple[Run | None, Splats]":
     """Open the run, or read the PLY file of splats; report what was left out of it."""
-    from refgs.export.splats import read_splats
+    from refgs.formats.splats import read_splats
     from refgs.run import open_run
 
     with warnings.catch_warnings(record=True) as caught:
@@ -305,7 +305,7 @@ def _make_folders(folders: list[Path]) -> None:
 
 def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, display: Path | None, report: Report) -> None:
     from refgs.export.display import displayed
-    from refgs.export.splats import write_display_splats, write_splats
+    from refgs.formats.splats import write_display_splats, write_splats
 
     def learned(done: int, total: int) -> None:
         if done % 10 == 0:
@@ -323,7 +323,8 @@ def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, displa
 def _write_mesh(run: "Run", target: Path, texture: int | None, report: Report) -> None:
     """Fuse, simplify, unwrap and bake the mesh, and write it with its textures."""
     from refgs.export.bake import bake
-    from refgs.export.mesh import write_glb, write_obj
+    from refgs.formats.gltf import write_glb
+    from refgs.formats.obj import write_obj
 
     mesh = _make_mesh(run, report)
 
@@ -340,8 +341,8 @@ def _make_mesh(run: "Run", report: Report) -> Any:
     """Return the simplified mesh with texture coordinates."""
     from refgs.export.outline import bring_out
     from refgs.export.unwrap import layout, unwrap
-    from refgs.geometry.extract import extract
     from refgs.geometry.mesh import clean, is_crumbs
+    from refgs.render.extract import extract
 
     settings, cameras = run.settings.mesh, run.training_cameras()
     mesh, voxel = extract(run.surfels(), cameras, run.near, run.centre, run.radius, settings.resolution)
@@ -364,10 +365,11 @@ def _make_mesh(run: "Run", report: Report) -> Any:
 def _baked_splats(run: "Run", mesh: Any) -> "Splats":
     """Return the splats to bake: shadows are taken out where the recovered light cannot have accounted for them."""
     from refgs.export.unshadowed import unshadowed
+    from refgs.render.baselines import method_of
 
     light = run.environment
     stands = light is not None and light.reference is None
-    if stands and run.occluder is None and run.settings.render.color_space == "linear":
+    if stands and run.occluder is None and not method_of(run.settings.render).light.display:
         return unshadowed(run.splats, run.surfels(), mesh, light)
     return run.splats
 

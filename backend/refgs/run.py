@@ -14,15 +14,15 @@ import torch
 from refgs import __version__
 from refgs.camera import Camera
 from refgs.capture import Capture, read_run_cameras, write_cameras
-from refgs.color import srgb_encode
 from refgs.errors import InputError
-from refgs.export.environment import read_environment
-from refgs.export.splats import Splats, read_splats
-from refgs.geometry.mesh import read_mesh
+from refgs.formats.mesh import read_mesh
+from refgs.formats.panorama import read_environment
+from refgs.formats.splats import Splats, read_splats
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, from_splats
 from refgs.paths import write_text
+from refgs.render.baselines import method_of
 from refgs.render.relight import Progress, Transport, relit
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.run_folder import check_finished, check_free
@@ -137,10 +137,11 @@ def open_run(folder: Path) -> Run:
     facts, settings = check_finished(folder)
     cameras, splits, to_capture, exposures = read_run_cameras(folder / "cameras.json")
     splats, environment = read_splats(folder / "splats.ply"), None
-    if settings.render.reflection != "mirror":  # edits may have added or removed specular: the splats know
+    method = method_of(settings.render)
+    if not method.mirror:  # edits may have added or removed specular shading: the splats know
         reflection = "none" if splats.constants.get("specular") == 0 else "microfacet"
         settings = settings.model_copy(update={"render": settings.render.model_copy(update={"reflection": reflection})})
-    if settings.render.shading != "sh":
+    if method.lit:
         reference = next(c for c, split in zip(cameras, splits, strict=True) if split == "train")
         panorama = read_environment(folder / "environment.exr")
         environment = light_of(panorama, settings, reference if settings.light.frame == "camera" else None)
@@ -165,6 +166,5 @@ def open_run(folder: Path) -> Run:
 
 def light_of(panorama: np.ndarray, settings: Settings, reference: Camera | None = None) -> Environment:
     """Make the light of a run of an equirectangular picture (H, W, 3): linear radiance, in Blender's orientation."""
-    display = settings.render.color_space == "display"
-    panorama = srgb_encode(panorama) if display else panorama
+    panorama = method_of(settings.render).light.from_linear(panorama)
     return Environment.from_panorama(panorama, settings.environment.resolution, reference)
