@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from refgs.export.mesh import write_glb
+from refgs.formats.gltf import write_glb
 from refgs_addon import ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit

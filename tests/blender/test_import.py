@@ -11,7 +11,7 @@ from mathutils import Vector
 from plyfile import PlyData, PlyElement
 
 from refgs.errors import InputWarning
-from refgs.export.splats import read_splats as read_by_refgs
+from refgs.formats.splats import read_splats as read_by_refgs
 from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.splats import EXTENT, NAME

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from refgs.export.mesh import write_obj
+from refgs.formats.obj import write_obj
 from tests.makers.box import textured_box
 
 

@@ -6,7 +6,7 @@ import torch
 import trimesh
 
 from refgs.export.unshadowed import LEAST, unshadowed
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.model.surfels import to_splats
 from tests.makers.occluders import bowl, even, mirrors, surfels
 

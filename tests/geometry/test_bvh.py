@@ -5,7 +5,7 @@ import pytest
 import torch
 import trimesh
 
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.render import renderer
 from tests.makers import scenes

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from tests.makers.occluders import plate
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from benchmarks.stability import compare
 from benchmarks.stability.geometry import camera, surfels
 from benchmarks.stability.material import lit, rays, steps
-from refgs.kernels import reference
 from refgs.model.surfels import activate
+from refgs.render import reference
 from refgs.render.rasterize import rasterize
 from refgs.render.ssim import dssim
 

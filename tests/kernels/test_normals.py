@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from refgs.kernels import reference
+from refgs.render import reference
 from refgs.render.facing import facing_normals
 from tests.makers import scenes
 

@@ -11,8 +11,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from refgs.kernels import load, reference
-from refgs.render import raster_cuda
+from refgs.kernels import load
+from refgs.render import raster_cuda, reference
 from refgs.render.rasterize import Raster, rasterize, trimmed_depth
 from tests.makers import scenes
 from tests.makers.emulate import emulate

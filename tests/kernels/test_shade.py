@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
-from refgs.kernels import reference
 from refgs.model.environment import Environment
+from refgs.render import reference
 from refgs.render.shade import mirror_directions, shade, shade_splats
 from tests.makers import scenes
 

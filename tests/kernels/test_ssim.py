@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from refgs.kernels import reference
+from refgs.render import reference
 from refgs.render.ssim import dssim
 from tests.makers import scenes
 

@@ -6,8 +6,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scenes.analytic import sky
-from refgs.export.environment import directions, write_environment
-from refgs.export.splats import write_splats
+from refgs.formats.panorama import directions, write_environment
+from refgs.formats.splats import write_splats
 from refgs.model.surfels import activate, initial_parameters, to_splats
 from refgs.run import create_run
 from refgs.settings import load_settings

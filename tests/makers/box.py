@@ -1,9 +1,10 @@
 import numpy as np
 import trimesh
 
-from refgs.export.bake import Textures
 from refgs.export.unwrap import unwrap
-from refgs.geometry.mesh import Mesh, smooth_normals
+from refgs.formats.mesh import Mesh
+from refgs.formats.textures import Textures
+from refgs.geometry.mesh import smooth_normals
 
 SIZE = 64
 

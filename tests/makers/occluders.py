@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, quaternions_towards

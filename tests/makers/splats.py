@@ -1,6 +1,6 @@
 import numpy as np
 
-from refgs.export.splats import Splats
+from refgs.formats.splats import Splats
 
 
 def arrays(splats):

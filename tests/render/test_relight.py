@@ -8,13 +8,12 @@ import torch
 import trimesh
 
 from refgs.camera import Camera
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
-from refgs.kernels import reference
 from refgs.model import cubemap, harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
-from refgs.render import relight
+from refgs.render import reference, relight
 from refgs.render.directional import directional
 from tests.makers.occluders import bowl, even, mirrors, plate, surfels
 

@@ -14,13 +14,14 @@ from benchmarks.terms import PARTS, terms
 from refgs import commands, jobs
 from refgs.capture import read_capture
 from refgs.color import srgb_encode
+from refgs.compare import surface
+from refgs.compare.pictures import maps
+from refgs.compare.truth import GroundTruth
 from refgs.errors import InputError
-from refgs.export.environment import directions, write_environment, write_exr
-from refgs.export.splats import read_splats, write_splats
+from refgs.formats.exr import write_exr
+from refgs.formats.panorama import directions, write_environment
+from refgs.formats.splats import read_splats, write_splats
 from refgs.model.environment import Environment
-from refgs.report import surface
-from refgs.report.pictures import maps
-from refgs.report.truth import GroundTruth
 from refgs.run import open_run
 from tests.makers.ball import BOX, MOVE, SCALE, TURN, write_run
 
@@ -158,7 +159,7 @@ def test_normals_that_a_data_set_brings_are_the_truth_where_there_is_no_other(ma
         images = maps(there.render(view.camera))
         return np.where(images["alpha"][..., None] > 0.5, -images["normal"] @ TURN.T, 0), images["alpha"]
 
-    monkeypatch.setattr("refgs.report.truth.published_normals", published)
+    monkeypatch.setattr("refgs.compare.truth.published_normals", published)
     commands.evaluate(run, "test", None)
     assert len(asked) == 4 and figures(run)["normal_mae_degrees"] == pytest.approx(180, abs=0.1)
     commands.evaluate(run, "test", truth)

@@ -11,12 +11,12 @@ from benchmarks.stability.optimisation import nan_gradient, nan_value, resumed
 from benchmarks.stability.training import trainer
 from refgs.capture import read_capture
 from refgs.errors import InputError
+from refgs.model.adam import Adam
 from refgs.model.environment import Environment
 from refgs.render.directional import directional
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import shade
 from refgs.settings import load_settings
-from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, faint
 from refgs.train.guard import MOST_IN_A_ROW, Guard, limits, remove_broken, running
 from tests.makers import scenes

@@ -6,7 +6,7 @@ import torch
 
 from benchmarks.scenes.analytic import TWO, meet, write_ball_capture
 from refgs.capture import read_capture
-from refgs.report.pictures import composite
+from refgs.compare.pictures import composite
 from refgs.run import create_run, open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset

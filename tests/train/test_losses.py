@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from refgs.kernels import reference as oracle
-from refgs.kernels.reference import unit
+from refgs.render import reference as oracle
+from refgs.render.reference import unit
 from refgs.render.renderer import COVERED, Rendering
 from refgs.settings import LossSettings
 from refgs.train.losses import Photo, objective

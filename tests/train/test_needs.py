@@ -12,8 +12,8 @@ import torch
 
 from benchmarks.scenes.analytic import write_ball_capture
 from refgs.capture import read_capture
-from refgs.export.splats import read_splats
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
+from refgs.formats.splats import read_splats
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.run import open_run

@@ -14,7 +14,7 @@ import torch
 from benchmarks.scenes.analytic import F0, ONE, meet, sky
 from refgs.capture import read_capture
 from refgs.errors import InputError
-from refgs.export.environment import directions
+from refgs.formats.panorama import directions
 from refgs.model import harmonics
 from refgs.model.surfels import to_splats
 from refgs.run import open_run

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from refgs.errors import InputError
-from refgs.export.bake import Textures
-from refgs.export.environment import write_environment
-from refgs.export.mesh import write_glb
-from refgs.export.splats import write_display_splats, write_splats
+from refgs.formats.gltf import write_glb
+from refgs.formats.panorama import write_environment
+from refgs.formats.splats import write_display_splats, write_splats
+from refgs.formats.textures import Textures
 from refgs.jobs import export
 from tests.makers.box import textured_box
 from tests.makers.disk import fill

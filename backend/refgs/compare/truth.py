@@ -7,10 +7,11 @@ import numpy as np
 from refgs.camera import Camera
 from refgs.capture import View, published_normals
 from refgs.capture.poses import split_similarity
+from refgs.compare import metrics
 from refgs.errors import InputError
-from refgs.export.environment import directions, read_environment, read_exr, sample
-from refgs.geometry.mesh import Mesh, read_mesh
-from refgs.report import metrics
+from refgs.formats.exr import read_exr
+from refgs.formats.mesh import Mesh, read_mesh
+from refgs.formats.panorama import directions, read_environment, sample
 
 FOLDER = "ground_truth"  # in a capture, where one brings its own
 PASSES = ("normal", "albedo", "roughness", "metallic", "visibility")

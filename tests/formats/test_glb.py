@@ -10,9 +10,9 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from refgs.color import srgb_encode
-from refgs.export.environment import read_exr
-from refgs.export.mesh import write_glb
-from refgs.export.tangents import vertex_tangents
+from refgs.formats.exr import read_exr
+from refgs.formats.gltf import write_glb
+from refgs.formats.tangents import vertex_tangents
 from tests.makers.box import textured_box
 
 

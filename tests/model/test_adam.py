@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from refgs.train.adam import Adam
+from refgs.model.adam import Adam
 from tests.makers import scenes
 
 SHAPES = [(1,), (1000, 3), (20_000,), (777, 4), (5, 2, 3)]

@@ -7,7 +7,7 @@ from embreex.rtcore_scene import EmbreeScene
 from scipy.spatial import cKDTree
 
 from refgs.camera import Camera
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 
 POINTS = 100_000  # on each mesh, evenly by area
 _NEAREST = 4  # of them, and as many centres of triangles: in those triangles the nearest point of a mesh is looked for

@@ -19,8 +19,8 @@ from scipy.optimize import linear_sum_assignment
 from skimage.metrics import structural_similarity
 
 from refgs.color import srgb_decode
-from refgs.export.environment import directions
-from refgs.report.pictures import over_white
+from refgs.compare.pictures import over_white
+from refgs.formats.panorama import directions
 
 COVERED = 0.5  # of a pixel: from here on it is the object's
 

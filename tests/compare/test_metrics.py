@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from refgs.color import srgb_decode, srgb_encode
-from refgs.export.environment import directions, sample
-from refgs.report import metrics
+from refgs.compare import metrics
+from refgs.formats.panorama import directions, sample
 
 RANDOM = np.random.default_rng(7)
 

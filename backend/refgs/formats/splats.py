@@ -1,5 +1,6 @@
 """splats.ply: one row a splat, in the property names of 3D Gaussian splatting, with materials."""
 
+import math
 import os
 import re
 import warnings
@@ -12,8 +13,9 @@ from plyfile import PlyElement, PlyListProperty, PlyProperty
 
 from refgs.color import srgb_decode
 from refgs.errors import InputError, InputWarning
-from refgs.export.ply import read_ply, write_ply
-from refgs.model.harmonics import DC
+from refgs.formats.ply import read_ply, write_ply
+
+DC = 0.5 / math.sqrt(math.pi)  # Y00: a constant harmonic f_dc shows the colour 0.5 + DC · f_dc
 
 
 @dataclass

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from refgs.camera import Camera
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.project import inside, project
 from refgs.geometry.tsdf import fuse
 from refgs.model.surfels import Surfels

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from refgs.camera import Camera
-from refgs.geometry.mesh import Mesh
-from refgs.report import surface
+from refgs.compare import surface
+from refgs.formats.mesh import Mesh
 
 
 def ball(radius=1.0, subdivisions=5, centre=(0, 0, 0)):

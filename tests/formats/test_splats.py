@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from refgs.export.splats import read_splats, write_splats
+from refgs.formats.splats import read_splats, write_splats
 from tests.makers.splats import arrays, make
 
 

@@ -12,8 +12,8 @@ from plyfile import PlyData
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from refgs.export.mesh import write_glb
-from refgs.export.splats import Splats, read_splats, write_display_splats
+from refgs.formats.gltf import write_glb
+from refgs.formats.splats import Splats, read_splats, write_display_splats
 from tests.makers.box import textured_box
 
 TOOLS = Path(__file__).parents[1] / "tools"

@@ -4,8 +4,8 @@ import torch
 import trimesh
 from benchmarks.distances import around, look_at
 
-from refgs.geometry import extract as module
-from refgs.geometry.extract import extract
+from refgs.render import extract as module
+from refgs.render.extract import extract
 from refgs.geometry.mesh import clean
 from refgs.model.surfels import Surfels
 

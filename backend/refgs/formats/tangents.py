@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 
 
 def vertex_tangents(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
