@@ -17,10 +17,13 @@ from refgs.errors import InputError, InputWarning
 from refgs.export.splats import read_splats, write_display_splats, write_splats
 from refgs.kernels import cuda
 from refgs.lock import RunLock
-from refgs.run import Run, check_free, create_run, open_run, read_run_facts, write_text
+from refgs.run import Run, check_free, create_run, open_run, read_run_facts, record_changes, write_text
 from refgs.settings import load_settings
+from refgs.train.measures import held_out_psnr
+from refgs.train.memory import full_card
 from refgs.train.plan import Plan
-from refgs.train.trainer import Report, Trainer, full_card
+from refgs.train.state import Report, State
+from refgs.train.trainer import Trainer
 
 DISKS = (
     errno.ENOSPC,
@@ -54,14 +57,14 @@ def train(
     changes: list[str],
     resume: bool,
     report: Report,
-    attend: Callable[[Trainer], bool],
-) -> tuple[Trainer, float | None]:
+    attend: Callable[[State], bool],
+) -> tuple[State, float | None]:
     """Train a capture into a run folder; its asset is written when the training has ended.
 
     Where `minutes` are given it makes as many iterations as fit, and all is written by then; what it is paused for is not counted. Without
     a preset everything else is chosen for that time, too; without either it is the standard one.
     `attend` is called before each iteration and stops it by True, as another process can (`refgs.lock`); the checkpoint then written
-    is what `resume` goes on from. The trainer that is returned says by `ended` which it was. With it comes the mean PSNR of the
+    is what `resume` goes on from. The state that is returned says by `ended` which it was. With it comes the mean PSNR of the
     held-out views, if there are any and the training has ended.
     """
     from refgs.train.ambiguity import ambiguities
@@ -92,15 +95,17 @@ def train(
                 trainer, preset = fitting(capture, changes, out, plan, device, report), f"{minutes:g} minutes"
             else:
                 trainer = Trainer(capture, settings, out, report, plan, device)
+            state = trainer.state
             if resume:
                 trainer.resume()
-                report("stage", {"what": f"going on from iteration {trainer.iteration}"})
+                report("stage", {"what": f"going on from iteration {state.iteration}"})
             else:
                 with _on_disk([out], "train again"):
-                    create_run(out, capture, trainer.settings, preset, device, trainer.chosen)
+                    create_run(out, capture, state.settings, preset, device, state.effective.chosen())
+                    record_changes(out, state.effective.rows())
                 held.enter_context(lock)
             held.enter_context(_on_disk([out], "go on with --resume"))
-            trainer.run(lambda: attend(trainer) or lock.attend(trainer))
+            trainer.run(lambda: attend(state) or lock.attend(state.iteration, state.total, state.seconds))
         except torch.OutOfMemoryError:
             raise full_card() from None
         except InputError:
@@ -109,9 +114,9 @@ def train(
             with suppress(OSError):
                 (out / "log.txt").write_text(traceback.format_exc(), encoding="utf-8")
             raise
-        if not trainer.ended:
-            return trainer, None
-        facts = {"training_seconds": trainer.seconds, "processor_seconds": trainer.processor_seconds}
+        if not state.ended:
+            return state, None
+        facts = {"training_seconds": state.seconds, "processor_seconds": state.processor_seconds}
         facts["steps_left_out"] = trainer.guard.left_out
         if peak := peak_memory():
             facts["peak_memory_bytes"] = peak
@@ -119,9 +124,10 @@ def train(
             facts["peak_card_memory_bytes"] = torch.cuda.max_memory_allocated()
         update_metrics(out, facts)
         try:
-            write_asset(trainer)
-            quality = trainer.test_psnr(most=len(trainer.test))
-            trades = ambiguities(trainer)
+            write_asset(state)
+            record_changes(out, state.effective.rows())
+            quality = held_out_psnr(state, most=len(state.test))
+            trades = ambiguities(state)
         except torch.OutOfMemoryError:
             again = f"refgs train {capture_folder} --out {out} --resume --device cpu"
             raise InputError(f"the card's memory is full; nothing is lost, go on with: {again}") from None
@@ -129,7 +135,7 @@ def train(
         for facts in trades.values():
             if "what" in facts:
                 report("stage", {"what": facts["what"]})
-        return trainer, quality
+        return state, quality
 
 
 @contextmanager

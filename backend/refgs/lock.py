@@ -8,15 +8,11 @@ import json
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 
 from refgs.errors import InputError
 from refgs.paths import whole
-
-if TYPE_CHECKING:
-    from refgs.train.trainer import Trainer
 
 LOCK, PROGRESS, STOP = "run.lock", "progress.json", "stop"
 EVERY = 1.0  # seconds between looks
@@ -45,14 +41,14 @@ class RunLock:
             (self._folder / LOCK).unlink()
         self._lock.release()
 
-    def attend(self, trainer: "Trainer") -> bool:
+    def attend(self, iteration: int, total: int, seconds: float) -> bool:
         """To be called often: says now and then how far the training is; True where someone has asked that it stops."""
         now = time.monotonic()
         if now < self._next:
             return False
         self._next = now + EVERY
-        left = trainer.seconds / max(trainer.iteration, 1) * (trainer.total - trainer.iteration)
-        facts = {"iteration": trainer.iteration, "total": trainer.total, "seconds_left": left}
+        left = seconds / max(iteration, 1) * (total - iteration)
+        facts = {"iteration": iteration, "total": total, "seconds_left": left}
         # A reader that has the file open, on Windows, or a full disk is no reason to end a training.
         with suppress(OSError), whole(self._folder / PROGRESS) as temporary:
             temporary.write_text(json.dumps(facts), encoding="utf-8")

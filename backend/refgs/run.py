@@ -127,6 +127,16 @@ def create_run(
     write_cameras(folder / "cameras.json", capture, settings.light.frame)
 
 
+def record_changes(folder: Path, rows: dict[str, dict]) -> None:
+    """Add to run.toml's [changed] what else changed a setting. What was asked stays as the first process recorded it."""
+    if not rows:
+        return
+    tables = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
+    known = tables.get("changed", {})
+    rows = {key: row | {"asked": known.get(key, row)["asked"]} for key, row in rows.items()}
+    write_text(folder / "run.toml", tomli_w.dumps(tables | {"changed": known | rows}))
+
+
 def check_free(folder: Path) -> None:
     """Raise InputError unless a new run can go into the folder."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

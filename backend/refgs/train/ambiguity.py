@@ -9,7 +9,8 @@ from torch import Tensor
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.renderer import render
-from refgs.train.trainer import Trainer, composite
+from refgs.report.pictures import composite
+from refgs.train.state import State
 
 VIEWS = 6  # at the most
 SMALL = 0.02  # the part of a change that its derivative is taken over
@@ -72,23 +73,23 @@ TRADES = {
 }
 
 
-def ambiguities(trainer: Trainer) -> dict[str, dict]:
+def ambiguities(state: State) -> dict[str, dict]:
     """Of each trade: by how much the pictures change, `alone`, and what is `left` of that where the other change makes up for it, as well
     as that goes (root mean squares of encoded colours); `answer` is by how much that is; the pictures' own `error`; and `what` there
     is to say, where less is left than a quarter of that, else none. Derivatives are taken by differences at the end of the training."""
-    light = trainer.environment()
+    light = state.environment()
     if light is None:
         return {}
-    chosen = range(0, len(trainer.views), max(1, -(-len(trainer.views) // VIEWS)))
+    chosen = range(0, len(state.views), max(1, -(-len(state.views) // VIEWS)))
     with torch.no_grad():
-        now = trainer.surfels(), light.radiance
-        before = _pictures(trainer, now, chosen)
-        photos = torch.cat([composite(trainer.views[i], trainer.background).flatten() for i in chosen])
+        now = state.surfels(), light.radiance
+        before = _pictures(state, now, chosen)
+        photos = torch.cat([composite(state.views[i], state.background).flatten() for i in chosen])
         error = float((before - photos).square().mean().sqrt())
         found = {}
         for name, trade in TRADES.items():
-            alone = (_pictures(trainer, trade.change(now, SMALL * trade.size), chosen) - before) / SMALL
-            other = (_pictures(trainer, trade.made_up(now, SMALL), chosen) - before) / SMALL
+            alone = (_pictures(state, trade.change(now, SMALL * trade.size), chosen) - before) / SMALL
+            other = (_pictures(state, trade.made_up(now, SMALL), chosen) - before) / SMALL
             answer = -float((alone * other).sum() / other.square().sum().clamp_min(1e-20))
             left = float((alone + answer * other).square().mean().sqrt())
             facts = {"alone": float(alone.square().mean().sqrt()), "left": left, "answer": answer, "error": error}
@@ -98,13 +99,13 @@ def ambiguities(trainer: Trainer) -> dict[str, dict]:
     return found
 
 
-def _pictures(trainer: Trainer, of: Explanation, chosen: range) -> Tensor:
+def _pictures(state: State, of: Explanation, chosen: range) -> Tensor:
     """What photos would be, all of their numbers side by side."""
-    reference, exposures = trainer.environment().reference, trainer.exposures
+    reference, exposures = state.environment().reference, state.exposures
     light, found = Environment(of[1].contiguous(), reference), []
     for i in chosen:
         exposure = None if exposures is None else exposures[i].exp()
-        settings = trainer.settings.render, trainer.near, trainer.occluder, exposure
-        picture = render(of[0], light, trainer.views[i].camera, trainer.background, *settings)
+        settings = state.settings.render, state.near, state.occluder, exposure
+        picture = render(of[0], light, state.views[i].camera, state.background, *settings)
         found.append(picture.color.clamp(0, 1).flatten())
     return torch.cat(found)
