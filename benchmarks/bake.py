@@ -24,12 +24,12 @@ from benchmarks.runs import mean, text
 from benchmarks.scenes.cycles import Renderer
 from refgs.camera import Camera
 from refgs.color import srgb_encode
+from refgs.compare import metrics
+from refgs.compare.pictures import as_bytes, maps, over_white, write_png
+from refgs.compare.truth import GroundTruth, read_relit
 from refgs.errors import InputError
 from refgs.paths import clone_root
 from refgs.render.renderer import render
-from refgs.report import metrics
-from refgs.report.pictures import as_bytes, maps, over_white, write_png
-from refgs.report.truth import GroundTruth, read_relit
 from refgs.run import Run, open_run
 
 SAMPLES = 16  # of Cycles, denoised; see `Renderer`

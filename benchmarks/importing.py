@@ -13,7 +13,7 @@ import numpy as np
 from rich.table import Table
 
 from benchmarks.runs import console
-from refgs.export.splats import Splats, read_splats, write_splats
+from refgs.formats.splats import Splats, read_splats, write_splats
 
 COUNTS = 24_000, 100_000, 1_000_000
 

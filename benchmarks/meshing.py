@@ -37,11 +37,11 @@ HEADINGS = (
 
 def measure(folder: Path, truth: Path, resolution: int) -> list[str]:
     """A row of the table, beginning with `resolution`; in a process of its own, whose peak memory is that of this alone."""
-    from refgs.geometry.extract import extract
+    from refgs.compare.surface import compare
+    from refgs.compare.truth import GroundTruth
     from refgs.geometry.mesh import clean
     from refgs.jobs import peak_memory
-    from refgs.report.surface import compare
-    from refgs.report.truth import GroundTruth
+    from refgs.render.extract import extract
     from refgs.run import open_run
 
     run = open_run(folder)

@@ -15,8 +15,8 @@ from rich.table import Table
 from benchmarks import runs
 from benchmarks.ablations import find_scenes
 from benchmarks.runs import console
+from refgs.formats import history
 from refgs.paths import clone_root
-from refgs.train import history
 
 PRESETS = "quick", "standard"
 HEADINGS = "scene", "trained by", "ended after", "iterations", "surfels", "PSNR", "presets by then", "of", "ahead by"

@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
+from refgs.compare import metrics
+from refgs.compare.pictures import over_white
+from refgs.compare.truth import GroundTruth, read_relit
 from refgs.model.environment import Environment
 from refgs.render.rasterize import rasterize
 from refgs.render.renderer import channels
 from refgs.render.shade import shade
 from refgs.render.stack import stack
 from refgs.render.volume import discs
-from refgs.report import metrics
-from refgs.report.pictures import over_white
-from refgs.report.truth import GroundTruth, read_relit
 from refgs.run import Run, open_run
 
 PARTS = ("normals", "materials", "light", "visibility")

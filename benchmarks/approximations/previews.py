@@ -14,8 +14,9 @@ from benchmarks.approximations import Row, rms, room
 from benchmarks.approximations.textures import sphere_of_splats
 from benchmarks.scenes.analytic import camera_matrix
 from refgs.color import srgb_encode
-from refgs.export.environment import directions, write_exr
-from refgs.export.splats import write_splats
+from refgs.formats.exr import write_exr
+from refgs.formats.panorama import directions
+from refgs.formats.splats import write_splats
 from refgs.paths import clone_root
 
 

@@ -20,8 +20,9 @@ from torch import Tensor
 from benchmarks.approximations import Row, rms, timed
 from benchmarks.kernels import ball
 from refgs.camera import Camera
-from refgs.kernels import build, load, reference
+from refgs.kernels import build, load
 from refgs.model.surfels import quaternions_towards
+from refgs.render import reference
 from refgs.render.rasterize import rasterize
 
 SOURCES, HEADERS = ("project.cpp", "blend.cpp"), ("splat.h", "raster.h")

@@ -9,7 +9,7 @@ import trimesh
 from benchmarks.approximations import Row, rms, timed
 from benchmarks.scenes.analytic import sunny
 from benchmarks.splitsum import environment, half_vectors
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.model import cubemap, prefilter
 

@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 from benchmarks.approximations import Row, rms, timed
 from refgs.export.bake import bake
 from refgs.export.composite import composite
-from refgs.export.splats import Splats
 from refgs.export.unwrap import unwrap
-from refgs.geometry.mesh import Mesh, smooth_normals
+from refgs.formats.mesh import Mesh
+from refgs.formats.splats import Splats
+from refgs.geometry.mesh import smooth_normals
 
 STRIPES = 40.0  # waves of the paint, in radians a radius
 

@@ -15,7 +15,7 @@ from benchmarks.scenes.light import read_light
 from benchmarks.scenes.shapes import Scene
 from refgs.color import srgb_encode
 from refgs.errors import InputError
-from refgs.export.environment import write_exr
+from refgs.formats.exr import write_exr
 
 
 def write_capture(

@@ -7,10 +7,10 @@ from scipy.spatial import cKDTree
 from benchmarks.approximations.textures import ball, look_up, on_surface, paint, sphere_of_splats
 from refgs.export.bake import bake
 from refgs.export.occlusion import openness
-from refgs.export.splats import Splats
-from refgs.export.tangents import vertex_tangents
 from refgs.export.unwrap import unwrap
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
+from refgs.formats.splats import Splats
+from refgs.formats.tangents import vertex_tangents
 
 
 @pytest.fixture(scope="module")

@@ -6,13 +6,13 @@ import torch
 
 from benchmarks.scenes.analytic import TWO, meet, write_ball_capture
 from refgs.capture import read_capture
-from refgs.report.pictures import composite
+from refgs.compare.pictures import composite
 from refgs.run import create_run, open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset
 from refgs.train.measures import held_out_psnr
 from refgs.train.trainer import Trainer
-from tests.kernels import scenes
+from tests.makers import scenes
 
 SMALL = ["surfels.start=3000", "surfels.budget=4000", "environment.resolution=16", "train.light_first=20"]
 SMALL += ["surfels.metallic=0.9", "train.iterations=600", "indirect.every=200", "indirect.resolution=64"]
@@ -85,13 +85,13 @@ def test_the_run_folder_has_it_all(trained):
     """Rendered from the files as it was in training; much the same where its light is taken for another."""
     made = trained[0]
     run, view = open_run(made.state.folder), made.state.test[0]
-    shown, asset = made.state.render(view.camera), run.render(view.camera)
+    shown, asset = made.state.render(view.camera), run.state.render(view.camera)
     assert float((shown.color - asset.color).abs().mean()) < 2e-3
     assert run.splats.indirect.shape[1:] == (16, 3) and np.abs(run.splats.indirect).max() > 0
-    relit = run.render(view.camera, run.environment)
+    relit = run.state.render(view.camera, run.state.environment)
     torch.testing.assert_close(relit.visibility, asset.visibility)
     free = asset.visibility > 0.5
     assert float((relit.color - asset.color)[free].abs().mean()) < 5e-3
     assert float((relit.color - asset.color)[~free].abs().mean()) < 0.1
-    assert run.relit(run.environment) is run.relit(run.environment)
+    assert run.relit(run.state.environment) is run.relit(run.state.environment)
     assert open_run(trained[1].folder).occluder is None

@@ -12,8 +12,8 @@ import torch
 
 from benchmarks.scenes.analytic import write_ball_capture
 from refgs.capture import read_capture
-from refgs.export.splats import read_splats
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
+from refgs.formats.splats import read_splats
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.run import open_run
@@ -25,7 +25,7 @@ from refgs.train.measures import held_out_psnr
 from refgs.train.needs import lighting, photos, schedule
 from refgs.train.plan import Plan
 from refgs.train.trace import why_not_traced
-from tests.train.test_trainer import trainer as small
+from tests.makers.training import trainer as small
 
 DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # at the start: few iterations have to do
 SMALL = ["environment.resolution=32", "indirect.every=100", "indirect.resolution=32"]
@@ -77,7 +77,7 @@ def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
     assert chalk.state.iteration == chalk.state.total == found["total"] == 100 + round(schedule.Iterations.ENOUGH * 200)
     forced = trainer(matte, tmp_path / "off", "needs.specular=off", total=150)
     assert forced.state.total == forced.state.needs["iterations"]["total"] == round(schedule.Iterations.ENOUGH * 150)
-    assert trainer(matte, tmp_path / "on", "needs.specular=off", "needs.iterations=on", total=150).state.total == 150
+    assert trainer(matte, tmp_path / "on", "needs.specular=off", "needs.iterations=on", total=150).total == 150
     forced.state.needs.clear()
     forced.state.plan = Plan(1.0)
     needs.evaluate_due(forced.state, "start")
@@ -346,7 +346,7 @@ def test_deciding_does_not_load_what_it_does_not_use(mirror, tmp_path):
 import sys
 from pathlib import Path
 from refgs.train import probe
-from tests.train.test_trainer import trainer
+from tests.makers.training import trainer
 made = trainer(Path(sys.argv[1]), Path(sys.argv[2]), total=10)
 made.run()
 probe.specular_explains(made.state), probe.seconds_saved(made.state)

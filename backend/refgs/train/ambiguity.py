@@ -6,10 +6,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from refgs.compare.pictures import composite
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.renderer import render
-from refgs.report.pictures import composite
 from refgs.train.state import State
 
 VIEWS = 6  # at the most

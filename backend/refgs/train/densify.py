@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters, activate, axes
 from refgs.settings import DensifySettings, PropagationSettings, RateSettings
-from refgs.train.adam import Adam
 from refgs.train.start import AROUND
 from refgs.train.state import State
 
@@ -41,7 +41,7 @@ def densify_due(state: State, progress: float) -> None:
 def since_propagation(state: State) -> int | None:
     """Count the iterations since normals were last propagated; None before the first time and after the last."""
     settings, iteration = state.settings.propagation, state.iteration
-    if not settings.every or iteration < settings.every or state.settings.render.shading == "sh":
+    if not settings.every or iteration < settings.every or not state.method.lit:
         return None
     last = iteration // settings.every * settings.every
     return iteration - last if last / state.total < settings.stop else None

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from refgs.errors import InputError
+from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters
 from refgs.train import checkpoint
-from refgs.train.adam import Adam
 from refgs.train.densify import take
 from refgs.train.state import State
 
@@ -21,17 +21,16 @@ LIMITS = {
     "metallic": (-LOGIT / 2, LOGIT / 2),  # activated by a function that nears its limits as the square
     "exposure": (-LOGIT, LOGIT),  # natural logarithms: 17 stops
 }
-# Raw light. In the dark, softplus' slope is the radiance itself; above, float32 sums lose small texels.
-DARKEST, BRIGHTEST = -LOGIT, 1e8
+DARKEST = -LOGIT  # raw light: below, softplus' slope, which is the radiance itself, is of no use
 SMALLEST, LARGEST = 1e-6, 1e2  # of a surfel, in scene radii
 
 
-def limits(name: str, radius: float, display: bool) -> tuple[float, float]:
-    """Bound a parameter's raw values, in a scene of this radius, to where their gradients still lead back."""
+def limits(name: str, radius: float, brightest: float) -> tuple[float, float]:
+    """Bound a parameter's raw values, in a scene of this radius, to where their gradients still lead back; raw light to `brightest`."""
     if name == "scale":
         return math.log(SMALLEST * radius), math.log(LARGEST * radius)
     if name == "environment":
-        return DARKEST, LOGIT if display else BRIGHTEST
+        return DARKEST, brightest
     return LIMITS.get(name, (-math.inf, math.inf))
 
 

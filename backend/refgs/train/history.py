@@ -4,11 +4,11 @@ import json
 import math
 from pathlib import Path
 
+from refgs.formats.history import FILE, read
 from refgs.paths import whole
 from refgs.train.measures import Measures
 from refgs.train.state import State
 
-FILE = "history.jsonl"  # in the run folder
 FIRST = 10  # iterations before the first line
 A_DECADE = 10  # lines while iterations grow tenfold: evenly spaced where both axes of a chart are logarithms
 SHARE = 0.025  # of the training's time that measuring may take; FLIP, as dear as all else, may take as much again
@@ -60,14 +60,3 @@ def trim(folder: Path, iteration: int) -> None:
         kept = [line for line in read(file.read_text(encoding="utf-8")) if line.get("iteration", math.inf) <= iteration]
         with whole(file) as temporary:
             temporary.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
-
-
-def read(text: str) -> list[dict]:
-    """Read the lines that are whole: a training that was killed can leave half of one."""
-    found = []
-    for line in text.splitlines():
-        try:
-            found.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return [item for item in found if isinstance(item, dict)]

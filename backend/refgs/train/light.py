@@ -10,8 +10,8 @@ from refgs.clock import timed
 from refgs.model import cubemap
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.render.channels import channels
 from refgs.render.rasterize import rasterize
-from refgs.render.renderer import channels
 from refgs.render.shade import mirror_directions
 from refgs.render.stack import stack
 from refgs.render.volume import discs
@@ -28,11 +28,9 @@ PART = 16  # texels along a side of the cubemap that says which directions are m
 SOLID = 0.5  # alpha
 
 
-def start_value(settings: Settings) -> float:
-    """The raw value that `State.environment` makes the radiance at the start of."""
-    radiance = settings.environment.radiance
-    display = settings.render.color_space == "display"
-    return math.log(radiance / (1 - radiance)) if display else math.log(math.expm1(radiance))
+def start_value(state: State) -> float:
+    """Raw value of a texel at the start."""
+    return state.method.light.raw(state.settings.environment.radiance)
 
 
 def resolution(settings: Settings, progress: float) -> int:
@@ -44,7 +42,7 @@ def resolution(settings: Settings, progress: float) -> int:
 @torch.no_grad()
 def refine_due(state: State, progress: float) -> None:
     """Double the texels along a side when it is time."""
-    if state.settings.render.shading == "sh" or len(state.light) >= 6 * resolution(state.settings, progress) ** 2:
+    if not state.method.lit or len(state.light) >= 6 * resolution(state.settings, progress) ** 2:
         return
     side = math.isqrt(len(state.light) // 6)
     directions = cubemap.texel_directions(2 * side).float()

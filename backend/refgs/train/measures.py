@@ -7,13 +7,12 @@ import numpy as np
 import torch
 
 from refgs.capture import LoadedView, View
-from refgs.color import srgb_decode
+from refgs.compare import metrics
+from refgs.compare.pictures import composite, maps
+from refgs.compare.truth import FOLDER, PASSES, GroundTruth, errors, known_maps
 from refgs.errors import InputError
 from refgs.model.environment import Environment
 from refgs.render.renderer import Rendering, render
-from refgs.report import metrics
-from refgs.report.pictures import composite, maps
-from refgs.report.truth import FOLDER, PASSES, GroundTruth, errors, known_maps
 from refgs.run import light_of
 from refgs.train.state import State
 
@@ -47,13 +46,14 @@ class _Look(NamedTuple):
 class Measures:
     """A few fixed held-out views, with their ground truth.
 
-    Ground truth is the capture's folder `ground_truth`, as `report.truth.GroundTruth` reads it, or the normals of its data set. Where
+    Ground truth is the capture's folder `ground_truth`, as `compare.truth.GroundTruth` reads it, or the normals of its data set. Where
     its size is not that of the photos, a warning is reported and it is left out.
     """
 
     def __init__(self, state: State) -> None:
         capture = state.capture
         self.settings, self._background = state.settings, torch.tensor(state.settings.image.background)
+        self._method = state.method
         chosen = _spread(list(zip(capture.test_views, state.test, strict=True)), VIEWS)
         folder = capture.folder / FOLDER
         self._light = self._panorama = None
@@ -73,14 +73,14 @@ class Measures:
         left = {"visibility"}
         if self.settings.render.diffuse == "sh":  # base colour is recovered from it when the training has ended
             left |= {"albedo"}
-        elif truth and truth.hdris and self.settings.render.shading != "sh":
+        elif truth and truth.hdris and self._method.lit:
             relit = truth.relit(truth.hdris[0], camera)
         known = {name: known[name] for name in PASSES if name in known and name not in left}
         return _Look(loaded, known, alpha, relit)
 
     def _read_lights(self, truth: GroundTruth, device: torch.device) -> None:
         """Read the true light, and the light of the held-out relit pictures: the first that there are pictures under."""
-        if self.settings.render.shading == "sh":
+        if not self._method.lit:
             return
         if truth.has_light and self.settings.light.frame != "camera":  # the true light stands still
             self._panorama = metrics.resized(truth.panorama("light"), ROWS)
@@ -107,8 +107,7 @@ class Measures:
             found["albedo_psnr"] = metrics.aligned_psnr(rows.pop("albedo"))["psnr_aligned"]
         found = {name: float(np.mean(values)) for name, values in rows.items()} | found
         if self._panorama is not None:
-            light = state.environment().panorama(ROWS)
-            light = srgb_decode(light) if self.settings.render.color_space == "display" else light
+            light = self._method.light.to_linear(state.environment().panorama(ROWS))
             found["light_log_rmse"] = metrics.environment_log_rmse(light, self._panorama)[0]
         if self._light is not None:
             found["relit_psnr"] = self._relit(state)

@@ -10,11 +10,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from refgs.color import srgb_encode
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.rasterize import rasterize
-from refgs.render.renderer import COVERED, Rendering
+from refgs.render.rendering import COVERED, Rendering
 from refgs.render.volume import discs
 from refgs.train.losses import Photo, objective
 from refgs.train.state import RenderInputs, State
@@ -133,13 +132,13 @@ def specular_explains(state: State) -> float:
     shown, matte = ([picture(state, view, how) for view in some] for how in (inputs, dull))
     over = [a.radiance - b.radiance for a, b in zip(shown, matte, strict=True)]
     mean = blended_shares(inputs.surfels, photos, state.near, over)
-    display, errors = inputs.settings.color_space == "display", ([], [])
+    errors = [], []
     for photo, rendering, base in zip(photos, shown, matte, strict=True):
         feature = rasterize(*discs(inputs.surfels, photo.camera), mean, photo.camera, near=state.near).features
         alpha = rendering.alpha[..., None]
         radiance = base.radiance + feature / alpha.clamp_min(COVERED)
         exposed = radiance if rendering.exposure is None else radiance * rendering.exposure
-        encoded = exposed if display else srgb_encode(exposed)
+        encoded = state.method.light.encode(exposed)
         flat = torch.where(alpha > COVERED, encoded * alpha, 0) + (1 - alpha) * state.background
         for found, image in zip(errors, (rendering.color, flat), strict=True):
             found.append(squared_error(image, photo, state.background))

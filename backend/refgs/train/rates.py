@@ -32,7 +32,7 @@ def _start_rate(state: State, name: str) -> float:
 def _frozen(state: State, progress: float) -> set[str]:
     """List the parameters that hold still."""
     settings, frozen = state.settings, set()
-    if state.from_hull and state.iteration < settings.train.light_first and settings.render.shading == "deferred":
+    if state.from_hull and state.iteration < settings.train.light_first and state.method.deferred:
         frozen |= {*GEOMETRY}
     since = since_propagation(state)
     if since is not None and since < settings.propagation.rest:

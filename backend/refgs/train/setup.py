@@ -5,9 +5,9 @@ from pathlib import Path
 import torch
 
 from refgs.capture import Capture
+from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters, activate
 from refgs.train import light, needs
-from refgs.train.adam import Adam
 from refgs.train.effective import Effective
 from refgs.train.guard import limits
 from refgs.train.light_frame import light_frame
@@ -16,8 +16,6 @@ from refgs.train.plan import Plan
 from refgs.train.start import start_appearance, start_parameters
 from refgs.train.state import Report, State
 from refgs.train.trace import why_not_traced
-
-MIRROR = 7.0  # logit of a mirror's base colour, and the negative of its roughness's
 
 
 def set_up(capture: Capture, effective: Effective, folder: Path, report: Report, plan: Plan, device: str) -> State:
@@ -37,7 +35,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
 
 def _choose_light_frame(state: State, start: Parameters, shown: int) -> None:
     """Ask the photos for the light's frame, where the settings leave it to them. The first surfels, `shown`, lie on the hull."""
-    lit = state.settings.render.shading != "sh"
+    lit = state.method.lit
     if state.settings.light.frame != "auto":
         return
     frame, why = "world", "there is no light" if not lit else "not every photo has a mask of the object"
@@ -54,40 +52,35 @@ def _choose_light_frame(state: State, start: Parameters, shown: int) -> None:
 
 def _start_learning(state: State) -> None:
     """Make light, exposures and the optimiser; set parameters aside that this run's shading never reads."""
-    settings, radius = state.settings, state.capture.radius
-    display = settings.render.color_space == "display"
+    settings, method = state.settings, state.method
     texels = torch.empty(6 * light.resolution(settings, 0) ** 2, 3, device=state.device)
-    state.light = texels.fill_(light.start_value(settings)).requires_grad_()
+    state.light = texels.fill_(light.start_value(state)).requires_grad_()
     _set_constants_aside(state)
     learned = dict(state.parameters)
-    if settings.render.shading != "sh":
+    if method.lit:
         learned["environment"] = state.light
         if settings.light.exposure != "off":
             learned["exposure"] = state.exposures = torch.zeros(len(state.views), device=state.device).requires_grad_()
-    state.optimizer = Adam(
-        [{"params": [value], "name": name, "limits": limits(name, radius, display)} for name, value in learned.items()]
-    )
+    radius, brightest = state.capture.radius, method.light.brightest
+    groups = [{"params": [value], "name": name} for name, value in learned.items()]
+    state.optimizer = Adam([group | {"limits": limits(group["name"], radius, brightest)} for group in groups])
     state.reset_motion()
 
 
 def _set_constants_aside(state: State) -> None:
     """Move parameters that the shading never reads to the constants, one row each."""
-    render, unused = state.settings.render, []
-    if render.shading == "sh":
-        unused = ["albedo", "metallic", "roughness"]
-    elif render.diffuse == "irradiance":
-        unused = ["sh_dc"] if state.residual_start < 1 else ["sh_dc", "sh_rest"]
+    method, diffuse = state.method, state.settings.render.diffuse
+    unused = [*method.unread]
+    if method.lit and diffuse == "irradiance":
+        unused += ["sh_dc"] if state.residual_start < 1 else ["sh_dc", "sh_rest"]
     if why := why_not_traced(state):
         unused += ["indirect_dc", "indirect_rest"]
-        if render.shading == "deferred" and state.settings.indirect.start < 1:
+        if method.deferred and state.settings.indirect.start < 1:
             state.announce("reflections", f"without inter-reflection: {why}")
-    if why or render.diffuse == "sh":
+    if why or diffuse == "sh":
         unused += ["received"]
-    mirror = {}
-    if render.reflection == "mirror" and render.shading != "sh":
-        mirror = {"albedo": MIRROR, "roughness": -MIRROR}
-    state.constant = {name: state.parameters.pop(name).detach()[:1] for name in [*unused, *mirror]}
-    for name, value in mirror.items():
+    state.constant = {name: state.parameters.pop(name).detach()[:1] for name in [*unused, *method.constants]}
+    for name, value in method.constants.items():
         state.constant[name].fill_(value)
 
 
@@ -99,7 +92,7 @@ def start_deferred(state: State) -> None:
         if name in state.parameters:
             state.parameters[name][:] = row
             state.optimizer.state.pop(state.parameters[name], None)
-    state.light.fill_(light.start_value(state.settings))
+    state.light.fill_(light.start_value(state))
     state.optimizer.state.pop(state.light, None)
     if state.exposures is not None:  # learned against the light before
         state.exposures.zero_()

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from refgs.errors import InputError
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.train import checkpoint, needs
 from refgs.train.state import State

@@ -11,11 +11,12 @@ from refgs.camera import Camera
 from refgs.capture import Capture, load_view
 from refgs.clock import Clock
 from refgs.geometry.visibility import Occluder
+from refgs.model.adam import Adam
 from refgs.model.environment import Environment
 from refgs.model.surfels import Parameters, Surfels, activate
+from refgs.render.baselines import Method, initial_stage, method_of
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.settings import LossSettings, RenderSettings, Settings
-from refgs.train.adam import Adam
 from refgs.train.effective import Effective
 from refgs.train.losses import Photo
 from refgs.train.motion import ScreenGradient
@@ -61,8 +62,7 @@ class State:
         self.seconds, self.processor_seconds = 0.0, 0.0  # the latter of all threads, which other programs hardly change
         self.decided: dict[str, str] = {}  # lines for the artist, by what was decided
         self.needs: dict[str, dict[str, Any]] = {}  # the decisions of `train/needs`, by the need's name
-        render = self.settings.render
-        self.initial = render.shading == "deferred" and self.settings.initial.until > 0  # its stage is not over
+        self.initial = self.method.deferred and self.settings.initial.until > 0  # its stage is not over
         self.parameters: Parameters = {}  # one row a surfel
         self.constant: Parameters = {}  # parameters that do not learn: one row for all surfels
         self.light = torch.empty(0, 3)  # raw texels; `environment` makes radiance of them
@@ -80,14 +80,19 @@ class State:
         return self.effective.settings
 
     @property
+    def method(self) -> Method:
+        """How surfels and light become pictures."""
+        return method_of(self.settings.render)
+
+    @property
     def ended(self) -> bool:
         return self.iteration >= self.total
 
     @property
     def residual_start(self) -> float:
         """The part of the training after which colour by direction learns what material and light leave over; 1: it never does."""
-        render = self.settings.render
-        return self.settings.residual.start if render.shading == "deferred" and render.diffuse == "irradiance" else 1.0
+        settings = self.settings
+        return settings.residual.start if self.method.deferred and settings.render.diffuse == "irradiance" else 1.0
 
     @property
     def losses(self) -> LossSettings:
@@ -99,27 +104,24 @@ class State:
 
     def surfels(self) -> Surfels:
         """Activate the surfels, with the values of what does not learn filled in."""
-        count, render, late = len(self.parameters["position"]), self.settings.render, self.residual_start
+        count, late = len(self.parameters["position"]), self.residual_start
         values = activate({**self.parameters, **self.constant})
         unlearned = late == 1 or self.iteration < late * self.total
-        if render.shading != "sh" and render.diffuse == "irradiance" and unlearned:
+        if self.method.lit and self.settings.render.diffuse == "irradiance" and unlearned:
             values = values.without_directions()
         return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
 
     def environment(self) -> Environment | None:
         """Make the light of its raw texels; None where nothing is lit."""
-        if self.settings.render.shading == "sh":
+        if not self.method.lit:
             return None
         reference = self.views[0].camera if self.settings.light.frame == "camera" else None
-        display = self.settings.render.color_space == "display"
-        radiance = torch.sigmoid(self.light) if display else torch.nn.functional.softplus(self.light)
-        return Environment(radiance, reference)
+        return Environment(self.method.light.radiance(self.light), reference)
 
     def inputs(self) -> RenderInputs:
         """Gather what pictures are rendered from at this stage."""
         settings = self.settings.render
-        if self.initial:
-            settings = settings.model_copy(update={"shading": "splat"})
+        settings = initial_stage(settings) if self.initial else settings
         return RenderInputs(self.surfels(), self.environment(), settings, self.occluder)
 
     def picture(self, inputs: RenderInputs, camera: Camera, exposure: Tensor | None = None) -> Rendering:

@@ -3,11 +3,11 @@
 import torch
 
 from refgs.errors import InputError
-from refgs.geometry.extract import extract
 from refgs.geometry.mesh import clean
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.render.extract import extract
 from refgs.render.relight import received
 from refgs.render.volume import with_normals_last
 from refgs.train import needs
@@ -20,7 +20,7 @@ VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer
 def why_not_traced(state: State) -> str:
     """Say why this run looks for no inter-reflection; "" where it does."""
     settings = state.settings
-    if settings.render.shading != "deferred":
+    if not state.method.deferred:
         return f"shading = {settings.render.shading}"
     if settings.indirect.start >= 1:
         return "its setting leaves it out (indirect.start = 1)"

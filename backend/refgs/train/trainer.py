@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from refgs.capture import Capture
-from refgs.report.metrics import decibels
+from refgs.compare.metrics import decibels
 from refgs.settings import Settings
 from refgs.train import densify, exposures, history, light, needs, snapshot
 from refgs.train.effective import Effective

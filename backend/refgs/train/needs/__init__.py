@@ -59,8 +59,7 @@ def evaluate_due(state: State, moment: Moment, *given: Any, progress: float = 0.
 
 def evaluate_iteration(state: State, progress: float) -> None:
     """Decide the needs that are due after an iteration."""
-    render = state.settings.render
-    if state.initial or render.shading != "deferred" or render.diffuse != "irradiance" or faint_now(state):
+    if state.initial or not state.method.deferred or state.settings.render.diffuse != "irradiance" or faint_now(state):
         return
     time_crops(state)
     evaluate_due(state, "iteration", progress=progress)

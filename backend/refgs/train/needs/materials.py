@@ -74,7 +74,7 @@ class Constants(Need):
     @torch.no_grad()
     def common(self, state: State, surfels: Surfels, kept: Tensor) -> dict[str, tuple[float, float]]:
         """Find the value, and its spread, of metallic and roughness where all surfels kept (N,) have about the same."""
-        if self.asked(state) == "on" or state.settings.render.shading == "sh":
+        if self.asked(state) == "on" or not state.method.lit:
             return {}
         photos = [state.photo(view) for view in probe.spread_views(state)]
         weight = probe.blended_shares(surfels, photos, state.near).sum(dim=0) * kept

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from refgs.capture import LoadedView
-from refgs.report.metrics import psnr
+from refgs.compare.metrics import psnr
 from refgs.train import probe
 from refgs.train.needs.need import MEGA, Decision, Moment, Need
 from refgs.train.state import State

@@ -15,7 +15,7 @@ class Initial(Need):
     def due(self, state: State, moment: Moment, progress: float) -> bool:
         # From the hull, deferred shading finds better normals alone than after this stage: docs/measurements.md.
         left_out = state.from_hull or self.asked(state) == "off"
-        return left_out and state.settings.initial.until > 0 and state.settings.render.shading == "deferred"
+        return left_out and state.settings.initial.until > 0 and state.method.deferred
 
     def measure(self, state: State) -> Decision:
         return Decision(False, ASKED if self.asked(state) == "off" else "surfels start on the hull of the masks")
