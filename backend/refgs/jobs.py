@@ -192,7 +192,7 @@ def _card_memory(what: str | None = None) -> Iterator[None]:
     """Raise InputError, with the line `what`, where the card's memory does not suffice."""
     import torch
 
-    from refgs.train.memory import full_card
+    from refgs.train.densify import full_card
 
     try:
         yield

@@ -15,10 +15,10 @@ from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, to_splats
 from refgs.paths import write_text
-from refgs.render.rasterize import rasterize
-from refgs.render.volume import discs, with_normals_last
+from refgs.render.volume import with_normals_last
 from refgs.run import OCCLUDER
 from refgs.train import needs
+from refgs.train.probe import blended_shares
 from refgs.train.state import State
 from refgs.train.trace import why_not_traced
 
@@ -105,21 +105,16 @@ def _received(surfels: Surfels, environment: Environment, state: State) -> Tenso
 def _seen_side(surfels: Surfels, state: State) -> Tensor:
     """Find the side of each surfel (N,) that training views see.
 
-    1: that which its normal points to; −1: the other; 0: none sees the surfel. Where none sees any surfel, all count as seen. A surfel's
-    weight in a view is the gradient of the sum of a constant feature.
+    1: that which its normal points to; −1: the other; 0: none sees the surfel. Where none sees any surfel, all count as seen.
     """
     surfels = Surfels(*(value.detach() for value in surfels))
-    count = len(surfels.positions)
-    side, seen = torch.zeros(count, device=state.device), torch.zeros(count, device=state.device)
     normals = surfels.normals()
-    for view in state.views:
-        feature = torch.ones(count, 1, device=state.device, requires_grad=True)
-        raster = rasterize(*discs(surfels, view.camera), feature, view.camera, near=state.near)
-        raster.features.sum().backward()
-        weight = feature.grad[:, 0]
-        towards = torch.from_numpy(view.camera.position).float().to(state.device) - surfels.positions
-        side += weight * torch.sign((normals * towards).sum(dim=-1))
-        seen += weight
+    side = seen = torch.zeros(len(normals), device=state.device)
+    for photo in state.photos:
+        weight = blended_shares(surfels, [photo], state.near)[0]
+        towards = torch.from_numpy(photo.camera.position).float().to(state.device) - surfels.positions
+        side = side + weight * torch.sign((normals * towards).sum(dim=-1))
+        seen = seen + weight
     known = seen > 0 if (seen > 0).any() else torch.ones_like(seen, dtype=torch.bool)
     return torch.where(side < 0, -1.0, 1.0) * known
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from refgs.errors import InputError
 from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters, activate, axes
 from refgs.settings import DensifySettings, PropagationSettings, RateSettings
@@ -14,6 +15,8 @@ from refgs.train.state import State
 
 RESET = 0.01  # opacity
 SEEN = 0.2  # opacity from which on surfels explain a picture: nothing is decided, and no mesh is made, of fainter ones
+FEWER = 0.8  # of the surfels, where there is no memory for all
+LEAST_SURFELS = 1000
 
 
 def faint_now(state: State, opacity: float = SEEN) -> bool:
@@ -137,6 +140,24 @@ def propagate_normals(parameters: Parameters, optimizer: Adam, settings: Propaga
 def thin(parameters: Parameters, optimizer: Adam, count: int) -> None:
     """Keep this many surfels, the most opaque."""
     take(parameters, optimizer, parameters["opacity"].topk(count).indices.sort().values)
+
+
+def full_card() -> InputError:
+    """Say what helps where a card's memory is too small."""
+    return InputError("the card's memory is too small: close what else uses it, or take --device cpu")
+
+
+def fewer_surfels(state: State) -> None:
+    """Lower the budget and keep the most opaque surfels. Raises InputError where too few would be left."""
+    budget = int(FEWER * len(state.parameters["position"]))
+    if budget < LEAST_SURFELS:
+        raise full_card()
+    state.forget_gradients()
+    torch.cuda.empty_cache()
+    state.change("surfels.budget", budget, "memory", "the card's memory is full")
+    thin(state.parameters, state.optimizer, budget)
+    state.reset_motion()
+    state.report("warning", {"what": f"the card's memory is full: going on with {budget:,} surfels at the most"})
 
 
 def take(parameters: Parameters, optimizer: Adam, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:

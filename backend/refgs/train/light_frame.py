@@ -11,33 +11,33 @@ from refgs.geometry.project import inside, project, sample
 from refgs.model import harmonics
 from refgs.model.environment import turn_between
 
-SIDE = 96  # pixels: finer than this the hull is not the object
+SIDE = 96  # pixels: the hull is not the object in finer detail
 POINTS = 2000
-FACING = 0.3  # cosine to the camera above which a point is looked at
+FACING = 0.3  # cosine to the camera above which a point is used
 BEHIND = 0.1  # scene radii behind the foremost point at which a point is hidden
 DEGREE = 3  # of the harmonics
-DARK = 0.01  # radiance beside which less is as good as black
+DARK = 0.01  # radiance that is added, so that black has a logarithm
 FOLDS = 4
-FEWEST = 3  # photos of a point from which its own brightness is known
+FEWEST = 3  # photos of a point that tell its own brightness
 RIDGE = 1e-4
 SWEEPS = 4
-LESS = 0.95  # of the error under a light that stands still, below which it turns: where in doubt, it stands
+LESS = 0.95  # of the error under a still light: the light turns only where it explains clearly more
 
 
 def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple[str, str]:
-    """ "world" or "camera", and why: from points (N, 3) on an object's visual hull, their normals, and the photos.
+    """Choose "world" or "camera", and say why, from points (N, 3) on an object's visual hull, their normals, and the photos.
 
-    A point's brightness is its own times what the light makes of it. Under a light in the world that changes from photo to
-    photo by the mirror direction alone; under one that turns with the camera, by normal and mirror direction in its frame. Its
-    logarithm is fitted by smooth functions of those, harmonics, by a number a point and by one a photo, its exposure, in three
-    quarters of the photos, and foretold in the others but for their exposure: whichever light foretells them better it was.
-    Seconds; no chance in it.
+    A point's brightness is its own, times a factor of the light. Under a still light that factor changes from photo to photo with the
+    mirror direction alone; under a light that turns with the camera, with normal and mirror direction in the camera's frame. The
+    brightness' logarithm is fitted, in three quarters of the photos, by harmonics of those directions, a number for each point, and one for
+    each photo, its exposure. The light that better predicts the other photos, apart from their exposures, is chosen. It takes seconds and
+    is deterministic.
     """
     points, photos, brightness, still, turning = _observations(views, positions, normals, radius)
     if len(np.unique(photos)) < 2 * FOLDS or len(points) < 100:
         return "world", "there are too few photos to tell"
     alone = np.zeros((len(points), 0))
-    around, world, camera = (_unforeseen(brightness, x, points, photos) for x in (alone, still, turning))
+    around, world, camera = (_prediction_error(brightness, x, points, photos) for x in (alone, still, turning))
     if around < 1e-6:
         return "world", "all photos are alike"
     told = [f"{max(0.0, 1 - error / around):.0%}" for error in (world, camera)]
@@ -49,10 +49,9 @@ def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndar
 
 
 def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple:
-    """What was seen of the points: which point and which photo (M,), the logarithm of its radiance (M,), and what that may
-    depend on under either light (M, K)."""
+    """List what photos show of the points: point, photo and log radiance (M,), and the terms (M, K) under either light."""
     some = np.arange(0, len(positions), max(1, len(positions) // POINTS))
-    coarse = int(np.clip(0.75 * np.sqrt(len(positions)), 16, SIDE))  # so that points leave no holes to see through
+    coarse = int(np.clip(0.75 * np.sqrt(len(positions)), 16, SIDE))  # coarse enough that points leave no holes
     reference, rows = views[0].camera, []
     for number, view in enumerate(views):
         camera = view.camera.fitted(SIDE)
@@ -80,7 +79,7 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
 
 
 def _in_front(camera: Camera, positions: np.ndarray, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which of some points are in the picture, and how far each is behind the foremost there."""
+    """Tell which of some points are in the picture, and how far each is behind the foremost point there."""
     pixels, depth = project(camera, positions)
     ahead = inside(camera, pixels, depth)
     limits = camera.height - 1, camera.width - 1
@@ -95,8 +94,8 @@ def _harmonics(directions: np.ndarray) -> np.ndarray:
     return harmonics.basis(torch.from_numpy(directions.astype(np.float64)), DEGREE)[:, 1:].numpy()
 
 
-def _unforeseen(values: np.ndarray, terms: np.ndarray, points: np.ndarray, photos: np.ndarray) -> float:
-    """Mean squared error of values (M,) in photos that a fit by terms (M, K) and a number a point and a photo has not seen."""
+def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray, photos: np.ndarray) -> float:
+    """Cross-validate a fit of values (M,) by terms (M, K), a number for each point and one for each photo: its mean squared error."""
     total = count = 0
     for fold in range(FOLDS):
         known = photos % FOLDS != fold
@@ -104,10 +103,10 @@ def _unforeseen(values: np.ndarray, terms: np.ndarray, points: np.ndarray, photo
         asked = ~known & often[points]
         columns = np.column_stack([values, terms])
         of_photo = np.zeros((photos.max() + 1, columns.shape[1]))
-        for _ in range(SWEEPS):  # what points and photos account for alone, one after the other
+        for _ in range(SWEEPS):  # means of points and of photos, one after the other
             of_point = _means(columns[known] - of_photo[photos[known]], points[known], points.max() + 1)
             of_photo = _means(columns[known] - of_point[points[known]], photos[known], photos.max() + 1)
-        columns = columns - of_point[points] - of_photo[photos]  # of those asked for that is nothing yet
+        columns = columns - of_point[points] - of_photo[photos]  # zero so far for the photos to predict
         y, x = columns[:, 0], columns[:, 1:]
         normal = x[known].T @ x[known] + RIDGE * known.sum() * np.eye(x.shape[1])
         error = (y - x @ np.linalg.solve(normal, x[known].T @ y[known]))[asked]
@@ -117,6 +116,6 @@ def _unforeseen(values: np.ndarray, terms: np.ndarray, points: np.ndarray, photo
 
 
 def _means(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
-    """Of rows (M, K) that belong to a group (M,): (groups, K), zero where nothing does."""
+    """Average rows (M, K) by their group (M,): (groups, K), zero for empty groups."""
     sums = np.stack([np.bincount(group, column, groups) for column in values.T], axis=1)
     return sums / np.maximum(np.bincount(group, minlength=groups), 1)[:, None]

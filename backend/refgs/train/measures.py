@@ -14,7 +14,7 @@ from refgs.errors import InputError
 from refgs.model.environment import Environment
 from refgs.render.renderer import Rendering, render
 from refgs.run import light_of
-from refgs.train.state import State
+from refgs.train.state import State, spread
 
 VIEWS = 4  # that are measured
 FEWER = 2  # of them for what is slow: FLIP, which takes as long as ten renderings, and relighting
@@ -23,15 +23,11 @@ ROWS = 128  # of the lights that are compared
 
 def held_out_psnr(state: State, most: int = VIEWS) -> float | None:
     """Average the PSNR over at most this many of the held-out views; None where there are none."""
-    chosen = _spread(state.test, most)
+    chosen = spread(state.test, most)
     if not chosen:
         return None
     pairs = ((state.render(v.camera).color.clamp(0, 1), composite(v, state.background)) for v in chosen)
     return float(np.mean([metrics.psnr(*(image.numpy(force=True) for image in pair)) for pair in pairs]))
-
-
-def _spread(views: list, most: int) -> list:
-    return views[:: max(1, len(views) // most)][:most]
 
 
 class _Look(NamedTuple):
@@ -54,7 +50,7 @@ class Measures:
         capture = state.capture
         self.settings, self._background = state.settings, torch.tensor(state.settings.image.background)
         self._method = state.method
-        chosen = _spread(list(zip(capture.test_views, state.test, strict=True)), VIEWS)
+        chosen = spread(list(zip(capture.test_views, state.test, strict=True)), VIEWS)
         folder = capture.folder / FOLDER
         self._light = self._panorama = None
         try:

@@ -25,7 +25,7 @@ class _Work(Work):
 
 
 class ScreenGradient:
-    """Mean gradient of the loss by a surfel's motion on the screen, in half image widths (as 3D Gaussian splatting counts it)."""
+    """Mean gradient of the loss by a surfel's motion on the screen, in half image widths, as in 3D Gaussian splatting."""
 
     def __init__(self, count: int, device: torch.device):
         self.total = torch.zeros(count, device=device)
@@ -34,7 +34,7 @@ class ScreenGradient:
     @timed("densification")
     @torch.no_grad()
     def add(self, position: Tensor, gradient: Tensor, camera: Camera, accepted: Tensor | None = None) -> None:
-        """Account for one view's gradient (N, 3) by the world position (N, 3), unless `accepted`, a float32 scalar, is zero."""
+        """Add one view's gradient (N, 3) by the world position (N, 3), unless `accepted`, a float32 scalar, is zero."""
         surfels = len(self.total)
         check(total=(self.total, (surfels,)), position=(position, (surfels, 3)), gradient=(gradient, (surfels, 3)))
         position, gradient, work = position.contiguous(), gradient.contiguous(), _Work(count=len(position))
@@ -45,5 +45,5 @@ class ScreenGradient:
         run("refgs_motion", work, position, items=work.count)
 
     def mean(self) -> Tensor:
-        """(N,), zero where a surfel was never seen."""
+        """Average over the views (N,); zero where a surfel was never seen."""
         return self.total / self.views.clamp_min(1)

@@ -16,7 +16,7 @@ from refgs.render.rasterize import rasterize
 from refgs.render.rendering import COVERED, Rendering
 from refgs.render.volume import discs
 from refgs.train.losses import Photo, objective
-from refgs.train.state import RenderInputs, State
+from refgs.train.state import RenderInputs, State, spread
 
 VIEWS = 8  # that are looked at, at the most
 SEVERAL = 12  # where a surfel has to be seen from several sides
@@ -59,7 +59,7 @@ def decibels_lost(errors: list[float], without: list[float]) -> float:
 
 def spread_views(state: State, most: int = VIEWS) -> list[int]:
     """Choose at most this many training views, evenly."""
-    return list(range(len(state.photos)))[:: max(1, len(state.photos) // most)][:most]
+    return [*spread(range(len(state.photos)), most)]
 
 
 @torch.no_grad()

@@ -1,6 +1,6 @@
 """State of a training: what it works on, what it learns, and what was decided about it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +24,11 @@ from refgs.train.plan import Plan
 
 Report = Callable[[str, dict[str, Any]], None]
 """Called with an event's name and its facts: "stage", "decided", "progress", "measured", "warning"."""
+
+
+def spread(items: Sequence, most: int) -> Sequence:
+    """Choose at most this many items, evenly."""
+    return items[:: max(1, len(items) // most)][:most]
 
 
 class RenderInputs(NamedTuple):

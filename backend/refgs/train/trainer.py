@@ -15,7 +15,6 @@ from refgs.train.effective import Effective
 from refgs.train.guard import Guard, running, warn
 from refgs.train.losses import departure, objective
 from refgs.train.measures import Measures
-from refgs.train.memory import fewer_surfels
 from refgs.train.plan import Plan, growth
 from refgs.train.rates import set_rates
 from refgs.train.setup import set_up, start_deferred
@@ -130,7 +129,7 @@ class Trainer:
         begun, used = time.perf_counter(), time.process_time()
         figures = self._attempt()
         while figures is None:  # out of the attempt, whose traceback held its tensors
-            fewer_surfels(self.state)
+            densify.fewer_surfels(self.state)
             figures = self._attempt()
         self.state.seconds += time.perf_counter() - begun
         self.state.processor_seconds += time.process_time() - used
