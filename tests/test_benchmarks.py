@@ -1,26 +1,52 @@
 """That the benchmarks run: what they print is a matter of the machine."""
 
+from argparse import ArgumentParser
+from functools import partial
+
 import pytest
 import torch
 
-from benchmarks import floors, gpu, machine
+from benchmarks import floors, gpu, kernels, machine
+from benchmarks.harness import Bench
 
 CPU = torch.device("cpu")
 
 
-def test_the_cards_benchmark_runs(capsys):
+@pytest.fixture
+def bench():
+    return Bench("gpu", ArgumentParser(), [])
+
+
+def test_the_cards_benchmark_runs(bench, capsys):
     """All but the trainings, with the CPU for a card."""
-    gpu.raster_table(CPU, [(500, 60, 40)], rounds=2)
-    gpu.frame_table(CPU, 500, 40, rounds=2)
+    gpu.measure_raster(bench, CPU, [(500, 60, 40)], rounds=2)
+    gpu.measure_frames(bench, CPU, 500, 40, rounds=2)
+    gpu.measure_iteration(bench, CPU, rounds=1)
+    bench.finish(*gpu.TABLES)
     said = capsys.readouterr().out
-    assert "500" in said and "frames a second" in " ".join(said.split())
+    assert "500 surfels, 60×40" in said and "a frame, 500 surfels" in said and "an iteration" in said
 
 
 def test_no_card_is_said(monkeypatch, capsys):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(SystemExit) as left:
-        gpu.main()
+        gpu.main([])
     assert left.value.code == 2 and "no NVIDIA card" in capsys.readouterr().out
+
+
+def test_the_kernels_benchmark_runs(monkeypatch, bench):
+    """Small, on one instruction set."""
+    for name, value in {"SPLATS": 300, "SIDE": 24, "ROUNDS": 1}.items():
+        monkeypatch.setattr(kernels, name, value)
+    monkeypatch.setattr(kernels.load, "supported", lambda: ["sse4"])
+    monkeypatch.setattr(kernels, "ball", partial(kernels.ball, 300, 24))
+    kernels.measure_all(bench)
+    assert {row.scene for row in bench.rows} == set(kernels.STEPS.values())
+    assert all(row.value > 0 for row in bench.rows) and {row.figure for row in bench.rows} == {
+        "least",
+        "median",
+        "floor",
+    }
 
 
 def test_covered_pairs_are_about_those_that_are_blended():

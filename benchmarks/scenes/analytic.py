@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from benchmarks.scenes.shapes import Material
 from refgs.color import srgb_encode
 from refgs.render.brdf import bounces, fresnel, one_bounce
+from scripts.demo.shapes import Material
 
 VIEWS, DISTANCE, ANGLE = 24, 4.0, 0.7  # training views, radii, radians
 F0 = np.array([0.9, 0.6, 0.3])

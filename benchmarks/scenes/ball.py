@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, lathe
+from scripts.demo.shapes import Material, Scene, lathe
 
 MATERIALS = (Material((0.95, 0.93, 0.88), 1.0, 0.03), Material((0.70, 0.30, 0.20), 1.0, 0.40))
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, join, mix, step
 from benchmarks.scenes.solids import Solid, blend, box, carve, disc, ellipsoid, mirrored, ring, sculpt, sweep
+from scripts.demo.shapes import Material, Scene, join, mix, step
 
 
 def paint(points: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """A dancer of polished bronze in a silver skirt on a plinth: limbs and folds that reflect each other."""
 
-from benchmarks.scenes.shapes import Material, Scene, join
 from benchmarks.scenes.solids import blend, disc, ellipsoid, mirrored, ring, sculpt, sweep
+from scripts.demo.shapes import Material, Scene, join
 
 BRONZE, SILVER, DARK = range(3)
 MATERIALS = (

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, join, mix, step
 from benchmarks.scenes.solids import Solid, blend, carve, disc, ellipsoid, mirrored, ring, sculpt, sweep
+from scripts.demo.shapes import Material, Scene, join, mix, step
 
 
 def stripes(points: np.ndarray) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Mesh, Scene, join, lathe, mix, moved, step
 from benchmarks.scenes.solids import sculpt, sweep
+from scripts.demo.shapes import Material, Mesh, Scene, join, lathe, mix, moved, step
 
 
 def clay(points: np.ndarray) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, join, lathe, mix, moved, step
 from benchmarks.scenes.solids import box, ring, sculpt
+from scripts.demo.shapes import Material, Scene, join, lathe, mix, moved, step
 
 
 def glaze(points: np.ndarray) -> np.ndarray:

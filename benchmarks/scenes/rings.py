@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, join, tube
+from scripts.demo.shapes import Material, Scene, join, tube
 
 MATERIALS = (
     Material((0.944, 0.720, 0.330), 1.0, 0.10),

@@ -12,7 +12,7 @@ from scipy.sparse import coo_array, diags_array
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from benchmarks.scenes.shapes import Mesh
+from scripts.demo.shapes import Mesh
 
 Solid = Callable[[np.ndarray], np.ndarray]
 FAR = 0.25  # beyond the width of any blend

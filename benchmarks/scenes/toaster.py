@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Mesh, Scene, join, mix, moved, step
 from benchmarks.scenes.solids import box, carve, disc, ellipsoid, sculpt, sweep
+from scripts.demo.shapes import Material, Mesh, Scene, join, mix, moved, step
 
 STEEL, TRAY, PLASTIC, BRASS, TOAST = range(5)
 SLICE = (0.36, 0.05, 0.25)  # half a slice

@@ -1,28 +1,20 @@
-"""The side of a mesh's textures, on a ball whose paint is a formula."""
-
-from collections.abc import Iterator
+"""Make a ball of splats whose paint is a formula, and read textures as a renderer does."""
 
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from benchmarks.approximations import Row, rms, timed
-from refgs.export.bake import bake
-from refgs.export.composite import composite
 from refgs.export.splats import Splats
-from refgs.export.unwrap import unwrap
 from refgs.geometry.mesh import Mesh, smooth_normals
 
-STRIPES = 40.0  # waves of the paint, in radians a radius
+
+def paint(p: np.ndarray) -> np.ndarray:
+    """Paint points of the unit sphere smoothly (P, 3)."""
+    return 0.5 + 0.4 * np.sin(2 * p + [0, 1, 2])
 
 
-def paint(p: np.ndarray, waves: float = 2.0) -> np.ndarray:
-    """A colour (P, 3) that varies smoothly over the unit sphere."""
-    return 0.5 + 0.4 * np.sin(waves * p + [0, 1, 2])
-
-
-def sphere_of_splats(count: int = 4000, radius: float = 1.0, outward: float = 1.0, waves: float = 2.0) -> Splats:
-    """Splats all over a sphere, as large as they are apart, painted so."""
+def sphere_of_splats(count: int = 4000, radius: float = 1.0, outward: float = 1.0) -> Splats:
+    """Cover a sphere with painted splats, each as large as their spacing."""
     i = np.arange(count) + 0.5
     z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
     ring = np.sqrt(1 - z * z)
@@ -38,7 +30,7 @@ def sphere_of_splats(count: int = 4000, radius: float = 1.0, outward: float = 1.
         opacities=np.full(count, 0.8, f),
         scales=np.full((count, 2), radius * np.sqrt(4 * np.pi / count), f),
         rotations=rotations.astype(f),
-        albedo=paint(n, waves).astype(f),
+        albedo=paint(n).astype(f),
         metallic=(0.5 + 0.5 * n[:, 2]).astype(f),
         roughness=(0.5 - 0.4 * n[:, 0]).astype(f),
         received=np.ones((count, 3), f),
@@ -47,12 +39,13 @@ def sphere_of_splats(count: int = 4000, radius: float = 1.0, outward: float = 1.
 
 
 def ball(level: int = 3) -> Mesh:
+    """Make a unit sphere of triangles with smooth normals."""
     sphere = trimesh.creation.icosphere(level)
     return Mesh(np.array(sphere.vertices), np.array(sphere.faces), smooth_normals(sphere.vertices, sphere.faces))
 
 
 def on_surface(mesh: Mesh, count: int = 3000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Random faces and barycentric weights, and their uv."""
+    """Draw random faces with barycentric weights, and their uv."""
     rng = np.random.default_rng(2)
     faces = mesh.faces[rng.integers(len(mesh.faces), size=count)]
     weights = rng.dirichlet([1, 1, 1], size=count)
@@ -60,7 +53,7 @@ def on_surface(mesh: Mesh, count: int = 3000) -> tuple[np.ndarray, np.ndarray, n
 
 
 def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Bilinear, as a renderer does, v upward."""
+    """Read a texture bilinearly, as a renderer does; v points up."""
     size = len(texture)
     x, y = uv[:, 0] * size - 0.5, (1 - uv[:, 1]) * size - 0.5
     x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
@@ -72,24 +65,3 @@ def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     return (at(y0, x0) * (1 - s) + at(y0, x0 + 1) * s) * (1 - t) + (
         at(y0 + 1, x0) * (1 - s) + at(y0 + 1, x0 + 1) * s
     ) * t
-
-
-def sizes(
-    settings: tuple = (256, 512, 1024, 2048, 4096), splats: int = 60_000, level: int = 5, points: int = 20_000
-) -> Iterator[Row]:
-    """Base colour at random points of the ball: how far it is from the paint, and from the splats composited right there, which is
-    what the texture adds."""
-    unit, mesh = "RMS error", unwrap(ball(level))
-    painted = sphere_of_splats(splats, waves=STRIPES)
-    faces, weights, uv = on_surface(mesh, points)
-    where, normals = (np.einsum("nk,nkc->nc", weights, values[faces]) for values in (mesh.vertices, mesh.normals))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    truth = {
-        "from the paint": paint(where / np.linalg.norm(where, axis=1, keepdims=True), STRIPES),
-        "from the splats": composite(painted, where, normals, lambda done, total: None)[:, :3],
-    }
-    for size in settings:
-        textures, spent = timed(bake, mesh, painted, size, seconds=0)
-        found = look_up(textures.base_color, uv)
-        for method, exact in truth.items():
-            yield Row("side of the texture", method, size, rms(found - exact), unit, spent, size == 1024)

@@ -8,7 +8,7 @@ import numpy as np
 import OpenEXR
 from mathutils import Matrix
 
-from benchmarks.scenes.shapes import Material, Mesh
+from scripts.demo.shapes import Material, Mesh
 
 FIELD_OF_VIEW = np.radians(40.0)
 # What is written beside the picture by the same camera rays; each is the mean over the covered part of a pixel.

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import trimesh
 
-from benchmarks.scenes.cycles import FIELD_OF_VIEW, Renderer
-from benchmarks.scenes.light import read_light
-from benchmarks.scenes.shapes import Scene
 from refgs.color import srgb_encode
 from refgs.errors import InputError
 from refgs.export.environment import write_exr
+from scripts.demo.cycles import FIELD_OF_VIEW, Renderer
+from scripts.demo.light import read_light
+from scripts.demo.shapes import Scene
 
 
 def write_capture(

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, join, lathe, tube
+from scripts.demo.shapes import Material, Scene, join, lathe, tube
 
 GOLD, COPPER, IRON, CERAMIC = range(4)
 MATERIALS = (

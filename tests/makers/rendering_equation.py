@@ -1,8 +1,7 @@
-"""What the split sum gets wrong: outgoing radiance of this program's shading against a Monte Carlo of the rendering equation.
+"""Outgoing radiance three ways: Monte Carlo of the rendering equation, the exact split sum, and the kernels.
 
-Under one light the error is that of the split itself: the lobe is taken to be seen from its own axis (N = V = R), so that it
-neither stretches at grazing angles nor ends at the horizon. What texels, levels of roughness and harmonics of degree 2 add
-is the difference between the two figures of a cell.
+The split sum sees each lobe from its own axis (N = V = R): it neither stretches at grazing angles nor ends at the horizon. That is its
+error against Monte Carlo. Texels and roughness levels add the difference between the kernels and the exact split sum.
 """
 
 import functools
@@ -11,8 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from refgs.camera import Camera
@@ -22,8 +19,8 @@ from refgs.model.prefilter import ggx_lobe
 from refgs.render.brdf import bounces, fresnel, one_bounce
 from refgs.render.shade import shade
 
-ROUGHNESS, ANGLES = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0), (0, 30, 60, 80)  # the latter between view and normal, in degrees
-RESOLUTION, SAMPLES = 64, 100_000
+ROUGHNESS, ANGLES = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0), (0, 30, 60, 80)  # degrees between view and normal
+RESOLUTION = 64
 SHARPNESS = 200.0  # of the sun, a standard deviation of 4 degrees
 
 Radiance = Callable[[np.ndarray], np.ndarray]
@@ -38,9 +35,9 @@ METAL, DIELECTRIC = Material(1.0, 0.7), Material(0.0, 0.5)
 
 
 class View(NamedTuple):
-    """Of a surface whose normal is +z."""
+    """Direction to the camera from a surface whose normal is +z, and the mirrored direction."""
 
-    way: np.ndarray  # to the camera
+    way: np.ndarray
     mirrored: np.ndarray
 
     @classmethod
@@ -50,7 +47,7 @@ class View(NamedTuple):
 
 
 def lights(sun: np.ndarray) -> dict[str, Radiance]:
-    """Radiance (P,) along directions (P, 3); a sun in that direction."""
+    """Lights by name: functions from directions (P, 3) to radiance (P,). `sun` is where the sun stands."""
     slope = np.array([-0.48, 0.48, 0.424])
     return {
         "constant": lambda d: np.ones(len(d)),
@@ -60,7 +57,7 @@ def lights(sun: np.ndarray) -> dict[str, Radiance]:
 
 
 class Reflected(NamedTuple):
-    """Of an even light, exactly: by which the lobe is brighter than its single bounce; what leaves; what the base is left."""
+    """Exact reflection of a constant light: factor of multiple bounces, specular part, and diffuse part of the base."""
 
     bounces: float
     specular: float
@@ -81,8 +78,9 @@ class Reflected(NamedTuple):
 
 
 def half_vectors(sine, cosine, alpha: float, u: np.ndarray, phi: np.ndarray) -> np.ndarray:
-    """Of microfacets (..., 3) about +z, by the distribution of those that a view sees (Heitz 2018), from numbers of 0..1 and azimuths.
-    The view (sine, 0, cosine) has as many, or is one."""
+    """Sample half vectors (..., 3) about +z by the distribution of visible normals (Heitz 2018).
+
+    `u` in 0..1 and `phi` are the random numbers; the view is (sine, 0, cosine)."""
     length = np.hypot(alpha * sine, cosine)
     x, z = alpha * sine / length, cosine / length
     t1, t2 = np.sqrt(u) * np.cos(phi), np.sqrt(u) * np.sin(phi)
@@ -96,8 +94,10 @@ def half_vectors(sine, cosine, alpha: float, u: np.ndarray, phi: np.ndarray) -> 
 def monte_carlo(
     light: Radiance, sun: np.ndarray, view: View, roughness: float, material: Material, samples: int, seed: int = 0
 ) -> tuple[float, float]:
-    """Outgoing radiance by the rendering equation, and its standard error. A third of the samples each by the distribution of
-    visible normals (Heitz 2018), by the cosine and by the sun's shape, weighed by the balance heuristic."""
+    """Integrate the rendering equation; return outgoing radiance and its standard error.
+
+    A third of the samples each follows the visible normals (Heitz 2018), the cosine and the sun's shape; the balance heuristic weights
+    them."""
     rng, alpha, v = np.random.default_rng(seed), roughness**2, view.way
     n = samples // 3
     u, phi = rng.random((3, n)), 2 * np.pi * rng.random((3, n))
@@ -132,7 +132,7 @@ def monte_carlo(
 
 
 def lobe_mean(light: Radiance, axes: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Radiance (P,) as lobes of these roughnesses (P,) about unit axes (P, 3) see it (Eq. 8), exactly."""
+    """Integrate radiance over GGX lobes (Eq. 8): (P,) for unit axes (P, 3) and roughnesses (P,), by quadrature."""
     x, weight = np.polynomial.legendre.leggauss(200)
     psi, alpha = np.pi / 4 * (x + 1), roughness[:, None] ** 2
     tangent = alpha * np.tan(psi)  # of half the angle from the axis
@@ -152,7 +152,7 @@ def lobe_mean(light: Radiance, axes: np.ndarray, roughness: np.ndarray) -> np.nd
 
 
 def split_sum(light: Radiance, view: View, roughness: float, material: Material) -> float:
-    """Outgoing radiance by the split sum, both factors exact (Eq. 7 and 8), and by Lambert's law."""
+    """Compute outgoing radiance by the split sum with both factors exact (Eq. 7 and 8), plus Lambert's diffuse part."""
     filtered = lobe_mean(light, view.mirrored[None], np.array([roughness]))[0]
     d, area = (v.numpy() for v in (cubemap.texel_directions(128), cubemap.texel_solid_angles(128)))
     received = (light(d) * np.maximum(d[:, 2], 0)) @ area / np.pi
@@ -161,12 +161,12 @@ def split_sum(light: Radiance, view: View, roughness: float, material: Material)
 
 
 def pixels(view: View, materials: list[tuple[float, Material]]) -> tuple[Tensor, Camera]:
-    """What `shade` takes of a surface of these roughnesses and materials, a pixel each, and the camera."""
+    """Make the input of `shade`: one pixel for each roughness and material, and the camera."""
     count = len(materials)
     right, up = np.array([0.0, 1.0, 0.0]), np.cross(view.way, [0.0, 1.0, 0.0])
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, -up, -view.way])
-    pose[:3, 3] = [0, 0, 1]  # the camera looks at the origin, from one away; so narrowly that all rays are parallel
+    pose[:3, 3] = [0, 0, 1]  # one unit from the origin; the view is so narrow that all rays are parallel
     camera = Camera("view", count, 1, 1e6, 1e6, count / 2, 0.5, pose)
     across = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) / 1e6
     features = torch.zeros(1, count, 11)
@@ -178,39 +178,12 @@ def pixels(view: View, materials: list[tuple[float, Material]]) -> tuple[Tensor,
 
 
 def environment(light: Radiance, resolution: int = RESOLUTION) -> Environment:
-    """A light without colour as a cubemap: its radiance at the texels' centres."""
+    """Make a grey cubemap from a light's radiance at the texels' centres."""
     radiance = torch.from_numpy(light(cubemap.texel_directions(resolution).numpy())).float()
     return Environment(radiance[:, None].expand(-1, 3).contiguous())
 
 
 def shaded(light: Radiance, view: View, materials: list[tuple[float, Material]]) -> Tensor:
-    """Outgoing radiance (P,) by this program's kernels: a pixel each."""
+    """Compute outgoing radiance (P,) by the kernels, one pixel each."""
     features, camera = pixels(view, materials)
     return shade(features, torch.ones(1, len(materials)), environment(light), camera, torch.zeros(3)).radiance[0, :, 0]
-
-
-def main() -> None:
-    console = Console()
-    for name, material in (("metal", METAL), ("dielectric", DIELECTRIC)):
-        title = f"{name}, albedo {material.albedo}: error of this program (of the exact split sum), standard error of the truth"
-        table = Table("roughness", "light", *(f"{angle}°" for angle in ANGLES), title=title)
-        for kind in ("constant", "gradient", "sun"):
-            columns = []
-            for angle in ANGLES:
-                view = View.at(angle)
-                light = lights(view.mirrored)[kind]
-                found = shaded(light, view, [(roughness, material) for roughness in ROUGHNESS]).tolist()
-                cells = []
-                for ours, roughness in zip(found, ROUGHNESS, strict=True):
-                    truth, error = monte_carlo(light, view.mirrored, view, roughness, material, SAMPLES)
-                    exact = split_sum(light, view, roughness, material)
-                    cells.append(f"{ours / truth - 1:+.2%} ({exact / truth - 1:+.2%}) {error / truth:.2%}")
-                columns.append(cells)
-            for roughness, row in zip(ROUGHNESS, zip(*columns, strict=True), strict=True):
-                table.add_row(f"{roughness}", kind, *row)
-        console.print(table)
-    console.print(f"A cubemap of 6×{RESOLUTION}²; a sun of 4 degrees, in the mirrored direction.")
-
-
-if __name__ == "__main__":
-    main()
