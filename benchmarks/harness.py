@@ -148,7 +148,8 @@ class Bench:
         kept = read(KEPT) if KEPT.exists() else []
         for table in tables:
             headings, *lines = table.lines(self.rows, kept)
-            printed = Printed(title=table.title)
+            shown = any(row.benchmark == self.name for row in kept)
+            printed = Printed(title=table.title, caption="in brackets: the kept figure" if shown else None)
             for index, heading in enumerate(headings):
                 printed.add_column(heading, justify="right" if index > bool(table.variant) else "left")
             for line in lines:

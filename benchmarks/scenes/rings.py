@@ -1,4 +1,4 @@
-"""Three metal rings through one another: they reflect and hide each other, the hard case."""
+"""Three linked metal rings that reflect and occlude each other: the hard case."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ MATERIALS = (
 
 
 def build() -> Scene:
-    """Rings of radius 0.65 and thickness 0.2 in three planes at right angles, each linked with both others."""
+    """Build rings of radius 0.65 and thickness 0.2 in three planes at right angles, each linked with both others."""
     angle = np.arange(96) * (2 * np.pi / 96)
     ring = np.stack([0.65 * np.cos(angle), 0.65 * np.sin(angle), np.zeros(96)], -1) - [0.35, 0, 0]
     rings = [

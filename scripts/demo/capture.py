@@ -1,4 +1,4 @@
-"""A scene's capture: where the cameras stand, and the folder that is written (layout: `write_capture`)."""
+"""Place the cameras around a scene and write its capture (layout: `write_capture`)."""
 
 import json
 import shutil
@@ -39,10 +39,10 @@ def write_capture(
         normal|albedo/NAME.exr      RGB: world-space unit normal; base colour
         roughness|metallic|depth|alpha/NAME.exr     Y: one channel; depth along the camera's axis
         visibility/NAME.exr         Y: 1 where the mirror direction about the true normal leaves the object, 0 where the
-                                    object is in its way
+                                    object occludes it
         relight/HDRI/NAME.exr       color of the test views under another panorama, which is relight/HDRI.exr
-    All but the photos is float32. In a pixel that the object covers in part, normal (then made unit length again),
-    albedo, roughness, metallic, depth and visibility are means over the covered part; where alpha is zero they are zero.
+    All but the photos are float32. In a partly covered pixel, albedo, roughness, metallic, depth, visibility and normal (normalised
+    again) are means over the covered part. They are zero where alpha is zero.
 
     `progress(done, total, what)` is called after every view. InputError: `out` exists; an HDRI is unknown.
     """
@@ -50,7 +50,7 @@ def write_capture(
         raise InputError(f"{out} exists: choose another folder, or remove it")
     light = read_light(scene.light)
     panoramas = {name: read_light(name) for name in relight}
-    # The object's bounding sphere just fits, with a margin, so that no silhouette touches the edge of a photo.
+    # The object's bounding sphere fits with a margin: no silhouette touches the edge of a photo.
     distance = 1.04 * np.linalg.norm(scene.mesh.vertices, axis=1).max() / np.sin(FIELD_OF_VIEW / 2)
     total, done = train + test * (1 + len(relight)), 0
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -63,7 +63,7 @@ def write_capture(
         renderer = Renderer(scene.mesh, scene.materials, size, samples)
         renderer.set_light(truth / "light.exr")
         splits = {"train": sphere_cameras(train, distance, scene.lowest, 0.0)}
-        # Half a step of the spiral away, or test views could coincide with training views.
+        # Turned, so that no test view coincides with a training view.
         splits["test"] = sphere_cameras(test, distance, scene.lowest, np.pi / 3)
         for split, cameras in splits.items():
             (folder / split).mkdir()
@@ -96,9 +96,9 @@ def write_capture(
 
 
 def sphere_cameras(count: int, distance: float, lowest: float, turn: float) -> np.ndarray:
-    """(count, 4, 4) camera-to-world matrices with OpenGL's axes, looking at the origin, up towards +z.
+    """Place cameras on a Fibonacci spiral over the sphere above z = `lowest`·distance, turned by `turn`.
 
-    They stand on a Fibonacci spiral over the part of the sphere above z = `lowest`·distance, turned by `turn`.
+    Returns (count, 4, 4) camera-to-world matrices with OpenGL's axes, looking at the origin, +z up.
     """
     steps = np.arange(count) + 0.5
     z = lowest + (1 - lowest) * steps / count
@@ -132,7 +132,7 @@ def _transforms(split: str, cameras: np.ndarray, size: int) -> dict:
 
 
 def _write_photo(path: Path, color: np.ndarray) -> None:
-    """Blender's Standard view transform: what is above one is clipped, the rest is sRGB."""
+    """Write a photo by Blender's Standard view transform: sRGB, clipped at one."""
     alpha = color[..., 3:]
     straight = color[..., :3] / np.where(alpha > 0, alpha, 1)
     pixels = np.concatenate([srgb_encode(straight).clip(0, 1), alpha], -1)

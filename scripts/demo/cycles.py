@@ -1,4 +1,4 @@
-"""The only module here that drives Blender: a scene's object under a panorama, rendered by Cycles view by view."""
+"""Render a scene's object under a panorama by Cycles, view by view; the only module here that drives Blender."""
 
 import tempfile
 from pathlib import Path
@@ -11,15 +11,15 @@ from mathutils import Matrix
 from scripts.demo.shapes import Material, Mesh
 
 FIELD_OF_VIEW = np.radians(40.0)
-# What is written beside the picture by the same camera rays; each is the mean over the covered part of a pixel.
+# Passes written beside the picture by the same camera rays; each is the mean over the covered part of a pixel.
 VECTORS, SCALARS = ("normal", "albedo"), ("roughness", "metallic", "depth")
 
 
 class Renderer:
     """Renders one object, square pictures of `size` pixels, 40° wide; Blender's current file is replaced.
 
-    Cycles is told to be comparable rather than pretty: a box filter one pixel wide (a pixel is the mean over its own
-    square, nothing of its neighbours), a fixed number of samples, no clamping of bright paths; then Intel's denoiser.
+    Pictures are to be compared: a box filter one pixel wide (a pixel is the mean over its own square), a fixed number of samples, no
+    clamping of bright paths; then Intel's denoiser.
     """
 
     def __init__(self, mesh: Mesh, materials: tuple[Material, ...], size: int, samples: int):
@@ -32,7 +32,7 @@ class Renderer:
         scene.camera = self._camera
         scene.world = bpy.data.worlds.new("World")
         scene.world.use_nodes = True
-        # What the mirror sees for `visibility`: white, and no lamps that light would be looked for at.
+        # `visibility` mirrors a white world without lamps to sample.
         self._white = bpy.data.worlds.new("White")
         self._white.use_nodes = True
         self._white.node_tree.nodes["Background"].inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
@@ -70,22 +70,22 @@ class Renderer:
         scene.render.image_settings.color_depth = "32"
 
     def set_light(self, path: Path) -> None:
-        """The world becomes this panorama (EXR, linear, Blender's orientation)."""
+        """Light the world by this panorama (EXR, linear, Blender's orientation)."""
         self._panorama.image = bpy.data.images.load(str(path))
 
     def render(self, camera_to_world: np.ndarray, seed: int) -> dict[str, np.ndarray]:
-        """One view, from a camera-to-world matrix with OpenGL's axes.
+        """Render one view from a camera-to-world matrix with OpenGL's axes.
 
         color (h, w, 4): linear, premultiplied; alpha (h, w); normal (h, w, 3): world space, unit length; albedo
         (h, w, 3): base colour; roughness, metallic, depth (h, w): depth along the camera's axis. All are zero where
-        alpha is.
+        alpha is zero.
         """
         return _passes(self._channels(camera_to_world, seed))
 
     def visibility(self, camera_to_world: np.ndarray, seed: int) -> np.ndarray:
-        """(h, w): the share of the covered part of a pixel whose mirrored rays miss the object; zero where alpha is.
+        """Share of a pixel's covered part whose mirrored rays miss the object (h, w); zero where alpha is zero.
 
-        The object becomes a perfect mirror in a white world, and what it sees of itself is black.
+        The object becomes a perfect mirror in a white world: it reflects itself black.
         """
         scene, layer, world = self.scene, self.scene.view_layers[0], self.scene.world
         layer.material_override, scene.world = self._mirror, self._white
@@ -101,7 +101,7 @@ class Renderer:
         return (channels["ViewLayer.Combined.R"] / np.where(alpha > 0, alpha, 1)).clip(0, 1)
 
     def _channels(self, camera_to_world: np.ndarray, seed: int) -> dict[str, np.ndarray]:
-        """The channels of Cycles' multilayer EXR, (h, w) float32 each."""
+        """Render and read the channels of Cycles' multilayer EXR, (h, w) float32 each."""
         self._camera.matrix_world = Matrix(camera_to_world.tolist())  # a list of rows alone would be read as columns
         self.scene.cycles.seed = seed
         with tempfile.TemporaryDirectory() as folder:
@@ -127,9 +127,9 @@ class Renderer:
 
 
 def _material(values: Material, attribute: str) -> bpy.types.Material:
-    """A Principled BSDF whose inputs, the shading normal and the depth also go to the passes.
+    """Make a Principled BSDF whose inputs, shading normal and depth also go to the passes.
 
-    Where the base colour is a texture, the mesh has it under the name `attribute`.
+    A base colour that is a texture is the mesh's attribute of that name.
     """
     material = bpy.data.materials.new("Material")
     material.use_nodes = True
@@ -172,7 +172,7 @@ def _mirror() -> bpy.types.Material:
 
 
 def _passes(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The passes of a multilayer EXR, each divided by alpha, for Cycles counts a ray that misses as zero."""
+    """Read the passes of a multilayer EXR, each divided by alpha: Cycles counts a ray that misses as zero."""
 
     def pick(name: str, letters: str) -> np.ndarray:
         return np.stack([channels[f"ViewLayer.{name}.{letter}"] for letter in letters], -1).astype(np.float32)

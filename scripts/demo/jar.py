@@ -1,4 +1,4 @@
-"""A lidded urn of gold, copper and glazed ceramic with a dark band, in a room: shiny, partly concave, several materials."""
+"""Lidded urn of gold, copper and glazed ceramic with a dark band, in a room: shiny, partly concave, several materials."""
 
 import numpy as np
 
@@ -28,14 +28,14 @@ HANDLE = [(0.232, 0.62), (0.464, 0.68), (0.673, 0.62), (0.76, 0.46), (0.719, 0.2
 
 
 def build() -> Scene:
-    """The urn, two units high, 0.8 from the axis to the handles."""
+    """Build the urn, two units high, 0.8 from the axis to the handles."""
     side = np.array([(x, 0.0, z) for x, z in HANDLE])
     handles = [tube(side * (sign, 1, 1), 0.045, COPPER, closed=False) for sign in (1, -1)]
     return Scene(join(lathe(PROFILE, rows=320, columns=288, flutes=_flutes), *handles), MATERIALS, light="interior")
 
 
 def _flutes(angle: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Sixteen shallow grooves that fade out towards both ends of the body."""
+    """Cut sixteen shallow grooves that fade towards both ends of the body."""
     fade = np.clip((z + 0.66) / 0.25, 0, 1) * np.clip((0.09 - z) / 0.2, 0, 1)
     fade = fade * fade * (3 - 2 * fade)
     return 1 + 0.022 * fade * (np.cos(16 * angle) - 1)

@@ -1,4 +1,4 @@
-"""The HDRIs that come with Blender."""
+"""Find and read the HDRIs that come with Blender."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from refgs.export.environment import read_environment
 
 
 def studio_lights() -> dict[str, Path]:
-    """Blender's own CC0 panoramas by name: city, courtyard, forest, interior, night, studio, sunrise, sunset."""
+    """List Blender's own CC0 panoramas by name: city, courtyard, forest, interior, night, studio, sunrise, sunset."""
     import bpy
 
     folder = Path(bpy.utils.system_resource("DATAFILES", path="studiolights/world"))
@@ -17,7 +17,7 @@ def studio_lights() -> dict[str, Path]:
 
 
 def read_light(name: str) -> np.ndarray:
-    """One of Blender's panoramas, (height, width, 3) float32 linear radiance, in Blender's orientation."""
+    """Read one of Blender's panoramas: (height, width, 3) float32 linear radiance, in Blender's orientation."""
     lights = studio_lights()
     if name not in lights:
         raise InputError(f"there is no HDRI {name!r}: choose one of {', '.join(lights)}")

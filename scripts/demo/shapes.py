@@ -1,4 +1,4 @@
-"""Triangle meshes of a benchmark's object, made in numpy, with a material a face."""
+"""Build an object's triangle mesh in numpy, with a material for each face."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 
 @dataclass(frozen=True)
 class Material:
-    """A Principled BSDF: linear Rec.709 base colour, metallic 0..1, perceptual roughness 0..1.
+    """Principled BSDF: linear Rec.709 base colour, metallic 0..1, perceptual roughness 0..1.
 
-    A texture is a function from points (n, 3) to base colours (n, 3); it is evaluated at the vertices, and a triangle
-    shows what lies linearly between its corners.
+    A texture is a function from points (n, 3) to base colours (n, 3). It is evaluated at the vertices and interpolated linearly between
+    them.
     """
 
     base_color: tuple[float, float, float] | Callable[[np.ndarray], np.ndarray]
@@ -22,7 +22,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices (n, 3); triangles (m, 3), counter-clockwise seen from outside; material (m,): an index a triangle."""
+    """Vertices (n, 3); triangles (m, 3), counter-clockwise seen from outside; material (m,), an index for each triangle."""
 
     vertices: np.ndarray
     triangles: np.ndarray
@@ -31,7 +31,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Scene:
-    """An object about the origin, Z up, and how it is photographed.
+    """Object about the origin, Z up, and how it is photographed.
 
     `light` names one of Blender's HDRIs; `lowest` is the smallest z of a camera's direction from the origin.
     """
@@ -43,23 +43,23 @@ class Scene:
 
 
 def moved(mesh: Mesh, by: tuple[float, float, float]) -> Mesh:
-    """The mesh elsewhere."""
+    """Move a mesh."""
     return Mesh(mesh.vertices + by, mesh.triangles, mesh.material)
 
 
 def step(start: float, end: float, values: np.ndarray) -> np.ndarray:
-    """From 0 at `start` to 1 at `end`, smoothly; for textures."""
+    """Smoothstep from 0 at `start` to 1 at `end`; for textures."""
     t = ((values - start) / (end - start)).clip(0, 1)
     return t * t * (3 - 2 * t)
 
 
 def mix(one, other, share: np.ndarray) -> np.ndarray:
-    """Colours (n, 3): `one` where share (n,) is 0, `other` where it is 1."""
+    """Mix colours (n, 3): `one` where share (n,) is 0, `other` where it is 1."""
     return np.asarray(one) + share[:, None] * (np.asarray(other) - np.asarray(one))
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """One mesh of several, which may pass through each other."""
+    """Join meshes, which may intersect."""
     offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
@@ -69,11 +69,10 @@ def join(*meshes: Mesh) -> Mesh:
 
 
 def lathe(segments: list[tuple[int, list[tuple[float, float]]]], rows: int, columns: int, flutes=None) -> Mesh:
-    """A closed surface of revolution about z.
+    """Turn a profile about z into a closed surface.
 
-    `segments`: (material, [(radius, z), …]) from the lowest point on the axis to the highest, each going on where the
-    last ended; the whole profile is one monotone cubic, which doesn't overshoot at a moulding. `flutes(angle, z)`
-    multiplies the radius.
+    `segments`: (material, [(radius, z), …]) from the lowest point on the axis to the highest, each starting where the last ended. The
+    whole profile is one monotone cubic, which does not overshoot at a moulding. `flutes(angle, z)` multiplies the radius.
     """
     points = np.array([point for _, segment in segments for point in segment])
     ends = np.cumsum([len(segment) for _, segment in segments])[:-1] - 1
@@ -103,7 +102,7 @@ def lathe(segments: list[tuple[int, list[tuple[float, float]]]], rows: int, colu
 
 
 def tube(path: np.ndarray, radius: float, material: int, closed: bool, rows: int = 128, columns: int = 32) -> Mesh:
-    """A round tube along a cubic spline through `path` (n, 3), which must be planar; open ends are not capped."""
+    """Sweep a round tube along a cubic spline through the planar `path` (n, 3); open ends are not capped."""
     path = np.asarray(path, float)
     if closed:
         path = np.concatenate([path, path[:1]])
@@ -123,7 +122,7 @@ def tube(path: np.ndarray, radius: float, material: int, closed: bool, rows: int
 
 
 def _grid_triangles(bands: int, columns: int) -> np.ndarray:
-    """Two triangles a cell of a grid that is closed along its columns, (2·bands·columns, 3)."""
+    """Triangulate a grid that is closed along its columns, two triangles a cell: (2·bands·columns, 3)."""
     row, column = np.meshgrid(np.arange(bands), np.arange(columns), indexing="ij")
     a, b = row * columns + column, row * columns + (column + 1) % columns
     c, d = b + columns, a + columns
