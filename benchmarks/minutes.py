@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.harness import Bench, Column, Table, Way, figures, scene_options
-from refgs.train import history
+from refgs.formats import history
 
 PRESETS = "quick", "standard"
 TABLES = (

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from refgs_addon import environment, jobs
-from tests.addon.waiting import until
+from tests.makers.waiting import until
 
 pytest.importorskip("bpy", reason="the extension is built with the tool in Blender's Python module")
 pytestmark = pytest.mark.slow

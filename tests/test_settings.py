@@ -3,7 +3,7 @@ import json
 import pytest
 
 from refgs.errors import InputError
-from refgs.run import read_run_facts
+from refgs.run_folder import read_run_facts
 from refgs.settings import load_settings, preset_names, recorded_settings
 
 

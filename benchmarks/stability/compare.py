@@ -7,8 +7,8 @@ from torch import Tensor
 
 from benchmarks.stability.cases import Found
 from refgs.camera import Camera
-from refgs.kernels import reference
 from refgs.model.environment import Environment
+from refgs.render import reference
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import shade
 

@@ -11,12 +11,12 @@ from torch import Tensor
 from benchmarks.stability import compare
 from benchmarks.stability.cases import Case, Found
 from refgs.camera import Camera
-from refgs.kernels import reference
 from refgs.model import harmonics
+from refgs.render import reference
 from refgs.render.directional import directional
 from refgs.render.facing import facing_normals
 from refgs.render.rasterize import rasterize
-from tests.kernels import scenes
+from tests.makers import scenes
 
 WIDTH, HEIGHT, COUNT = 40, 28, 90
 

@@ -10,15 +10,15 @@ from torch import Tensor
 from benchmarks.stability import compare
 from benchmarks.stability.cases import Case, Found
 from refgs.camera import Camera
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
-from refgs.kernels import reference
 from refgs.model import cubemap
+from refgs.model.adam import Adam
 from refgs.model.prefilter import prefilter
 from refgs.model.surfels import activate
+from refgs.render import reference
 from refgs.render.ssim import dssim
-from refgs.train.adam import Adam
-from tests.kernels import scenes
+from tests.makers import scenes
 
 SIDE, RESOLUTION = 32, 16
 

@@ -14,11 +14,11 @@ from benchmarks.stability.geometry import camera, surfels
 from benchmarks.stability.photos import NOISE
 from benchmarks.stability.training import TOTAL, ball, train, trainer, usual
 from refgs.errors import InputError
-from refgs.kernels import reference
+from refgs.model.adam import Adam
+from refgs.render import reference
 from refgs.render.rasterize import rasterize
 from refgs.settings import RATES
 from refgs.train import needs
-from refgs.train.adam import Adam
 from refgs.train.start import GEOMETRY
 from refgs.train.trainer import Trainer
 

@@ -13,8 +13,8 @@ from benchmarks.stability.material import RESOLUTION, SIDE, ball
 from benchmarks.stability.training import ball as capture
 from benchmarks.stability.training import train
 from refgs.camera import Camera
-from refgs.kernels import reference
 from refgs.model import cubemap, prefilter
+from refgs.render import reference
 from refgs.settings import load_settings
 from refgs.train.ambiguity import ambiguities
 from refgs.train.losses import departure

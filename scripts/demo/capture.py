@@ -12,7 +12,7 @@ import trimesh
 
 from refgs.color import srgb_encode
 from refgs.errors import InputError
-from refgs.export.environment import write_exr
+from refgs.formats.exr import write_exr
 from scripts.demo.cycles import FIELD_OF_VIEW, Renderer
 from scripts.demo.light import read_light
 from scripts.demo.shapes import Scene

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from refgs.errors import InputError
-from refgs.export.environment import read_environment
+from refgs.formats.panorama import read_environment
 
 
 def studio_lights() -> dict[str, Path]:

@@ -1,7 +1,6 @@
 """The paper's tables: which scenes are found, what of them is done again, and the figures side by side."""
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -9,9 +8,7 @@ import pytest
 from benchmarks import harness, paper
 from refgs import commands
 from refgs.errors import InputError
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "capture"))
-from makers import colmap, nero, shiny_blender
+from tests.makers.captures import colmap, nero, shiny_blender
 
 
 def finish(run: Path, **figures: float) -> None:

@@ -11,8 +11,8 @@ from refgs_addon import jobs
 from refgs_addon.errors import InputError
 from refgs_addon.scene.beside import render_beside
 from refgs_addon.scene.run import import_run
-from tests.addon.waiting import until
-from tests.blender.runs import write_panorama
+from tests.makers.runs import write_panorama
+from tests.makers.waiting import until
 
 
 @pytest.fixture(autouse=True)

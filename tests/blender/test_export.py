@@ -14,7 +14,7 @@ from refgs_addon.scene.export import SH_DC, edited_materials, export_light, expo
 from refgs_addon.scene.parts import show
 from refgs_addon.scene.run import import_run
 from refgs_addon.scene.splats import read_rows
-from tests.blender.runs import write_ply
+from tests.makers.runs import write_ply
 
 
 @pytest.fixture

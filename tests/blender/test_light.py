@@ -13,7 +13,7 @@ from refgs_addon.scene.panorama import turn_between
 from refgs_addon.scene.relight import hdris, load_panorama, match_light, relight
 from refgs_addon.scene.run import import_run
 from refgs_addon.ui import light
-from tests.blender.runs import write_panorama
+from tests.makers.runs import write_panorama
 
 
 def room(height=48, seed=0):

@@ -14,7 +14,7 @@ from refgs_addon.scene.parts import show
 from refgs_addon.scene.preview import render_preview
 from refgs_addon.scene.relight import relight
 from refgs_addon.scene.run import import_run
-from tests.blender.runs import COLUMNS, look_at, read_exr, write_panorama, write_ply
+from tests.makers.runs import COLUMNS, look_at, read_exr, write_panorama, write_ply
 
 SIZE = 64
 

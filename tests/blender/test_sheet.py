@@ -11,7 +11,7 @@ from refgs_addon.scene.preview import render_preview
 from refgs_addon.scene.relight import relight
 from refgs_addon.scene.run import import_run
 from refgs_addon.scene.sheet import GAP, contact_sheet
-from tests.blender.runs import write_panorama
+from tests.makers.runs import write_panorama
 
 
 def test_a_view_under_each_light(run_folder, scene, tmp_path):

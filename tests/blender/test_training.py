@@ -21,7 +21,7 @@ from refgs_addon.ui import capture as capture_ui
 from refgs_addon.ui.closing import question
 from refgs_addon.ui.pictures import CURVE, DOTS, GRID, LINE, plot
 from refgs_addon.ui.training import how_far_elsewhere
-from tests.addon.waiting import until
+from tests.makers.waiting import until
 
 
 @pytest.fixture

@@ -5,10 +5,10 @@ import pickle
 
 import numpy as np
 import pytest
-from makers import colmap, edit, nerf_blender, nerfstudio, nero, ring, shiny_blender, write
 
 from refgs.capture import load_view, published_normals, read_cameras, read_capture
 from refgs.errors import InputError
+from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, nero, ring, shiny_blender, write
 
 
 def refused(read, *parts: str) -> None:

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from makers import CENTRE, RADIUS, colmap, nerf_blender, nerfstudio
 from scipy.spatial.transform import Rotation
 
 from refgs.capture import read_capture
 from refgs.capture.box import Box
 from refgs.errors import InputError
 from refgs.settings import load_settings
+from tests.makers.captures import CENTRE, RADIUS, colmap, nerf_blender, nerfstudio
 
 UP = np.array([0.6, 0.0, 0.8])
 

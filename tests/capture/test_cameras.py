@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from makers import colmap, nerf_blender, nerfstudio
 
 from refgs.capture import read_cameras, read_capture, read_run_cameras, write_cameras
 from refgs.capture.poses import in_frame
+from tests.makers.captures import colmap, nerf_blender, nerfstudio
 
 
 def assert_same(a, b):

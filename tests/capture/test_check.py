@@ -6,11 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from makers import CENTRE, ball, colmap, edit, nerf_blender, nerfstudio, ring, write
 
 from refgs.capture import read_capture
 from refgs.capture.check import check, describe
 from refgs.errors import InputError
+from tests.makers.captures import CENTRE, ball, colmap, edit, nerf_blender, nerfstudio, ring, write
 
 
 def text(folder) -> str:

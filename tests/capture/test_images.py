@@ -5,11 +5,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from makers import colmap, edit, nerf_blender, nerfstudio, write
 
 from refgs.capture import load_view, read_capture
 from refgs.capture.images import read_image
 from refgs.errors import InputError
+from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, write
 
 OPENCV = (4, "OPENCV", [60.0, 61.0, 31.0, 25.0, -0.2, 0.05, 0.003, -0.002])
 

@@ -4,7 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from makers import (
+from plyfile import PlyData, PlyElement
+
+from refgs.capture import load_view, published_normals, read_capture, read_run_cameras, write_cameras
+from tests.makers.captures import (
     CENTRE,
     RADIUS,
     ball,
@@ -18,9 +21,6 @@ from makers import (
     shiny_blender,
     write,
 )
-from plyfile import PlyData, PlyElement
-
-from refgs.capture import load_view, published_normals, read_capture, read_run_cameras, write_cameras
 
 RED, GREEN, NOTHING = (220, 0, 0), (20, 200, 0), (0, 0, 0)
 

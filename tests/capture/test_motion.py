@@ -4,13 +4,13 @@ import multiprocessing
 
 import numpy as np
 import pytest
-from makers import look_at, write
 from scipy.ndimage import map_coordinates
 
 from refgs.capture import read_capture
 from refgs.capture.motion import AGAINST, ALL_PAIRS, CONTRADICTED, against, find_cameras, pairs
 from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.errors import InputError, NoCameras
+from tests.makers.captures import look_at, write
 
 WIDTH, HEIGHT, FOCAL = 256, 192, 280.0
 POSES = [

@@ -4,8 +4,9 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from refgs.export.splats import Splats
-from refgs.geometry.mesh import Mesh, smooth_normals
+from refgs.formats.mesh import Mesh
+from refgs.formats.splats import Splats
+from refgs.geometry.mesh import smooth_normals
 
 
 def paint(p: np.ndarray) -> np.ndarray:

@@ -8,14 +8,14 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake_temporarily
 
 from refgs.capture import read_capture
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.kernels import cuda
 from refgs.model import prefilter
 from refgs.render import raster_cuda, shade
 from refgs.settings import load_settings
 from refgs.train.trainer import Trainer
-from tests.kernels.emulate import emulate
+from tests.makers.emulate import emulate
 
 CARD = torch.device("cuda:0")
 

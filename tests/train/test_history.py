@@ -9,12 +9,13 @@ import pytest
 
 from benchmarks.scenes.analytic import F0, ONE, meet, sky
 from refgs.capture import read_capture
-from refgs.export.environment import directions, write_environment, write_exr
+from refgs.formats.exr import write_exr
+from refgs.formats.panorama import directions, write_environment
 from refgs.run import create_run
 from refgs.settings import load_settings
 from refgs.train import history
 from refgs.train.trainer import Trainer
-from tests.kernels import scenes
+from tests.makers import scenes
 
 SMALL = [
     "surfels.start=600",

@@ -6,12 +6,12 @@ import torch
 
 from benchmarks.scenes.analytic import TWO, meet, write_ball_capture
 from refgs.capture import read_capture
-from refgs.report.pictures import composite
+from refgs.compare.pictures import composite
 from refgs.run import create_run, open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset
 from refgs.train.trainer import Trainer
-from tests.kernels import scenes
+from tests.makers import scenes
 
 SMALL = ["surfels.start=3000", "surfels.budget=4000", "environment.resolution=16", "train.light_first=20"]
 SMALL += ["surfels.metallic=0.9", "train.iterations=600", "indirect.every=200", "indirect.resolution=64"]

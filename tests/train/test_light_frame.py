@@ -11,7 +11,7 @@ from benchmarks.scenes.analytic import DISTANCE, F0, TWO, camera_matrix, sky, wr
 from refgs.camera import Camera
 from refgs.capture import read_capture
 from refgs.capture.poses import OPENGL_TO_OPENCV
-from refgs.export.environment import directions
+from refgs.formats.panorama import directions
 from refgs.model.environment import turn_between
 from refgs.run import create_run, open_run
 from refgs.settings import load_settings

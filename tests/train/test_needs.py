@@ -12,8 +12,8 @@ import torch
 
 from benchmarks.scenes.analytic import write_ball_capture
 from refgs.capture import read_capture
-from refgs.export.splats import read_splats
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
+from refgs.formats.splats import read_splats
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.run import open_run
@@ -22,7 +22,7 @@ from refgs.train.asset import write_asset
 from refgs.train.densify import RESET
 from refgs.train.losses import Photo, objective
 from refgs.train.plan import Plan
-from tests.train.test_trainer import trainer as small
+from tests.makers.training import trainer as small
 
 DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # at the start: few iterations have to do
 SMALL = ["environment.resolution=32", "indirect.every=100", "indirect.resolution=32"]
@@ -329,7 +329,7 @@ def test_deciding_does_not_load_what_it_does_not_use(mirror, tmp_path):
 import sys
 from pathlib import Path
 from refgs.train import probe
-from tests.train.test_trainer import trainer
+from tests.makers.training import trainer
 made = trainer(Path(sys.argv[1]), Path(sys.argv[2]), total=10)
 made.run()
 probe.specular_explains(made), probe.seconds_saved(made)

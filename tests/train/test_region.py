@@ -11,8 +11,8 @@ from benchmarks.scenes.analytic import TWO, camera_matrix, photo, write_ball_cap
 from refgs import commands, jobs
 from refgs.capture import read_capture
 from refgs.errors import InputError
-from refgs.export.mesh import read_glb
-from refgs.export.splats import read_splats
+from refgs.formats.gltf import read_glb
+from refgs.formats.splats import read_splats
 from refgs.run import open_run
 from refgs.settings import load_settings
 from refgs.train.preview import write_preview

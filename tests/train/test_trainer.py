@@ -14,30 +14,14 @@ import torch
 from benchmarks.scenes.analytic import F0, ONE, meet, sky
 from refgs.capture import read_capture
 from refgs.errors import InputError
-from refgs.export.environment import directions
+from refgs.formats.panorama import directions
 from refgs.model.surfels import to_splats
-from refgs.run import create_run, open_run
+from refgs.run import open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset
 from refgs.train.trainer import Trainer
-from tests.kernels import scenes
-
-SMALL = [
-    "surfels.start=1500",
-    "surfels.budget=1800",
-    "surfels.hull=64",
-    "environment.resolution=16",
-    "train.light_first=20",
-]
-
-
-def trainer(capture_folder, folder, *changes, total=150):
-    settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
-    capture = read_capture(capture_folder, settings.region)
-    made = Trainer(capture, settings, folder, lambda event, facts: None)
-    if not folder.exists():
-        create_run(folder, capture, settings, "quick", "cpu")
-    return made
+from tests.makers import scenes
+from tests.makers.training import SMALL, trainer
 
 
 @pytest.fixture(scope="module")

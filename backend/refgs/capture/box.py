@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from refgs.settings import RegionSettings
 
@@ -17,6 +16,8 @@ class Box:
     @classmethod
     def of(cls, region: RegionSettings) -> "Box":
         """The box that settings describe."""
+        from scipy.spatial.transform import Rotation  # slow to import, and few captures have a region
+
         turn = Rotation.from_euler("xyz", region.rotation, degrees=True).as_matrix()
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = turn * np.array(region.size) / 2, region.centre

@@ -12,15 +12,16 @@ import torch
 from refgs.camera import Camera
 from refgs.capture import LoadedView, View, load_view
 from refgs.color import srgb_encode
-from refgs.export.environment import read_environment
-from refgs.export.mesh import read_glb
+from refgs.compare import metrics, surface
+from refgs.compare.pictures import as_bytes, composite, maps, over_white, picture, write_png
+from refgs.compare.truth import PASSES, GroundTruth, errors, known_maps
+from refgs.formats.gltf import read_glb
+from refgs.formats.panorama import read_environment
 from refgs.kernels import cuda
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.render.baselines import method_of
 from refgs.render.renderer import render
-from refgs.report import metrics, surface
-from refgs.report.pictures import as_bytes, composite, maps, over_white, picture, write_png
-from refgs.report.truth import PASSES, GroundTruth, errors, known_maps
 from refgs.run import Run
 
 PANORAMA = 256  # rows of the pictures of the light
@@ -79,7 +80,7 @@ def _view(
         loaded = replace(loaded, alpha=shown if loaded.alpha is None else np.minimum(shown, loaded.alpha))
     photo = composite(loaded, torch.from_numpy(background)).numpy()
     figures = {measure.__name__: measure(color, photo) for measure in (metrics.psnr, metrics.ssim, metrics.flip)}
-    if run.exposed and run.settings.render.color_space == "linear":
+    if run.exposed and not method_of(run.settings.render).light.display:
         # A held-out photo's exposure is not known: it is fitted, in linear radiance, for a second figure.
         exposure = metrics.fitted_exposure(rendering.radiance.numpy(), rendering.alpha.numpy(), photo)
         fitted = run.render(camera, exposure=exposure).color.numpy()

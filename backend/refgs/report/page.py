@@ -25,12 +25,12 @@ import numpy as np
 
 from refgs import __version__
 from refgs.errors import InputError
+from refgs.formats import history
 from refgs.paths import whole
 from refgs.report.charts import PARTS, error_chart, parts_chart
 from refgs.report.curves import QUANTITIES, Curve, as_csv, curve, knee, levels, time_to
 from refgs.report.figures import DETAILS, HEADLINE, RELIT, Quantity, duration, flatten, is_number, relit_pair
 from refgs.report.labels import labels
-from refgs.train import history
 
 PASSES = {
     "photo": "photo",

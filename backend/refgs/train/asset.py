@@ -9,15 +9,16 @@ from torch import Tensor
 from refgs.capture import write_cameras
 from refgs.color import srgb_decode, srgb_encode
 from refgs.errors import InputError
-from refgs.export.environment import write_environment
-from refgs.export.splats import write_splats
-from refgs.geometry.mesh import write_mesh
+from refgs.formats.mesh import write_mesh
+from refgs.formats.panorama import write_environment
+from refgs.formats.splats import write_splats
 from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, to_splats
+from refgs.paths import write_text
 from refgs.render.rasterize import rasterize
 from refgs.render.volume import discs, with_normals_last
-from refgs.run import OCCLUDER, write_text
+from refgs.run import OCCLUDER
 from refgs.train import needs
 from refgs.train.trainer import Trainer
 

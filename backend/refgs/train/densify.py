@@ -10,9 +10,9 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.clock import timed
 from refgs.kernels.load import Shared, Work, check, run
+from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters, activate, axes
 from refgs.settings import DensifySettings, PropagationSettings, RateSettings
-from refgs.train.adam import Adam
 
 RESET = 0.01  # opacity
 

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from refgs.errors import InputError
+from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters
 from refgs.train import checkpoint
-from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, take
 
 if TYPE_CHECKING:

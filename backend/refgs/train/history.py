@@ -5,12 +5,12 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from refgs.formats.history import FILE, read
 from refgs.paths import whole
 
 if TYPE_CHECKING:
     from refgs.train.trainer import Trainer
 
-FILE = "history.jsonl"  # in the run folder
 FIRST = 10  # iterations before the first line
 A_DECADE = 10  # lines while iterations grow tenfold: evenly spaced where both axes of a chart are logarithms
 SHARE = 0.025  # of the training's time, which measuring may take, and FLIP by itself, which is as dear as all the rest
@@ -60,14 +60,3 @@ def trim(folder: Path, iteration: int) -> None:
         kept = [line for line in read(file.read_text(encoding="utf-8")) if line.get("iteration", math.inf) <= iteration]
         with whole(file) as temporary:
             temporary.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
-
-
-def read(text: str) -> list[dict]:
-    """The lines that are whole: a training that was killed can leave half of one."""
-    found = []
-    for line in text.splitlines():
-        try:
-            found.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return [item for item in found if isinstance(item, dict)]

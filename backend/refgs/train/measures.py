@@ -8,12 +8,12 @@ import torch
 
 from refgs.capture import Capture, LoadedView, View
 from refgs.color import srgb_decode
+from refgs.compare import metrics
+from refgs.compare.pictures import composite, maps
+from refgs.compare.truth import FOLDER, PASSES, GroundTruth, errors, known_maps
 from refgs.errors import InputError
 from refgs.model.environment import Environment
 from refgs.render.renderer import Rendering, render
-from refgs.report import metrics
-from refgs.report.pictures import composite, maps
-from refgs.report.truth import FOLDER, PASSES, GroundTruth, errors, known_maps
 from refgs.run import light_of
 from refgs.settings import Settings
 
@@ -37,7 +37,7 @@ class _Look(NamedTuple):
 class Measures:
     """A few fixed views of those that were held out, and what is known of them.
 
-    Ground truth is the capture's folder `ground_truth`, as `report.truth.GroundTruth` reads it, or the normals of its data set;
+    Ground truth is the capture's folder `ground_truth`, as `compare.truth.GroundTruth` reads it, or the normals of its data set;
     where that is not of the size that is trained at, it is said to `report` and left out.
     """
 

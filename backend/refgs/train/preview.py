@@ -3,10 +3,10 @@
 import numpy as np
 import torch
 
-from refgs.export.splats import write_splats
+from refgs.compare.pictures import color_picture, write_png
+from refgs.formats.splats import write_splats
 from refgs.model.surfels import to_splats
 from refgs.render.volume import with_normals_last
-from refgs.report.pictures import color_picture, write_png
 from refgs.train.trainer import Trainer
 
 FOLDER = "preview"  # in the run folder

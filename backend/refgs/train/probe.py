@@ -14,13 +14,13 @@ from torch import Tensor
 
 from refgs.capture import LoadedView
 from refgs.color import srgb_encode
+from refgs.compare.metrics import psnr
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.rasterize import rasterize
 from refgs.render.renderer import COVERED, Rendering, render
 from refgs.render.volume import discs
-from refgs.report.metrics import psnr
 from refgs.settings import RenderSettings
 from refgs.train.losses import Photo, objective
 

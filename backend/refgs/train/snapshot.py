@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from refgs.errors import InputError
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.train import checkpoint, needs
 

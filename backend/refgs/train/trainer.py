@@ -13,21 +13,21 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.capture import Capture, load_view
 from refgs.clock import Clock, timed
+from refgs.compare.metrics import decibels, psnr
+from refgs.compare.pictures import composite
 from refgs.errors import InputError
-from refgs.geometry.extract import extract
 from refgs.geometry.mesh import clean
 from refgs.geometry.visibility import Occluder
 from refgs.model import cubemap
+from refgs.model.adam import Adam
 from refgs.model.environment import Environment
 from refgs.model.surfels import Parameters, Surfels, activate
+from refgs.render.extract import extract
 from refgs.render.relight import received
 from refgs.render.renderer import Rendering, near_plane, render
 from refgs.render.volume import with_normals_last
-from refgs.report.metrics import decibels, psnr
-from refgs.report.pictures import composite
 from refgs.settings import LossSettings, RenderSettings, Settings
 from refgs.train import history, needs, snapshot
-from refgs.train.adam import Adam
 from refgs.train.densify import ScreenGradient, densify, faint, propagate_normals, reset_opacity, thin
 from refgs.train.guard import Guard, limits, running
 from refgs.train.light import light_frame, mirrored

@@ -1,0 +1,253 @@
+"""How far a picture or a light is from the truth.
+
+Pictures are (height, width, 3) float arrays; "encoded" means sRGB, 0..1, as on a screen, "linear" means radiance.
+A figure for a set of views is the mean of the figures of the views.
+"""
+
+import importlib.util
+import math
+from collections.abc import Callable, Iterable
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import flip_evaluator
+import numpy as np
+import torch
+from scipy.ndimage import maximum_filter
+from scipy.optimize import linear_sum_assignment
+from skimage.metrics import structural_similarity
+
+from refgs.color import srgb_decode
+from refgs.compare.pictures import over_white
+from refgs.formats.panorama import directions
+
+COVERED = 0.5  # of a pixel: from here on it is the object's
+
+LIGHT_BLUR = 3.0  # degrees, the standard deviation
+LIGHTS_APART = 15.0  # degrees
+MOST_LIGHTS = 5
+LOST_LIGHT = 30.0  # degrees: the error of a light that was not found
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec.709
+
+
+def decibels(square: float) -> float:
+    """Peak signal-to-noise ratio in dB of a mean squared error, the peak being 1. At most 100, so that means stay finite."""
+    return -10 * math.log10(max(square, 1e-10))
+
+
+def psnr(image: np.ndarray, reference: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB of encoded pictures."""
+    return decibels(float(((np.asarray(image, np.float64) - reference) ** 2).mean()))
+
+
+def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) -> float:
+    """What linear radiance (h, w, 3) is to be multiplied by to come nearest, by least squares, to an encoded photo; over the
+    pixels that are opaque, alpha (h, w), and not clipped in the photo. 1 where there is nothing to go by."""
+    seen = (alpha > 0.5) & (photo.max(axis=-1) < 0.98)
+    rendered, taken = radiance[seen].astype(np.float64), srgb_decode(photo[seen].astype(np.float64))
+    square = (rendered * rendered).sum()
+    return float((rendered * taken).sum() / square) if square > 0 else 1.0
+
+
+def ssim(image: np.ndarray, reference: np.ndarray) -> float:
+    """Structural similarity of encoded pictures with the settings of Wang et al. 2004: a Gaussian window, sigma 1.5."""
+    return float(
+        structural_similarity(
+            np.asarray(image, np.float64),
+            np.asarray(reference, np.float64),
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+            data_range=1.0,
+            channel_axis=-1,
+        )
+    )
+
+
+def flip(image: np.ndarray, reference: np.ndarray) -> float:
+    """Mean FLIP (Andersson et al. 2020) of encoded pictures, 0 alike to 1, at its authors' 67 pixels a degree."""
+    pair = (np.ascontiguousarray(x, np.float32) for x in (reference, image))
+    error, *_ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False)
+    return float(error.mean(dtype=np.float64))
+
+
+def lpips_missing() -> str | None:
+    """Why LPIPS cannot be measured here; None where it can. Its network's weights are never downloaded."""
+    missing = [name for name in ("lpips", "torchvision") if importlib.util.find_spec(name) is None]
+    if missing:
+        return f"the package {missing[0]} is not installed"
+    weights = Path(torch.hub.get_dir(), "checkpoints", "vgg16-397923af.pth")
+    return None if weights.is_file() else f"torchvision's weights of VGG-16 are not there: {weights}"
+
+
+@lru_cache(maxsize=1)
+def _lpips_network():
+    import lpips
+
+    return lpips.LPIPS(net="vgg", verbose=False).eval()
+
+
+def lpips(image: np.ndarray, reference: np.ndarray) -> float:
+    """LPIPS (Zhang et al. 2018) of encoded pictures with VGG-16 and its linear layers, version 0.1."""
+    pair = (torch.from_numpy(np.asarray(x, np.float32)).permute(2, 0, 1)[None] for x in (image, reference))
+    with torch.no_grad():
+        return float(_lpips_network()(*pair, normalize=True))
+
+
+def normal_mae_degrees(
+    normals: np.ndarray, reference: np.ndarray, alpha: np.ndarray, reference_alpha: np.ndarray
+) -> float:
+    """Mean angle in degrees between normals (h, w, 3), over the pixels that the object covers at least by half.
+
+    Each pixel counts the same and both normals are made unit length first. Where the rendering has next to nothing
+    (alpha below 0.1) or a normal of no length, the error is 90°: leaving a part out doesn't pay.
+    """
+    seen = reference_alpha >= COVERED
+    a, b = normals[seen].astype(np.float64), reference[seen].astype(np.float64)
+    length = np.linalg.norm(a, axis=-1)
+    missing = (length < 1e-6) | (alpha[seen] < 0.1) | ~np.isfinite(length)
+    cosine = (a * b).sum(-1) / np.where(missing, 1, length) / np.linalg.norm(b, axis=-1)
+    return float(np.degrees(np.where(missing, np.pi / 2, np.arccos(np.clip(cosine, -1, 1)))).mean())
+
+
+def normal_ssim(normals: np.ndarray, reference: np.ndarray, alpha: np.ndarray, reference_alpha: np.ndarray) -> float:
+    """Structural similarity of the pictures (n + 1)/2 of unit normals, each over white by its own alpha; all pixels count."""
+
+    def encoded(n: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+        return np.nan_to_num((n * 0.5 + 0.5) * alpha[..., None]) + 1 - alpha[..., None]
+
+    return ssim(encoded(normals, alpha), encoded(reference, reference_alpha))
+
+
+def channel_products(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Means (3, 3) by channel over a mask (h, w) of image², image · reference, reference²: what `aligned_psnr` needs of a view."""
+    a, b = image[mask].astype(np.float64), reference[mask].astype(np.float64)
+    return np.stack([(a * a).mean(0), (a * b).mean(0), (b * b).mean(0)])
+
+
+def aligned_psnr(views: list[np.ndarray]) -> dict[str, float | list[float]]:
+    """PSNR of linear base colours, mean over views (`channel_products` of each): psnr_raw, psnr_aligned, scale.
+
+    A light's tint and its inverse on the base colours look the same: the second figure is after one `scale` a channel, for
+    all views together, that fits best in least squares.
+    """
+    aa, ab, bb = np.moveaxis(np.array(views), 1, 0)
+    power = aa.sum(0)
+    scale = np.where(power > 0, ab.sum(0) / np.where(power > 0, power, 1), 1)
+
+    def mean(scale: np.ndarray) -> float:
+        return float(np.mean([decibels(e) for e in (scale * scale * aa - 2 * scale * ab + bb).mean(-1)]))
+
+    return {"psnr_raw": mean(np.ones(3)), "psnr_aligned": mean(scale), "scale": scale.tolist()}
+
+
+def relit(
+    pairs: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]],
+    measures: tuple[Callable[[np.ndarray, np.ndarray], float], ...] = (psnr, flip),
+) -> dict[str, float]:
+    """Of views under another light, over white: psnr_raw, psnr_aligned, flip_raw, flip_aligned or what else measures them, and scale.
+
+    `pairs()` gives, as often as it is called, the picture and the truth of each view, premultiplied linear RGBA. Base
+    colours and light share one free scale; "aligned" is after multiplying the pictures' radiance by the `scale` that fits
+    the truth best in least squares, one for all views. Pixels in which either is brighter than a screen is (a sun in a
+    mirror) are left out of the fit, for a few of them would decide it.
+    """
+    product = power = 0.0
+    for image, reference in pairs():
+        a, b = (np.asarray(x[..., :3], np.float64) for x in (image, reference))
+        fit = (a.max(-1) < 1) & (b.max(-1) < 1)
+        product, power = product + (a[fit] * b[fit]).sum(), power + (a[fit] ** 2).sum()
+    scale = float(product / power) if power > 0 else 1.0
+    rows = []
+    for image, reference in pairs():
+        truth = over_white(reference)
+        rows.append([measure(over_white(image, s), truth) for measure in measures for s in (1.0, scale)])
+    names = [f"{measure.__name__}_{how}" for measure in measures for how in ("raw", "aligned")]
+    return dict(zip(names, np.mean(rows, axis=0).tolist(), strict=True)) | {"scale": scale}
+
+
+def resized(panorama: np.ndarray, height: int) -> np.ndarray:
+    """A panorama averaged down to so many rows."""
+    return cv2.resize(panorama.astype(np.float32), (2 * height, height), interpolation=cv2.INTER_AREA)
+
+
+def _elevations(height: int) -> np.ndarray:
+    return np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+
+
+def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
+    """Error of a recovered panorama: (root mean square of the difference of log radiance, the scale taken out first).
+
+    Both are equirectangular (h, w, 3), linear, each of its own size: the larger is averaged down to the smaller.
+    Pixels count by solid angle. The scale is the one that makes the mean difference zero. Natural logarithm: 0.1 is
+    about 10 %. A thousandth of the mean radiance is added to both, below which nothing can be seen.
+    """
+    a, b = (resized(x, min(len(environment), len(reference))) for x in (environment, reference))
+    weight = np.cos(_elevations(len(a)))
+    weight = np.broadcast_to(weight[:, None, None], a.shape) / (weight.sum() * a.shape[1] * 3)
+    difference = np.log(b + 1e-3 * (b * weight).sum()) - np.log(a + 1e-3 * (a * weight).sum())
+    mean = (difference * weight).sum()
+    return float(np.sqrt(((difference - mean) ** 2 * weight).sum())), float(np.exp(mean))
+
+
+def _blur(values: np.ndarray, degrees: float) -> np.ndarray:
+    """Blur a panorama (h, 2h) on the sphere: a mean weighted by exp((cos angle − 1) / σ²), the sphere's Gaussian."""
+    elevation, turn = _elevations(len(values)), 2 * np.pi / values.shape[1] * np.arange(values.shape[1])
+    up, out = np.sin(elevation), np.cos(elevation)
+    cosine = up[:, None, None] * up[:, None] + out[:, None, None] * out[:, None] * np.cos(turn)
+    kernel = np.fft.rfft(np.exp((cosine - 1) / np.radians(degrees) ** 2))  # of two rows, along the columns
+
+    def convolve(rows: np.ndarray) -> np.ndarray:
+        return np.fft.irfft(np.einsum("rsk,sk->rk", kernel, np.fft.rfft(rows * out[:, None])), rows.shape[1])
+
+    return convolve(values) / convolve(np.ones_like(values))
+
+
+def find_lights(panorama: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions (K, 3) of a panorama's lights and how often the mean they are as bright (K,), the brightest first.
+
+    A light is a peak of the luminance blurred by LIGHT_BLUR, brighter than the mean over the sphere, with no brighter one
+    within LIGHTS_APART.
+    """
+    luminance = panorama.astype(np.float64) @ _LUMINANCE
+    area = np.broadcast_to(np.cos(_elevations(len(luminance)))[:, None], luminance.shape)
+    luminance = luminance / max((luminance * area).sum() / area.sum(), 1e-30)
+    blurred = _blur(luminance, LIGHT_BLUR)
+    rays = directions(*luminance.shape).astype(np.float64)
+    peaks = (blurred >= maximum_filter(blurred, size=3, mode=("nearest", "wrap"))) & (blurred > 1.01)
+    found: list[np.ndarray] = []
+    values = []
+    for place in sorted(zip(*np.nonzero(peaks), strict=True), key=lambda place: -blurred[place]):
+        if all(rays[place] @ other < np.cos(np.radians(LIGHTS_APART)) for other in found):
+            found.append(rays[place])
+            values.append(blurred[place])
+    for i in range(len(found)):  # finer than the pixels: mean shift ends where the blurred luminance is greatest
+        for _ in range(30):
+            weight = np.exp((rays @ found[i] - 1) / np.radians(LIGHT_BLUR) ** 2)
+            centre = np.einsum("hw,hwa->a", weight * luminance * area, rays)
+            found[i] = centre / np.linalg.norm(centre)
+    return np.array(found).reshape(-1, 3), np.array(values)
+
+
+def lights_error(environment: np.ndarray, reference: np.ndarray) -> tuple[float, int] | None:
+    """How far the brightest lights are from where they should be: (degrees, how many lights); None where there are none.
+
+    Lights (`find_lights`, at 128 rows at most) of the truth are those at least twice as bright as its mean and a quarter of its
+    brightest, at most MOST_LIGHTS. They are matched one to one, so that the sum of the angles is least, to the brightest
+    of the recovered panorama, twice as many. A light with none within LOST_LIGHT counts as that. The mean is weighted by
+    the true lights' brightness. Scale plays no part.
+    """
+    recovered, truth = (resized(x, min(128, len(environment), len(reference))) for x in (environment, reference))
+    lights, bright = find_lights(truth)
+    count = int(((bright >= 2) & (bright >= 0.25 * bright.max(initial=0))).sum())
+    lights, bright = lights[: min(count, MOST_LIGHTS)], bright[: min(count, MOST_LIGHTS)]
+    if not len(lights):
+        return None
+    others = find_lights(recovered)[0][: 2 * len(lights)]
+    angle = np.full((len(lights), len(others) + len(lights)), LOST_LIGHT)
+    # By the sine and the cosine: the cosine alone is blind to small angles.
+    sine = np.linalg.norm(np.cross(lights[:, None], others[None]), axis=-1)
+    angle[:, : len(others)] = np.degrees(np.arctan2(sine, lights @ others.T)).clip(max=LOST_LIGHT)
+    match = angle[linear_sum_assignment(angle)]
+    return float(match @ bright / bright.sum()), len(lights)
