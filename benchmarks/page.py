@@ -50,11 +50,11 @@ def markdown(rows: Sequence[Row]) -> str:
     machines, dates = ", ".join(sorted({row.machine for row in rows})), sorted({row.date for row in rows})
     parts = [HEAD.format(machine=machines, date=" to ".join(dict.fromkeys((dates[0], dates[-1]))))]
     for title, text, tables in SECTIONS:
-        parts.append(f"## {title}\n\n{text}\n")
-        for table in tables:
-            lines = table.lines(rows)
-            lines.insert(1, ["---"] * len(lines[0]))
-            parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n")
+        found = [lines for table in tables if len(lines := table.lines(rows)) > 1]
+        parts += [f"## {title}\n\n{text}\n"] if found else []
+        for headings, *lines in found:
+            cells = [headings, ["---"] * len(headings), *lines]
+            parts.append("\n".join(f"| {' | '.join(line)} |" for line in cells) + "\n")
     return "\n".join(parts)
 
 

@@ -1,4 +1,4 @@
-"""What a training is put off its course by, and how it comes back; and whether it is the same training again."""
+"""Disturb trainings and see them recover; check that a training repeats bit for bit."""
 
 import functools
 import math
@@ -28,14 +28,14 @@ AT, UNTIL, LONG = 50, 90, 300  # iterations: from which on it is disturbed, unti
 def disturbed(
     start: Callable[[Trainer], None], end: Callable[[Trainer], None] | None = None, total: int = TOTAL
 ) -> Found:
-    """By how many dB a training ends worse than an undisturbed one, and when it is back."""
+    """Compare a disturbed training with an undisturbed one: dB lost at the end, and when it recovered."""
     course = train(ball(), total=total, disturb={AT: start} | ({UNTIL: end} if end else {}))
     since = UNTIL if end else AT
     return Found(course.finite, max(0.0, usual(total).end - course.end), course.back_after(since, usual(total)))
 
 
 def faster(factor: float, geometry: bool) -> Callable[[Trainer], None]:
-    """The rates of geometry, or those of light and materials."""
+    """Scale the rates of geometry, or those of light and materials."""
 
     def change(made: Trainer) -> None:
         rates = made.settings.rates
@@ -46,7 +46,7 @@ def faster(factor: float, geometry: bool) -> Callable[[Trainer], None]:
 
 
 def heavier(factor: float) -> Callable[[Trainer], None]:
-    """All weights but that of D-SSIM, which is a share."""
+    """Scale all loss weights but that of D-SSIM, which is a share."""
 
     def change(made: Trainer) -> None:
         loss = made.settings.loss
@@ -57,7 +57,7 @@ def heavier(factor: float) -> Callable[[Trainer], None]:
 
 
 def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
-    """One number of a gradient, once or in each step from now on."""
+    """Make one number of a gradient NaN, once or in every step from now on."""
 
     def change(made: Trainer) -> None:
         judge = made.guard.judge
@@ -82,7 +82,7 @@ def nan_value(name: str) -> Callable[[Trainer], None]:
 
 
 def stopped() -> Found:
-    """Gradients that are never finite again: back to the checkpoint, and then an end, with one line."""
+    """Make all further gradients NaN: the training returns to the checkpoint, then ends with one line."""
     try:
         train(ball(), disturb={AT: nan_gradient("albedo", every=True)})
     except InputError as error:
@@ -96,7 +96,7 @@ def with_settings(*changes: str, total: int = TOTAL) -> Found:
 
 
 def trajectories() -> Found:
-    """Thirty steps of Adam down the same loss: our kernels, and float64. How far the pictures are apart at the end, by what was learned."""
+    """Take thirty steps of Adam with the kernels and in float64; return how far the final pictures differ, relative to what was learned."""
     view = camera(size=(24, 18))
     target = reference.rasterize(*(v.double() for v in surfels(view, 60)), view, 0.1)[0].float()
     start = surfels(view, 60)
@@ -138,8 +138,7 @@ CUTS: dict[int, Callable[[Trainer], bool]] = {
     75: lambda made: made.faint(needs.SEEN),
     90: lambda made: made.iteration > made.residual_start * made.total,
 }
-"""Iterations to cut at, and what tells that it is another stage: light first, surfels one by one, deferred, inter-reflection, faint after
-a reset, what is left over."""
+"""Iterations to stop at and a test for each stage: light first, per surfel, deferred, inter-reflection, after a reset, residual."""
 
 
 def bits(made: Trainer) -> list[Tensor]:
@@ -147,7 +146,7 @@ def bits(made: Trainer) -> list[Tensor]:
 
 
 def resumed() -> Found:
-    """A training cut in each of its stages and gone on with from there: the part of the tensors that come out otherwise."""
+    """Stop a training in each stage and resume it; return the share of tensors that differ."""
     whole = trainer(ball(), *STAGES, total=100)
     copies: dict[int, Path] = {}
     for cut, in_stage in CUTS.items():
@@ -175,7 +174,7 @@ def same(whole: Trainer, others: list[Trainer]) -> Found:
 
 
 def threads() -> Found:
-    """The same training on one, two and three threads."""
+    """Run the same training on one, two and three threads."""
     before, made = torch.get_num_threads(), []
     try:
         for count in (1, 2, 3):
