@@ -208,16 +208,7 @@ def export(
 
 def bench(what: str, options: list[str]) -> None:
     """Run a benchmark of the repository with its own options."""
-    folder = clone_root() / "benchmarks"
-    files = {file.stem: file for file in folder.glob("*.py")}
-    files["approximations"] = folder / "approximations" / "__main__.py"
-    texts = {name: file.read_text(encoding="utf-8") for name, file in sorted(files.items())}
-    names = [name for name, text in texts.items() if "__main__" in text]
-    if what not in names:
-        raise InputError(f"no benchmark {what}: take one of {', '.join(names)}")
-    if options and "argparse" not in texts[what]:
-        raise InputError(f"{' '.join(options)}: the benchmark {what} has no options; leave them out")
-    _run_module(f"benchmarks.{what}", options)
+    _run_module("benchmarks", [what, *options])
 
 
 def stability(only: str) -> None:
