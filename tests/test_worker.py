@@ -264,5 +264,5 @@ def test_a_folder_that_is_trained_in(talk, ball_capture, tmp_path):
     talk.process.kill()
     talk.process.wait(timeout=PATIENCE)
     assert free(run)
-    trainer, _ = jobs.train(*words)
-    assert trainer.iteration >= stopped
+    state, _ = jobs.train(*words)
+    assert state.iteration >= stopped
