@@ -138,12 +138,10 @@ def bench(
     context: typer.Context,
     what: Annotated[
         str,
-        typer.Argument(
-            help="kernels, iteration, truth, minutes, bake or another of benchmarks/; any other word lists them"
-        ),
+        typer.Argument(help="kernels, truth, paper, needs, minutes, gpu or page; another word lists them"),
     ] = "kernels",
 ) -> None:
-    """Measure times or errors of parts; `paper --data DIR [--out DIR] [--preset NAME]` measures whole trainings on the paper's data."""
+    """Measure the parts in milliseconds, or whole trainings by their errors; `--csv FILE` writes the figures."""
     from refgs import commands
 
     commands.bench(what, context.args)

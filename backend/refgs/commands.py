@@ -13,7 +13,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from refgs import jobs
 from refgs.capture import read_cameras, read_capture
 from refgs.capture.poses import in_frame
-from refgs.compare.pictures import color_picture, maps, picture, write_png
 from refgs.errors import InputError
 from refgs.paths import clone_root
 from refgs.run_folder import check_finished
@@ -116,6 +115,7 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
     if format not in ("png", "exr"):
         raise InputError(f"--format {format}: take png or exr")
     check_finished(folder)  # before torch is imported
+    from refgs.compare.pictures import color_picture, maps, picture, write_png
     from refgs.formats.exr import write_exr
     from refgs.run import open_run
 
@@ -208,16 +208,7 @@ def export(
 
 def bench(what: str, options: list[str]) -> None:
     """Run a benchmark of the repository with its own options."""
-    folder = clone_root() / "benchmarks"
-    files = {file.stem: file for file in folder.glob("*.py")}
-    files["approximations"] = folder / "approximations" / "__main__.py"
-    texts = {name: file.read_text(encoding="utf-8") for name, file in sorted(files.items())}
-    names = [name for name, text in texts.items() if "__main__" in text]
-    if what not in names:
-        raise InputError(f"no benchmark {what}: take one of {', '.join(names)}")
-    if options and "argparse" not in texts[what]:
-        raise InputError(f"{' '.join(options)}: the benchmark {what} has no options; leave them out")
-    _run_module(f"benchmarks.{what}", options)
+    _run_module("benchmarks", [what, *options])
 
 
 def stability(only: str) -> None:

@@ -38,7 +38,7 @@ def run(out: Path) -> None:
 
     if not capture.exists():
         stage("rendering a capture with Cycles: 80 photos of a jar of gold, copper and glazed ceramic")
-        _child(root, "rendering", "benchmarks.scenes", SCENE, "--out", capture, "--relight", *HDRIS)
+        _child(root, "rendering", "scripts.demo", SCENE, "--out", capture, "--relight", *HDRIS)
     if not (folder / "splats.ply").exists():
         stage("training surfels, materials and light")
         commands.train(capture, folder, "quick", "auto", None, [], resume=(folder / "run.toml").exists())

@@ -1,4 +1,4 @@
-"""What a training is put off its course by, and how it comes back; and whether it is the same training again."""
+"""Disturb trainings and see them recover; check that a training repeats bit for bit."""
 
 import functools
 import math
@@ -28,14 +28,14 @@ AT, UNTIL, LONG = 50, 90, 300  # iterations: from which on it is disturbed, unti
 def disturbed(
     start: Callable[[Trainer], None], end: Callable[[Trainer], None] | None = None, total: int = TOTAL
 ) -> Found:
-    """By how many dB a training ends worse than an undisturbed one, and when it is back."""
+    """Compare a disturbed training with an undisturbed one: dB lost at the end, and when it recovered."""
     course = train(ball(), total=total, disturb={AT: start} | ({UNTIL: end} if end else {}))
     since = UNTIL if end else AT
     return Found(course.finite, max(0.0, usual(total).end - course.end), course.back_after(since, usual(total)))
 
 
 def faster(factor: float, geometry: bool) -> Callable[[Trainer], None]:
-    """The rates of geometry, or those of light and materials."""
+    """Scale the rates of geometry, or those of light and materials."""
 
     def change(made: Trainer) -> None:
         rates = made.state.settings.rates
@@ -51,7 +51,7 @@ def _set(made: Trainer, section: str, values: dict[str, float]) -> None:
 
 
 def heavier(factor: float) -> Callable[[Trainer], None]:
-    """All weights but that of D-SSIM, which is a share."""
+    """Scale all loss weights but that of D-SSIM, which is a share."""
 
     def change(made: Trainer) -> None:
         loss = made.state.settings.loss
@@ -62,7 +62,7 @@ def heavier(factor: float) -> Callable[[Trainer], None]:
 
 
 def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
-    """One number of a gradient, once or in each step from now on."""
+    """Make one number of a gradient NaN, once or in every step from now on."""
 
     def change(made: Trainer) -> None:
         judge = made.guard.judge
@@ -87,7 +87,7 @@ def nan_value(name: str) -> Callable[[Trainer], None]:
 
 
 def stopped() -> Found:
-    """Gradients that are never finite again: back to the checkpoint, and then an end, with one line."""
+    """Make all further gradients NaN: the training returns to the checkpoint, then ends with one line."""
     try:
         train(ball(), disturb={AT: nan_gradient("albedo", every=True)})
     except InputError as error:
@@ -101,7 +101,7 @@ def with_settings(*changes: str, total: int = TOTAL) -> Found:
 
 
 def trajectories() -> Found:
-    """Thirty steps of Adam down the same loss: our kernels, and float64. How far the pictures are apart at the end, by what was learned."""
+    """Take thirty steps of Adam with the kernels and in float64; return how far the final pictures differ, relative to what was learned."""
     view = camera(size=(24, 18))
     target = reference.rasterize(*(v.double() for v in surfels(view, 60)), view, 0.1)[0].float()
     start = surfels(view, 60)
@@ -143,8 +143,7 @@ CUTS: dict[int, Callable[[Trainer], bool]] = {
     75: lambda made: faint_now(made.state),
     90: lambda made: made.state.iteration > made.state.residual_start * made.state.total,
 }
-"""Iterations to cut at, and what tells that it is another stage: light first, surfels one by one, deferred, inter-reflection, faint after
-a reset, what is left over."""
+"""Iterations to stop at and a test for each stage: light first, per surfel, deferred, inter-reflection, after a reset, residual."""
 
 
 def bits(made: Trainer) -> list[Tensor]:
@@ -156,7 +155,7 @@ def bits(made: Trainer) -> list[Tensor]:
 
 
 def resumed() -> Found:
-    """A training cut in each of its stages and gone on with from there: the part of the tensors that come out otherwise."""
+    """Stop a training in each stage and resume it; return the share of tensors that differ."""
     whole = trainer(ball(), *STAGES, total=100)
     copies: dict[int, Path] = {}
     for cut, in_stage in CUTS.items():
@@ -184,7 +183,7 @@ def same(whole: Trainer, others: list[Trainer]) -> Found:
 
 
 def threads() -> Found:
-    """The same training on one, two and three threads."""
+    """Run the same training on one, two and three threads."""
     before, made = torch.get_num_threads(), []
     try:
         for count in (1, 2, 3):

@@ -2,7 +2,7 @@ import refgs  # noqa: F401, I001  before torch
 import numpy as np
 import torch
 import trimesh
-from benchmarks.distances import around, look_at
+from tests.makers.distances import around, look_at
 
 from refgs.render import extract as module
 from refgs.render.extract import extract

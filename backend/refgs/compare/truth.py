@@ -21,7 +21,7 @@ class GroundTruth:
     """A folder of what is known of a capture, brought into the run's frame; what is there is measured, every part is optional.
 
     light.exr; mesh.ply; normal, albedo, roughness, metallic, visibility/NAME.exr of the views with alpha/NAME.exr;
-    relight/HDRI.exr with relight/HDRI/NAME.exr (see `benchmarks.scenes.capture`).
+    relight/HDRI.exr with relight/HDRI/NAME.exr (see `scripts.demo.capture`).
     """
 
     def __init__(self, folder: Path, to_capture: np.ndarray):
