@@ -15,6 +15,7 @@ from benchmarks.scenes.analytic import write_ball_capture
 from refgs.capture import read_capture
 from refgs.render.renderer import render
 from refgs.settings import load_settings
+from refgs.train.light import mean_radiance
 from refgs.train.losses import objective
 from refgs.train.trainer import Trainer
 
@@ -44,22 +45,26 @@ def measure() -> dict[str, list[float]]:
 
 def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
     """Time an iteration in pieces, then a whole one."""
-    photo, settings, clock = trainer.photos[0], trainer.settings, time.perf_counter
+    photo, settings, clock = trainer.state.photos[0], trainer.state.settings, time.perf_counter
 
     def record(name: str, since: float) -> float:
         rows.setdefault(name, []).append(clock() - since)
         return clock()
 
     at = clock()
-    surfels, environment = trainer.surfels(), trainer.environment()
+    surfels, environment = trainer.state.surfels(), trainer.state.environment()
     at = record("activations and light's prefilter", at)
-    rendering = render(surfels, environment, photo.camera, trainer.background, settings.render, trainer.near)
+    rendering = render(
+        surfels, environment, photo.camera, trainer.state.background, settings.render, trainer.state.near
+    )
     at = record("raster and shading", at)
-    loss, _ = objective(rendering, trainer.mean_light(environment), photo, trainer.background, settings.loss, 0.5)
+    loss, _ = objective(
+        rendering, mean_radiance(trainer.state, environment), photo, trainer.state.background, settings.loss, 0.5
+    )
     at = record("losses", at)
     loss.backward()
     record("backward of all", at)
-    trainer.forget_gradients()
+    trainer.state.forget_gradients()
     at = clock()
     trainer.step()
     record("a whole iteration", at)

@@ -1,4 +1,4 @@
-"""The demo, every stage of it, on fewer and smaller photos and with a shorter training than it takes itself."""
+"""Every stage of the demo, on fewer and smaller photos and with a shorter training."""
 
 import json
 import subprocess

@@ -13,7 +13,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from refgs import jobs
 from refgs.capture import read_cameras, read_capture
 from refgs.capture.poses import in_frame
-from refgs.compare.pictures import color_picture, maps, picture, write_png
 from refgs.errors import InputError
 from refgs.paths import clone_root
 from refgs.run_folder import check_finished
@@ -116,6 +115,7 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
     if format not in ("png", "exr"):
         raise InputError(f"--format {format}: take png or exr")
     check_finished(folder)  # before torch is imported
+    from refgs.compare.pictures import color_picture, maps, picture, write_png
     from refgs.formats.exr import write_exr
     from refgs.run import open_run
 

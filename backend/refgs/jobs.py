@@ -24,6 +24,7 @@ from refgs.train.plan import Plan
 if TYPE_CHECKING:
     from refgs.formats.splats import Splats
     from refgs.run import Run
+    from refgs.train.state import State
     from refgs.train.trainer import Trainer
 
 Report = Callable[[str, dict[str, Any]], None]
@@ -39,13 +40,13 @@ def train(
     changes: list[str],
     resume: bool,
     report: Report,
-    attend: "Callable[[Trainer], bool]",
-) -> "tuple[Trainer, float | None]":
+    attend: "Callable[[State], bool]",
+) -> "tuple[State, float | None]":
     """Train a capture into a run folder, or resume the training in it. When it ends, write the asset and measure it.
 
     `minutes` limits the whole job, pauses not counted; without a preset all settings are then planned for that time. Without
     `minutes` the preset is `standard`. `attend` is called before each iteration: True stops the training with a checkpoint, which
-    `resume` starts from. Another process can stop it too (`refgs.lock`). Returns the trainer, whose `ended` tells a finished
+    `resume` starts from. Another process can stop it too (`refgs.lock`). Returns the state, whose `ended` tells a finished
     training from a stopped one, and the mean PSNR of the held-out views if it has ended and there are any.
     """
     plan, lock = Plan(minutes), RunLock(out)
@@ -65,8 +66,9 @@ def train(
                 trainer = _start(capture, settings, preset, changes, out, plan, device, report)
                 held.enter_context(lock)  # its folder exists only now
             held.enter_context(_disk_errors_named([out], "resume with --resume"))
-            trainer.run(lambda: attend(trainer) or lock.attend(trainer.iteration, trainer.total, trainer.seconds))
-        return trainer, _finish(trainer, out, plan, report) if trainer.ended else None
+            state = trainer.state
+            trainer.run(lambda: attend(state) or lock.attend(state.iteration, state.total, state.seconds))
+        return state, _finish(trainer, out, plan, report) if state.ended else None
 
 
 def choose_device(device: str, report: Report) -> str:
@@ -125,7 +127,7 @@ def _start(
     report: Report,
 ) -> "Trainer":
     """Make the trainer of a new run, and the run's folder."""
-    from refgs.run import create_run
+    from refgs.run import create_run, record_changes
     from refgs.train.fit import fitting
     from refgs.train.trainer import Trainer
 
@@ -134,7 +136,9 @@ def _start(
     else:
         trainer = Trainer(capture, settings, out, report, plan, device)
     with _disk_errors_named([out], "train again"):
-        create_run(out, capture, trainer.settings, preset or "standard", device, trainer.chosen)
+        effective = trainer.state.effective
+        create_run(out, capture, effective.settings, preset or "standard", device, effective.chosen())
+        record_changes(out, effective.rows())
     return trainer
 
 
@@ -144,21 +148,25 @@ def _resume(capture: Capture, settings: Settings, out: Path, plan: Plan, device:
 
     trainer = Trainer(capture, settings, out, report, plan, device)
     trainer.resume()
-    report("stage", {"what": f"resumed at iteration {trainer.iteration}"})
+    report("stage", {"what": f"resumed at iteration {trainer.state.iteration}"})
     return trainer
 
 
 def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float | None:
     """Write the asset and metrics.json; return the mean PSNR of the held-out views."""
+    from refgs.run import record_changes
     from refgs.train.ambiguity import ambiguities
     from refgs.train.asset import write_asset
+    from refgs.train.measures import held_out_psnr
 
+    state = trainer.state
     update_metrics(out, _costs(trainer))
-    again = f"refgs train {trainer.capture.folder} --out {out} --resume --device cpu"
+    again = f"refgs train {state.capture.folder} --out {out} --resume --device cpu"
     with _card_memory(f"the card's memory is full; nothing is lost, resume with: {again}"):
-        write_asset(trainer)
-        quality = trainer.test_psnr(most=len(trainer.test))
-        trades = ambiguities(trainer)
+        write_asset(state)
+        record_changes(out, state.effective.rows())
+        quality = held_out_psnr(state, most=len(state.test))
+        trades = ambiguities(state)
     update_metrics(out, {"ambiguities": trades, "total_seconds": plan.spent})
     for facts in trades.values():
         if "what" in facts:
@@ -169,11 +177,12 @@ def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float 
 def _costs(trainer: "Trainer") -> dict[str, Any]:
     import torch
 
-    costs = {"training_seconds": trainer.seconds, "processor_seconds": trainer.processor_seconds}
+    state = trainer.state
+    costs = {"training_seconds": state.seconds, "processor_seconds": state.processor_seconds}
     costs["steps_left_out"] = trainer.guard.left_out
     if peak := peak_memory():
         costs["peak_memory_bytes"] = peak
-    if trainer.device.type == "cuda":
+    if state.device.type == "cuda":
         costs["peak_card_memory_bytes"] = torch.cuda.max_memory_allocated()
     return costs
 
@@ -183,7 +192,7 @@ def _card_memory(what: str | None = None) -> Iterator[None]:
     """Raise InputError, with the line `what`, where the card's memory does not suffice."""
     import torch
 
-    from refgs.train.trainer import full_card
+    from refgs.train.densify import full_card
 
     try:
         yield

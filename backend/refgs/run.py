@@ -4,6 +4,7 @@ Rendering, evaluation, export and Blender read a run folder and nothing else.
 """
 
 import platform
+import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -130,6 +131,16 @@ def create_run(
     }
     write_text(folder / "run.toml", tomli_w.dumps(facts))
     write_cameras(folder / "cameras.json", capture, settings.light.frame)
+
+
+def record_changes(folder: Path, rows: dict[str, dict]) -> None:
+    """Add changes of settings to run.toml's [changed]. A setting's `asked` stays as it was first recorded."""
+    if not rows:
+        return
+    tables = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
+    known = tables.get("changed", {})
+    rows = {key: row | {"asked": known.get(key, row)["asked"]} for key, row in rows.items()}
+    write_text(folder / "run.toml", tomli_w.dumps(tables | {"changed": known | rows}))
 
 
 def open_run(folder: Path) -> Run:

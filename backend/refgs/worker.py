@@ -22,7 +22,7 @@ from refgs.capture.motion import find_cameras
 from refgs.errors import InputError, NoCameras
 from refgs.kernels import cuda
 from refgs.train.preview import write_preview
-from refgs.train.trainer import Trainer
+from refgs.train.state import State
 
 PROTOCOL = 1
 
@@ -170,7 +170,7 @@ class Worker:
 
     def _train(self, command: Train) -> tuple[str, dict]:
         out = Path(command.out)
-        trainer, quality = jobs.train(
+        state, quality = jobs.train(
             Path(command.capture),
             out,
             command.preset,
@@ -181,14 +181,14 @@ class Worker:
             self.send,
             self._attend,
         )
-        facts = {"run": str(out.resolve()), "iteration": trainer.iteration, "seconds": trainer.seconds}
-        if not trainer.ended:
+        facts = {"run": str(out.resolve()), "iteration": state.iteration, "seconds": state.seconds}
+        if not state.ended:
             return "cancelled", facts
         needs = json.loads((out / "needs.json").read_text(encoding="utf-8"))
         left_out = [need for need in needs if not need.get("needed", False)]
         return "done", facts | {"psnr": quality, "left_out": left_out}
 
-    def _attend(self, trainer: Trainer) -> bool:
+    def _attend(self, state: State) -> bool:
         """Handle the commands since the last iteration. Return True to stop the training here."""
         paused = False
         while paused or not self._commands.empty():
@@ -202,13 +202,13 @@ class Worker:
             match command.command:
                 case "pause" | "resume":
                     paused = command.command == "pause"
-                    self.send("paused" if paused else "resumed", {"iteration": trainer.iteration})
+                    self.send("paused" if paused else "resumed", {"iteration": state.iteration})
                 case "preview":
-                    self.send("preview", write_preview(trainer))
+                    self.send("preview", write_preview(state))
                 case "cancel":
                     return True
                 case "stop":
-                    trainer.total = trainer.iteration
+                    state.total = state.iteration
                     return True
                 case _:
                     self._waiting.append(command)

@@ -18,7 +18,7 @@ from refgs.model.adam import Adam
 from refgs.render import reference
 from refgs.render.rasterize import rasterize
 from refgs.settings import RATES
-from refgs.train import needs
+from refgs.train.densify import faint_now
 from refgs.train.start import GEOMETRY
 from refgs.train.trainer import Trainer
 
@@ -38,20 +38,25 @@ def faster(factor: float, geometry: bool) -> Callable[[Trainer], None]:
     """Scale the rates of geometry, or those of light and materials."""
 
     def change(made: Trainer) -> None:
-        rates = made.settings.rates
+        rates = made.state.settings.rates
         changed = {name: factor * getattr(rates, name) for name in RATES if (name in GEOMETRY) == geometry}
-        made.settings = made.settings.model_copy(update={"rates": rates.model_copy(update=changed)})
+        _set(made, "rates", changed)
 
     return change
+
+
+def _set(made: Trainer, section: str, values: dict[str, float]) -> None:
+    for name, value in values.items():
+        made.state.change(f"{section}.{name}", value, "plan", "disturbed")
 
 
 def heavier(factor: float) -> Callable[[Trainer], None]:
     """Scale all loss weights but that of D-SSIM, which is a share."""
 
     def change(made: Trainer) -> None:
-        loss = made.settings.loss
+        loss = made.state.settings.loss
         weights = {name: factor * value for name, value in loss.model_dump().items() if name != "dssim"}
-        made.settings = made.settings.model_copy(update={"loss": loss.model_copy(update=weights)})
+        _set(made, "loss", weights)
 
     return change
 
@@ -65,7 +70,7 @@ def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
         def judged(loss: Tensor, optimizer) -> Tensor:
             if not every:
                 made.guard.judge = judge
-            made.parameters[name].grad.view(-1)[7] = math.nan
+            made.state.parameters[name].grad.view(-1)[7] = math.nan
             return judge(loss, optimizer)
 
         made.guard.judge = judged
@@ -75,7 +80,7 @@ def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
 
 def nan_value(name: str) -> Callable[[Trainer], None]:
     def change(made: Trainer) -> None:
-        value = made.light if name == "light" else made.parameters[name]
+        value = made.state.light if name == "light" else made.state.parameters[name]
         value.data.view(-1)[10:13] = math.nan
 
     return change
@@ -131,18 +136,22 @@ STAGES += [
 ]
 STAGES += ["train.checkpoint_every=1000", "residual.start=0.8", "needs.initial=on", "needs.reflections=on"]
 CUTS: dict[int, Callable[[Trainer], bool]] = {
-    5: lambda made: made.initial and made.iteration < made.settings.train.light_first,
-    20: lambda made: made.initial,
-    37: lambda made: not made.initial and made.occluder is None,
-    52: lambda made: made.occluder is not None,
-    75: lambda made: made.faint(needs.SEEN),
-    90: lambda made: made.iteration > made.residual_start * made.total,
+    5: lambda made: made.state.initial and made.state.iteration < made.state.settings.train.light_first,
+    20: lambda made: made.state.initial,
+    37: lambda made: not made.state.initial and made.state.occluder is None,
+    52: lambda made: made.state.occluder is not None,
+    75: lambda made: faint_now(made.state),
+    90: lambda made: made.state.iteration > made.state.residual_start * made.state.total,
 }
 """Iterations to stop at and a test for each stage: light first, per surfel, deferred, inter-reflection, after a reset, residual."""
 
 
 def bits(made: Trainer) -> list[Tensor]:
-    return [*(v.detach() for _, v in sorted(made.parameters.items())), made.light.detach(), made.exposures.detach()]
+    return [
+        *(v.detach() for _, v in sorted(made.state.parameters.items())),
+        made.state.light.detach(),
+        made.state.exposures.detach(),
+    ]
 
 
 def resumed() -> Found:
@@ -150,10 +159,10 @@ def resumed() -> Found:
     whole = trainer(ball(), *STAGES, total=100)
     copies: dict[int, Path] = {}
     for cut, in_stage in CUTS.items():
-        whole.run(stop=lambda cut=cut: whole.iteration >= cut)
+        whole.run(stop=lambda cut=cut: whole.state.iteration >= cut)
         assert in_stage(whole), f"at {cut} the training is in another stage than it should be"
-        copies[cut] = whole.folder.with_name(f"{whole.folder.name} {cut}")
-        shutil.copytree(whole.folder, copies[cut])
+        copies[cut] = whole.state.folder.with_name(f"{whole.state.folder.name} {cut}")
+        shutil.copytree(whole.state.folder, copies[cut])
     whole.run()
     others = []
     for folder in copies.values():

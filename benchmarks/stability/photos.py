@@ -27,7 +27,7 @@ def elsewhere(scale: float, offset: float) -> Found:
         return matrix
 
     course = train(changed(pose=pose))
-    made = course.trainer
+    made = course.trainer.state
     surfels = activate({**made.constant, **made.parameters})
     to_capture = made.capture.to_capture
     place = surfels.positions.detach().numpy().astype(float) @ to_capture[:3, :3].T + to_capture[:3, 3]

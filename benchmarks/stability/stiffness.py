@@ -162,7 +162,7 @@ def by_autograd() -> Found:
 
 def said() -> Found:
     """Train an all-metal ball: the report says that photos do not tell the light's scale, and does not say so of metal."""
-    trades = ambiguities(train(capture(), total=300).trainer)
+    trades = ambiguities(train(capture(), total=300).trainer.state)
     right = "what" in trades["light_scale"] and "what" in trades["white_balance"] and "what" not in trades["metal"]
     return Found(all(v["left"] <= v["alone"] for v in trades.values()), 0.0 if right else 1.0)
 

@@ -16,6 +16,7 @@ from benchmarks.scenes.analytic import write_ball_capture
 from benchmarks.stability.cases import NEVER
 from refgs.capture import read_capture
 from refgs.settings import load_settings
+from refgs.train.measures import held_out_psnr
 from refgs.train.trainer import Trainer
 
 SIZE, TOTAL, LOOK = 32, 150, 10  # pixels; iterations; iterations between looks at the held-out views
@@ -78,14 +79,14 @@ class Course(NamedTuple):
     @property
     def finite(self) -> bool:
         values = [
-            *self.trainer.parameters.values(),
-            self.trainer.light,
-            *(v.color for v in map(self._seen, self.trainer.test)),
+            *self.trainer.state.parameters.values(),
+            self.trainer.state.light,
+            *(v.color for v in map(self._seen, self.trainer.state.test)),
         ]
         return all(bool(value.isfinite().all()) for value in values) and all(np.isfinite(list(self.psnr.values())))
 
     def _seen(self, view):
-        return self.trainer.render(view.camera)
+        return self.trainer.state.render(view.camera)
 
     def back_after(self, start: int, undisturbed: "Course") -> int:
         """Iterations from `start` until all later looks are within BACK of the undisturbed training."""
@@ -114,9 +115,9 @@ def train(
     made, psnr = trainer(capture, *changes, total=total, said=said), {}
     for end in range(LOOK, total + 1, LOOK):
         (disturb or {}).get(end - LOOK, lambda _: None)(made)
-        while made.iteration < end and not made.ended:  # it may go back to a checkpoint, or end early
-            made.run(stop=lambda end=end: made.iteration >= end)
-        psnr[end] = made.test_psnr()
+        while made.state.iteration < end and not made.state.ended:  # it may go back to a checkpoint, or end early
+            made.run(stop=lambda end=end: made.state.iteration >= end)
+        psnr[end] = held_out_psnr(made.state)
     return Course(psnr, said, made)
 
 

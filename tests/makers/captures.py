@@ -1,4 +1,4 @@
-"""Tiny captures of every layout, made on the spot: a ball with a red top and a green bottom, seen from around it."""
+"""Make tiny captures of every layout: photos around a ball with a red top and a green bottom."""
 
 import json
 import pickle
@@ -14,7 +14,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Camera-to-world, OpenGL axes, +Z up."""
+    """Return camera-to-world with OpenGL axes; +Z is up."""
     back = (position - target) / np.linalg.norm(position - target)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -24,7 +24,7 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def ring(count: int = 16, distance: float = 3.0, centre: np.ndarray = CENTRE) -> list[np.ndarray]:
-    """Poses around the ball at alternating heights."""
+    """Return poses around the ball at alternating heights."""
     poses = []
     for i in range(count):
         azimuth, elevation = 2 * np.pi * i / count, (0.2, 0.9)[i % 2]
@@ -34,7 +34,7 @@ def ring(count: int = 16, distance: float = 3.0, centre: np.ndarray = CENTRE) ->
 
 
 def ball(pose: np.ndarray, width: int, height: int, focal: float, centre: np.ndarray = CENTRE) -> np.ndarray:
-    """RGBA (H, W, 4) uint8 of the ball, by ray casting; principal point in the middle."""
+    """Ray-cast the ball to RGBA (H, W, 4) uint8, with the principal point in the middle."""
     normals = ball_normals(pose, width, height, focal, centre)
     image = np.zeros((height, width, 4), np.uint8)
     image[..., :3] = np.where(normals[..., 2:] > 0, (220, 0, 0), (20, 200, 0))
@@ -44,7 +44,7 @@ def ball(pose: np.ndarray, width: int, height: int, focal: float, centre: np.nda
 
 
 def ball_normals(pose: np.ndarray, width: int, height: int, focal: float, centre: np.ndarray = CENTRE) -> np.ndarray:
-    """The ball's normals (H, W, 3) in the world, NaN where there is none."""
+    """Return the ball's normals (H, W, 3) in the world, NaN off the ball."""
     u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     rays = np.stack([u / focal, -v / focal, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -56,7 +56,7 @@ def ball_normals(pose: np.ndarray, width: int, height: int, focal: float, centre
 
 
 def write(path: Path, image: np.ndarray) -> None:
-    """Any image, RGB(A) or grey, 8 or 16 bits, by the path's suffix; paths may hold any letters."""
+    """Write an image, RGB(A) or grey, 8 or 16 bits, in the format of the path's suffix. Non-ASCII paths work, too."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if image.ndim == 3:
         image = image[..., [2, 1, 0, 3][: image.shape[2]]]
@@ -64,7 +64,7 @@ def write(path: Path, image: np.ndarray) -> None:
 
 
 def edit(file: Path, change) -> None:
-    """Rewrites a JSON file after `change(data)`."""
+    """Rewrite a JSON file after `change(data)`."""
     data = json.loads(file.read_text())
     change(data)
     file.write_text(json.dumps(data))
@@ -83,7 +83,7 @@ def nerf_blender(folder: Path, splits: dict[str, int] | None = None) -> Path:
 
 
 def nerfstudio(folder: Path, count: int = 16, poses: list[np.ndarray] | None = None) -> Path:
-    """Shared intrinsics, PNGs without alpha, no masks."""
+    """Make a capture with shared intrinsics and PNGs without alpha or masks."""
     frames = []
     for i, pose in enumerate(poses or ring(count)):
         write(folder / "images" / f"{i:04d}.png", ball(pose, 64, 48, 60.0)[..., :3])
@@ -99,7 +99,7 @@ def colmap(
     model: tuple[int, str, list[float]] = (1, "PINHOLE", [60.0, 60.0, 32.0, 24.0]),
     count: int = 16,
 ) -> Path:
-    """A sparse model with one camera, `count` images, and 50 points on the ball."""
+    """Make a sparse model with one camera, `count` images and 50 points on the ball."""
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
     rng = np.random.default_rng(0)
@@ -136,7 +136,7 @@ def colmap(
 
 
 def shiny_blender(folder: Path) -> Path:
-    """Ref-NeRF's scene `ball`: opaque photos with NAME_alpha.png beside them, normals in the world and disparities."""
+    """Make a capture like Ref-NeRF's scene `ball`: opaque photos, with NAME_alpha.png, world-space normals and disparities."""
     nerf_blender(folder)
     for split in ("train", "test"):
         frames = json.loads((folder / f"transforms_{split}.json").read_text())["frames"]
@@ -154,7 +154,7 @@ def shiny_blender(folder: Path) -> Path:
 
 
 def nero(folder: Path, count: int = 16, split: tuple[list, list] | None = None, protocol: int = 4) -> Path:
-    """A scene of Glossy Synthetic: opaque photos, 16-bit depth, cameras as pickles; beside it the split."""
+    """Make a scene of Glossy Synthetic: opaque photos, 16-bit depth, cameras as pickles; the split lies beside it."""
     folder.mkdir(parents=True)
     for i, pose in enumerate(ring(count)):
         image = ball(pose, 64, 48, 60.0)
@@ -171,7 +171,7 @@ def nero(folder: Path, count: int = 16, split: tuple[list, list] | None = None, 
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """wxyz of a rotation matrix: the eigenvector that rotations share with their quaternion's outer product."""
+    """Return the quaternion wxyz of a rotation matrix, as the eigenvector of its symmetric 4×4 form."""
     (a, b, c), (d, e, f), (g, h, i) = rotation
     matrix = [
         [a + e + i, h - f, c - g, d - b],

@@ -80,7 +80,7 @@ def test_torchs_compiler_is_not_loaded():
     """Which takes two seconds of a training's start, and is not used."""
     program = """
 import sys, torch
-from refgs.train.trainer import Adam
+from refgs.train.adam import Adam
 value = torch.ones(3, requires_grad=True)
 optimizer = Adam([{"params": [value], "lr": 0.1}])
 value.sum().backward()

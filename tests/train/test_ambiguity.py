@@ -14,7 +14,7 @@ from refgs.train.ambiguity import TRADES, _pictures, ambiguities
 def ball(ball_capture, tmp_path_factory):
     made = trainer(ball_capture, total=150, folder=tmp_path_factory.mktemp("run"))
     made.run()
-    return made
+    return made.state
 
 
 def test_what_is_left_is_what_both_changes_leave(ball):
@@ -40,7 +40,7 @@ def test_a_metals_light_has_no_scale_of_its_own(ball):
 
 
 def test_no_light_no_trades(ball_capture, tmp_path):
-    assert ambiguities(trainer(ball_capture, "shading=sh", folder=tmp_path)) == {}
+    assert ambiguities(trainer(ball_capture, "shading=sh", folder=tmp_path).state) == {}
 
 
 def test_the_report_says_it(ball):

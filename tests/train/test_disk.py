@@ -1,4 +1,4 @@
-"""Disks that fill up, or are taken out, while a run is made on them."""
+"""Disks that fill up or are taken out during a training or an export."""
 
 import pytest
 
@@ -36,7 +36,7 @@ def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
 
 
 def test_a_disk_that_is_full(ball_capture, small_disk):
-    """While what is written is no checkpoint: those say so themselves."""
+    """A write other than a checkpoint fails; failed checkpoints are reported elsewhere."""
     filler = small_disk / "filler"
 
     def later(trainer):
@@ -53,7 +53,7 @@ def test_a_disk_that_is_full(ball_capture, small_disk):
 
 
 def test_a_mesh_that_cannot_be_written(ball_capture, small_disk):
-    """The old files stay."""
+    """The old mesh and textures stay as they were."""
     run = small_disk / "run"
     words = ["train.iterations=60", "mesh.resolution=32", "mesh.triangles=500"]
     train(ball_capture, run, lambda trainer: False, *SMALL, *words)

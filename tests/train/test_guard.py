@@ -13,12 +13,14 @@ from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.model.adam import Adam
 from refgs.model.environment import Environment
+from refgs.render.baselines import LINEAR, SCREEN
 from refgs.render.directional import directional
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import shade
 from refgs.settings import load_settings
-from refgs.train.densify import ScreenGradient, faint
+from refgs.train.densify import faint
 from refgs.train.guard import MOST_IN_A_ROW, Guard, limits, remove_broken, running
+from refgs.train.motion import ScreenGradient
 from tests.makers import scenes
 
 
@@ -96,10 +98,10 @@ def test_values_stay_within_limits(device):
 
 
 def test_limits_keep_to_the_scenes_size():
-    assert limits("position", 2.0, False) == (-math.inf, math.inf)
-    low, high = limits("scale", 2.0, False)
+    assert limits("position", 2.0, LINEAR.brightest) == (-math.inf, math.inf)
+    low, high = limits("scale", 2.0, LINEAR.brightest)
     assert math.exp(low) == pytest.approx(2e-6) and math.exp(high) == pytest.approx(200)
-    assert limits("environment", 1.0, True)[1] < limits("environment", 1.0, False)[1]
+    assert limits("environment", 1.0, SCREEN.brightest)[1] < limits("environment", 1.0, LINEAR.brightest)[1]
 
 
 def test_a_mean_passes_over_what_is_no_number():
@@ -128,23 +130,23 @@ def test_surfels_are_faint_until_what_the_picture_needs_can_be_back(decay, opaci
 def test_broken_surfels_are_removed_and_that_is_said(ball_capture, tmp_path):
     said = []
     made = trainer(ball_capture, "densify.every=1000", total=60, said=said, folder=tmp_path)
-    made.run(stop=lambda: made.iteration >= 15)
+    made.run(stop=lambda: made.state.iteration >= 15)
     nan_value("roughness")(made)
     nan_value("position")(made)  # not drawn, and so not felt
-    count = len(made.parameters["position"])
-    made.run(stop=lambda: made.iteration >= 30)
-    broken = count - len(made.parameters["position"])
-    assert 4 <= broken <= 6 and all(v.isfinite().all() for v in made.parameters.values())
+    count = len(made.state.parameters["position"])
+    made.run(stop=lambda: made.state.iteration >= 30)
+    broken = count - len(made.state.parameters["position"])
+    assert 4 <= broken <= 6 and all(v.isfinite().all() for v in made.state.parameters.values())
     assert any("not taken" in line for line in said) and any("removed" in line for line in said)
-    assert len(made.motion.total) == len(made.parameters["position"])
+    assert len(made.state.motion.total) == len(made.state.parameters["position"])
 
 
 def test_a_broken_light_goes_back_to_the_checkpoint(ball_capture, tmp_path):
     said = []
     made = trainer(ball_capture, total=60, said=said, folder=tmp_path)
-    made.run(stop=lambda: made.iteration >= 20)
+    made.run(stop=lambda: made.state.iteration >= 20)
     nan_value("light")(made)
-    assert made.run() and made.light.isfinite().all()
+    assert made.run() and made.state.light.isfinite().all()
     assert any("going back to that of 20" in line for line in said)
 
 
@@ -153,10 +155,10 @@ def test_a_training_that_cannot_go_on_ends_with_one_line(ball_capture, tmp_path)
     nan_gradient("albedo", every=True)(made)
     with pytest.raises(InputError, match="no checkpoint yet") as error:
         made.run()
-    assert "\n" not in str(error.value) and made.iteration <= MOST_IN_A_ROW + 10
+    assert "\n" not in str(error.value) and made.state.iteration <= MOST_IN_A_ROW + 10
     again = trainer(ball_capture, folder=tmp_path / "again")
     (tmp_path / "again").mkdir()
-    again.run(stop=lambda: again.iteration >= 20)
+    again.run(stop=lambda: again.state.iteration >= 20)
     nan_gradient("albedo", every=True)(again)
     with pytest.raises(InputError, match="again after going back"):
         again.run()

@@ -1,7 +1,7 @@
-"""COLMAP: a sparse model in `sparse/0` or `sparse`, binary or text, with the photos in `images` or beside it.
+"""Read COLMAP captures: a sparse model in `sparse/0` or `sparse`, binary or text, with photos in `images` or beside it.
 
-Ref-NeRF's real scenes and mip-NeRF 360's have the photos reduced as well, in `images_2`, `images_4` and `images_8`:
-naming such a folder takes its photos, which may have another ending than those in the model.
+Ref-NeRF's real scenes and mip-NeRF 360's also have reduced photos in `images_2`, `images_4` and `images_8`. Naming such a folder
+uses its photos; their suffix may differ from that in the model.
 """
 
 import re
@@ -20,9 +20,9 @@ from refgs.formats.colmap import SUPPORTED, Image, Intrinsics, model_files, read
 
 
 def find_model(folder: Path) -> tuple[Path, Path] | None:
-    """The folders of a capture's photos and of its sparse model, None where there is no model.
+    """Return the folders of a capture's photos and of its sparse model; None without a model.
 
-    `folder` is the capture's, or that of its reduced photos.
+    `folder` is the capture's, or one with its reduced photos.
     """
     reduced = re.fullmatch(r"images_\d+", folder.name)
     root, photos = (folder.parent, folder) if reduced else (folder, folder / "images")
@@ -35,7 +35,7 @@ def find_model(folder: Path) -> tuple[Path, Path] | None:
 
 
 def read_colmap(photos: Path, model: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None]:
-    """The views, points (M, 3) and their colours (M, 3) in 0..1, in the model's frame. Raises InputError."""
+    """Read the views, points (M, 3) and their colours (M, 3) in 0..1, in the model's frame. Raises InputError."""
     cameras_file, images_file, points_file = model_files(model)
     for file in (cameras_file, images_file):
         if not file.is_file():
@@ -79,7 +79,7 @@ def _camera(image: Image, intrinsics: Intrinsics, where: str) -> tuple[Camera, L
         raise InputError(f"{where}: focal length or size is zero, negative or NaN. Export the sparse model again.")
     qw, qx, qy, qz, *translation = image.pose
     rotation = _rotation(np.array([qw, qx, qy, qz]))
-    # Through camera-to-world, so that the one check of poses sees it.
+    # Via camera-to-world, because `world_to_camera` checks poses.
     camera_to_world = np.column_stack([rotation.T, -rotation.T @ translation])
     pose = world_to_camera(camera_to_world, where)
     name = camera_name(image.name)
@@ -88,7 +88,7 @@ def _camera(image: Image, intrinsics: Intrinsics, where: str) -> tuple[Camera, L
 
 
 def _rotation(q: np.ndarray) -> np.ndarray:
-    """The rotation matrix of a quaternion wxyz, normalised; NaN for a zero one."""
+    """Return the rotation matrix of a quaternion wxyz, which need not be normalised. A zero one gives NaN."""
     with np.errstate(invalid="ignore"):
         w, x, y, z = q / np.linalg.norm(q)
     return np.array(

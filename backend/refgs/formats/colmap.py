@@ -1,7 +1,6 @@
-"""COLMAP's sparse models, binary or text: the files of its documentation, "Output Format".
+"""Read COLMAP's sparse models, binary or text, as its documentation describes them under "Output Format".
 
-COLMAP's own reader is a large dependency that answers a file cut short with an unrelated message or a request for terabytes of memory;
-this one names the file.
+COLMAP's own reader answers a truncated file with an unrelated message, or asks for terabytes of memory; this one names the file.
 """
 
 import re
@@ -75,7 +74,7 @@ def _parse(file: Path, binary: Callable[[Path], T], text: Callable[[Path], T]) -
     try:
         return (binary if file.suffix == ".bin" else text)(file)
     except (struct.error, ValueError, IndexError, OverflowError) as error:
-        raise InputError(f"{file}: the file is cut short or not COLMAP's. Export the sparse model again.") from error
+        raise InputError(f"{file}: the file is truncated or not COLMAP's. Export the sparse model again.") from error
 
 
 class _Bytes:
@@ -99,7 +98,7 @@ class _Bytes:
     def skip(self, count: int) -> None:
         self.at += count
         if self.at > len(self.data):
-            raise ValueError("cut short")
+            raise ValueError("truncated")
 
 
 def _binary_cameras(file: Path) -> dict[int, Intrinsics]:

@@ -152,9 +152,9 @@ def draw_colors(
     normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
     colors = directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera)
     features, depth, alpha = rasterize(*discs(surfels, camera), stack([normals, colors]), camera, near=near)
+    over = (1 - alpha[..., None]) * background
     normal, color = features.split(3, dim=-1)
     mean = normal / alpha.clamp_min(COVERED)[..., None]
-    over = (1 - alpha[..., None]) * background
     return Rendering(color + over, alpha, depth, mean, background=background)
 
 
@@ -173,10 +173,11 @@ def draw_shaded_surfels(
     lit = channels(surfels, camera, settings, indirect=False)
     blended = [lit[0], shade_splats(stack(lit), environment, camera, method.mirror), *lit[1 : 2 if matte else 4]]
     features, depth, alpha = rasterize(*discs(surfels, camera), stack(blended), camera, near=near)
+    over = (1 - alpha[..., None]) * background
     means = features / alpha.clamp_min(COVERED)[..., None]
     normal, mean, material = means.split((3, 3, 3 if matte else 5), dim=-1)
     if matte:  # metallic 0, roughness 1
         material = torch.cat([material, alpha.new_tensor([0.0, 1.0]).expand(*alpha.shape, 2)], dim=-1)
     encoded = method.light.encode(mean if exposure is None else exposure * mean)
-    color = encoded * alpha[..., None] + (1 - alpha[..., None]) * background
+    color = encoded * alpha[..., None] + over
     return Rendering(color, alpha, depth, normal, material, None, background, exposure)
