@@ -44,10 +44,8 @@ def compiled(**constants: float):
             assert found == 1, f"{name}: {found} definitions"
         for header, text in headers.items():
             (copy / header).write_text(text, encoding="utf-8")
-        text = "".join((copy / source).read_text(encoding="utf-8") for source in SOURCES)
-        sizes = {name: arguments for name, arguments in load.SIZES.items() if f" {name}(" in text}
         fresh = functools.cache(load._load.__wrapped__)
-        with patch.multiple(build, HERE=copy, SOURCES=SOURCES), patch.multiple(load, SIZES=sizes, _load=fresh):
+        with patch.multiple(build, HERE=copy, SOURCES=SOURCES), patch.object(load, "_load", fresh):
             yield
 
 

@@ -1,1 +1,1 @@
-"""The C++ kernels: sources, how they are built and loaded, and the reference that they are tested against."""
+"""C++ kernels: their sources, how they are built and loaded, and the reference that they are tested against."""

@@ -7,7 +7,6 @@ coarse ones in its tail. A matrix is as symmetric as the cube, so a 24th of it i
 cubemap of 6×64² texels and 0.25 s for 6×128², too little to want a file.
 """
 
-import ctypes
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -19,7 +18,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.clock import timed
-from refgs.kernels.load import Shared, Work, check, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import check, run
 from refgs.model import cubemap
 from refgs.model.cubemap import SYMMETRIES
 
@@ -175,15 +175,7 @@ def _order(resolution: int, device: torch.device) -> Tensor:
     return cubemap.orbit_order((resolution,)).int().to(device)
 
 
-class _Work(Work):
-    """`struct Product` of sparse.cpp."""
-
-    _fields_ = (
-        ("orbits", ctypes.c_int64),
-        *((n, ctypes.c_void_p) for n in ("starts", "columns", "numbers", "compositions", "dense")),
-        *((n, ctypes.c_void_p) for n in ("rows", "out", "scratch")),
-        ("shared", Shared),
-    )
+_Work = struct("Product", "sparse.cpp")
 
 
 def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tensor:

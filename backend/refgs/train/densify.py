@@ -1,6 +1,5 @@
 """Adding surfels where the picture asks for them, and removing those that nobody sees."""
 
-import ctypes
 import math
 from collections.abc import Sequence
 
@@ -9,7 +8,8 @@ from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.clock import timed
-from refgs.kernels.load import Shared, Work, check, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import check, run
 from refgs.model.surfels import Parameters, activate, axes
 from refgs.settings import DensifySettings, PropagationSettings, RateSettings
 from refgs.train.adam import Adam
@@ -17,18 +17,7 @@ from refgs.train.adam import Adam
 RESET = 0.01  # opacity
 
 
-class _Work(Work):
-    """`struct Motion` of motion.cpp."""
-
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        *((n, ctypes.c_void_p) for n in ("positions", "gradients")),
-        ("view", ctypes.c_double * 12),
-        ("accepted", ctypes.c_void_p),
-        ("scale", ctypes.c_double),
-        *((n, ctypes.c_void_p) for n in ("total", "views", "scratch")),
-        ("shared", Shared),
-    )
+_Work = struct("Motion", "motion.cpp")
 
 
 class ScreenGradient:
