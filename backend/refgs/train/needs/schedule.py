@@ -13,7 +13,7 @@ class Initial(Need):
     moments = ("start",)
 
     def due(self, state: State, moment: Moment, progress: float) -> bool:
-        # From the hull, deferred shading finds better normals alone than after this stage: docs/measurements.md.
+        # From the hull, deferred shading finds better normals alone than after this stage: docs/notebook/ablations.md.
         left_out = state.from_hull or self.asked(state) == "off"
         return left_out and state.settings.initial.until > 0 and state.method.deferred
 
@@ -30,7 +30,7 @@ class Iterations(Need):
 
     name, what = "iterations", "all iterations"
     moments, follows = ("start",), "specular"
-    ENOUGH = 0.8  # part of the iterations left after which matte scenes are as good as after all: docs/measurements.md
+    ENOUGH = 0.8  # part of the iterations left after which matte scenes are as good as after all: docs/notebook/needs-and-minutes.md
 
     def due(self, state: State, moment: Moment, progress: float) -> bool:
         matte = not state.needs.get("specular", {"needed": True})["needed"]
