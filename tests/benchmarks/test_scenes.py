@@ -1,4 +1,4 @@
-"""Captures with ground truth: the files agree with each other, with the true mesh and with the light."""
+"""Files of a capture with ground truth agree with each other, with the true mesh and with the light."""
 
 import json
 import subprocess
@@ -46,7 +46,7 @@ def read(path):
 
 @pytest.fixture(scope="module")
 def rings(tmp_path_factory):
-    """Made by `all`, where the other scenes' folders are there already."""
+    """Make scenes by `all` where the other scenes' folders exist already."""
     pytest.importorskip("bpy")
     out = tmp_path_factory.mktemp("all")
     for name in set(NAMES) - {"rings"}:
@@ -61,7 +61,7 @@ def passes(capture):
 
 
 def camera_rays(capture, per_side=1):
-    """Origin (3,), unit directions (SIZE·n, SIZE·n, 3) and the camera's axis, from the file alone."""
+    """Read the origin (3,), unit rays (SIZE·n, SIZE·n, 3) and the camera's axis from the file alone."""
     transforms = json.loads((capture[0] / "transforms_test.json").read_text())
     matrix = np.array(transforms["frames"][0]["transform_matrix"])
     focal = SIZE * per_side / 2 / np.tan(transforms["camera_angle_x"] / 2)
@@ -134,7 +134,7 @@ def test_materials_are_where_they_belong(capture):
 
 
 def lookup(panorama, directions):
-    """Radiance of a panorama in Blender's orientation: u = 0.5 − atan2(y, x)/2π, v = 0.5 + asin(z)/π from below."""
+    """Look up a panorama in Blender's orientation: u = 0.5 − atan2(y, x)/2π, v = 0.5 + asin(z)/π from below."""
     height, width = panorama.shape[:2]
     u = 0.5 - np.arctan2(directions[..., 1], directions[..., 0]) / (2 * np.pi)
     v = 0.5 - np.arcsin(directions[..., 2].clip(-1, 1)) / np.pi
@@ -190,7 +190,7 @@ def pixel_means(values, per_side):
 
 
 def march(solid, origins, directions):
-    """Whether rays (n, 3) meet the surface of a distance, and where they come closest to it."""
+    """March rays (n, 3) to a distance's surface: whether they meet it, and where they end."""
     along = np.zeros(len(directions))
     for _ in range(200):
         distance = solid(origins + directions * along[:, None])
@@ -202,7 +202,7 @@ def test_a_convex_object_is_never_in_its_own_way(capture):
     images = passes(capture)
     inner = images["alpha"] > 0.999
     assert (images["visibility"][inner] > 0.999).all()
-    # At the very edge a mirrored ray may start below the facets that stand for the sphere.
+    # At the very edge a mirrored ray may start below the sphere's facets.
     assert images["visibility"][images["alpha"] > 0].mean() > 0.99
     assert not images["visibility"][images["alpha"] == 0].any()
 

@@ -1,4 +1,4 @@
-"""The table that `refgs stability` prints, its trainings among the slow tests; and the command."""
+"""Run the cases of `refgs stability`, trainings among the slow tests, and the command."""
 
 import subprocess
 import sys

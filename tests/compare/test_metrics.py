@@ -50,7 +50,7 @@ def test_normal_error_is_the_angle_whatever_the_length():
 def test_missing_normals_count_as_ninety_degrees_and_the_background_not_at_all():
     reference, alpha = unit_normals((10, 10)), np.ones((10, 10))
     covered = alpha.copy()
-    covered[5:] = 0.4  # background: whatever is there is not looked at
+    covered[5:] = 0.4  # background is ignored
     normals = reference.copy()
     normals[5:] *= -1
     normals[0] = 0  # no normal
@@ -63,8 +63,8 @@ def test_missing_normals_count_as_ninety_degrees_and_the_background_not_at_all()
 def test_flip_of_flat_greys_is_the_papers_colour_distance():
     picture = RANDOM.uniform(0, 1, (32, 40, 3))
     assert metrics.flip(picture, picture) == 0
-    # Without features only the colours are left (Andersson et al. 2020, §4.1): the difference in lightness to the power 0.7, of
-    # the largest there is, that of green and blue, 41.28; from 0.4 of it on compressed into 0.95 to 1.
+    # Without features only colours count (Andersson et al. 2020, §4.1): the difference in lightness to the power 0.7, relative to the
+    # largest, between green and blue, 41.28; above 0.4 of it errors are compressed into 0.95 to 1.
     black, white = np.zeros((32, 32, 3)), np.ones((32, 32, 3))
     largest = 41.28
     expected = 0.95 + 0.05 * (100**0.7 - 0.4 * largest) / (0.6 * largest)
@@ -98,9 +98,9 @@ def test_normal_ssim_is_of_encoded_normals_over_white():
     def luminance(a, b):
         return (2 * a * b + 0.01**2) / (a * a + b * b + 0.01**2)
 
-    # (½, ½, 1) against (1, ½, ½): flat, so only the luminance term of Wang et al. is left.
+    # (½, ½, 1) against (1, ½, ½) is flat: only the luminance term of Wang et al. is left.
     assert metrics.normal_ssim(up, side, ones, ones) == pytest.approx((2 * luminance(0.5, 1) + 1) / 3)
-    # What is not there is white, whatever its normal is.
+    # Uncovered pixels are white, whatever their normal is.
     normals = up.copy()
     normals[:] = np.nan
     assert metrics.normal_ssim(normals, up, 0 * ones, ones) == pytest.approx((2 * luminance(0.5, 1) + 1) / 3)
@@ -171,7 +171,7 @@ def test_environment_pixels_count_by_solid_angle():
 
 
 def lamps(turn=0.0, lift=0.0, height=64):
-    """A dim room with two lamps, the second half as bright, moved by degrees round the axis and upwards."""
+    """Make a dim room with two lamps, the second half as bright, turned about the axis and raised by degrees."""
     rays = directions(height, 2 * height).astype(np.float64)
     light = np.full((height, 2 * height), 0.1)
     for azimuth, elevation, bright in ((40, 10, 20.0), (160, 35, 10.0)):
@@ -194,10 +194,10 @@ def test_lights_error_is_the_angle_they_are_off_whatever_the_scale():
     assert metrics.lights_error(3 * truth, truth) == (pytest.approx(0, abs=1e-3), 2)
     up, count = metrics.lights_error(lamps(lift=7), truth)
     assert up == pytest.approx(7, abs=0.1) and count == 2
-    # A turn about the axis moves a light by less the higher it stands; the first counts twice.
+    # A turn about the axis moves a higher light by less; the first light counts twice.
     moved = [2 * np.degrees(np.arcsin(np.sin(np.radians(5)) * np.cos(np.radians(e)))) for e in (10, 35)]
     assert metrics.lights_error(lamps(turn=10), truth)[0] == pytest.approx((2 * moved[0] + moved[1]) / 3, abs=0.1)
-    # Of another size, in another frame: half a turn about the vertical.
+    # Compare panoramas of two sizes, half a turn about the vertical apart.
     turned = sample(lamps(height=100), directions(100, 200) * np.float32([-1, -1, 1]))
     assert metrics.lights_error(turned, lamps(turn=180))[0] < 0.2
 

@@ -1,4 +1,4 @@
-"""A mesh that is too small, or sticks out, is brought to the outlines of the pictures."""
+"""Move a mesh that is too small, or sticks out, to the outlines of the pictures."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def cameras(count=12):
 
 
 def unit_sphere(camera):
-    """What a camera sees of the unit sphere."""
+    """Render the unit sphere's coverage."""
     y, x = np.mgrid[:SIDE, :SIDE] + 0.5 - SIDE / 2
     edge = FOCAL / np.sqrt(DISTANCE**2 - 1)
     alpha = torch.from_numpy((edge - np.hypot(x, y) + 0.5).clip(0, 1).astype(np.float32))
@@ -57,7 +57,7 @@ def test_what_sticks_out_is_pulled_in():
     grown = bring_out(mesh, unit_sphere, cameras(24), VOXEL)
     reached = np.linalg.norm(grown.vertices, axis=1)
     assert abs(reached[~bump].mean() - 1) < 0.15 * VOXEL
-    assert reached[bump].mean() < 1 + VOXEL  # moved out by as much as the rest it would be two and a half
+    assert reached[bump].mean() < 1 + VOXEL  # it would be 2.5 voxels out if it moved as far as the rest
 
 
 def test_without_a_background_nothing_moves():

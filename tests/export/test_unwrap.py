@@ -1,4 +1,4 @@
-"""Charts: that they are the surface, apart from each other, and evenly dense."""
+"""Charts cover the surface, do not overlap, and are evenly dense."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from refgs.geometry.mesh import smooth_normals
 
 @pytest.fixture(scope="module")
 def bumpy():
-    """A sphere with waves, of several parts."""
+    """Make a wavy sphere, large enough to be unwrapped in several parts."""
     sphere = trimesh.creation.icosphere(4)
     vertices = np.array(sphere.vertices) * (1 + 0.15 * np.sin(5 * sphere.vertices).prod(axis=1, keepdims=True))
     return Mesh(vertices, np.array(sphere.faces), smooth_normals(vertices, sphere.faces))
@@ -30,7 +30,7 @@ def test_it_is_the_same_surface(bumpy, unwrapped):
 
 
 def test_nothing_overlaps(unwrapped):
-    """No point of the square lies in two triangles, nor does a triangle lie upside down between others."""
+    """No point of the square lies in two triangles, and no triangle is flipped."""
     size, count = 1024, np.zeros((1024, 1024), int)
     for corners in unwrapped.uv[unwrapped.faces] * size:
         low, high = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)

@@ -1,4 +1,4 @@
-"""Disks that are full or may not be written: what was there stays, and nothing is left beside it."""
+"""On a full or read-only disk the old file stays, and nothing is left beside it."""
 
 import dataclasses
 import errno
@@ -28,7 +28,7 @@ def noisy_box(path, side):
     write_glb(path, mesh, Textures(**noise))
 
 
-WRITERS = {  # with a size, in some thousands of bytes at least
+WRITERS = {  # `size` is in thousands of bytes, at least
     "splats.ply": lambda path, size: write_splats(path, make(10 * size)),
     "display.ply": lambda path, size: write_display_splats(path, make(10 * size)),
     "environment.exr": lambda path, size: write_environment(path, RNG.random((2 * size, 4 * size, 3))),

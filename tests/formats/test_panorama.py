@@ -56,7 +56,7 @@ def test_sampling_is_smooth_across_the_seam_and_finite_at_the_poles():
 
 @pytest.fixture
 def seen(tmp_path):
-    """What a camera in Blender sees in a direction (x, y, z) of a panorama that is the world, by Cycles."""
+    """Render the world's panorama in a direction (x, y, z) by Cycles."""
     bpy = pytest.importorskip("bpy")
     mathutils = pytest.importorskip("mathutils")
     bpy.ops.wm.read_factory_settings(use_empty=True)

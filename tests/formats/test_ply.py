@@ -1,4 +1,4 @@
-"""Other programs' PLY files, and broken ones."""
+"""Read PLY files of other programs, and broken ones."""
 
 import subprocess
 import sys
@@ -32,7 +32,7 @@ LAYOUTS = {
 
 
 def table(names, count=COUNT, kind="<f4"):
-    """Rows as trainings leave them: quaternions of any length, normals of zeros."""
+    """Make rows as trainings write them: quaternions of any length, zero normals."""
     rng = np.random.default_rng(3)
     rows = np.empty(count, [(name, kind) for name in names])
     for name in names:
@@ -50,7 +50,7 @@ def stacked(rows, *names):
 
 
 def covariances(rows):
-    """Of Gaussians in a PLY's rows (N, 3, 3)."""
+    """Compute the covariances (N, 3, 3) of a PLY's rows."""
     scales = [np.exp(rows[f"scale_{i}"]) for i in range(3) if f"scale_{i}" in rows.dtype.names]
     scales = np.stack(scales + [0 * scales[0]] * (3 - len(scales)), axis=1)
     turn = Rotation.from_quat(stacked(rows, "rot_1", "rot_2", "rot_3", "rot_0")).as_matrix() * scales[:, None]
@@ -75,7 +75,7 @@ def test_other_programs_splats(tmp_path, layout):
     np.testing.assert_allclose(covariances(ours), covariances(rows), rtol=1e-4, atol=1e-5)
     write_display_splats(tmp_path / "display.ply", splats)
     shown = PlyData.read(str(tmp_path / "display.ply"))["vertex"].data
-    thin = 3e-3 * np.exp(2 * np.minimum(rows["scale_0"], rows["scale_1"]))  # the square of the third that discs get
+    thin = 3e-3 * np.exp(2 * np.minimum(rows["scale_0"], rows["scale_1"]))  # the squared third scale that discs get
     slack = 1e-5 if splats.scales.shape[1] == 3 else thin[:, None, None] + 1e-5
     assert (np.abs(covariances(shown) - covariances(rows)) <= slack + 1e-4 * np.abs(covariances(rows))).all()
     for name in ("f_dc_1", "f_rest_17"):
@@ -219,7 +219,7 @@ def test_our_own_lacks_nothing(tmp_path):
 
 @pytest.mark.parametrize("format", ["text", "<", ">"])
 def test_no_damage_is_a_fault_of_ours(tmp_path, format):
-    """Bytes changed, taken out and put in at random, in the head above all: one line, or splats."""
+    """Change, remove and insert random bytes, mostly in the header: the result is a one-line error, or finite splats."""
     rng = np.random.default_rng(7)
     rows = table(LAYOUTS["2DGS"], 6)
     face = PlyElement.describe(np.array([([0, 1, 2],)], [("vertex_indices", "O")]), "face")

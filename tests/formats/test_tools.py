@@ -1,4 +1,4 @@
-"""What other people's programs make of our files: those that tests/tools/package.json names."""
+"""Open our files in the programs that tests/tools/package.json names."""
 
 import json
 import shutil
@@ -35,13 +35,13 @@ def said(*words, folder=TOOLS):
 
 
 def transform(source, target, *words):
-    """By PlayCanvas's splat-transform, without a graphics card."""
+    """Convert by PlayCanvas's splat-transform on the CPU."""
     program = TOOLS / "node_modules" / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
     return said(program, "-q", "-w", "-g", "cpu", "--max-workers", "0", source, *words, target)
 
 
 def discs(count=COUNT, degree=3):
-    """Surfels of all sizes, turned in all ways, with colours by direction."""
+    """Make surfels of all sizes and orientations, with colours by direction."""
     rng = np.random.default_rng(5)
     turn = Rotation.random(count, random_state=5)
     values = {
@@ -61,8 +61,8 @@ def discs(count=COUNT, degree=3):
     return Splats(**{name: value.astype(np.float32) for name, value in values.items()})
 
 
-# A format's ending, and how far off its numbers may be: positions, log scales, degrees, opacities, the picture's constant colour, and the
-# root mean square of what harmonics add to it. By what its numbers are written with:
+# Tolerances by a format's ending: positions, log scales, degrees, opacities, the constant colour, and the RMS of what harmonics add to it.
+# They follow from how the format stores numbers:
 QUANTISED = {
     # 32-bit floats
     ".ply": (0, 1e-5, 0.02, 1e-5, 0, 0),
@@ -84,7 +84,7 @@ def test_display_splats_in_other_formats_and_back(tmp_path, ending):
         assert there.stat().st_size < 0.6 * (tmp_path / "des éclats.ply").stat().st_size
     transform(there, tmp_path / "back.ply")
     before, after = (read_splats(tmp_path / name) for name in ("des éclats.ply", "back.ply"))
-    # Formats put the splats in an order of their own.
+    # Formats reorder the splats.
     nearest = cKDTree(after.positions).query(before.positions)[1]
     assert len(after) == COUNT and len(np.unique(nearest)) == COUNT
     position, scale, angle, opacity, colour, direction = QUANTISED[ending]

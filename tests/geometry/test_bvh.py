@@ -1,4 +1,4 @@
-"""The card's rays against Embree's, on meshes with back faces, holes and few triangles."""
+"""Compare the card's rays with Embree's, on meshes with back faces, holes and few triangles."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ SHAPES = {"rings": rings, "half open": half_open, "five faces": lambda: trimesh.
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(("scale", "moved"), [(1.0, 0.0), (1e3, 2e4)])
 def test_as_embree(shape, scale, moved, card, monkeypatch):
-    """What the pixels of a camera before the shape mirror, the normals being any."""
+    """Trace the mirror directions of a camera's pixels; their normals are random."""
     mesh = SHAPES[shape]()
     occluder = Occluder(Mesh(mesh.vertices * scale + moved, np.asarray(mesh.faces)))
     camera = scenes.camera(60, 50)
@@ -38,7 +38,7 @@ def test_as_embree(shape, scale, moved, card, monkeypatch):
     camera = type(camera)(camera.name, 60, 50, 60.0, 60.0, 30.0, 25.0, matrix)
     rng = np.random.default_rng(0)
     alpha = torch.from_numpy(rng.uniform(-0.5, 1, (50, 60)).clip(0)).float()
-    # Points of the shape and around it; ways that leave towards the camera's side of some surface.
+    # Points lie on the shape and around it; rays leave towards the camera's side of a surface.
     depth = alpha * torch.from_numpy(rng.uniform(2, 4, (50, 60)) * scale).float()
     rays = torch.nn.functional.normalize(scenes.camera_rays(camera), dim=-1)
     normals = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(50, 60, 3))).float(), dim=-1)

@@ -73,7 +73,7 @@ def test_smooth_normals_do_not_depend_on_the_triangulation():
 
 
 def test_no_edge_has_three_faces():
-    """Two balls that touch along an edge, as folds do that simplifying leaves, and two crossing sheets of nearly no thickness."""
+    """Simplify a sheet of nearly no thickness, and two that cross: simplifying folds them so that edges touch."""
     rng = np.random.default_rng(0)
     sheet = ball(level=6)
     sheet.vertices[:, 2] *= 0.002

@@ -18,8 +18,8 @@ def degrees(a, b):
 
 
 def expected(masks, cameras, low, high, resolution):
-    """What is left of voxels, in float64 and with every view looked at: the smallest mask, the next, and how near to its border a view
-    sees a voxel, in pixels."""
+    """Carve in float64 with every view: the smallest mask of each voxel, the second smallest, all, and the voxel's distance to the
+    nearest picture border in pixels."""
     grid = np.stack(np.meshgrid(*((np.arange(resolution) + 0.5) / resolution,) * 3, indexing="ij"), axis=-1)
     points, values, border = low + grid * (high - low), [], np.full(3 * (resolution,), np.inf)
     seen = np.zeros(border.shape, int)
@@ -49,7 +49,7 @@ def expected(masks, cameras, low, high, resolution):
 
 @pytest.mark.parametrize("isa", supported())
 def test_carving_matches_float64(isa, monkeypatch):
-    """Masks of noise, of several sizes, seen from all sides, from within and in part; no voxel count that vectors divide."""
+    """Masks are noise of several sizes, seen from all sides, from within and in part. The voxel count is no multiple of a vector."""
     monkeypatch.setenv("REFGS_ISA", isa)
     rng = np.random.default_rng(0)
     cameras = [look_at(view.position * (0.2 if i % 5 == 0 else 0.7), 64, view.name) for i, view in enumerate(VIEWS)]
@@ -78,14 +78,14 @@ def test_points_lie_evenly_on_the_hull_of_a_sphere():
     assert abs(distance.mean()) < 0.2 * VOXEL
     angle = degrees(normals, gradient(sphere, positions))
     assert angle.mean() < 2.5 and angle.max() < 12
-    # 2000 points on an even hexagonal pattern would be this far apart; random ones' nearest three vary by a third.
+    # On an even hexagonal pattern 2000 points are this far apart; distances of random points vary by a third.
     even = np.sqrt(4 * np.pi / 2000 * 2 / np.sqrt(3))
     assert 0.8 * even < spacing.mean() < 1.05 * even
     assert spacing.std() < 0.2 * spacing.mean()
 
 
 def test_some_points_lie_inside():
-    """As many in every part of the volume, their normals those of the surface that is near."""
+    """Inner points are even in volume and take the normals of the nearest surface."""
     positions, normals, _ = visual_hull_points(DISCS, VIEWS, (0.1, 0, -0.1), 1.5, 4000, resolution=48, on_hull=1000)
     assert positions.shape == normals.shape == (4000, 3)
     assert np.abs(sphere(positions[:1000])).max() < VOXEL

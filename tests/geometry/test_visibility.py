@@ -1,4 +1,4 @@
-"""Rays against shapes whose answer is known, at sizes and places far from one and zero."""
+"""Trace rays against shapes whose answer is known, at scales far from one and places far from the origin."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def directions(count: int, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_nothing_is_hidden_on_a_sphere(scale, moved):
-    """Down to directions one degree above the horizon, on a mesh that is inside the sphere and on one outside."""
+    """Directions go down to one degree above the horizon, on meshes inside and outside the sphere."""
     normals, towards = directions(20_000), directions(20_000, seed=1)
     tangent = np.cross(normals, towards)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -35,7 +35,7 @@ def test_nothing_is_hidden_on_a_sphere(scale, moved):
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_two_plates_that_face_each_other(scale, moved):
-    """From the lower one, what goes through the upper one's square and only that is hidden."""
+    """From the lower plate exactly the directions through the upper square are occluded."""
     occluder = placed(trimesh.util.concatenate(plate(0.0, 1), plate(1.0, -1)), scale, moved)
     rng = np.random.default_rng(3)
     points = np.concatenate([rng.uniform(-0.9, 0.9, (20_000, 2)), np.zeros((20_000, 1))], axis=1)
@@ -53,7 +53,7 @@ def test_two_plates_that_face_each_other(scale, moved):
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_the_inside_of_a_bowl(scale, moved):
-    """Half a sphere's inside: from its pole, ways within 45° of the axis are free."""
+    """From the pole of half a sphere, directions within 45° of the axis are free."""
     ball = trimesh.creation.icosphere(5)
     bowl = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0][:, ::-1], process=False)
     occluder = placed(bowl, scale, moved)

@@ -1,4 +1,4 @@
-"""Compiling, caching and choosing the kernels."""
+"""Compile, cache and choose the kernels."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The kernels for CUDA cards: compiling and caching. What they compute is tested beside the CPU's, emulated and on a card."""
+"""Compile and cache the kernels for CUDA cards. The `device` fixture tests what they compute, emulated and on a card."""
 
 import pytest
 

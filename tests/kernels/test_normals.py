@@ -1,4 +1,4 @@
-"""Facing normals against torch in float64."""
+"""Compare facing normals with torch in float64."""
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ def surfels(count: int = 1000) -> tuple[Tensor, Tensor]:
 
 
 def expected(rotations: Tensor, positions: Tensor, camera) -> tuple[Tensor, Tensor]:
-    """And the cosines."""
+    """Compute facing normals and cosines."""
     normals = reference.rotation_matrices(rotations)[..., 2]
     towards = reference.unit(torch.from_numpy(camera.position) - positions.double())
     cosine = (normals.detach() * towards).sum(dim=-1, keepdim=True)

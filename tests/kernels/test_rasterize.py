@@ -1,4 +1,4 @@
-"""The rasteriser against the float64 reference, and what it promises besides."""
+"""Compare the rasteriser with the float64 reference; check determinism, ties, empty and absurd input."""
 
 import functools
 import gc
@@ -18,15 +18,15 @@ from tests.makers import scenes
 from tests.makers.emulate import emulate
 
 NAMES = ("positions", "rotations", "scales", "opacities", "features")
-# A pixel whose value hangs on a comparison (of alpha with its cut, of transmittance with its end …) that float32 may decide
-# otherwise than float64 is left out: closer than this, relative, in float64. Its share of the picture is checked.
+# Leave out pixels that depend on a comparison (of alpha with its cut-off, of transmittance with its end …) closer than this: float32 may
+# decide it differently. Their share of the picture is checked.
 MARGIN = 1e-4
 FORWARD, GRADIENT = 1e-5, 1e-4
 
 
 @functools.cache
 def case(kind: str, channels: int, size: tuple[int, int] = (45, 30), centre: tuple[float, float] | None = None):
-    """Inputs, camera, and the reference's maps, safe pixels, upstream gradients and gradients."""
+    """Make inputs, camera, and the reference's maps, safe pixels, upstream gradients and gradients."""
     camera, inputs = scenes.camera(*size, centre), scenes.surfels(kind, channels)
     exact = [v.double().requires_grad_() for v in inputs]
     *maps, margin = reference.rasterize(*exact, camera, scenes.NEAR)
@@ -38,7 +38,7 @@ def case(kind: str, channels: int, size: tuple[int, int] = (45, 30), centre: tup
 
 
 def run(device, inputs: tuple[Tensor, ...], camera, upstream: list[Tensor]) -> tuple[Raster, tuple[Tensor, ...]]:
-    """Maps and gradients, on the CPU."""
+    """Rasterise on a device; return maps and gradients on the CPU."""
     inputs = [v.to(device, copy=True).requires_grad_() for v in inputs]
     raster = rasterize(*inputs, camera, near=scenes.NEAR)
     gradients = torch.autograd.grad(raster, inputs, [u.to(device) for u in upstream])
@@ -46,7 +46,7 @@ def run(device, inputs: tuple[Tensor, ...], camera, upstream: list[Tensor]) -> t
 
 
 def check(device, inputs, camera, maps, safe, upstream, gradients) -> None:
-    """Every error relative to the largest value of the same tensor."""
+    """Check maps and gradients; errors are relative to the largest value of the same tensor."""
     assert safe.float().mean() > 0.9
     raster, found = run(device, inputs, camera, upstream)
     for name, value, expected in zip(raster._fields, raster, maps, strict=True):
@@ -89,7 +89,7 @@ def test_trimmed_depth_matches_reference(kind, trim, device):
     _, depth, alpha, margin = reference.rasterize(*exact, exact[-1][:, None], camera, scenes.NEAR, *trim)
     found = [m.cpu() for m in trimmed_depth(*(v.to(device) for v in inputs), camera, scenes.NEAR, *trim)]
     part = trim[0] - (1 - alpha).clamp(*trim[::-1])
-    safe = (margin > MARGIN) & ((part > 0.01) | (part == 0))  # of a small part float32 has few digits
+    safe = (margin > MARGIN) & ((part > 0.01) | (part == 0))  # a small part has few digits in float32
     assert safe.float().mean() > 0.85 and part[safe].max() > 0.05
     expected = torch.where(part > 0, depth / part, 0)[safe]
     assert (found[0][safe] - expected).abs().max() <= 1e-4 * expected.max()
@@ -97,7 +97,7 @@ def test_trimmed_depth_matches_reference(kind, trim, device):
 
 
 def test_trimmed_depth_is_that_of_the_surface(device):
-    """Discs across the camera's axis: fog before the surface, and what shows through it a thousand times as far, move the mean."""
+    """Fog before the surface, and a disc a thousand times as far behind it, move the mean depth but not the trimmed one."""
     camera = replace(scenes.camera(9, 9, (4.5, 4.5)), world_to_camera=np.eye(4))
     depths, opacities = torch.tensor([0.5, 0.7, 2.0, 2000.0]), torch.tensor([0.1, 0.1, 0.9, 0.9])
     positions = torch.stack([0 * depths, 0 * depths, depths], dim=1)
@@ -109,14 +109,14 @@ def test_trimmed_depth_is_that_of_the_surface(device):
 
 
 def test_more_tiles_than_16_bits_number(monkeypatch):
-    """As with images of more than eight million pixels."""
+    """Images of more than eight million pixels have as many."""
     emulate(monkeypatch)
     monkeypatch.setattr(raster_cuda, "SHORT", 0)
     check(torch.device("cpu"), *case("mixed", 3, (33, 20), (-25.0, 60.0)))
 
 
 def test_instruction_sets_differ(monkeypatch):
-    """The variable that the tests above rely on does pick another library."""
+    """REFGS_ISA, on which the tests above rely, picks another library."""
     paths = set()
     for isa in load.supported():
         monkeypatch.setenv("REFGS_ISA", isa)
@@ -125,7 +125,7 @@ def test_instruction_sets_differ(monkeypatch):
 
 
 def test_reference_gradients():
-    """The reference's own derivatives, by finite differences."""
+    """Check the reference's own derivatives by finite differences."""
     inputs, camera, *_ = case("mixed", 2, (11, 8))
     picked = slice(None, None, 12)
     exact = [v[picked].double().requires_grad_() for v in inputs]
@@ -209,7 +209,7 @@ def test_absurd_input_stays_finite(device):
 
 
 def test_exactly_edge_on_is_a_dot(device):
-    """A disc seen exactly from its side is drawn by the screen-space filter alone, at its centre's depth."""
+    """The low-pass filter alone draws a disc that is seen exactly edge-on, at its centre's depth."""
     camera = scenes.camera(9, 9, (4.5, 4.5))
     centre = torch.tensor(camera.camera_to_world @ [0, 0, 2, 1], dtype=torch.float64)[:3]
     right, down, forward = camera.camera_to_world[:3, :3].T

@@ -1,4 +1,4 @@
-"""D-SSIM against plain torch in float64."""
+"""Compare D-SSIM with plain torch in float64."""
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ def test_matches_float64(shape, likeness, device):
 
 
 def test_flat_images(device):
-    """Where variances vanish beside C2, float32 computes them as small differences of squares: fewer digits are left."""
+    """Variances far below C2 are small differences of squares: float32 keeps fewer digits."""
     image, target = torch.full((30, 30, 3), 0.9), torch.full((30, 30, 3), 0.8)
     exact = image.double().requires_grad_()
     expected = reference.dssim(exact, target.double())

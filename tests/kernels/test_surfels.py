@@ -1,4 +1,4 @@
-"""What is done to each surfel's numbers before and after the rasteriser, against torch in float64."""
+"""Compare activations, stacking and screen motion of surfels with torch in float64."""
 
 import numpy as np
 import pytest

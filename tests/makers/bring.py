@@ -1,4 +1,4 @@
-"""An add-on that brings a trainer, and a uv which only speaks as one."""
+"""Make wheels as the extension brings them, with a fake uv."""
 
 import sys
 import zipfile
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def bring(folder: Path, version: str = "9.9") -> Path:
-    """The folder of its wheels."""
+    """Write the wheels of a trainer and of the fake uv; return their folder."""
     folder = folder / f"wheels {version}"
     folder.mkdir()
     (folder / f"refgs-{version}-py3-none-any.whl").touch()

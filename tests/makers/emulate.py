@@ -1,4 +1,4 @@
-"""CUDA kernels on this processor: the sources that a card runs, compiled with CUDA's language emulated (emulator.h)."""
+"""Run CUDA kernels on the CPU: compile the card's sources with CUDA's language emulated (emulator.h)."""
 
 import ctypes
 import functools
@@ -24,7 +24,7 @@ def _library(source: str) -> ctypes.CDLL:
     digest = hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
     file = Path(tempfile.gettempdir()) / "refgs-emulated" / f"{Path(source).stem}-{digest}.so"
     file.parent.mkdir(exist_ok=True)
-    with FileLock(file.with_suffix(".lock")):  # another process of the same run compiles them too
+    with FileLock(file.with_suffix(".lock")):  # the other test process compiles the same source
         if not file.exists():
             made = file.with_suffix(".part")
             words = ["-include", str(EMULATOR), "-x", "c++", str(HERE / source), "-o", str(made)]
@@ -40,6 +40,6 @@ def _launch(name: str, work: ctypes.Structure, device, blocks: int, threads: int
 
 
 def emulate(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have tensors on the CPU taken for a card's: the kernels for CUDA run on them, and what is around those."""
+    """Treat tensors on the CPU as a card's: CUDA's kernels and their callers run on them."""
     monkeypatch.setattr(load, "on_gpu", lambda tensor: True)
     monkeypatch.setattr(cuda, "launch", _launch)

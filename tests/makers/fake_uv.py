@@ -1,4 +1,4 @@
-"""Stands for uv: says what uv says. What goes wrong is in FAKE_UV: "hang" while it fetches, "network", "full", "mute" (a dumb trainer)."""
+"""Stand in for uv and print its lines. FAKE_UV names a failure: "hang" while fetching, "network", "full", "mute" (silent)."""
 
 import json
 import os

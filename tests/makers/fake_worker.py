@@ -1,5 +1,4 @@
-"""Speaks the job protocol without training anything. What it does is in the name of the capture: "good", "newer", "crash", "noise",
-"bare", "slow"."""
+"""Speak the job protocol without training. The capture's name says how: "good", "newer", "crash", "noise", "bare", "slow"."""
 
 import json
 import os
@@ -74,7 +73,7 @@ def learn(command, asked, out):
 
 
 def png(grey):
-    """A picture of one pixel."""
+    """Make a picture of one pixel."""
     chunks = (b"IHDR", b"\0\0\0\1\0\0\0\1\x08\0\0\0\0"), (b"IDAT", zlib.compress(bytes([0, grey]))), (b"IEND", b"")
     parts = (
         len(data).to_bytes(4, "big") + name + data + zlib.crc32(name + data).to_bytes(4, "big") for name, data in chunks
@@ -83,7 +82,7 @@ def png(grey):
 
 
 def check(command):
-    """Two cameras, four units from the origin on either side, and their photos."""
+    """Write two cameras, four units from the origin on either side, and their photos."""
     out, frames = Path(command["out"]), []
     out.mkdir(parents=True, exist_ok=True)
     for number, side in enumerate((1, -1)):
@@ -122,7 +121,7 @@ def main():
     def asked():
         with lock:
             taken = heard[:]
-            heard[:] = [None] if None in heard else []  # the end stays the end
+            heard[:] = [None] if None in heard else []  # an ended job stays ended
         return taken
 
     threading.Thread(target=listen, daemon=True).start()

@@ -1,4 +1,4 @@
-"""Layouts that Python gives the structures of the kernels, as assertions for the C++ compilers."""
+"""Write Python's layouts of the kernels' structures as assertions for the C++ compilers."""
 
 import ctypes
 import re

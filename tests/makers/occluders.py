@@ -1,4 +1,4 @@
-"""Shapes that hide light from each other, where the answer is known."""
+"""Make shapes that occlude each other, where the answer is known."""
 
 import functools
 
@@ -58,7 +58,7 @@ def even(radiance: float = 1.0) -> Environment:
 
 
 def mirrors(monkeypatch: pytest.MonkeyPatch, part: float) -> None:
-    """Surfaces mirror this part of the light, whatever the angle, and scatter the rest."""
+    """Have surfaces mirror this share of the light at any angle, and scatter the rest."""
 
     def shares(albedo, metallic, roughness, cosine):
         return torch.full_like(albedo, part), (1 - part) * albedo

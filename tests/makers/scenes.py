@@ -1,4 +1,4 @@
-"""Random surfels that are hard to rasterise, each kind by itself and all together."""
+"""Make random surfels that are hard to rasterise, each kind by itself and all together."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ CHANNELS = {"plain": 3, "edge_on": 1, "across_near": 16, "huge": 5, "sub_pixel":
 
 
 def camera(width: int = 45, height: int = 30, centre: tuple[float, float] | None = None) -> Camera:
-    """A turned camera at (0.3, −0.2, −0.4) that looks along +z; neither square nor of whole tiles."""
+    """Place a rolled camera at (0.3, −0.2, −0.4) that looks along +z; its picture is neither square nor of whole tiles."""
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_euler("xyz", [4, -6, 25], degrees=True).as_matrix()
     matrix[:3, 3] = -matrix[:3, :3] @ [0.3, -0.2, -0.4]
@@ -24,7 +24,7 @@ def camera(width: int = 45, height: int = 30, centre: tuple[float, float] | None
 
 
 def camera_rays(camera: Camera) -> Tensor:
-    """Directions (H, W, 3) in the world through the pixels' centres, with unit depth along the camera's axis; float32."""
+    """Compute world-space rays (H, W, 3) through pixel centres, of unit depth along the camera's axis; float32."""
     x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
     rotation = torch.from_numpy(camera.world_to_camera[:3, :3].copy())
@@ -33,7 +33,7 @@ def camera_rays(camera: Camera) -> Tensor:
 
 
 def surfels(kind: str, channels: int, seed: int = 0) -> tuple[Tensor, ...]:
-    """Positions, rotations, scales, opacities and features, float32, whose depths differ by more than float rounding."""
+    """Make positions, rotations, scales, opacities and features, float32; depths differ by more than rounding."""
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     if kind == "mixed":
         parts = [surfels(k, channels, seed) for k in KINDS if k not in ("mixed", "layers")]

@@ -1,4 +1,4 @@
-"""Trainings that are small enough for a test."""
+"""Start trainings that are small enough for a test."""
 
 from refgs.capture import read_capture
 from refgs.run import create_run
@@ -15,7 +15,7 @@ SMALL = [
 
 
 def trainer(capture_folder, folder, *changes, total=150):
-    """Start a training that is small enough for a test; its run folder is created once."""
+    """Start a small training; create its run folder unless it is there."""
     settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
     capture = read_capture(capture_folder, settings.region)
     made = Trainer(capture, settings, folder, lambda event, facts: None)

@@ -1,4 +1,4 @@
-"""The optimiser against torch's in float64, which is held where there is no gradient."""
+"""Compare the optimiser with torch's in float64, which is held where a gradient is zero."""
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ RATES = [1e-3, 0.0, 3e-2, 1e-4, 1.0]
 
 
 def tensors(steps: int) -> tuple[list[Tensor], list[list[Tensor]]]:
-    """Values, and gradients of each step, from 1e-12 to 1e3 in size; some are zero, one tensor has one only now and then."""
+    """Make values, and gradients of each step from 1e-12 to 1e3. Some are zero; one tensor has none in one step."""
     generator = torch.Generator().manual_seed(0)
     sizes = [10.0 ** (15 * torch.rand(s, generator=generator) - 12) for s in SHAPES]
     values = [torch.randn(s, generator=generator) for s in SHAPES]
@@ -29,7 +29,7 @@ def train(optimizer: torch.optim.Optimizer | Adam, values: list[Tensor], gradien
 
 
 class Held(torch.optim.Adam):
-    """Adam, but that a number whose gradient is zero stays, with its moments."""
+    """Adam that keeps a number, and its moments, where the gradient is zero."""
 
     @torch.no_grad()
     def step(self) -> None:

@@ -32,7 +32,7 @@ def test_a_texels_own_direction_reads_that_texel():
 
 
 def test_no_seam_between_faces():
-    """A smooth function read back on either side of every edge: the jump shrinks with the texels, as inside a face."""
+    """Read a smooth function across edges: the error falls with the texels, as it does inside a face."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(4000, 3))
     direction[:, 1] = direction[:, 0] * rng.choice([-1, 1], 4000)  # on edges between x and y faces

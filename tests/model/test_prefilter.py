@@ -27,7 +27,7 @@ def errors(radiance: torch.Tensor, fine: torch.Tensor, rows: int) -> list[float]
 
 
 def light(side: int) -> torch.Tensor:
-    """A sky with a soft sun and some stripes."""
+    """Make a sky with a soft sun and stripes."""
     d = cubemap.texel_directions(side)
     sun = torch.exp(
         20 * (d @ torch.nn.functional.normalize(torch.tensor([0.3, 0.5, 0.8], dtype=torch.float64), dim=0) - 1)
@@ -37,7 +37,7 @@ def light(side: int) -> torch.Tensor:
 
 
 def test_levels_match_direct_integration(device):
-    """Each level against the sum of the lobe over a cubemap four times as fine."""
+    """Compare each level with the lobe's sum over a cubemap four times as fine."""
     assert max(errors(light(32).to(device), light(128), rows=40)) < 0.005
 
 
@@ -47,8 +47,8 @@ def test_levels_of_large_cubemaps_match_direct_integration(side):
 
 
 def test_smaller_cells_bring_the_error_down(monkeypatch):
-    """In proportion to their size, nearly: it is of second order in a texel's side. The light is constant over texels here. The sharpest
-    lobe is no wider than a texel, and its error small from the start."""
+    """The error falls nearly in proportion to the cells' size, second order in a texel's side. The light is constant over texels. The
+    sharpest lobe is no wider than a texel: its error is small from the start."""
     side, found = 32, []
     radiance = light(side)
     fine = radiance.reshape(6, side, 1, side, 1, 3).expand(6, side, 4, side, 4, 3).reshape(-1, 3)
@@ -86,7 +86,7 @@ def test_irradiance_of_a_constant_and_of_a_cosine_sky():
 
 
 def test_a_sun_leaves_what_faces_away_from_it_dark():
-    """All light from one texel: irradiance is its cosine, and nothing beyond a right angle."""
+    """Irradiance from one texel is its cosine, and zero beyond a right angle."""
     side, texel = 64, 1234
     directions = cubemap.texel_directions(side)
     radiance = torch.zeros(6 * side**2, 3)
@@ -99,7 +99,7 @@ def test_a_sun_leaves_what_faces_away_from_it_dark():
 
 
 def test_panorama_round_trip():
-    """Cubemap → environment.exr → cubemap loses little of a light that the texels resolve."""
+    """A light that the texels resolve survives cubemap → environment.exr → cubemap."""
     original = light(64)
     panorama = Environment(original).panorama(256)
     back = Environment.from_panorama(panorama, 64).radiance

@@ -1,4 +1,4 @@
-"""The table of what materials reflect of an even light, against the rendering equation."""
+"""Compare the table of reflectances with the rendering equation."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ import torch
 from refgs.render import reference
 from refgs.render.brdf import bounces
 
-# What Cycles 4.5 renders of a plane under a white world, as a Principled BSDF with its defaults, 65 000 samples each; errors of
-# 0.0003 to 0.0005. Roughness, degrees from the normal, then: a metal of base colour (0.9, 0.6, 0.3); a black dielectric.
+# Radiance of a plane under a white world by Cycles 4.5, a Principled BSDF with its defaults, 65 000 samples; errors are 0.0003 to 0.0005.
+# Roughness, degrees from the normal, a metal of base colour (0.9, 0.6, 0.3), a black dielectric.
 CYCLES = [
     (0.1, 60, (0.9031, 0.6125, 0.3219), 0.0892),
     (0.2, 0, (0.8999, 0.5996, 0.2997), 0.0400),
@@ -27,17 +27,16 @@ def schlick(cosine: np.ndarray) -> np.ndarray:
 
 
 def dielectric(cosine: np.ndarray) -> np.ndarray:
-    """Fresnel's equations at an index of 1.5, by the angle of refraction."""
+    """Solve Fresnel's equations at an index of 1.5, by the angle of refraction."""
     inside = np.sqrt(1 - (1 - cosine**2) / 1.5**2)
     across, along = (cosine - 1.5 * inside) / (cosine + 1.5 * inside), (inside - 1.5 * cosine) / (inside + 1.5 * cosine)
     return (across**2 + along**2) / 2
 
 
 def integrate(n_v: np.ndarray, roughness: np.ndarray, nodes: int) -> np.ndarray:
-    """∫ D G2 F / (4 N·L N·V) N·L dL (3, P) for F of 1 − Schlick's (1 − V·H)⁵, of that, and a dielectric's.
+    """Integrate D G2 F / (4 N·L N·V) N·L over L (3, P), F being 1 − (1 − V·H)⁵, (1 − V·H)⁵ (Schlick), and a dielectric's.
 
-    Over light directions, in polar coordinates about the mirrored view, that far out that they are above the horizon. The
-    table is made over half vectors.
+    It takes light directions above the horizon, in polar coordinates about the mirrored view; the table is made over half vectors.
     """
     x, weight = np.polynomial.legendre.leggauss(nodes)
     at, weight = np.sin(np.pi / 4 * (x + 1)) ** 2, weight * np.pi / 4 * np.cos(np.pi / 2 * x)
@@ -59,7 +58,7 @@ def integrate(n_v: np.ndarray, roughness: np.ndarray, nodes: int) -> np.ndarray:
             v_l = c_b * (2 * c**2 - 1) + s_b * np.cos(azimuth) * 2 * s * c
             v_h = np.sqrt(np.maximum(1 + v_l, 1e-30) / 2)
             n_h2 = ((n_l + c) / (2 * v_h)) ** 2
-            # 1 - (1 - α²) N·H² would lose all of a small α's digits; 1 - N·H² by what H has beside N: L's part across the plane.
+            # 1 - (1 - α²) N·H² would lose all digits of a small α: take 1 - N·H² from the part of H at right angles to N.
             across = (s_b * np.sin(azimuth)) ** 2
             within = (s + c_b * -s + s_b * np.cos(azimuth) * c) ** 2
             slope = (across + within) / (n_l + c) ** 2
@@ -78,7 +77,7 @@ def grid(n_v: np.ndarray, roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def test_the_integral_converges():
-    """Faster than any power of the nodes: 32 are right to a 40th of what the table may err by."""
+    """The error falls faster than any power of the nodes: with 32 it is a 40th of the table's tolerance."""
     points = grid(np.array([0.02, 0.05, 0.3, 0.7, 1 - 1e-9]), np.array([0.03, 0.05, 0.1, 0.3, 1.0]))
     finest = integrate(*points, 96)
     found = [abs(integrate(*points, nodes) - finest).max() for nodes in (16, 32, 64)]
@@ -87,7 +86,7 @@ def test_the_integral_converges():
 
 
 def test_table_everywhere():
-    """As the kernels look it up, between its entries too: FG0, FG1, a dielectric's bounce, reflectance at F0 of 0.04 and of 1."""
+    """Look up, between entries too: FG0, FG1, a dielectric's bounce, and reflectance at F0 of 0.04 and 1."""
     n_v, roughness = grid(np.linspace(0.02, 1 - 1e-9, 59), np.linspace(0.03, 1, 61))
     exact = integrate(n_v, roughness, 32)
     fg0, fg1, average, coat = reference.table(torch.from_numpy(n_v), torch.from_numpy(roughness)).numpy().T
@@ -116,7 +115,7 @@ def test_table_everywhere():
 
 @pytest.mark.parametrize(("roughness", "angle", "metal", "black"), CYCLES)
 def test_reflects_as_cycles_does(roughness, angle, metal, black):
-    """A metal, and what lies over a dielectric's base."""
+    """Compare a metal, and the coat over a dielectric's base."""
     n_v, albedo = torch.tensor([np.cos(np.radians(angle))]), torch.tensor([[0.9, 0.6, 0.3]]).double()
     found = reference.reflectance(n_v, torch.tensor([roughness]).double(), albedo)
     assert found[0][0].tolist() == pytest.approx(metal, abs=1.5e-3)

@@ -14,7 +14,7 @@ NEAR = 0.01
 
 
 def sheet(positions, normals, size, opacity):
-    """Round surfels of one size where the positions (N, 3) are."""
+    """Make round surfels of one size at positions (N, 3)."""
     turn = np.stack(
         [1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1
     )  # from +Z to the normal
@@ -32,7 +32,7 @@ def joined(*parts):
 
 
 def spread(count):
-    """Unit vectors, even over the sphere."""
+    """Spread unit vectors evenly over the sphere."""
     i = np.arange(count) + 0.5
     z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
     ring = np.sqrt(1 - z * z)
@@ -40,7 +40,7 @@ def spread(count):
 
 
 def ball(opacity, thickness, count=12000):
-    """Surfels of a ball of radius 1 that lie up to so deep below its surface."""
+    """Make surfels of a ball of radius 1, up to `thickness` below its surface."""
     normals = spread(count)
     depth = thickness * np.random.default_rng(0).uniform(size=(count, 1))
     return sheet((1 - depth) * normals, normals, 0.03, opacity)
@@ -58,12 +58,12 @@ def test_a_ball_of_one_layer():
 
 
 def test_what_is_hardly_there_has_no_surface():
-    """What covers is as dense as it is, not as the surfels that tell the depth."""
+    """Coverage is that of the picture, not of the surfels that give the depth."""
     assert len(radii(ball(0.004, 0.1))) == 0
 
 
 def test_voxels_are_no_finer_than_pixels():
-    """96 of them show 3.3 units at the middle of the ball, 2.5 where it is nearest: 2.6 units have 78 to 104 of them across."""
+    """96 pixels show 3.3 units at the ball's middle, 2.5 where it is nearest: 2.6 units are 78 to 104 pixels wide."""
     layer = ball(0.95, 0.0)
     fine, finer, coarse = (len(radii(layer, resolution)) for resolution in (120, 240, 75))
     assert coarse < fine == finer == len(radii(layer, 104))
@@ -76,7 +76,7 @@ ARC = [
 
 
 def place():
-    """A ball on the ground, far walls around, seen from one side through fog: no masks."""
+    """Make a ball on the ground with far walls around it, seen from one side through fog, without masks."""
     rng = np.random.default_rng(1)
     grid = np.stack(np.meshgrid(*[np.linspace(-5, 5, 100)] * 2, [-1.0]), axis=-1).reshape(-1, 3)
     ground = sheet(grid, np.tile([0.0, 0, 1], (len(grid), 1)), 0.08, 0.95)
@@ -96,11 +96,11 @@ def test_a_foreground_without_masks(monkeypatch):
         return clean(mesh, 10**6), voxel, distance.max(), np.abs(distance[high] - 1), around
 
     mesh, voxel, farthest, ball, ground = found()
-    assert 1.2 * 2.2 / 64 < voxel < 2 * 2.2 / 64  # of the ground, so much as most cameras show, but not the walls
+    assert 1.2 * 2.2 / 64 < voxel < 2 * 2.2 / 64  # it has the ground that most cameras show, but not the walls
     assert 1.5 < farthest < module.REACH * 1.1 + voxel
     assert np.quantile(ball, 0.9) < voxel and np.quantile(ground, 0.9) < 0.1 * voxel
     assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).body_count == 1  # the fog has no surface
-    # What is faint before the surface, and walls that show through, move the mean.
+    # Fog before the surface, and walls that show through it, move the mean.
     monkeypatch.setattr(module, "UPPER", 1.0)
     monkeypatch.setattr(module, "LOWER", 0.0)
     *_, mean, _ = found()

@@ -1,4 +1,4 @@
-"""Light that is hidden and light that is sent on, in places where both are known."""
+"""Compare occluded light and light between surfaces with closed forms."""
 
 import math
 
@@ -33,7 +33,7 @@ def received(points: Surfels, occluder: Occluder, light: Environment, directions
 
 
 def test_an_open_plane_has_the_whole_light():
-    """Its diffuse part is what it is without the object; its coat as the split sum has it, to 2 % of white."""
+    """Diffuse light is as without an object; the coat is the split sum's, to 2 % of white."""
     light, up = colourful(), np.tile([0.0, 0.0, 1.0], (5, 1))
     plane = surfels(np.zeros((5, 3)), up)
     transport = relight.Transport(plane, plates(plate(0.0, 1)))
@@ -54,8 +54,8 @@ def looking_down(position: np.ndarray) -> Camera:
 
 
 def test_between_two_plates():
-    """In the middle of a black square below another: the light but for the upper square's form factor (Howell, B-4). The
-    error falls at least as the number of directions grows."""
+    """The middle of a black square below another misses the upper square's form factor (Howell, B-4). The error falls at least as
+    fast as the number of directions grows."""
     occluder = plates(plate(0.0, 1), plate(1.0, -1))
     middle = surfels(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), albedo=0.0)
     a = 1 / (1 - occluder.lift)
@@ -71,7 +71,7 @@ def test_between_two_plates():
 
 @pytest.mark.parametrize("albedo", [0.0, 0.5, 0.9])
 def test_inside_a_matte_bowl(albedo, monkeypatch):
-    """Any point of half a sphere sees half of the sky and half of the bowl: x = 1/2 + albedo x / 2."""
+    """Any point of half a sphere sees half sky and half bowl: x = 1/2 + albedo x / 2."""
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
     found = received(surfels(points, normals, albedo), occluder, even(), bounces=20)
@@ -81,7 +81,7 @@ def test_inside_a_matte_bowl(albedo, monkeypatch):
 
 
 def test_what_training_takes_of_it(monkeypatch):
-    """As a part of what an unhidden surface would receive, whichever way normals point; from some of the surfels alone."""
+    """Training takes the share of what a free surface receives, whichever way normals point, and from some of the surfels."""
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
     inside = surfels(points, normals).turned(torch.arange(len(points)) % 2 == 0)
@@ -98,7 +98,7 @@ def test_what_training_takes_of_it(monkeypatch):
 
 @pytest.mark.parametrize("part", [0.0, 0.3, 1.0])
 def test_a_white_bowl_under_an_even_sky_cannot_be_seen(part, monkeypatch):
-    """Whatever part of the light its surface mirrors; light from the object is as even as the sky."""
+    """Light from the bowl is as even as the sky, whatever share its surface mirrors."""
     occluder, points, normals = bowl()
     mirrors(monkeypatch, part)
     transport = relight.Transport(surfels(points, normals, 1.0), occluder)
@@ -111,7 +111,7 @@ def test_a_white_bowl_under_an_even_sky_cannot_be_seen(part, monkeypatch):
 
 
 def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
-    """What a mirror above sends down is the light from below, by direction."""
+    """A mirror above sends down the light from below, direction by direction."""
     light = colourful()
     mirrors(monkeypatch, 1.0)
     occluder = plates(plate(1.0, -1))
@@ -128,7 +128,7 @@ def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
 
 
 def test_a_light_that_the_object_hides_reaches_nothing():
-    """A small sun behind the upper of two plates; beside it, all of it."""
+    """The upper of two plates occludes a small sun; above that plate all of the sun arrives."""
     radiance = torch.full((6 * 32**2, 3), 1e-3)
     directions = cubemap.texel_directions(32)
     radiance[(directions[:, 2] > 0.99)] = 100.0

@@ -1,4 +1,4 @@
-"""The shading's outgoing radiance against the rendering equation."""
+"""Compare the shading's outgoing radiance with the rendering equation."""
 
 import itertools
 
@@ -20,7 +20,7 @@ from tests.makers.rendering_equation import (
 
 @pytest.fixture(scope="module")
 def found() -> dict:
-    """What the kernels send out, by light, angle, material and roughness."""
+    """Shade by the kernels: radiance by light, angle, material and roughness."""
     cases, radiance = list(itertools.product((METAL, DIELECTRIC), ROUGHNESS)), {}
     for kind, angle in itertools.product(("constant", "gradient", "sun"), ANGLES):
         view = View.at(angle)
@@ -38,7 +38,7 @@ def truth(kind: str, angle: float, material, roughness: float, samples: int = 30
 @pytest.mark.parametrize("material", [METAL, DIELECTRIC])
 @pytest.mark.parametrize("kind", ["constant", "gradient", "sun"])
 def test_the_truth_knows_its_error(kind, material):
-    """It halves with four times the samples; under an even light it is that from what is known exactly."""
+    """The standard error halves with four times the samples, and is the error under an even light, which is known exactly."""
     for angle, roughness in ((0, 0.1), (60, 0.4), (80, 1.0)):
         (_, coarse), (value, fine) = (truth(kind, angle, material, roughness, n) for n in (15_000, 60_000))
         assert coarse / fine == pytest.approx(2, rel=0.15)
@@ -48,7 +48,7 @@ def test_the_truth_knows_its_error(kind, material):
 
 
 def test_an_even_light_is_reflected_exactly(found):
-    """To 0.001 at any roughness and angle."""
+    """The relative error is below 0.001 at any roughness and angle."""
     for (kind, angle, material, roughness), radiance in found.items():
         if kind == "constant":
             exact = Reflected.of(material, View.at(angle).way[2], roughness)
@@ -58,8 +58,8 @@ def test_an_even_light_is_reflected_exactly(found):
 @pytest.mark.parametrize("angle", ANGLES)
 @pytest.mark.parametrize("material", [METAL, DIELECTRIC])
 def test_a_gradient(found, material, angle):
-    """Texels, levels and harmonics add at most 0.7 % to what is the split sum's own error: 1.5 % up to a roughness of 0.2, and 13 %
-    for a rough metal, part of whose lobe lies below the horizon."""
+    """Texels, levels and harmonics add at most 0.7 % to the split sum's own error. That is 1.5 % up to a roughness of 0.2, and 13 % for a
+    rough metal, whose lobe is partly below the horizon."""
     view = View.at(angle)
     for roughness in ROUGHNESS:
         radiance = found["gradient", angle, material, roughness]
@@ -73,8 +73,8 @@ def test_a_gradient(found, material, angle):
 
 @pytest.mark.parametrize("material", [METAL, DIELECTRIC])
 def test_a_small_sun_seen_from_above(found, material):
-    """4 degrees wide, in the mirrored direction. The split sum itself is 2 % off where the lobe is narrow and 20 % where it is not;
-    a blend of two levels of roughness is not the lobe between: 31 % in all."""
+    """The sun is 4 degrees wide, in the mirror direction. The split sum errs by 2 % for narrow lobes and 20 % for wide ones; blending two
+    roughness levels in place of the lobe between makes it 31 %."""
     view = View.at(0)
     for roughness in ROUGHNESS:
         expected, error = truth("sun", 0, material, roughness)

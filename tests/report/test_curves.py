@@ -1,4 +1,4 @@
-"""Error against run time: fronts, knees and times against plain definitions and known curves; what runs are called."""
+"""Fronts, knees and times to an error agree with plain definitions and known curves; runs get names."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_a_decibel_is_the_same_step_of_the_error_everywhere():
 
 
 def test_the_front_is_what_nothing_beats():
-    """By comparing every point with every other."""
+    """Compare every point with every other."""
     random = np.random.default_rng(0)
     times = [np.sort(random.integers(1, 30, 25)) for _ in range(3)]
     curves = [of(t, (100 / t + random.exponential(20, 25)).round()) for t in times]

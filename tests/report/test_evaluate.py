@@ -1,4 +1,4 @@
-"""`refgs evaluate`: a run whose ground truth is known, in a capture whose frame is turned, moved and scaled from the run's."""
+"""Evaluate a run whose ground truth is known, in a capture that is rotated, moved and scaled from the run's frame."""
 
 import json
 
@@ -23,17 +23,17 @@ from tests.makers.ball import BOX, MOVE, SCALE, TURN, write_run
 
 
 def dusk(direction):
-    """Another light than the sky that the run holds."""
+    """Compute radiance of a light other than the run's sky."""
     return sky(direction[..., [1, 2, 0]]) * [1.0, 0.6, 0.3]
 
 
 def turned(light, turn, height=64):
-    """The panorama that shows in a frame, where `turn` leads to it, what `light` is in the frame it comes from."""
+    """Sample `light` as a panorama in the frame to which `turn` leads."""
     return light(directions(height, 2 * height) @ turn)
 
 
 def write_truth(folder, run, views):
-    """All that there can be, from what the run itself shows and holds: it has no error but what a test puts there."""
+    """Write all kinds of ground truth from the run itself, so that all errors are those that a test adds."""
     lights = {"light": sky, "relight/dusk": dusk}
     for name, light in lights.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -117,7 +117,7 @@ def test_known_errors_are_found(made, tmp_path):
         hidden[: view.camera.height // 2] = 0
         write_exr(truth / "visibility" / name, hidden)
         normal = images["normal"] @ TURN.T
-        axis = np.cross(normal, view.camera.position @ TURN.T)  # tilted about an axis that lies in the surface
+        axis = np.cross(normal, view.camera.position @ TURN.T)  # tilt about an axis in the surface
         axis /= np.linalg.norm(axis, axis=-1, keepdims=True) + 1e-12
         write_exr(truth / "normal" / name, np.cos(0.2) * normal + np.sin(0.2) * np.cross(axis, normal))
         image = maps(there.render(view.camera, Environment.from_panorama(dusk(directions(64, 128)), 16)))["color"]

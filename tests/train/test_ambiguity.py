@@ -1,4 +1,4 @@
-"""What photos do not tell is said."""
+"""Report what the photos cannot tell."""
 
 import json
 
@@ -18,7 +18,7 @@ def ball(ball_capture, tmp_path_factory):
 
 
 def test_what_is_left_is_what_both_changes_leave(ball):
-    """Of changes a tenth as large, made together: derivatives are of changes that are small."""
+    """Make both changes together, a tenth as large: derivatives are of small changes."""
     found = ambiguities(ball)
     now = ball.surfels(), ball.environment().radiance
     views = range(0, len(ball.views), 4)

@@ -1,4 +1,4 @@
-"""Training on a CUDA card, without one: its kernels emulated, and an iteration's tensors followed from device to device."""
+"""Train on a CUDA card without one: emulate its kernels, and follow an iteration's tensors from device to device."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def make_trainer(capture, folder, *changes: str, device: str = "cpu") -> Trainer
     "changes", [["indirect.start=0"], ["render.shading=sh"], ["initial.until=0.99", "needs.initial=on"]]
 )
 def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
-    """The same steps with the kernels of both, the object in its own way, too."""
+    """CPU and card kernels take the same steps, with self-occlusion too."""
     figures, learned = [], []
     for name in ("cpu", "card"):
         trainer = make_trainer(ball_capture, tmp_path / name, *changes)
@@ -54,13 +54,13 @@ def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
         learned.append({name: value.detach().clone() for name, value in trainer.state.parameters.items()})
     np.testing.assert_allclose(figures[0], figures[1], rtol=1e-3)
     for name, value in learned[0].items():
-        # Adam's first steps are the gradients' signs, which rounding may turn where they are next to nothing.
+        # Adam's first steps are the gradients' signs; rounding may flip those of tiny gradients.
         off = (value - learned[1][name]).abs() > 1e-3 * value.abs().max()
         assert float(off.float().mean()) < 0.05, name
 
 
 def follow_to_the_card(monkeypatch) -> list[str]:
-    """Have tensors be none but shapes on devices, as which a card's need no card; names of the kernels that are launched."""
+    """Replace tensors by shapes on devices, which need no card. Return the names of launched kernels."""
 
     def empty(value):
         if isinstance(value, Tensor):
@@ -70,7 +70,7 @@ def follow_to_the_card(monkeypatch) -> list[str]:
             return type(value)(*moved) if hasattr(value, "_fields") else type(value)(moved)
         return value
 
-    def computed_on_the_cpu(make):  # what numpy has a hand in
+    def computed_on_the_cpu(make):  # numpy computes these
         def made(*arguments):
             with unset_fake_temporarily():
                 value = make(*arguments[:-1], torch.device("cpu"))
@@ -90,7 +90,7 @@ def follow_to_the_card(monkeypatch) -> list[str]:
 
 
 def backward(loss: Tensor) -> None:
-    """Autograd, whose own engine asks for the card. What a function takes beside tensors comes after those with a derivative."""
+    """Differentiate without autograd's engine, which asks for a card. Arguments other than tensors follow those with a derivative."""
     order: list = []
 
     def visit(node) -> None:
@@ -118,8 +118,8 @@ def backward(loss: Tensor) -> None:
 
 @pytest.mark.parametrize("indirect", [False, True])
 def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, indirect):
-    """No operation finds its tensors on two devices, and none waits for a number but the one that is named: reading one, or
-    making a tensor whose size depends on one, is an error here."""
+    """No operation mixes devices or waits for the card. Reading a value, or making a tensor whose size depends on one, is an error
+    here; the one exception is named."""
     ball = trimesh.creation.icosphere(2)
     occluder = Occluder(Mesh(ball.vertices, np.asarray(ball.faces)))
     tree = occluder.tree(torch.device("cpu"))
@@ -128,11 +128,11 @@ def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, ind
         changes = f"indirect.start={0 if indirect else 1}", "light.frame=world"  # photos say on the CPU what it is
         trainer = make_trainer(ball_capture, tmp_path / "run", *changes, device="cuda")
         with unset_fake_temporarily():
-            trainer._next_view()  # the views' order is drawn on the CPU
+            trainer._next_view()  # the views' order is shuffled on the CPU
         if indirect:
             tree._boxes, tree._triangles = (torch.empty(v.shape, device=CARD) for v in (tree._boxes, tree._triangles))
             trainer.state.occluder = occluder
-        # Which part of the light the object shows is looked at when the training begins.
+        # The part of the light that the object shows is found when the training begins.
         trainer.state.light_shown = torch.empty(len(trainer.state.light), device=CARD)
         figures = trainer.step()
         assert all(figure.device == CARD for figure in figures.values())

@@ -73,7 +73,7 @@ def test_faint_surfels_go_and_one_stays():
 
 
 def test_screen_gradient_is_by_pixels_of_motion():
-    """dL/d(half image widths) of a point, against the derivative of its own projection."""
+    """Compare dL/d(half image widths) of a point with the derivative of its projection."""
     camera = Camera("a", 200, 100, 150.0, 150.0, 100.0, 50.0, np.eye(4))
     position = torch.tensor([[0.3, -0.2, 2.5]])
     wanted = torch.tensor([2.0, -1.0])  # dL/d(pixel)

@@ -1,4 +1,4 @@
-"""Which device is trained on, and what is said where it is not the one that was asked for; a card whose memory is full."""
+"""Choose the device, warn where it is not the one asked for, and handle a card whose memory is full."""
 
 import warnings
 
@@ -14,13 +14,13 @@ from refgs.train.trainer import Trainer
 
 
 def chosen(device: str) -> tuple[str, list[str]]:
-    """What is trained on, and the warnings."""
+    """Choose a device; return it and the warnings."""
     said = []
     return jobs.choose_device(device, lambda event, facts: said.append(facts["what"])), said
 
 
 def card(monkeypatch, capability: tuple[int, int], driver: str | None = None) -> None:
-    """Have torch tell of a card."""
+    """Make torch report a card."""
 
     def module(source: str, device: int) -> int:
         if driver:

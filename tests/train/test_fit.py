@@ -1,4 +1,4 @@
-"""Settings for a training that is given nothing but a time."""
+"""Choose settings for a training that is given nothing but a time."""
 
 import json
 import tomllib
@@ -26,7 +26,7 @@ def test_it_lies_between_the_presets():
 
 
 def test_more_time_brings_more_of_all(ball_capture, tmp_path):
-    """From less than `quick` needs to more than `standard` does: by the pace alone, for no training is as long as that."""
+    """Times go from less than `quick` takes to more than `standard` takes; only the pace is measured, nothing is trained so long."""
     capture = read_capture(ball_capture)
     said, found = [], []
     for minutes in (0.2, 2, 6, 600):

@@ -1,4 +1,4 @@
-"""What is done where a step would not be finite."""
+"""Guard a training against steps that are not finite."""
 
 import json
 import math
@@ -31,7 +31,7 @@ def learner(device):
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e30])
 def test_a_step_that_is_not_finite_leaves_all_as_it_was(device, wrong):
-    """Bit for bit, moments too; 1e30 is a number, but its square, which Adam keeps, is none in float32."""
+    """Values and moments stay bit for bit. 1e30 is finite, but its square, which Adam keeps, overflows float32."""
     values, optimizer = learner(device)
     guard, motion = Guard(torch.device(device)), ScreenGradient(50, torch.device(device))
     for step in range(3):
@@ -62,7 +62,7 @@ def test_a_loss_that_is_no_number_is_not_stepped_on():
 
 
 def test_no_kernel_hides_what_is_no_number(device):
-    """Colour by direction, shading, the rasteriser's derivatives: NaN in, NaN out."""
+    """NaN in, NaN out: colour by direction, shading, and the rasteriser's derivatives."""
     camera, nan = scenes.camera(20, 16), math.nan
     constant, rest, position = torch.ones(3, 1, 3), torch.ones(3, 3, 3), torch.rand(3, 3)
     constant[1, 0, 2] = rest[2, 1, 0] = nan
@@ -132,7 +132,7 @@ def test_broken_surfels_are_removed_and_that_is_said(ball_capture, tmp_path):
     made = trainer(ball_capture, "densify.every=1000", total=60, said=said, folder=tmp_path)
     made.run(stop=lambda: made.state.iteration >= 15)
     nan_value("roughness")(made)
-    nan_value("position")(made)  # not drawn, and so not felt
+    nan_value("position")(made)  # not drawn, so no gradient
     count = len(made.state.parameters["position"])
     made.run(stop=lambda: made.state.iteration >= 30)
     broken = count - len(made.state.parameters["position"])
@@ -176,7 +176,7 @@ def test_resumed_in_every_stage_it_is_the_same_run():
 
 
 def moved(folder, target, scale, offset):
-    """The capture in another unit and place."""
+    """Copy the capture in another unit and place."""
     target.mkdir()
     for split in ("train", "test"):
         (target / split).symlink_to(folder / split)
@@ -191,9 +191,9 @@ def moved(folder, target, scale, offset):
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e-6, 1.0), (1e6, 0.0), (1.0, 1e5), (1e3, -1e7)])
 def test_a_capture_anywhere_is_learned_about_the_origin(ball_capture, tmp_path, scale, offset):
-    """The same cameras in the run's frame, to what float64 leaves of them; and the way back."""
+    """Cameras are the same in the run's frame, to float64's rounding, and `to_capture` leads back."""
     usual, found = (read_capture(c) for c in (ball_capture, moved(ball_capture, tmp_path / "moved", scale, offset)))
-    assert np.array_equal(usual.to_capture, np.eye(4))  # NeRF-Blender's own frame, where that will do
+    assert np.array_equal(usual.to_capture, np.eye(4))  # NeRF-Blender's own frame is kept where it will do
     assert np.abs(found.centre).max() < 1e-9 and found.radius == pytest.approx(1)
     lost = 1e-15 * (abs(offset) / scale + 1) + 1e-9
     for before, after in zip(usual.views, found.views, strict=True):

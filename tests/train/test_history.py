@@ -1,4 +1,4 @@
-"""What a training writes down of itself: when, what, at what cost; and that errors are what they are said to be."""
+"""History of a training: when it is written, what is in it, what it costs, and whether its errors are right."""
 
 import json
 import math
@@ -49,7 +49,7 @@ def test_lines_are_evenly_spaced_by_logarithm():
 
 @pytest.mark.parametrize(("cost", "lines"), [(0.1, 26), (2.0, 5), (100.0, 2)])
 def test_measuring_has_its_share(cost, lines):
-    """Of a training of 3,000 iterations, a tenth of a second each; where it is dear it is thinned out evenly."""
+    """3,000 iterations take a tenth of a second each; expensive measuring is thinned out evenly."""
     spent, at = 0.0, []
     for i in [*filter(history.due, range(3000)), 3000]:
         if i == 3000 or spent <= history.allowed(i, 3000, 0.1 * i):
@@ -63,7 +63,7 @@ def test_measuring_has_its_share(cost, lines):
 
 
 def test_measuring_is_not_in_the_seconds(ball_capture, tmp_path, monkeypatch):
-    """Where measuring takes a thousand seconds, and the rest of the world none but the clock's own ticks."""
+    """Measuring takes a thousand seconds; all else takes the clock's own ticks."""
 
     class Time:
         now = 0.0
@@ -119,7 +119,7 @@ def test_a_resumed_run_records_the_same(ball_capture, tmp_path, monkeypatch):
     first = make(ball_capture, tmp_path / "cut", *changes)
     first.run(stop=lambda: first.state.iteration >= 34)
     assert rows(tmp_path / "cut")[-1]["iteration"] == 32
-    (tmp_path / "cut" / "checkpoints" / "00000034.toml").unlink()  # killed before that one was complete
+    (tmp_path / "cut" / "checkpoints" / "00000034.toml").unlink()  # killed before this checkpoint was complete
     second = make(ball_capture, tmp_path / "cut", *changes)
     second.resume()
     assert rows(tmp_path / "cut")[-1]["iteration"] == 20 == second.state.iteration
@@ -150,7 +150,7 @@ def test_a_training_that_is_ended_early_has_a_last_line(ball_capture, tmp_path):
 
 
 def rays(camera):
-    """Unit rays (P, 3) of a camera's pixels; which meet the ball; where, and the normal there."""
+    """Compute unit rays (P, 3) of a camera's pixels, which of them meet the ball, where, and the normal there."""
     ray = scenes.camera_rays(camera).double().numpy().reshape(-1, 3)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     return ray, *meet(np.broadcast_to(camera.position, ray.shape), ray, ONE)
@@ -161,7 +161,7 @@ def dusk(direction):
 
 
 def write_truth(capture):
-    """What the ball's formulas say of its held-out views, and of them under another light."""
+    """Write ground truth of the held-out views, and of them relit, by the ball's formulas."""
     truth = capture / "ground_truth"
     for name in ("alpha", "normal", "albedo", "roughness", "metallic", "relight/dusk"):
         (truth / name).mkdir(parents=True)
@@ -196,7 +196,7 @@ def known_capture(ball_capture, tmp_path_factory):
 
 
 def test_errors_against_the_truth(known_capture, tmp_path):
-    """Each as another program would measure it, and all less when the ball has been learned."""
+    """Errors agree with a second computation, and are lower after training."""
     trainer = make(
         known_capture, tmp_path / "run", "surfels.metallic=0.9", "surfels.budget=1500", "surfels.start=1500", total=250
     )
@@ -228,7 +228,7 @@ def test_errors_against_the_truth(known_capture, tmp_path):
 
 
 def test_a_light_known_exactly_leaves_the_relit_picture_alone(known_capture, tmp_path):
-    """A surfel ball of the true metal under that light is nearly the truth, up to the ball's outline."""
+    """A surfel ball of the true metal under that light is nearly the truth, but for the outline."""
     trainer = make(known_capture, tmp_path / "run", "surfels.start=3000", "surfels.budget=3000", "surfels.hull=96")
     logit = np.log(F0 / (1 - F0))
     settings = {"albedo": logit, "metallic": 9.0, "roughness": -9.0}

@@ -1,4 +1,4 @@
-"""Two metal balls that mirror each other, with and without inter-reflection."""
+"""Train two metal balls that mirror each other, with and without inter-reflection."""
 
 import numpy as np
 import pytest
@@ -20,12 +20,12 @@ SMALL += ["surfels.metallic=0.9", "train.iterations=600", "indirect.every=200", 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Both trainings, the one with inter-reflection first; what its test PSNR was whenever the mesh was made anew."""
+    """Train with inter-reflection and without. Return both, and the first one's PSNR before and after its mesh was made."""
     folder = tmp_path_factory.mktemp("two")
     write_ball_capture(folder / "capture", 64, TWO)
     capture, made, heard = read_capture(folder / "capture"), [], []
     for start in (0.3, 1):
-        alone = "residual.start=1"  # which makes up for some of what is without
+        alone = "residual.start=1"  # a residual would make up for some of what is missing
         settings = load_settings("quick", [*SMALL, f"indirect.start={start}", alone])
         run = Trainer(capture, settings, folder / str(start), lambda *_: None)
         create_run(run.state.folder, capture, settings, "quick", "cpu")
@@ -55,7 +55,7 @@ def test_pictures_gain_where_the_balls_mirror_each_other(trained):
 
 
 def test_joining_loses_nothing(trained):
-    """What the surfels know of each other starts as what they mirrored before."""
+    """Indirect light starts as the light that was mirrored before."""
     before, after = trained[2]
     assert after > before - 0.1
 
@@ -82,7 +82,7 @@ def test_visibility_is_that_of_the_balls(trained):
 
 
 def test_the_run_folder_has_it_all(trained):
-    """Rendered from the files as it was in training; much the same where its light is taken for another."""
+    """The files render as the training did, and nearly so where the run's own light is passed as another light."""
     made = trained[0]
     run, view = open_run(made.state.folder), made.state.test[0]
     shown, asset = made.state.render(view.camera), run.state.render(view.camera)

@@ -1,4 +1,4 @@
-"""Light that turns with the camera, and photos of different exposures, on balls whose every answer is known."""
+"""Light that turns with the camera, and photos of different exposures, on balls whose answers are known."""
 
 import json
 import tomllib
@@ -61,7 +61,7 @@ def test_auto_tells_which_light_it_was(ball_capture, turntable, tmp_path):
         found = made(capture, tmp_path / "one")
         assert found.settings.light.frame == ("camera" if turning else "world"), found.chosen
         assert "explains" in found.chosen["light.frame"]
-        write_ball_capture(tmp_path / f"two{turning}", 48, TWO, turning=turning)  # which mirror each other, too
+        write_ball_capture(tmp_path / f"two{turning}", 48, TWO, turning=turning)  # two balls that mirror each other
         found = made(tmp_path / f"two{turning}", tmp_path / "two")
         assert found.settings.light.frame == ("camera" if turning else "world"), found.chosen
 
@@ -86,7 +86,7 @@ def test_without_masks_the_light_stands_still(turntable, tmp_path):
 
 
 def test_a_light_that_turns_is_recovered(turntable, tmp_path):
-    """Better pictures than under one that stands still; and what is saved renders, and says, as the training did."""
+    """Pictures are better than under a fixed light, and the saved run renders and reports as the training did."""
     still = made(turntable, tmp_path / "still", "light.frame=world", "light.exposure=off", total=300)
     still.run()
     turning = made(turntable, tmp_path / "scratch", "light.exposure=off", total=300)

@@ -1,4 +1,4 @@
-"""What a scene does without: each statistic on either side of its threshold, and what comes of it."""
+"""Decide what a scene does without: each statistic on either side of its threshold, and the consequences."""
 
 import json
 import math
@@ -27,7 +27,7 @@ from refgs.train.plan import Plan
 from refgs.train.trace import why_not_traced
 from tests.makers.training import trainer as small
 
-DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # at the start: few iterations have to do
+DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # at the start, as the trainings are short
 SMALL = ["environment.resolution=32", "indirect.every=100", "indirect.resolution=32"]
 
 
@@ -42,7 +42,7 @@ def mirror(ball_capture):
 
 @pytest.fixture(scope="module")
 def matte(tmp_path_factory):
-    """The ball as white chalk would look: its irradiance, the same from everywhere."""
+    """Capture a matte ball: its colour is its irradiance, the same from every direction."""
     folder = tmp_path_factory.mktemp("matte")
     write_ball_capture(folder, 64, matte=True)
     return read_capture(folder)
@@ -50,7 +50,7 @@ def matte(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def chalk(matte, tmp_path_factory):
-    """Learned, with all that it wants, its asset written."""
+    """Train the matte ball with all needs decided, and write its asset."""
     made = trainer(matte, tmp_path_factory.mktemp("runs") / "chalk", *DULL, total=300)
     made.run()
     write_asset(made.state)
@@ -67,7 +67,7 @@ def test_what_is_matte_goes_without_specular(chalk):
 
 
 def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
-    """By a fifth of what was left, unless all is wanted, or a time was given to be used."""
+    """A fifth of what was left is saved, unless the setting is on or a time was given."""
     found = chalk.state.needs["iterations"]
     assert (
         not found["needed"]
@@ -94,7 +94,7 @@ def test_a_mirror_keeps_it(mirror, tmp_path):
 
 @pytest.mark.parametrize("word", ["on", "off"])
 def test_forced_either_way(word, matte, mirror, tmp_path):
-    """Against what the photos say."""
+    """Settings overrule the photos."""
     made = trainer(matte if word == "on" else mirror, tmp_path / "run", f"needs.specular={word}", total=120)
     made.run()
     assert ("metallic" in made.state.parameters) == (word == "on")
@@ -106,7 +106,7 @@ def test_forced_either_way(word, matte, mirror, tmp_path):
 
 
 def test_the_asset_says_so_once(chalk):
-    """No columns, and the pictures that were learned."""
+    """Constant columns go into the header, and the pictures stay."""
     splats, run = read_splats(chalk.state.folder / "splats.ply"), open_run(chalk.state.folder)
     assert splats.constants == {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
     assert (splats.metallic == 0).all() and (splats.roughness == 1).all()
@@ -124,11 +124,11 @@ def test_needs_are_written_down(chalk):
         assert math.isfinite(rows[name]["decibels"]) and rows[name]["seconds"] >= 0
         assert rows[name]["saved"] and rows[name]["cost"] and name in chalk.state.decided
     assert rows["light"]["side"] == 16
-    assert "cost" not in rows["iterations"]  # that could not be measured
+    assert "cost" not in rows["iterations"]  # its cost could not be measured
 
 
 def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
-    """Bit for bit."""
+    """Parameters and light agree bit for bit."""
     more = [*DULL, "train.checkpoint_every=20", "densify.every=25", "train.light_first=0"]
     whole = trainer(matte, tmp_path / "whole", *more, total=150)
     whole.run()
@@ -145,7 +145,7 @@ def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
 
 
 def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
-    """To a checkpoint of before they were made, as the guard has it."""
+    """The guard goes back to a checkpoint from before the decisions."""
     made = trainer(matte, tmp_path / "run", *DULL, "train.light_first=0", total=200)
     made.run(stop=lambda: made.state.iteration == 96)
     assert "specular" not in made.state.needs
@@ -168,15 +168,13 @@ def test_a_convex_mirror_does_without_reflections(mirror, tmp_path):
 
 
 def test_reflections_by_what_they_could_be_worth(mirror, tmp_path):
-    """A mirror of which a fifth is said to be hidden keeps them; a rough dielectric, which would hardly be darker, does not."""
+    """A mirror with a fifth occluded keeps reflections; a rough dielectric, which would hardly be darker, does not."""
     made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
     made.run(stop=lambda: made.state.iteration == 99)
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-3, 3, 61)] * 2))
     at = np.arange(60 * 61).reshape(60, 61)[:, :-1].ravel()
     faces = np.concatenate([np.stack([at, at + 61, at + 1], axis=1), np.stack([at + 1, at + 61, at + 62], axis=1)])
-    made.state.occluder = Occluder(
-        Mesh(np.stack([x, y, np.full_like(x, 1.5)], axis=1), faces)
-    )  # a lid, which faces down
+    made.state.occluder = Occluder(Mesh(np.stack([x, y, np.full_like(x, 1.5)], axis=1), faces))  # a lid that faces down
     needs.evaluate_mesh(made.state, 0.2)
     assert (
         made.state.needs["reflections"]["needed"]
@@ -207,7 +205,7 @@ def test_views_that_show_the_same_from_the_same_place(mirror, tmp_path):
 
 
 def test_the_part_about_the_mask_is_all_that_counts(mirror, tmp_path):
-    """Loss and derivatives are the whole photo's where nothing is beyond it."""
+    """The loss and gradients of a crop are the full photo's where nothing lies outside the crop."""
     made, generator = trainer(mirror, tmp_path / "run", total=10), torch.Generator().manual_seed(0)
     camera = made.state.photos[0].camera
     camera = replace(camera, fx=0.6 * camera.fx, fy=0.6 * camera.fy)
@@ -231,7 +229,7 @@ def test_the_part_about_the_mask_is_all_that_counts(mirror, tmp_path):
 
 
 def test_a_photo_that_its_object_fills_stays_whole(mirror, tmp_path, monkeypatch):
-    monkeypatch.setattr(photos, "MARGIN", 5)  # of 64 pixels the ball has 45
+    monkeypatch.setattr(photos, "MARGIN", 5)  # the ball covers 45 of 64 pixels
     made = trainer(mirror, tmp_path / "run", total=10)
     assert made.state.crops is not None
     for view in made.state.views:
@@ -261,12 +259,14 @@ def test_what_the_part_about_the_mask_saves_is_timed(mirror, tmp_path, monkeypat
     asked = []
     monkeypatch.setattr(probe, "seconds_saved", lambda trainer, whole: asked.append(whole) or 8.0)
     made.run(stop=lambda: made.state.iteration == 6)
-    assert asked == [True] and made.state.needs["outside"]["seconds"] == 7.0  # one iteration in eight sees the whole
+    assert (
+        asked == [True] and made.state.needs["outside"]["seconds"] == 7.0
+    )  # one iteration in eight sees the full photo
     assert next(row for row in needs.rows(made.state) if row["need"] == "outside")["saved"] == "7.0 s, 0.0 MB"
 
 
 def test_texels_by_the_lobe():
-    """A quarter turn over so many texels is no more than half of the lobe's width, which is roughness squared."""
+    """A texel, a quarter turn over their number, takes no more than half of the lobe's width, roughness²."""
     lobe = lighting.Light.LOBE
     for roughness, side in ((1.0, 16), (0.5, 16), (0.4, 32), (0.2, 128), (0.05, 256)):
         assert lighting.resolvable(roughness, lobe, 256, 16) == side
@@ -321,7 +321,7 @@ def photographed(state, photo, noise=0.0):
 
 
 def test_specular_on_synthetic_surfels(mirror, tmp_path):
-    """Of pictures that the model itself made: a mirror's are lost without it, chalk's are not."""
+    """Photos are the model's own pictures: a mirror needs specular shading, chalk does not."""
     made = trainer(mirror, tmp_path / "run", total=10)
     light = torch.randn(made.state.light.shape, generator=torch.Generator().manual_seed(1))
     for metallic, roughness, least, most in ((5.0, -3.0, 3.0, math.inf), (-20.0, 20.0, -math.inf, 0.3)):
@@ -334,7 +334,7 @@ def test_specular_on_synthetic_surfels(mirror, tmp_path):
 
 
 def test_shares_are_weights(mirror, tmp_path):
-    """Those of all surfels make up the picture's alpha; means by them, of what is the same everywhere, are that."""
+    """All shares add up to the picture's alpha; weighted means of a constant are that constant."""
     made = trainer(mirror, tmp_path / "run", total=10)
     photo, surfels = made.state.photo(0), made.state.surfels()
     alpha = made.state.render(photo.camera).alpha

@@ -1,4 +1,4 @@
-"""A training that is given a time ends by it, whatever an iteration takes."""
+"""A training that is given a time ends on time, whatever an iteration takes."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def clock(monkeypatch) -> _Time:
 def _train(
     clock: _Time, made: Plan, pace, paused: float = 0.0, start: float = 12.0, first: int = 0, growth: float = 1.5
 ) -> tuple[int, float]:
-    """Iterate as a trainer does: how many iterations, and the seconds to when the asset is written, but for what it was paused."""
+    """Iterate as a trainer does. Return the iterations, and the seconds until the asset is written, without pauses."""
     begun = clock.now
     clock.now += start
     made.begin(first, growth)
@@ -54,7 +54,7 @@ def test_it_ends_on_time_whatever_an_iteration_takes(clock, pace, minutes):
 
 
 def test_where_iterations_grow_slower_as_expected_their_number_is_known_at_once(clock):
-    """A schedule goes by the part of the iterations that are done: it must not move about."""
+    """Schedules follow the fraction of iterations done, so the total must not change."""
     made, asked = Plan(5), []
     whole = made.total
 

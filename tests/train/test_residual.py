@@ -1,4 +1,4 @@
-"""Colour by direction that adds to the picture what material and light leave over."""
+"""Residual colour by direction adds to the picture what material and light leave over."""
 
 import json
 
@@ -59,7 +59,7 @@ def test_it_learns_when_material_and_light_have(ball_capture, tmp_path):
 
 
 def test_it_adds_its_blend_to_the_picture(learned):
-    """In float64: Σ_k c_k Y_k(d) of each surfel, d the direction from the camera."""
+    """The residual is Σ_k c_k Y_k(d) of each surfel, d the direction from the camera, in float64."""
     run, camera = open_run(learned.state.folder), learned.state.test[0].camera
     surfels = run.surfels()
     ways = surfels.positions.double() - torch.from_numpy(camera.position)
@@ -94,7 +94,7 @@ def test_one_that_ends_before_it_leaves_none(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run")
     for _ in range(3):
         made.step()
-    made.state.total = made.state.iteration  # good enough: stop here
+    made.state.total = made.state.iteration  # end here
     write_asset(made.state)
     assert open_run(tmp_path / "run").splats.sh.shape[1] == 1
 

@@ -1,4 +1,4 @@
-"""Stages of a training: surfels shaded one by one first, opacity resets, normal propagation, a screen's colours."""
+"""Stages of a training: per-splat shading first, opacity resets, normal propagation, display colours."""
 
 import pytest
 import torch
@@ -76,7 +76,7 @@ def test_learns_and_renders_as_it_trained(ball_capture, tmp_path, changes):
 
 
 def test_the_papers_schedule_runs_to_its_end(ball_capture, tmp_path):
-    """Through all of its stages, in fewer iterations."""
+    """All of its stages run, in fewer iterations."""
     changes = ["train.iterations=300", "densify.every=20", "propagation.every=100", "rates.environment=0.05"]
     changes += ["propagation.rest=10", "indirect.every=60", "indirect.resolution=32"]
     made = trainer(ball_capture, tmp_path / "run", "paper", *changes)
@@ -112,8 +112,8 @@ def test_all_grow_faint_and_mirrors_grow(ball_capture, tmp_path):
 
 @pytest.mark.parametrize("waves", [1, 5, 15])
 def test_the_light_diffuses_as_heat_does(ball_capture, tmp_path, waves):
-    """A cosine between insulated ends is an eigenvector of the discrete Laplacian: it fades by 1 − 4 c sin²(θ / 2) a step. Here
-    c is 0.5 · 6.4 · (16 / 64)²."""
+    """A cosine between insulated ends is an eigenvector of the discrete Laplacian: a step multiplies it by 1 − 4 c sin²(θ / 2), with
+    c = 0.5 · 6.4 · (16 / 64)² here."""
     changes = ["environment.diffusion=6.4", "rates.environment=0.5", "train.iterations=10"]
     made = trainer(ball_capture, tmp_path / "run", "quick", *changes)
     set_rates(made.state, 0.0)

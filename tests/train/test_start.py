@@ -1,4 +1,4 @@
-"""Where surfels start when nothing is masked."""
+"""Place the first surfels of captures without masks."""
 
 import dataclasses
 

@@ -28,7 +28,7 @@ from tests.makers.training import SMALL, trainer
 
 @pytest.fixture(scope="module")
 def ball(ball_capture, tmp_path_factory):
-    """The ball, learned as metal for 700 iterations, its asset written."""
+    """Train the metal ball for 700 iterations and write its asset."""
     folder = tmp_path_factory.mktemp("runs") / "ball"
     made = trainer(ball_capture, folder, "train.checkpoint_every=200", "surfels.metallic=0.9", total=700)
     made.run()
@@ -37,7 +37,7 @@ def ball(ball_capture, tmp_path_factory):
 
 
 def test_the_ball_is_recovered(ball):
-    """Novel views, normals, light and metal, each against what the capture was made from."""
+    """Compare held-out views, normals, depth, light and metal with what the capture was made from."""
     assert held_out_psnr(ball.state) > 30
     for view in ball.state.test:
         seen, ray = ball.state.render(view.camera), scenes.camera_rays(view.camera).double().numpy().reshape(-1, 3)
@@ -67,14 +67,12 @@ def test_the_asset_renders_as_the_training_did(ball):
 
 
 def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
-    """Near the horizon it matters which way a surfel's normal points: only the column of normals is turned outward."""
+    """Near the horizon a surfel's side matters: only the column of normals is turned outward, not the surfel."""
     made = trainer(ball_capture, tmp_path / "run", total=10)
     made.run()
     with torch.no_grad():
         w, x, y, z = made.state.parameters["rotation"][::2].unbind(-1)
-        made.state.parameters["rotation"][::2] = torch.stack(
-            [-x, w, z, -y], dim=-1
-        )  # every other surfel the other way round
+        made.state.parameters["rotation"][::2] = torch.stack([-x, w, z, -y], dim=-1)  # flip every other surfel
     write_asset(made.state)
     run, camera = open_run(made.state.folder), made.state.test[0].camera
     learned = made.state.render(camera).normal
@@ -83,7 +81,9 @@ def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
     inward = (run.surfels().normals() * torch.from_numpy(run.splats.normals)).sum(dim=-1) < 0
     assert 0.3 < inward.float().mean() < 0.7
     object.__setattr__(run, "splats", to_splats(run.surfels().turned(inward)))
-    assert float((learned - run.render(camera).normal).abs().max()) > 0.01  # what was shown when they were turned too
+    assert (
+        float((learned - run.render(camera).normal).abs().max()) > 0.01
+    )  # turning the surfels too would change the picture
 
 
 def test_what_a_ball_does_without(ball):
@@ -126,13 +126,13 @@ REGION = ["region.centre=[0.0, 0.0, 0.4]", "region.size=[2.5, 2.5, 1.2]", "regio
 
 @pytest.mark.parametrize("changes", [[], ["shading=sh"], ["diffuse=sh"], INDIRECT, TURNING, STAGES, REGION])
 def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
-    """Bit for bit, through densification."""
+    """Parameters agree bit for bit, through densification."""
     changes = [*changes, "train.checkpoint_every=40", "densify.every=25"]
     whole = trainer(ball_capture, tmp_path / "whole", *changes, total=80)
     whole.run()
     first = trainer(ball_capture, tmp_path / "cut", *changes, total=80)
     first.run(stop=lambda: first.state.iteration >= 47)
-    (tmp_path / "cut" / "checkpoints" / "00000047.toml").unlink()  # killed before that one was complete
+    (tmp_path / "cut" / "checkpoints" / "00000047.toml").unlink()  # killed before this checkpoint was complete
     second = trainer(ball_capture, tmp_path / "cut", *changes, total=80)
     second.resume()
     assert second.state.iteration == 40
@@ -142,7 +142,7 @@ def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
     for name, value in whole.state.parameters.items():
         assert torch.equal(value, second.state.parameters[name]), name
     assert torch.equal(whole.state.light, second.state.light)
-    # By the stages all surfels are faint when exposures would be judged.
+    # With STAGES all surfels are faint when exposures would be judged.
     assert (second.state.exposures is not None) == (changes[0] in (TURNING[0], STAGES[0]))
     if second.state.exposures is not None:
         assert torch.equal(whole.state.exposures, second.state.exposures) and whole.state.exposures.any()
