@@ -63,13 +63,8 @@ _MATERIAL = ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
 # `specular` is the Principled BSDF's Specular IOR Level. Its default is 0.5.
 CONSTANTS = ("metallic", "roughness", "specular")
 _CONSTANT = re.compile(rf"constant ({'|'.join(CONSTANTS)}) ([0-9.e+-]+)")  # in a comment of the header
-_REF_GAUSSIAN = [
-    "ori_color_0",
-    "ori_color_1",
-    "ori_color_2",
-    "refl_strength",
-    "roughness",
-]  # Ref-Gaussian's properties, as logits
+# Properties of Ref-Gaussian's files, as logits.
+_REF_GAUSSIAN = ["ori_color_0", "ori_color_1", "ori_color_2", "refl_strength", "roughness"]
 MATTE = 0.0, 1.0  # metallic and roughness of splats without materials
 # Rotations, as quaternions wxyz, that move axis 0, 1 or 2 to the third place.
 _TO_THIRD = np.array([(0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1, 0, 0, 0)], np.float32)
