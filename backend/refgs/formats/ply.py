@@ -55,9 +55,8 @@ def _check_header(file, path: Path) -> None:
     text = lines[1][1] == "ascii"
     need, rows, last = 0, 0, 0
     for count, properties in _elements(lines[2:], path):
-        least = (
-            2 * len(properties) if text else sum(properties)
-        )  # a value is a digit and a blank at least; a list may be empty
+        # In text a value takes a digit and a blank at least. A list may be empty: only its length counts.
+        least = 2 * len(properties) if text else sum(properties)
         need, rows, last = need + count * least, rows + count, least
     there = os.fstat(file.fileno()).st_size - end.end()
     if need > there + text:  # the last line of text may lack its line break

@@ -16,7 +16,7 @@ BITS = 10  # bits a coordinate in a Morton code
 _Work = struct("Trace", "trace.cu")
 
 
-def _spread(v: Tensor) -> Tensor:
+def _spread_bits(v: Tensor) -> Tensor:
     """Insert two zero bits between any two bits of integers below 2^10."""
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         v = (v | v << shift) & mask
@@ -33,7 +33,7 @@ class Tree:
         self.centre, self.size, self.lift = centre, size, lift
         corners = torch.from_numpy(((mesh.vertices[mesh.faces] - centre) / size).astype(np.float32)).to(device)
         cell = ((corners.mean(dim=1) + 1) / 2 * 2**BITS).long().clamp(0, 2**BITS - 1)
-        x, y, z = (_spread(v) for v in cell.unbind(-1))
+        x, y, z = (_spread_bits(v) for v in cell.unbind(-1))
         corners = corners[torch.argsort(x | y << 1 | z << 2)]
         self.leaves = 1 << max(0, (-(-len(corners) // LEAF) - 1).bit_length())
         empty = corners.new_full((self.leaves * LEAF - len(corners), 3, 3), torch.nan)

@@ -42,7 +42,7 @@ def visual_hull_points(
     """
     masks, views = [], []
     for alpha, camera in zip(alphas, cameras, strict=True):
-        mask = _unit(alpha)
+        mask = _as_float(alpha)
         if mask.max() >= 0.5:
             masks.append(mask)
             views.append(camera)
@@ -87,7 +87,7 @@ def visual_hull_points(
     vertices, faces, _, _ = marching_cubes(field, 0.5)
     rng = np.random.default_rng(seed)
     on_hull = count if on_hull is None else on_hull
-    points = _spread(_sample_triangles(vertices * voxel, faces, 10 * on_hull, rng), on_hull)
+    points = _choose_evenly(_sample_triangles(vertices * voxel, faces, 10 * on_hull, rng), on_hull)
     # Compute normals from a wider filter: masks' edges are about a voxel wide, so the gradient of one voxel is noise.
     wide = gaussian_filter(field, 1.5)
     normals = np.stack(
@@ -104,7 +104,7 @@ def visual_hull_points(
     return positions.astype(np.float32), normals.astype(np.float32), spacing.astype(np.float32)
 
 
-def _unit(alpha: np.ndarray) -> np.ndarray:
+def _as_float(alpha: np.ndarray) -> np.ndarray:
     """Convert a mask to float32 in 0..1."""
     alpha = np.asarray(alpha)
     if np.issubdtype(alpha.dtype, np.integer):
@@ -158,7 +158,7 @@ def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int, rng: 
     return a[chosen] * (1 - root) + b[chosen] * (root * (1 - v)) + c[chosen] * (root * v)
 
 
-def _spread(dense: np.ndarray, count: int) -> np.ndarray:
+def _choose_evenly(dense: np.ndarray, count: int) -> np.ndarray:
     """Choose `count` evenly spaced points by a few Lloyd iterations. Each moves a cell's centre to the point nearest to its mean."""
     chosen = dense[:: len(dense) // count][:count]
     for _ in range(5):

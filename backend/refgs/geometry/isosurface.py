@@ -16,24 +16,24 @@ def isosurface(block: np.ndarray, signed: np.ndarray) -> Mesh:
     centre of the first voxel of block (0, 0, 0). Chunks are meshed one by one, each with one layer of its neighbours' voxels, and their
     common vertices are merged. So memory grows with the blocks, not with the volume that they span.
     """
-    rows, chunks = _in_chunks(block)
+    rows, chunks = _assign_to_chunks(block)
     order = np.lexsort(chunks.T)
     rows, chunks = rows[order], chunks[order]
     first = np.flatnonzero(np.r_[True, (chunks[1:] != chunks[:-1]).any(axis=1)]) if len(rows) else np.zeros(0, int)
     vertices, faces, count = [], [], 0
     for part in np.split(np.arange(len(rows)), first[1:]) if len(rows) else ():
         chunk = chunks[part[0]]
-        found = _mesh(block[rows[part]] - _CHUNK * chunk, signed[rows[part]])
+        found = _mesh_chunk(block[rows[part]] - _CHUNK * chunk, signed[rows[part]])
         if found is not None:
             vertices.append(found[0] + float(BLOCK * _CHUNK) * chunk)
             faces.append(found[1] + count)
             count += len(found[0])
     if not vertices:
         return Mesh.empty()
-    return _joined(np.concatenate(vertices), np.concatenate(faces))
+    return _merge_vertices(np.concatenate(vertices), np.concatenate(faces))
 
 
-def _in_chunks(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _assign_to_chunks(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Assign blocks to chunks: rows (K,) of blocks, and the chunk (K, 3) of each.
 
     A block on the lower side of a chunk is also in the chunk before, whose last cells need its voxels.
@@ -46,7 +46,7 @@ def _in_chunks(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(rows), np.concatenate(chunks)
 
 
-def _mesh(block: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def _mesh_chunk(block: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Mesh one chunk: vertices, exact in the chunk's frame, and faces. `block` counts from the chunk's corner."""
     side = _CHUNK + 1
     grid = np.full((side * BLOCK,) * 3, np.nan, np.float32)
@@ -70,7 +70,7 @@ def _mesh(block: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return vertices.astype(np.float64), faces.astype(np.int64)
 
 
-def _joined(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     """Merge the vertices that chunks share.
 
     Shared vertices have equal coordinates, bit for bit: on the plane between chunks both are interpolated from the same two voxels.

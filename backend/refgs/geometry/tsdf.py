@@ -43,11 +43,11 @@ def fuse(
     voxel = 2 * radius / resolution
     low = np.asarray(centre, np.float64) - radius
     blocks = -(-resolution // _BLOCK)
-    met = [
+    hit = [
         _blocks_of_pixels(depth, alpha, camera, low, voxel * _BLOCK, blocks)
         for depth, alpha, camera in zip(depths, alphas, cameras, strict=True)
     ]
-    block = _with_neighbours(torch.cat(met), blocks)
+    block = _with_neighbours(torch.cat(hit), blocks)
     votes = torch.zeros(2, len(block), _BLOCK**3, device=block.device)
     for depth, alpha, camera in zip(depths, alphas, cameras, strict=True):
         view = _View(depth, alpha, camera, low, voxel)
@@ -63,17 +63,17 @@ def fuse(
 def _with_neighbours(block: Tensor, blocks: int) -> Tensor:
     """Add the neighbours of blocks (M, 3) inside a cube of `blocks`³; unique and sorted."""
     step = torch.arange(-1, 2, device=block.device)
-    around = (_each(block, blocks)[:, None] + torch.cartesian_prod(step, step, step)).view(-1, 3)
-    return _each(around[((around >= 0) & (around < blocks)).all(dim=-1)], blocks)
+    around = (_unique(block, blocks)[:, None] + torch.cartesian_prod(step, step, step)).view(-1, 3)
+    return _unique(around[((around >= 0) & (around < blocks)).all(dim=-1)], blocks)
 
 
-def _each(block: Tensor, blocks: int) -> Tensor:
+def _unique(block: Tensor, blocks: int) -> Tensor:
     """Sort blocks (M, 3) and remove duplicates."""
     number = ((block[:, 0] * blocks + block[:, 1]) * blocks + block[:, 2]).unique()
     return torch.stack([number // blocks**2, number // blocks % blocks, number % blocks], dim=-1)
 
 
-def _on(like: Tensor, numbers: np.ndarray) -> Tensor:
+def _tensor_like(like: Tensor, numbers: np.ndarray) -> Tensor:
     return torch.tensor(numbers, dtype=torch.float32).to(like.device)
 
 
@@ -94,9 +94,9 @@ def _blocks_of_pixels(
     """Find the blocks (M, 3) of the pixels' points; unique and sorted."""
     camera, solid = camera.resized(*depth.shape[::-1]), _solid(depth, alpha)
     local = _rays(camera, depth)[solid] * depth[solid][:, None]
-    to_block = _on(depth, camera.world_to_camera[:3, :3] / side)
-    cell = (local @ to_block + _on(depth, (camera.position - low) / side)).floor()
-    return _each(cell[((cell >= 0) & (cell < blocks)).all(dim=-1)].long(), blocks)
+    to_block = _tensor_like(depth, camera.world_to_camera[:3, :3] / side)
+    cell = (local @ to_block + _tensor_like(depth, (camera.position - low) / side)).floor()
+    return _unique(cell[((cell >= 0) & (cell < blocks)).all(dim=-1)].long(), blocks)
 
 
 class _View:
@@ -107,8 +107,8 @@ class _View:
         self.truncation = _TRUNCATION * voxel
         # first + step · index of a voxel = its pixel position times depth, and its depth.
         matrix = camera.projection
-        self.first = _on(depth, matrix[:, :3] @ (low + 0.5 * voxel) + matrix[:, 3])
-        self.step = _on(depth, matrix[:, :3] * voxel)
+        self.first = _tensor_like(depth, matrix[:, :3] @ (low + 0.5 * voxel) + matrix[:, 3])
+        self.step = _tensor_like(depth, matrix[:, :3] * voxel)
 
         def largest(map: Tensor) -> Tensor:
             return max_pool2d(map[None], 3, 1, 1)[0]

@@ -45,25 +45,25 @@ class Occluder:
         """Trace rays from surface `points` (P, 3), in the mesh's frame, along unit `directions` (P, 3).
 
         Returns the first face hit (P,), −1 for none, and the weights of its corners (P, 3). Rays start `lift` above the surface, along
-        its `normals` (P, 3). Only the front of a face occludes. A ray passes through a back face, because it started below the mesh or meets
+        its `normals` (P, 3). Only fronts of faces occlude. A ray passes through a back face, because it started below the mesh or meets
         the mesh's open side.
         """
         lift = self.lift / self._size
         directions = np.ascontiguousarray(directions, np.float32)
         origins = ((points - self._centre) / self._size + lift * normals).astype(np.float32)
         face, weights = np.full(len(origins), -1, np.int32), np.zeros((len(origins), 3), np.float32)
-        going = np.arange(len(origins))
+        rays = np.arange(len(origins))
         for _ in range(_PASSES):
             hit = self._scene.run(origins, directions, query="INTERSECT", output=True)
             facing = np.einsum("pa,pa->p", hit["Ng"], directions)
             met = hit["primID"] >= 0
             front = met & (facing < 0)
-            face[going[front]] = hit["primID"][front]
+            face[rays[front]] = hit["primID"][front]
             u, v = hit["u"][front], hit["v"][front]
-            weights[going[front]] = np.stack([1 - u - v, u, v], axis=1)
-            on = met & ~front
-            if not on.any():
+            weights[rays[front]] = np.stack([1 - u - v, u, v], axis=1)
+            back = met & ~front
+            if not back.any():
                 break
-            going, directions = going[on], directions[on]
-            origins = origins[on] + (hit["tfar"][on, None] + 0.1 * lift) * directions
+            rays, directions = rays[back], directions[back]
+            origins = origins[back] + (hit["tfar"][back, None] + 0.1 * lift) * directions
         return face, weights
