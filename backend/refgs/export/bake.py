@@ -1,4 +1,4 @@
-"""Textures for a mesh, baked from the splats around it."""
+"""Bake a mesh's textures from the splats around it."""
 
 import cv2
 import numpy as np
@@ -13,15 +13,17 @@ from refgs.formats.splats import Splats
 from refgs.formats.tangents import vertex_tangents
 from refgs.formats.textures import Textures
 
-FINE = 3  # texels at least that a splat's standard deviation is long where splats are composited; between them textures are linear
-_ROWS = 64  # of texels at a time
+# Least texels along a splat's standard deviation where splats are composited. Larger textures are interpolated from these texels.
+FINE = 3
+_ROWS = 64  # rows of texels at a time
 _BESIDE = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]
 
 
 def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:
-    """What the splats (`composite`) are at each texel's point of the mesh, and how open that is to light (`openness`).
+    """Bake base colour, materials and normals (`composite`) and occlusion (`openness`) at the point of each texel on the mesh.
 
-    `mesh` has normals and uv (`unwrap`). Texels that a chart covers in part have the point of the mesh's plane beyond its edge.
+    `mesh` has normals and uv (`unwrap`). If a texel's centre lies just beyond a chart's edge, its point is on the extended plane of the
+    face. `progress` is called with the points done and their total.
     """
     coarse = _composited(mesh, splats, size, progress)
     tangents, signs = vertex_tangents(mesh)
@@ -44,13 +46,13 @@ def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done
 
 
 def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
-    """Base colour, metallic, roughness, normal (C, C, 8), of as many texels C up to `size` as the splats need."""
+    """Composite base colour, metallic, roughness and normal (C, C, 8). C is the resolution that the splats need, `size` at most."""
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     covered = np.abs(_area(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0])).sum()
     texel = np.sqrt(area / max(covered, 1e-12)) / size
     deviation = float(np.median(splats.scales[:, :2].min(axis=1)))
-    # Two charts, 1/128 apart, must not reach each other by the texel that each goes beyond its edge.
+    # At least 256 texels: charts are 1/128 apart, and each extends a texel beyond its edge.
     coarse = min(size, max(int(np.ceil(size * FINE * texel / deviation)), min(size, 256)))
     scene, mask, found = _flat(mesh, coarse), np.zeros((coarse, coarse), bool), []
     for rows in _blocks(coarse):
@@ -66,12 +68,12 @@ def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np
 
 
 def _blocks(size: int) -> list[slice]:
-    """All rows, some at a time."""
+    """Split all rows into blocks of _ROWS."""
     return [slice(start, min(start + _ROWS, size)) for start in range(0, size, _ROWS)]
 
 
 def _enlarged(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
-    """Rows of a square picture (C, C, 8) that is enlarged to `size`, bilinearly."""
+    """Enlarge a square picture (C, C, 8) to `size` bilinearly, and return some of its rows."""
     place = ((np.arange(rows.start, rows.stop) + 0.5) * len(picture) / size - 0.5).clip(0, len(picture) - 1)
     above = place.astype(int)
     below, part = np.minimum(above + 1, len(picture) - 1), (place - above).astype(np.float32)[:, None, None]
@@ -80,7 +82,7 @@ def _enlarged(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
 
 
 def _pad(maps: list[np.ndarray], mask: np.ndarray) -> None:
-    """Give each texel outside the mask the values of the nearest one in it."""
+    """Fill texels outside the mask with the values of the nearest one in it."""
     nearest = distance_transform_edt(~mask, return_distances=False, return_indices=True)
     for rows in _blocks(len(mask)):
         for values in maps:
@@ -92,10 +94,10 @@ def _mean(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
-    """Unit vectors (N, 3) in terms of tangents, bitangents and normals (N, 3).
+    """Solve for unit vectors' coordinates (N, 3) in the basis of tangents, bitangents and normals (N, 3).
 
-    A shader forms x·tangent + y·bitangent + z·normal from interpolated vectors that are neither of unit length nor
-    orthogonal: what it needs is the solution, not three dot products.
+    A shader forms x·tangent + y·bitangent + z·normal from interpolated vectors that are neither of unit length nor orthogonal. So the
+    coordinates are the solution of a linear system, not three dot products.
     """
     a, b, c = basis
     across = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
@@ -103,13 +105,13 @@ def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
     regular = np.abs(volume) > 1e-3
     local = np.einsum("nkc,nc->nk", across, vectors) / np.where(regular, volume, 1)[:, None]
     local[~regular] = (0, 0, 1)
-    # A normal below the horizon of the mesh cannot be encoded.
+    # Tangent-space maps cannot encode a normal below the mesh's horizon.
     local[:, 2] = np.maximum(local[:, 2], 0.05)
     return local / np.linalg.norm(local, axis=1, keepdims=True)
 
 
 def _flat(mesh: Mesh, size: int) -> EmbreeScene:
-    """The mesh's charts, in texels."""
+    """Lay the mesh's charts flat, in units of texels, for ray tracing."""
     flat = np.concatenate([mesh.uv * size, np.zeros((len(mesh.uv), 1))], axis=1).astype(np.float32)
     scene = EmbreeScene()
     TriangleMesh(scene, flat, mesh.faces.astype(np.int32))
@@ -117,8 +119,11 @@ def _flat(mesh: Mesh, size: int) -> EmbreeScene:
 
 
 def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The face (R, S) at each texel's centre, or beside it, -1 where there is none, its barycentric weights (R, S, 3) and the point
-    (R, S, 3): that of the face's plane where the centre lies beyond an edge, with the weights of the nearest texel on the face."""
+    """Find the face (R, S) at each texel's centre, its barycentric weights (R, S, 3), and the point (R, S, 3) on the mesh.
+
+    A texel beside a face takes that face. Its point is then on the face's extended plane, its weights are those of the neighbour on the
+    face. Other texels have face −1.
+    """
     first, last = max(rows.start - 1, 0), min(rows.stop + 1, size)
     y, x = np.mgrid[first:last, :size].astype(np.float32) + np.float32(0.5)
     origins = np.stack([x, size - y, np.ones_like(x)], axis=-1).reshape(-1, 3)
@@ -144,7 +149,7 @@ def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[
 
 
 def _barycentric(points: np.ndarray, corners: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """Weights (N, 3) of triangles' corners (N, 3, 2) at points (N, 2) that need not lie inside; `otherwise` in slivers."""
+    """Compute barycentric weights (N, 3) of points (N, 2), also outside of triangles (N, 3, 2). Slivers have the weights `otherwise`."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     c, area = points - corners[:, 0], _area(a, b)
     good = np.abs(area) > 0.05 * ((a * a).sum(axis=1) + (b * b).sum(axis=1))
@@ -154,5 +159,5 @@ def _barycentric(points: np.ndarray, corners: np.ndarray, otherwise: np.ndarray)
 
 
 def _area(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The signed areas (N,) of parallelograms of plane vectors (N, 2)."""
+    """Compute signed areas (N,) of parallelograms of plane vectors (N, 2): the 2D cross product."""
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
