@@ -10,8 +10,8 @@ from torch import Tensor
 from refgs.formats.splats import Splats
 from refgs.model.surfels import axes
 
-NEIGHBOURS = 64  # splats tested per ray
-FADED = 1 / 255  # alpha at or below which a splat is transparent
+NEAREST = 64  # splats tested per ray
+LEAST_ALPHA = 1 / 255  # alpha at or below which a splat is transparent
 REACH = 3.0  # largest distance of a splat from the surface, in its standard deviations
 RIDGE = 0.1  # part of the positions' total variance: bounds the normals' slope where splats lie in a line
 _CHUNK = 1 << 13  # points at a time: about 100 MB
@@ -27,9 +27,9 @@ def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress:
     blended normal is that of the splats' mean position: it is extrapolated to the point by the normals' slope, fitted by weighted least
     squares. Where no splat reaches the ray, the nearest ones decide. `progress` is called with the points done and their total.
     """
-    table, values = _table(splats), _values(splats)
+    table, values = _geometry(splats), _appearance(splats)
     spread = float(np.median(splats.scales[:, :2].mean(axis=1))) or 1.0
-    count = min(NEIGHBOURS, len(splats))
+    count = min(NEAREST, len(splats))
     # Points in one cell, half a splat wide, share their neighbours.
     cell = np.floor(points / (spread / 2)).astype(np.int64)
     cell -= cell.min(axis=0)
@@ -44,12 +44,12 @@ def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress:
         for start in range(0, len(points), _CHUNK):
             at = slice(start, start + _CHUNK)
             given = (torch.from_numpy(np.asarray(x[at], np.float32)) for x in (points, normals))
-            result[at] = _composite(table, values, torch.from_numpy(near[cell[at]]), *given, spread).numpy()
+            result[at] = _blend(table, values, torch.from_numpy(near[cell[at]]), *given, spread).numpy()
             progress(min(start + _CHUNK, len(points)), len(points))
     return result
 
 
-def _table(splats: Splats) -> Tensor:
+def _geometry(splats: Splats) -> Tensor:
     """Return (N, 17): position, axes divided by their standard deviations, plane's normal, outward normal, opacity, mean deviation."""
     u, v, normal = (axis.numpy() for axis in axes(torch.from_numpy(splats.rotations)))
     scales = np.maximum(splats.scales[:, :2], 1e-12)
@@ -58,12 +58,12 @@ def _table(splats: Splats) -> Tensor:
     return torch.from_numpy(np.concatenate(columns, axis=1).astype(np.float32))
 
 
-def _values(splats: Splats) -> Tensor:
+def _appearance(splats: Splats) -> Tensor:
     columns = [splats.albedo, splats.metallic[:, None], splats.roughness[:, None], splats.normals]
     return torch.from_numpy(np.concatenate(columns, axis=1).astype(np.float32))
 
 
-def _composite(table: Tensor, values: Tensor, near: Tensor, points: Tensor, normals: Tensor, spread: float) -> Tensor:
+def _blend(table: Tensor, values: Tensor, near: Tensor, points: Tensor, normals: Tensor, spread: float) -> Tensor:
     rows = table[near.flatten()].view(*near.shape, -1)
     center, u, v, plane, outward, opacity, deviation = rows.split((3, 3, 3, 3, 3, 1, 1), dim=-1)
     offset, ray = center - points[:, None], normals[:, None]
@@ -74,8 +74,8 @@ def _composite(table: Tensor, values: Tensor, near: Tensor, points: Tensor, norm
     met = height[..., None] * ray - offset
     apart = (u * met).sum(dim=-1) ** 2 + (v * met).sum(dim=-1) ** 2
     alpha = opacity[..., 0] * torch.exp(-0.5 * apart)
-    counts = (alpha > FADED) & ((outward * ray).sum(dim=-1) > 0) & (height.abs() < REACH * deviation[..., 0])
-    alpha = torch.where(counts, alpha, 0)
+    contributes = (alpha > LEAST_ALPHA) & ((outward * ray).sum(dim=-1) > 0) & (height.abs() < REACH * deviation[..., 0])
+    alpha = torch.where(contributes, alpha, 0)
     order = height.argsort(dim=1, descending=True)
     passed = (1 - alpha.gather(1, order)).cumprod(dim=1)
     before = torch.cat([torch.ones_like(passed[:, :1]), passed[:, :-1]], dim=1)

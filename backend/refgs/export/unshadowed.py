@@ -20,7 +20,8 @@ PASSES = 3
 def unshadowed(splats: Splats, surfels: Surfels, mesh: Mesh, light: Environment) -> Splats:
     """Divide the base colour of matte splats by the received part of the irradiance: direct light past the `mesh`, and light from it.
 
-    Metals are unchanged. A training that traced no mesh has learned shadows as colour. `light` is that of the training; `surfels` are the splats as tensors.
+    Metals are unchanged. Shadows are in the colours if the training traced no mesh. `light` is that of the training; `surfels` are the
+    splats as tensors.
     """
     shadowed, occluder = surfels.albedo, Occluder(mesh)
     matt = 1 - surfels.metallic[:, None]
