@@ -1,20 +1,17 @@
 """Measure what this machine can do at most: arithmetic and memory."""
 
-import ctypes
 import time
 
 import torch
 
-from refgs.kernels.load import Shared, Work, kernels, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import kernels, run
 
 CPU = torch.device("cpu")
 CHAINS = 12  # of peak.cpp
 
 
-class _Peak(Work):
-    """`struct Peak` of peak.cpp."""
-
-    _fields_ = (("rounds", ctypes.c_int64), ("out", ctypes.c_void_p), ("scratch", ctypes.c_void_p), ("shared", Shared))
+_Peak = struct("Peak", "peak.cpp")
 
 
 def arithmetic(seconds: float = 0.5, device: torch.device = CPU) -> float:

@@ -82,9 +82,8 @@ class Worker:
 
     def __init__(self, events: IO[str]):
         self._events = events
-        self._commands: queue.SimpleQueue[_Command | None] = (
-            queue.SimpleQueue()
-        )  # safe if a signal handler puts while it is read
+        # A signal handler may put while the queue is read: only SimpleQueue allows that.
+        self._commands: queue.SimpleQueue[_Command | None] = queue.SimpleQueue()
         self._waiting: list[_Command] = []  # jobs that came during a training
         self._keep = False  # run jobs to their end after the input has closed
         self._attentive = True  # no job runs that cannot read commands

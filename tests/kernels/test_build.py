@@ -8,22 +8,24 @@ import pytest
 from refgs.errors import InputError
 from refgs.kernels import load
 from refgs.kernels.build import TARGETS, build, target
+from tests.makers.layouts import asserted
 
 EVERY = [(system, machine, isa) for (system, machine), (_, _, isas) in TARGETS.items() for isa in isas]
 MAGIC = {"so": b"\x7fELF", "dll": b"MZ", "dylib": b"\xcf\xfa\xed\xfe"}
 
 
 @pytest.mark.parametrize(("system", "machine", "isa"), EVERY)
-def test_compiles_for_every_platform(system, machine, isa, tmp_path):
-    wanted = target(system, machine, isa)
-    library = build(wanted, tmp_path)
+def test_compiles_for_every_platform_with_the_layouts_of_python(system, machine, isa, tmp_path, monkeypatch):
+    monkeypatch.setattr("refgs.kernels.build.HERE", asserted(tmp_path / "sources"))
+    wanted, cache = target(system, machine, isa), tmp_path / "cache"
+    library = build(wanted, cache)
     content = library.read_bytes()
     assert content.startswith(MAGIC[wanted.extension])
     for name in (b"refgs_forward", b"refgs_backward", b"refgs_ssim_backward"):
         assert name in content
-    assert [p.name for p in tmp_path.iterdir()] == [library.name]  # nothing left over
+    assert [p.name for p in cache.iterdir()] == [library.name]  # nothing left over
     made = library.stat().st_mtime_ns
-    assert build(wanted, tmp_path) == library and library.stat().st_mtime_ns == made
+    assert build(wanted, cache) == library and library.stat().st_mtime_ns == made
 
 
 def test_first_uses_at_the_same_time(tmp_path):

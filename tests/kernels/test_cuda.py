@@ -3,6 +3,7 @@
 import pytest
 
 from refgs.kernels import cuda
+from tests.makers.layouts import asserted
 
 pytest.importorskip("cuda.bindings.nvrtc", reason="NVIDIA has nothing for this system")
 
@@ -12,10 +13,11 @@ ELF = b"\x7fELF"
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 @pytest.mark.parametrize("source", cuda.SOURCES)
-def test_compiles_without_a_card(source, architecture):
+def test_compiles_without_a_card_with_the_layouts_of_python(source, architecture, tmp_path, monkeypatch):
+    monkeypatch.setattr(cuda, "HERE", asserted(tmp_path / "sources"))
     code = cuda.compile_source(source, architecture)
     assert code.startswith(ELF)
-    for name, home in cuda.kernel_sources().items():
+    for name, home in cuda.KERNELS.items():
         assert (name.encode() in code) == (home == source)
 
 

@@ -45,7 +45,7 @@ def _library(source: str) -> ctypes.CDLL:
 
 
 def _launch(name: str, work: ctypes.Structure, device, blocks: int, threads: int = cuda.BLOCK) -> None:
-    getattr(_library(cuda.kernel_sources()[name]), name)(ctypes.byref(work), blocks, threads)
+    getattr(_library(cuda.KERNELS[name]), name)(ctypes.byref(work), blocks, threads)
 
 
 def emulate(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,8 +1,5 @@
 """The optimiser against torch's in float64, which is held where there is no gradient."""
 
-import subprocess
-import sys
-
 import torch
 from torch import Tensor
 
@@ -74,17 +71,3 @@ def test_same_bits_for_any_number_of_threads():
         return [v.detach() for v in values]
 
     scenes.check_same_bits_for_any_number_of_threads(all_of_it)
-
-
-def test_torchs_compiler_is_not_loaded():
-    """Which takes two seconds of a training's start, and is not used."""
-    program = """
-import sys, torch
-from refgs.train.adam import Adam
-value = torch.ones(3, requires_grad=True)
-optimizer = Adam([{"params": [value], "lr": 0.1}])
-value.sum().backward()
-optimizer.step()
-assert value.max() < 1 and "torch._dynamo" not in sys.modules
-"""
-    subprocess.run([sys.executable, "-c", program], check=True)

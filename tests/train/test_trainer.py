@@ -15,6 +15,7 @@ from benchmarks.scenes.analytic import F0, ONE, meet, sky
 from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.formats.panorama import directions
+from refgs.model import harmonics
 from refgs.model.surfels import to_splats
 from refgs.run import open_run
 from refgs.settings import load_settings
@@ -167,17 +168,25 @@ def test_shading_sh_learns_colour_alone(ball_capture, tmp_path):
 
 
 def test_sh_diffuse_leaves_an_albedo_that_relights(ball_capture, tmp_path):
+    """A dielectric's albedo is its colour divided by the light that it receives; a metal's is its reflectance."""
     made = trainer(ball_capture, tmp_path / "run", "diffuse=sh", "surfels.metallic=0.1", total=100)
     made.run()
+    reflectance = torch.tensor([0.9, 0.6, 0.3])
+    parameters = made.state.parameters
+    with torch.no_grad():
+        parameters["metallic"][::2], parameters["metallic"][1::2] = -20, 20
+        parameters["albedo"][:] = reflectance.logit()
+        sent = 0.3 * (0.5 + harmonics.DC * parameters["sh_dc"])  # darker, or most of it would be beyond white
+        parameters["sh_dc"][:] = (sent - 0.5) / harmonics.DC
     write_asset(made.state)
     run = open_run(tmp_path / "run")
-    received = run.environment.diffuse(torch.from_numpy(run.splats.normals))
-    sent = 0.5 + 0.28209479 * run.splats.sh[:, 0]
-    dull = run.splats.metallic < 0.05
-    if dull.any():
-        expected = np.clip(sent / received.numpy(), 0, 1)[dull]
-        np.testing.assert_allclose(run.splats.albedo[dull], expected, atol=0.06)
-    assert np.isfinite(run.splats.albedo).all()
+    received = run.environment.diffuse(run.surfels().normals())
+    sent = 0.5 + harmonics.DC * run.splats.sh[:, 0]
+    dull = run.splats.metallic < 0.5
+    assert 0.4 < dull.mean() < 0.6
+    assert run.splats.albedo[dull].std() > 0.05 and run.splats.albedo[dull].max() < 1
+    np.testing.assert_allclose(run.splats.albedo[dull], np.clip(sent / received.numpy(), 0, 1)[dull], atol=0.005)
+    np.testing.assert_allclose(run.splats.albedo[~dull], np.broadcast_to(reflectance, (sum(~dull), 3)), atol=1e-5)
 
 
 def refgs(*words, **options):
@@ -256,6 +265,6 @@ def test_a_missing_hull_is_an_error_in_words(ball_capture, tmp_path):
     capture = read_capture(ball_capture)
     settings = load_settings("quick", SMALL)
     object.__setattr__(capture, "centre", np.array([100.0, 0, 0]))
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="check that masks and poses belong together"):
         Trainer(capture, settings, tmp_path / "run", lambda *_: None)
     assert not (tmp_path / "run").exists()

@@ -1,1 +1,1 @@
-"""Metrics, pictures and ground truth: how far renderings, light and meshes are from what is known."""
+"""Metrics, pictures and ground truth: errors of renderings, light and meshes."""

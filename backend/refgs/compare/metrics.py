@@ -1,7 +1,7 @@
-"""How far a picture or a light is from the truth.
+"""Error measures of pictures and lights.
 
-Pictures are (height, width, 3) float arrays; "encoded" means sRGB, 0..1, as on a screen, "linear" means radiance.
-A figure for a set of views is the mean of the figures of the views.
+Pictures are (height, width, 3) float arrays; "encoded" means sRGB in 0..1, "linear" means radiance. The figure of several views is
+the mean over the views.
 """
 
 import importlib.util
@@ -22,17 +22,17 @@ from refgs.color import srgb_decode
 from refgs.compare.pictures import over_white
 from refgs.formats.panorama import directions
 
-COVERED = 0.5  # of a pixel: from here on it is the object's
+COVERED = 0.5  # alpha from which on a pixel belongs to the object
 
-LIGHT_BLUR = 3.0  # degrees, the standard deviation
+LIGHT_BLUR = 3.0  # degrees, standard deviation
 LIGHTS_APART = 15.0  # degrees
 MOST_LIGHTS = 5
-LOST_LIGHT = 30.0  # degrees: the error of a light that was not found
+LOST_LIGHT = 30.0  # degrees; the error of a light that is not found
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec.709
 
 
 def decibels(square: float) -> float:
-    """Peak signal-to-noise ratio in dB of a mean squared error, the peak being 1. At most 100, so that means stay finite."""
+    """Peak signal-to-noise ratio in dB of a mean squared error, for a peak of 1. At most 100, so that means stay finite."""
     return -10 * math.log10(max(square, 1e-10))
 
 
@@ -42,8 +42,10 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) -> float:
-    """What linear radiance (h, w, 3) is to be multiplied by to come nearest, by least squares, to an encoded photo; over the
-    pixels that are opaque, alpha (h, w), and not clipped in the photo. 1 where there is nothing to go by."""
+    """Fit the factor by which linear radiance (h, w, 3) matches an encoded photo, by least squares.
+
+    Only pixels count that are opaque by alpha (h, w) and not clipped in the photo. Returns 1 if there are none.
+    """
     seen = (alpha > 0.5) & (photo.max(axis=-1) < 0.98)
     rendered, taken = radiance[seen].astype(np.float64), srgb_decode(photo[seen].astype(np.float64))
     square = (rendered * rendered).sum()
@@ -51,7 +53,7 @@ def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) 
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:
-    """Structural similarity of encoded pictures with the settings of Wang et al. 2004: a Gaussian window, sigma 1.5."""
+    """Structural similarity of encoded pictures, with the Gaussian window of Wang et al. 2004, σ 1.5."""
     return float(
         structural_similarity(
             np.asarray(image, np.float64),
@@ -66,14 +68,14 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def flip(image: np.ndarray, reference: np.ndarray) -> float:
-    """Mean FLIP (Andersson et al. 2020) of encoded pictures, 0 alike to 1, at its authors' 67 pixels a degree."""
+    """Mean FLIP (Andersson et al. 2020) of encoded pictures, 0 (equal) to 1, at the authors' 67 pixels a degree."""
     pair = (np.ascontiguousarray(x, np.float32) for x in (reference, image))
     error, *_ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False)
     return float(error.mean(dtype=np.float64))
 
 
 def lpips_missing() -> str | None:
-    """Why LPIPS cannot be measured here; None where it can. Its network's weights are never downloaded."""
+    """Say why LPIPS cannot be measured here; None if it can. The network's weights are never downloaded."""
     missing = [name for name in ("lpips", "torchvision") if importlib.util.find_spec(name) is None]
     if missing:
         return f"the package {missing[0]} is not installed"
@@ -100,8 +102,8 @@ def normal_mae_degrees(
 ) -> float:
     """Mean angle in degrees between normals (h, w, 3), over the pixels that the object covers at least by half.
 
-    Each pixel counts the same and both normals are made unit length first. Where the rendering has next to nothing
-    (alpha below 0.1) or a normal of no length, the error is 90°: leaving a part out doesn't pay.
+    Each pixel counts the same, and both normals are normalised first. Where the rendering is almost empty (alpha below 0.1) or its normal
+    has no length, the error is 90°, so that leaving a part out does not pay.
     """
     seen = reference_alpha >= COVERED
     a, b = normals[seen].astype(np.float64), reference[seen].astype(np.float64)
@@ -112,7 +114,7 @@ def normal_mae_degrees(
 
 
 def normal_ssim(normals: np.ndarray, reference: np.ndarray, alpha: np.ndarray, reference_alpha: np.ndarray) -> float:
-    """Structural similarity of the pictures (n + 1)/2 of unit normals, each over white by its own alpha; all pixels count."""
+    """Structural similarity of unit normals, encoded as (n + 1)/2, each over white by its own alpha. All pixels count."""
 
     def encoded(n: np.ndarray, alpha: np.ndarray) -> np.ndarray:
         return np.nan_to_num((n * 0.5 + 0.5) * alpha[..., None]) + 1 - alpha[..., None]
@@ -121,16 +123,16 @@ def normal_ssim(normals: np.ndarray, reference: np.ndarray, alpha: np.ndarray, r
 
 
 def channel_products(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Means (3, 3) by channel over a mask (h, w) of image², image · reference, reference²: what `aligned_psnr` needs of a view."""
+    """Means (3, 3) over a mask (h, w), by channel, of image², image · reference, reference²: the input of `aligned_psnr`."""
     a, b = image[mask].astype(np.float64), reference[mask].astype(np.float64)
     return np.stack([(a * a).mean(0), (a * b).mean(0), (b * b).mean(0)])
 
 
 def aligned_psnr(views: list[np.ndarray]) -> dict[str, float | list[float]]:
-    """PSNR of linear base colours, mean over views (`channel_products` of each): psnr_raw, psnr_aligned, scale.
+    """PSNR of linear base colours, mean over views, from each view's `channel_products`: psnr_raw, psnr_aligned, scale.
 
-    A light's tint and its inverse on the base colours look the same: the second figure is after one `scale` a channel, for
-    all views together, that fits best in least squares.
+    Photos cannot tell a light's tint from its inverse on the base colours. psnr_aligned is therefore measured after the least-squares
+    `scale` of each channel, one for all views.
     """
     aa, ab, bb = np.moveaxis(np.array(views), 1, 0)
     power = aa.sum(0)
@@ -146,12 +148,11 @@ def relit(
     pairs: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]],
     measures: tuple[Callable[[np.ndarray, np.ndarray], float], ...] = (psnr, flip),
 ) -> dict[str, float]:
-    """Of views under another light, over white: psnr_raw, psnr_aligned, flip_raw, flip_aligned or what else measures them, and scale.
+    """Measure views under another light, over white: psnr_raw, psnr_aligned, flip_raw, flip_aligned (by `measures`), and scale.
 
-    `pairs()` gives, as often as it is called, the picture and the truth of each view, premultiplied linear RGBA. Base
-    colours and light share one free scale; "aligned" is after multiplying the pictures' radiance by the `scale` that fits
-    the truth best in least squares, one for all views. Pixels in which either is brighter than a screen is (a sun in a
-    mirror) are left out of the fit, for a few of them would decide it.
+    Each call of `pairs()` yields every view's picture and truth, premultiplied linear RGBA. Base colours and light share one free scale:
+    "aligned" figures are measured after multiplying radiance by the least-squares `scale`, one for all views. Pixels brighter than a
+    screen in either picture, such as a sun in a mirror, are left out of the fit: a few of them would dominate it.
     """
     product = power = 0.0
     for image, reference in pairs():
@@ -168,7 +169,7 @@ def relit(
 
 
 def resized(panorama: np.ndarray, height: int) -> np.ndarray:
-    """A panorama averaged down to so many rows."""
+    """Reduce a panorama to `height` rows, by averaging."""
     return cv2.resize(panorama.astype(np.float32), (2 * height, height), interpolation=cv2.INTER_AREA)
 
 
@@ -177,11 +178,11 @@ def _elevations(height: int) -> np.ndarray:
 
 
 def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
-    """Error of a recovered panorama: (root mean square of the difference of log radiance, the scale taken out first).
+    """RMS error of a recovered panorama's log radiance after one scale is taken out; returns the error and that scale.
 
-    Both are equirectangular (h, w, 3), linear, each of its own size: the larger is averaged down to the smaller.
-    Pixels count by solid angle. The scale is the one that makes the mean difference zero. Natural logarithm: 0.1 is
-    about 10 %. A thousandth of the mean radiance is added to both, below which nothing can be seen.
+    Both are equirectangular (h, w, 3) and linear; the larger is averaged down to the smaller. Pixels are weighted by solid angle. The scale
+    makes the mean difference zero. The logarithm is natural: 0.1 is about 10 %. A thousandth of the mean radiance is added to both, since
+    darker light cannot be seen.
     """
     a, b = (resized(x, min(len(environment), len(reference))) for x in (environment, reference))
     weight = np.cos(_elevations(len(a)))
@@ -192,11 +193,11 @@ def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tupl
 
 
 def _blur(values: np.ndarray, degrees: float) -> np.ndarray:
-    """Blur a panorama (h, 2h) on the sphere: a mean weighted by exp((cos angle − 1) / σ²), the sphere's Gaussian."""
+    """Blur a panorama (h, 2h) on the sphere, with weights exp((cos angle − 1) / σ²), the sphere's Gaussian."""
     elevation, turn = _elevations(len(values)), 2 * np.pi / values.shape[1] * np.arange(values.shape[1])
     up, out = np.sin(elevation), np.cos(elevation)
     cosine = up[:, None, None] * up[:, None] + out[:, None, None] * out[:, None] * np.cos(turn)
-    kernel = np.fft.rfft(np.exp((cosine - 1) / np.radians(degrees) ** 2))  # of two rows, along the columns
+    kernel = np.fft.rfft(np.exp((cosine - 1) / np.radians(degrees) ** 2))  # of each pair of rows, along the columns
 
     def convolve(rows: np.ndarray) -> np.ndarray:
         return np.fft.irfft(np.einsum("rsk,sk->rk", kernel, np.fft.rfft(rows * out[:, None])), rows.shape[1])
@@ -205,10 +206,10 @@ def _blur(values: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def find_lights(panorama: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions (K, 3) of a panorama's lights and how often the mean they are as bright (K,), the brightest first.
+    """Find a panorama's lights: unit directions (K, 3) and luminance (K,) relative to the mean, the brightest first.
 
-    A light is a peak of the luminance blurred by LIGHT_BLUR, brighter than the mean over the sphere, with no brighter one
-    within LIGHTS_APART.
+    A light is a peak of the luminance blurred by LIGHT_BLUR that is brighter than the mean over the sphere and has no brighter peak within
+    LIGHTS_APART.
     """
     luminance = panorama.astype(np.float64) @ _LUMINANCE
     area = np.broadcast_to(np.cos(_elevations(len(luminance)))[:, None], luminance.shape)
@@ -222,7 +223,7 @@ def find_lights(panorama: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if all(rays[place] @ other < np.cos(np.radians(LIGHTS_APART)) for other in found):
             found.append(rays[place])
             values.append(blurred[place])
-    for i in range(len(found)):  # finer than the pixels: mean shift ends where the blurred luminance is greatest
+    for i in range(len(found)):  # refine beyond pixels: mean shift converges to the blurred peak
         for _ in range(30):
             weight = np.exp((rays @ found[i] - 1) / np.radians(LIGHT_BLUR) ** 2)
             centre = np.einsum("hw,hwa->a", weight * luminance * area, rays)
@@ -231,12 +232,12 @@ def find_lights(panorama: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lights_error(environment: np.ndarray, reference: np.ndarray) -> tuple[float, int] | None:
-    """How far the brightest lights are from where they should be: (degrees, how many lights); None where there are none.
+    """Mean angular error of the brightest lights in degrees, and how many there are; None if there are none.
 
-    Lights (`find_lights`, at 128 rows at most) of the truth are those at least twice as bright as its mean and a quarter of its
-    brightest, at most MOST_LIGHTS. They are matched one to one, so that the sum of the angles is least, to the brightest
-    of the recovered panorama, twice as many. A light with none within LOST_LIGHT counts as that. The mean is weighted by
-    the true lights' brightness. Scale plays no part.
+    True lights (`find_lights`, at most 128 rows) are at least twice as bright as the mean and a quarter as bright as the brightest; at most
+    MOST_LIGHTS count. They are matched one to one, by the least sum of angles, to the brightest lights of the recovered panorama, twice as
+    many. A light without a match within LOST_LIGHT counts as LOST_LIGHT. The mean is weighted by the true brightness. A scale of the
+    radiance has no effect.
     """
     recovered, truth = (resized(x, min(128, len(environment), len(reference))) for x in (environment, reference))
     lights, bright = find_lights(truth)
@@ -246,7 +247,7 @@ def lights_error(environment: np.ndarray, reference: np.ndarray) -> tuple[float,
         return None
     others = find_lights(recovered)[0][: 2 * len(lights)]
     angle = np.full((len(lights), len(others) + len(lights)), LOST_LIGHT)
-    # By the sine and the cosine: the cosine alone is blind to small angles.
+    # The cosine alone does not resolve small angles: use the sine too.
     sine = np.linalg.norm(np.cross(lights[:, None], others[None]), axis=-1)
     angle[:, : len(others)] = np.degrees(np.arctan2(sine, lights @ others.T)).clip(max=LOST_LIGHT)
     match = angle[linear_sum_assignment(angle)]

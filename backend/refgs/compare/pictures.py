@@ -1,4 +1,4 @@
-"""A rendering as arrays to compare and as pictures to look at."""
+"""Renderings as arrays to compare, and as pictures to look at."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from refgs.render.renderer import Rendering
 
 
 def composite(view: LoadedView, background: Tensor) -> Tensor:
-    """The photo over the background, sRGB-encoded float (H, W, 3) in 0..1."""
+    """Composite a photo over the background (3,): sRGB-encoded float (H, W, 3) in 0..1."""
     image = torch.from_numpy(view.image).to(background.device).float() / 255
     if view.alpha is None:
         return image
@@ -23,7 +23,7 @@ def composite(view: LoadedView, background: Tensor) -> Tensor:
 
 
 def maps(rendering: Rendering) -> dict[str, np.ndarray]:
-    """A rendering's passes as float arrays: colours (H, W, 4) premultiplied, the rest (H, W, 3) or (H, W)."""
+    """A rendering's passes as float arrays: colour (H, W, 4), linear and premultiplied; the others (H, W, 3) or (H, W)."""
     alpha = rendering.alpha.numpy(force=True)
     normal = torch.nn.functional.normalize(rendering.normal, dim=-1).numpy(force=True)
     images = {"normal": normal, "depth": rendering.depth.numpy(force=True), "alpha": alpha}
@@ -36,15 +36,17 @@ def maps(rendering: Rendering) -> dict[str, np.ndarray]:
 
 
 def color_picture(rendering: Rendering, background: np.ndarray) -> np.ndarray:
-    """The colours as 8-bit RGBA, sRGB-encoded, straight alpha."""
+    """A rendering's colour as 8-bit RGBA, sRGB-encoded, with straight alpha."""
     alpha = rendering.alpha.numpy(force=True)[..., None]
     over = rendering.color.numpy(force=True) - background * (1 - alpha)
     return as_bytes(np.dstack([over / np.maximum(alpha, 1e-6), alpha]))
 
 
 def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """A pass of `maps` as 8-bit RGB or grey: colours over white, base colours sRGB-encoded, normals n/2 + 1/2, depth divided
-    by its largest."""
+    """A pass of `maps` as 8-bit RGB or grey.
+
+    Colour is over white, base colour is sRGB-encoded, normals are n/2 + 1/2, depth is divided by its maximum.
+    """
     if name == "color":
         value = over_white(value)
     elif name == "normal":
@@ -57,12 +59,12 @@ def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def over_white(pixels: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """Premultiplied linear RGBA, its radiance times `scale`, as a screen shows it over white: sRGB-encoded (H, W, 3), 0..1."""
+    """Composite premultiplied linear RGBA over white, radiance times `scale`: sRGB-encoded (H, W, 3), 0..1."""
     return np.clip(srgb_encode(pixels[..., :3] * scale + 1 - pixels[..., 3:]), 0, 1)
 
 
 def as_bytes(value: np.ndarray) -> np.ndarray:
-    """0..1 to 0..255; what is not a number is 0."""
+    """Convert 0..1 to 0..255; NaN becomes 0."""
     return np.rint(np.clip(np.nan_to_num(value), 0, 1) * 255).astype(np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""How far a mesh is from the true one."""
+"""Errors of a mesh against the true one."""
 
 import numpy as np
 import trimesh
@@ -10,12 +10,12 @@ from refgs.camera import Camera
 from refgs.formats.mesh import Mesh
 
 POINTS = 100_000  # on each mesh, evenly by area
-_NEAREST = 4  # of them, and as many centres of triangles: in those triangles the nearest point of a mesh is looked for
-_SAME = 1e-3  # of the radius: what a ray meets this near to a point is the point
+_NEAREST = 4  # sample points, and as many centres, whose triangles are searched for a mesh's nearest point
+_SAME = 1e-3  # of the radius; a ray starts this far from its point, so that it does not hit its own surface
 
 
 def radius(mesh: Mesh) -> float:
-    """The largest distance of a vertex from the middle of the mesh's bounding box."""
+    """The largest distance of a vertex from the centre of the mesh's bounding box."""
     middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
     return float(np.linalg.norm(mesh.vertices - middle, axis=1).max())
 
@@ -23,9 +23,9 @@ def radius(mesh: Mesh) -> float:
 def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
     """Chamfer distance, in radii of the true mesh, and normal consistency of two meshes in one frame.
 
-    From POINTS even points on either mesh to the nearest point of the other: the mean distance, and the mean of the absolute
-    cosine between the faces' normals; both are the mean of the two ways. Points that no camera sees, by rays against their
-    own mesh, set out on neither way: photos don't tell what is there. They may be met. Nothing where all are such.
+    POINTS even samples on each mesh are matched to the nearest point of the other. The figures are the mean distance and the mean absolute
+    cosine between the faces' normals, averaged over both directions. Samples that no camera sees, by rays against their own mesh, are not
+    matched, since photos do not show what is there; others may match them. Returns {} if no sample of a mesh is seen.
     """
     unit = radius(truth)
     samples = []
@@ -41,8 +41,8 @@ def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
 
 
 def seen(mesh: Mesh, points: np.ndarray, cameras: list[Camera], tolerance: float) -> np.ndarray:
-    """Which points (P, 3) of a mesh some camera has in its picture, with nothing of the mesh in between (P,)."""
-    middle = mesh.vertices.mean(axis=0)  # rays are traced in single precision about it
+    """Mark the points (P, 3) of a mesh that any camera sees, unoccluded by the mesh: (P,)."""
+    middle = mesh.vertices.mean(axis=0)  # Embree traces in float32: centre the mesh
     scene = EmbreeScene()
     TriangleMesh(scene, (mesh.vertices[mesh.faces] - middle).astype(np.float32))
     found = np.zeros(len(points), bool)
@@ -52,7 +52,7 @@ def seen(mesh: Mesh, points: np.ndarray, cameras: list[Camera], tolerance: float
         depth = np.where(z > 0, z, np.inf)
         u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
         left = left[(z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)]
-        # Towards the camera, starting a little nearer to it: so what a ray may meet is not the surface it starts on.
+        # Trace towards the camera, from a little nearer to it, so that a ray does not hit the surface it starts on.
         way = camera.position - points[left]
         way /= np.linalg.norm(way, axis=1, keepdims=True)
         origins = (points[left] - middle + tolerance * way).astype(np.float32)
@@ -61,12 +61,12 @@ def seen(mesh: Mesh, points: np.ndarray, cameras: list[Camera], tolerance: float
 
 
 def _to_nearest(sample: tuple, other: tuple) -> tuple[float, float]:
-    """Mean distance and absolute cosine from the seen points of a mesh to the nearest points of another."""
+    """Mean distance and mean absolute cosine from the seen samples of a mesh to the nearest points of another."""
     solid, points, face, visible = sample
     points, normals = points[visible], solid.face_normals[face[visible]]
     target, targets, target_face, _ = other
-    # From sample to sample alone, even equal meshes would be half a spacing apart. Samples find the triangles that are larger
-    # than their spacing, centres those that are smaller.
+    # Between samples alone, even equal meshes would be half a spacing apart, so the nearest point is searched in triangles. Samples find
+    # triangles larger than their spacing, centres find smaller ones.
     centres = target.triangles_center
     candidates = np.hstack(
         [

@@ -1,4 +1,4 @@
-"""What is known of a capture beyond its photos, and how far renderings are from it."""
+"""Ground truth of a capture, and errors of renderings against it."""
 
 from pathlib import Path
 
@@ -13,12 +13,12 @@ from refgs.formats.exr import read_exr
 from refgs.formats.mesh import Mesh, read_mesh
 from refgs.formats.panorama import directions, read_environment, sample
 
-FOLDER = "ground_truth"  # in a capture, where one brings its own
+FOLDER = "ground_truth"  # in a capture that has its own
 PASSES = ("normal", "albedo", "roughness", "metallic", "visibility")
 
 
 class GroundTruth:
-    """A folder of what is known of a capture, brought into the run's frame; what is there is measured, every part is optional.
+    """A folder of ground truth, read in the run's frame. Every part is optional.
 
     light.exr; mesh.ply; normal, albedo, roughness, metallic, visibility/NAME.exr of the views with alpha/NAME.exr;
     relight/HDRI.exr with relight/HDRI/NAME.exr (see `scripts.demo.capture`).
@@ -36,13 +36,13 @@ class GroundTruth:
             raise InputError(f"{folder}: there is no ground truth in it; known are {known}")
 
     def maps(self, camera: Camera) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """All passes of a view that there are, and its coverage."""
+        """All passes of a view in the folder, and its alpha."""
         if not self.passes:
             return {}, np.zeros((camera.height, camera.width), np.float32)
         return {name: self.view(name, camera) for name in self.passes}, self.view("alpha", camera)
 
     def view(self, name: str, camera: Camera) -> np.ndarray:
-        """A pass of a view, float32 (h, w) or (h, w, channels)."""
+        """Read a pass of a view, float32 (h, w) or (h, w, channels)."""
         file = self.folder / name / f"{camera.name}.exr"
         pixels = read_exr(file)
         if pixels.shape[:2] != (camera.height, camera.width):
@@ -55,7 +55,7 @@ class GroundTruth:
         return pixels[..., :3] @ self._turn.T.astype(np.float32) if name == "normal" else pixels[..., :3]
 
     def panorama(self, name: str) -> np.ndarray:
-        """A light, equirectangular in Blender's orientation."""
+        """Read a light, equirectangular in Blender's orientation."""
         panorama = read_environment(self.folder / f"{name}.exr")
         return sample(panorama, directions(*panorama.shape[:2]) @ self._turn.astype(np.float32))
 
@@ -64,13 +64,13 @@ class GroundTruth:
         return Mesh(mesh.vertices @ self._to_run[:3, :3].T + self._to_run[:3, 3], mesh.faces)
 
     def relit(self, hdri: str, camera: Camera) -> np.ndarray:
-        """A view under another light, premultiplied linear RGBA."""
+        """Read a view under another light, premultiplied linear RGBA."""
         file = self.folder / "relight" / hdri / f"{camera.name}.exr"
         return read_relit(file, (camera.height, camera.width))
 
 
 def read_relit(file: Path, size: tuple[int, int] | None = None) -> np.ndarray:
-    """A picture of premultiplied linear RGBA of this height and width. Raises InputError where it is none."""
+    """Read a premultiplied linear RGBA picture. Raises InputError if it has no alpha or another (height, width) than `size`."""
     pixels = read_exr(file)
     if pixels.ndim != 3 or pixels.shape[2] != 4:
         raise InputError(f"{file} has no alpha: an RGBA picture is needed to put it over a background")
@@ -82,8 +82,10 @@ def read_relit(file: Path, size: tuple[int, int] | None = None) -> np.ndarray:
 def known_maps(
     truth: GroundTruth | None, view: View, camera: Camera, to_capture: np.ndarray
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """What is known of a view, as `GroundTruth.maps` says. Where no pass of it is in the ground truth, the normals that its data set
-    brings are the truth. `camera` is the view's, of the size that is rendered."""
+    """The true maps of a view, as `GroundTruth.maps` returns them; without any, the data set's own normals.
+
+    `camera` is the view's, at the size that is rendered.
+    """
     known, alpha = truth.maps(camera) if truth else ({}, np.zeros((camera.height, camera.width), np.float32))
     if not known and (published := published_normals(view, max(camera.width, camera.height))):
         turn = split_similarity(to_capture)[1].astype(np.float32)
@@ -92,9 +94,9 @@ def known_maps(
 
 
 def errors(images: dict[str, np.ndarray], known: dict[str, np.ndarray], true_alpha: np.ndarray) -> dict:
-    """How far a view's maps, of `pictures.maps`, are from what is known of it; nothing where its object covers no pixel.
+    """Errors of a view's maps (`pictures.maps`) against the true ones; {} if the object covers no pixel.
 
-    Of the base colour it is what `metrics.aligned_psnr` needs of all views together.
+    For base colour these are the `channel_products` that `metrics.aligned_psnr` takes of all views together.
     """
     figures, covered, alpha = {}, true_alpha >= metrics.COVERED, images["alpha"]
     for name, true in known.items() if covered.any() else ():

@@ -1,34 +1,19 @@
 """Rays against a mesh on a CUDA card."""
 
-import ctypes
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.formats.mesh import Mesh
-from refgs.kernels.load import Shared, Work, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import run
 
 LEAF = 4  # triangles, as in trace.cu
 BITS = 10  # of a Morton code's coordinate
 
 
-class _Work(Work):
-    """`struct Trace` of trace.cu."""
-
-    _fields_ = (
-        *((n, ctypes.c_int64) for n in ("width", "height")),
-        ("view", ctypes.c_double * 12),
-        ("camera", ctypes.c_double * 3),
-        *((n, ctypes.c_double) for n in ("fx", "fy", "cx", "cy")),
-        ("centre", ctypes.c_double * 3),
-        *((n, ctypes.c_double) for n in ("size", "lift")),
-        *((n, ctypes.c_void_p) for n in ("mirrored", "depth", "alpha")),
-        ("leaves", ctypes.c_int64),
-        *((n, ctypes.c_void_p) for n in ("boxes", "triangles", "visible", "scratch")),
-        ("shared", Shared),
-    )
+_Work = struct("Trace", "trace.cu")
 
 
 def _spread(v: Tensor) -> Tensor:

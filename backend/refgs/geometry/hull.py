@@ -11,7 +11,8 @@ from skimage.measure import marching_cubes
 
 from refgs.camera import Camera
 from refgs.errors import InputError
-from refgs.kernels.load import Shared, Work, kernels, parallel
+from refgs.kernels.layout import struct
+from refgs.kernels.load import kernels, parallel
 
 # A view that alone removes more of the object than this, against the word of all the others, has a bad mask. Measured
 # with true masks of a sphere and a torus: at most 0.04 among 8 views, 0.015 among 12, 0.005 among 40.
@@ -110,26 +111,8 @@ def _unit(alpha: np.ndarray) -> np.ndarray:
     return alpha.astype(np.float32)
 
 
-class _Silhouette(ctypes.Structure):
-    """`struct Silhouette` of carve.cpp."""
-
-    _fields_ = (
-        ("first", ctypes.c_double * 3),
-        ("step", ctypes.c_double * 9),
-        ("mask", ctypes.c_void_p),
-        *((n, ctypes.c_int64) for n in ("width", "height", "whole")),
-    )
-
-
-class _Work(Work):
-    """`struct Carve` of carve.cpp."""
-
-    _fields_ = (
-        *((n, ctypes.c_int64) for n in ("resolution", "views")),
-        ("silhouettes", ctypes.POINTER(_Silhouette)),
-        *((n, ctypes.c_void_p) for n in ("least", "second", "carver", "seen", "scratch")),
-        ("shared", Shared),
-    )
+_Silhouette = struct("Silhouette", "carve.cpp")
+_Work = struct("Carve", "carve.cpp")
 
 
 def _silhouette(mask: np.ndarray, camera: Camera, low: np.ndarray, voxel: np.ndarray) -> _Silhouette:
@@ -139,7 +122,8 @@ def _silhouette(mask: np.ndarray, camera: Camera, low: np.ndarray, voxel: np.nda
     # elsewhere nothing is known about it.
     whole = max(mask[0].max(), mask[-1].max(), mask[:, 0].max(), mask[:, -1].max()) < 0.5
     first, step = matrix[:, :3] @ (low + 0.5 * voxel) + matrix[:, 3], matrix[:, :3] * voxel
-    return _Silhouette(tuple(first), tuple(step.ravel()), mask.ctypes.data, width, height, int(whole))
+    size = {"width": width, "height": height, "whole": int(whole)}
+    return _Silhouette(first=tuple(first), step=tuple(step.ravel()), mask=mask.ctypes.data, **size)
 
 
 def _carve(masks, cameras, low, high, resolution):
@@ -149,7 +133,8 @@ def _carve(masks, cameras, low, high, resolution):
     views = [_silhouette(mask, camera, low, voxel) for mask, camera in zip(masks, cameras, strict=True)]
     least, second = (np.empty(3 * (resolution,), np.float32) for _ in range(2))
     carver, seen = (np.empty(3 * (resolution,), np.int32) for _ in range(2))
-    work = _Work(resolution=resolution, views=len(views), silhouettes=(_Silhouette * len(views))(*views))
+    silhouettes = (_Silhouette * len(views))(*views)
+    work = _Work(resolution=resolution, views=len(views), silhouettes=ctypes.addressof(silhouettes))
     for name, values in (("least", least), ("second", second), ("carver", carver), ("seen", seen)):
         setattr(work, name, values.ctypes.data)
     parallel(kernels().refgs_carve, work)

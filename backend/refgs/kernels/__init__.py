@@ -1,1 +1,1 @@
-"""The C++ kernels: sources, and how they are built and loaded."""
+"""C++ kernels: their sources, and how they are built and loaded."""

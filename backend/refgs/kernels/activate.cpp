@@ -18,7 +18,6 @@ constexpr int MOST = 8;  // tensors
 struct Activate {
   int64_t tensors;
   Activation activations[MOST];
-  float* scratch;  // none is used
   mutable Shared shared;
 };
 

@@ -19,7 +19,6 @@ struct Adam {
   Learned learned[MOST];
   double beta1, beta2, epsilon;
   const float* accepted;  // zero where the step is not to be taken; or null
-  float* scratch;  // none is used
   mutable Shared shared;
 };
 

@@ -3,6 +3,7 @@
 import hashlib
 import importlib.metadata
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -14,44 +15,15 @@ import platformdirs
 from refgs.errors import InputError
 
 HERE = Path(__file__).parent
-SOURCES = (
-    "activate.cpp",
-    "adam.cpp",
-    "blend.cpp",
-    "carve.cpp",
-    "harmonics.cpp",
-    "losses.cpp",
-    "motion.cpp",
-    "normals.cpp",
-    "peak.cpp",
-    "project.cpp",
-    "shade.cpp",
-    "sparse.cpp",
-    "ssim.cpp",
-    "stack.cpp",
-)
-HEADERS = (
-    "blended.h",
-    "device.h",
-    "lane.h",
-    "library.h",
-    "light.h",
-    "pixels.h",
-    "project.h",
-    "raster.h",
-    "rows.h",
-    "splat.h",
-    "sums.h",
-    "vector.h",
-)
-# -ffp-contract=on: fused within an expression, never across, so that a formula rounds the same wherever it is inlined.
+SOURCES, HEADERS = (sorted(file.name for file in HERE.glob(pattern)) for pattern in ("*.cpp", "*.h"))
+# -ffp-contract=on fuses a product and a sum within an expression, never across: a formula rounds the same wherever it is inlined.
 FLAGS = ["-shared", "-s", "-O3", "-std=c++20", "-fno-exceptions", "-fno-rtti", "-nostdlib", "-fvisibility=hidden"]
 FLAGS += ["-fno-builtin", "-ffp-contract=on", "-fno-math-errno", "-mprefer-vector-width=512"]
 
 
 @dataclass(frozen=True)
 class Target:
-    """What a library is compiled for: Zig's names of the platform and of the processor."""
+    """Zig's names of the platform and of the processor that a library is compiled for, and the library's extension."""
 
     platform: str
     processor: str
@@ -69,32 +41,39 @@ TARGETS = {
 
 
 def target(system: str, machine: str, isa: str) -> Target:
-    """The target of `sys.platform`, a machine ("x86_64" or "aarch64") and "sse4", "avx2", "avx512" or "neon"."""
+    """Choose the target by `sys.platform`, machine ("x86_64" or "aarch64") and "sse4", "avx2", "avx512" or "neon"."""
     platform, extension, processors = TARGETS[system, machine]
     return Target(platform, processors[isa], extension)
 
 
 def cache_folder() -> Path:
-    """Where compiled kernels are kept: the environment variable REFGS_CACHE, else the user's cache."""
+    """Return the folder of compiled kernels: the environment variable REFGS_CACHE, else in the user's cache."""
     return Path(os.environ.get("REFGS_CACHE") or platformdirs.user_cache_dir("refgs", appauthor=False))
 
 
 def _fingerprint(target: Target) -> str:
     digest = hashlib.sha256(repr((target, FLAGS, importlib.metadata.version("ziglang"))).encode())
-    for name in SOURCES + HEADERS:
+    for name in (*SOURCES, *HEADERS):
         digest.update((HERE / name).read_bytes())
     return digest.hexdigest()[:16]
 
 
+def sizes() -> dict[str, int]:
+    """Find the functions that return a size, each with the number of integers that it takes."""
+    text = "".join((HERE / source).read_text(encoding="utf-8") for source in SOURCES)
+    found = re.findall(r"^EXPORT int64_t (\w+)\((.*?)\)", text, re.MULTILINE)
+    return {name: parameters.count("int64_t") for name, parameters in found}
+
+
 def unwritable(cache: Path, error: OSError) -> InputError:
-    """What to say where compiled kernels cannot be kept."""
+    """Make the error for a cache that cannot be written."""
     return InputError(
         f"cannot write compiled kernels to {cache}: {error.strerror}; set REFGS_CACHE to a folder that can be written"
     )
 
 
 def build(target: Target, cache: Path) -> Path:
-    """The library for a target, compiled into `cache` if it isn't there yet. Safe when several processes want it at once.
+    """Compile the library for a target into `cache`, unless it is there. Safe when several processes want it at once.
 
     Raises InputError where `cache` can't be written.
     """
@@ -120,7 +99,7 @@ def build(target: Target, cache: Path) -> Path:
         ]
         if target.extension != "dll":
             command.append("-fPIC")
-        # Zig's own cache goes with the scratch folder: tens of megabytes that save nothing the next time.
+        # Zig's own cache is deleted with the scratch folder: it takes tens of megabytes and saves nothing the next time.
         environment = os.environ | {"ZIG_LOCAL_CACHE_DIR": scratch.name, "ZIG_GLOBAL_CACHE_DIR": scratch.name}
         done = subprocess.run(
             [*command, *SOURCES, "-o", str(made)], cwd=HERE, env=environment, capture_output=True, text=True

@@ -17,7 +17,6 @@ struct Carve {
   const Silhouette* silhouettes;
   float *least, *second;    // (resolution, resolution, resolution)
   int32_t *carver, *seen;
-  float* scratch;  // none is used
   mutable Shared shared;
 };
 
@@ -43,7 +42,7 @@ INLINE Vector sample(const Silhouette& s, Vector x, Vector y, Mask lanes) {
 // The smallest and the second smallest mask over the views that see a voxel, which view has the smallest, and how many see it. A view
 // whose mask keeps clear of the border shows the whole object: it sees what lies outside it, empty. A voxel that two views say is empty
 // is not looked at by those that follow.
-KERNEL(refgs_carve, Carve, c) {
+EXPORT void refgs_carve(const Carve* c) {
   int64_t n = c->resolution, side = (n + BLOCK - 1) / BLOCK, along = (n + LANES - 1) / LANES;
   Vector lane;
   for (int i = 0; i < LANES; i++) lane[i] = i;

@@ -1,6 +1,6 @@
 """Compile the kernels for CUDA cards, and launch them.
 
-NVRTC, NVIDIA's compiler as a library, comes with torch: no toolkit and no host compiler is needed, nor a card to compile.
+NVRTC, NVIDIA's compiler as a library, comes with torch. Compiling needs no toolkit, no host compiler and no card.
 """
 
 import ctypes
@@ -15,23 +15,7 @@ import torch
 
 from refgs.kernels.build import HEADERS, HERE, cache_folder, unwritable
 
-# Those of the sources that a card runs.
-SOURCES = (
-    "activate.cpp",
-    "adam.cpp",
-    "harmonics.cpp",
-    "losses.cpp",
-    "motion.cpp",
-    "normals.cpp",
-    "peak.cpp",
-    "raster.cu",
-    "shade.cpp",
-    "sparse.cpp",
-    "ssim.cpp",
-    "stack.cpp",
-    "trace.cu",
-)
-# A product and a sum fuse as the CPU's do; but for lane.h's reciprocal and exp2, nothing is rounded other than IEEE 754 has it.
+# Products and sums fuse as on the CPU. Everything is rounded as IEEE 754 says, except lane.h's reciprocal and exp2.
 OPTIONS = (
     "--std=c++17",
     "--device-as-default-execution-space",
@@ -39,16 +23,23 @@ OPTIONS = (
     "--fmad=true",
     "--diag-suppress=177",
 )
-OLDEST = (7, 5)  # the compute capability from which on NVRTC 13 compiles
-BLOCK = 256  # threads, where a kernel does not care
+# The source of each kernel by its name. A source without any has functions for the CPU alone.
+KERNELS = {
+    name: file.name
+    for file in sorted(HERE.glob("*.c*"))
+    for name in re.findall(r"^KERNEL\((\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
+}
+SOURCES = tuple(dict.fromkeys(KERNELS.values()))
+OLDEST = (7, 5)  # the least compute capability that NVRTC 13 compiles for
+BLOCK = 256  # threads of a kernel that works with any number of them
 NO_CARD = "no NVIDIA card, or no driver for it, was found"
 
 
 def unusable() -> str | None:
-    """Why no card can be used here, in a line, NO_CARD where there is none; None where one can."""
+    """Say in a line why no card can be used here, NO_CARD if there is none. Return None if one can."""
     if torch.version.cuda is None:
         return NO_CARD
-    with warnings.catch_warnings(record=True) as said:  # torch warns of a driver that is too old
+    with warnings.catch_warnings(record=True) as said:  # torch warns if the driver is too old
         warnings.simplefilter("always")
         available = torch.cuda.is_available()
     if not available:
@@ -57,25 +48,15 @@ def unusable() -> str | None:
         found, least = (".".join(map(str, version)) for version in (capability, OLDEST))
         return f"{torch.cuda.get_device_name()} is too old: its compute capability is {found}, {least} is the least"
     try:
-        for source in SOURCES:  # now, as later the memory may be full
+        for source in SOURCES:  # load all now: later the memory may be full
             _module(source, torch.cuda.current_device())
     except RuntimeError as error:
         return f"the kernels cannot be loaded ({str(error).splitlines()[0]}): a newer driver may do"
     return None
 
 
-@functools.cache
-def kernel_sources() -> dict[str, str]:
-    """The source of each kernel by its name."""
-    return {
-        name: source
-        for source in SOURCES
-        for name in re.findall(r"^KERNEL\((\w+)", (HERE / source).read_text(encoding="utf-8"), re.MULTILINE)
-    }
-
-
 def _check(result: tuple, what: str):
-    """The values of a call of NVIDIA's, without its status."""
+    """Return the values of a call of NVIDIA's, without its status. Raise an error if the status is one."""
     status, *values = result
     if status.name == "CUDA_ERROR_OUT_OF_MEMORY":
         raise torch.OutOfMemoryError(what)
@@ -85,7 +66,7 @@ def _check(result: tuple, what: str):
 
 
 def compile_source(source: str, architecture: str) -> bytes:
-    """Machine code (cubin) of a source for an architecture such as "sm_86". Needs no card."""
+    """Compile a source to machine code (cubin) for an architecture such as "sm_86". Needs no card."""
     from cuda.bindings import nvrtc
 
     headers = [(HERE / name).read_bytes() for name in HEADERS]
@@ -105,7 +86,7 @@ def compile_source(source: str, architecture: str) -> bytes:
 
 
 def cubin(source: str, architecture: str, cache: Path) -> bytes:
-    """The same out of `cache`, where it is kept by what it depends on."""
+    """Return the same from `cache`, compiling it if it is not there. Its name has a hash of all that it depends on."""
     from cuda.bindings import nvrtc
 
     parts = [(HERE / name).read_bytes() for name in (source, *HEADERS)]
@@ -124,7 +105,7 @@ def cubin(source: str, architecture: str, cache: Path) -> bytes:
 
 @functools.cache
 def _module(source: str, device: int):
-    """A source's kernels on a card, in torch's own context, which the thread must have."""
+    """Load a source's kernels on a card, in torch's own context."""
     from cuda.bindings import driver
 
     major, minor = torch.cuda.get_device_capability(device)
@@ -136,14 +117,14 @@ def _module(source: str, device: int):
 def _function(name: str, device: int):
     from cuda.bindings import driver
 
-    return _check(driver.cuModuleGetFunction(_module(kernel_sources()[name], device), name.encode()), name)
+    return _check(driver.cuModuleGetFunction(_module(KERNELS[name], device), name.encode()), name)
 
 
 def launch(name: str, work: ctypes.Structure, device: torch.device, blocks: int, threads: int = BLOCK) -> None:
-    """Run a kernel on torch's current stream of a device; what the work points at must live until it is done."""
+    """Run a kernel on torch's current stream of a device. The tensors that `work` points at must live until it is done."""
     from cuda.bindings import driver
 
-    # Autograd's own threads have no context until they ask for one, and torch's `device` asks only where it changes.
+    # Autograd's own threads have no context until they ask for one, and `torch.cuda.device` asks only if the device changes.
     torch.cuda.set_device(device)
     function, stream = _function(name, torch.cuda.current_device()), torch.cuda.current_stream().cuda_stream
     arguments = (ctypes.c_void_p * 1)(ctypes.addressof(work))

@@ -24,9 +24,7 @@ typedef unsigned long long uint64_t;
   static void name##_threads(const Work* w)
 #endif
 
-struct Shared {
-  int64_t next, thread;
-};
+struct Shared;  // library.h
 
 // body(i) for each i below n, each by a thread of its own, or by turns where there are fewer.
 template <class Body>

@@ -14,7 +14,6 @@ struct Harmonics {
   float* color;  // (count, 3)
   const float* by_color;
   float *by_constant, *by_rest;
-  float* scratch;  // none is used
   mutable Shared shared;
 };
 

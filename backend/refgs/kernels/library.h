@@ -5,7 +5,14 @@
 #include "device.h"
 #else
 #include <stdint.h>
+#endif
 
+// How the threads inside a function share its work.
+struct Shared {
+  int64_t next, thread;
+};
+
+#ifndef __CUDACC__
 #if defined(_WIN32)
 #define EXPORT extern "C" __declspec(dllexport)
 #else
@@ -14,11 +21,6 @@
 
 // A function that several threads may enter at once; they share its work.
 #define KERNEL(name, Work, w) EXPORT void name(const Work* w)
-
-// How the threads inside a function share its work.
-struct Shared {
-  int64_t next, thread;
-};
 
 static inline int64_t take(int64_t& next, int64_t n) { return __atomic_fetch_add(&next, n, __ATOMIC_RELAXED); }
 

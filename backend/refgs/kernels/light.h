@@ -7,10 +7,9 @@
 // Cubemaps of several roughnesses and one of irradiance / pi, one after another; see refgs.model.cubemap for the order of texels. Each
 // face is padded by one, so that a look-up's four neighbours lie side by side, two and two.
 struct Levels {
-  static constexpr int MOST = 8;
   int64_t count;
-  int32_t side[MOST], start[MOST], line[MOST];  // where a level starts, in cells, and in lines: rows of cells
-  float alpha[MOST];  // of GGX: roughness²
+  int32_t side[8], start[8], line[8];  // where a level starts, in cells, and in lines: rows of cells
+  float alpha[8];  // of GGX: roughness²
   const float* cells;  // (cells, 4): red, green, blue, nothing
 
   MEMBER int level_of(int32_t at) const {

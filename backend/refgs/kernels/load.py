@@ -15,25 +15,14 @@ import torch
 from refgs import CORES
 from refgs.errors import InputError
 from refgs.kernels import cuda
-from refgs.kernels.build import build, cache_folder, target
+from refgs.kernels.build import build, cache_folder, sizes, target
 
 MACHINES = {"AMD64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}
-# Functions that return how large a buffer must be, and how many integers they take.
-SIZES = {
-    "refgs_tiles": 2,
-    "refgs_projected_size": 0,
-    "refgs_octagon_size": 0,
-    "refgs_row_size": 1,
-    "refgs_scratch_size": 1,
-    "refgs_ssim_scratch_size": 1,
-    "refgs_shade_halo": 0,
-    "refgs_peak_round": 0,
-}
 
 
 @functools.cache
 def supported() -> list[str]:
-    """The instruction sets this processor has kernels for, best first."""
+    """List the instruction sets that this processor has kernels for, best first."""
     if MACHINES.get(platform.machine()) == "aarch64":
         return ["neon"]
     sets = ["avx512", "avx2", "sse4"]
@@ -41,11 +30,11 @@ def supported() -> list[str]:
 
 
 def _keep_memory() -> None:
-    """Have GNU's malloc keep what is freed: by default the buffers of an iteration go back to the system at its end, and the
-    next one faults them in again page by page (4 % of the time of a small picture's, half of a large one's)."""
+    """Have GNU's malloc keep freed memory. By default the buffers of an iteration go back to the system at its end, and the next
+    iteration faults them in again page by page: 4 % of its time for small pictures, half for large ones."""
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
-        libc.mallopt(-4, 0)  # M_MMAP_MAX: no allocation is the system's own, however large
-        libc.mallopt(-8, 1)  # M_ARENA_MAX: what one thread frees, another may have
+        libc.mallopt(-4, 0)  # M_MMAP_MAX: no allocation is mapped by itself, however large
+        libc.mallopt(-8, 1)  # M_ARENA_MAX: memory that one thread frees, another may have
         libc.mallopt(-1, 512 << 20)  # M_TRIM_THRESHOLD
 
 
@@ -54,16 +43,16 @@ def _load(isa: str) -> ctypes.CDLL:
     _keep_memory()
     path = build(target(sys.platform, MACHINES[platform.machine()], isa), cache_folder())
     library = ctypes.CDLL(str(path))
-    for name, arguments in SIZES.items():
+    for name, arguments in sizes().items():
         getattr(library, name).restype = ctypes.c_int64
         getattr(library, name).argtypes = [ctypes.c_int64] * arguments
     return library
 
 
 def kernels() -> ctypes.CDLL:
-    """The library for this processor, compiled on first use (seconds). The environment variable REFGS_ISA picks another.
+    """Load the library for this processor, compiled on first use (seconds). The environment variable REFGS_ISA picks another.
 
-    Raises InputError where this processor can't run it, or its cache can't be written.
+    Raises InputError if this processor can't run it, or the cache can't be written.
     """
     sets = supported()
     isa = os.environ.get("REFGS_ISA") or sets[0]
@@ -74,9 +63,9 @@ def kernels() -> ctypes.CDLL:
 
 @functools.cache
 def _openmp() -> Callable | None:
-    """GOMP_parallel of the OpenMP library that torch itself runs on, where it is GNU's.
+    """Find GOMP_parallel of the OpenMP library that torch itself runs on, if it is GNU's.
 
-    Its workers spin for a while after torch's own work: a second pool would have to share the cores with them.
+    Its workers spin for a while after torch's own work: a second pool would compete with them for the cores.
     """
     torch_folder = Path(torch.__file__).parent
     for path in (*torch_folder.glob("lib/libgomp*"), *torch_folder.parent.glob("torch.libs/libgomp*")):
@@ -96,13 +85,12 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def on_gpu(tensor: torch.Tensor) -> bool:
-    """Whether kernels that work on this tensor run on a CUDA card."""
+    """Tell whether kernels that work on this tensor run on a CUDA card."""
     return tensor.device.type == "cuda"
 
 
 def check(**expected: tuple[torch.Tensor, tuple[int, ...]]) -> None:
-    """What a kernel is about to read: raise ValueError unless each tensor is float32, of its shape, and on the first one's
-    device, the CPU or a CUDA card."""
+    """Raise ValueError unless each tensor is float32, of its shape, and on the first one's device, the CPU or a CUDA card."""
     home = next(iter(expected.values()))[0].device
     for name, (tensor, shape) in expected.items():
         known = tensor.device == home and home.type in ("cpu", "cuda")
@@ -111,43 +99,31 @@ def check(**expected: tuple[torch.Tensor, tuple[int, ...]]) -> None:
             raise ValueError(f"{name}: expected float32 {shape} on {home}, the CPU or a CUDA card; got {found}")
 
 
-class Shared(ctypes.Structure):
-    """`struct Shared` of library.h."""
-
-    _fields_ = (("next", ctypes.c_int64), ("thread", ctypes.c_int64))
-
-
-class Work(ctypes.Structure):
-    """What a kernel works on: pointers to tensors among its fields."""
-
-    def attach(self, **tensors: torch.Tensor) -> None:
-        """Point at tensors, which must be contiguous, and outlive the calls that use them."""
-        for name, tensor in tensors.items():
-            assert tensor.is_contiguous()
-            setattr(self, name, tensor.data_ptr())
-
-
 _kept = threading.local()
 
 
 def borrow(name: str, count: int) -> torch.Tensor:
-    """Memory for `count` 32-bit numbers, until the same name is asked for again: one that is used in passing, and whose
-    size differs from view to view, would leave gaps in malloc's memory each time."""
+    """Lend memory for `count` 32-bit numbers, until the same name is asked for again.
+
+    Temporary buffers whose size differs from view to view would leave gaps in malloc's memory each time.
+    """
     memory = _kept.__dict__.get(name)
     if memory is None or len(memory) < count:
-        _kept.__dict__[name] = None  # so that both are not there at once
+        _kept.__dict__[name] = None  # freed first, so that both are never there at once
         memory = _kept.__dict__[name] = torch.empty(count + count // 8, dtype=torch.int32)
     return memory
 
 
 def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most: int = CORES) -> None:
-    """Call `function(&work)` on as many threads at once as torch has, but at `most` so many, and no more than there are cores.
+    """Call `function(&work)` at once on as many threads as torch has, but on no more than there are cores, or than `most`.
 
-    They share the work through `work.shared`. Each thread gets `scratch` floats of `work.scratch`.
+    The threads share the work through `work.shared`. Each gets `scratch` floats of `work.scratch`, which only a kernel that
+    needs them has.
     """
     threads = max(1, min(torch.get_num_threads(), CORES, most))
-    work.scratch = borrow("scratch", threads * scratch).data_ptr() if scratch else None
-    work.shared = Shared()
+    if scratch:
+        work.scratch = borrow("scratch", threads * scratch).data_ptr()
+    work.shared = type(work.shared)()
     if threads == 1:
         function(ctypes.byref(work))
     elif openmp := _openmp():
@@ -157,8 +133,8 @@ def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most:
 
 
 def run(name: str, work: ctypes.Structure, like: torch.Tensor, items: int, scratch: int = 0) -> None:
-    """Run a kernel that shares `items` out where the tensor `like` is: to torch's threads on the CPU, each with `scratch`
-    floats of its own, or to a thread an item on a card."""
+    """Run a kernel on `items` where the tensor `like` is: on torch's threads on the CPU, each with `scratch` floats of its own,
+    or on a card, one thread an item."""
     if on_gpu(like):
         cuda.launch(name, work, like.device, max(1, -(-items // cuda.BLOCK)))
     else:

@@ -19,12 +19,11 @@ struct Losses {
   float *by_color, *by_normal, *by_depth, *by_alpha, *by_material;
   float* slopes;            // (4, H, W) derivatives by the depths to the right, to the left, below and above
   double* sums;             // (SUMS) of each row, or of each block's pixels
-  const double* totals[2];  // (SUMS) of each pass
+  const double *first, *second;  // (SUMS) of each pass
   const float* structure;   // D-SSIM, or null
   const float* light;  // (3): its mean radiance; or null
   float dssim_weight, light_weight;
   float *loss, *square, *by_light;  // what comes of it: the loss; the mean squared error; (3)
-  float* scratch;           // none is used
   mutable Shared shared;
 };
 
@@ -244,7 +243,7 @@ KERNEL(refgs_losses_second, Losses, l) {
     const float* material = r.of(l.material, MATERIAL);
     auto of_material = [&](int i) { return r.at.get(material + i, MATERIAL); };
     Vector metallic = of_material(METAL), brightest = larger(larger(of_material(0), of_material(1)), of_material(2));
-    float surfaces = (float)l.totals[0][SURFACES], share_of_each = 1 / (surfaces > 1 ? surfaces : 1);
+    float surfaces = (float)l.first[SURFACES], share_of_each = 1 / (surfaces > 1 ? surfaces : 1);
     float weight = share_of_each * l.metallic_weight;
     Vector dark = share_of_each * l.dark_weight * clamp(1.0f - brightest * (1 / DARK), 0, 1);
     Vector matte = of_material(ROUGH) - GLOSSY, slope = clamp(matte * (1 / FLAT), 0, 1);  // Huber's: surfels may start at the kink
@@ -260,7 +259,7 @@ KERNEL(refgs_losses_second, Losses, l) {
 // numbers m with mean u that is mean((m / u - 1)^2).
 KERNEL(refgs_losses_total, Losses, l) {
   share(l->shared, 1, 1, [&](int64_t) {
-    const double *first = l->totals[0], *second = l->totals[1];
+    const double *first = l->first, *second = l->second;
     double loss = first[LOSS] + second[LOSS];
     if (l->structure) loss += l->dssim_weight * (double)*l->structure;
     if (l->light) {

@@ -10,7 +10,6 @@ struct Motion {
   const float* accepted;               // zero where the gradients are not to be counted; or null
   double scale;                        // from the derivative by a unit across, at depth 1, to that by half an image's width
   float *total, *views;                // (count)
-  float* scratch;                      // none is used
   mutable Shared shared;
 };
 

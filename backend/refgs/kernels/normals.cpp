@@ -13,7 +13,6 @@ struct Normals {
   float* normals;                      // (count, 3)
   const float* by_normals;
   float* by_rotations;
-  float* scratch;                      // none is used
   mutable Shared shared;
 };
 

@@ -5,7 +5,7 @@ namespace {
 
 struct Peak {
   int64_t rounds;
-  float *out, *scratch;  // (1): never written to, but no compiler knows; none is used
+  float* out;  // (1): never written to, but no compiler knows
   mutable Shared shared;
 };
 

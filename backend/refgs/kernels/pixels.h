@@ -43,7 +43,6 @@ struct Shade {
   // With CUDA in place of those three, zero at first:
   int64_t *map_sums, *cell_sums;    // (4, height, width), (cells, 3)
   int32_t* largest;                 // (2): of the numbers that are added to each
-  float* scratch;                   // none is used
   mutable Shared shared;
 };
 

@@ -56,8 +56,6 @@ void gather(const Raster& r, int64_t first) {
 }  // namespace
 
 EXPORT int64_t refgs_tiles(int64_t width, int64_t height) { return ((width + TILE_X - 1) / TILE_X) * ((height + TILE_Y - 1) / TILE_Y); }
-EXPORT int64_t refgs_projected_size() { return sizeof(Projected); }
-EXPORT int64_t refgs_octagon_size() { return sizeof(Octagon); }
 EXPORT int64_t refgs_row_size(int64_t channels) { return GEOMETRY + padded(channels); }
 
 // parallel

@@ -14,7 +14,6 @@ struct Product {
   const float* dense;           // (columns, 3)
   const int32_t* rows;          // (24 orbits) where in `out` each row goes; null where it stays in place
   float* out;                   // (24 orbits, 3)
-  float* scratch;               // none is used
   mutable Shared shared;
 
   MEMBER int64_t place(int64_t row) const { return rows ? rows[row] : row; }

@@ -14,7 +14,6 @@ struct Stack {
   int64_t rows, parts, width;  // of all
   Part part[MOST];
   float* stacked;              // (rows, width)
-  float* scratch;              // none is used
   mutable Shared shared;
 };
 

@@ -20,7 +20,6 @@ struct Trace {
   const float* boxes;                        // (2 leaves, 6): least and greatest corner; a node's children are 2 i and 2 i + 1, the root is 1
   const float* triangles;                    // (leaves LEAF, 9): a corner and the two edges from it
   float* visible;                            // (height, width)
-  float* scratch;                            // none is used
   mutable Shared shared;
 };
 

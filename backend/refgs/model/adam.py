@@ -1,6 +1,5 @@
 """The optimiser."""
 
-import ctypes
 import math
 from collections import defaultdict
 
@@ -8,32 +7,11 @@ import torch
 from torch import Tensor
 
 from refgs.clock import timed
-from refgs.kernels.load import Shared, Work, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import run
 
-MOST = 16  # tensors
-
-
-class _Learned(Work):
-    """`struct Learned` of adam.cpp."""
-
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        *((n, ctypes.c_void_p) for n in ("value", "mean", "square", "gradient")),
-        *((n, ctypes.c_double) for n in ("rate", "square_scale", "low", "high")),
-    )
-
-
-class _Work(Work):
-    """`struct Adam` of adam.cpp."""
-
-    _fields_ = (
-        ("tensors", ctypes.c_int64),
-        ("learned", _Learned * MOST),
-        *((n, ctypes.c_double) for n in ("beta1", "beta2", "epsilon")),
-        ("accepted", ctypes.c_void_p),
-        ("scratch", ctypes.c_void_p),
-        ("shared", Shared),
-    )
+_Learned = struct("Learned", "adam.cpp")
+_Work = struct("Adam", "adam.cpp")
 
 
 class Adam:

@@ -7,7 +7,6 @@ cube's symmetries, so only a 24th of it is computed and kept. That takes 0.05 s 
 cache on disk.
 """
 
-import ctypes
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import NamedTuple
@@ -19,7 +18,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.clock import timed
-from refgs.kernels.load import Shared, Work, check, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import check, run
 from refgs.model import cubemap
 from refgs.model.cubemap import SYMMETRIES
 
@@ -177,15 +177,7 @@ def _order(resolution: int, device: torch.device) -> Tensor:
     return cubemap.orbit_order((resolution,)).int().to(device)
 
 
-class _Work(Work):
-    """`struct Product` of sparse.cpp."""
-
-    _fields_ = (
-        ("orbits", ctypes.c_int64),
-        *((n, ctypes.c_void_p) for n in ("starts", "columns", "numbers", "compositions", "dense")),
-        *((n, ctypes.c_void_p) for n in ("rows", "out", "scratch")),
-        ("shared", Shared),
-    )
+_Work = struct("Product", "sparse.cpp")
 
 
 def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tensor:

@@ -1,6 +1,5 @@
 """Surfels: raw parameters, which are learned, and activated values, which are rendered."""
 
-import ctypes
 import math
 from typing import NamedTuple
 
@@ -11,7 +10,8 @@ from torch.autograd.function import once_differentiable
 
 from refgs.clock import timed
 from refgs.formats.splats import Splats
-from refgs.kernels.load import Shared, Work, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import run
 from refgs.model import harmonics
 
 FLAT = 0.3  # initial thickness of 3D Gaussians, as a part of their width
@@ -74,24 +74,7 @@ class Surfels(NamedTuple):
         return self._replace(rotations=torch.where(which[:, None], turned, self.rotations))
 
 
-class _Activation(ctypes.Structure):
-    """`struct Activation` of activate.cpp."""
-
-    _fields_ = (
-        *((n, ctypes.c_int64) for n in ("count", "kind")),
-        *((n, ctypes.c_void_p) for n in ("raw", "value", "by_value", "by_raw")),
-    )
-
-
-class _Work(Work):
-    """`struct Activate` of activate.cpp."""
-
-    _fields_ = (
-        ("tensors", ctypes.c_int64),
-        ("activations", _Activation * 8),
-        ("scratch", ctypes.c_void_p),
-        ("shared", Shared),
-    )
+_Work = struct("Activate", "activate.cpp")
 
 
 @timed("surfels")
@@ -103,7 +86,9 @@ class _Activate(torch.autograd.Function):
         raw = [tensor.contiguous() for tensor in raw]
         values, work = [torch.empty_like(tensor) for tensor in raw], _Work(tensors=len(raw))
         for i, (kind, tensor, value) in enumerate(zip(_KINDS.values(), raw, values, strict=True)):
-            work.activations[i] = _Activation(tensor.numel(), kind, tensor.data_ptr(), value.data_ptr())
+            slot = work.activations[i]
+            slot.count, slot.kind = tensor.numel(), kind
+            slot.attach(raw=tensor, value=value)
         run("refgs_activate_forward", work, raw[0], items=sum(tensor.numel() for tensor in raw))
         ctx.save_for_backward(*raw, *values)
         ctx.mark_non_differentiable(*(v for v, needed in zip(values, ctx.needs_input_grad, strict=True) if not needed))
@@ -115,11 +100,12 @@ class _Activate(torch.autograd.Function):
         raw, values = ctx.saved_tensors[: len(by_values)], ctx.saved_tensors[len(by_values) :]
         work, by_raw = _Work(), [None] * len(by_values)
         by_values = [by.contiguous() for by in by_values]
-        for i, (kind, *tensors) in enumerate(zip(_KINDS.values(), raw, values, by_values, strict=True)):
+        for i, kind in enumerate(_KINDS.values()):
             if ctx.needs_input_grad[i]:
                 by_raw[i] = torch.empty_like(values[i])
-                slot = _Activation(by_raw[i].numel(), kind, *(t.data_ptr() for t in (*tensors, by_raw[i])))
-                work.activations[work.tensors] = slot
+                slot = work.activations[work.tensors]
+                slot.count, slot.kind = by_raw[i].numel(), kind
+                slot.attach(raw=raw[i], value=values[i], by_value=by_values[i], by_raw=by_raw[i])
                 work.tensors += 1
         run("refgs_activate_backward", work, values[0], items=sum(value.numel() for value in values))
         return tuple(by_raw)

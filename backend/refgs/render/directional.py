@@ -1,26 +1,15 @@
 """Colour of surfels by viewing direction."""
 
-import ctypes
-
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
 from refgs.clock import timed
-from refgs.kernels.load import Shared, Work, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import run
 
-
-class _Work(Work):
-    """`struct Harmonics` of harmonics.cpp."""
-
-    _fields_ = (
-        [(n, ctypes.c_int64) for n in ("count", "coefficients")]
-        + [(n, ctypes.c_void_p) for n in ("constant", "rest", "positions", "normals")]
-        + [("camera", ctypes.c_double * 3), ("offset", ctypes.c_float)]
-        + [(n, ctypes.c_void_p) for n in ("color", "by_color", "by_constant", "by_rest", "scratch")]
-        + [("shared", Shared)]
-    )
+_Work = struct("Harmonics", "harmonics.cpp")
 
 
 @timed("surfels")

@@ -1,26 +1,15 @@
 """Normals of surfels, turned towards a camera."""
 
-import ctypes
-
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.camera import Camera
 from refgs.clock import timed
-from refgs.kernels.load import Shared, Work, check, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import check, run
 
-
-class _Work(Work):
-    """`struct Normals` of normals.cpp."""
-
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        *((n, ctypes.c_void_p) for n in ("rotations", "positions")),
-        ("camera", ctypes.c_double * 3),
-        *((n, ctypes.c_void_p) for n in ("normals", "by_normals", "by_rotations", "scratch")),
-        ("shared", Shared),
-    )
+_Work = struct("Normals", "normals.cpp")
 
 
 @timed("surfels")

@@ -4,26 +4,23 @@ import ctypes
 
 import torch
 
-from refgs.kernels.load import Shared, borrow, kernels, parallel
+from refgs.kernels.layout import struct
+from refgs.kernels.load import borrow, kernels, parallel
 from refgs.render.raster import Scene
 
+PROJECTED = ctypes.sizeof(struct("Projected", "raster.h"))
+OCTAGON = ctypes.sizeof(struct("Octagon", "raster.h"))
 
-class Raster(Scene):
-    """`struct Raster` of raster.h."""
 
-    _fields_ = (
-        [(n, ctypes.c_void_p) for n in ("octagons", "keys", "order")]
-        + [(n, ctypes.c_int64) for n in ("visible", "pairs")]
-        + [(n, ctypes.c_void_p) for n in ("splat_start", "tile_start", "members", "places", "reach", "row_start")]
-        + [("row_count", ctypes.c_int64), ("rows", ctypes.c_void_p), ("scratch", ctypes.c_void_p), ("shared", Shared)]
-    )
+class Raster(struct("Raster", "raster.h"), Scene):
+    """Arguments of the CPU rasteriser's kernels."""
 
     def project(self, device: torch.device) -> None:
         library, n = kernels(), self.splats
         tiles = library.refgs_tiles(self.width, self.height)
         self.keep(
-            projected=torch.empty(n * library.refgs_projected_size(), dtype=torch.uint8),
-            octagons=torch.empty(n * library.refgs_octagon_size(), dtype=torch.uint8),
+            projected=torch.empty(n * PROJECTED, dtype=torch.uint8),
+            octagons=torch.empty(n * OCTAGON, dtype=torch.uint8),
             order=torch.empty(n, dtype=torch.int32),
             splat_start=torch.empty(n + 1, dtype=torch.int64),
             tile_start=torch.empty(tiles + 1, dtype=torch.int64),

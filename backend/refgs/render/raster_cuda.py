@@ -5,12 +5,13 @@ import ctypes
 import torch
 
 from refgs.kernels import cuda, load
+from refgs.kernels.layout import struct
 from refgs.render.raster import Scene
 
 SIZES = (4, 8, 12, 16, 20)  # channel counts that kernels are compiled for; others take the next larger one
 MOST = SIZES[-1]
 TILE, THREADS, PHASES = 16, 128, 8  # as in raster.cu
-PROJECTED = 128  # bytes of `struct Projected` of raster.h
+PROJECTED = ctypes.sizeof(struct("Projected", "raster.h"))
 GEOMETRY = 16  # floats of a gradient row before its features, as there
 SHORT = 1 << 15  # tiles that an int16 can number: such keys sort in half the time
 
@@ -20,15 +21,8 @@ def how_many(ends: torch.Tensor) -> int:
     return int(ends[-1]) if len(ends) else 0
 
 
-class Raster(Scene):
-    """`struct Raster` of raster.cu."""
-
-    _fields_ = (
-        [(n, ctypes.c_void_p) for n in ("depths", "counts", "order", "ends", "starts")]
-        + [("pair_count", ctypes.c_int64)]
-        + [(n, ctypes.c_void_p) for n in ("pairs", "sorted", "tile_start", "members", "places", "reach", "last")]
-        + [("size", ctypes.c_int64), ("rows", ctypes.c_void_p)]
-    )
+class Raster(struct("Raster", "raster.cu"), Scene):
+    """Arguments of the CUDA rasteriser's kernels."""
 
     def project(self, device: torch.device) -> None:
         def integers(*shape: int) -> torch.Tensor:

@@ -1,6 +1,5 @@
 """Differentiable shading: of blended maps, or of each surfel."""
 
-import ctypes
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -11,7 +10,7 @@ from torch.autograd.function import once_differentiable
 from refgs.camera import Camera
 from refgs.clock import timed
 from refgs.kernels import cuda, load
-from refgs.kernels.load import Shared, Work
+from refgs.kernels.layout import struct
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
 from refgs.render.brdf import reflectance_table
@@ -34,39 +33,8 @@ class Shaded(NamedTuple):
     radiance: Tensor
 
 
-class _Levels(ctypes.Structure):
-    """`struct Levels` of light.h."""
-
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        ("side", ctypes.c_int32 * 8),
-        ("start", ctypes.c_int32 * 8),
-        ("line", ctypes.c_int32 * 8),
-        ("alpha", ctypes.c_float * 8),
-        ("cells", ctypes.c_void_p),
-    )
-
-
-class _Work(Work):
-    """`struct Shade` of pixels.h."""
-
-    _fields_ = (
-        [(n, ctypes.c_int64) for n in ("width", "height", "channels", "chunk_rows")]
-        + [("view", ctypes.c_float * 12), ("turn", ctypes.c_float * 9)]
-        + [(n, ctypes.c_float) for n in ("fx", "fy", "cx", "cy")]
-        + [(n, ctypes.c_void_p) for n in ("background", "exposure")]
-        + [(n, ctypes.c_int64) for n in ("harmonics", "splats", "display", "mirror", "matte")]
-        + [(n, ctypes.c_void_p) for n in ("features", "alpha", "visibility")]
-        + [("levels", _Levels)]
-        + [(n, ctypes.c_int64) for n in ("texels", "cells", "lines")]
-        + [(n, ctypes.c_void_p) for n in ("light", "texel", "padded", "starts", "cell", "reflectance")]
-        + [("reflectance_side", ctypes.c_int64)]
-        + [(n, ctypes.c_void_p) for n in ("mirrored", "color", "normal", "material", "radiance")]
-        + [(n, ctypes.c_void_p) for n in ("by_color", "by_normal", "by_material", "by_features", "by_alpha")]
-        + [(n, ctypes.c_void_p) for n in ("by_light", "by_exposure", "near", "by_cells", "touched")]
-        + [(n, ctypes.c_void_p) for n in ("map_sums", "cell_sums", "largest")]
-        + [("scratch", ctypes.c_void_p), ("shared", Shared)]
-    )
+class _Work(struct("Shade", "pixels.h")):
+    """Arguments of shade.cpp's kernels."""
 
     @classmethod
     def of(cls, features: Tensor, alpha: Tensor, camera: Camera) -> "_Work":

@@ -1,26 +1,16 @@
 """Structural dissimilarity of two images."""
 
-import ctypes
-
 import torch
 from torch import Tensor
 
 from refgs.kernels import cuda, load
-from refgs.kernels.load import Shared, Work, check, kernels, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import check, kernels, run
 
 TILE = 224, 6  # floats of a row, and rows, of a CUDA block in ssim.cpp
 
 
-class _Work(Work):
-    """`struct Ssim` of ssim.cpp."""
-
-    _fields_ = (
-        *((n, ctypes.c_int64) for n in ("height", "width")),
-        *((n, ctypes.c_void_p) for n in ("image", "target", "by_mean", "by_square", "by_product", "sums")),
-        ("scale", ctypes.c_float),
-        *((n, ctypes.c_void_p) for n in ("by_image", "scratch")),
-        ("shared", Shared),
-    )
+_Work = struct("Ssim", "ssim.cpp")
 
 
 @torch.no_grad()

@@ -1,6 +1,5 @@
 """Concatenation of the surfels' features."""
 
-import ctypes
 from collections.abc import Sequence
 
 import torch
@@ -8,26 +7,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.clock import timed
-from refgs.kernels.load import Shared, Work, check, run
-
-MOST = 8  # parts
-
-
-class _Part(ctypes.Structure):
-    """`struct Part` of stack.cpp."""
-
-    _fields_ = (("width", ctypes.c_int64), ("numbers", ctypes.c_void_p))
+from refgs.kernels.layout import struct
+from refgs.kernels.load import check, run
 
 
-class _Work(Work):
-    """`struct Stack` of stack.cpp."""
-
-    _fields_ = (
-        *((n, ctypes.c_int64) for n in ("rows", "parts", "width")),
-        ("part", _Part * MOST),
-        *((n, ctypes.c_void_p) for n in ("stacked", "scratch")),
-        ("shared", Shared),
-    )
+class _Work(struct("Stack", "stack.cpp")):
+    """Arguments of stack.cpp's kernels."""
 
     @classmethod
     def of(cls, stacked: Tensor, widths: Sequence[int], parts: Sequence[Tensor | None]) -> "_Work":

@@ -1,6 +1,5 @@
 """The objective (paper §3.3): colour, normal consistency, edge-aware smoothness; and the mask."""
 
-import ctypes
 from typing import NamedTuple
 
 import torch
@@ -11,7 +10,8 @@ from refgs.camera import Camera
 from refgs.capture import LoadedView
 from refgs.clock import timed
 from refgs.kernels import cuda, load
-from refgs.kernels.load import Shared, Work, check, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import check, run
 from refgs.render.renderer import Rendering
 from refgs.render.ssim import dssim
 from refgs.settings import LossSettings
@@ -55,26 +55,7 @@ class Objective(NamedTuple):
     square: Tensor
 
 
-class _Work(Work):
-    """`struct Losses` of losses.cpp."""
-
-    _fields_ = (
-        *((n, ctypes.c_int64) for n in ("width", "height")),
-        *(
-            (n, ctypes.c_void_p)
-            for n in ("color", "normal", "depth", "alpha", "material", "image", "mask", "background")
-        ),
-        ("rotation", ctypes.c_float * 9),
-        *((n, ctypes.c_float) for n in ("across", "down", "left", "top")),
-        *((f"{n}_weight", ctypes.c_float) for n in ("color", "normal", "smooth_x", "smooth_y", "even_x", "even_y")),
-        *((f"{n}_weight", ctypes.c_float) for n in ("alpha", "metallic", "dark", "matte")),
-        *((n, ctypes.c_void_p) for n in ("photo", "clipped", "by_clipped")),
-        *((f"by_{n}", ctypes.c_void_p) for n in ("color", "normal", "depth", "alpha", "material")),
-        *((n, ctypes.c_void_p) for n in ("slopes", "sums", "first", "second", "structure", "light")),
-        *((n, ctypes.c_float) for n in ("dssim_weight", "light_weight")),
-        *((n, ctypes.c_void_p) for n in ("loss", "square", "by_light", "scratch")),
-        ("shared", Shared),
-    )
+_Work = struct("Losses", "losses.cpp")
 
 
 @timed("loss")

@@ -1,27 +1,14 @@
 """Each surfel's mean gradient on the screen, by which densification divides surfels."""
 
-import ctypes
-
 import torch
 from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.clock import timed
-from refgs.kernels.load import Shared, Work, check, run
+from refgs.kernels.layout import struct
+from refgs.kernels.load import check, run
 
-
-class _Work(Work):
-    """`struct Motion` of motion.cpp."""
-
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        *((n, ctypes.c_void_p) for n in ("positions", "gradients")),
-        ("view", ctypes.c_double * 12),
-        ("accepted", ctypes.c_void_p),
-        ("scale", ctypes.c_double),
-        *((n, ctypes.c_void_p) for n in ("total", "views", "scratch")),
-        ("shared", Shared),
-    )
+_Work = struct("Motion", "motion.cpp")
 
 
 class ScreenGradient:

@@ -1,0 +1,63 @@
+"""Read the structures that kernels take from their C++ declarations, so that no layout is written down twice."""
+
+import ctypes
+import functools
+import re
+
+import torch
+
+from refgs.kernels.build import HERE
+
+NUMBERS = {
+    "double": ctypes.c_double,
+    "float": ctypes.c_float,
+    "int64_t": ctypes.c_int64,
+    "int32_t": ctypes.c_int32,
+    "int16_t": ctypes.c_int16,
+}
+
+
+class Work(ctypes.Structure):
+    """Arguments of a kernel, pointers to tensors among them."""
+
+    def attach(self, **tensors: torch.Tensor) -> None:
+        """Point fields at tensors, which must be contiguous and outlive the calls that use them."""
+        for name, tensor in tensors.items():
+            assert tensor.is_contiguous()
+            setattr(self, name, tensor.data_ptr())
+
+
+def struct(name: str, source: str) -> type[Work]:
+    """Make the ctypes class of `struct name`, which a source of the kernels declares or includes.
+
+    Its fields stand before the first empty line: numbers, other such structures, pointers, and arrays whose length is an
+    integer or an integer constant of the same file. Raises ValueError where a field is anything else.
+    """
+    if made := _made(name, source):
+        return made
+    raise ValueError(f"{source}: no struct {name}; declare it there or in a header that is included")
+
+
+@functools.cache
+def _text(source: str) -> str:
+    return re.sub(r"^ *//.*\n| *//.*", "", (HERE / source).read_text(encoding="utf-8"), flags=re.MULTILINE)
+
+
+@functools.cache
+def _made(name: str, source: str) -> type[Work] | None:
+    text = _text(source)
+    pattern = rf"^struct (?:alignas\(\d+\) )?{name} (?:: (\w+) )?{{\n(.*?)^(?:\n|}};)"
+    if not (found := re.search(pattern, text, re.MULTILINE | re.DOTALL)):
+        included = re.findall(r'^#include "(.*)"', text, re.MULTILINE)
+        return next(filter(None, (_made(name, header) for header in included)), None)
+    base, body = found.groups()
+    constants, fields = dict(re.findall(r"\b(\w+) = (\d+)[,;]", text)), []
+    for statement in body.split(";")[:-1]:
+        kind, declarators = re.fullmatch(r"\s*(?:mutable )?(?:const )?(\w*)(.*)", statement, re.DOTALL).groups()
+        for declarator in declarators.split(","):
+            if not (parts := re.fullmatch(r"\s*(\*?)\s*(\w+)(?:\[(\w+)\])?", declarator)):
+                raise ValueError(f"{source}: struct {name}: cannot read the field '{' '.join(statement.split())}'")
+            pointer, field, length = parts.groups()
+            type_ = ctypes.c_void_p if pointer else NUMBERS.get(kind) or struct(kind, source)
+            fields.append((field, type_ * int(constants.get(length, length)) if length else type_))
+    return type(name, (struct(base, source) if base else Work,), {"_fields_": fields})

@@ -1,0 +1,48 @@
+"""Layouts that Python gives the structures of the kernels, as assertions for the C++ compilers."""
+
+import ctypes
+import re
+import shutil
+from pathlib import Path
+
+from refgs.kernels.build import HERE
+from refgs.kernels.layout import struct
+
+ROOT = Path(__file__).parents[2]
+
+
+def used() -> list[tuple[str, str]]:
+    """List the structures that Python asks for: the name and the source of each."""
+    files = [file for folder in ("backend", "benchmarks") for file in (ROOT / folder).rglob("*.py")]
+    return sorted({pair for file in files for pair in re.findall(r'\bstruct\("(\w+)", "([\w.]+)"\)', file.read_text())})
+
+
+def fields(made: type[ctypes.Structure]) -> list[tuple[str, type]]:
+    """List the fields of a structure, its bases' among them."""
+    return [field for part in made.__mro__ if "_fields_" in vars(part) for field in part._fields_]
+
+
+def assertions(made: type[ctypes.Structure]) -> str:
+    """Assert the size of a structure, and the offset and the size of each field; of structures among the fields, too."""
+    name = made.__name__
+    lines = [f'static_assert(sizeof({name}) == {ctypes.sizeof(made)}, "size of {name}");']
+    for field, kind in fields(made):
+        at, what = getattr(made, field), f"{name}::{field}"
+        lines.append(f'static_assert(__builtin_offsetof({name}, {field}) == {at.offset}, "offset of {what}");')
+        lines.append(f'static_assert(sizeof({what}) == {at.size}, "size of {what}");')
+        part = kind._type_ if issubclass(kind, ctypes.Array) else kind
+        if issubclass(part, ctypes.Structure):
+            lines.append(assertions(part))
+    return "\n".join(lines)
+
+
+def asserted(folder: Path) -> Path:
+    """Copy the kernels' sources to a new folder, where they assert the layouts of all structures that Python asks for."""
+    shutil.copytree(HERE, folder, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
+    for name, source in used():
+        text = assertions(struct(name, source))
+        if (name, source) == ("Raster", "raster.h"):  # the CPU's; raster.cu has its own
+            text = f"#ifndef __CUDACC__\n{text}\n#endif"
+        with (folder / source).open("a", encoding="utf-8") as file:
+            file.write(f"\n{text}\n")
+    return folder
