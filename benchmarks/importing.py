@@ -55,9 +55,9 @@ def timed(work, times: int = 3) -> float:
 def main() -> None:
     import bpy
 
-    from refgs_addon.scene.run import import_run
-    from refgs_addon.scene.splats import normal_slopes
-    from refgs_addon.scene.splats import read_splats as read
+    from refgs_addon.scene.import_run import import_run
+    from refgs_addon.scene.splat_cloud import normal_slopes
+    from refgs_addon.scene.splat_cloud import read_splats as read
 
     heads = "splats", "reading", "normals", "all of it", "the trainer's writing", "and reading"
     table = Table(*heads, title="seconds to import")

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 
-from . import environment
+from . import installation
 from .errors import InputError
 
 if sys.platform == "win32":
@@ -242,7 +242,7 @@ def ask(python: Path, log: Path) -> Job:
 
 def install(home: Path, log: Path) -> Job:
     """Install the trainer that the add-on brings into an environment of its own, or go on with that: `ready`, when the job is done."""
-    words = {"uv": str(environment.wheel("uv")), "trainer": str(environment.wheel("refgs"))}
+    words = {"uv": str(installation.wheel("uv")), "trainer": str(installation.wheel("refgs"))}
     return _by_blender("install", home, log, words)
 
 
@@ -254,7 +254,7 @@ def remove(home: Path, log: Path) -> Job:
 def _by_blender(command: str, home: Path, log: Path, words: dict[str, str]) -> Job:
     """By Blender's own Python, which needs nothing but its own library for it."""
     told = {"command": command, "home": str(home)} | words
-    return _add(Job(command, Path(sys.executable), [told], log, words=("-I", environment.__file__)))
+    return _add(Job(command, Path(sys.executable), [told], log, words=("-I", installation.__file__)))
 
 
 def train(

@@ -7,9 +7,9 @@ from zlib import crc32
 import bpy
 from bpy.props import StringProperty
 
-from . import environment, jobs
+from . import installation, jobs
 from .errors import InputError
-from .follow import follow
+from .job_timers import follow
 
 PACKAGE = __package__.removesuffix(".refgs_addon")
 
@@ -63,7 +63,7 @@ def preferences() -> Preferences:
 def set_up() -> bool:
     """Whether there is a Python to ask."""
     addon = bpy.context.preferences.addons.get(PACKAGE)
-    return addon is not None and bool(addon.preferences.python or environment.installed(home()))
+    return addon is not None and bool(addon.preferences.python or installation.installed(home()))
 
 
 def python() -> Path:
@@ -72,7 +72,7 @@ def python() -> Path:
         return Path(bpy.path.abspath(preferences().python))
     if not set_up():
         raise InputError("no trainer is set up: install it, or choose its Python, in the add-on's preferences")
-    return environment.python(home())
+    return installation.python(home())
 
 
 def home() -> Path:
@@ -114,7 +114,7 @@ def ask() -> None:
 
 def install() -> None:
     """Install the trainer, or go on with that. Raises InputError where it cannot be."""
-    if reason := why_no_installation() or environment.too_full(home()):
+    if reason := why_no_installation() or installation.too_full(home()):
         raise InputError(reason)
     forget()
     _asked.append(jobs.install(home(), log_file("installation")))
@@ -177,7 +177,7 @@ def state() -> tuple[str, str]:
 
 def why_no_installation() -> str:
     """Why the trainer cannot be installed now: a line for the artist, or ""."""
-    if not environment.brought():
+    if not installation.brought():
         return "This copy of the add-on brings no trainer to install: choose a Python that has it"
     if preferences().python:
         return "A Python is chosen: empty its field to install the trainer here"
@@ -200,8 +200,8 @@ def _draw_installation(box: bpy.types.UILayout, width: int) -> None:
         if job.name == "install":
             box.operator("refgs.stop_installing", text="Stop", icon="CANCEL")
         return
-    there, brought = environment.installed(home()), environment.brought()
-    begun = environment.begun(home())
+    there, brought = installation.installed(home()), installation.brought()
+    begun = installation.begun(home())
     if there:
         lines(
             box,
@@ -213,7 +213,7 @@ def _draw_installation(box: bpy.types.UILayout, width: int) -> None:
             box, "An installation was stopped halfway, and can be gone on with, unless another Blender is at it", width
         )
     elif brought:
-        lines(box, f"The trainer can be installed: {environment.room(home())}", width)
+        lines(box, f"The trainer can be installed: {installation.room(home())}", width)
     if there or begun or brought:
         lines(box, str(home()), width, "FILE_FOLDER")
     row = box.row(align=True)

@@ -47,10 +47,10 @@ def main(arguments: list[str] | None = None) -> int:
 def preview(options: argparse.Namespace) -> None:
     import bpy
 
-    from .scene.parts import show
-    from .scene.preview import render_preview
-    from .scene.relight import relight
-    from .scene.run import import_run
+    from .scene.import_run import import_run
+    from .scene.render_eevee import render_preview
+    from .scene.run_parts import show
+    from .scene.world_light import relight
 
     # Blender and its add-ons print to standard output what they like: that goes to standard error, the events do not.
     events = os.fdopen(os.dup(1), "w", buffering=1)

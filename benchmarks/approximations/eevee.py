@@ -12,9 +12,9 @@ from pathlib import Path
 import bpy
 
 from benchmarks.approximations import timed
-from refgs_addon.scene.parts import show
-from refgs_addon.scene.preview import render_preview
-from refgs_addon.scene.run import import_run
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.render_eevee import render_preview
+from refgs_addon.scene.run_parts import show
 
 
 def main(folder: Path, out: Path, size: int, samples: list[int]) -> None:

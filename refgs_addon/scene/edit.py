@@ -4,12 +4,12 @@ import bpy
 
 from .. import compat
 from ..errors import InputError
-from ..nodes.edit import FOLLOW, NAME, REGIONS, edit_tree, follow_tree, show_edits
-from ..nodes.materials import read_edits
-from ..nodes.splats import NAME as SPLATS
-from .materials import give, read_material
-from .parts import parts
+from ..nodes.edit_tree import FOLLOW, NAME, REGIONS, edit_tree, follow_tree, show_edits
+from ..nodes.splat_material import read_edits
+from ..nodes.splats_tree import NAME as SPLATS
+from .material_presets import give, read_material
 from .regions import REGION, add_region
+from .run_parts import parts
 
 
 def add_edit(

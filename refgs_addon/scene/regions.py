@@ -8,7 +8,7 @@ from mathutils import Matrix, Vector
 
 from .. import compat, jobs
 from ..errors import InputError
-from ..nodes.splats import NAME
+from ..nodes.splats_tree import NAME
 
 REGION = "refgs_region"  # the custom property of what was made to mark a region
 

@@ -7,7 +7,7 @@ import bpy
 
 from .. import jobs
 from ..errors import InputError
-from ..follow import follow
+from ..job_timers import follow
 from ..preferences import capture_folder, log_file, python, set_up
 from .regions import region_settings
 
@@ -51,7 +51,7 @@ def train(scene: bpy.types.Scene) -> jobs.Job:
 def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: Path) -> jobs.Job | None:
     """Write a run with its edits as a new run folder, which the scene remembers; the trainer makes its mesh and textures, where there
     is one, and the job is returned. Raises InputError."""
-    from .export import export_run
+    from .export_run import export_run
 
     export_run(collection, out)
     _remember(scene, out)
@@ -66,7 +66,7 @@ def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.
     """Have the trainer write a run with its edits as splats for viewers that know no light: they show what the run shows under its
     recovered light. What the file holds is replaced. Raises InputError where there is no trainer, no run or no folder to write to."""
     from .edit import edits, splats_of
-    from .export import export_run, run_folder
+    from .export_run import export_run, run_folder
 
     trainer, folder = python(), run_folder(collection)
     if not file.parent.is_dir():

@@ -6,7 +6,7 @@ import bpy
 
 from .. import compat
 from ..errors import InputError
-from .parts import parts
+from .run_parts import parts
 
 KEY = "refgs_turntable"  # the custom property of the Empty that turns
 

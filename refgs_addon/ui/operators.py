@@ -9,15 +9,15 @@ from bpy_extras.io_utils import ExportHelper
 
 from ..errors import InputError
 from ..preferences import hdri_folder, set_up
-from ..scene.beside import render_beside
-from ..scene.cameras import PHOTO, next_camera, photo_shown, show_photo
-from ..scene.capture import active_cameras
-from ..scene.notes import capture_of, newer, tilted
-from ..scene.parts import active_run, show
-from ..scene.preview import render_preview
+from ..scene.camera_objects import PHOTO, next_camera, photo_shown, show_photo
+from ..scene.capture_cameras import active_cameras
 from ..scene.regions import crop, training_region
-from ..scene.relight import hdris
+from ..scene.render_eevee import render_preview
+from ..scene.render_process import render_beside
+from ..scene.run_parts import active_run, show
+from ..scene.run_toml import capture_of, newer, tilted
 from ..scene.turntable import add_turntable
+from ..scene.world_light import hdris
 
 
 class Door:
@@ -52,7 +52,7 @@ def has_trainer(operator: type[bpy.types.Operator]) -> bool:
 
 def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> None:
     """Import a run, and report what came of it."""
-    from ..scene.run import import_run
+    from ..scene.import_run import import_run
 
     run = import_run(folder, context.scene)
     operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
@@ -218,7 +218,7 @@ class ContactSheet(_Render, bpy.types.Operator):
     def work(self, context: bpy.types.Context) -> None:
         png, lights = Path(bpy.path.abspath(self.filepath)), hdris(hdri_folder())
         if bpy.app.background:
-            from ..scene.sheet import contact_sheet
+            from ..scene.contact_sheet import contact_sheet
 
             contact_sheet(context.scene, png, lights, self.size, self.samples)
         else:

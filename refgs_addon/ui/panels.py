@@ -5,11 +5,11 @@ from pathlib import Path
 import bpy
 
 from .. import compat, jobs
-from ..nodes.splats import NAME as MODIFIER
-from ..scene.cameras import photo_shown
-from ..scene.parts import parts
+from ..nodes.splats_tree import NAME as MODIFIER
+from ..scene.camera_objects import photo_shown
+from ..scene.run_parts import parts
 from . import operators
-from .pictures import thumbnail
+from .icons import thumbnail
 
 
 class Tab:

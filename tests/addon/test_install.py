@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from refgs_addon import environment, jobs
+from refgs_addon import installation, jobs
 from tests.addon.bring import bring
 from tests.addon.waiting import until
 
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture
 def home(tmp_path, monkeypatch):
     """Where to install, with an add-on that brings a trainer and the fake uv."""
-    monkeypatch.setattr(environment, "WHEELS", bring(tmp_path))
+    monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     yield tmp_path / "user" / "trainer"
     jobs.stop_all()
 
@@ -50,20 +50,20 @@ def alive(pid):
 def test_an_installation_to_its_end(home, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/nowhere")
     monkeypatch.setenv("UV_DEFAULT_INDEX", "mirror")
-    assert environment.brought() == "9.9" and not environment.installed(home) and not environment.begun(home)
+    assert installation.brought() == "9.9" and not installation.installed(home) and not installation.begun(home)
     job = install(home)
     assert ended(job)[0] == "done" and job.ready["refgs"] == "9.9"
-    assert environment.installed(home) == "9.9" and environment.python(home).is_file()
+    assert installation.installed(home) == "9.9" and installation.python(home).is_file()
     until(lambda: not (home / "cache").exists())
-    assert not (home / "uv").exists() and not environment.begun(home)
+    assert not (home / "uv").exists() and not installation.begun(home)
     make, fill = calls(home)
-    assert make["words"][-4:] == ["venv", "--python", environment.PYTHONS, str(home / "env")]
+    assert make["words"][-4:] == ["venv", "--python", installation.PYTHONS, str(home / "env")]
     assert fill["words"][-1].endswith("refgs-9.9-py3-none-any.whl") and "--no-build" in fill["words"]
     variables = fill["variables"]
     assert variables["UV_DEFAULT_INDEX"] == "mirror" and variables["UV_TORCH_BACKEND"] == "auto"
     assert variables["UV_PYTHON_PREFERENCE"] == "only-managed" and "PYTHONPATH" not in variables
     assert "torch==2.14.0" in job.log.read_text()
-    asked = jobs.ask(environment.python(home), home.parent / "logs" / "trainer.txt")
+    asked = jobs.ask(installation.python(home), home.parent / "logs" / "trainer.txt")
     assert ended(asked)[0] == "done"
 
 
@@ -83,11 +83,11 @@ def test_progress_stopping_and_going_on(home, monkeypatch):
     job.stop()
     assert ended(job) == ("cancelled", "Stopped")
     until(lambda: not alive(calls(home)[-1]["pid"]))
-    assert environment.begun(home) and not environment.installed(home) and (home / "cache" / "torch").exists()
+    assert installation.begun(home) and not installation.installed(home) and (home / "cache" / "torch").exists()
     monkeypatch.delenv("FAKE_UV")
     half = home / "env" / "half"
     half.touch()
-    assert ended(install(home))[0] == "done" and environment.installed(home) == "9.9" and not half.exists()
+    assert ended(install(home))[0] == "done" and installation.installed(home) == "9.9" and not half.exists()
 
 
 def test_two_blenders_do_not_install_at_once(home, monkeypatch):
@@ -116,7 +116,7 @@ def test_killed_in_the_middle(home, monkeypatch, how):
         until(lambda: not alive(uv))
     else:
         os.kill(uv, signal.SIGKILL)
-    assert environment.begun(home)
+    assert installation.begun(home)
     monkeypatch.delenv("FAKE_UV")
     assert ended(install(home))[0] == "done"
 
@@ -136,50 +136,50 @@ def test_what_fails_is_said_in_one_line(home, monkeypatch, fate, line):
     monkeypatch.setenv("FAKE_UV", fate)
     job = install(home)
     assert ended(job) == ("failed", line.format(home=home)) and job.log.stat().st_size > 0
-    assert environment.begun(home)
+    assert installation.begun(home)
 
 
 def test_what_else_uv_may_say():
-    assert "none of for this machine" in environment.explain(
+    assert "none of for this machine" in installation.explain(
         "error: No solution found when resolving\n cause: torch", "/a"
     )
-    assert environment.explain("error: Access is denied. (os error 5)", "/a").startswith("/a cannot be written to")
-    assert environment.explain("error: something else", "/a") == ""
+    assert installation.explain("error: Access is denied. (os error 5)", "/a").startswith("/a cannot be written to")
+    assert installation.explain("error: something else", "/a") == ""
 
 
 def test_a_newer_release_goes_into_what_is_there(home, tmp_path, monkeypatch):
     ended(install(home))
     kept = home / "env" / "torch"
     kept.touch()
-    monkeypatch.setattr(environment, "WHEELS", bring(tmp_path, "9.10"))
-    assert environment.installed(home) == "9.9" and environment.brought() == "9.10"
-    assert ended(install(home))[0] == "done" and environment.installed(home) == "9.10" and kept.exists()
+    monkeypatch.setattr(installation, "WHEELS", bring(tmp_path, "9.10"))
+    assert installation.installed(home) == "9.9" and installation.brought() == "9.10"
+    assert ended(install(home))[0] == "done" and installation.installed(home) == "9.10" and kept.exists()
 
 
 def test_removing(home):
     ended(install(home))
     job = jobs.remove(home, home.parent / "logs" / "installation.txt")
-    assert ended(job)[0] == "done" and not home.exists() and not environment.installed(home)
+    assert ended(job)[0] == "done" and not home.exists() and not installation.installed(home)
     assert ended(jobs.remove(home, job.log))[0] == "done"
 
 
 def test_a_disk_that_is_too_full(home, monkeypatch):
-    assert environment.free(home) > 0  # of the folder above, while there is none yet
-    monkeypatch.setattr(environment, "free", lambda home: 1.2e9)
-    monkeypatch.setattr(environment.shutil, "which", lambda name: None)
-    said = environment.too_full(home)
+    assert installation.free(home) > 0  # of the folder above, while there is none yet
+    monkeypatch.setattr(installation, "free", lambda home: 1.2e9)
+    monkeypatch.setattr(installation.shutil, "which", lambda name: None)
+    said = installation.too_full(home)
     assert str(home) in said and "it needs about 2 GB; 1 GB are free" in said
-    monkeypatch.setattr(environment, "size", lambda folder: 1e9)  # half of it is here already
-    assert environment.too_full(home) == ""
-    monkeypatch.setattr(environment.shutil, "which", lambda name: f"/bin/{name}")
-    assert "it needs about 7 GB" in environment.too_full(home)
+    monkeypatch.setattr(installation, "size", lambda folder: 1e9)  # half of it is here already
+    assert installation.too_full(home) == ""
+    monkeypatch.setattr(installation.shutil, "which", lambda name: f"/bin/{name}")
+    assert "it needs about 7 GB" in installation.too_full(home)
 
 
 def test_a_clone_brings_no_trainer(monkeypatch, tmp_path):
-    monkeypatch.setattr(environment, "WHEELS", tmp_path)
-    assert environment.brought() == ""
+    monkeypatch.setattr(installation, "WHEELS", tmp_path)
+    assert installation.brought() == ""
 
 
 def test_the_pythons_are_those_of_the_package():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["requires-python"] == environment.PYTHONS
+    assert project["requires-python"] == installation.PYTHONS

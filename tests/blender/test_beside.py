@@ -9,8 +9,8 @@ from PIL import Image
 
 from refgs_addon import jobs
 from refgs_addon.errors import InputError
-from refgs_addon.scene.beside import render_beside
-from refgs_addon.scene.run import import_run
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.render_process import render_beside
 from tests.addon.waiting import until
 from tests.blender.runs import write_panorama
 

@@ -7,9 +7,9 @@ from plyfile import PlyData
 from refgs.export.splats import read_splats as backend_splats
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.export import edited_materials, export_splats
-from refgs_addon.scene.run import import_run
-from refgs_addon.scene.splats import read_constants
+from refgs_addon.scene.export_run import edited_materials, export_splats
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.splat_cloud import read_constants
 
 MATTE = {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
 

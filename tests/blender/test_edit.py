@@ -7,12 +7,12 @@ from mathutils import Matrix
 
 from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
-from refgs_addon.nodes.edit import AMOUNT, COLOR, SURFACE
+from refgs_addon.nodes.edit_tree import AMOUNT, COLOR, SURFACE
 from refgs_addon.scene.edit import add_edit, edits, remove_edit
-from refgs_addon.scene.materials import set_material
-from refgs_addon.scene.parts import show
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.material_presets import set_material
 from refgs_addon.scene.regions import crop
-from refgs_addon.scene.run import import_run
+from refgs_addon.scene.run_parts import show
 
 GOLD = (1.0, 0.766, 0.336), 1.0, 0.15  # base colour, metallic, roughness
 CHROME_ROUGHNESS = 0.02

@@ -13,8 +13,8 @@ from refgs.export.mesh import write_glb
 from refgs_addon import ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.export import export_mesh, export_run
-from refgs_addon.scene.run import data_blocks, import_run
+from refgs_addon.scene.export_run import export_mesh, export_run
+from refgs_addon.scene.import_run import data_blocks, import_run
 from tests.export.test_glb import make
 
 IMPORTERS = [

@@ -10,10 +10,10 @@ import pytest
 from refgs_addon import ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.export import SH_DC, edited_materials, export_light, export_mesh, export_run, export_splats
-from refgs_addon.scene.parts import show
-from refgs_addon.scene.run import import_run
-from refgs_addon.scene.splats import read_rows
+from refgs_addon.scene.export_run import SH_DC, edited_materials, export_light, export_mesh, export_run, export_splats
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.run_parts import show
+from refgs_addon.scene.splat_cloud import read_rows
 from tests.blender.runs import write_ply
 
 

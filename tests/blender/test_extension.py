@@ -42,10 +42,10 @@ def test_registers_and_draws_without_numpy():
         from types import SimpleNamespace
         import bpy
         from refgs_addon import ui
-        from refgs_addon.ui import pictures
+        from refgs_addon.ui import icons
         ui.register()
         job = SimpleNamespace(serial=1, curve=[(1.0, 20.0), (2.0, 21.0)], held_out=[])
-        assert pictures.curve(job) == 0
+        assert icons.curve(job) == 0
         ui.unregister()
         print("registered")
     """

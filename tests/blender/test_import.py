@@ -14,14 +14,14 @@ from refgs.errors import InputWarning
 from refgs.export.splats import read_splats as read_by_refgs
 from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
-from refgs_addon.nodes.splats import EXTENT, NAME
-from refgs_addon.scene.cameras import frame_camera, next_camera, photo_shown, show_photo
+from refgs_addon.nodes.splats_tree import EXTENT, NAME
+from refgs_addon.scene.camera_objects import frame_camera, next_camera, photo_shown, show_photo
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.export import export_mesh, export_splats
-from refgs_addon.scene.notes import newer
-from refgs_addon.scene.parts import parts, show
-from refgs_addon.scene.run import import_run
-from refgs_addon.scene.splats import MATERIALS, normal_slopes, read_splats
+from refgs_addon.scene.export_run import export_mesh, export_splats
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.run_parts import parts, show
+from refgs_addon.scene.run_toml import newer
+from refgs_addon.scene.splat_cloud import MATERIALS, normal_slopes, read_splats
 from tests.blender.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
 
 

@@ -8,11 +8,11 @@ import pytest
 
 from refgs_addon import ui
 from refgs_addon.errors import InputError
-from refgs_addon.nodes.world import IMAGE, ROTATION, STRENGTH
+from refgs_addon.nodes.panorama_world import IMAGE, ROTATION, STRENGTH
+from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.panorama import turn_between
-from refgs_addon.scene.relight import hdris, load_panorama, match_light, relight
-from refgs_addon.scene.run import import_run
-from refgs_addon.ui import light
+from refgs_addon.scene.world_light import hdris, load_panorama, match_light, relight
+from refgs_addon.ui import light_panel
 from tests.blender.runs import write_panorama
 
 
@@ -77,7 +77,7 @@ def test_blenders_own_and_the_artists_hdris_are_at_hand(scene, tmp_path):
 
 def test_the_chooser_says_and_sets_what_lights_the_scene(run_folder, scene, monkeypatch, tmp_path):
     write_panorama(tmp_path / "my room.exr", np.ones((8, 16, 3)))
-    monkeypatch.setattr(light, "hdri_folder", lambda: tmp_path)
+    monkeypatch.setattr(light_panel, "hdri_folder", lambda: tmp_path)
     ui.register()
     try:
         manager = bpy.context.window_manager

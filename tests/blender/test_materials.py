@@ -6,8 +6,15 @@ import pytest
 from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit, edits
-from refgs_addon.scene.materials import INPUTS, materials, read_material, remove_material, save_material, set_material
-from refgs_addon.scene.run import import_run
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.material_presets import (
+    INPUTS,
+    materials,
+    read_material,
+    remove_material,
+    save_material,
+    set_material,
+)
 
 OURS = ["Brushed Steel", "Chrome", "Clay", "Copper", "Glazed Ceramic", "Gold", "Polished", "Rubber", "Silver"]
 

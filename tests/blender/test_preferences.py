@@ -5,7 +5,7 @@ import sys
 import bpy
 import pytest
 
-from refgs_addon import environment, jobs, preferences, ui
+from refgs_addon import installation, jobs, preferences, ui
 from refgs_addon.errors import InputError
 from tests.addon.bring import bring
 from tests.addon.waiting import until
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is 
 @pytest.fixture
 def online(scene, tmp_path, monkeypatch):
     """The add-on, enabled, with a trainer to install, a folder of its own, and leave to use the network."""
-    monkeypatch.setattr(environment, "WHEELS", bring(tmp_path))
+    monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     monkeypatch.setattr(preferences, "_folder", lambda name: tmp_path / name)
     enabled = bpy.context.preferences.addons.new()
     enabled.module = preferences.PACKAGE
@@ -35,7 +35,7 @@ def test_installed_used_and_removed(online):
     job = preferences.installing()
     until(lambda: job.ended)
     assert preferences.state() == ("CHECKMARK", "RefGS 9.9, training on the processor: it is a fake")
-    assert preferences.set_up() and preferences.python() == environment.python(preferences.home())
+    assert preferences.set_up() and preferences.python() == installation.python(preferences.home())
     bpy.ops.refgs.ask_trainer()
     until(lambda: preferences.asked()[0].ended)
     assert preferences.state()[0] == "CHECKMARK"
@@ -51,7 +51,9 @@ def test_stopped_and_gone_on_with(online, monkeypatch):
     until(lambda: job.part > 0)
     bpy.ops.refgs.stop_installing()
     until(lambda: job.ended)
-    assert job.state == "cancelled" and environment.begun(preferences.home()) and "not set up" in preferences.state()[1]
+    assert (
+        job.state == "cancelled" and installation.begun(preferences.home()) and "not set up" in preferences.state()[1]
+    )
     monkeypatch.setenv("FAKE_UV", "network")
     bpy.ops.refgs.install_trainer()
     until(lambda: not preferences.installing())
@@ -76,10 +78,10 @@ def test_why_it_cannot_be_installed(online, python, monkeypatch, tmp_path):
     with pytest.raises(InputError, match="at work"):
         preferences.remove()
     jobs.stop_all()
-    monkeypatch.setattr(environment, "free", lambda home: 1e9)
+    monkeypatch.setattr(installation, "free", lambda home: 1e9)
     with pytest.raises(RuntimeError, match=r"too full \(it needs about"):
         bpy.ops.refgs.install_trainer()
-    monkeypatch.setattr(environment, "WHEELS", tmp_path)
+    monkeypatch.setattr(installation, "WHEELS", tmp_path)
     assert not bpy.ops.refgs.install_trainer.poll() and "brings no trainer" in preferences.why_no_installation()
 
 
@@ -89,5 +91,5 @@ def test_taken_away_while_it_installs(online, monkeypatch):
     job = preferences.installing()
     until(lambda: job.part > 0)
     ui.unregister()
-    assert job._process.wait(timeout=20) == 1 and not environment.installed(preferences.home())
+    assert job._process.wait(timeout=20) == 1 and not installation.installed(preferences.home())
     ui.register()

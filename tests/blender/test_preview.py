@@ -8,12 +8,12 @@ import pytest
 from mathutils import Matrix
 
 from refgs_addon.errors import InputError
-from refgs_addon.nodes.splats import NAME
-from refgs_addon.scene.cameras import add_camera
-from refgs_addon.scene.parts import show
-from refgs_addon.scene.preview import render_preview
-from refgs_addon.scene.relight import relight
-from refgs_addon.scene.run import import_run
+from refgs_addon.nodes.splats_tree import NAME
+from refgs_addon.scene.camera_objects import add_camera
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.render_eevee import render_preview
+from refgs_addon.scene.run_parts import show
+from refgs_addon.scene.world_light import relight
 from tests.blender.runs import COLUMNS, look_at, read_exr, write_panorama, write_ply
 
 SIZE = 64

@@ -6,11 +6,11 @@ import pytest
 from PIL import Image
 
 from refgs_addon.errors import InputError
-from refgs_addon.nodes.world import IMAGE, ROTATION, STRENGTH
-from refgs_addon.scene.preview import render_preview
-from refgs_addon.scene.relight import relight
-from refgs_addon.scene.run import import_run
-from refgs_addon.scene.sheet import GAP, contact_sheet
+from refgs_addon.nodes.panorama_world import IMAGE, ROTATION, STRENGTH
+from refgs_addon.scene.contact_sheet import GAP, contact_sheet
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.render_eevee import render_preview
+from refgs_addon.scene.world_light import relight
 from tests.blender.runs import write_panorama
 
 

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from refgs_addon import follow, jobs, preferences, ui
+from refgs_addon import job_timers, jobs, preferences, ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene import regions, training
-from refgs_addon.scene.cameras import photo_shown
-from refgs_addon.scene.capture import cameras_of
-from refgs_addon.scene.run import import_run
-from refgs_addon.scene.splats import read_rows
-from refgs_addon.ui import capture as capture_ui
+from refgs_addon.scene.camera_objects import photo_shown
+from refgs_addon.scene.capture_cameras import cameras_of
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.splat_cloud import read_rows
+from refgs_addon.ui import checked_capture
 from refgs_addon.ui.closing import question
-from refgs_addon.ui.pictures import CURVE, DOTS, GRID, LINE, plot
-from refgs_addon.ui.training import how_far_elsewhere
+from refgs_addon.ui.icons import CURVE, DOTS, GRID, LINE, plot
+from refgs_addon.ui.train_panel import how_far_elsewhere
 from tests.addon.waiting import until
 
 
@@ -180,8 +180,8 @@ class Drawn:
 def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
     job, number = checked
     drawn = Drawn()
-    monkeypatch.setattr(capture_ui, "thumbnail", drawn.thumbnail)  # without a window Blender gives no icons
-    capture_ui.draw_capture(drawn, addon, number, job)
+    monkeypatch.setattr(checked_capture, "thumbnail", drawn.thumbnail)  # without a window Blender gives no icons
+    checked_capture.draw_capture(drawn, addon, number, job)
     assert drawn.icons == [1, 2] and drawn.pressed == [False]
     assert drawn.pictures == [("0000.png", job.serial), ("0001.png", job.serial)]
     assert bpy.ops.refgs.show_cameras(number=number) == {"FINISHED"}
@@ -192,7 +192,7 @@ def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
     assert bpy.ops.refgs.next_camera() == {"FINISHED"}
     assert addon.camera == cameras.objects[1] and photo_shown(addon.camera) == 1
     assert addon.camera.data.background_images[0].image.filepath == str(capture / "1.png")
-    capture_ui.draw_capture(drawn, addon, number, job)
+    checked_capture.draw_capture(drawn, addon, number, job)
     assert drawn.pressed == [False, True]
     bpy.ops.refgs.show_cameras(number=number)
     assert cameras_of(addon, capture) is None and not bpy.data.cameras and addon.camera is None
@@ -392,7 +392,7 @@ def test_a_run_that_another_process_trains(addon, capture, tmp_path):
     run = job.run
     jobs.JOBS.clear()
     with FileLock(run / "run.lock"):
-        assert jobs.run_state(run) == "training" and follow._look_elsewhere() == follow.ELSEWHERE
+        assert jobs.run_state(run) == "training" and job_timers._look_elsewhere() == job_timers.ELSEWHERE
         (run / "progress.json").write_text('{"iteration": 250, "total": 1000, "seconds_left": 190.0}')
         assert how_far_elsewhere(run) == (0.25, "25%, 3:10 left")
         with pytest.raises(InputError, match="is being trained already"):
@@ -402,6 +402,6 @@ def test_a_run_that_another_process_trains(addon, capture, tmp_path):
         (run / "progress.json").unlink()
         (run / "splats.ply").touch()
         assert how_far_elsewhere(run)[1] == "Making the mesh"
-    assert jobs.run_state(run) == "finished" and follow._look_elsewhere() is None
+    assert jobs.run_state(run) == "finished" and job_timers._look_elsewhere() is None
     with pytest.raises(RuntimeError, match="is not being trained"):
         bpy.ops.refgs.stop_run(folder=str(run))

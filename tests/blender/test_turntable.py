@@ -8,7 +8,7 @@ import pytest
 
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.run import import_run
+from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.turntable import add_turntable
 
 

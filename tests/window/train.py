@@ -97,7 +97,7 @@ def work_with_it(folder):
     yield lambda: True, "photo"
     with view():
         bpy.ops.refgs.photo()
-    manager.refgs_light = next(str(file) for file in addon("scene.relight").hdris() if file.stem == "city")
+    manager.refgs_light = next(str(file) for file in addon("scene.world_light").hdris() if file.stem == "city")
     bpy.ops.refgs.match_light()
     yield lambda: True, "relit"
     bpy.ops.refgs.add_edit(where="Sphere", material="Gold")
@@ -124,14 +124,14 @@ def measured():
 
 def measure_ours():
     """Measure what the add-on does when no button was pressed: its timer, and its panels being drawn."""
-    follow = addon("follow")
-    look = follow._look
+    timers = addon("job_timers")
+    look = timers._look
 
     def measured_look():
         with measured():
             return look()
 
-    follow._look = measured_look
+    timers._look = measured_look
     for cls in addon("ui").CLASSES:
         if issubclass(cls, bpy.types.Panel):
             cls.draw = measured_draw(cls.draw)

@@ -5,7 +5,7 @@ from pathlib import Path
 import bpy
 
 from ..errors import InputError
-from ..nodes.world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama, panorama_world
+from ..nodes.panorama_world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama, panorama_world
 
 ENDINGS = (".exr", ".hdr")
 

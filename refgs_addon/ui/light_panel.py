@@ -9,10 +9,10 @@ from bpy.props import EnumProperty, FloatProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
 from ..errors import InputError
-from ..nodes.world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama
+from ..nodes.panorama_world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama
 from ..preferences import hdri_folder
-from ..scene.relight import hdris, match_light, relight
-from . import pictures
+from ..scene.world_light import hdris, match_light, relight
+from . import icons
 from .operators import Door
 from .panels import Tab
 
@@ -26,11 +26,11 @@ def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, 
     _listed.clear()
     if is_panorama(world) and world.get(RECOVERED) is not None:
         recovered = world[RECOVERED]
-        icon = pictures.thumbnail(Path(bpy.path.abspath(recovered.filepath)))
+        icon = icons.thumbnail(Path(bpy.path.abspath(recovered.filepath)))
         _listed.append(("RECOVERED", "Recovered", "The light that was recovered from the photos", icon, 0))
     files = hdris(hdri_folder())
     for file in files:
-        _listed.append((str(file), file.stem.capitalize(), str(file), pictures.thumbnail(file), _number(file)))
+        _listed.append((str(file), file.stem.capitalize(), str(file), icons.thumbnail(file), _number(file)))
     if _shown(world, files) == OTHER:
         name = shown.name if shown else "None"
         _listed.append(("OTHER", name, "What lights the scene now", 0, OTHER))

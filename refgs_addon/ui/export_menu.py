@@ -8,7 +8,7 @@ from bpy.props import StringProperty
 from bpy_extras.io_utils import ExportHelper
 
 from ..scene import training
-from ..scene.parts import FOLDER, active_run
+from ..scene.run_parts import FOLDER, active_run
 from .operators import Door, ImportRun, has_run, has_trainer
 
 
@@ -28,9 +28,11 @@ class _Export(Door, ExportHelper):
         return {"RUNNING_MODAL"}
 
     def work(self, context: bpy.types.Context) -> None:
-        from ..scene import export
+        from ..scene import export_run
 
-        write = {"splats": export.export_splats, "mesh": export.export_mesh, "light": export.export_light}[self.kind]
+        write = {"splats": export_run.export_splats, "mesh": export_run.export_mesh, "light": export_run.export_light}[
+            self.kind
+        ]
         write(active_run(context), Path(bpy.path.abspath(self.filepath)))
         self.report({"INFO"}, f"Wrote {self.filepath}")
 

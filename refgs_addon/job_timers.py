@@ -6,7 +6,7 @@ from pathlib import Path
 import bpy
 
 from . import jobs
-from .scene import live
+from .scene import live_splats
 
 EVERY = 0.2  # seconds between looks while there is a job, which cost microseconds when nothing was said
 LOOK = 4.0  # seconds between previews of a training
@@ -30,7 +30,7 @@ def _look() -> float | None:
         for job in jobs.JOBS:
             if job.run and job.state == "running" and job.progress and "train" not in job.results:
                 job.tell("preview")
-    live.update()
+    live_splats.update()
     if changed:
         redraw()
     return EVERY if any(not job.ended for job in jobs.JOBS) else None

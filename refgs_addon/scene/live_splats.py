@@ -8,7 +8,7 @@ import bpy
 
 from .. import compat, jobs
 from ..errors import InputError
-from ..nodes.splats import NAME
+from ..nodes.splats_tree import NAME
 
 
 @dataclass
@@ -30,7 +30,7 @@ def watch(job: jobs.Job, scene: bpy.types.Scene, on: bool = True) -> None:
     for live in [live for live in _shown if live.job is job]:
         _take_away(live)
     if on and not job.ended:
-        from .splats import add_splats
+        from .splat_cloud import add_splats
 
         name = f"{job.name} in training"
         item = add_splats(name, bpy.data.pointclouds.new(name), scene.collection)
@@ -61,7 +61,7 @@ def _read(path: Path) -> dict | None:
     """Flat splats: how they bend takes longer than all the rest."""
     import numpy as np
 
-    from .splats import read_splats, with_slopes
+    from .splat_cloud import read_splats, with_slopes
 
     try:
         splats, _ = read_splats(path)
@@ -72,7 +72,7 @@ def _read(path: Path) -> dict | None:
 
 
 def _put(live: _Live, values: dict) -> None:
-    from .splats import point_cloud
+    from .splat_cloud import point_cloud
 
     item = bpy.data.objects[live.item]
     before, item.data = item.data, point_cloud(item.name, values)

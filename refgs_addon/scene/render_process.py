@@ -9,11 +9,11 @@ import bpy
 
 from .. import jobs
 from ..errors import InputError
-from ..follow import follow
+from ..job_timers import follow
 from ..preferences import log_file
 
 ROOT = Path(__file__).resolve().parents[2]  # where the package refgs_addon is
-_START = "import sys; sys.path.insert(0, {root!r}); import refgs_addon.background as background; background.main()"
+_START = "import sys; sys.path.insert(0, {root!r}); import refgs_addon.render_worker as background; background.main()"
 _numbers = itertools.count()
 
 

@@ -7,11 +7,11 @@ from bl_ui.utils import PresetPanel
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from .. import compat
-from ..nodes.edit import REGIONS
+from ..nodes.edit_tree import REGIONS
 from ..scene.edit import add_edit, edits, remove_edit
-from ..scene.materials import PRESETS, ROOT, materials, remove_material, save_material, set_material
-from ..scene.parts import active_run, parts
-from .export import ApplyEdits
+from ..scene.material_presets import PRESETS, ROOT, materials, remove_material, save_material, set_material
+from ..scene.run_parts import active_run, parts
+from .export_menu import ApplyEdits
 from .operators import Door, choose, has_run
 from .panels import Tab
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from .. import compat
 from ..errors import InputError
-from ..nodes.materials import splat_material, values_material
-from ..nodes.splats import NAME, splats_tree
+from ..nodes.splat_material import splat_material, values_material
+from ..nodes.splats_tree import NAME, splats_tree
 
 MATERIALS = "albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"
 SURFACE = {

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import bpy
 
-from .cameras import PHOTO, add_camera, frame_camera, read_cameras
-from .parts import active_run
+from .camera_objects import PHOTO, add_camera, frame_camera, read_cameras
+from .run_parts import active_run
 
 CAPTURE = "refgs_capture"  # the custom property of a collection of a capture's cameras: the capture's folder
 

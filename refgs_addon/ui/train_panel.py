@@ -7,15 +7,15 @@ import bpy
 from bpy.props import IntProperty, StringProperty
 
 from .. import jobs, preferences
-from ..follow import follow_elsewhere
+from ..job_timers import follow_elsewhere
 from ..preferences import lines
-from ..scene import live, training
+from ..scene import live_splats, training
 from ..scene.regions import add_training_region, training_region
-from .capture import draw_capture
+from .checked_capture import draw_capture
 from .closing import Keep, StopRun
+from .icons import curve, picture
 from .operators import Door, choose, has_trainer, import_run_folder
 from .panels import Tab
-from .pictures import curve, picture
 
 
 def has_capture(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
@@ -133,7 +133,7 @@ class Watch(Door, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         job = jobs.JOBS[self.number]
-        live.watch(job, context.scene, not live.is_watched(job))
+        live_splats.watch(job, context.scene, not live_splats.is_watched(job))
 
 
 class PutAway(Door, bpy.types.Operator):
@@ -246,7 +246,7 @@ def _job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs
         _tell(row, number, command, command.title(), "PLAY" if command == "resume" else "PAUSE")
         _tell(row, number, "stop", "Finish", "CHECKMARK")
         _tell(row, number, "cancel", "Stop", "CANCEL")
-        watched = live.is_watched(job)
+        watched = live_splats.is_watched(job)
         icon = "HIDE_OFF" if watched else "HIDE_ON"
         box.operator(Watch.bl_idname, icon=icon, depress=watched).number = number
     elif not job.ended:

@@ -4,7 +4,7 @@ import bpy
 
 from ..compat import node_tree
 from . import add, math, out
-from .edit import AMOUNT
+from .edit_tree import AMOUNT
 
 VALUES_NAME = "RefGS Splat Values"
 COLOR, VECTOR, FACTOR = 0, 1, 2  # the outputs of an Attribute node; the third is Fac up to 4.5 and Factor in 5.2

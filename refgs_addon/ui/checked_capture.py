@@ -6,9 +6,9 @@ import bpy
 from bpy.props import IntProperty
 
 from .. import jobs
-from ..scene.capture import cameras_of, remove_cameras, show_cameras
+from ..scene.capture_cameras import cameras_of, remove_cameras, show_cameras
+from .icons import thumbnail
 from .operators import Door, choose
-from .pictures import thumbnail
 
 
 class ShowCameras(Door, bpy.types.Operator):

@@ -9,8 +9,8 @@ import sys
 import threading
 from pathlib import Path
 
-from .environment import end_with_input
 from .errors import InputError
+from .installation import end_with_input
 from .jobs import PROTOCOL
 
 
@@ -42,8 +42,8 @@ def main() -> None:
 def _render(command: dict, say) -> None:
     import bpy
 
-    from .scene.preview import render_preview
-    from .scene.sheet import contact_sheet
+    from .scene.contact_sheet import contact_sheet
+    from .scene.render_eevee import render_preview
 
     png, hdris = Path(command["png"]), [Path(hdri) for hdri in command["hdris"]]
     look = {"size": command["size"], "samples": command["samples"]}

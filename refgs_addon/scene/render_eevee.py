@@ -8,8 +8,8 @@ import bpy
 
 from .. import compat
 from ..errors import InputError
-from .cameras import frame_camera
-from .files import whole
+from .atomic_file import whole
+from .camera_objects import frame_camera
 
 
 def render_preview(

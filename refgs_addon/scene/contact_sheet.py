@@ -7,10 +7,10 @@ from pathlib import Path
 import bpy
 
 from ..errors import InputError
-from ..nodes.world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama
-from .files import whole
-from .preview import render_preview
-from .relight import relight
+from ..nodes.panorama_world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama
+from .atomic_file import whole
+from .render_eevee import render_preview
+from .world_light import relight
 
 GAP = 4  # pixels between pictures
 

@@ -8,7 +8,7 @@ from bl_operators.presets import AddPresetBase
 
 from .. import compat
 from ..errors import InputError
-from .files import whole
+from .atomic_file import whole
 
 ROOT = Path(__file__).resolve().parents[1]  # the add-on's own are in the folder of presets there
 PRESETS = "refgs_material"  # that folder's part with materials; the artist's has one of the same name

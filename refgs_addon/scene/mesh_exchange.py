@@ -8,9 +8,9 @@ import bpy
 from ..compat import node_tree, usd_keeps_textures
 from ..errors import InputError
 from ..nodes import add, out
-from ..nodes.materials import SPECULAR, principled
-from .files import whole
-from .run import add_mesh, data_blocks
+from ..nodes.splat_material import SPECULAR, principled
+from .atomic_file import whole
+from .import_run import add_mesh, data_blocks
 
 TEXTURES = "textures"  # beside a run's mesh.glb
 _PICTURES = {"base_color": "Base Color", "metallic": "Metallic", "roughness": "Roughness", "normal": "Normal"}

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.lib.recfunctions import append_fields
 
 from ..errors import InputError
-from ..nodes.splats import NAME as SPLATS
+from ..nodes.splats_tree import NAME as SPLATS
+from .atomic_file import whole
 from .edit import edits, splats_of
-from .exchange import TEXTURES, write_mesh
-from .files import whole
-from .parts import FOLDER
-from .splats import MATERIALS, PLY_TYPES, SH_DC, finite, read_constants, read_rows
+from .mesh_exchange import TEXTURES, write_mesh
+from .run_parts import FOLDER
+from .splat_cloud import MATERIALS, PLY_TYPES, SH_DC, finite, read_constants, read_rows
 
 KEPT = ("environment.exr", "cameras.json", "needs.json", "occluder.ply", "run.toml")
 DARK = 0.02  # base colour below which it does not tell how much light there is

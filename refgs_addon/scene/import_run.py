@@ -6,12 +6,12 @@ from pathlib import Path
 import bpy
 
 from ..errors import InputError
-from . import parts
-from .cameras import add_camera, frame_camera, light_of, read_cameras
-from .capture import hand_over
-from .notes import capture_of
-from .relight import light_with_recovered, load_panorama
-from .splats import add_splats, normal_slopes, point_cloud, read_constants, read_splats, with_slopes
+from . import run_parts
+from .camera_objects import add_camera, frame_camera, light_of, read_cameras
+from .capture_cameras import hand_over
+from .run_toml import capture_of
+from .splat_cloud import add_splats, normal_slopes, point_cloud, read_constants, read_splats, with_slopes
+from .world_light import light_with_recovered, load_panorama
 
 
 @dataclass
@@ -34,7 +34,7 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     """Import a run folder into a scene, in a new collection `RefGS NAME`.
 
     splats.ply must be there; mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be
-    missing. The mesh is hidden at first, for it is where the splats are: see `parts.show`. Cameras that `capture.show_cameras`
+    missing. The mesh is hidden at first, for it is where the splats are: see `run_parts.show`. Cameras that `capture.show_cameras`
     added of the same capture make way for the run's. Raises InputError, and then leaves the file as it was.
     """
     folder = Path(folder)
@@ -47,12 +47,12 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     before, world, camera = data_blocks(), scene.world, scene.camera
     try:
         collection = bpy.data.collections.new(f"RefGS {name}")
-        collection[parts.FOLDER] = str(folder.resolve())
+        collection[run_parts.FOLDER] = str(folder.resolve())
         scene.collection.children.link(collection)
         cloud = point_cloud(f"{name} splats", with_slopes(splats, *normal_slopes(splats)))
         drawn = add_splats(cloud.name, cloud, collection, read_constants(folder / "splats.ply"))
         run = Run(collection, drawn, left_out)
-        run.splats[parts.KEY] = "splats"
+        run.splats[run_parts.KEY] = "splats"
         if (folder / "mesh.glb").exists():
             run.mesh = add_mesh(folder / "mesh.glb", f"{name} mesh", collection)
         if (folder / "environment.exr").exists():
@@ -66,7 +66,7 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
             run.cameras = {frame["name"]: add_camera(frame, cameras) for frame in frames}
             if scene.camera is None:
                 frame_camera(scene, next(iter(run.cameras.values())))
-        parts.show(collection, "splats")
+        run_parts.show(collection, "splats")
     except BaseException:
         scene.world, scene.camera = world, camera
         bpy.data.batch_remove(data_blocks() - before)
@@ -94,7 +94,7 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
             other.objects.unlink(item)
         collection.objects.link(item)
         item.name = item.data.name = name
-        item[parts.KEY] = "mesh"
+        item[run_parts.KEY] = "mesh"
     bpy.data.batch_remove(set(added) - set(meshes))
     if not meshes:
         raise InputError(f"{path} has no mesh in it: export the run again")
