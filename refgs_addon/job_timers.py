@@ -1,5 +1,4 @@
-"""Timers: one takes in what the jobs say, and has the window drawn anew where that changed anything; one looks after runs that other
-processes train."""
+"""Timers: one polls the jobs and redraws the window after a change, one follows trainings of other processes."""
 
 from pathlib import Path
 
@@ -8,61 +7,60 @@ import bpy
 from . import jobs
 from .scene import live_splats
 
-EVERY = 0.2  # seconds between looks while there is a job, which cost microseconds when nothing was said
-LOOK = 4.0  # seconds between previews of a training
-ELSEWHERE = 2.0  # seconds between looks at runs that others train
+POLL_SECONDS = 0.2  # a poll without news costs microseconds
+PREVIEW_SECONDS = 4.0  # between the previews of a training
+OTHER_SECONDS = 2.0  # between looks at runs that other processes train
 
-_since_look = 0.0
-
-
-def follow() -> None:
-    """Look at the jobs from now on, until all have ended."""
-    if not bpy.app.timers.is_registered(_look):
-        bpy.app.timers.register(_look, first_interval=EVERY, persistent=True)
+_since_preview = 0.0
 
 
-def _look() -> float | None:
-    global _since_look
-    _since_look += EVERY
+def follow_jobs() -> None:
+    """Poll the jobs until all have ended."""
+    if not bpy.app.timers.is_registered(_poll_jobs):
+        bpy.app.timers.register(_poll_jobs, first_interval=POLL_SECONDS, persistent=True)
+
+
+def _poll_jobs() -> float | None:
+    global _since_preview
+    _since_preview += POLL_SECONDS
     changed = jobs.poll()
-    if _since_look >= LOOK:
-        _since_look = 0.0
+    if _since_preview >= PREVIEW_SECONDS:
+        _since_preview = 0.0
         for job in jobs.JOBS:
             if job.run and job.state == "running" and job.progress and "train" not in job.results:
                 job.tell("preview")
     live_splats.update()
     if changed:
         redraw()
-    return EVERY if any(not job.ended for job in jobs.JOBS) else None
+    return POLL_SECONDS if any(not job.ended for job in jobs.JOBS) else None
 
 
-def follow_elsewhere() -> None:
-    """Draw the panel anew now and then, as long as a process that is not of this Blender trains a run that is listed."""
-    if not bpy.app.timers.is_registered(_look_elsewhere):
-        bpy.app.timers.register(_look_elsewhere, first_interval=ELSEWHERE, persistent=True)
+def follow_other_processes() -> None:
+    """Redraw the panel every other second while another process trains a listed run."""
+    if not bpy.app.timers.is_registered(_poll_other_processes):
+        bpy.app.timers.register(_poll_other_processes, first_interval=OTHER_SECONDS, persistent=True)
 
 
-def _look_elsewhere() -> float | None:
+def _poll_other_processes() -> float | None:
     listed = {Path(known.folder) for scene in bpy.data.scenes for known in scene.refgs.runs}
     others = listed - {job.run for job in jobs.JOBS if not job.ended}
-    trained = any(jobs.run_state(folder) == "training" for folder in others)
     redraw()
-    return ELSEWHERE if trained else None
+    return OTHER_SECONDS if any(jobs.run_state(folder) == "training" for folder in others) else None
 
 
 def redraw() -> None:
-    """Draw the panel, the preferences and the status bar anew."""
+    """Redraw the panel, the preferences and the status bar."""
     manager = bpy.context.window_manager
     for window in manager.windows if manager else ():
         for area in window.screen.areas:
             if area.type in ("VIEW_3D", "PREFERENCES"):
                 area.tag_redraw()
-        window.workspace.status_text_set_internal(None)  # the bar is no area that could be tagged
+        window.workspace.status_text_set_internal(None)  # the status bar is no area that could be tagged
 
 
 def unregister() -> None:
-    """Follow no longer, and end the jobs cleanly but those that are kept."""
-    for timer in (_look, _look_elsewhere):
+    """Stop the timers, and end all jobs cleanly except those that are kept."""
+    for timer in (_poll_jobs, _poll_other_processes):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     jobs.stop_all()

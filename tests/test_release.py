@@ -63,10 +63,10 @@ def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
 
     until(done, seconds=2900)
     assert job.state == "done", job.line + "\n" + job.log.read_text()[-3000:]
-    print("\n".join(lines), f"\n{installation.size(home) / installation.GB:.2f} GB")
-    assert job.ready["refgs"] == installation.brought() == installation.installed(home)
+    print("\n".join(lines), f"\n{installation.folder_bytes(home) / installation.GB:.2f} GB")
+    assert job.ready["refgs"] == installation.bundled_version() == installation.installed(home)
     assert any(line.startswith("Fetching ") for line in lines)
-    asked = jobs.ask(installation.python(home), tmp_path / "asked.txt")
+    asked = jobs.query_trainer(installation.python(home), tmp_path / "asked.txt")
     until(lambda: asked.ended, seconds=200)
     assert asked.state == "done" and asked.ready == job.ready
     program = "from refgs.settings import load_settings; print(load_settings('quick').train.iterations)"

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Atomic writes: a file is written completely or not at all."""
 
 import contextlib
 import os
@@ -9,16 +9,16 @@ from ..errors import InputError
 
 
 @contextlib.contextmanager
-def whole(path: Path) -> Iterator[Path]:
-    """A file beside, to be written, that then becomes the one that is meant. Raises InputError where that cannot be."""
-    # The ending stays last: Blender adds it where it does not see it.
+def atomic_write(path: Path) -> Iterator[Path]:
+    """Yield a temporary file beside `path`, then rename it to `path`. Raises InputError where a write fails."""
+    # Keep the extension last: Blender appends a missing one.
     temporary = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
-    except (RuntimeError, OSError) as error:  # Blender's own writing raises the first
-        reason = getattr(error, "strerror", None) or "is its folder there, with room on the disk?"
+    except (RuntimeError, OSError) as error:  # Blender's own writers raise RuntimeError
+        reason = getattr(error, "strerror", None) or "does its folder exist, and has the disk free space?"
         raise InputError(f"cannot write {path}: {reason}") from None
     finally:
-        with contextlib.suppress(OSError):  # as where its folder is no folder
+        with contextlib.suppress(OSError):  # its parent may be a file
             temporary.unlink(missing_ok=True)

@@ -17,35 +17,24 @@ from . import (
     trainer_buttons,
 )
 
-_WITH_CLASSES = (
-    preferences,
-    properties,
-    operators,
-    trainer_buttons,
-    checked_capture,
-    train_panel,
-    closing,
-    panels,
-    materials_panel,
-    light_panel,
-    export_menu,
-    drop,
-)
-CLASSES = [cls for module in _WITH_CLASSES for cls in module.CLASSES]
-_WITH_STATE = (properties, icons, materials_panel, light_panel, export_menu, train_panel, closing)
+_MODULES = (preferences, properties, operators, trainer_buttons, icons, checked_capture, train_panel, closing, panels)
+_MODULES += (materials_panel, light_panel, export_menu, drop)
+CLASSES = [cls for module in _MODULES for cls in getattr(module, "CLASSES", ())]
 
 
 def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
-    for module in _WITH_STATE:
-        module.register()
+    for module in _MODULES:
+        if hasattr(module, "register"):
+            module.register()
 
 
 def unregister() -> None:
-    preferences.forget()
+    preferences.forget_queries()
     job_timers.unregister()
-    for module in reversed(_WITH_STATE):
-        module.unregister()
+    for module in reversed(_MODULES):
+        if hasattr(module, "unregister"):
+            module.unregister()
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -1,4 +1,4 @@
-"""The RefGS tab in the 3D viewport's sidebar."""
+"""Run and Preview panels, and the RefGS tab in the 3D view's sidebar that all panels are in."""
 
 from pathlib import Path
 
@@ -88,7 +88,7 @@ class PreviewPanel(Tab, bpy.types.Panel):
             box.label(text=job.line)
             box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
         else:
-            box.progress(factor=job.part, text=job.line)
+            box.progress(factor=job.fraction, text=job.line)
 
 
 CLASSES = (RunPanel, PreviewPanel)

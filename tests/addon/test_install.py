@@ -50,12 +50,16 @@ def alive(pid):
 def test_an_installation_to_its_end(home, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/nowhere")
     monkeypatch.setenv("UV_DEFAULT_INDEX", "mirror")
-    assert installation.brought() == "9.9" and not installation.installed(home) and not installation.begun(home)
+    assert (
+        installation.bundled_version() == "9.9"
+        and not installation.installed(home)
+        and not installation.interrupted(home)
+    )
     job = install(home)
     assert ended(job)[0] == "done" and job.ready["refgs"] == "9.9"
     assert installation.installed(home) == "9.9" and installation.python(home).is_file()
     until(lambda: not (home / "cache").exists())
-    assert not (home / "uv").exists() and not installation.begun(home)
+    assert not (home / "uv").exists() and not installation.interrupted(home)
     make, fill = calls(home)
     assert make["words"][-4:] == ["venv", "--python", installation.PYTHONS, str(home / "env")]
     assert fill["words"][-1].endswith("refgs-9.9-py3-none-any.whl") and "--no-build" in fill["words"]
@@ -63,7 +67,7 @@ def test_an_installation_to_its_end(home, monkeypatch):
     assert variables["UV_DEFAULT_INDEX"] == "mirror" and variables["UV_TORCH_BACKEND"] == "auto"
     assert variables["UV_PYTHON_PREFERENCE"] == "only-managed" and "PYTHONPATH" not in variables
     assert "torch==2.14.0" in job.log.read_text()
-    asked = jobs.ask(installation.python(home), home.parent / "logs" / "trainer.txt")
+    asked = jobs.query_trainer(installation.python(home), home.parent / "logs" / "trainer.txt")
     assert ended(asked)[0] == "done"
 
 
@@ -78,12 +82,12 @@ def test_what_the_studio_has_set_stays(home, monkeypatch):
 def test_progress_stopping_and_going_on(home, monkeypatch):
     monkeypatch.setenv("FAKE_UV", "hang")
     job = install(home)
-    until(lambda: job.part > 0)
-    assert job.line.startswith("Fetching torch (850.5MiB) and 1 more: 0.1 of about ") and 0.005 < job.part < 0.03
+    until(lambda: job.fraction > 0)
+    assert job.line.startswith("Fetching torch (850.5MiB) and 1 more: 0.1 of about ") and 0.005 < job.fraction < 0.03
     job.stop()
     assert ended(job) == ("cancelled", "Stopped")
     until(lambda: not alive(calls(home)[-1]["pid"]))
-    assert installation.begun(home) and not installation.installed(home) and (home / "cache" / "torch").exists()
+    assert installation.interrupted(home) and not installation.installed(home) and (home / "cache" / "torch").exists()
     monkeypatch.delenv("FAKE_UV")
     half = home / "env" / "half"
     half.touch()
@@ -93,10 +97,10 @@ def test_progress_stopping_and_going_on(home, monkeypatch):
 def test_two_blenders_do_not_install_at_once(home, monkeypatch):
     monkeypatch.setenv("FAKE_UV", "hang")
     first = install(home)
-    until(lambda: first.part > 0)
+    until(lambda: first.fraction > 0)
     for second in (install(home), jobs.remove(home, home.parent / "logs" / "removal.txt")):
         state, line = ended(second)
-        assert state == "failed" and line.startswith("another Blender installs the trainer")
+        assert state == "failed" and line.startswith("another Blender installs or removes the trainer")
     assert not first.ended and (home / "cache" / "torch").exists()
 
 
@@ -104,19 +108,19 @@ def test_two_blenders_do_not_install_at_once(home, monkeypatch):
 def test_killed_in_the_middle(home, monkeypatch, how):
     monkeypatch.setenv("FAKE_UV", "hang")
     job = install(home)
-    until(lambda: job.part > 0)
+    until(lambda: job.fraction > 0)
     if how == "Blender":  # of whose end the process hears as its input ends
         job._process.stdin.close()
     else:
         job._process.send_signal(signal.SIGKILL)
     state, line = ended(job)
-    assert state == "failed" and "its log says more" in line
+    assert state == "failed" and "see its log" in line
     uv = calls(home)[-1]["pid"]
     if how == "Blender":
         until(lambda: not alive(uv))
     else:
         os.kill(uv, signal.SIGKILL)
-    assert installation.begun(home)
+    assert installation.interrupted(home)
     monkeypatch.delenv("FAKE_UV")
     assert ended(install(home))[0] == "done"
 
@@ -126,25 +130,25 @@ def test_killed_in_the_middle(home, monkeypatch, how):
     [
         (
             "network",
-            "wheels.example cannot be reached: see to the connection, or have the firewall allow it, and go on",
+            "wheels.example cannot be reached: check the connection and the firewall, and resume",
         ),
-        ("full", "the disk that {home} is on is full: free some of it and go on"),
-        ("mute", "all is installed, but the trainer does not start on this machine: the log says why"),
+        ("full", "the disk of {home} is full: free some space and resume"),
+        ("mute", "the trainer is installed but does not start on this machine: see the log"),
     ],
 )
 def test_what_fails_is_said_in_one_line(home, monkeypatch, fate, line):
     monkeypatch.setenv("FAKE_UV", fate)
     job = install(home)
     assert ended(job) == ("failed", line.format(home=home)) and job.log.stat().st_size > 0
-    assert installation.begun(home)
+    assert installation.interrupted(home)
 
 
 def test_what_else_uv_may_say():
-    assert "none of for this machine" in installation.explain(
+    assert "does not exist for this machine" in installation.explain_uv_error(
         "error: No solution found when resolving\n cause: torch", "/a"
     )
-    assert installation.explain("error: Access is denied. (os error 5)", "/a").startswith("/a cannot be written to")
-    assert installation.explain("error: something else", "/a") == ""
+    assert installation.explain_uv_error("error: Access is denied. (os error 5)", "/a").startswith("cannot write to /a")
+    assert installation.explain_uv_error("error: something else", "/a") == ""
 
 
 def test_a_newer_release_goes_into_what_is_there(home, tmp_path, monkeypatch):
@@ -152,7 +156,7 @@ def test_a_newer_release_goes_into_what_is_there(home, tmp_path, monkeypatch):
     kept = home / "env" / "torch"
     kept.touch()
     monkeypatch.setattr(installation, "WHEELS", bring(tmp_path, "9.10"))
-    assert installation.installed(home) == "9.9" and installation.brought() == "9.10"
+    assert installation.installed(home) == "9.9" and installation.bundled_version() == "9.10"
     assert ended(install(home))[0] == "done" and installation.installed(home) == "9.10" and kept.exists()
 
 
@@ -164,20 +168,20 @@ def test_removing(home):
 
 
 def test_a_disk_that_is_too_full(home, monkeypatch):
-    assert installation.free(home) > 0  # of the folder above, while there is none yet
-    monkeypatch.setattr(installation, "free", lambda home: 1.2e9)
+    assert installation.free_bytes(home) > 0  # of the folder above, while there is none yet
+    monkeypatch.setattr(installation, "free_bytes", lambda home: 1.2e9)
     monkeypatch.setattr(installation.shutil, "which", lambda name: None)
-    said = installation.too_full(home)
+    said = installation.disk_full_line(home)
     assert str(home) in said and "it needs about 2 GB; 1 GB are free" in said
-    monkeypatch.setattr(installation, "size", lambda folder: 1e9)  # half of it is here already
-    assert installation.too_full(home) == ""
+    monkeypatch.setattr(installation, "folder_bytes", lambda folder: 1e9)  # half of it is here already
+    assert installation.disk_full_line(home) == ""
     monkeypatch.setattr(installation.shutil, "which", lambda name: f"/bin/{name}")
-    assert "it needs about 7 GB" in installation.too_full(home)
+    assert "it needs about 7 GB" in installation.disk_full_line(home)
 
 
 def test_a_clone_brings_no_trainer(monkeypatch, tmp_path):
     monkeypatch.setattr(installation, "WHEELS", tmp_path)
-    assert installation.brought() == ""
+    assert installation.bundled_version() == ""
 
 
 def test_the_pythons_are_those_of_the_package():

@@ -81,5 +81,5 @@ def test_a_column_has_the_last_word(run_folder):
     assert read_constants(file) == {} and backend_splats(file).constants == {}
     say_once(run_folder, {"metallic": 0.25})
     file.write_bytes(file.read_bytes().replace(b"metallic 0.25", b"metallic much", 1))
-    with pytest.raises(InputError, match="metallic is much"):
+    with pytest.raises(InputError, match="metallic is much, not a number"):
         read_constants(file)

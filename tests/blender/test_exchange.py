@@ -107,14 +107,14 @@ def test_what_is_in_the_way_is_said_in_one_line(textured, scene, tmp_path, endin
     with pytest.raises(InputError, match=r"cannot write .*b\."):
         export_mesh(run.collection, tmp_path / f"b{ending}")
     (folder / "textures" / "metallic.png").unlink()
-    with pytest.raises(InputError, match=r"metallic\.png is not there: make the run's mesh again"):
+    with pytest.raises(InputError, match=r"metallic\.png does not exist: make the run's mesh again"):
         export_mesh(run.collection, tmp_path / f"a{ending}")
     (folder / "mesh.glb").unlink()
     with pytest.raises(InputError, match="make the run's mesh first"):
         export_mesh(run.collection, tmp_path / f"a{ending}")
     assert data_blocks() == before
     add_edit(run.collection)
-    with pytest.raises(InputError, match="without the edits"):
+    with pytest.raises(InputError, match="lacks the edits"):
         export_mesh(run.collection, tmp_path / f"a{ending}")
     assert not (tmp_path / f"a{ending}").exists()
 

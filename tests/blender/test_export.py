@@ -89,7 +89,7 @@ def test_without_edits_the_mesh_comes_along(run, tmp_path, scene):
     export_mesh(run.collection, tmp_path / "a.glb")
     export_light(run.collection, tmp_path / "a.exr")
     add_edit(run.collection)
-    with pytest.raises(InputError, match="without the edits"):
+    with pytest.raises(InputError, match="lacks the edits"):
         export_mesh(run.collection, tmp_path / "b.glb")
 
 
@@ -102,7 +102,7 @@ def test_what_is_not_there_is_said_in_one_line(run, run_folder, tmp_path):
     with pytest.raises(InputError, match="has no light"):
         export_light(run.collection, tmp_path / "a.exr")
     shutil.rmtree(run_folder)
-    with pytest.raises(InputError, match="import it again from where it is now"):
+    with pytest.raises(InputError, match="import it again from its new place"):
         export_splats(run.collection, tmp_path / "a.ply")
     assert list(tmp_path.iterdir()) == []
 

@@ -45,7 +45,7 @@ def test_registers_and_draws_without_numpy():
         from refgs_addon.ui import icons
         ui.register()
         job = SimpleNamespace(serial=1, curve=[(1.0, 20.0), (2.0, 21.0)], held_out=[])
-        assert icons.curve(job) == 0
+        assert icons.curve_icon(job) == 0
         ui.unregister()
         print("registered")
     """
@@ -111,7 +111,7 @@ def test_dropped_files_stand_for_their_folders(run_folder, addon, tmp_path):
     assert bpy.data.objects["pot splats"]
     bpy.ops.refgs.drop_capture(filepath=str(tmp_path / "transforms_train.json"))
     assert addon.refgs.capture == str(tmp_path)
-    with pytest.raises(RuntimeError, match=r"^Error: settings\.json is no transforms"):
+    with pytest.raises(RuntimeError, match=r"^Error: settings\.json is not a transforms"):
         bpy.ops.refgs.drop_capture(filepath=str(tmp_path / "settings.json"))
 
 

@@ -20,7 +20,7 @@ from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import export_mesh, export_splats
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import parts, show
-from refgs_addon.scene.run_toml import newer
+from refgs_addon.scene.run_toml import newer_release
 from refgs_addon.scene.splat_cloud import MATERIALS, normal_slopes, read_splats
 from tests.blender.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
 
@@ -59,9 +59,9 @@ def test_a_light_that_turned_is_said_to(run_folder, scene):
 )
 def test_a_run_of_a_newer_release(run_folder, made_by, is_newer):
     (run_folder / "run.toml").write_text(f"[run]\nrefgs = {made_by}\n")
-    assert newer(run_folder) == (json.loads(made_by) if is_newer else "")
+    assert newer_release(run_folder) == (json.loads(made_by) if is_newer else "")
     (run_folder / "run.toml").unlink()
-    assert newer(run_folder) == ""
+    assert newer_release(run_folder) == ""
 
 
 def test_points_hold_what_the_file_holds(run_folder, scene):
@@ -208,7 +208,7 @@ def test_splats_that_are_not_finite_are_left_out(run_folder, scene, tmp_path, ca
     ui.register()
     try:
         bpy.ops.refgs.import_run(directory=f"{run_folder}/")
-        assert "5 splats with numbers that are not finite are left out" in capfd.readouterr().out
+        assert "5 splats with values that are not finite were left out" in capfd.readouterr().out
     finally:
         ui.unregister()
     run = import_run(run_folder, scene)
@@ -236,7 +236,7 @@ def test_edits_of_what_has_no_materials_cannot_be_written(scene, tmp_path):
     (tmp_path / "other").mkdir()
     write_ply(tmp_path / "other" / "splats.ply", others(3, True))
     run = import_run(tmp_path / "other", scene)
-    with pytest.raises(InputError, match=r"has no materials that edits could be written to: make one .* --splats"):
+    with pytest.raises(InputError, match=r"has no materials to edit: add them .* --splats"):
         export_splats(run.collection, tmp_path / "edited.ply")
     assert not (tmp_path / "edited.ply").exists()
 
@@ -329,7 +329,7 @@ def test_a_photo_that_is_gone_is_said_in_one_line(run_folder, scene, tmp_path):
     with_photos(run_folder, tmp_path / "capture")
     run = import_run(run_folder, scene)
     (tmp_path / "capture" / "photos" / "front.png").unlink()
-    with pytest.raises(InputError, match=r"front\.png is not there: put the capture back"):
+    with pytest.raises(InputError, match=r"front\.png does not exist: move the capture back"):
         show_photo(run.cameras["front.001"] if "front.001" in run.cameras else run.cameras["front"])
 
 
@@ -416,20 +416,20 @@ def bent_camera(path):
     ("name", "spoil", "says"),
     [
         ("splats.ply", lambda path: path.unlink(), "cannot read"),
-        ("splats.ply", cut, "cut short"),
-        ("splats.ply", no_number, "head that is broken"),
-        ("splats.ply", twice, "head that is broken"),
+        ("splats.ply", cut, "truncated"),
+        ("splats.ply", no_number, "broken header"),
+        ("splats.ply", twice, "broken header"),
         ("splats.ply", negative, "is empty"),
         ("splats.ply", without_properties, "is empty"),
-        ("splats.ply", listed, "is not a PLY file of splats"),
-        ("splats.ply", other_first, "is not a PLY file of splats"),
-        ("splats.ply", unknown_type, "head that is broken"),
+        ("splats.ply", listed, "is not a PLY of splats"),
+        ("splats.ply", other_first, "is not a PLY of splats"),
+        ("splats.ply", unknown_type, "broken header"),
         ("splats.ply", not_json, "not a binary little-endian PLY"),
-        ("splats.ply", infinite, "holds no splat whose numbers are all finite"),
+        ("splats.ply", infinite, "has no splat with finite values"),
         ("splats.ply", without_materials, "has no metallic, roughness"),
         ("cameras.json", not_json, "not the cameras.json"),
         ("cameras.json", bent_camera, "not the cameras.json"),
-        ("environment.exr", not_json, "not a whole EXR"),
+        ("environment.exr", not_json, "not a complete EXR"),
         ("mesh.glb", cut, "glTF"),
     ],
 )

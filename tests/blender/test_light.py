@@ -10,7 +10,7 @@ from refgs_addon import ui
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.panorama_world import IMAGE, ROTATION, STRENGTH
 from refgs_addon.scene.import_run import import_run
-from refgs_addon.scene.panorama import turn_between
+from refgs_addon.scene.panorama import best_rotation
 from refgs_addon.scene.world_light import hdris, load_panorama, match_light, relight
 from refgs_addon.ui import light_panel
 from tests.blender.runs import write_panorama
@@ -40,11 +40,11 @@ def test_the_turn_between_two_panoramas_is_found(turn, scene, tmp_path):
     write_panorama(tmp_path / "a.exr", panorama(0))
     write_panorama(tmp_path / "b.exr", 2.5 * panorama(turn))
     a, b = (load_panorama(tmp_path / f"{name}.exr") for name in "ab")
-    found, scale = turn_between(a, b)
+    found, scale = best_rotation(a, b)
     assert abs((found - turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(0.5)
     assert scale == pytest.approx(2.5, rel=0.01)
     write_panorama(tmp_path / "finer.exr", 2.5 * room(100)(turn))  # another size, no whole multiple of any
-    found, scale = turn_between(a, load_panorama(tmp_path / "finer.exr"))
+    found, scale = best_rotation(a, load_panorama(tmp_path / "finer.exr"))
     assert abs((found - turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(1)
     assert scale == pytest.approx(2.5, rel=0.02)
 

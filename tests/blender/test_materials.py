@@ -63,11 +63,11 @@ def test_one_is_saved_used_and_removed(edit, own):
 
 def test_what_cannot_be_is_said_and_leaves_all_as_it_was(edit, own):
     ours = read_material("Gold")
-    for name, said in (("gold", "gold already"), ("Brushed_Steel", "already"), (" ", "type one first")):
+    for name, said in (("gold", "gold exists already"), ("Brushed_Steel", "already"), (" ", "type one first")):
         with pytest.raises(InputError, match=said):
             save_material(edit, name)
     for name in ("Gold", "Nothing"):
-        with pytest.raises(InputError, match="stays"):
+        with pytest.raises(InputError, match="only those can be removed"):
             remove_material(name)
     assert read_material("Gold") == ours and not own.exists()
     own.mkdir(parents=True)
@@ -77,10 +77,10 @@ def test_what_cannot_be_is_said_and_leaves_all_as_it_was(edit, own):
         lambda: set_material(edit, "Broken"),
         lambda: add_edit(edit.id_data.users_collection[0], "Box", "Broken"),
     ):
-        with pytest.raises(InputError, match=r"Broken\.py cannot be read .*save it anew"):
+        with pytest.raises(InputError, match=r"Broken\.py cannot be read .*save it again"):
             call()
     assert len(edits(edit.id_data)) == count and values(edit)["Metallic"] == before
-    with pytest.raises(InputError, match="there is no material Marble: take one of Broken"):
+    with pytest.raises(InputError, match="there is no material Marble: choose one of Broken"):
         set_material(edit, "Marble")
 
 
@@ -113,7 +113,7 @@ def test_the_buttons(edit, own):
         with pytest.raises(RuntimeError, match="already"):
             bpy.ops.refgs.keep_material(**which, name="Steel of mine")
         bpy.ops.refgs.keep_material(name="Steel of mine", remove_name=True)
-        with pytest.raises(RuntimeError, match="stays"):
+        with pytest.raises(RuntimeError, match="only those can be removed"):
             bpy.ops.refgs.keep_material(name="Gold", remove_name=True)
         assert list(materials()) == OURS
     finally:

@@ -47,7 +47,7 @@ def test_a_view_under_each_light(run_folder, scene, tmp_path):
 def test_without_lights_or_a_place_to_write(run_folder, scene, tmp_path):
     (run_folder / "environment.exr").unlink()
     import_run(run_folder, scene)
-    with pytest.raises(InputError, match="no light to show"):
+    with pytest.raises(InputError, match="no light to render under"):
         contact_sheet(scene, tmp_path / "a.png", [])
     write_panorama(tmp_path / "grey.exr", np.ones((8, 16, 3)))
     with pytest.raises(InputError, match="cannot write"):

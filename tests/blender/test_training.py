@@ -18,9 +18,9 @@ from refgs_addon.scene.capture_cameras import cameras_of
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.splat_cloud import read_rows
 from refgs_addon.ui import checked_capture
-from refgs_addon.ui.closing import question
+from refgs_addon.ui.closing import quit_question
 from refgs_addon.ui.icons import CURVE, DOTS, GRID, LINE, plot
-from refgs_addon.ui.train_panel import how_far_elsewhere
+from refgs_addon.ui.train_panel import other_process_status
 from tests.addon.waiting import until
 
 
@@ -45,13 +45,13 @@ def capture(addon, tmp_path):
 
 
 def test_the_trainer_is_asked_when_it_is_chosen(addon):
-    assert preferences.state()[1] == "Asking …"
+    assert preferences.status()[1] == "Querying …"
     until(lambda: all(job.ended for job in jobs.JOBS))
-    assert preferences.state() == ("CHECKMARK", "RefGS 9.9, training on the processor: it is a fake")
+    assert preferences.status() == ("CHECKMARK", "RefGS 9.9, training on the processor: it is a fake")
     preferences.preferences().python = "/no/python"
-    assert preferences.state()[0] == "ERROR" and "cannot be started" in preferences.state()[1]
+    assert preferences.status()[0] == "ERROR" and "cannot be started" in preferences.status()[1]
     preferences.preferences().python = ""
-    assert "not set up" in preferences.state()[1]
+    assert "not set up" in preferences.status()[1]
     with pytest.raises(InputError, match="no trainer is set up"):
         preferences.python()
 
@@ -81,7 +81,7 @@ def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
     bpy.ops.refgs.resume(folder=str(out))
     until(lambda: jobs.JOBS[-1].ended)
     assert jobs.run_state(out) == "finished"
-    with pytest.raises(InputError, match="no training that was stopped"):
+    with pytest.raises(InputError, match="no stopped training"):
         training.resume(scene, out)
     training.forget(scene, out)
     assert not scene.refgs.runs and out.is_dir()
@@ -258,7 +258,7 @@ def test_display_splats_are_made_by_the_trainer(addon, run_folder, tmp_path):
     assert given != run_folder and (given / "cameras.json").is_file()
     assert read_rows(given / "splats.ply")["roughness"] == pytest.approx(0.9)
     assert (run_folder / "splats.ply").read_bytes() == before
-    with pytest.raises(RuntimeError, match="its folder is not there"):
+    with pytest.raises(RuntimeError, match="its folder does not exist"):
         bpy.ops.refgs.export_display_splats(filepath=str(tmp_path / "not there" / "a.ply"))
     preferences.preferences().python = ""
     assert not bpy.ops.refgs.export_display_splats.poll()
@@ -368,7 +368,7 @@ def test_closing_asks_only_while_something_trains(addon, capture):
     assert not bpy.ops.refgs.quit.poll()
     first, second = training.train(addon), training.train(addon)
     until(lambda: first.progress)
-    assert bpy.ops.refgs.quit.poll() and question() == "2 trainings are running or waiting"
+    assert bpy.ops.refgs.quit.poll() and quit_question() == "2 trainings are running or waiting"
     bpy.ops.refgs.keep(number=jobs.JOBS.index(first))
     assert first.kept and not second.kept
     bpy.ops.refgs.keep(number=jobs.JOBS.index(first))
@@ -376,7 +376,7 @@ def test_closing_asks_only_while_something_trains(addon, capture):
     jobs.keep_all(True)
     assert first.kept and second.kept
     second.stop()
-    assert question() == "A training is running"
+    assert quit_question() == "A training is running"
     # As when Blender closes, which takes its add-ons away: what is kept goes on.
     ui.unregister()
     assert not jobs.JOBS and first._process.wait(timeout=20) == 0
@@ -392,16 +392,16 @@ def test_a_run_that_another_process_trains(addon, capture, tmp_path):
     run = job.run
     jobs.JOBS.clear()
     with FileLock(run / "run.lock"):
-        assert jobs.run_state(run) == "training" and job_timers._look_elsewhere() == job_timers.ELSEWHERE
+        assert jobs.run_state(run) == "training" and job_timers._poll_other_processes() == job_timers.OTHER_SECONDS
         (run / "progress.json").write_text('{"iteration": 250, "total": 1000, "seconds_left": 190.0}')
-        assert how_far_elsewhere(run) == (0.25, "25%, 3:10 left")
+        assert other_process_status(run) == (0.25, "25%, 3:10 left")
         with pytest.raises(InputError, match="is being trained already"):
             training.resume(addon, run)
         bpy.ops.refgs.stop_run(folder=str(run))
-        assert (run / "stop").exists() and how_far_elsewhere(run)[1] == "Stopping"
+        assert (run / "stop").exists() and other_process_status(run)[1] == "Stopping"
         (run / "progress.json").unlink()
         (run / "splats.ply").touch()
-        assert how_far_elsewhere(run)[1] == "Making the mesh"
-    assert jobs.run_state(run) == "finished" and job_timers._look_elsewhere() is None
+        assert other_process_status(run)[1] == "Making the mesh"
+    assert jobs.run_state(run) == "finished" and job_timers._poll_other_processes() is None
     with pytest.raises(RuntimeError, match="is not being trained"):
         bpy.ops.refgs.stop_run(folder=str(run))
