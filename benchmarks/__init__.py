@@ -1,1 +1,3 @@
-"""Measurements of RefGS: scenes with ground truth, kernels, peers, stability. Run from the repository root."""
+"""Measurements of RefGS, from a clone: `refgs bench` and `refgs stability`; scenes with ground truth."""
+
+BENCHMARKS = ("kernels", "truth", "paper", "needs", "minutes", "gpu", "page")

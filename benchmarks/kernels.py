@@ -1,23 +1,22 @@
-"""How long the CPU kernels take: `refgs bench kernels`, or `python -m benchmarks.kernels`.
+"""Milliseconds of the CPU kernels and of a training iteration: `refgs bench kernels`.
 
-The scene is a ball that fills most of the picture: 20,000 discs on its surface, at random (uniform), each tangent to it, both scales the
-mean distance to its three nearest neighbours and opacity 0.73 — how training starts on a visual hull. Half of the discs face
-away and are mostly hidden.
+The kernels' scene is a ball that fills most of the picture, as training starts on a visual hull: 20,000 discs, uniformly random and
+tangent to the surface, both scales the mean distance to the three nearest neighbours, opacity 0.73. Half of the discs face away and
+are mostly hidden.
 """
 
+import argparse
 import os
-import platform
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.table import Table
 from scipy.spatial import cKDTree
 
-from benchmarks import floors
+from benchmarks import floors, iteration
+from benchmarks.harness import Bench, Column, Table
 from refgs.camera import Camera
 from refgs.kernels import load
 from refgs.model.environment import Environment
@@ -27,11 +26,42 @@ from refgs.render.rasterize import rasterize
 from refgs.render.shade import shade
 from refgs.render.ssim import dssim
 
-SPLATS, SIDE, CHANNELS, ROUNDS = 20_000, 400, 16, 30
+SPLATS, SIDE, CHANNELS, ROUNDS, THREADS = 20_000, 400, 16, 30, 2
+STEPS = {
+    "binning": "projection, depth sort, tiles",
+    "forward": "raster forward, with them",
+    "backward": "raster backward",
+    "both": "raster, both ways",
+    "ssim": "D-SSIM, both ways",
+    "shading": "deferred shading, both ways",
+    "prefilter 64": "prefilter of 6×64², both ways",
+    "prefilter 128": "prefilter of 6×128², both ways",
+}
+TABLES = (
+    Table(
+        f"{SPLATS:,} surfels, {SIDE}×{SIDE}, {CHANNELS} channels, {THREADS} threads: least ms",
+        "kernels",
+        (
+            Column("AVX-512", "least", ".1f", "avx512"),
+            Column("median", "median", ".1f", "avx512"),
+            Column("floor", "floor", ".1f", "avx512"),
+            Column("AVX2", "least", ".1f", "avx2"),
+            Column("SSE4.2", "least", ".1f", "sse4"),
+            Column("NEON", "least", ".1f", "neon"),
+        ),
+        line="kernel",
+    ),
+    Table(
+        f"an iteration, {iteration.SIZE}×{iteration.SIZE}, {iteration.SURFELS:,} surfels: ms",
+        "kernels",
+        (Column("least", "least", ".1f", "iteration"), Column("median", "median", ".1f", "iteration")),
+        line="part",
+    ),
+)
 
 
 def ball(splats: int = SPLATS, side: int = SIDE, channels: int = CHANNELS) -> tuple[list[torch.Tensor], Camera]:
-    """The surfels (positions, rotations, scales, opacities, features) and a camera at distance 4, the ball's radius being 1."""
+    """Make the surfels (positions, rotations, scales, opacities, features) of a unit ball and a camera at distance 4."""
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(splats, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -48,7 +78,7 @@ def ball(splats: int = SPLATS, side: int = SIDE, channels: int = CHANNELS) -> tu
 
 
 def _time(*steps: Callable[[], None]) -> list[list[float]]:
-    """Milliseconds of each step, in each round."""
+    """Time steps, one after the other: milliseconds of each in each round."""
     rounds = []
     for _ in range(ROUNDS + 3):
         stamps = [time.perf_counter()]
@@ -60,7 +90,7 @@ def _time(*steps: Callable[[], None]) -> list[list[float]]:
 
 
 def measure() -> dict[str, list[float]]:
-    """Milliseconds of each step in each round, with the instruction set in REFGS_ISA and torch's threads."""
+    """Time each step with the instruction set in REFGS_ISA: milliseconds in each round."""
     surfels, camera = ball()
     detached = [v.clone() for v in surfels]
     inputs = [v.requires_grad_() for v in surfels]
@@ -91,7 +121,7 @@ def measure() -> dict[str, list[float]]:
 
 
 def _shading() -> Callable[[], None]:
-    """The ball as a rough metal under a light of noise, both ways."""
+    """Shade the ball as a rough metal under a light of noise, both ways."""
     (positions, *geometry, _), camera = ball()
     material = torch.tensor([0.9, 0.7, 0.5, 1.0, 0.3]).expand(SPLATS, 5)
     raster = rasterize(positions, *geometry, torch.cat([positions, material, positions], dim=1), camera, near=0.1)
@@ -107,14 +137,14 @@ def _shading() -> Callable[[], None]:
 
 
 def _prefilter(side: int) -> Callable[[], None]:
-    """Of a cubemap of 6·side² texels, both ways."""
+    """Prefilter a cubemap of 6·side² texels, both ways."""
     radiance = torch.rand(6 * side**2, 3, requires_grad=True)
     upstream = torch.rand_like(prefilter(radiance, side))
     return lambda: torch.autograd.grad(prefilter(radiance, side), radiance, upstream)
 
 
 def _needs() -> dict[str, floors.Need]:
-    """What the steps have to do."""
+    """Needs of the steps whose floor is known."""
     surfels, camera = ball()
     forward, backward = floors.raster(surfels, camera)
     covered = int((rasterize(*surfels, camera, near=0.1).alpha > 1 / 255).sum())
@@ -124,44 +154,30 @@ def _needs() -> dict[str, floors.Need]:
     return needs | {f"prefilter {side}": floors.prefiltering(side) for side in (64, 128)}
 
 
-def run(threads: int = 2) -> dict[str, dict[str, list[float]]]:
-    """Print a table, one column an instruction set; returns {set: {step: milliseconds of each round}}."""
-    title = (
-        f"{SPLATS:,} surfels, {SIDE}×{SIDE}, {CHANNELS} channels, {threads} threads: ms, least (median), floor, before²"
-    )
-    table, release, kept = Table("", title=title), "", {}
-    steps = {"binning": "binning¹", "forward": "raster forward", "backward": "backward", "both": "both ways"}
-    steps |= {"ssim": "D-SSIM, both ways", "shading": "deferred shading, both ways"}
-    steps |= {f"prefilter {side}": f"prefilter of 6×{side}², both ways" for side in (64, 128)}
-    results, floor, before, chosen = {}, {}, torch.get_num_threads(), os.environ.get("REFGS_ISA")
+def measure_all(bench: Bench, threads: int = THREADS) -> None:
+    """Record each part on each instruction set, and its floor."""
+    before, chosen = torch.get_num_threads(), os.environ.get("REFGS_ISA")
     torch.set_num_threads(threads)
     try:
         for isa in load.supported():
             os.environ["REFGS_ISA"] = isa
-            results[isa], machine = measure(), floors.Machine.measured()
-            floor[isa] = {step: machine.floor(need) for step, need in _needs().items()}
-            release, kept[isa] = floors.previous("kernels", isa)
-            table.add_column(isa, justify="right")
+            times, machine, needs = measure(), floors.Machine.measured(), _needs()
+            for step, name in STEPS.items():
+                floor = machine.floor(needs[step]) if step in needs else None
+                least, median = min(times[step]), statistics.median(times[step])
+                bench.record(name, isa, "ms", least=least, median=median, floor=floor)
     finally:
         torch.set_num_threads(before)
         os.environ.pop("REFGS_ISA")
         if chosen:
             os.environ["REFGS_ISA"] = chosen
-    for step, title in steps.items():
-        cells = []
-        for isa, times in results.items():
-            least, middle = min(times[step]), statistics.median(times[step])
-            beside = (f"{figures[step]:.1f}" if step in figures else "–" for figures in (floor[isa], kept[isa]))
-            cells.append(", ".join([f"{least:.1f} ({middle:.1f})", *beside]))
-        table.add_row(title, *cells)
-    console = Console()
-    console.print(table)
-    console.print(f"¹ projection, depth sort and tiles; part of forward. {platform.processor() or platform.machine()}")
-    console.print(
-        f"² least of release {release}, on the machine of docs/benchmarks.toml" if release else "² nothing is kept"
-    )
-    return results
 
 
-if __name__ == "__main__":
-    run()
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Time the kernels, then an iteration with the threads that a training has."""
+    bench = Bench("kernels", argparse.ArgumentParser(description=__doc__.splitlines()[0]), arguments)
+    measure_all(bench)
+    for part, seconds in iteration.measure().items():
+        least, median = 1e3 * min(seconds), 1e3 * statistics.median(seconds)
+        bench.record(part, "iteration", "ms", least=least, median=median)
+    bench.finish(*TABLES)

@@ -1,4 +1,4 @@
-"""What this machine can do at the most, which other figures are set beside."""
+"""Measure what this machine can do at most: arithmetic and memory."""
 
 import ctypes
 import time
@@ -18,9 +18,9 @@ class _Peak(Work):
 
 
 def arithmetic(seconds: float = 0.5, device: torch.device = CPU) -> float:
-    """Floating-point operations a second, a product and a sum being two, on torch's threads or a card; the best of many runs."""
+    """Floating-point operations a second on torch's threads or a card, the best of many runs; a multiply-add counts as two."""
     on_card = device.type == "cuda"
-    launches = 20 if on_card else 1  # so that waiting for the card counts little
+    launches = 20 if on_card else 1  # several, so that waiting for the card counts little
     rounds, one = (1 << 20, 2 * 1000 * CHAINS) if on_card else (1000, kernels().refgs_peak_round())
     work, out = _Peak(rounds=rounds), torch.zeros(1, device=device)
     work.attach(out=out)
@@ -36,7 +36,7 @@ def arithmetic(seconds: float = 0.5, device: torch.device = CPU) -> float:
 
 
 def bandwidth(seconds: float = 0.5, device: torch.device = CPU) -> float:
-    """Bytes a second of memory, read and written, by copying more than the caches hold, on torch's threads or a card."""
+    """Bytes of memory read and written a second, by copying more than the caches hold, on torch's threads or a card."""
     source = torch.ones(64 << 20, device=device)
     target, best, started = source.clone(), 0.0, time.perf_counter()
     copies = 20 if device.type == "cuda" else 1

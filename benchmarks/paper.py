@@ -1,22 +1,18 @@
 """The paper's tables with today's program: `refgs bench paper --data DIR`.
 
-DIR holds the published data sets as they are downloaded, any part of them: `shiny_blender/SCENE`,
-`glossy_synthetic/SCENE` (NeRO's, or converted to NeRF-Blender and then perhaps called SCENE_blender; its split
-`synthetic_split_128.pkl` beside the scenes), `ref_real/SCENE` and `nerf_synthetic/SCENE`. Each scene that is there is trained on its
-training views at the photos' own size and evaluated on its test views; the real ones with the reduced photos that are
-usual (`images_4`, of the sedan `images_8`). Runs lie in OUT/PRESET/DATA SET/SCENE: one that is finished is not trained
-again, one that was interrupted goes on. Prints Tables 1, 2 and 8 with the paper's own figures beside ours.
+DIR holds the published data sets as they are downloaded, any part of them: `shiny_blender/SCENE`, `ref_real/SCENE`,
+`nerf_synthetic/SCENE`, and `glossy_synthetic/SCENE` (NeRO's with `synthetic_split_128.pkl` beside the scenes, or converted to
+NeRF-Blender and then perhaps named SCENE_blender). Each scene is trained on its training views at the photos' size and evaluated on its
+test views; real scenes use the usual reduced photos (`images_4`, of the sedan `images_8`). Runs lie in OUT/PRESET/DATA SET/SCENE.
 """
 
 import argparse
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-from rich.table import Table
-
-from benchmarks import runs
-from benchmarks.runs import console, figures, mean, text
+from benchmarks.harness import Bench, Column, Table, console, figures, train
 from refgs.capture.nero import SPLIT
 from refgs.errors import InputError
 from refgs.paths import clone_root
@@ -24,24 +20,19 @@ from refgs.settings import load_settings
 
 PAPER = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 NORMALS = PAPER.pop("normals")
-MEASURES = (("psnr", "PSNR", ".2f"), ("ssim", "SSIM", ".3f"), ("lpips", "LPIPS", ".3f"))
+FORMS = {"psnr": ("PSNR", ".2f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".3f")}
 
 
-@dataclass(frozen=True)
-class Scene:
+class Scene(NamedTuple):
     """A scene of the paper that is on this disk: the data set's key, its name, and the folder to train on."""
 
     data_set: str
     name: str
     capture: Path
 
-    def run(self, out: Path) -> Path:
-        """Its run folder."""
-        return out / self.data_set / self.name
-
 
 def find_scenes(data: Path) -> list[Scene]:
-    """The paper's scenes in a folder. Raises InputError, saying what to put where, if there are none."""
+    """Find the paper's scenes in a folder. Raises InputError, saying what to put where, if there are none."""
     scenes = []
     for key, data_set in PAPER.items():
         for number, name in enumerate(data_set["scenes"]):
@@ -61,74 +52,48 @@ def find_scenes(data: Path) -> list[Scene]:
     return scenes
 
 
-def measure(scene: Scene, run: Path, preset: str) -> bool:
-    """Train and evaluate what of it is not done yet; whether that succeeded."""
-    return runs.measure(scene.capture, run, ["--preset", preset, "--set", "image.max_side=8192"])
-
-
-def tables(found: dict[tuple[str, str], dict[str, float]], preset: str) -> list[Table]:
-    """The paper's tables from the figures of each (data set, scene)."""
+def tables() -> list[Table]:
+    """Tables 1, 8 and 2, the paper's figures beside ours."""
     result = []
     for key, data_set in PAPER.items():
-        rows = [(name, number) for number, name in enumerate(data_set["scenes"]) if (key, name) in found]
-        if not rows:
-            continue
-        table = Table(
-            "scene", title=f"{data_set['title']}: preset {preset}, {len(rows)} of {len(data_set['scenes'])} scenes"
-        )
-        columns = []
-        for measure, heading, form in MEASURES:
-            ours = [found[key, name].get(measure) for name, _ in rows]
-            theirs = [data_set[measure][number] for _, number in rows]
-            for title, values in ((heading, ours), ("paper", theirs)):
-                table.add_column(title, justify="right")
-                columns.append([text(value, form) for value in (*values, mean(values))])
-        for name, *cells in zip([*(name for name, _ in rows), "mean"], *columns, strict=True):
-            if name == "mean":
-                table.add_section()
-            table.add_row(name, *cells)
-        result.append(table)
-    shiny = {}
-    for (key, name), row in found.items():
-        if key == "shiny_blender":
-            seconds = row.get("training_seconds")
-            shiny[name] = row | {"hours": None if seconds is None else seconds / 3600}
-    if shiny:
-        title = (
-            f"Table 2, Shiny Blender: preset {preset}, {len(shiny)} of {len(PAPER['shiny_blender']['scenes'])} scenes"
-        )
-        table = Table("scene", title=title)
-        keys = (("normal_mae_degrees", "normal error, degrees", ".2f"), ("hours", "training, hours", ".2f"))
-        for _, heading, _ in keys:
-            table.add_column(heading, justify="right")
-        for name, row in shiny.items():
-            table.add_row(name, *(text(row.get(key), form) for key, _, form in keys))
-        table.add_section()
-        table.add_row("mean", *(text(mean([r.get(key) for r in shiny.values()]), form) for key, _, form in keys))
-        table.add_row("paper", *(text(NORMALS[key], form) for key, _, form in keys))
-        result.append(table)
-    return result
+        columns = [
+            Column(heading, figure, form, variant)
+            for figure, (title, form) in FORMS.items()
+            for heading, variant in ((title, key), ("paper", f"{key}, paper"))
+        ]
+        result.append(Table(data_set["title"], "paper", tuple(columns), mean=tuple(data_set["scenes"])))
+    columns = Column("normals °", "normals", ".2f", "shiny_blender"), Column("hours", "hours", ".2f", "shiny_blender")
+    mean = tuple(PAPER["shiny_blender"]["scenes"])
+    title = "Table 2, Shiny Blender; the paper: {normal_mae_degrees} °, {hours} hours".format(**NORMALS)
+    return [*result, Table(title, "paper", columns, mean=mean)]
 
 
-def main(arguments: list[str] | None = None) -> None:
+def record(bench: Bench, scene: Scene, found: dict) -> None:
+    """Keep a scene's figures."""
+    seconds = found.get("training_seconds")
+    bench.record(scene.name, scene.data_set, "dB", psnr=found["psnr"])
+    bench.record(scene.name, scene.data_set, "", ssim=found.get("ssim"), lpips=found.get("lpips"))
+    bench.record(scene.name, scene.data_set, "°", normals=found.get("normal_mae_degrees"))
+    bench.record(scene.name, scene.data_set, "h", hours=None if seconds is None else seconds / 3600)
+    theirs = PAPER[scene.data_set]
+    place = theirs["scenes"].index(scene.name)
+    bench.record(scene.name, f"{scene.data_set}, paper", "", **{figure: theirs[figure][place] for figure in FORMS})
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure what is there and print the tables; exit status 1 where a scene failed."""
-    parser = argparse.ArgumentParser(prog="refgs bench paper", description="The paper's tables with today's program.")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="folder with shiny_blender/SCENE and so on")
-    parser.add_argument("--out", type=Path, default=None, help="folder for the runs (default: demo/paper)")
+    parser.add_argument("--out", type=Path, help="folder for the runs (default: demo/paper)")
     parser.add_argument("--preset", default="paper", help="a preset's name or a TOML file")
-    options = parser.parse_args(arguments)
-    load_settings(options.preset)  # one that is wrong is said before anything else
-    preset = Path(options.preset).stem
-    out = (options.out or clone_root() / "demo" / "paper") / preset
-    scenes = find_scenes(options.data)
-    failed = [scene for scene in scenes if not measure(scene, scene.run(out), options.preset)]
-    found = {(scene.data_set, scene.name): figures(scene.run(out)) for scene in scenes if scene not in failed}
-    for table in tables(found, preset):
-        console.print(table)
-    if failed:
-        console.print(f"not measured, see above: {', '.join(f'{s.data_set}/{s.name}' for s in failed)}")
-        raise SystemExit(1)
-
-
-if __name__ == "__main__":
-    main()
+    bench = Bench("paper", parser, arguments)
+    preset = bench.options.preset
+    load_settings(preset)  # a wrong one is said before anything else
+    out = (bench.options.out or clone_root() / "demo" / "paper") / Path(preset).stem
+    for scene in find_scenes(bench.options.data):
+        run = out / scene.data_set / scene.name
+        if train(scene.capture, run, ("--preset", preset, "--set", "image.max_side=8192")):
+            record(bench, scene, figures(run))
+        else:
+            bench.failed.append(run)
+    bench.finish(*tables())

@@ -11,7 +11,7 @@ import torch._dynamo  # its Triton brings an LLVM that crashes when it is loaded
 
 from benchmarks.scenes.analytic import write_ball_capture
 from refgs.kernels import load
-from tests.kernels.emulate import emulate
+from tests.makers.emulate import emulate
 
 NO_CARD = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA card here")
 
@@ -61,7 +61,7 @@ def python(tmp_path):
 
     if sys.platform == "win32":
         pytest.skip("the fake trainer is a script that Windows does not start")
-    file, fake = tmp_path / "the Python", Path(__file__).parent / "addon" / "fake_worker.py"
+    file, fake = tmp_path / "the Python", Path(__file__).parent / "makers" / "fake_worker.py"
     file.write_text(f"#!{sys.executable}\nimport runpy\nrunpy.run_path({str(fake)!r})\n")
     file.chmod(0o755)
     yield file

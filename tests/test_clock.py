@@ -1,4 +1,4 @@
-"""The clock of a training's parts, against a time that only the parts themselves let pass."""
+"""Clock of a training's parts, against a fake time that only the parts advance."""
 
 import pytest
 import torch
@@ -35,7 +35,7 @@ def test_a_function_is_timed_while_an_iteration_is_watched(time, watch):
     assert draw(5) == 5
     with watch.iteration(0):
         assert draw(2) == 2
-        time.now += 7  # of no part
+        time.now += 7  # outside any part
         draw(1)
     draw(9)
     assert watch.seconds == {"raster": 3}

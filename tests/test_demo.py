@@ -1,4 +1,4 @@
-"""The demo, every stage of it, on fewer and smaller photos and with a shorter training than it takes itself."""
+"""Every stage of the demo, on fewer and smaller photos and with a shorter training."""
 
 import json
 import subprocess
@@ -31,7 +31,7 @@ def test_from_photos_to_the_report(tmp_path, monkeypatch):
     monkeypatch.setattr(demo, "HDRIS", ("studio",))
     monkeypatch.setattr(demo, "VIEWS", ("test_000",))
     words = ("--size", "48", "--train", "10", "--test", "1", "--samples", "1", "--relight", "studio")
-    scene = [sys.executable, "-m", "benchmarks.scenes", demo.SCENE, "--out", out / "capture", *words]
+    scene = [sys.executable, "-m", "scripts.demo", demo.SCENE, "--out", out / "capture", *words]
     subprocess.run(list(map(str, scene)), cwd=clone_root(), check=True, capture_output=True)
     demo.run(out)
     run = out / "run"

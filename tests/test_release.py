@@ -1,4 +1,4 @@
-"""What is released: zips that bring the trainer and what installs it, and that installation. It fetches gigabytes."""
+"""Release zips, which contain the trainer and its installer, and the installation, which downloads gigabytes."""
 
 import platform
 import subprocess
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from refgs_addon import installation, jobs
-from tests.addon.waiting import until
+from tests.makers.waiting import until
 
 pytest.importorskip("bpy", reason="the extension is built with the tool in Blender's Python module")
 pytestmark = pytest.mark.slow
@@ -19,7 +19,7 @@ NAMES = {("Linux", "x86_64"): "linux_x64", ("Windows", "AMD64"): "windows_x64", 
 
 @pytest.fixture(scope="module")
 def archives(tmp_path_factory):
-    """The zips, built and validated, by their platforms."""
+    """Build and validate the zips, by platform."""
     out = tmp_path_factory.mktemp("dist")
     subprocess.run([sys.executable, ROOT / "scripts" / "build_extension.py", out], check=True)
     return {archive.stem.split("-")[-1]: archive for archive in out.glob("*.zip")}
@@ -27,7 +27,7 @@ def archives(tmp_path_factory):
 
 @pytest.fixture
 def archive(archives):
-    """This platform's."""
+    """Return this platform's zip."""
     name = NAMES.get((platform.system(), platform.machine()))
     if name is None:
         pytest.skip("there is no zip for this platform")
@@ -48,7 +48,7 @@ def test_the_zips(archives):
 
 @pytest.mark.timeout(3000)
 def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
-    """By the real uv, with a Python of this machine's and torch from the package index, which is all that a mirror may have."""
+    """Install with the real uv, with this machine's Python, and torch from the package index: a mirror may have no other."""
     monkeypatch.setenv("UV_PYTHON_PREFERENCE", "only-system")
     monkeypatch.setenv("UV_TORCH_BACKEND", "")
     zipfile.ZipFile(archive).extractall(tmp_path / "extension")

@@ -3,8 +3,9 @@ import json
 import pytest
 
 from refgs.errors import InputError
-from refgs.run import read_run_facts
+from refgs.run_folder import read_run_facts
 from refgs.settings import load_settings, preset_names, recorded_settings
+from scripts import settings_page
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -77,6 +78,10 @@ def test_an_unknown_preset_lists_the_known():
         load_settings("fast")
 
 
+def test_the_page_is_what_the_code_generates():
+    assert settings_page.PAGE.read_text(encoding="utf-8") == settings_page.page()
+
+
 def test_a_run_of_before_a_setting_still_opens():
     settings = load_settings("quick")
     recorded = settings.model_dump(mode="json")
@@ -84,7 +89,7 @@ def test_a_run_of_before_a_setting_still_opens():
     opened = recorded_settings(recorded, "run.toml")
     assert opened.train == settings.train
     assert opened.mesh == load_settings("standard").mesh
-    assert (opened.light.frame, opened.light.exposure) == ("world", "off")  # as it then was
+    assert (opened.light.frame, opened.light.exposure) == ("world", "off")  # as in runs before these keys
 
 
 @pytest.mark.parametrize(
@@ -98,7 +103,7 @@ def test_a_run_of_before_a_setting_still_opens():
     ],
 )
 def test_a_run_of_a_newer_release_is_not_read(tmp_path, made_by, says):
-    """One that only mends is the same to this one, which then looks for what is not in this file."""
+    """A patch release counts as this one: the file is read, and what it lacks is reported."""
     (tmp_path / "run.toml").write_text(f"[run]\nrefgs = {json.dumps(made_by)}\n")
     with pytest.raises(InputError, match=says):
         read_run_facts(tmp_path)

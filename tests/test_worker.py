@@ -1,4 +1,4 @@
-"""The job protocol, spoken with the real process."""
+"""Job protocol, spoken with the real process."""
 
 import json
 import queue
@@ -27,7 +27,7 @@ PATIENCE = 120  # seconds
 
 
 class Talk:
-    """A worker, and what it has said."""
+    """Worker process, and the events it has sent."""
 
     def __init__(self):
         command = [sys.executable, "-m", "refgs.cli", "worker"]
@@ -48,7 +48,7 @@ class Talk:
         self.process.stdin.flush()
 
     def until(self, event: str) -> dict:
-        """The next event of this kind."""
+        """Wait for the next event of this kind."""
         while line := self.lines.get(timeout=PATIENCE):
             self.heard.append(json.loads(line))
             if self.heard[-1]["event"] == event:
@@ -69,7 +69,7 @@ def talk():
 
 
 def test_jobs_one_after_another(talk, ball_capture, tmp_path):
-    """What is asked is done in turn; what is wrong is said in one line, and the next job is none the worse."""
+    """Jobs run in order. A wrong command is answered in one line and does not disturb the next job."""
     run = tmp_path / "größe 'a'"
     talk.tell("check", capture=str(ball_capture))
     talk.tell("check", capture=str(ball_capture), out=str(tmp_path / "found"))
@@ -129,14 +129,14 @@ def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture
     assert cancelled["iteration"] > paused and not (run / "splats.ply").exists()
     talk.tell("train", capture=str(ball_capture), out=str(run), resume=True)
     assert talk.until("progress")["iteration"] > cancelled["iteration"]
-    # Whoever listened is gone: the training ends by itself, and can be gone on with.
+    # Nobody listens any more: the training ends by itself and can be resumed.
     assert talk.end() == 0
     ended = talk.until("cancelled")
     assert (run / "checkpoints" / f"{ended['iteration']:08d}.toml").exists(), list((run / "checkpoints").iterdir())
 
 
 def test_photos_without_cameras(talk, tmp_path):
-    """They are told from a folder without photos; finding their cameras can be left, and begun again."""
+    """The check tells them from a folder without photos. Finding their cameras can be interrupted and started again."""
     for number in range(4):
         cv2.imwrite(
             str(tmp_path / f"{number}.png"), np.random.default_rng(number).integers(0, 255, (96, 128, 3), np.uint8)
@@ -179,7 +179,7 @@ def until(condition) -> None:
 
 
 def free(run) -> bool:
-    """Whether no process works in a run."""
+    """Tell whether no process holds a run."""
     try:
         with RunLock(run):
             return True
@@ -188,7 +188,7 @@ def free(run) -> bool:
 
 
 def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
-    """Paused, then left with both pipes closed, it trains to its end and makes the mesh."""
+    """Paused and then left with both pipes closed, it trains to the end and exports the mesh."""
     run = tmp_path / "run"
     commands = [
         {"command": "train"}
@@ -211,7 +211,7 @@ def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
 
 
 def test_what_waits_goes_with_the_input(talk, ball_capture, tmp_path):
-    """Finished and left at once: the surfels are written, the mesh that was asked for as well is not begun."""
+    """Stopped and left at once, it writes the surfels but does not start the waiting export."""
     run = tmp_path / "run"
     talk.tell("train", **train(ball_capture, run))
     talk.tell("export", run=str(run), texture=64)
@@ -246,7 +246,7 @@ def test_a_training_that_was_left_ends_when_it_is_terminated(talk, ball_capture,
 
 
 def test_a_folder_that_is_trained_in(talk, ball_capture, tmp_path):
-    """No other process trains there; others see how far it is, and can stop it. One that is killed leaves the folder free."""
+    """No other process can train there, but it can see the progress and stop it. A killed process leaves the folder free."""
     run = tmp_path / "run"
     talk.tell("train", **train(ball_capture, run))
     until((run / PROGRESS).exists)
@@ -264,5 +264,5 @@ def test_a_folder_that_is_trained_in(talk, ball_capture, tmp_path):
     talk.process.kill()
     talk.process.wait(timeout=PATIENCE)
     assert free(run)
-    trainer, _ = jobs.train(*words)
-    assert trainer.iteration >= stopped
+    state, _ = jobs.train(*words)
+    assert state.iteration >= stopped

@@ -1,4 +1,4 @@
-"""The command line."""
+"""Parse the command line. What a command needs is imported in it, so that help and wrong arguments are answered at once."""
 
 import signal
 import sys
@@ -9,17 +9,16 @@ from typing import Annotated
 
 import typer
 
+import refgs
 from refgs.errors import InputError, InputWarning
 
-app = typer.Typer(
-    help=__import__("refgs").__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
-)
-RunFolder = Annotated[Path, typer.Argument(help="a run folder, made by `refgs train`")]
+app = typer.Typer(help=refgs.__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+RunFolder = Annotated[Path, typer.Argument(help="run folder, made by `refgs train`")]
 
 
 @app.command()
-def check(capture: Annotated[Path, typer.Argument(help="a folder with photos and cameras")]) -> None:
-    """Read a capture whole and say what it is and what is wrong with it."""
+def check(capture: Annotated[Path, typer.Argument(help="folder with photos and cameras")]) -> None:
+    """Check a capture: read all of it and list what it holds and what is wrong with it."""
     from refgs.capture import read_capture
     from refgs.capture.check import describe
 
@@ -28,8 +27,8 @@ def check(capture: Annotated[Path, typer.Argument(help="a folder with photos and
 
 
 @app.command()
-def poses(photos: Annotated[Path, typer.Argument(help="a folder with photos, in it or in its images")]) -> None:
-    """Find where photos were taken from; writes PHOTOS/sparse/0, which makes them a capture."""
+def poses(photos: Annotated[Path, typer.Argument(help="folder with photos, in it or in its folder images")]) -> None:
+    """Find the cameras of photos and write them to PHOTOS/sparse/0, which makes the folder a capture."""
     from refgs import commands
 
     commands.poses(photos)
@@ -37,23 +36,23 @@ def poses(photos: Annotated[Path, typer.Argument(help="a folder with photos, in 
 
 @app.command()
 def train(
-    capture: Annotated[Path, typer.Argument(help="a folder with photos and cameras")],
-    out: Annotated[Path, typer.Option(help="the run folder to make")],
+    capture: Annotated[Path, typer.Argument(help="folder with photos and cameras")],
+    out: Annotated[Path, typer.Option(help="run folder to create")],
     preset: Annotated[
         str | None,
-        typer.Option(help="quick, standard, paper, or a TOML file", show_default="standard, or what --minutes allow"),
+        typer.Option(help="quick, standard, paper, or a TOML file", show_default="standard, or planned for --minutes"),
     ] = None,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
     minutes: Annotated[
         float | None,
-        typer.Option(min=0.05, help="be done after this long, start and end included"),
+        typer.Option(min=0.05, help="limit for the whole command, in minutes"),
     ] = None,
     changes: Annotated[
         list[str] | None, typer.Option("--set", help="section.key=value, e.g. train.iterations=2000")
     ] = None,
-    resume: Annotated[bool, typer.Option(help="go on with the run in --out")] = False,
+    resume: Annotated[bool, typer.Option(help="resume the run in --out")] = False,
 ) -> None:
-    """Learn surfels, materials and light from a capture."""
+    """Train surfels, materials and light from a capture."""
     from refgs import commands
 
     commands.train(capture, out, preset, device, minutes, changes or [], resume)
@@ -65,9 +64,9 @@ def render(
     cameras: Annotated[Path, typer.Option(help="NeRF-Blender or nerfstudio JSON, in the capture's frame")],
     out: Annotated[Path, typer.Option(help="folder for the images: OUT/PASS/NAME.png")],
     passes: Annotated[
-        str, typer.Option(help="of color,normal,albedo,roughness,metallic,depth,alpha,visibility")
+        str, typer.Option(help="some of color,normal,albedo,roughness,metallic,depth,alpha,visibility")
     ] = "color",
-    hdri: Annotated[Path | None, typer.Option(help="light it with this panorama instead")] = None,
+    hdri: Annotated[Path | None, typer.Option(help="panorama to relight with")] = None,
     format: Annotated[str, typer.Option(help="png or exr")] = "png",
 ) -> None:
     """Render a run from any cameras."""
@@ -85,7 +84,7 @@ def evaluate(
         typer.Option(help="folder with light.exr, mesh.ply, relight/, and normal/, albedo/ … of the views, as EXR"),
     ] = None,
 ) -> None:
-    """Compare renderings with photos that were held out; writes metrics.json and pictures/."""
+    """Compare renderings with held-out photos; write metrics.json and pictures/."""
     from refgs import commands
 
     commands.evaluate(run, split, ground_truth)
@@ -93,16 +92,19 @@ def evaluate(
 
 @app.command()
 def export(
-    run: Annotated[Path, typer.Argument(help="a run folder, or a PLY file of splats by any program")],
-    mesh: Annotated[Path | None, typer.Option(help="the mesh's file, .glb or .obj (default: RUN/mesh.glb)")] = None,
+    run: Annotated[Path, typer.Argument(help="run folder, or PLY file of splats by any program")],
+    mesh: Annotated[Path | None, typer.Option(help="mesh file, .glb or .obj (default: RUN/mesh.glb)")] = None,
     texture: Annotated[int | None, typer.Option(min=64, max=8192, help="side of the textures, in pixels")] = None,
     splats: Annotated[Path | None, typer.Option(help="write the splats to this file")] = None,
     display_splats: Annotated[
-        Path | None, typer.Option(help="write splats for viewers of 3D Gaussians, the light baked into their colours")
+        Path | None,
+        typer.Option(
+            help="write splats for viewers of 3D Gaussians to this file, with the light baked into their colours"
+        ),
     ] = None,
     overwrite: Annotated[bool, typer.Option(help="replace files that exist")] = False,
 ) -> None:
-    """Make the textured mesh: fuse depth, simplify, unwrap, bake. Where splats are asked for, the mesh only if its file is named."""
+    """Export the textured mesh: fuse depth, simplify, unwrap, bake. With a splats option, export a mesh only if --mesh is given too."""
     from refgs import commands
 
     commands.export(run, mesh, texture, splats, display_splats, overwrite)
@@ -111,7 +113,7 @@ def export(
 @app.command()
 def report(
     runs: Annotated[list[Path], typer.Argument(help="run folders; several are shown side by side")],
-    out: Annotated[Path | None, typer.Option(help="the page's file (default: RUN/report.html)")] = None,
+    out: Annotated[Path | None, typer.Option(help="file of the page (default: RUN/report.html)")] = None,
 ) -> None:
     """Write one self-contained page: pictures, figures, error against run time."""
     from refgs.report.page import write_report
@@ -123,12 +125,12 @@ def report(
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="folder for everything that is made")] = Path("demo"),
+    out: Annotated[Path, typer.Option(help="folder for all results")] = Path("demo"),
 ) -> None:
-    """The whole way on a small capture, ending in relit Eevee previews and a report."""
-    from refgs import demo as whole
+    """Run every step on a small capture that it renders itself, up to relit Eevee previews and a report."""
+    from refgs import demo
 
-    whole.run(out)
+    demo.run(out)
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
@@ -136,12 +138,10 @@ def bench(
     context: typer.Context,
     what: Annotated[
         str,
-        typer.Argument(
-            help="kernels, iteration, truth, minutes, bake or another of benchmarks/; one that is none lists them"
-        ),
+        typer.Argument(help="kernels, truth, paper, needs, minutes, gpu or page; another word lists them"),
     ] = "kernels",
 ) -> None:
-    """Measure the parts, in milliseconds or errors; `paper --data DIR [--out DIR] [--preset NAME]`: the whole on the paper's data."""
+    """Measure the parts in milliseconds, or whole trainings by their errors; `--csv FILE` writes the figures."""
     from refgs import commands
 
     commands.bench(what, context.args)
@@ -149,9 +149,9 @@ def bench(
 
 @app.command()
 def stability(
-    only: Annotated[str, typer.Option(help="cases whose name holds this word, or a group of them")] = "",
+    only: Annotated[str, typer.Option(help="run only cases whose name holds this word, or this group")] = "",
 ) -> None:
-    """Run stiff and extreme cases through every kernel and through training, and print their table; exit status 1 where one fails."""
+    """Run stiff and extreme cases through every kernel and through training, and print a table. Exit status 1 if a case fails."""
     from refgs import commands
 
     commands.stability(only)
@@ -159,18 +159,18 @@ def stability(
 
 @app.command()
 def worker() -> None:
-    """Speak the job protocol on stdin and stdout, as the extension does with it."""
+    """Speak the job protocol of the Blender extension on stdin and stdout."""
     from refgs import worker
 
     worker.work()
 
 
-def _end(*_) -> None:
+def _interrupt(*_) -> None:
     raise KeyboardInterrupt
 
 
-def _show(show):
-    """`show`, but for what the user is warned of: that is one line."""
+def _one_line(show):
+    """Return `show`, but print an InputWarning as one line."""
 
     def shown(message, category, *where) -> None:
         if issubclass(category, InputWarning):
@@ -182,9 +182,9 @@ def _show(show):
 
 
 def main() -> None:
-    """Entry point: 0 done, 2 the input is wrong (one line), 1 our fault (a traceback), 130 interrupted."""
-    warnings.showwarning = _show(warnings.showwarning)
-    signal.signal(signal.SIGTERM, _end)
+    """Run a command. Exit status: 0 done, 2 wrong input (one line), 1 our fault (a traceback), 130 interrupted."""
+    warnings.showwarning = _one_line(warnings.showwarning)
+    signal.signal(signal.SIGTERM, _interrupt)
     try:
         app(standalone_mode=True)
     except InputError as error:

@@ -1,8 +1,8 @@
-"""Where a training's seconds go, by its parts: forward and backward, and what is done now and then.
+"""Time the parts of a training: forward and backward passes, and work at intervals.
 
-Functions and autograd's Functions that belong to a part say so (`timed`); they are timed while a clock is watching an iteration.
-What is called within a part counts as that. On the CPU every iteration is watched, which takes some 25 µs of it. A card works on while
-Python goes on: it is watched in one of `SAMPLED` iterations, by events on its stream, and that one counts for the others.
+`timed` marks a function or an autograd Function as a part; it is timed while a clock watches an iteration. A part called within
+another one counts as the outer part. On the CPU every iteration is watched, for about 25 µs. A card runs asynchronously: one of
+`SAMPLED` iterations is watched, by events on its stream, and counts for the others.
 """
 
 import functools
@@ -12,13 +12,13 @@ from contextlib import contextmanager
 
 import torch
 
-SAMPLED = 50  # iterations, of which a card is watched in one
+SAMPLED = 50  # iterations; a card is watched in one of them
 
 _watching: "Clock | None" = None
 
 
 class Clock:
-    """Seconds by part, of work on a device."""
+    """Count seconds of work on a device, by part."""
 
     def __init__(self, device: torch.device):
         self.seconds: dict[str, float] = {}
@@ -26,13 +26,13 @@ class Clock:
         self._events: list[tuple[str, torch.cuda.Event, torch.cuda.Event]] = []
 
     def resume(self, seconds: dict[str, float]) -> None:
-        """Count on from what was spent before."""
+        """Add the seconds counted before a resume."""
         for name, value in seconds.items():
             self._add(name, value)
 
     @contextmanager
     def iteration(self, number: int) -> Iterator[None]:
-        """Watch an iteration, if it is one of those that are."""
+        """Watch an iteration. On a card, watch only one of `SAMPLED`."""
         global _watching
         if self._on_card and number % SAMPLED != SAMPLED // 2:
             yield
@@ -50,8 +50,10 @@ class Clock:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Count what is done within, now and then, but for what is a part of its own. Its results are on the CPU, or a card's would not
-        have been waited for."""
+        """Count work at intervals as one part, without the `part`s nested in it.
+
+        Its results must be on the CPU: a card is not waited for.
+        """
         begun, known = time.perf_counter(), sum(self.seconds.values())
         before, self._within = self._within, True
         try:
@@ -62,7 +64,7 @@ class Clock:
             self._add(name, time.perf_counter() - begun - others)
 
     def call(self, name: str, function: Callable, *arguments, **words):
-        """Call a function as a part of an iteration."""
+        """Call a function and count it as a part."""
         if self._within:
             return function(*arguments, **words)
         self._within, begun = True, self._now()
@@ -87,7 +89,7 @@ class Clock:
 
 
 def timed(name: str) -> Callable:
-    """Say of a function, or of an autograd Function's two ways, which part it is."""
+    """Mark a function, or an autograd Function's forward and backward, as a part."""
 
     def decorate(what):
         if isinstance(what, type):

@@ -1,4 +1,4 @@
-"""The sRGB transfer curve, for numpy arrays and torch tensors alike."""
+"""Apply the sRGB transfer curve to numpy arrays and torch tensors."""
 
 import numpy as np
 
@@ -7,20 +7,19 @@ _ENCODED_END = 0.04045  # the same point, encoded
 
 
 def srgb_encode(linear):
-    """Linear Rec.709 radiance to sRGB-encoded values (IEC 61966-2-1), element by element.
+    """Encode linear Rec.709 radiance as sRGB (IEC 61966-2-1), element by element.
 
-    Nothing is clamped: below zero the straight piece goes on, above one the power law does, so values and gradients
-    are finite for every finite input. Clamp to 0..1 where a display or an 8-bit file needs it.
+    Values are not clamped: the straight piece extends below zero and the power law above one. So values and gradients are
+    finite for every finite input. Clamp to 0..1 where a display or an 8-bit file needs it.
     """
     where, maximum = _functions(linear)
-    # The power is taken of a clamped value: its gradient at and below zero would otherwise be infinite or NaN, and
-    # where() does not mask a NaN gradient.
+    # Clamp before the power: at and below zero its gradient is infinite or NaN, and where() does not mask a NaN gradient.
     curve = 1.055 * maximum(linear, _LINEAR_END) ** (1 / 2.4) - 0.055
     return where(linear <= _LINEAR_END, 12.92 * linear, curve)
 
 
 def srgb_decode(encoded):
-    """sRGB-encoded values (a photo's are 0..1) to linear Rec.709 radiance: the inverse of `srgb_encode`."""
+    """Decode sRGB values (0..1 in a photo) to linear Rec.709 radiance: the inverse of `srgb_encode`."""
     where, maximum = _functions(encoded)
     curve = ((maximum(encoded, _ENCODED_END) + 0.055) / 1.055) ** 2.4
     return where(encoded <= _ENCODED_END, encoded / 12.92, curve)
@@ -29,6 +28,6 @@ def srgb_decode(encoded):
 def _functions(values):
     if isinstance(values, np.ndarray | np.number | float | int):
         return np.where, np.maximum
-    import torch  # not at the top: what renders captures in Blender and writes reports has no need of it
+    import torch  # here, because most users of numpy arrays never need torch
 
     return torch.where, lambda x, low: x.clamp(min=low)

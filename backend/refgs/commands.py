@@ -1,4 +1,4 @@
-"""What the command line does, one function a command."""
+"""Run the commands of the command line, one function each."""
 
 import runpy
 import signal
@@ -14,11 +14,8 @@ from refgs import jobs
 from refgs.capture import read_cameras, read_capture
 from refgs.capture.poses import in_frame
 from refgs.errors import InputError
-from refgs.export.environment import read_environment, write_exr
 from refgs.paths import clone_root
-from refgs.report.figures import DETAILS, HEADLINE, in_words, relit_in_words
-from refgs.report.pictures import color_picture, maps, picture, write_png
-from refgs.run import open_run
+from refgs.run_folder import check_finished
 
 console = Console(highlight=False, soft_wrap=True)
 PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha", "visibility")
@@ -26,7 +23,7 @@ PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha"
 
 @contextmanager
 def progress_bar(what: str, total: int):
-    """A progress bar with the time left; yields a function to call with how many are done and a few words."""
+    """Show a progress bar with the time left; yield a function that takes the count done and a note."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -39,30 +36,30 @@ def progress_bar(what: str, total: int):
         yield lambda done, note="", total=total: progress.update(task, completed=done, note=note, total=total)
 
 
-def say(event: str, facts: dict) -> None:
-    """An event of a job as a line."""
+def print_event(event: str, facts: dict) -> None:
+    """Print an event of a job as a line."""
     console.print(("warning: " if event == "warning" else "") + facts["what"])
 
 
 @contextmanager
-def report_of(what: str):
-    """Yields what takes a job's events: stages with their progress, and lines."""
+def job_report(what: str):
+    """Yield a function that takes a job's events and shows them: progress as a bar, the rest as lines."""
     with progress_bar(what, 1) as bar:
 
         def report(event: str, facts: dict) -> None:
             if event == "progress":
                 bar(facts["done"], facts["stage"], facts["total"])
             else:
-                say(event, facts)
+                print_event(event, facts)
 
         yield report
 
 
 def poses(folder: Path) -> None:
-    """Find the cameras of photos; what is interrupted goes on when it is started again."""
+    """Find the cameras of photos. Started again after an interruption, it resumes."""
     from refgs.capture.motion import find_cameras
 
-    with report_of("finding cameras") as report:
+    with job_report("finding cameras") as report:
         found = find_cameras(folder, report)
     console.print(
         f"{found['placed']} of {found['photos']} photos placed, to {found['error']:.2f} pixels: {folder / 'sparse' / '0'}"
@@ -78,7 +75,7 @@ def train(
     changes: list[str],
     resume: bool,
 ) -> None:
-    """Train a capture into a run folder; Ctrl-C leaves a run that `--resume` goes on with, twice ends it at once."""
+    """Train a capture into a run folder. Ctrl-C stops it with a checkpoint for `--resume`; a second one ends it at once."""
     stopped = []
     with progress_bar("training", 1) as bar:
 
@@ -87,12 +84,12 @@ def train(
                 note = f"loss {facts['loss']:.4f}  {facts['psnr']:.2f} dB  {facts['splats']:,} surfels"
                 bar(facts["iteration"], note, facts["total"])
             elif event != "measured":
-                say(event, facts)
+                print_event(event, facts)
 
         def stop(*_) -> None:
             if stopped:
                 raise KeyboardInterrupt
-            stopped.append(True)  # at the end of the iteration, with a checkpoint
+            stopped.append(True)  # the training ends after this iteration, with a checkpoint
 
         before = signal.signal(signal.SIGINT, stop)
         try:
@@ -103,7 +100,7 @@ def train(
             signal.signal(signal.SIGINT, before)
     if not trainer.ended:
         console.print(
-            f"stopped at iteration {trainer.iteration}; go on with: refgs train {capture_folder} --out {out} --resume"
+            f"stopped at iteration {trainer.iteration}; resume with: refgs train {capture_folder} --out {out} --resume"
         )
         raise KeyboardInterrupt
     held_out = "" if quality is None else f", {quality:.2f} dB on {len(trainer.test)} held-out views"
@@ -112,25 +109,19 @@ def train(
 
 def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path | None, format: str) -> None:
     """Write OUT/PASS/NAME.png or .exr for each camera."""
-    run = open_run(folder)
-    without = {"albedo", "roughness", "metallic"} if run.environment is None else set()
-    without |= {"visibility"} if run.occluder is None else set()
-    known = [p for p in PASSES if p not in without]
-    unknown = [p for p in passes if p not in known]
-    if unknown:
-        raise InputError(f"--passes {unknown[0]}: this run has {', '.join(known)}")
+    for name in passes:
+        if name not in PASSES:
+            raise InputError(f"--passes {name}: take some of {', '.join(PASSES)}")
     if format not in ("png", "exr"):
         raise InputError(f"--format {format}: take png or exr")
-    if format == "exr" and "color" in passes and run.environment is None:
-        raise InputError("--format exr: a run with shading = sh has no linear radiance; take png")
-    light = None
-    if hdri is not None:
-        if run.environment is None:
-            raise InputError("--hdri: a run with shading = sh has no materials to relight")
-        light = run.light(read_environment(hdri))
-        if run.occluder is not None:
-            with progress_bar("tracing light", len(run.splats)) as bar:
-                run.relit(light, lambda done, total: bar(done))
+    check_finished(folder)  # before torch is imported
+    from refgs.compare.pictures import color_picture, maps, picture, write_png
+    from refgs.formats.exr import write_exr
+    from refgs.run import open_run
+
+    run = open_run(folder)
+    _check_passes(run, passes, format)
+    light = None if hdri is None else _relight(run, hdri)
     to_run = np.linalg.inv(run.to_capture)
     views = [in_frame(camera, to_run) for camera in read_cameras(cameras)]
     background = np.array(run.settings.image.background)
@@ -151,14 +142,40 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
     console.print(f"{len(views)} views, {', '.join(passes)}: {out}")
 
 
-def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
-    """Compare renderings with held-out photos, and with ground truth where there is some; write metrics.json and pictures."""
-    from refgs.report.evaluate import evaluate as measure
-    from refgs.report.truth import GroundTruth
+def _check_passes(run, passes: list[str], format: str) -> None:
+    """Raise InputError for a pass that the run does not have."""
+    without = {"albedo", "roughness", "metallic"} if run.environment is None else set()
+    without |= {"visibility"} if run.occluder is None else set()
+    if missing := [name for name in passes if name in without]:
+        raise InputError(f"--passes {missing[0]}: this run has {', '.join(p for p in PASSES if p not in without)}")
+    if format == "exr" and "color" in passes and run.environment is None:
+        raise InputError("--format exr: a run with shading = sh has no linear radiance; take png")
 
-    run = open_run(folder)
+
+def _relight(run, hdri: Path):
+    """Return the light of a panorama; inter-reflection under it is traced here, where the run has any."""
+    from refgs.formats.panorama import read_environment
+
+    if run.environment is None:
+        raise InputError("--hdri: a run with shading = sh has no materials to relight")
+    light = run.light(read_environment(hdri))
+    if run.occluder is not None:
+        with progress_bar("tracing light", len(run.splats)) as bar:
+            run.relit(light, lambda done, total: bar(done))
+    return light
+
+
+def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
+    """Compare renderings with held-out photos, and with ground truth if given. Write metrics.json and pictures/."""
     if split not in ("test", "train"):
         raise InputError(f"--split {split}: take test or train")
+    check_finished(folder)  # before torch is imported
+    from refgs.compare.truth import GroundTruth
+    from refgs.report.evaluate import evaluate as measure
+    from refgs.report.figures import DETAILS, HEADLINE, in_words, relit_in_words
+    from refgs.run import open_run
+
+    run = open_run(folder)
     capture = read_capture(run.capture_folder, run.settings.region)
     if capture.fingerprint() != run.fingerprint:
         raise InputError(f"{run.capture_folder} was changed since {folder} was trained on it")
@@ -182,25 +199,16 @@ def export(
     display_file: Path | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write the mesh and its textures, or splats."""
-    with report_of("exporting") as report:
+    """Write the mesh with its textures, or splats."""
+    with job_report("exporting") as report:
         files = jobs.export(folder, mesh_file, texture, splats_file, display_file, overwrite, report)
     for file in files:
         console.print(f"wrote {file}")
 
 
 def bench(what: str, options: list[str]) -> None:
-    """Run a benchmark of the repository, with the options that are its own."""
-    folder = clone_root() / "benchmarks"
-    files = {file.stem: file for file in folder.glob("*.py")}
-    files["approximations"] = folder / "approximations" / "__main__.py"
-    texts = {name: file.read_text(encoding="utf-8") for name, file in sorted(files.items())}
-    names = [name for name, text in texts.items() if "__main__" in text]
-    if what not in names:
-        raise InputError(f"no benchmark {what}: take one of {', '.join(names)}")
-    if options and "argparse" not in texts[what]:
-        raise InputError(f"{' '.join(options)}: the benchmark {what} has no options; leave them out")
-    _run_module(f"benchmarks.{what}", options)
+    """Run a benchmark of the repository with its own options."""
+    _run_module("benchmarks", [what, *options])
 
 
 def stability(only: str) -> None:
@@ -209,7 +217,7 @@ def stability(only: str) -> None:
 
 
 def _run_module(name: str, options: list[str]) -> None:
-    """A program of the repository, with words for its command line."""
+    """Run a module of the repository as a program with these options."""
     sys.path.insert(0, str(clone_root()))
     sys.argv[1:] = options
     runpy.run_module(name, run_name="__main__")

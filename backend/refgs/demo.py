@@ -1,4 +1,4 @@
-"""`refgs demo`: from nothing to a relit picture in Blender, on a capture that it makes itself."""
+"""Run every step on a capture that is rendered here, up to relit pictures in Blender."""
 
 import json
 import os
@@ -10,19 +10,19 @@ import time
 from pathlib import Path
 
 from refgs import commands, jobs
+from refgs.compare import metrics
+from refgs.compare.truth import read_relit
 from refgs.errors import InputError
 from refgs.paths import clone_root
-from refgs.report import metrics
 from refgs.report.page import write_report
-from refgs.report.truth import read_relit
 
 SCENE = "jar"
-HDRIS = ("studio", "courtyard")  # Blender's own; the capture is lit by another
+HDRIS = ("studio", "courtyard")  # shipped with Blender; the capture is lit by another one
 VIEWS = ("test_002", "test_004")
 
 
 def run(out: Path) -> None:
-    """Make capture, run, mesh, .blend, previews and report under `out`; what is already there is gone on from."""
+    """Make capture, run, mesh, .blend, previews and report under `out`. Steps that are done already are skipped."""
     started = time.perf_counter()
     root, out = clone_root(), out.resolve()
     capture, folder = out / "capture", out / "run"
@@ -38,7 +38,7 @@ def run(out: Path) -> None:
 
     if not capture.exists():
         stage("rendering a capture with Cycles: 80 photos of a jar of gold, copper and glazed ceramic")
-        _child(root, "rendering", "benchmarks.scenes", SCENE, "--out", capture, "--relight", *HDRIS)
+        _child(root, "rendering", "scripts.demo", SCENE, "--out", capture, "--relight", *HDRIS)
     if not (folder / "splats.ply").exists():
         stage("training surfels, materials and light")
         commands.train(capture, folder, "quick", "auto", None, [], resume=(folder / "run.toml").exists())
@@ -65,7 +65,7 @@ def run(out: Path) -> None:
 
 
 def _check_blender(root: Path) -> None:
-    """Raise InputError with the program's own line where Blender cannot be loaded."""
+    """Raise InputError if Blender cannot be loaded."""
     check = "from refgs_addon.preview import check_libraries; check_libraries()"
     done = subprocess.run([sys.executable, "-c", check], cwd=root, capture_output=True, text=True)
     if done.returncode:
@@ -73,7 +73,7 @@ def _check_blender(root: Path) -> None:
 
 
 def _child(root: Path, what: str, module: str, *arguments: object) -> None:
-    """Run a module that needs Blender in a process of its own, and show the progress that it prints as JSON lines."""
+    """Run a module that needs Blender in its own process. Show the progress that it prints as JSON lines."""
     command = [sys.executable, "-m", module, *map(str, arguments)]
     with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
         with (
@@ -94,7 +94,7 @@ def _child(root: Path, what: str, module: str, *arguments: object) -> None:
 
 
 def _compare(folder: Path, truth: Path, previews: Path) -> None:
-    """Figures of the Eevee previews against Cycles' pictures under the same light; the previews go into the report."""
+    """Compare the Eevee previews with Cycles' pictures under the same light. Copy the previews for the report."""
     result: dict[str, dict[str, dict[str, float]]] = {}
     pictures = folder / "pictures" / "relight"
     for hdri in HDRIS:
@@ -111,7 +111,7 @@ def _compare(folder: Path, truth: Path, previews: Path) -> None:
 
 
 def _record(folder: Path, seconds: float) -> None:
-    """Add the demo's own time and the largest memory of any of its processes to metrics.json."""
+    """Add the demo's time and the peak memory of its processes to metrics.json."""
     facts, largest = {"seconds": seconds}, [jobs.peak_memory(children) for children in (False, True)]
     if None not in largest:
         facts["peak_memory_bytes"] = max(largest)

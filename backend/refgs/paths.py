@@ -1,4 +1,4 @@
-"""Where things lie on this disk, and how they come to lie there."""
+"""Paths of the program's own files, and writing files whole or not at all."""
 
 import os
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ PRESETS = PACKAGE / "presets" if (PACKAGE / "presets").is_dir() else ROOT / "pre
 
 @contextmanager
 def whole(path: str | os.PathLike) -> Iterator[Path]:
-    """The name to write a file under, which becomes `path` once all of it is there; where that fails, nothing is left."""
+    """Yield a temporary name to write to; rename it to `path` at the end, or delete it if that fails."""
     path = Path(path)
     temporary = path.with_name(path.name + ".tmp")
     try:
@@ -24,8 +24,14 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_text(file: Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    with whole(file) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def clone_root() -> Path:
-    """The repository's root, for what is not part of the package: the benchmark scenes and the Blender extension."""
+    """Return the repository's root, which holds the benchmark scenes and the Blender extension; neither is in the package."""
     if not (ROOT / "blender_manifest.toml").exists():
         raise InputError("this needs the whole repository: clone it and install with `pip install -e .` from there")
     return ROOT

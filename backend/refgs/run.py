@@ -1,4 +1,7 @@
-"""The run folder: what a training leaves, and the only thing that rendering, evaluation, export and Blender read."""
+"""Create a run folder, and open a finished run to render it.
+
+Rendering, evaluation, export and Blender read a run folder and nothing else.
+"""
 
 import platform
 import tomllib
@@ -12,25 +15,26 @@ import torch
 from refgs import __version__
 from refgs.camera import Camera
 from refgs.capture import Capture, read_run_cameras, write_cameras
-from refgs.color import srgb_encode
 from refgs.errors import InputError
-from refgs.export.environment import read_environment
-from refgs.export.splats import Splats, read_splats
-from refgs.geometry.mesh import read_mesh
+from refgs.formats.mesh import read_mesh
+from refgs.formats.panorama import read_environment
+from refgs.formats.splats import Splats, read_splats
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, from_splats
-from refgs.paths import whole
+from refgs.paths import write_text
+from refgs.render.baselines import method_of
 from refgs.render.relight import Progress, Transport, relit
 from refgs.render.renderer import Rendering, near_plane, render
-from refgs.settings import Settings, recorded_settings
+from refgs.run_folder import check_finished, check_free
+from refgs.settings import Settings
 
-OCCLUDER = "occluder.ply"  # the mesh that inter-reflection was traced on, where there was any
+OCCLUDER = "occluder.ply"  # the mesh that inter-reflection was traced on; absent without inter-reflection
 
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run, ready to render. Cameras are in the run's frame and of the photos' full size."""
+    """Finished run, ready to render. Cameras are in the run's frame and have the photos' full size."""
 
     folder: Path
     settings: Settings
@@ -43,43 +47,45 @@ class Run:
     cameras: list[Camera]
     splits: list[str]
     to_capture: np.ndarray
-    exposed: bool  # photos were found to have exposures of their own
+    exposed: bool  # at least one photo has an exposure of its own
     splats: Splats
     environment: Environment | None
     occluder: Occluder | None
     _traced: dict = field(default_factory=dict, repr=False, compare=False)
 
     def surfels(self) -> Surfels:
-        """The asset's surfels as tensors."""
+        """Return the asset's surfels as tensors."""
         return from_splats(self.splats)
 
     def training_cameras(self) -> list[Camera]:
-        """The cameras of the photos that were trained on, at the size they were trained at."""
+        """Return the cameras of the training photos, at the size they were trained at."""
         side = self.settings.image.max_side
         return [c.fitted(side) for c, split in zip(self.cameras, self.splits, strict=True) if split == "train"]
 
     def light(self, panorama: np.ndarray) -> Environment:
-        """Another light for `render`: an equirectangular picture (H, W, 3) of linear radiance, in Blender's orientation."""
+        """Make a light for `render` of an equirectangular picture (`light_of`)."""
         return light_of(panorama, self.settings)
 
     def relit(self, light: Environment, progress: Progress = lambda done, total: None) -> Surfels:
-        """The surfels under another light, with what they receive of each other where the run has a mesh to trace that on:
-        seconds for the first light, less for others, nothing for the last one again. `progress` hears how much is traced."""
+        """Relight the surfels, with inter-reflection where the run has a mesh to trace it on.
+
+        The first light takes seconds, another one less, and the last one again nothing. `progress` is called while rays are traced.
+        """
         if self.occluder is None:
-            return self.surfels().without_directions()  # they were true under the recovered light
+            return self.surfels().without_directions()  # learned under the recovered light: wrong under this one
         with torch.no_grad():
             if "transport" not in self._traced:
                 surfels = self.surfels()
                 inward = (surfels.normals() * torch.from_numpy(self.splats.normals)).sum(dim=-1) < 0
                 self._traced["transport"] = Transport(surfels.turned(inward), self.occluder, progress=progress)
             if self._traced.get("light") is not light:
-                # Drawn as they were learned: near the horizon it matters which way a surfel's normal points.
+                # Render with the learned rotations: near the horizon the side that a normal points to matters.
                 found = relit(self._traced["transport"], light)._replace(rotations=self.surfels().rotations)
                 self._traced.update(light=light, surfels=found)
         return self._traced["surfels"]
 
     def render(self, camera: Camera, environment: Environment | None = None, exposure: float = 1.0) -> Rendering:
-        """Render a camera of the run's frame, under another light where one is given; the picture is exposed so much more."""
+        """Render a camera of the run's frame, under `environment` if given; radiance is multiplied by `exposure`."""
         surfels, settings = self.surfels(), self.settings.render
         if environment is not None:
             surfels = self.relit(environment)
@@ -96,9 +102,9 @@ class Run:
 def create_run(
     folder: Path, capture: Capture, settings: Settings, preset: str, device: str, chosen: dict[str, str] | None = None
 ) -> None:
-    """Make a new run folder with its run.toml and cameras.json. Raises InputError where the folder is taken.
+    """Create a run folder with its run.toml and cameras.json. Raise InputError if the folder is not empty.
 
-    `chosen` says of a setting that was "auto" what was chosen, and why; `settings` have it already.
+    `chosen` names what was chosen for each setting that was "auto", and why; `settings` already hold these values.
     """
     check_free(folder)
     try:
@@ -127,47 +133,26 @@ def create_run(
     write_cameras(folder / "cameras.json", capture, settings.light.frame)
 
 
-def check_free(folder: Path) -> None:
-    """Raise InputError unless a new run can go into the folder."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        what = "holds another run" if (folder / "run.toml").exists() else "is not empty"
-        raise InputError(f"{folder} {what}: choose another folder with --out, or go on with that run with --resume")
-
-
-def read_run_facts(folder: Path) -> tuple[dict, Settings]:
-    """What run.toml says: its [run] table and its settings. Raises InputError for none, and for that of a newer release."""
-    file = folder / "run.toml"
-    try:
-        facts = tomllib.loads(file.read_text(encoding="utf-8"))
-        made_by = facts["run"]["refgs"]
-        if _release(made_by) > _release(__version__):
-            raise InputError(
-                f"{folder} was made by RefGS {made_by}, which is newer than this, {__version__}: update RefGS"
-            )
-        return facts["run"], recorded_settings(facts["settings"], str(file))
-    except FileNotFoundError:
-        raise InputError(f"{folder} is not a run folder: there is no run.toml in it") from None
-    except (OSError, KeyError, TypeError, AttributeError, ValueError) as error:
-        raise InputError(f"{file} is broken ({error}): train again") from None
-
-
-def _release(version: str) -> tuple[int, ...]:
-    return tuple(int(number) for number in version.split(".")[:2])  # the third only mends
+def record_changes(folder: Path, rows: dict[str, dict]) -> None:
+    """Add changes of settings to run.toml's [changed]. A setting's `asked` stays as it was first recorded."""
+    if not rows:
+        return
+    tables = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
+    known = tables.get("changed", {})
+    rows = {key: row | {"asked": known.get(key, row)["asked"]} for key, row in rows.items()}
+    write_text(folder / "run.toml", tomli_w.dumps(tables | {"changed": known | rows}))
 
 
 def open_run(folder: Path) -> Run:
-    """Read a finished run. Raises InputError naming what is missing."""
-    facts, settings = read_run_facts(folder)
-    if not (folder / "splats.ply").exists():
-        raise InputError(f"{folder}: the training has not ended: go on with `refgs train … --out {folder} --resume`")
+    """Open a finished run. Raise InputError naming what is missing."""
+    facts, settings = check_finished(folder)
     cameras, splits, to_capture, exposures = read_run_cameras(folder / "cameras.json")
     splats, environment = read_splats(folder / "splats.ply"), None
-    if (
-        settings.render.reflection != "mirror"
-    ):  # the splats say whether anything is mirrored: edits may have changed that
+    method = method_of(settings.render)
+    if not method.mirror:  # edits may have added or removed specular shading: the splats know
         reflection = "none" if splats.constants.get("specular") == 0 else "microfacet"
         settings = settings.model_copy(update={"render": settings.render.model_copy(update={"reflection": reflection})})
-    if settings.render.shading != "sh":
+    if method.lit:
         reference = next(c for c, split in zip(cameras, splits, strict=True) if split == "train")
         panorama = read_environment(folder / "environment.exr")
         environment = light_of(panorama, settings, reference if settings.light.frame == "camera" else None)
@@ -191,13 +176,6 @@ def open_run(folder: Path) -> Run:
 
 
 def light_of(panorama: np.ndarray, settings: Settings, reference: Camera | None = None) -> Environment:
-    """An equirectangular picture (H, W, 3) of linear radiance, in Blender's orientation, as the light of a run with these settings."""
-    display = settings.render.color_space == "display"
-    panorama = srgb_encode(panorama) if display else panorama
+    """Make the light of a run of an equirectangular picture (H, W, 3): linear radiance, in Blender's orientation."""
+    panorama = method_of(settings.render).light.from_linear(panorama)
     return Environment.from_panorama(panorama, settings.environment.resolution, reference)
-
-
-def write_text(file: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
-    with whole(file) as temporary:
-        temporary.write_text(text, encoding="utf-8")

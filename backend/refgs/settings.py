@@ -1,4 +1,4 @@
-"""Settings: what a preset may say, within which range. The numbers themselves live in presets/*.toml."""
+"""Settings: keys, ranges and descriptions. The values are in presets/*.toml; docs/settings.md lists all."""
 
 import tomllib
 from pathlib import Path
@@ -12,6 +12,7 @@ from refgs.paths import PRESETS
 Length = Annotated[FiniteFloat, Field(ge=0)]
 Part = Annotated[float, Field(ge=0, le=1)]
 Need = Literal["auto", "on", "off"]
+Vector = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class _Section(BaseModel):
@@ -19,16 +20,17 @@ class _Section(BaseModel):
 
 
 class RegionSettings(_Section):
-    """What of a capture is wanted, a box, and which way is up: in the frame of the cameras.json of a run without (docs/run-folder.md)."""
+    """Wanted part of a capture, as a box, and its up direction.
 
-    centre: tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-    size: tuple[Length, Length, Length] = Field(description="the lengths of its edges; three zeros take all")
-    rotation: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = Field(
-        description="degrees about x, then about y, then about z, which stand still: Blender's XYZ Euler angles"
+    Both are in the frame of the cameras.json of a run without them (docs/run-folder.md).
+    """
+
+    centre: Vector = Field(description="centre of the box")
+    size: tuple[Length, Length, Length] = Field(description="edge lengths of the box; three zeros: no box")
+    rotation: Vector = Field(
+        description="rotation of the box: degrees about fixed x, then y, then z (Blender's XYZ Euler angles)"
     )
-    up: tuple[FiniteFloat, FiniteFloat, FiniteFloat] = Field(
-        description="the direction that is to be the result's +Z, of any length; three zeros leave it to the cameras"
-    )
+    up: Vector = Field(description="direction of the result's +Z, of any length; three zeros: found from the cameras")
 
     @model_validator(mode="after")
     def _has_a_volume(self) -> "RegionSettings":
@@ -41,22 +43,19 @@ class RegionSettings(_Section):
 
 
 class ImageSettings(_Section):
-    max_side: int = Field(ge=16, le=8192, description="photos are reduced to this many pixels on their longer side")
-    background: tuple[Part, Part, Part] = Field(description="sRGB colour behind masked objects, 0..1")
+    """Photos as they are trained on."""
+
+    max_side: int = Field(ge=16, le=8192, description="pixels on the longer side; larger photos are reduced to it")
+    background: tuple[Part, Part, Part] = Field(description="sRGB colour behind masked objects")
 
 
 class RenderSettings(_Section):
-    shading: Literal["deferred", "splat", "sh"] = Field(
-        description="split-sum materials, of what was blended or of each surfel before; or plain view-dependent colour"
-    )
-    diffuse: Literal["irradiance", "sh"] = Field(description="diffuse light: from the environment, or SH per surfel")
-    reflection: Literal["microfacet", "mirror", "none"] = Field(
-        description="of metals and dielectrics, by roughness; none, of what is matte; or, to compare with, a mirror's before diffuse = sh, "
-        "metallic its share"
-    )
-    color_space: Literal["linear", "display"] = Field(
-        description="radiance is linear, HDR, and encoded as sRGB at the end; or a screen's numbers, 0..1, as in the paper"
-    )
+    """Shading."""
+
+    shading: Literal["deferred", "splat", "sh"] = Field(description="deferred: materials are blended, then shaded")
+    diffuse: Literal["irradiance", "sh"] = Field(description="diffuse light: the environment's, or SH per surfel")
+    reflection: Literal["microfacet", "mirror", "none"] = Field(description="GGX microfacets, or no reflection")
+    color_space: Literal["linear", "display"] = Field(description="linear: HDR radiance is learned")
 
     @model_validator(mode="after")
     def _mirrors_have_colours_of_their_own(self) -> "RenderSettings":
@@ -68,160 +67,173 @@ class RenderSettings(_Section):
 
 
 class SurfelSettings(_Section):
-    primitive: Literal["2dgs", "3dgs"] = Field(description="flat discs, or 3D Gaussians, to compare with")
-    start: int = Field(ge=1, le=10_000_000, description="surfels at the start")
-    budget: int = Field(ge=1, le=10_000_000, description="surfels at the most")
-    hull: int = Field(ge=16, le=512, description="voxels along each side of the visual hull's grid")
+    """Surfels, and their values at the start."""
+
+    primitive: Literal["2dgs", "3dgs"] = Field(description="2dgs: flat discs")
+    start: int = Field(ge=1, le=10_000_000, description="number of surfels at the start")
+    budget: int = Field(ge=1, le=10_000_000, description="maximum number of surfels")
+    hull: int = Field(ge=16, le=512, description="voxels along each side of the visual hull")
     inside: float = Field(
-        ge=0, lt=1, description="part of the surfels that start inside the visual hull, the others on it"
+        ge=0, lt=1, description="part of the first surfels inside the visual hull; the others lie on it"
     )
-    sh_degree: int = Field(ge=0, le=3)
-    opacity: float = Field(gt=0, lt=1, description="at the start")
-    albedo: float = Field(gt=0, lt=1, description="at the start")
-    metallic: float = Field(gt=0, lt=1, description="at the start")
-    roughness: float = Field(gt=0, lt=1, description="at the start")
+    sh_degree: int = Field(ge=0, le=3, description="highest degree of spherical harmonics per surfel")
+    opacity: float = Field(gt=0, lt=1, description="opacity at the start")
+    albedo: float = Field(gt=0, lt=1, description="albedo at the start")
+    metallic: float = Field(gt=0, lt=1, description="metallic at the start")
+    roughness: float = Field(gt=0, lt=1, description="roughness at the start")
 
 
 class EnvironmentSettings(_Section):
-    resolution: Literal[16, 32, 64, 128, 256] = Field(description="side of the cubemap's faces, in texels")
-    radiance: float = Field(gt=0, le=1e6, description="at the start")
+    """Learned light."""
+
+    resolution: Literal[16, 32, 64, 128, 256] = Field(description="texels along each side of the cubemap's faces")
+    radiance: float = Field(gt=0, le=1e6, description="radiance at the start")
     diffusion: float = Field(
         ge=0,
-        description="of texels of 6×64² into their neighbours, a part of the light's rate, and as far on the sphere at other resolutions; "
-        "keeps noise out of what photos hardly show",
+        description="smoothing per iteration, a part of rates.environment: how much of a texel flows into its neighbours, at 64 texels "
+        "a side; scaled at other resolutions. Suppresses noise where photos hardly show the light",
     )
 
 
 class LightSettings(_Section):
+    """Light and exposure that vary between photos."""
+
     frame: Literal["auto", "world", "camera"] = Field(
-        description="whether the light stands still or turns with the camera, as on a turntable; auto asks the photos"
+        description="light fixed to the world, or to the camera as on a turntable; auto: found from the photos"
     )
-    exposure: Literal["auto", "on", "off"] = Field(
-        description="whether each photo has an exposure of its own; auto leaves them out where the photos agree"
-    )
+    exposure: Need = Field(description="exposure per photo; auto: off if the photos agree")
 
 
 class TrainSettings(_Section):
-    iterations: int = Field(ge=1, le=10_000_000)
-    light_first: int = Field(ge=0, description="iterations in which only light and materials learn")
-    checkpoint_every: int = Field(ge=1, description="iterations")
-    seed: int = Field(ge=0)
+    """Length and seed of a training."""
+
+    iterations: int = Field(ge=1, le=10_000_000, description="number of iterations, one photo each")
+    light_first: int = Field(ge=0, description="iterations at the start in which geometry is frozen")
+    checkpoint_every: int = Field(ge=1, description="iterations between checkpoints")
+    seed: int = Field(ge=0, description="seed of all random choices")
 
 
 class InitialSettings(_Section):
-    until: float = Field(
-        ge=0,
-        lt=1,
-        description="part of the training in which each surfel is shaded by itself; then colour, material and light start anew",
-    )
+    """Initial stage: each surfel is shaded by itself. Then colour, material and light start anew on the geometry found."""
+
+    until: float = Field(ge=0, lt=1, description="end of the stage, a part of the training; 0: no such stage")
 
 
 class IndirectSettings(_Section):
-    start: float = Field(
-        ge=0, le=1, description="part of the training after which inter-reflection joins; 1 does without"
-    )
+    """Inter-reflection: the object's reflection in itself, by rays against a mesh."""
+
+    start: float = Field(ge=0, le=1, description="start, a part of the training; 1: never")
     every: int = Field(ge=1, description="iterations between meshes")
     resolution: int = Field(ge=16, le=1024, description="voxels along each side of the mesh's volume")
-    least: float = Field(ge=0, le=1, description="part of the object that must mirror the object, else it is left out")
+    least: float = Field(
+        ge=0, le=1, description="smallest part of the object that reflects the object; below it, left out"
+    )
 
 
 class ResidualSettings(_Section):
-    """Colour by direction, sRGB-encoded, that adds to the picture what material and light leave over; gone under another light."""
+    """Colour by direction that adds what material and light do not explain, sRGB-encoded. Dropped under another light."""
 
     start: float = Field(
-        gt=0,
-        le=1,
-        description="part of the training after which it learns, and material and light no longer do; 1 does without",
+        gt=0, le=1, description="start, a part of the training; material and light are frozen from then on. 1: never"
     )
 
 
 class RateSettings(_Section):
-    """Adam's learning rates, at the start; the decays are the factors reached at the end. Position is in scene radii."""
+    """Adam's learning rates at the start, and the factors that they decay by."""
 
-    position: float = Field(ge=0)
-    rotation: float = Field(ge=0)
-    scale: float = Field(ge=0)
-    opacity: float = Field(ge=0)
-    sh_dc: float = Field(ge=0)
-    sh_rest: float = Field(ge=0)
-    residual: float = Field(ge=0)
-    albedo: float = Field(ge=0)
-    metallic: float = Field(ge=0)
-    roughness: float = Field(ge=0)
-    indirect_dc: float = Field(ge=0)
-    indirect_rest: float = Field(ge=0)
-    environment: float = Field(ge=0)
-    exposure: float = Field(ge=0)
-    decay: float = Field(gt=0, le=1, description="every rate's factor at the end of the training, but the position's")
-    position_decay: float = Field(gt=0, le=1, description="the position's, reached at `position_until`")
-    position_until: float = Field(gt=0, le=1, description="part of the training after which it stays")
+    position: float = Field(ge=0, description="position, in scene radii")
+    rotation: float = Field(ge=0, description="rotation quaternion")
+    scale: float = Field(ge=0, description="logarithm of the scale")
+    opacity: float = Field(ge=0, description="logit of the opacity")
+    sh_dc: float = Field(ge=0, description="colour, SH degree 0")
+    sh_rest: float = Field(ge=0, description="colour, SH degrees above 0")
+    residual: float = Field(ge=0, description="residual colour (section residual)")
+    albedo: float = Field(ge=0, description="logit of the albedo")
+    metallic: float = Field(ge=0, description="metallic, as the logit of its inverse smoothstep")
+    roughness: float = Field(ge=0, description="logit of the roughness")
+    indirect_dc: float = Field(ge=0, description="indirect light, SH degree 0")
+    indirect_rest: float = Field(ge=0, description="indirect light, SH degrees above 0")
+    environment: float = Field(ge=0, description="texels of the light")
+    exposure: float = Field(ge=0, description="logarithm of a photo's exposure")
+    decay: float = Field(gt=0, le=1, description="factor on every rate but position's at the end of the training")
+    position_decay: float = Field(gt=0, le=1, description="factor on position's rate at position_until")
+    position_until: float = Field(
+        gt=0, le=1, description="part of the training after which position's rate is constant"
+    )
 
 
 RATES = tuple(name for name in RateSettings.model_fields if not name.startswith(("decay", "position_")))
-"""The rates among them."""
+"""Names of the learning rates, without the decays."""
 
 
 class LossSettings(_Section):
-    dssim: float = Field(ge=0, le=1, description="λ of (1 − λ) L1 + λ D-SSIM")
-    normal: float = Field(ge=0, description="weight of normal consistency with the depth")
-    smooth: float = Field(ge=0, description="weight of edge-aware normal smoothness")
-    even: float = Field(ge=0, description="weight of edge-aware smoothness of metallic and roughness")
-    alpha: float = Field(ge=0, description="weight of the mask, where there is one")
+    """Weights of the terms of the loss."""
+
+    dssim: float = Field(ge=0, le=1, description="λ in (1 − λ) L1 + λ D-SSIM")
+    normal: float = Field(ge=0, description="consistency of normals with depth")
+    smooth: float = Field(ge=0, description="edge-aware smoothness of normals")
+    even: float = Field(ge=0, description="edge-aware smoothness of metallic and roughness")
+    alpha: float = Field(ge=0, description="agreement with the mask")
     metallic: float = Field(
-        ge=0, description="weight, at the end, of a metallic that is neither 0 nor 1; and of metals too dark for any"
+        ge=0,
+        description="penalty of metallic between 0 and 1, growing with progress², and of metals darker than any real one",
     )
-    matte: float = Field(ge=0, description="weight of roughness above 0.3: a surface is matte where photos say so")
-    light: float = Field(ge=0, description="weight of the light's being neutral on the whole")
-    exposure: float = Field(ge=0, description="weight of a photo's being exposed as most are")
+    matte: float = Field(ge=0, description="penalty of roughness above 0.3")
+    light: float = Field(ge=0, description="penalty of a coloured mean of the light")
+    exposure: float = Field(ge=0, description="penalty of a photo's exposure that differs from most")
 
 
 class NeedsSettings(_Section):
-    """What a scene may do without. `auto` measures whether it does (refgs.train.needs), `on` keeps it, `off` leaves it out."""
+    """Parts of the method that a scene may do without. `auto` measures whether it needs them; `on` keeps and `off` drops them."""
 
-    views: Need = Field(description="photos that are another's twin, taken from where that was")
-    outside: Need = Field(description="pixels beyond the mask, but for some about it")
-    initial: Need = Field(description="the stage in which each surfel is shaded by itself")
-    specular: Need = Field(description="what surfaces mirror; without it they are matte")
-    iterations: Need = Field(description="a fifth of them, where nothing is mirrored")
-    reflections: Need = Field(description="of the object in itself: its mesh, rays, and harmonics of its light")
-    light: Need = Field(description="texels of the light finer than its blurred image on the object")
-    degrees: Need = Field(description="harmonics of the higher degrees, of what `residual` learns")
+    views: Need = Field(description="photos from the same place as another one")
+    outside: Need = Field(description="pixels outside the mask, apart from a margin")
+    initial: Need = Field(description="initial stage (section initial)")
+    specular: Need = Field(description="specular reflection; without it the scene is matte")
+    iterations: Need = Field(description="a fifth of the iterations, if the scene is matte")
+    reflections: Need = Field(description="inter-reflection (section indirect)")
+    light: Need = Field(description="texels of the light finer than the sharpest reflection of it")
+    degrees: Need = Field(description="higher SH degrees of the residual")
     constants: Need = Field(
-        description="columns of splats.ply for metallic and roughness where all surfels have the same"
+        description="columns metallic and roughness of splats.ply, if all surfels have the same value"
     )
 
 
 class DensifySettings(_Section):
-    start: float = Field(ge=0, le=1, description="part of the training after which surfels are added")
-    stop: float = Field(ge=0, le=1, description="part of the training after which no more are")
-    every: int = Field(ge=1, description="iterations")
-    gradient: float = Field(ge=0, description="mean gradient per pixel of motion above which a surfel is divided")
-    prune_opacity: float = Field(ge=0, lt=1, description="surfels fainter than this are removed")
-    reset_every: int = Field(
-        ge=0, description="iterations between making all surfels faint; 0 never does, nor after `stop`"
+    """Adding and removing surfels."""
+
+    start: float = Field(ge=0, le=1, description="start, a part of the training")
+    stop: float = Field(ge=0, le=1, description="part of the training after which surfels are only removed")
+    every: int = Field(ge=1, description="iterations between passes")
+    gradient: float = Field(
+        ge=0, description="threshold on a surfel's mean screen-space gradient, above which it is split"
     )
+    prune_opacity: float = Field(ge=0, lt=1, description="opacity below which surfels are removed")
+    reset_every: int = Field(ge=0, description="iterations between opacity resets, until stop; 0: none")
 
 
 class PropagationSettings(_Section):
-    """Material-aware normal propagation (paper §3.3): mirrors grow over what surrounds them, now and then."""
+    """Material-aware normal propagation (paper §3.3): surfels of shiny metal grow at intervals and pass their normals on."""
 
-    every: int = Field(ge=0, description="iterations; 0 does without")
-    stop: float = Field(ge=0, le=1, description="part of the training after which there is no more of it")
-    metallic: float = Field(ge=0, le=1, description="of surfels that grow, at the least")
-    roughness: float = Field(ge=0, le=1, description="of surfels that grow, at the most")
-    growth: float = Field(ge=1, description="factor of their size")
-    opacity: float = Field(gt=0, lt=1, description="of all surfels then, at the least")
-    rest: int = Field(ge=0, description="iterations for which opacity then stays as it is")
+    every: int = Field(ge=0, description="iterations between passes; 0: none")
+    stop: float = Field(ge=0, le=1, description="end, a part of the training")
+    metallic: float = Field(ge=0, le=1, description="least metallic of the surfels that grow")
+    roughness: float = Field(ge=0, le=1, description="greatest roughness of the surfels that grow")
+    growth: float = Field(ge=1, description="factor on their size")
+    opacity: float = Field(gt=0, lt=1, description="least opacity of all surfels after a pass")
+    rest: int = Field(ge=0, description="iterations after a pass in which opacity is frozen")
 
 
 class MeshSettings(_Section):
+    """Exported mesh."""
+
     resolution: int = Field(ge=16, le=1024, description="voxels along each side of the fused volume")
-    triangles: int = Field(ge=100, le=10_000_000)
-    texture: int = Field(ge=64, le=8192, description="side of the baked textures, in pixels")
+    triangles: int = Field(ge=100, le=10_000_000, description="number of triangles after simplification")
+    texture: int = Field(ge=64, le=8192, description="pixels along each side of the textures")
 
 
 class Settings(_Section):
-    """Every number of a run. All are in the preset; there are no defaults in the code."""
+    """All settings of a run. Every value is in the preset; the code has no defaults."""
 
     region: RegionSettings
     image: ImageSettings
@@ -241,20 +253,30 @@ class Settings(_Section):
     mesh: MeshSettings
 
 
-SHORT = {"primitive": "surfels.primitive"} | {
-    key: f"render.{key}" for key in RenderSettings.model_fields
-}  # keys that `--set` takes without their section
+SHORT = {"primitive": "surfels.primitive"} | {key: f"render.{key}" for key in RenderSettings.model_fields}
+"""Keys that `--set` takes without their section."""
+
+COMPARISON = {
+    "render.shading": {
+        "splat": "each surfel is shaded before it is blended",
+        "sh": "no materials, only colour by direction (spherical harmonics, SH): no relighting",
+    },
+    "render.reflection": {"mirror": "mirrors in front of `diffuse = sh`, with metallic as their share"},
+    "render.color_space": {"display": "sRGB-encoded values 0..1 are learned"},
+    "surfels.primitive": {"3dgs": "3D Gaussians"},
+}
+"""Values that exist only for comparison with papers, and what they do."""
 
 
 def preset_names() -> list[str]:
-    """Names of the presets that come with the program."""
+    """Return the names of the program's presets."""
     return sorted(file.stem for file in PRESETS.glob("*.toml"))
 
 
 def load_settings(preset: str, changes: list[str] = ()) -> Settings:
-    """Settings from a preset's name or a TOML file, with `section.key=value` changes.
+    """Load a preset by name or a TOML file, and apply `section.key=value` changes.
 
-    A file may start from another with `base = "NAME"`. Raises InputError with the key and what it may be.
+    A file may start from a preset with `base = "NAME"`. Raises InputError naming the wrong key and what it may be.
     """
     tables = _read_preset(preset)
     for change in changes:
@@ -270,15 +292,15 @@ def load_settings(preset: str, changes: list[str] = ()) -> Settings:
 
 
 def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
-    """Settings that a run wrote down; what the program did not know of yet is as in the standard preset."""
-    # All light stood in the world, no photo had an exposure, what was left over was not learned, and all was held to be needed.
+    """Complete the settings recorded by a run. Keys that its release did not have yet get the standard preset's values."""
+    # Before these keys existed, light was fixed to the world, there were no exposures and no residual, and nothing was left out.
     still = {"light": {"frame": "world", "exposure": "off"}, "residual": {"start": 1.0}}
     still["needs"] = dict.fromkeys(NeedsSettings.model_fields, "on")
     return validate(_merge(_merge(_read_preset("standard"), still), tables), source)
 
 
 def validate(tables: dict[str, Any], source: str) -> Settings:
-    """Settings from nested tables. Raises InputError naming the first key that is wrong and what it may be."""
+    """Make settings of nested tables. Raise InputError naming the first wrong key and what it may be."""
     try:
         return Settings.model_validate(tables)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""`refgs worker`: the job protocol of docs/job-protocol.md. Commands come in on stdin, events go out on stdout, a JSON object a line."""
+"""Speak the job protocol (docs/job-protocol.md): read commands on stdin, write events to stdout, one JSON object a line."""
 
 import _thread
 import json
@@ -22,7 +22,7 @@ from refgs.capture.motion import find_cameras
 from refgs.errors import InputError, NoCameras
 from refgs.kernels import cuda
 from refgs.train.preview import write_preview
-from refgs.train.trainer import Trainer
+from refgs.train.state import State
 
 PROTOCOL = 1
 
@@ -61,89 +61,92 @@ class Export(_Command):
 
 
 class During(_Command):
-    """What can be asked of a job while it runs. "stop" ends a training here, with its asset; "cancel" leaves it to be resumed."""
+    """Command to a running job. "stop" ends a training here and writes its asset; "cancel" leaves it to be resumed."""
 
     command: Literal["preview", "pause", "resume", "stop", "cancel"]
 
 
 class Keep(_Command):
-    """Whether the jobs that were asked for are done to their end when the input closes. Told at any time, and heard at once."""
+    """Tell whether jobs still run to their end after the input has closed. Takes effect at once, also during a job."""
 
     command: Literal["keep"]
     on: bool
 
 
 COMMANDS = TypeAdapter(Annotated[Check | Poses | Train | Export | During | Keep, Field(discriminator="command")])
-CLOSED = None  # in place of a command: there will be no more of them
+CLOSED = None  # queued in place of a command: the input has ended
 
 
 class Worker:
-    """Does one job after another, each said to be `started`, then `done`, `cancelled` or `failed`."""
+    """Run one job after another. Each sends `started`, then `done`, `cancelled` or `failed`."""
 
     def __init__(self, events: IO[str]):
         self._events = events
-        self._commands: queue.SimpleQueue[_Command | None] = queue.SimpleQueue()  # a signal may put while it is read
-        self._waiting: list[_Command] = []  # jobs that were asked for during a training
-        self._open, self._deaf, self._kept = True, False, False
-        self._closed = False  # no more commands will come, though some may not have been read
+        # A signal handler may put while the queue is read: only SimpleQueue allows that.
+        self._commands: queue.SimpleQueue[_Command | None] = queue.SimpleQueue()
+        self._waiting: list[_Command] = []  # jobs that came during a training
+        self._keep = False  # run jobs to their end after the input has closed
+        self._attentive = True  # no job runs that cannot read commands
+        self._open = True  # CLOSED has not been taken from the queue
+        self._closed = False  # the input has ended; commands may still be queued
 
     def listen(self, commands: IO[str]) -> None:
-        """Take commands until there are no more; in a thread of its own."""
+        """Read commands until the input ends. Runs in its own thread."""
         for line in commands:
             try:
                 command = COMMANDS.validate_json(line)
                 if isinstance(command, Keep):
-                    self._kept = command.on
+                    self._keep = command.on
                 else:
                     self._commands.put(command)
             except ValidationError as error:
                 what = "; ".join(f"{'.'.join(map(str, e['loc']))} {e['msg']}".strip() for e in error.errors())
-                self.say("warning", {"what": f"not a command of protocol {PROTOCOL}: {what}"})
+                self.send("warning", {"what": f"not a command of protocol {PROTOCOL}: {what}"})
         self.close()
-        if self._deaf and not self._kept:
+        if not self._attentive and not self._keep:
             _thread.interrupt_main()
 
     def close(self) -> None:
-        """No more commands will come."""
+        """Note that no more commands will come."""
         self._closed = True
         self._commands.put(CLOSED)
 
-    def interrupted(self, *_) -> None:
-        """End: a training after its iteration, with a checkpoint; other jobs at once, for they leave nothing half done."""
-        self._kept = False
+    def interrupt(self, *_) -> None:
+        """Handle a signal. A training ends after its iteration, with a checkpoint; other jobs end at once and leave nothing half done."""
+        self._keep = False
         self.close()
-        if self._deaf:
+        if not self._attentive:
             raise KeyboardInterrupt
 
-    def say(self, event: str, facts: dict[str, Any]) -> None:
-        """Send an event. Where nobody listens any more it is time to end, unless told to go on."""
+    def send(self, event: str, facts: dict[str, Any]) -> None:
+        """Write an event. If nobody reads it any more, end, unless told to keep running."""
         try:
             self._events.write(json.dumps({"event": event} | facts) + "\n")
             self._events.flush()
-        except (OSError, ValueError):  # a broken pipe, which Windows calls an invalid argument
-            if not self._kept:
+        except (OSError, ValueError):  # broken pipe; Windows reports an invalid argument
+            if not self._keep:
                 self.close()
 
     def run(self) -> None:
-        """Work until there are no more commands."""
+        """Run jobs until there are no more commands."""
         why = cuda.unusable()
         card = torch.cuda.get_device_name() if why is None else None
-        self.say("ready", {"protocol": PROTOCOL, "refgs": __version__, "card": card, "no_card": why})
+        self.send("ready", {"protocol": PROTOCOL, "refgs": __version__, "card": card, "no_card": why})
         jobs_of = {Check: self._check, Poses: self._poses, Train: self._train, Export: self._export}
-        while self._open or (self._kept and self._waiting):
-            if self._waiting and self._closed and not self._kept:
-                break  # what waited for the training goes with the input, wherever the training was then
+        while self._open or (self._keep and self._waiting):
+            if self._waiting and self._closed and not self._keep:
+                break  # the input has ended: drop the jobs that came during the training
             command = self._waiting.pop(0) if self._waiting else self._commands.get()
             if command is CLOSED:
                 break
             if type(command) in jobs_of:
-                self._do(command.command, jobs_of[type(command)], command)
+                self._run_job(command.command, jobs_of[type(command)], command)
             else:
-                self.say("warning", {"what": f"nothing to {command.command}: no job is running"})
+                self.send("warning", {"what": f"nothing to {command.command}: no job is running"})
 
-    def _do(self, name: str, job: Callable[[Any], tuple[str, dict]], command: _Command) -> None:
-        self.say("started", {"job": name})
-        self._deaf = name != "train"
+    def _run_job(self, name: str, job: Callable[[Any], tuple[str, dict]], command: _Command) -> None:
+        self.send("started", {"job": name})
+        self._attentive = name == "train"
         try:
             event, facts = job(command)
         except InputError as error:
@@ -152,8 +155,8 @@ class Worker:
             traceback.print_exc()
             event, facts = "failed", {"what": f"a fault of ours: {type(error).__name__}: {error}", "fault": True}
         finally:
-            self._deaf = False
-        self.say(event, {"job": name} | facts)
+            self._attentive = True
+        self.send(event, {"job": name} | facts)
 
     def _check(self, command: Check) -> tuple[str, dict]:
         capture = read_capture(Path(command.capture))
@@ -162,11 +165,11 @@ class Worker:
         return "done", check(capture, Path(command.out))
 
     def _poses(self, command: Poses) -> tuple[str, dict]:
-        return "done", find_cameras(Path(command.capture), self.say)
+        return "done", find_cameras(Path(command.capture), self.send)
 
     def _train(self, command: Train) -> tuple[str, dict]:
         out = Path(command.out)
-        trainer, quality = jobs.train(
+        state, quality = jobs.train(
             Path(command.capture),
             out,
             command.preset,
@@ -174,37 +177,37 @@ class Worker:
             command.minutes,
             command.settings,
             command.resume,
-            self.say,
+            self.send,
             self._attend,
         )
-        facts = {"run": str(out.resolve()), "iteration": trainer.iteration, "seconds": trainer.seconds}
-        if not trainer.ended:
+        facts = {"run": str(out.resolve()), "iteration": state.iteration, "seconds": state.seconds}
+        if not state.ended:
             return "cancelled", facts
         needs = json.loads((out / "needs.json").read_text(encoding="utf-8"))
         left_out = [need for need in needs if not need.get("needed", False)]
         return "done", facts | {"psnr": quality, "left_out": left_out}
 
-    def _attend(self, trainer: Trainer) -> bool:
-        """Do what was asked since the last iteration; True to stop here."""
+    def _attend(self, state: State) -> bool:
+        """Handle the commands since the last iteration. Return True to stop the training here."""
         paused = False
         while paused or not self._commands.empty():
             command = self._commands.get()
             if command is CLOSED:
                 self._open = False
-                if not self._kept:
+                if not self._keep:
                     return True
-                paused = False  # there is nobody to let it go on
+                paused = False  # nobody is left to resume it
                 continue
             match command.command:
                 case "pause" | "resume":
                     paused = command.command == "pause"
-                    self.say("paused" if paused else "resumed", {"iteration": trainer.iteration})
+                    self.send("paused" if paused else "resumed", {"iteration": state.iteration})
                 case "preview":
-                    self.say("preview", write_preview(trainer))
+                    self.send("preview", write_preview(state))
                 case "cancel":
                     return True
                 case "stop":
-                    trainer.total = trainer.iteration
+                    state.total = state.iteration
                     return True
                 case _:
                     self._waiting.append(command)
@@ -213,17 +216,17 @@ class Worker:
     def _export(self, command: Export) -> tuple[str, dict]:
         display = None if command.display_splats is None else Path(command.display_splats)
         run = Path(command.run)
-        files = jobs.export(run, None, command.texture, None, display, overwrite=display is not None, report=self.say)
+        files = jobs.export(run, None, command.texture, None, display, overwrite=display is not None, report=self.send)
         return "done", {"mesh" if display is None else "display_splats": str(files[0].resolve())}
 
 
 def work() -> None:
-    """Speak the protocol on this process's stdin and stdout. Whatever else prints goes to stderr."""
+    """Speak the protocol on stdin and stdout. All other output goes to stderr."""
     events = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     sys.stdin.reconfigure(encoding="utf-8")
     worker = Worker(events)
     for kind in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(kind, worker.interrupted)
+        signal.signal(kind, worker.interrupt)
     threading.Thread(target=worker.listen, args=(sys.stdin,), daemon=True).start()
     worker.run()

@@ -1,12 +1,13 @@
 """Captures with ground truth, rendered by Cycles: `python -m benchmarks.scenes NAME --out DIR`.
 
-One module a scene (each has `build()`); `shapes` makes meshes and `solids` sculpts them, `light` finds and reads HDRIs,
-`cycles` is all that touches Blender, `capture` places the cameras and writes the folder.
+One module a scene, each with `build()`; `solids` sculpts their meshes. `scripts.demo` has the jar and what photographs them all;
+`analytic` makes captures without Blender.
 """
 
 import importlib
 
-from benchmarks.scenes.shapes import Scene
+from scripts.demo import jar
+from scripts.demo.shapes import Scene
 
 REFLECTIVE = ("ball", "car", "figure", "helmet", "jar", "plate", "rings", "teapot", "toaster")
 MATTE = ("matte",)
@@ -14,5 +15,5 @@ NAMES = REFLECTIVE + MATTE
 
 
 def build(name: str) -> Scene:
-    """A scene by its name."""
-    return importlib.import_module(f"benchmarks.scenes.{name}").build()
+    """Build a scene by its name."""
+    return jar.build() if name == "jar" else importlib.import_module(f"benchmarks.scenes.{name}").build()

@@ -1,4 +1,4 @@
-"""Balls under a smooth sky, photographed by formulas: captures whose every answer is known, made without Blender."""
+"""Photograph balls under a smooth sky by formulas: captures whose every answer is known, made without Blender."""
 
 import json
 from pathlib import Path
@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from benchmarks.scenes.shapes import Material
 from refgs.color import srgb_encode
 from refgs.render.brdf import bounces, fresnel, one_bounce
+from scripts.demo.shapes import Material
 
 VIEWS, DISTANCE, ANGLE = 24, 4.0, 0.7  # training views, radii, radians
 F0 = np.array([0.9, 0.6, 0.3])
@@ -18,13 +18,13 @@ TWO = np.array([[-0.6, 0.0, 0.0, 0.5], [0.6, 0.0, 0.0, 0.5]])
 
 
 def sky(direction: np.ndarray) -> np.ndarray:
-    """Linear radiance (…, 3): bright above, dark below, warmer to +x. Smooth, so that a low roughness hardly blurs it."""
+    """Linear radiance (…, 3): bright above, dark below, warmer to +x. It is smooth: a low roughness hardly blurs it."""
     x, y, z = np.moveaxis(direction, -1, 0)
     return np.stack([0.5 + 0.3 * z + 0.2 * x, 0.5 + 0.35 * z + 0.1 * y, 0.5 + 0.4 * z - 0.2 * x], axis=-1)
 
 
 def meet(origin: np.ndarray, ray: np.ndarray, balls: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whether unit rays (P, 3) meet a ball (P,), and where they first do (P, 3), with the normal there (P, 3)."""
+    """Intersect unit rays (P, 3) with balls: hit or not (P,), first point (P, 3) and its normal (P, 3)."""
     apart = origin[:, None] - balls[:, :3]
     b = (apart * ray[:, None]).sum(-1)
     inside = b * b - ((apart**2).sum(-1) - balls[:, 3] ** 2)
@@ -36,24 +36,25 @@ def meet(origin: np.ndarray, ray: np.ndarray, balls: np.ndarray) -> tuple[np.nda
     return hit, point, (point - balls[first, :3]) / balls[first, 3:]
 
 
-# From the top down, each where the normal's z is more than this: what a mirror says of the light, the others are seen under.
+# From the top down, each where the normal's z is above this. The mirror tells the light; the others are seen under it.
 BANDS = (
     (0.25, Material((0.9, 0.6, 0.3), 1.0, 0.1)),
     (-0.3, Material((0.7, 0.7, 0.8), 1.0, 0.5)),
     (-1.0, Material((0.2, 0.4, 0.5), 0.0, 0.6)),
 )
 SUNS = np.array([[0.6, 0.0, 0.8], [-0.64, 0.6, 0.48], [0.0, -0.96, 0.28]])
-STEPS = 14  # of the lobe's quadrature, both ways
+STEPS = 14  # of the lobe's quadrature in either direction
 
 
 def sunny(direction: np.ndarray) -> np.ndarray:
-    """The sky with soft suns, 10 degrees wide: enough for a roughness to show."""
+    """Add soft suns, 10 degrees wide, to the sky: enough for a roughness to show."""
     return 0.4 * sky(direction) + 0.55 * np.exp(30 * (direction @ SUNS.T - 1)).sum(axis=-1, keepdims=True)
 
 
 def reflect(material: Material, ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Radiance (P, 3) against unit rays (P, 3) off a convex object under that light, by quadrature of the rendering equation: of
-    the specular lobe over its visible normals (Heitz 2018), of the matte base over the cosine."""
+    """Radiance (P, 3) against unit rays (P, 3) off a convex object under `sunny`, by quadrature of the rendering equation.
+
+    The specular lobe is integrated over its visible normals (Heitz 2018), the diffuse base over the cosine."""
     view, alpha = -ray, material.roughness**2
     n_v = (view * normal).sum(-1).clip(1e-3, 1 - 1e-9)
     side = view - (view * normal).sum(-1, keepdims=True) * normal
@@ -95,12 +96,12 @@ def reflect(material: Material, ray: np.ndarray, normal: np.ndarray) -> np.ndarr
 
 
 def banded(ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Radiance (P, 3) of a ball of BANDS."""
+    """Radiance (P, 3) off a ball of BANDS."""
     color, left = np.zeros_like(ray), np.ones(len(ray), bool)
     for lowest, material in BANDS:
         here = left & (normal[:, 2] >= lowest)
         left &= ~here
-        for some in np.array_split(np.flatnonzero(here), 1 + here.sum() // 256):  # what the caches hold
+        for some in np.array_split(np.flatnonzero(here), 1 + here.sum() // 256):  # as many as the caches hold
             color[some] = reflect(material, ray[some], normal[some])
     return color
 
@@ -116,10 +117,9 @@ def photo(
     angle: float = ANGLE,
     matte: bool = False,
 ) -> np.ndarray:
-    """RGBA in 0..1 of balls (B, 4), centre and radius: mirrors with Schlick's Fresnel, one of BANDS, or a matte one with a pattern; alpha
-    by `samples`² rays a pixel.
+    """Photograph balls (B, 4), centre and radius: mirrors with Schlick's Fresnel, BANDS, or matte with a pattern. RGBA in 0..1.
 
-    The mirrors' sky stands still, or turns with the camera, which is level, about z. Their photo is exposed so many stops more.
+    Alpha is by `samples`² rays a pixel. The mirrors' sky stands still or turns with the level camera about z; `stops` is their exposure.
     """
     focal = 0.5 * size / np.tan(angle / 2)
     grid = (np.arange(size * samples) + 0.5) / samples
@@ -138,7 +138,7 @@ def photo(
     cosine, sine = np.cos(azimuth), np.sin(azimuth)
     ray = ray @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
     color = np.where(seen[:, None], 2**stops * share * sky(ray), 0)
-    if matte:  # of a sky linear in the direction, a + b·d, irradiance / π is a + 2/3 b·n
+    if matte:  # a sky linear in the direction, a + b·d, has irradiance / π = a + 2/3 b·n
         color = np.where(seen[:, None], (0.5 + 0.3 * np.sin(6 * first_normal)) * sky(2 / 3 * first_normal), 0)
     blocks = (size, samples, size, samples)
     alpha = seen.reshape(blocks).mean(axis=(1, 3))
@@ -148,7 +148,7 @@ def photo(
         return total / np.maximum(seen.reshape(blocks).sum(axis=(1, 3)), 1)[..., None]
 
     color = mean(color)
-    if bands:  # these are smooth: once a pixel
+    if bands:  # smooth, so once a pixel is enough
         there = alpha > 0
         ray, normal = (mean(v)[there] for v in (first_ray, first_normal))
         color[there] = banded(*(v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (ray, normal)))
@@ -156,7 +156,7 @@ def photo(
 
 
 def camera_matrix(direction: np.ndarray, distance: float = DISTANCE) -> np.ndarray:
-    """OpenGL camera-to-world at a distance along a direction, looking at the origin, +z up."""
+    """Place a camera at a distance along a direction, looking at the origin, +z up: camera-to-world with OpenGL's axes."""
     back = direction / np.linalg.norm(direction)
     right = np.cross([0, 0, 1], back)
     right /= np.linalg.norm(right)
@@ -176,8 +176,9 @@ def write_ball_capture(
     distance: float = DISTANCE,
     matte: bool = False,
 ) -> None:
-    """A NeRF-Blender capture of balls, mirrors, with BANDS, or matte: 24 training and 4 test views, as large whatever the cameras'
-    distance. `stops` are the training views' by turns."""
+    """Write a NeRF-Blender capture of balls: 24 training and 4 test views, of the same size at any distance.
+
+    `stops` are the training views' exposures in turn."""
     angle = ANGLE if distance == DISTANCE else 2 * np.arctan(np.tan(ANGLE / 2) * DISTANCE / distance)
     steps = np.arange(VIEWS + 4) + 0.5
     z = 0.9 - 1.5 * steps / len(steps)

@@ -1,14 +1,14 @@
-"""A mirror ball with a rough band about its equator: convex, so nothing but its own light is reflected."""
+"""Mirror ball with a rough band about its equator: convex, so it reflects only the light."""
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, lathe
+from scripts.demo.shapes import Material, Scene, lathe
 
 MATERIALS = (Material((0.95, 0.93, 0.88), 1.0, 0.03), Material((0.70, 0.30, 0.20), 1.0, 0.40))
 
 
 def build() -> Scene:
-    """The unit sphere; the band is |z| < 0.2."""
+    """Build the unit sphere; the band is |z| < 0.2."""
 
     def arc(start: float, end: float) -> list[tuple[float, float]]:
         return [(abs(np.cos(a)), np.sin(a)) for a in np.linspace(start, end, 65)]

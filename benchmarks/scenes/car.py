@@ -1,13 +1,13 @@
-"""A small round car: glossy paint over a pattern, dark glass, chrome and rubber."""
+"""Small round car: glossy paint over a pattern, dark glass, chrome and rubber."""
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, join, mix, step
 from benchmarks.scenes.solids import Solid, blend, box, carve, disc, ellipsoid, mirrored, ring, sculpt, sweep
+from scripts.demo.shapes import Material, Scene, join, mix, step
 
 
 def paint(points: np.ndarray) -> np.ndarray:
-    """Blue-green with flames from the front wheels, and two cream stripes from front to back."""
+    """Paint it blue-green with flames from the front wheels, and two cream stripes from front to back."""
     x, y, z = points.T
     flame = 0.10 - 0.30 * np.abs(np.sin(9 * z + 0.6)) - 0.10 * np.sin(21 * z)
     flames = step(-0.02, 0.02, x - flame) * step(0.16, 0.20, np.abs(y))
@@ -29,7 +29,7 @@ WHEELS = (0.60, -0.58)
 
 
 def build() -> Scene:
-    """It drives along +x; 2 long."""
+    """Build the car along +x, 2 units long."""
     cabin = ellipsoid((-0.10, 0, 0.06), (0.60, 0.36, 0.34))
     fenders = [mirrored(ellipsoid((x, 0.31, -0.10), (0.34, 0.15, 0.24))) for x in WHEELS]
     hull = blend(
@@ -63,7 +63,7 @@ def build() -> Scene:
 
 
 def _windows(cabin: Solid) -> Solid:
-    """Panes that stand a little out of the cabin: those of both sides, and those in front and behind."""
+    """Let panes stand a little out of the cabin, on both sides, in front and behind."""
     panes = (box((-0.10, 0, 0.235), (0.34, 0.6, 0.085), 0.06), box((-0.10, 0, 0.235), (0.8, 0.21, 0.085), 0.06))
     outside = [
         carve(0.03, lambda points: cabin(points) - 0.008, lambda points, pane=pane: -pane(points)) for pane in panes

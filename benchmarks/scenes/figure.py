@@ -1,7 +1,7 @@
-"""A dancer of polished bronze in a silver skirt on a plinth: limbs and folds that reflect each other."""
+"""Dancer of polished bronze in a silver skirt on a plinth: limbs and folds that reflect each other."""
 
-from benchmarks.scenes.shapes import Material, Scene, join
 from benchmarks.scenes.solids import blend, disc, ellipsoid, mirrored, ring, sculpt, sweep
+from scripts.demo.shapes import Material, Scene, join
 
 BRONZE, SILVER, DARK = range(3)
 MATERIALS = (
@@ -12,7 +12,7 @@ MATERIALS = (
 
 
 def build() -> Scene:
-    """Two units high, on one leg; the other foot rests at the knee and the arms make a ring."""
+    """Build the dancer, two units high, on one leg; the other foot rests at the knee and the arms make a ring."""
     standing = sweep(
         [(0.10, 0.02, -0.82), (0.0, 0.02, -0.76), (0.03, 0.04, -0.42), (0.0, 0.07, -0.05)], [0.035, 0.05, 0.075, 0.115]
     )

@@ -1,13 +1,13 @@
-"""A pilot's helmet: a shell of rough plastic with stripes, a gold visor, a steel frame, copper at the ears, rubber below."""
+"""Pilot's helmet: a shell of rough plastic with stripes, a gold visor, a steel frame, copper at the ears, rubber below."""
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, join, mix, step
 from benchmarks.scenes.solids import Solid, blend, carve, disc, ellipsoid, mirrored, ring, sculpt, sweep
+from scripts.demo.shapes import Material, Scene, join, mix, step
 
 
 def stripes(points: np.ndarray) -> np.ndarray:
-    """Off-white; a red stripe from front to back between two blue ones."""
+    """Paint it off-white; a red stripe from front to back between two blue ones."""
     across = np.abs(points[:, 1])
     red, blue = 1 - step(0.085, 0.10, across), step(0.13, 0.145, across) * (1 - step(0.175, 0.19, across))
     return mix((0.70, 0.68, 0.62), (0.50, 0.04, 0.03), red) + blue[:, None] * (np.array([0.03, 0.09, 0.35]) - 0.66)
@@ -24,7 +24,7 @@ MATERIALS = (
 
 
 def build() -> Scene:
-    """It looks along +x; 1.5 high."""
+    """Build the helmet looking along +x, 1.5 units high."""
     skull = ellipsoid((-0.02, 0, 0.12), (0.76, 0.67, 0.66))
     opening = ellipsoid((0.80, 0, 0.13), (0.55, 0.54, 0.37))
     ears = mirrored(
@@ -51,5 +51,5 @@ def build() -> Scene:
 
 
 def _frame(one: Solid, other: Solid, thickness: float) -> Solid:
-    """A tube about the line where two surfaces meet."""
+    """Lay a tube along the line where two surfaces meet."""
     return lambda points: np.hypot(one(points), other(points)) - thickness

@@ -1,13 +1,13 @@
-"""A cactus in flower in a clay pot, everything as dull as chalk: the scene without reflections."""
+"""Cactus in flower in a clay pot, all matte: the scene without reflections."""
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Mesh, Scene, join, lathe, mix, moved, step
 from benchmarks.scenes.solids import sculpt, sweep
+from scripts.demo.shapes import Material, Mesh, Scene, join, lathe, mix, moved, step
 
 
 def clay(points: np.ndarray) -> np.ndarray:
-    """Terracotta with a painted band of triangles."""
+    """Paint terracotta with a band of triangles."""
     angle, z = np.arctan2(points[:, 1], points[:, 0]), points[:, 2]
     wave = np.abs((angle * 8 / np.pi) % 2 - 1)  # a zigzag, 16 a turn
     band = step(0.0, 0.02, z + 0.72 - 0.17 * wave) * (1 - step(0.0, 0.02, z + 0.50))
@@ -15,7 +15,7 @@ def clay(points: np.ndarray) -> np.ndarray:
 
 
 def green(points: np.ndarray) -> np.ndarray:
-    """Darker below, lighter towards the tops."""
+    """Paint it darker below and lighter towards the tops."""
     return mix((0.05, 0.15, 0.06), (0.14, 0.32, 0.10), step(-0.4, 0.9, points[:, 2]))
 
 
@@ -44,7 +44,7 @@ STEM = [(0.0, -0.45), (0.15, -0.44), (0.20, -0.35), (0.24, 0.0), (0.24, 0.45), (
 
 
 def build() -> Scene:
-    """Two units high, from the saucer to the flower."""
+    """Build the plant, two units high from the saucer to the flower."""
     arms = (
         sweep([(0, 0.12, 0.0), (0.02, 0.40, 0.02), (0.04, 0.52, 0.20), (0.05, 0.53, 0.48)], [0.09, 0.10, 0.115, 0.09]),
         sweep([(0, -0.12, 0.22), (0, -0.36, 0.24), (0, -0.47, 0.40), (0, -0.48, 0.62)], [0.08, 0.085, 0.10, 0.08]),
@@ -63,7 +63,7 @@ def build() -> Scene:
 
 
 def _flower() -> Mesh:
-    """Eight petals that stand up about a hollow."""
+    """Let eight petals stand about a hollow."""
     bell = [
         (0.0, 0.0),
         (0.06, 0.01),

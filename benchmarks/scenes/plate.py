@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, join, lathe, mix, moved, step
 from benchmarks.scenes.solids import box, ring, sculpt
+from scripts.demo.shapes import Material, Scene, join, lathe, mix, moved, step
 
 
 def glaze(points: np.ndarray) -> np.ndarray:
-    """White, with a blue line within a wreath of leaves on the rim."""
+    """Paint it white, with a blue line within a wreath of leaves on the rim."""
     radius, angle = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
     line = 1 - step(0.010, 0.020, np.abs(radius - 0.66))
     leaf = 1 - step(-0.008, 0.008, np.abs(radius - 0.83) - 0.07 * np.abs(np.sin(12 * angle)) ** 0.7)
@@ -15,7 +15,7 @@ def glaze(points: np.ndarray) -> np.ndarray:
 
 
 def skin(points: np.ndarray) -> np.ndarray:
-    """An apple's: red, yellow about the stalk, with fine streaks."""
+    """Paint an apple: red, yellow about the stalk, with fine streaks."""
     x, y = points[:, 0] + 0.36, points[:, 1] - 0.28
     angle, radius = np.arctan2(y, x), np.hypot(x, y)
     streaks = 0.5 + 0.25 * np.sin(17 * angle) + 0.25 * np.sin(29 * angle + 1)
@@ -51,7 +51,7 @@ HOLLOW = [(0.15, 0.44), (0.11, 0.37), (0.0, 0.33)]
 
 
 def build() -> Scene:
-    """The plate is 2 wide; its floor is at z = -0.36."""
+    """Build the plate, 2 units wide, its floor at z = -0.36."""
     ball = [(0.30 * abs(np.cos(a)), 0.30 * np.sin(a)) for a in np.linspace(-np.pi / 2, np.pi / 2, 65)]
     turned = np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])
     cube = box((0, 0, 0), (0.15, 0.15, 0.15), 0.04)

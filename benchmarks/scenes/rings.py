@@ -1,8 +1,8 @@
-"""Three metal rings through one another: they reflect and hide each other, the hard case."""
+"""Three linked metal rings that reflect and occlude each other: the hard case."""
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, join, tube
+from scripts.demo.shapes import Material, Scene, join, tube
 
 MATERIALS = (
     Material((0.944, 0.720, 0.330), 1.0, 0.10),
@@ -12,7 +12,7 @@ MATERIALS = (
 
 
 def build() -> Scene:
-    """Rings of radius 0.65 and thickness 0.2 in three planes at right angles, each linked with both others."""
+    """Build rings of radius 0.65 and thickness 0.2 in three planes at right angles, each linked with both others."""
     angle = np.arange(96) * (2 * np.pi / 96)
     ring = np.stack([0.65 * np.cos(angle), 0.65 * np.sin(angle), np.zeros(96)], -1) - [0.35, 0, 0]
     rings = [

@@ -1,7 +1,7 @@
-"""Solids as distances, negative inside: blended, carved out of each other and meshed by `sculpt`.
+"""Blend and carve solids, and mesh them by `sculpt`.
 
-A solid is a function from points (n, 3) to n distances. They need not be exact, but must be smooth near the surface and
-must not grow by much more than one a unit.
+A solid is a function from points (n, 3) to n signed distances, negative inside. They need not be exact, but must be smooth near the
+surface and must not grow by much more than one a unit.
 """
 
 from collections.abc import Callable
@@ -12,14 +12,14 @@ from scipy.sparse import coo_array, diags_array
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from benchmarks.scenes.shapes import Mesh
+from scripts.demo.shapes import Mesh
 
 Solid = Callable[[np.ndarray], np.ndarray]
 FAR = 0.25  # beyond the width of any blend
 
 
 def ellipsoid(centre, radii) -> Solid:
-    """An ellipsoid along the axes; exact near its surface."""
+    """Ellipsoid along the axes; exact near its surface."""
     centre, radii = np.asarray(centre, float), np.asarray(radii, float)
 
     def distance(points):
@@ -32,7 +32,7 @@ def ellipsoid(centre, radii) -> Solid:
 
 
 def box(centre, half, round: float) -> Solid:
-    """A box along the axes, `half` its size with its edges, which have the radius `round`."""
+    """Box along the axes with edges of radius `round`; `half` is half its size."""
     centre, inner = np.asarray(centre, float), np.asarray(half, float) - round
 
     def distance(points):
@@ -43,7 +43,7 @@ def box(centre, half, round: float) -> Solid:
 
 
 def ring(centre, axis, radius: float, thickness: float) -> Solid:
-    """A torus about `axis`; `thickness` is its tube's radius."""
+    """Torus about `axis`; `thickness` is its tube's radius."""
     centre, axis = np.asarray(centre, float), np.asarray(axis, float) / np.linalg.norm(axis)
 
     def distance(points):
@@ -55,7 +55,7 @@ def ring(centre, axis, radius: float, thickness: float) -> Solid:
 
 
 def disc(centre, axis, radius: float, half: float, round: float) -> Solid:
-    """A cylinder about `axis`, `half` its height, with edges of radius `round`."""
+    """Cylinder about `axis`, `half` its height, with edges of radius `round`."""
     centre, axis = np.asarray(centre, float), np.asarray(axis, float) / np.linalg.norm(axis)
 
     def distance(points):
@@ -74,9 +74,9 @@ def disc(centre, axis, radius: float, half: float, round: float) -> Solid:
 
 
 def sweep(path, radii) -> Solid:
-    """A round limb along a cubic spline through `path` (n, 3), with radii (n,) or one; its ends are half balls.
+    """Round limb along a cubic spline through `path` (n, 3), with radii (n,) or one; its ends are half balls.
 
-    What is further than FAR from it is not told apart.
+    Distances end at FAR.
     """
     path = np.asarray(path, float)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -100,7 +100,7 @@ def sweep(path, radii) -> Solid:
 
 
 def blend(width: float, *parts: Solid) -> Solid:
-    """The union; where two surfaces are closer than `width` they run into each other (a cubic smooth minimum)."""
+    """Unite solids; surfaces closer than `width` run into each other (a cubic smooth minimum)."""
 
     def distance(points):
         result = parts[0](points)
@@ -114,25 +114,25 @@ def blend(width: float, *parts: Solid) -> Solid:
 
 
 def carve(width: float, solid: Solid, *tools: Solid) -> Solid:
-    """`solid` less the tools, with edges rounded over about `width`."""
+    """Subtract tools from a solid, with edges rounded over about `width`."""
     rest = blend(width, lambda points: -solid(points), *tools)
     return lambda points: -rest(points)
 
 
 def mirrored(solid: Solid) -> Solid:
-    """The solid's half of y > 0 on both sides."""
+    """Mirror the solid's half of y > 0."""
     return lambda points: solid(np.stack([points[:, 0], np.abs(points[:, 1]), points[:, 2]], axis=1))
 
 
 def sculpt(solid: Solid, low, high, cell: float, material: int) -> Mesh:
-    """The surface of a solid that lies within `low` to `high` (3,), in triangles of about `cell`.
+    """Mesh the surface of a solid within `low` to `high` (3,), in triangles of about `cell`.
 
-    Marching cubes, then the vertices slide along the surface until the triangles are even, as mirrors need.
+    Marching cubes; then vertices slide along the surface until the triangles are even, as mirrors need.
     """
     block = 4
     low = np.asarray(low, float) - 2 * cell
     blocks = np.ceil((np.asarray(high, float) + 2 * cell - low) / (block * cell)).astype(int)
-    # Only blocks that the surface may pass through are evaluated in full.
+    # Only blocks that the surface may cross are evaluated in full.
     centres = low + (np.stack(np.indices(blocks), -1) + 0.5) * (block * cell)
     coarse = solid(centres.reshape(-1, 3)).reshape(blocks)
     field = np.repeat(np.repeat(np.repeat(coarse, block, 0), block, 1), block, 2)

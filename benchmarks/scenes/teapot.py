@@ -1,13 +1,13 @@
-"""A teapot of glossy ceramic: one smooth body with its spout and handle, two glazes that run into each other, a lid."""
+"""Teapot of glossy ceramic: one smooth body with its spout and handle, two glazes that run into each other, a lid."""
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Scene, join, mix, step
 from benchmarks.scenes.solids import blend, carve, disc, ellipsoid, ring, sculpt, sweep
+from scripts.demo.shapes import Material, Scene, join, mix, step
 
 
 def glaze(points: np.ndarray) -> np.ndarray:
-    """Blue-green from above, runs down over a cream one in uneven drops; thin and pale at the lid's and the foot's edge."""
+    """Glaze it blue-green from above, running down over cream in uneven drops."""
     angle = np.arctan2(points[:, 1], points[:, 0])
     edge = -0.12 + 0.07 * np.sin(5 * angle + 0.7) + 0.05 * np.sin(8 * angle) + 0.03 * np.sin(19 * angle)
     over = step(-0.025, 0.025, points[:, 2] - edge)
@@ -23,7 +23,7 @@ MATERIALS = (
 
 
 def build() -> Scene:
-    """2.2 from the handle to the spout."""
+    """Build the teapot, 2.2 units from the handle to the spout."""
     spout = sweep([(0.40, 0, -0.24), (0.74, 0, -0.14), (0.90, 0, 0.12), (1.06, 0, 0.33)], [0.19, 0.125, 0.085, 0.08])
     mouth = sweep([(0.93, 0, 0.16), (1.06, 0, 0.33), (1.20, 0, 0.50)], [0.03, 0.048, 0.06])
     handle = [(-0.42, 0, 0.24), (-0.80, 0, 0.36), (-1.03, 0, 0.10), (-0.88, 0, -0.22), (-0.45, 0, -0.34)]

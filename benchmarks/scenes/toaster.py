@@ -1,16 +1,16 @@
-"""A toaster on a tray, all of polished steel: flat and concave mirrors that see each other, and two slices of bread."""
+"""Toaster on a tray, all of polished steel: flat and concave mirrors that see each other, and two slices of bread."""
 
 import numpy as np
 
-from benchmarks.scenes.shapes import Material, Mesh, Scene, join, mix, moved, step
 from benchmarks.scenes.solids import box, carve, disc, ellipsoid, sculpt, sweep
+from scripts.demo.shapes import Material, Mesh, Scene, join, mix, moved, step
 
 STEEL, TRAY, PLASTIC, BRASS, TOAST = range(5)
 SLICE = (0.36, 0.05, 0.25)  # half a slice
 
 
 def toast(points: np.ndarray) -> np.ndarray:
-    """Golden in the middle, brown towards the crust, darker where the grid was hot."""
+    """Toast bread: golden in the middle, brown towards the crust, darker where the grid was hot."""
     x, z = points[:, 0] / SLICE[0], (points[:, 2] - 0.36) / SLICE[2]
     crust = step(0.55, 1.0, np.maximum(np.abs(x), np.abs(z)))
     grid = 0.5 + 0.5 * np.cos(7 * np.pi * x)
@@ -27,7 +27,7 @@ MATERIALS = (
 
 
 def build() -> Scene:
-    """The body is 1.24 long, 0.68 wide and 0.8 high; both long sides are hollow mirrors of radius 0.9, the tray's rim one of 0.2."""
+    """Build a body 1.24 long, 0.68 wide and 0.8 high. Both long sides are concave mirrors of radius 0.9, the tray's rim of 0.2."""
     body = carve(
         0.04,
         box((0, 0, -0.08), (0.62, 0.34, 0.40), 0.09),

@@ -1,4 +1,4 @@
-"""Stiff and extreme cases, through every kernel and through training: `refgs stability [--only WORD]`. docs/stability.md keeps the table.
+"""Stiff and extreme cases, through every kernel and through training: `refgs stability [--only WORD]`.
 
-A module a group of cases, each a list CASES.
+Each module is a group of cases, a list CASES. docs/stability.md keeps the tables.
 """

@@ -1,4 +1,4 @@
-"""What a case is, and how its outcome is written."""
+"""Define a case and write its outcome."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,7 +7,7 @@ NEVER = -1
 
 
 class Found(NamedTuple):
-    """Whether all was finite; the error; iterations until a training was back on its course, or NEVER, where it was put off it."""
+    """Outcome of a case: all values finite or not, the error, and the iterations until a disturbed training was back, or NEVER."""
 
     finite: bool
     error: float
@@ -15,7 +15,7 @@ class Found(NamedTuple):
 
 
 class Case(NamedTuple):
-    """`run` is compared with what `against` says. The error may be `most`, `because` of that; `guard` is what is done about it."""
+    """Stiff or extreme case. The error of `run` beside `against` may be `most`, and `because` says why; `guard` is the remedy."""
 
     name: str
     run: Callable[[], Found]
@@ -49,5 +49,5 @@ HEADINGS = ["case", "finite", "error", "at most", "compared with", "back after, 
 
 
 def line(cells: list[str]) -> str:
-    """A row of a table in Markdown."""
+    """Write a row of a Markdown table."""
     return f"| {' | '.join(cells)} |"

@@ -1,4 +1,4 @@
-"""Kernels in float32 against the float64 reference: the largest error of values and gradients, each by its tensor's largest value."""
+"""Compare float32 kernels with the float64 reference: largest error of values and gradients, each by its tensor's largest value."""
 
 from collections.abc import Sequence
 
@@ -7,24 +7,25 @@ from torch import Tensor
 
 from benchmarks.stability.cases import Found
 from refgs.camera import Camera
-from refgs.kernels import reference
 from refgs.model.environment import Environment
+from refgs.render import reference
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import shade
 
-MARGIN = 1e-4  # pixels nearer to a decision that rounding could turn are left out
-SMOOTH = 2e-5  # the same of kinks in derivatives: values have none
-SAFE = 0.5  # of the picture, or of what is drawn of it, at the least, must be left
+MARGIN = 1e-4  # pixels nearer to a comparison that rounding could flip are left out
+SMOOTH = 2e-5  # the same for kinks, which only derivatives have
+SAFE = 0.5  # least share of the picture, or of its drawn part, that must remain
 FLOAT32 = "float32, sums of hundreds of terms"
 
 
 class Undecided(Exception):
-    """Too much of a picture hangs on comparisons that rounding can turn."""
+    """Too much of a picture depends on comparisons that rounding can flip."""
 
 
 def worst(found: Sequence[Tensor], expected: Sequence[Tensor], terms: Sequence[Tensor] | None = None) -> float:
-    """The largest error of pairs of tensors, by the largest value of each, or of the `terms` that it is a sum of where they are larger.
-    What is expected to be nothing has an error by itself."""
+    """Largest error of pairs of tensors, each relative to its largest value, or to its cancelling `terms` where they are larger.
+
+    An error beside an expected zero is absolute."""
     errors = [0.0]
     for value, exact, summed in zip(found, expected, terms or expected, strict=True):
         if exact.numel():
@@ -40,13 +41,13 @@ def outcome(
     exact_by: Sequence[Tensor],
     terms: Sequence[Tensor] | None = None,
 ) -> Found:
-    """Of values and gradients; a gradient's error counts a tenth."""
+    """Combine the errors of values and gradients; a gradient's counts a tenth."""
     finite = all(bool(v.isfinite().all()) for v in (*found, *by))
     return Found(finite, max(worst(found, expected), 0.1 * worst(by, exact_by, terms)))
 
 
 def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest: int | None = None) -> Found:
-    """The rasteriser forward and backward. Of many surfels the reference may take the `nearest`, where these hide the rest."""
+    """Compare the rasteriser forward and backward. The reference may take only the `nearest` surfels where they occlude the rest."""
     order = None if nearest is None else _order(inputs, camera)
     few = inputs if order is None else [v[order[:nearest]] for v in inputs]
     exact = [v.double().requires_grad_() for v in few]
@@ -72,7 +73,7 @@ def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest:
 
 
 def _learned(by: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
-    """Derivatives by positions, by turns and by scales' logarithms; and the rest."""
+    """Turn derivatives into those by position, rotation angle and log scale; leave the rest."""
     position, rotation, scale, *rest = by
     return [position, rotation * inputs[1].double().norm(dim=-1, keepdim=True), scale * inputs[2].double(), *rest]
 
@@ -84,12 +85,14 @@ def _terms(
     exact_by: Sequence[Tensor],
     generator: torch.Generator,
 ) -> list[Tensor]:
-    """What the derivatives by what is learned are small differences of.
+    """Bound the terms that cancel in each derivative: where a gradient cancels larger terms, its error is relative to them.
 
-    By alpha it is one of what a surfel adds and what it hides. The latter is what the surfels in front leave of the pixel's total, over
-    1 - alpha: it rounds as the total does, however little it comes to. As the transmittance's derivative by alpha is over 1 - alpha, too,
-    totals of either sign are taken back by it. And a disc is turned and stretched about a centre that the same pixels move: these are
-    differences of what moving comes to, times the radius, and stretching one of what turning comes to."""
+    - By alpha: what a surfel adds, less what it occludes. The latter is the pixel's total left by the surfels in front, over 1 - alpha: it
+      rounds as the total does, however small it is. The transmittance's derivative is over 1 - alpha, too, so totals of either sign
+      are propagated back by it.
+    - By rotation and scale: a disc turns and stretches about a centre that the same pixels move. Turning is a difference of what moving
+      gives, times the radius; stretching is a difference of what turning gives.
+    """
     features, depth, alpha = (m.detach() for m in maps)
     by_features, by_depth, by_alpha = upstream
     total = (features * by_features).abs().sum(dim=-1) + (depth * by_depth).abs() + (alpha * by_alpha).abs()
@@ -108,8 +111,9 @@ def _order(inputs: Sequence[Tensor], camera: Camera) -> Tensor:
 
 
 def shading(features: Tensor, alpha: Tensor, radiance: Tensor, camera: Camera, kink: bool = False) -> Found:
-    """Deferred shading forward and backward: of maps as `shade` takes them, under a light (6·R², 3). Where all of the picture lies on a
-    `kink`, gradients have to be finite, no more."""
+    """Compare deferred shading forward and backward, of maps as `shade` takes them, under a light (6·R², 3).
+
+    Where all of the picture lies on a `kink`, gradients only have to be finite."""
     light = Environment(radiance)
     light.levels = light.levels.requires_grad_()
     background = torch.tensor([0.2, 0.5, 1.0])

@@ -1,4 +1,4 @@
-"""Surfels and cameras beyond the usual, through the rasteriser and what else looks at where surfels are."""
+"""Unusual surfels and cameras, through the rasteriser and the other kernels that read positions."""
 
 import dataclasses
 from functools import partial
@@ -11,12 +11,12 @@ from torch import Tensor
 from benchmarks.stability import compare
 from benchmarks.stability.cases import Case, Found
 from refgs.camera import Camera
-from refgs.kernels import reference
 from refgs.model import harmonics
+from refgs.render import reference
 from refgs.render.directional import directional
 from refgs.render.facing import facing_normals
 from refgs.render.rasterize import rasterize
-from tests.kernels import scenes
+from tests.makers import scenes
 
 WIDTH, HEIGHT, COUNT = 40, 28, 90
 
@@ -24,7 +24,7 @@ WIDTH, HEIGHT, COUNT = 40, 28, 90
 def camera(
     focal: float = 1.1, centre: tuple[float, float] | None = None, size: tuple[int, int] = (WIDTH, HEIGHT)
 ) -> Camera:
-    """A turned camera; focal length in widths, principal point in pixels."""
+    """Make a turned camera; focal length in widths, principal point in pixels."""
     return dataclasses.replace(scenes.camera(*size, centre), fx=focal * size[0], fy=focal * size[0])
 
 
@@ -37,7 +37,7 @@ def surfels(
     aspect: float = 3.0,
     edge_on: float | None = None,
 ) -> list[Tensor]:
-    """Surfels all over a camera's picture, of so many pixels' size, their normals anywhere, or so many radians from being edge-on."""
+    """Spread surfels over a camera's picture, sized in pixels; normals are random or within `edge_on` radians of edge-on."""
     rng = np.random.default_rng(0)
     z = rng.uniform(*depth, count)
     at = rng.uniform(0, 1, (count, 2)) * [view.width, view.height]
@@ -59,7 +59,7 @@ def surfels(
 
 
 def moved(scale: float = 1.0, offset: float = 0.0) -> Found:
-    """All of a scene, in another unit and elsewhere."""
+    """Scale and move a whole scene."""
     view = camera()
     position, rotation, size, *rest = surfels(view)
     pose = view.world_to_camera.copy()
@@ -74,7 +74,7 @@ def seen(focal: float = 1.1, centre: tuple[float, float] | None = None, **how) -
 
 
 def on_the_camera() -> Found:
-    """Some within 1e-7 of the camera's centre, some exactly there, some behind; the others as usual."""
+    """Put some surfels at the camera's centre, some within 1e-7 of it and some behind."""
     view = camera()
     position, *rest = surfels(view)
     here = torch.from_numpy(view.position).float()
@@ -85,7 +85,7 @@ def on_the_camera() -> Found:
 
 
 def towards_the_camera() -> Found:
-    """Colour by direction and normals of surfels on the camera, 1e-7 and 1e5 from it."""
+    """Compare colour by direction and normals of surfels 0, 1e-7 … 1e5 from the camera."""
     view, generator = camera(), torch.Generator().manual_seed(0)
     way = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator, dtype=torch.float64), dim=-1)
     distance = torch.tensor([0.0, 1e-7, 1e-3, 1.0, 1e5], dtype=torch.float64).repeat(60)[:, None]
@@ -103,7 +103,7 @@ def towards_the_camera() -> Found:
     column = reference.rotation_matrices(exact[2])[:, :, 2]
     along = (column * towards).sum(dim=-1)
     column = torch.where(along < -0.3 * towards.norm(dim=-1), -1.0, 1.0).detach()[:, None] * column
-    kept = rotation.detach().norm(dim=-1) > 0  # the reference's own derivative has no value there
+    kept = rotation.detach().norm(dim=-1) > 0  # the reference has no derivative there
     exact_by = torch.autograd.grad([expected.sum(), column[kept].sum()], exact)
     by = [*by[:2], torch.where(kept[:, None], by[2], 0)]
     return compare.outcome([color.detach(), normal.detach()], [expected.detach(), column.detach()], by, exact_by)
@@ -114,7 +114,7 @@ def across_near() -> Found:
 
 
 def coincident(count: int = 3000) -> Found:
-    """All of them at one place, of different colours."""
+    """Put all surfels in one place, in different colours."""
     view = camera(size=(16, 12))
     one = surfels(view, 1, pixels=(3.0, 3.0), depth=(2.0, 2.0))
     generator = torch.Generator().manual_seed(0)
@@ -125,7 +125,7 @@ def coincident(count: int = 3000) -> Found:
 
 
 def ties() -> Found:
-    """Depths that are the same bit for bit: drawn in the surfels' order."""
+    """Give all surfels the same depth, bit for bit: they are drawn in their order."""
     view = dataclasses.replace(camera(), world_to_camera=np.eye(4))
     position, *rest = surfels(view)
     position[:, 2] = 2.0
@@ -133,12 +133,13 @@ def ties() -> Found:
 
 
 def one_pixel(count: int = 1_000_000) -> Found:
-    """All of them smaller than a pixel, and in the same one: about its centre, not on it, where rounding decides between a surfel's own
-    distance and the screen filter's, both nothing."""
+    """Put all surfels, smaller than a pixel, into one pixel.
+
+    They lie about its centre: on it, rounding decides between the surfel's distance and the low-pass filter's, both zero."""
     view = camera(size=(3, 3))
     _, rotation, scale, opacity, features = surfels(view, count, pixels=(0.01, 0.38), depth=(1.0, 1.0))
     depth = np.concatenate([np.linspace(1, 2, 20_000), np.linspace(2, 3, count - 20_000)])[:, None]
-    at = np.random.default_rng(1).uniform(1.4, 1.6, (count, 2))  # the front ones are further apart than rounding
+    at = np.random.default_rng(1).uniform(1.4, 1.6, (count, 2))  # the nearest are further apart than rounding
     way = np.concatenate([(at - [view.cx, view.cy]) / [view.fx, view.fy], np.ones((count, 1))], axis=1)
     position = torch.from_numpy(view.position + depth * way @ view.world_to_camera[:3, :3]).float()
     scale = (scale * torch.from_numpy(depth)).float()
@@ -146,7 +147,7 @@ def one_pixel(count: int = 1_000_000) -> Found:
 
 
 def nothing() -> Found:
-    """No surfel at all: the picture is empty, gradients have no rows."""
+    """Draw no surfel: the picture is empty and gradients have no rows."""
     view = camera()
     leaves = [v[:0].requires_grad_() for v in surfels(view)]
     maps = rasterize(*leaves, view, near=0.1)

@@ -1,4 +1,4 @@
-"""Materials and lights beyond the usual, through shading, the light's prefilter, D-SSIM, activations, the optimiser and rays."""
+"""Unusual materials and lights, through shading, prefilter, D-SSIM, activations, optimiser and rays."""
 
 from functools import partial
 
@@ -10,22 +10,23 @@ from torch import Tensor
 from benchmarks.stability import compare
 from benchmarks.stability.cases import Case, Found
 from refgs.camera import Camera
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
-from refgs.kernels import reference
 from refgs.model import cubemap
+from refgs.model.adam import Adam
 from refgs.model.prefilter import prefilter
 from refgs.model.surfels import activate
+from refgs.render import reference
 from refgs.render.ssim import dssim
-from refgs.train.adam import Adam
-from tests.kernels import scenes
+from tests.makers import scenes
 
 SIDE, RESOLUTION = 32, 16
 
 
 def ball(grazing: float | None = None) -> tuple[Tensor, Tensor, Camera]:
-    """What a far camera sees of a ball that fills its picture: normals and positions (H, W, 3), float64; or of a surface whose normals
-    are so far from being at right angles to the view, everywhere."""
+    """Normals and positions (H, W, 3), float64, of a ball that fills a far camera's picture.
+
+    With `grazing`, all normals have this cosine with the view instead."""
     view = Camera("far", SIDE, SIDE, 1e3, 1e3, SIDE / 2 + 0.13, SIDE / 2 - 0.17, np.eye(4))
     y, x = torch.meshgrid(*[(torch.arange(SIDE, dtype=torch.float64) + 0.5) / SIDE * 1.2 - 0.6] * 2, indexing="ij")
     normal = torch.stack([x, y, -torch.sqrt(1 - x**2 - y**2)], dim=-1)
@@ -42,7 +43,7 @@ def ball(grazing: float | None = None) -> tuple[Tensor, Tensor, Camera]:
 
 
 def light(sun: float = 0.0, scale: float = 1.0) -> Tensor:
-    """Smooth radiance (6·R², 3), with a sun in one texel that the ball mirrors."""
+    """Make smooth radiance (6·R², 3) with a sun in one texel that the ball mirrors."""
     way = cubemap.texel_directions(RESOLUTION)
     radiance = scale * torch.exp(0.7 * way + 0.2 * torch.sin(5 * way[:, [1, 2, 0]]))
     radiance[int((way @ torch.tensor([0.3, 0.4, -0.87], dtype=torch.float64)).argmax())] += sun
@@ -58,7 +59,7 @@ def lit(
     scale: float = 1.0,
     kink: bool = False,
 ) -> Found:
-    """A ball whose material is as given, the rest of it anything."""
+    """Shade a ball whose material is partly given and otherwise random."""
     normal, position, view = ball(grazing)
     generator = torch.Generator().manual_seed(0)
     material = 0.05 + 0.9 * torch.rand(SIDE, SIDE, 5, generator=generator, dtype=torch.float64)
@@ -71,7 +72,7 @@ def lit(
 
 
 def one_sun(radiance: float) -> Found:
-    """The prefilter is linear: of smooth light with a sun it is the sum of both, added up in float64. And back."""
+    """Check that the prefilter is linear, both ways: smooth light with a sun gives the float64 sum of the two."""
     smooth, texel = light(), light(sun=1.0) - light()
     both = (smooth + radiance * texel).requires_grad_()
     found = prefilter(both, RESOLUTION)
@@ -82,13 +83,13 @@ def one_sun(radiance: float) -> Found:
     error = max(
         compare.worst([found.detach()], [exact]), 0.1 * compare.worst([by], [by_each[0] + radiance * by_each[1]])
     )
-    dim = exact < 1e-3 * radiance  # what the sun does not reach must not drown in it
+    dim = exact < 1e-3 * radiance  # texels that the sun does not reach, whose error it must not hide
     error = max(error, float(((found.detach() - exact).abs() / exact)[dim].max()) / 10)
     return Found(bool(found.isfinite().all() and by.isfinite().all()), error)
 
 
 def likeness(kind: str) -> Found:
-    """D-SSIM of constant pictures, of noise, of one and the same."""
+    """Compare D-SSIM of two pictures with float64."""
     generator = torch.Generator().manual_seed(0)
     image, target = torch.rand(2, 30, 40, 3, generator=generator)
     if kind == "constant":
@@ -107,7 +108,7 @@ def likeness(kind: str) -> Found:
 
 
 def activations() -> Found:
-    """Raw values 0 … ±1e4, against float64: within the limits of training the slopes are no zeros."""
+    """Compare activations of raw values 0 … ±1e4 with float64; within the limits of training no slope is zero."""
     raw = torch.tensor([-1e4, -87, -12, -6, -1, 0, 1, 6, 12, 87, 1e4])
     names = ("scale", "opacity", "albedo", "metallic", "roughness")
     empty = {
@@ -136,7 +137,7 @@ def activations() -> Found:
 
 
 def steps(size: float) -> Found:
-    """A hundred steps of Adam on gradients of such a size, against torch's in float64."""
+    """Compare a hundred steps of Adam on gradients of a given size with torch's in float64."""
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(1000, generator=generator)
     gradients = size * torch.randn(100, 1000, generator=generator)
@@ -149,7 +150,7 @@ def steps(size: float) -> Found:
 
 
 def rays(scale: float, offset: float) -> Found:
-    """Which mirror directions of a hollow are free, of it in another unit and elsewhere: the part that differs from the truth."""
+    """Trace the mirror directions of a hollow, scaled and moved; return the share whose visibility is wrong."""
     shape = trimesh.creation.icosphere(4)
     open_side = shape.triangles_center[:, 2] < 0.3
     mesh = Mesh(shape.vertices * scale + offset, np.asarray(shape.faces)[open_side][:, ::-1])
@@ -158,7 +159,7 @@ def rays(scale: float, offset: float) -> Found:
     way = rng.normal(size=inner.shape)
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     found = Occluder(mesh).visible(inner * scale + offset, -inner / 0.9, way)
-    # Out of a ball by its opening: where the ray leaves the ball of radius 1.
+    # A ray is free where it leaves the ball of radius 1 through its opening.
     b = (inner * way).sum(axis=1)
     leaves = inner + (-b + np.sqrt(b * b - (inner**2).sum(axis=1) + 1))[:, None] * way
     clear = np.abs(leaves[:, 2] - 0.3) > 0.06  # not at the rim, which triangles make jagged

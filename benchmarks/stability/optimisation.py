@@ -1,4 +1,4 @@
-"""What a training is put off its course by, and how it comes back; and whether it is the same training again."""
+"""Disturb trainings and see them recover; check that a training repeats bit for bit."""
 
 import functools
 import math
@@ -14,11 +14,11 @@ from benchmarks.stability.geometry import camera, surfels
 from benchmarks.stability.photos import NOISE
 from benchmarks.stability.training import TOTAL, ball, train, trainer, usual
 from refgs.errors import InputError
-from refgs.kernels import reference
+from refgs.model.adam import Adam
+from refgs.render import reference
 from refgs.render.rasterize import rasterize
 from refgs.settings import RATES
-from refgs.train import needs
-from refgs.train.adam import Adam
+from refgs.train.densify import faint_now
 from refgs.train.start import GEOMETRY
 from refgs.train.trainer import Trainer
 
@@ -28,36 +28,41 @@ AT, UNTIL, LONG = 50, 90, 300  # iterations: from which on it is disturbed, unti
 def disturbed(
     start: Callable[[Trainer], None], end: Callable[[Trainer], None] | None = None, total: int = TOTAL
 ) -> Found:
-    """By how many dB a training ends worse than an undisturbed one, and when it is back."""
+    """Compare a disturbed training with an undisturbed one: dB lost at the end, and when it recovered."""
     course = train(ball(), total=total, disturb={AT: start} | ({UNTIL: end} if end else {}))
     since = UNTIL if end else AT
     return Found(course.finite, max(0.0, usual(total).end - course.end), course.back_after(since, usual(total)))
 
 
 def faster(factor: float, geometry: bool) -> Callable[[Trainer], None]:
-    """The rates of geometry, or those of light and materials."""
+    """Scale the rates of geometry, or those of light and materials."""
 
     def change(made: Trainer) -> None:
-        rates = made.settings.rates
+        rates = made.state.settings.rates
         changed = {name: factor * getattr(rates, name) for name in RATES if (name in GEOMETRY) == geometry}
-        made.settings = made.settings.model_copy(update={"rates": rates.model_copy(update=changed)})
+        _set(made, "rates", changed)
 
     return change
 
 
+def _set(made: Trainer, section: str, values: dict[str, float]) -> None:
+    for name, value in values.items():
+        made.state.change(f"{section}.{name}", value, "plan", "disturbed")
+
+
 def heavier(factor: float) -> Callable[[Trainer], None]:
-    """All weights but that of D-SSIM, which is a share."""
+    """Scale all loss weights but that of D-SSIM, which is a share."""
 
     def change(made: Trainer) -> None:
-        loss = made.settings.loss
+        loss = made.state.settings.loss
         weights = {name: factor * value for name, value in loss.model_dump().items() if name != "dssim"}
-        made.settings = made.settings.model_copy(update={"loss": loss.model_copy(update=weights)})
+        _set(made, "loss", weights)
 
     return change
 
 
 def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
-    """One number of a gradient, once or in each step from now on."""
+    """Make one number of a gradient NaN, once or in every step from now on."""
 
     def change(made: Trainer) -> None:
         judge = made.guard.judge
@@ -65,7 +70,7 @@ def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
         def judged(loss: Tensor, optimizer) -> Tensor:
             if not every:
                 made.guard.judge = judge
-            made.parameters[name].grad.view(-1)[7] = math.nan
+            made.state.parameters[name].grad.view(-1)[7] = math.nan
             return judge(loss, optimizer)
 
         made.guard.judge = judged
@@ -75,14 +80,14 @@ def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
 
 def nan_value(name: str) -> Callable[[Trainer], None]:
     def change(made: Trainer) -> None:
-        value = made.light if name == "light" else made.parameters[name]
+        value = made.state.light if name == "light" else made.state.parameters[name]
         value.data.view(-1)[10:13] = math.nan
 
     return change
 
 
 def stopped() -> Found:
-    """Gradients that are never finite again: back to the checkpoint, and then an end, with one line."""
+    """Make all further gradients NaN: the training returns to the checkpoint, then ends with one line."""
     try:
         train(ball(), disturb={AT: nan_gradient("albedo", every=True)})
     except InputError as error:
@@ -96,7 +101,7 @@ def with_settings(*changes: str, total: int = TOTAL) -> Found:
 
 
 def trajectories() -> Found:
-    """Thirty steps of Adam down the same loss: our kernels, and float64. How far the pictures are apart at the end, by what was learned."""
+    """Take thirty steps of Adam with the kernels and in float64; return how far the final pictures differ, relative to what was learned."""
     view = camera(size=(24, 18))
     target = reference.rasterize(*(v.double() for v in surfels(view, 60)), view, 0.1)[0].float()
     start = surfels(view, 60)
@@ -131,30 +136,33 @@ STAGES += [
 ]
 STAGES += ["train.checkpoint_every=1000", "residual.start=0.8", "needs.initial=on", "needs.reflections=on"]
 CUTS: dict[int, Callable[[Trainer], bool]] = {
-    5: lambda made: made.initial and made.iteration < made.settings.train.light_first,
-    20: lambda made: made.initial,
-    37: lambda made: not made.initial and made.occluder is None,
-    52: lambda made: made.occluder is not None,
-    75: lambda made: made.faint(needs.SEEN),
-    90: lambda made: made.iteration > made.residual_start * made.total,
+    5: lambda made: made.state.initial and made.state.iteration < made.state.settings.train.light_first,
+    20: lambda made: made.state.initial,
+    37: lambda made: not made.state.initial and made.state.occluder is None,
+    52: lambda made: made.state.occluder is not None,
+    75: lambda made: faint_now(made.state),
+    90: lambda made: made.state.iteration > made.state.residual_start * made.state.total,
 }
-"""Iterations to cut at, and what tells that it is another stage: light first, surfels one by one, deferred, inter-reflection, faint after
-a reset, what is left over."""
+"""Iterations to stop at and a test for each stage: light first, per surfel, deferred, inter-reflection, after a reset, residual."""
 
 
 def bits(made: Trainer) -> list[Tensor]:
-    return [*(v.detach() for _, v in sorted(made.parameters.items())), made.light.detach(), made.exposures.detach()]
+    return [
+        *(v.detach() for _, v in sorted(made.state.parameters.items())),
+        made.state.light.detach(),
+        made.state.exposures.detach(),
+    ]
 
 
 def resumed() -> Found:
-    """A training cut in each of its stages and gone on with from there: the part of the tensors that come out otherwise."""
+    """Stop a training in each stage and resume it; return the share of tensors that differ."""
     whole = trainer(ball(), *STAGES, total=100)
     copies: dict[int, Path] = {}
     for cut, in_stage in CUTS.items():
-        whole.run(stop=lambda cut=cut: whole.iteration >= cut)
+        whole.run(stop=lambda cut=cut: whole.state.iteration >= cut)
         assert in_stage(whole), f"at {cut} the training is in another stage than it should be"
-        copies[cut] = whole.folder.with_name(f"{whole.folder.name} {cut}")
-        shutil.copytree(whole.folder, copies[cut])
+        copies[cut] = whole.state.folder.with_name(f"{whole.state.folder.name} {cut}")
+        shutil.copytree(whole.state.folder, copies[cut])
     whole.run()
     others = []
     for folder in copies.values():
@@ -175,7 +183,7 @@ def same(whole: Trainer, others: list[Trainer]) -> Found:
 
 
 def threads() -> Found:
-    """The same training on one, two and three threads."""
+    """Run the same training on one, two and three threads."""
     before, made = torch.get_num_threads(), []
     try:
         for count in (1, 2, 3):

@@ -1,4 +1,4 @@
-"""Captures beyond the usual, through a whole training."""
+"""Unusual captures, through a whole training."""
 
 import functools
 from collections.abc import Callable
@@ -15,19 +15,19 @@ NOISE = 0.7  # dB: what another seed changes is less, docs/stability.md
 
 
 def against(course: Course, least: float) -> Found:
-    """By how many dB the held-out views are worse than they ought to be."""
+    """Decibels that the held-out views are below their target."""
     return Found(course.finite, max(0.0, least - course.end))
 
 
 def elsewhere(scale: float, offset: float) -> Found:
-    """The same scene in another unit and place; it must also come out there."""
+    """Train the scene scaled and moved; the splats must lie there, too."""
 
     def pose(matrix: np.ndarray) -> np.ndarray:
         matrix[:3, 3] = scale * matrix[:3, 3] + offset
         return matrix
 
     course = train(changed(pose=pose))
-    made = course.trainer
+    made = course.trainer.state
     surfels = activate({**made.constant, **made.parameters})
     to_capture = made.capture.to_capture
     place = surfels.positions.detach().numpy().astype(float) @ to_capture[:3, :3].T + to_capture[:3, 3]
@@ -46,7 +46,7 @@ def of_these(**how) -> Found:
 
 
 def refused(make: Callable[[], object]) -> Found:
-    """With one line."""
+    """Check that it is refused with one line."""
     try:
         make()
     except InputError as error:
@@ -55,7 +55,7 @@ def refused(make: Callable[[], object]) -> Found:
 
 
 def mixed(pixels: np.ndarray, index: int) -> np.ndarray:
-    """Every third photo at three quarters of the size, every third but not square."""
+    """Make every third photo three quarters as large, and every third not square."""
     if index % 3 == 0:
         return pixels
     from PIL import Image
@@ -91,7 +91,7 @@ LEAST = "as a picture without detail"
 
 
 def _poor(name: str, photo, least: float, guard: str, total: int = TOTAL) -> Case:
-    """Photos that say little: what a training reaches is at least so many dB."""
+    """Train on uninformative photos: the result has at least so many dB."""
     run = functools.partial(photographed, photo, lambda: least, total)
     return _case(name, run, guard, 0.0, LEAST, f"{least:g} dB")
 

@@ -1,5 +1,7 @@
-"""Light against material, in float64: singular values of the Jacobian of pictures by two changes that may make up for each other, and
-what each weight of the loss does to that."""
+"""Measure in float64 how well photos tell light from material.
+
+For pairs of changes that may compensate each other: singular values of the pictures' Jacobian, and the effect of each loss weight.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,15 +15,15 @@ from benchmarks.stability.material import RESOLUTION, SIDE, ball
 from benchmarks.stability.training import ball as capture
 from benchmarks.stability.training import train
 from refgs.camera import Camera
-from refgs.kernels import reference
 from refgs.model import cubemap, prefilter
+from refgs.render import reference
 from refgs.settings import load_settings
 from refgs.train.ambiguity import ambiguities
 from refgs.train.losses import departure
 
 STEP = 1e-4
-ROUNDING = 1e-12  # of the largest eigenvalue: what is less is nothing
-RESIDUAL = 0.02  # of a picture that is trained: an L1 loss about residuals of such a deviation curves by 0.8 / RESIDUAL a pixel's square
+ROUNDING = 1e-12  # of the largest eigenvalue: smaller ones are zero
+RESIDUAL = 0.02  # of a trained picture: an L1 loss about residuals of this deviation has curvature 0.8 / RESIDUAL
 TURNS = ((0, 0, 0), (0, 2.1, 0), (0, 4.2, 0.5))  # of the views about the ball
 WARM, MATTE = torch.tensor([0.9, 0.6, 0.3]).double(), torch.tensor([0.2, 0.4, 0.5]).double()
 LIGHT, ALBEDO, LIGHT_TINT, TINT, ROUGHNESS, BLUR, METALLIC, EXPOSURE = range(8)
@@ -35,13 +37,13 @@ TRADES = {
 
 
 class Scene(NamedTuple):
-    """A ball under a light: base colour, metallic and roughness of its left half, then of its right."""
+    """Ball under a light; `materials` are base colour, metallic and roughness of its left half, then of its right."""
 
     light: Callable
     materials: tuple[tuple[Tensor, float, float], ...]
 
     def radiance(self) -> tuple[Tensor, Tensor, Tensor]:
-        """That of the light, of its tint and of its blur by a sixteenth of a face, (6·R², 3) each."""
+        """Radiance of the light, of its tint and of its blur by a sixteenth of a face, (6·R², 3) each."""
         base = torch.from_numpy(self.light(cubemap.texel_directions(RESOLUTION).numpy())).float()
         faces = torch.nn.functional.pad(
             base.view(6, RESOLUTION, RESOLUTION, 3).permute(0, 3, 1, 2), (1,) * 4, mode="replicate"
@@ -50,7 +52,7 @@ class Scene(NamedTuple):
         return base, base * torch.tensor([1.0, 0.0, -1.0]), mean - base
 
     def pictures(self, change: Tensor) -> Tensor:
-        """Of a change (8,), encoded, all numbers side by side."""
+        """Render the encoded pictures after a change (8,), flattened."""
         normal, position, view = ball()
         base, tint, blur = (prefilter.prefilter(radiance, RESOLUTION).double() for radiance in self.radiance())
         levels = (1 + change[LIGHT]) * base + change[LIGHT_TINT] * tint + change[BLUR] * blur
@@ -77,12 +79,12 @@ class Scene(NamedTuple):
         return torch.cat(found)
 
     def jacobian(self) -> Tensor:
-        """Of the pictures by the eight changes (P, 8), by central differences, over the root of P."""
+        """Jacobian of the pictures by the eight changes (P, 8), by central differences, over the root of P."""
         columns = [self.pictures(STEP * e) - self.pictures(-STEP * e) for e in torch.eye(8).double()]
         return torch.stack(columns, dim=1) / (2 * STEP) / len(columns[0]) ** 0.5
 
     def weights(self, change: Tensor) -> dict[str, Tensor]:
-        """What each weight of the loss costs, at the end of a training, by the numbers of the standard preset."""
+        """Value of each loss term after a change, with the standard preset's weights at the end of a training."""
         loss = load_settings("standard").loss
         base, tint, blur = (radiance.double().mean(dim=0) for radiance in self.radiance())
         mean = (1 + change[LIGHT]) * base + change[LIGHT_TINT] * tint + change[BLUR] * blur
@@ -96,7 +98,7 @@ class Scene(NamedTuple):
         }
 
     def derivatives(self, weight: str) -> tuple[Tensor, Tensor]:
-        """First and second, of what a weight costs (8,), (8, 8)."""
+        """First (8,) and second (8, 8) derivative of a loss term."""
         at = torch.zeros(8).double()
         return tuple(
             derivative(lambda change: self.weights(change)[weight], at)
@@ -107,7 +109,7 @@ class Scene(NamedTuple):
 METAL, DIELECTRIC = (
     (WARM, 0.95, 0.2),
     (MATTE, 0.05, 0.45),
-)  # of roughnesses between levels: at one derivatives have a kink
+)  # roughnesses between the prefilter's levels, where derivatives have kinks
 SCENES = {
     "metal, smooth sky": Scene(sky, (METAL,)),
     "metal, suns": Scene(sunny, (METAL,)),
@@ -118,7 +120,7 @@ SCENES = {
 
 
 def condition(hessian: Tensor) -> str:
-    """The largest eigenvalue over the smallest; of one that is no minimum, or is flat some way, so."""
+    """Largest eigenvalue over the smallest; "no minimum" or "∞" where the smallest is negative or zero."""
     low, high = torch.linalg.eigvalsh(hessian).tolist()
     if abs(low) < ROUNDING * high:
         return "∞"
@@ -126,7 +128,7 @@ def condition(hessian: Tensor) -> str:
 
 
 def tables() -> list[tuple[str, list[str], list[list[str]]]]:
-    """Title, headings, rows."""
+    """Tables after the cases: title, headings, rows."""
     weights, rows = ("loss.light", "loss.metallic", "loss.matte", "loss.exposure"), []
     for name, scene in SCENES.items():
         jacobian = scene.jacobian()
@@ -147,7 +149,7 @@ def tables() -> list[tuple[str, list[str], list[list[str]]]]:
 
 
 def by_autograd() -> Found:
-    """The Jacobian's columns of roughness and metallic, by differences and by the reference's own derivatives."""
+    """Compare the Jacobian by differences with the reference's autograd."""
     scene = SCENES["half metal, half dielectric, suns"]
     upstream = torch.randn(
         len(scene.pictures(torch.zeros(8).double())), generator=torch.Generator().manual_seed(0)
@@ -159,8 +161,8 @@ def by_autograd() -> Found:
 
 
 def said() -> Found:
-    """A ball all of metal: the report says that the light's scale is not told, and does not say so of metal."""
-    trades = ambiguities(train(capture(), total=300).trainer)
+    """Train an all-metal ball: the report says that photos do not tell the light's scale, and does not say so of metal."""
+    trades = ambiguities(train(capture(), total=300).trainer.state)
     right = "what" in trades["light_scale"] and "what" in trades["white_balance"] and "what" not in trades["metal"]
     return Found(all(v["left"] <= v["alone"] for v in trades.values()), 0.0 if right else 1.0)
 

@@ -1,4 +1,4 @@
-"""Small trainings of a metal ball: what cases are run on, and compared with."""
+"""Small trainings of a metal ball, which cases disturb and compare with."""
 
 import atexit
 import functools
@@ -16,6 +16,7 @@ from benchmarks.scenes.analytic import write_ball_capture
 from benchmarks.stability.cases import NEVER
 from refgs.capture import read_capture
 from refgs.settings import load_settings
+from refgs.train.measures import held_out_psnr
 from refgs.train.trainer import Trainer
 
 SIZE, TOTAL, LOOK = 32, 150, 10  # pixels; iterations; iterations between looks at the held-out views
@@ -27,7 +28,7 @@ SMALL = [
     "train.light_first=10",
 ]
 SMALL += ["surfels.metallic=0.9", "densify.every=25", "train.checkpoint_every=20", "indirect.start=1"]
-BACK = 1.0  # dB to the undisturbed training, from which on one counts as back on its course
+BACK = 1.0  # dB to the undisturbed training within which a disturbed one has recovered
 
 
 @functools.cache
@@ -49,7 +50,7 @@ def changed(
     photo: Callable[[np.ndarray, int], np.ndarray] = lambda pixels, index: pixels,
     views: int | None = None,
 ) -> Path:
-    """The ball's capture with other camera-to-world matrices, or other pixels (H, W, 4) in 0..1 of each of its photos."""
+    """Change the ball's capture: its camera-to-world matrices, or the pixels (H, W, 4) in 0..1 of each photo."""
     folder = Path(tempfile.mkdtemp(dir=workspace()))
     for split in ("train", "test"):
         frames = json.loads((ball() / f"transforms_{split}.json").read_text())
@@ -65,7 +66,7 @@ def changed(
 
 
 class Course(NamedTuple):
-    """PSNR of the held-out views, dB, at iterations; what was warned of; the trainer."""
+    """Training that has ended: held-out PSNR in dB by iteration, its warnings, the trainer."""
 
     psnr: dict[int, float]
     said: list[str]
@@ -78,17 +79,17 @@ class Course(NamedTuple):
     @property
     def finite(self) -> bool:
         values = [
-            *self.trainer.parameters.values(),
-            self.trainer.light,
-            *(v.color for v in map(self._seen, self.trainer.test)),
+            *self.trainer.state.parameters.values(),
+            self.trainer.state.light,
+            *(v.color for v in map(self._seen, self.trainer.state.test)),
         ]
         return all(bool(value.isfinite().all()) for value in values) and all(np.isfinite(list(self.psnr.values())))
 
     def _seen(self, view):
-        return self.trainer.render(view.camera)
+        return self.trainer.state.render(view.camera)
 
     def back_after(self, start: int, undisturbed: "Course") -> int:
-        """Iterations from one on until all later looks are as good as the undisturbed training's, to BACK."""
+        """Iterations from `start` until all later looks are within BACK of the undisturbed training."""
         late = [i for i in self.psnr if i > start and self.psnr[i] < undisturbed.psnr.get(i, undisturbed.end) - BACK]
         return NEVER if late and max(late) == max(self.psnr) else max(late, default=start - LOOK) + LOOK - start
 
@@ -109,14 +110,14 @@ def trainer(
 def train(
     capture: Path, *changes: str, total: int = TOTAL, disturb: dict[int, Callable[[Trainer], None]] | None = None
 ) -> Course:
-    """A whole training; before some of its iterations something is done to it."""
+    """Train to the end; `disturb` has what is done before some iterations."""
     said: list[str] = []
     made, psnr = trainer(capture, *changes, total=total, said=said), {}
     for end in range(LOOK, total + 1, LOOK):
         (disturb or {}).get(end - LOOK, lambda _: None)(made)
-        while made.iteration < end and not made.ended:  # it may have gone back, or be done with less than was planned
-            made.run(stop=lambda end=end: made.iteration >= end)
-        psnr[end] = made.test_psnr()
+        while made.state.iteration < end and not made.state.ended:  # it may go back to a checkpoint, or end early
+            made.run(stop=lambda end=end: made.state.iteration >= end)
+        psnr[end] = held_out_psnr(made.state)
     return Course(psnr, said, made)
 
 

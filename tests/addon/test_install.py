@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from refgs_addon import installation, jobs
-from tests.addon.bring import bring
-from tests.addon.waiting import until
+from tests.makers.bring import bring
+from tests.makers.waiting import until
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is a script that Windows does not start")
 ROOT = Path(__file__).resolve().parents[2]

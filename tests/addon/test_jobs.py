@@ -10,7 +10,7 @@ import pytest
 
 from refgs_addon import jobs
 from refgs_addon.errors import InputError
-from tests.addon.waiting import until
+from tests.makers.waiting import until
 
 
 @pytest.fixture

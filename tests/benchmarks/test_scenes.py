@@ -14,9 +14,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from benchmarks.scenes import NAMES, build
-from benchmarks.scenes.shapes import lathe
 from benchmarks.scenes.solids import blend, box, ellipsoid, ring, sculpt
 from refgs.color import srgb_encode
+from scripts.demo.shapes import lathe
 
 ROOT = Path(__file__).parents[2]
 SIZE = 48
@@ -268,8 +268,9 @@ def test_the_albedo_pass_shows_the_textures(tmp_path):
 
 
 def test_every_scene_is_listed():
-    modules = {path.stem for path in (ROOT / "benchmarks/scenes").glob("*.py") if "\ndef build()" in path.read_text()}
-    assert modules == set(NAMES)
+    folders = (ROOT / "benchmarks/scenes", ROOT / "scripts/demo")
+    files = [path for folder in folders for path in folder.glob("*.py")]
+    assert {path.stem for path in files if "\ndef build()" in path.read_text()} == set(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.blender.runs import write_run
+from tests.makers.runs import write_run
 
 bpy = pytest.importorskip("bpy", reason="needs Blender's Python module")
 

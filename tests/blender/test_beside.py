@@ -11,8 +11,8 @@ from refgs_addon import jobs
 from refgs_addon.errors import InputError
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.render_process import render_in_background
-from tests.addon.waiting import until
-from tests.blender.runs import write_panorama
+from tests.makers.runs import write_panorama
+from tests.makers.waiting import until
 
 
 @pytest.fixture(autouse=True)

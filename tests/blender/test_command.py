@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from refgs_addon.preview import main
-from tests.blender.runs import SIZE, read_exr, write_panorama
+from tests.makers.runs import SIZE, read_exr, write_panorama
 
 ROOT = Path(__file__).resolve().parents[2]
 

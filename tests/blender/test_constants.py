@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from refgs.export.splats import read_splats as backend_splats
+from refgs.formats.splats import read_splats as backend_splats
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import edited_materials, export_splats

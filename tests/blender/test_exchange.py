@@ -9,13 +9,13 @@ import pytest
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from refgs.export.mesh import write_glb
+from refgs.formats.gltf import write_glb
 from refgs_addon import ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import export_mesh, export_run
 from refgs_addon.scene.import_run import data_blocks, import_run
-from tests.export.test_glb import make
+from tests.makers.box import textured_box
 
 IMPORTERS = [
     (".usdc", lambda file: bpy.ops.wm.usd_import(filepath=file, import_textures_mode="IMPORT_NONE")),
@@ -26,7 +26,7 @@ IMPORTERS = [
 
 @pytest.fixture
 def textured(run_folder):
-    mesh, textures = make()
+    mesh, textures = textured_box()
     write_glb(run_folder / "mesh.glb", mesh, textures)
     return run_folder, mesh
 
@@ -86,7 +86,7 @@ def level(item):
 def test_what_mirrors_nothing_is_not_given_gloss(run_folder, scene, tmp_path, specular):
     """Of the two importers of FBX the one in Python reads that."""
     ending, read = IMPORTERS[1]
-    mesh, textures = make()
+    mesh, textures = textured_box()
     write_glb(run_folder / "mesh.glb", mesh, replace(textures, specular=specular))
     run = import_run(run_folder, scene)
     assert level(run.mesh[0]) == pytest.approx(0.5 * specular)

@@ -14,7 +14,7 @@ from refgs_addon.scene.export_run import SH_DC, edited_materials, export_light, 
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import show
 from refgs_addon.scene.splat_cloud import read_rows
-from tests.blender.runs import write_ply
+from tests.makers.runs import write_ply
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from refgs_addon import ui
-from tests.blender.runs import COUNT, write_panorama
+from tests.makers.runs import COUNT, write_panorama
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOL = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg", "cli", "blender_ext.py")

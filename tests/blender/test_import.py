@@ -11,7 +11,7 @@ from mathutils import Vector
 from plyfile import PlyData, PlyElement
 
 from refgs.errors import InputWarning
-from refgs.export.splats import read_splats as read_by_refgs
+from refgs.formats.splats import read_splats as read_by_refgs
 from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.splats_tree import EXTENT, NAME
@@ -22,7 +22,7 @@ from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import parts, show
 from refgs_addon.scene.run_toml import newer_release
 from refgs_addon.scene.splat_cloud import MATERIALS, normal_slopes, read_splats
-from tests.blender.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
+from tests.makers.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
 
 
 def values(data, name, width=1, field="value"):

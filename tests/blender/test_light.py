@@ -13,7 +13,7 @@ from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.panorama import best_rotation
 from refgs_addon.scene.world_light import hdris, load_panorama, match_light, relight
 from refgs_addon.ui import light_panel
-from tests.blender.runs import write_panorama
+from tests.makers.runs import write_panorama
 
 
 def room(height=48, seed=0):

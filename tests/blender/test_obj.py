@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from refgs.export.mesh import write_obj
-from tests.export.test_glb import make
+from refgs.formats.obj import write_obj
+from tests.makers.box import textured_box
 
 
 @pytest.fixture
 def imported(tmp_path, scene):
     folder = tmp_path / "a run, été"
     folder.mkdir()
-    mesh, textures = make()
+    mesh, textures = textured_box()
     write_obj(folder / "le pot.obj", mesh, textures)
     before = set(bpy.data.objects)
     bpy.ops.wm.obj_import(filepath=str(folder / "le pot.obj"))
@@ -46,7 +46,7 @@ def test_its_material_has_its_pictures(imported):
 
 
 def test_what_mirrors_nothing_is_not_given_gloss(tmp_path, scene):
-    mesh, textures = make()
+    mesh, textures = textured_box()
     write_obj(tmp_path / "a.obj", mesh, replace(textures, specular=0.0))
     bpy.ops.wm.obj_import(filepath=str(tmp_path / "a.obj"))
     (material,) = bpy.data.objects["RefGS"].data.materials

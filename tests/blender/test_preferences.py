@@ -7,8 +7,8 @@ import pytest
 
 from refgs_addon import installation, jobs, preferences, ui
 from refgs_addon.errors import InputError
-from tests.addon.bring import bring
-from tests.addon.waiting import until
+from tests.makers.bring import bring
+from tests.makers.waiting import until
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is a script that Windows does not start")
 

@@ -11,7 +11,7 @@ from refgs_addon.scene.contact_sheet import GAP, contact_sheet
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.render_eevee import render_preview
 from refgs_addon.scene.world_light import relight
-from tests.blender.runs import write_panorama
+from tests.makers.runs import write_panorama
 
 
 def test_a_view_under_each_light(run_folder, scene, tmp_path):

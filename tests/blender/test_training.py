@@ -21,7 +21,7 @@ from refgs_addon.ui import checked_capture
 from refgs_addon.ui.closing import quit_question
 from refgs_addon.ui.icons import CURVE, DOTS, GRID, LINE, plot
 from refgs_addon.ui.train_panel import other_process_status
-from tests.addon.waiting import until
+from tests.makers.waiting import until
 
 
 @pytest.fixture

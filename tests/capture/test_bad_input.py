@@ -1,18 +1,18 @@
-"""What is wrong with a capture is said in one line that names the place."""
+"""Wrong captures are refused with one line that names the place."""
 
 import json
 import pickle
 
 import numpy as np
 import pytest
-from makers import colmap, edit, nerf_blender, nerfstudio, nero, ring, shiny_blender, write
 
 from refgs.capture import load_view, published_normals, read_cameras, read_capture
 from refgs.errors import InputError
+from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, nero, ring, shiny_blender, write
 
 
 def refused(read, *parts: str) -> None:
-    """`read` raises an InputError of one line that holds all `parts`."""
+    """Assert that `read` raises an InputError of one line that holds all `parts`."""
     with pytest.raises(InputError) as error:
         read()
     message = str(error.value)
@@ -154,7 +154,7 @@ def test_colmap_files_cut_short(tmp_path, name, binary, kept):
     header = data.rfind(b"# ") if not binary else 0
     cut = max(int(kept * len(data)), data.index(b"\n", header) + 1 if not binary else 0)
     file.write_bytes(data[:cut])
-    refused(lambda: read_capture(tmp_path), file.name, "cut short")
+    refused(lambda: read_capture(tmp_path), file.name, "truncated")
 
 
 def test_colmap_without_its_cameras(tmp_path):
@@ -207,7 +207,7 @@ def test_image_truncated_since(tmp_path):
     view = read_capture(nerfstudio(tmp_path)).views[5]
     data = view.image_path.read_bytes()
     view.image_path.write_bytes(data[: len(data) // 2])
-    refused(lambda: load_view(view, 32), view.image_path.name, "cut short")
+    refused(lambda: load_view(view, 32), view.image_path.name, "truncated")
 
 
 def test_image_that_is_text(tmp_path):

@@ -1,14 +1,14 @@
-"""The region that is wanted: a box in the capture's own frame, whatever its layout, and which way is up there."""
+"""Wanted region and up direction: both are in the capture's own frame, in every layout."""
 
 import numpy as np
 import pytest
-from makers import CENTRE, RADIUS, colmap, nerf_blender, nerfstudio
 from scipy.spatial.transform import Rotation
 
 from refgs.capture import read_capture
 from refgs.capture.box import Box
 from refgs.errors import InputError
 from refgs.settings import load_settings
+from tests.makers.captures import CENTRE, RADIUS, colmap, nerf_blender, nerfstudio
 
 UP = np.array([0.6, 0.0, 0.8])
 
@@ -46,7 +46,7 @@ def test_a_region_moves_nothing_and_up_turns_all(tmp_path, make):
         assert capture.centre[2] < centre[2], "the masks show nothing in the box's upper half"
 
     tilted = read_capture(tmp_path, region(centre=centre, size=size, rotation=(0, 0, 30), up=3 * UP))
-    turn = np.linalg.inv(plain.to_capture) @ tilted.to_capture  # to what was the run's frame
+    turn = np.linalg.inv(plain.to_capture) @ tilted.to_capture  # from the new run frame to the one without `up`
     np.testing.assert_allclose(turn[:3] @ (0, 0, 1, 0), UP, atol=1e-9)
     np.testing.assert_allclose(turn[:3, :3] @ turn[:3, :3].T, np.eye(3), atol=1e-9)
     assert np.abs(turn[:3, 3]).max() < 1e-9

@@ -1,11 +1,11 @@
-"""Camera files: to a run folder and back, and from the capture's own JSON."""
+"""Camera files: written to a run folder and read back, and read from the capture's own JSON."""
 
 import numpy as np
 import pytest
-from makers import colmap, nerf_blender, nerfstudio
 
 from refgs.capture import read_cameras, read_capture, read_run_cameras, write_cameras
 from refgs.capture.poses import in_frame
+from tests.makers.captures import colmap, nerf_blender, nerfstudio
 
 
 def assert_same(a, b):
@@ -23,13 +23,13 @@ def test_run_cameras_round_trip(tmp_path, make):
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["cameras.json"]
     cameras, splits, to_capture, exposures = read_run_cameras(file)
     assert splits == [view.split for view in capture.views]
-    # A held-out view of the same name has none.
+    # A held-out view of the same name has no exposure.
     known = [given.get(view.camera.name, 1.0) if view.split == "train" else 1.0 for view in capture.views]
     assert exposures == known and known.count(1.25) == 1
     np.testing.assert_array_equal(to_capture, capture.to_capture)
     for camera, view in zip(cameras, capture.views, strict=True):
         assert_same(camera, view.camera)
-    # The same file as a camera path is in the capture's frame.
+    # Read as a camera path, the same file is in the capture's frame.
     for camera, view in zip(read_cameras(file), capture.views, strict=True):
         assert_same(camera, in_frame(view.camera, capture.to_capture))
 

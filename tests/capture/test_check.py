@@ -1,4 +1,4 @@
-"""What `refgs check` says."""
+"""Lines and files of `refgs check`."""
 
 import json
 from pathlib import Path
@@ -6,11 +6,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from makers import CENTRE, ball, colmap, edit, nerf_blender, nerfstudio, ring, write
 
 from refgs.capture import read_capture
 from refgs.capture.check import check, describe
 from refgs.errors import InputError
+from tests.makers.captures import CENTRE, ball, colmap, edit, nerf_blender, nerfstudio, ring, write
 
 
 def text(folder) -> str:
@@ -74,7 +74,7 @@ def test_blurred_photos_are_named(tmp_path):
 
 
 def test_what_is_shown_of_it(tmp_path):
-    """Cameras that read back as the capture's, and some of its photos, small and masked."""
+    """The cameras read back as the capture's; thumbnails are small, masked photos."""
     capture = read_capture(nerf_blender(tmp_path / "capture", {"train": 24, "test": 6}))
     found = check(capture, tmp_path / "new" / "out")
     assert found["capture"] == str(tmp_path / "capture") and any(

@@ -1,15 +1,15 @@
-"""Photos are decoded whole or refused, masked, undistorted and downsized without inventing colours."""
+"""Photos are refused or decoded completely, and masked, undistorted and reduced without inventing colours."""
 
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-from makers import colmap, edit, nerf_blender, nerfstudio, write
 
 from refgs.capture import load_view, read_capture
 from refgs.capture.images import read_image
 from refgs.errors import InputError
+from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, write
 
 OPENCV = (4, "OPENCV", [60.0, 61.0, 31.0, 25.0, -0.2, 0.05, 0.003, -0.002])
 
@@ -73,7 +73,7 @@ def test_full_size_is_returned_as_stored(tmp_path):
 
 
 def distorted_dots(width, height, matrix, coefficients):
-    """A photo of dots through OpenCV's own distortion, and their rays (n, 3)."""
+    """Make a photo of dots through OpenCV's own distortion; return it with their rays (n, 3)."""
     rays = np.stack([*np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.4, 0.4, 4)), np.ones((4, 5))], -1)
     rays = rays.reshape(-1, 3)
     pixels = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
@@ -123,7 +123,7 @@ def test_undistortion_against_opencv(tmp_path, k1, side):
     ],
 )
 def test_colmap_models_leave_no_invalid_pixels(tmp_path, model, binary):
-    """A white photo stays white to its corners, whichever way the lens bends, and the map is the model's."""
+    """A white photo stays white to its corners for either sign of distortion, and the map follows the model."""
     folder = colmap(tmp_path, binary, model)
     for path in (folder / "images").iterdir():
         write(path, np.full((48, 64, 3), 255, np.uint8))
@@ -134,7 +134,7 @@ def test_colmap_models_leave_no_invalid_pixels(tmp_path, model, binary):
         return
     across, down = view.lens.maps(view.camera)
     assert across.min() >= -0.51 and across.max() <= 63.51 and down.min() >= -0.51 and down.max() <= 47.51
-    # As little is lost as can be: somewhere the border of the photo is reached.
+    # As little as possible is lost: the map reaches the photo's border somewhere.
     slack = min(across.min() + 0.5, 63.5 - across.max(), down.min() + 0.5, 47.5 - down.max())
     assert slack < 1.0
     fx, fy, cx, cy, k1, k2, p1, p2 = {

@@ -1,10 +1,13 @@
-"""Every layout is read to the same cameras: what they see lies where their photos show it."""
+"""Cameras of every layout see the scene where their photos show it."""
 
 import json
 
 import numpy as np
 import pytest
-from makers import (
+from plyfile import PlyData, PlyElement
+
+from refgs.capture import load_view, published_normals, read_capture, read_run_cameras, write_cameras
+from tests.makers.captures import (
     CENTRE,
     RADIUS,
     ball,
@@ -18,9 +21,6 @@ from makers import (
     shiny_blender,
     write,
 )
-from plyfile import PlyData, PlyElement
-
-from refgs.capture import load_view, published_normals, read_capture, read_run_cameras, write_cameras
 
 RED, GREEN, NOTHING = (220, 0, 0), (20, 200, 0), (0, 0, 0)
 
@@ -245,7 +245,7 @@ def test_one_sided_cameras_are_not_taken_for_an_object(tmp_path):
 def test_cameras_that_look_outwards_are_a_room(tmp_path):
     poses = []
     for pose in ring(16, distance=0.5):
-        pose[:3, [0, 2]] *= -1  # turned round
+        pose[:3, [0, 2]] *= -1  # rotated by 180°
         poses.append(pose)
     capture = read_capture(nerfstudio(tmp_path, poses=poses))
     assert not capture.bounded and "outwards" in capture.bounded_because
@@ -352,7 +352,7 @@ def test_glossy_synthetic_without_depth_takes_the_photos_alpha(tmp_path):
 
 
 def test_glossy_synthetic_converted_to_nerf_blender(tmp_path):
-    """As its users convert it: photos of both splits in `rgb`, and sizes and focal lengths in the files."""
+    """Its users convert it so: photos of both splits in `rgb`, sizes and focal lengths in the files."""
     folder = nerf_blender(tmp_path)
     (folder / "rgb").mkdir()
     for split, first in (("train", 0), ("test", 20)):
@@ -371,7 +371,7 @@ def test_glossy_synthetic_converted_to_nerf_blender(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".png", ".PNG", ".webp"])
 def test_reduced_photos_of_a_colmap_capture(tmp_path, suffix):
-    """Ref-NeRF's real scenes: naming `images_4` takes its photos, every eighth for testing as with the others."""
+    """Naming `images_4` of Ref-NeRF's real scenes uses its photos; every eighth is held out."""
     folder = colmap(tmp_path / "sedan")
     for i, pose in enumerate(ring(16)):
         write(folder / "images_4" / f"{i:04d}.png", ball(pose, 16, 12, 15.0)[..., :3])

@@ -1,16 +1,16 @@
-"""Poses from photos alone, of a scene whose poses are known."""
+"""Poses from photos alone, against known poses."""
 
 import multiprocessing
 
 import numpy as np
 import pytest
-from makers import look_at, write
 from scipy.ndimage import map_coordinates
 
 from refgs.capture import read_capture
-from refgs.capture.motion import AGAINST, ALL_PAIRS, CONTRADICTED, against, find_cameras, pairs
+from refgs.capture.motion import ALL_PAIRS, CONTRADICTED, MATCH_TOLERANCE, epipolar_distance, find_cameras, pairs
 from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.errors import InputError, NoCameras
+from tests.makers.captures import look_at, write
 
 WIDTH, HEIGHT, FOCAL = 256, 192, 280.0
 POSES = [
@@ -24,7 +24,7 @@ def quiet(event: str, facts: dict) -> None:
 
 
 def speckled(pose: np.ndarray) -> np.ndarray:
-    """A block on the floor, both of a speckled stone: RGB (H, W, 3) uint8, by ray casting."""
+    """Ray-cast a block on a floor, both of speckled stone, to RGB (H, W, 3) uint8."""
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     rays = np.stack([u / FOCAL, -v / FOCAL, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
     eye, half, middle = pose[:3, 3], np.array([0.6, 0.5, 0.4]), np.array([0, 0, 0.4])
@@ -49,14 +49,14 @@ def pictures():
 
 @pytest.fixture
 def photos(tmp_path, pictures):
-    """The photos alone, with a space in their names."""
+    """Write the photos alone, with a space in their names."""
     for number, picture in enumerate(pictures):
         write(tmp_path / f"stone {number:02d}.png", picture)
     return tmp_path
 
 
 def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) after the similarity that brings them nearest to others (Umeyama 1991), and its rotation."""
+    """Align points (N, 3) with others by the best similarity (Umeyama 1991); return them and its rotation."""
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     u, stretch, vt = np.linalg.svd(b.T @ a)
     flip = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
@@ -93,7 +93,7 @@ def test_photos_become_a_capture(photos):
 
 
 def test_one_that_is_interrupted_goes_on(photos):
-    """What was ended in the middle is no capture; its features serve the next time, unless a photo was changed."""
+    """An interrupted search leaves no capture. The next one reuses its features, unless a photo was changed."""
 
     def interrupt(event: str, facts: dict) -> None:
         if facts.get("stage") == "matching":
@@ -125,8 +125,10 @@ def test_no_photos(tmp_path):
 
 
 def test_what_stands_still_contradicts_what_turns():
-    """An object turns once before a room, the camera never quite at one place: cameras around the object contradict the matches of the
-    room, cameras in the room those of the object."""
+    """An object turns in front of a room, and the camera moves a little.
+
+    Cameras around the object contradict the room's matches; cameras in the room contradict the object's.
+    """
     rng, focal, count = np.random.default_rng(0), 1000, 36
     block, room = rng.uniform(-0.8, 0.8, (100, 3)), np.add(rng.uniform(-2, 2, (50, 3)), [0, 6, 0])
     places, around, inside = [], [], []
@@ -140,13 +142,16 @@ def test_what_stands_still_contradicts_what_turns():
         places.append(seen[:, :2] / seen[:, 2:])
 
     def contradicted(poses: list[np.ndarray], reach: int, features: slice) -> np.ndarray:
-        """Of the matches of photos that are at most so far apart in the turn."""
+        """Return the contradicted part of the matches between photos at most this far apart."""
         near = [(a, b) for a, b in pairs(count) if min(b - a, count - b + a) <= reach]
         ways = [(poses[b] @ np.linalg.inv(poses[a]))[:3] for a, b in near]
-        far = [against(places[a][features], places[b][features], way) for (a, b), way in zip(near, ways, strict=True)]
-        return np.concatenate(far) * focal > AGAINST
+        far = [
+            epipolar_distance(places[a][features], places[b][features], way)
+            for (a, b), way in zip(near, ways, strict=True)
+        ]
+        return np.concatenate(far) * focal > MATCH_TOLERANCE
 
-    of_block, of_room = (6, slice(100)), (count, slice(100, None))  # the block's features are hidden six photos on
+    of_block, of_room = (6, slice(100)), (count, slice(100, None))  # six photos on, the block's features are hidden
     for poses in (around, inside):
         both = [contradicted(poses, *of_block), contradicted(poses, *of_room)]
         assert np.concatenate(both).mean() > CONTRADICTED

@@ -1,4 +1,4 @@
-"""A pickle gives its arrays, whoever wrote it with whatever, and nothing that it names is run."""
+"""Pickles of all NumPy releases and protocols are read, and no code that they name runs."""
 
 import os
 import pickle
@@ -22,7 +22,7 @@ def refused(file, data: bytes, says: str) -> None:
 
 
 class _Runs:
-    """What a pickle from a stranger may hold: reading it as pickles are read makes a file."""
+    """Malicious object: unpickling it with `pickle.load` creates a file."""
 
     def __init__(self, path):
         self.path = path
@@ -75,7 +75,7 @@ def test_a_pickle_that_is_cut_short(tmp_path, kept):
 
 
 def test_lists_within_lists_are_not_followed(tmp_path):
-    """A few hundred bytes can stand for more items than there is memory."""
+    """A few hundred bytes can describe more items than fit into memory."""
     value = [1] * 10
     for _ in range(30):
         value = [value] * 10

@@ -8,16 +8,16 @@ import torch
 from plyfile import PlyData
 
 from refgs.capture import read_capture
+from refgs.compare.metrics import psnr
 from refgs.errors import InputError
 from refgs.export.display import displayed
-from refgs.export.splats import THIN, Splats, read_splats, write_display_splats, write_splats
+from refgs.formats.splats import THIN, Splats, read_splats, write_display_splats, write_splats
 from refgs.jobs import export
 from refgs.model.surfels import from_splats
 from refgs.render.renderer import render
-from refgs.report.metrics import psnr
 from refgs.run import open_run
-from tests.export.test_splats import make
-from tests.report.test_evaluate import write_run
+from tests.makers.ball import write_run
+from tests.makers.splats import make
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,8 @@ import trimesh
 
 from refgs.camera import Camera
 from refgs.export.outline import bring_out
-from refgs.geometry.mesh import Mesh, smooth_normals
+from refgs.formats.mesh import Mesh
+from refgs.geometry.mesh import smooth_normals
 from refgs.render.renderer import Rendering
 
 VOXEL, DISTANCE, FOCAL, SIDE = 0.02, 4.0, 300.0, 160

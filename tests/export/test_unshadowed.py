@@ -6,15 +6,15 @@ import torch
 import trimesh
 
 from refgs.export.unshadowed import LEAST, unshadowed
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.model.surfels import to_splats
-from tests.render.test_relight import bowl, even, mirrors, surfels  # noqa: F401
+from tests.makers.occluders import bowl, even, mirrors, surfels
 
 
 @pytest.mark.parametrize("albedo", [0.1, 0.5, 0.8])
-def test_the_shadow_of_a_bowl_goes(bowl, albedo, monkeypatch):  # noqa: F811
+def test_the_shadow_of_a_bowl_goes(albedo, monkeypatch):
     """Any point of half a sphere receives x = 1/2 + albedo x / 2, and was learned to be albedo · x; metals have none in their colour."""
-    occluder, points, normals = bowl
+    occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
     seen = surfels(points, normals, albedo * 0.5 / (1 - albedo / 2))
     found = unshadowed(to_splats(seen), seen, occluder.mesh, even(2.0))

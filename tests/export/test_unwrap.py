@@ -5,7 +5,8 @@ import pytest
 import trimesh
 
 from refgs.export.unwrap import PART, layout, unwrap
-from refgs.geometry.mesh import Mesh, smooth_normals
+from refgs.formats.mesh import Mesh
+from refgs.geometry.mesh import smooth_normals
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,10 @@ import pytest
 import torch
 import trimesh
 
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.render import renderer
-from tests.kernels import scenes
+from tests.makers import scenes
 
 
 def rings() -> trimesh.Trimesh:

@@ -3,7 +3,8 @@ import pytest
 import trimesh
 
 from refgs.errors import InputError
-from refgs.geometry.mesh import Mesh, clean, is_crumbs, smooth_normals
+from refgs.formats.mesh import Mesh
+from refgs.geometry.mesh import clean, is_crumbs, smooth_normals
 
 
 def as_mesh(*parts):

@@ -3,10 +3,10 @@ import logging
 import numpy as np
 import pytest
 
-from benchmarks.distances import around, gradient, look_at, mask, sphere, torus
 from refgs.errors import InputError
 from refgs.geometry.hull import _carve, visual_hull_points
 from refgs.kernels.load import supported
+from tests.makers.distances import around, gradient, look_at, mask, sphere, torus
 
 VIEWS = around(32, 128)
 DISCS = [mask(view, sphere) for view in VIEWS]

@@ -5,8 +5,8 @@ import pytest
 import torch
 import trimesh
 
-from benchmarks.distances import around, box, depth, gradient, look_at, sphere, torus
 from refgs.geometry.tsdf import fuse
+from tests.makers.distances import around, box, depth, gradient, look_at, sphere, torus
 
 VIEWS = around(24, 128)
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
+from tests.makers.occluders import plate
 
 FRAMES = [(1.0, 0.0), (1e-3, 0.0), (1e3, 0.0), (1.0, 1e4)]
 
@@ -17,16 +18,6 @@ def placed(shape: trimesh.Trimesh, scale: float, moved: float) -> Occluder:
 def directions(count: int, seed: int = 0) -> np.ndarray:
     d = np.random.default_rng(seed).normal(size=(count, 3))
     return d / np.linalg.norm(d, axis=1, keepdims=True)
-
-
-def plate(z: float, up: int) -> trimesh.Trimesh:
-    """The square of half-side 1 at a height, in 2 × 20² triangles, facing up (1) or down (-1)."""
-    at = np.linspace(-1, 1, 21)
-    x, y = np.meshgrid(at, at, indexing="ij")
-    corner = (np.arange(20)[:, None] * 21 + np.arange(20)).ravel()
-    quads = np.stack([corner, corner + 21, corner + 22, corner + 1], axis=1)[:, ::up]
-    faces = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
-    return trimesh.Trimesh(np.stack([x, y, np.full_like(x, z)], axis=-1).reshape(-1, 3), faces, process=False)
 
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)

@@ -9,16 +9,16 @@ import torch
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
-from refgs.kernels import reference
 from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.render import reference
 from refgs.render.directional import directional
 from refgs.render.renderer import render
 from refgs.settings import load_settings
-from tests.kernels import scenes
+from tests.makers import scenes
 
 
 def surfels(coefficients: int, count: int = 1000):

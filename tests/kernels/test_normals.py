@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from refgs.kernels import reference
+from refgs.render import reference
 from refgs.render.facing import facing_normals
-from tests.kernels import scenes
+from tests.makers import scenes
 
 
 def surfels(count: int = 1000) -> tuple[Tensor, Tensor]:

@@ -11,11 +11,11 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from refgs.kernels import load, reference
-from refgs.render import raster_cuda
+from refgs.kernels import load
+from refgs.render import raster_cuda, reference
 from refgs.render.rasterize import Raster, rasterize, trimmed_depth
-from tests.kernels import scenes
-from tests.kernels.emulate import emulate
+from tests.makers import scenes
+from tests.makers.emulate import emulate
 
 NAMES = ("positions", "rotations", "scales", "opacities", "features")
 # A pixel whose value hangs on a comparison (of alpha with its cut, of transmittance with its end …) that float32 may decide

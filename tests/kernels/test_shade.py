@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
-from refgs.kernels import reference
 from refgs.model.environment import Environment
+from refgs.render import reference
 from refgs.render.shade import mirror_directions, shade, shade_splats
-from tests.kernels import scenes
+from tests.makers import scenes
 
 NAMES = ("features", "alpha", "levels", "exposure")
 # Pixels nearer to a kink of their derivatives than this are left out of the gradients; their share is checked.

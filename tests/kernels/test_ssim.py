@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from refgs.kernels import reference
+from refgs.render import reference
 from refgs.render.ssim import dssim
-from tests.kernels import scenes
+from tests.makers import scenes
 
 
 @pytest.mark.parametrize("shape", [(40, 57), (64, 16), (3, 4), (1, 1), (11, 200)])

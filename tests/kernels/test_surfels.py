@@ -6,8 +6,8 @@ import torch
 
 from refgs.model.surfels import activate, initial_parameters
 from refgs.render.stack import stack
-from refgs.train.densify import ScreenGradient
-from tests.kernels import scenes
+from refgs.train.motion import ScreenGradient
+from tests.makers import scenes
 
 COUNT = 5003
 ACTIVATED = {"scale": (2,), "opacity": (), "albedo": (3,), "metallic": (), "roughness": ()}

@@ -4,9 +4,26 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.approximations.prefiltering import errors
 from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
+
+
+def errors(radiance: torch.Tensor, fine: torch.Tensor, rows: int) -> list[float]:
+    """Compare `rows` random texels of each level with the lobe's sum over a finer cubemap: RMS error by the mean, for each level."""
+    side, fine_side = (math.isqrt(len(v) // 6) for v in (radiance, fine))
+    levels = prefilter.prefilter(radiance, side).cpu()
+    levels = cubemap.in_texel_order(levels, tuple(prefilter.level_sides(side))).numpy()
+    directions, area = cubemap.texel_directions(fine_side).numpy(), cubemap.texel_solid_angles(fine_side).numpy()
+    start, found, rng = 6 * side * side, [], np.random.default_rng(0)
+    for level_side, lobe in zip(prefilter.level_sides(side)[1:], prefilter.LOBES, strict=True):
+        axes = cubemap.texel_directions(level_side).numpy()
+        chosen = rng.choice(len(axes), rows, replace=False)
+        weight = lobe(axes[chosen] @ directions.T) * area
+        expected = weight @ fine.numpy() / weight.sum(axis=1, keepdims=True)
+        got = levels[start : start + len(axes)][chosen]
+        found.append(float(np.sqrt(((got - expected) ** 2).mean()) / expected.mean()))
+        start += len(axes)
+    return found
 
 
 def light(side: int) -> torch.Tensor:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from refgs.kernels import reference
+from refgs.render import reference
 from refgs.render.brdf import bounces
 
 # What Cycles 4.5 renders of a plane under a white world, as a Principled BSDF with its defaults, 65 000 samples each; errors of

@@ -8,37 +8,14 @@ import torch
 import trimesh
 
 from refgs.camera import Camera
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
-from refgs.kernels import reference
 from refgs.model import cubemap, harmonics
 from refgs.model.environment import Environment
-from refgs.model.surfels import Surfels, quaternions_towards
-from refgs.render import relight
+from refgs.model.surfels import Surfels
+from refgs.render import reference, relight
 from refgs.render.directional import directional
-from tests.geometry.test_visibility import plate
-
-
-def surfels(points: np.ndarray, normals: np.ndarray, albedo: float = 0.5, metallic: float = 0.0) -> Surfels:
-    n = len(points)
-    return Surfels(
-        positions=torch.from_numpy(np.float32(points)),
-        rotations=torch.from_numpy(quaternions_towards(normals)).float(),
-        scales=torch.full((n, 2), 0.05),
-        opacities=torch.ones(n),
-        sh_dc=torch.zeros(n, 1, 3),
-        sh_rest=torch.zeros(n, 0, 3),
-        albedo=torch.full((n, 3), albedo),
-        metallic=torch.full((n,), metallic),
-        roughness=torch.full((n,), 0.5),
-        received=torch.ones(n, 3),
-        indirect_dc=torch.zeros(n, 1, 3),
-        indirect_rest=torch.zeros(n, 0, 3),
-    )
-
-
-def even(radiance: float = 1.0) -> Environment:
-    return Environment(torch.full((6 * 32**2, 3), radiance))
+from tests.makers.occluders import bowl, even, mirrors, plate, surfels
 
 
 def colourful() -> Environment:
@@ -46,29 +23,9 @@ def colourful() -> Environment:
     return Environment(torch.stack([1 + 0.5 * x, 1 + 0.8 * z, 1 - 0.6 * y * x], dim=1))
 
 
-def mirrors(monkeypatch, part: float) -> None:
-    """Surfaces mirror this part of the light, whatever the angle, and scatter the rest."""
-
-    def shares(albedo, metallic, roughness, cosine):
-        return torch.full_like(albedo, part), (1 - part) * albedo
-
-    monkeypatch.setattr(relight, "_split_sum", shares)
-
-
 def plates(*shapes: trimesh.Trimesh) -> Occluder:
     mesh = trimesh.util.concatenate(shapes)
     return Occluder(Mesh(mesh.vertices, np.asarray(mesh.faces)))
-
-
-@pytest.fixture(scope="module")
-def bowl() -> tuple[Occluder, np.ndarray, np.ndarray]:
-    """Half a sphere's inside, of radius 1 below z = 0; points whose rays start on it, and their normals."""
-    ball = trimesh.creation.icosphere(5)
-    inside = ball.faces[ball.triangles_center[:, 2] < 0][:, ::-1]
-    occluder = Occluder(Mesh(ball.vertices, inside))
-    points = trimesh.creation.icosphere(3).vertices
-    points = points[points[:, 2] < -0.1]
-    return occluder, points * (1 + occluder.lift - 0.002), -points
 
 
 def received(points: Surfels, occluder: Occluder, light: Environment, directions: int = relight.DIRECTIONS, bounces=4):
@@ -113,9 +70,9 @@ def test_between_two_plates():
 
 
 @pytest.mark.parametrize("albedo", [0.0, 0.5, 0.9])
-def test_inside_a_matte_bowl(bowl, albedo, monkeypatch):
+def test_inside_a_matte_bowl(albedo, monkeypatch):
     """Any point of half a sphere sees half of the sky and half of the bowl: x = 1/2 + albedo x / 2."""
-    occluder, points, normals = bowl
+    occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
     found = received(surfels(points, normals, albedo), occluder, even(), bounces=20)
     exact = 0.5 / (1 - albedo / 2)
@@ -123,9 +80,9 @@ def test_inside_a_matte_bowl(bowl, albedo, monkeypatch):
     assert float((found / exact - 1).square().mean().sqrt()) < 0.02
 
 
-def test_what_training_takes_of_it(bowl, monkeypatch):
+def test_what_training_takes_of_it(monkeypatch):
     """As a part of what an unhidden surface would receive, whichever way normals point; from some of the surfels alone."""
-    occluder, points, normals = bowl
+    occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
     inside = surfels(points, normals).turned(torch.arange(len(points)) % 2 == 0)
     assert (inside.normals() * torch.from_numpy(normals)).sum(dim=1)[::2].max() < -0.99
@@ -140,9 +97,9 @@ def test_what_training_takes_of_it(bowl, monkeypatch):
 
 
 @pytest.mark.parametrize("part", [0.0, 0.3, 1.0])
-def test_a_white_bowl_under_an_even_sky_cannot_be_seen(bowl, part, monkeypatch):
+def test_a_white_bowl_under_an_even_sky_cannot_be_seen(part, monkeypatch):
     """Whatever part of the light its surface mirrors; light from the object is as even as the sky."""
-    occluder, points, normals = bowl
+    occluder, points, normals = bowl()
     mirrors(monkeypatch, part)
     transport = relight.Transport(surfels(points, normals, 1.0), occluder)
     found, indirect = relight._gather(transport, even(), 20)

@@ -1,10 +1,10 @@
-"""The shading's outgoing radiance against the rendering equation: `refgs bench splitsum` prints the errors themselves."""
+"""The shading's outgoing radiance against the rendering equation."""
 
 import itertools
 
 import pytest
 
-from benchmarks.splitsum import (
+from tests.makers.rendering_equation import (
     ANGLES,
     DIELECTRIC,
     METAL,

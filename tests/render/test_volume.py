@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from refgs.kernels import reference
+from refgs.render import reference
 from refgs.render.rasterize import rasterize
 from refgs.render.volume import across_the_axis, shortest_last
-from tests.kernels import scenes
+from tests.makers import scenes
 
 CAMERA = scenes.camera(60, 40)
 

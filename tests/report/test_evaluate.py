@@ -1,35 +1,25 @@
 """`refgs evaluate`: a run whose ground truth is known, in a capture whose frame is turned, moved and scaled from the run's."""
 
 import json
-import shutil
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
-import torch
-import trimesh
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scenes.analytic import sky
-from benchmarks.terms import PARTS, terms
 from refgs import commands, jobs
 from refgs.capture import read_capture
 from refgs.color import srgb_encode
+from refgs.compare import surface
+from refgs.compare.pictures import maps
+from refgs.compare.truth import GroundTruth
 from refgs.errors import InputError
-from refgs.export.environment import directions, write_environment, write_exr
-from refgs.export.splats import read_splats, write_splats
+from refgs.formats.exr import write_exr
+from refgs.formats.panorama import directions, write_environment
 from refgs.model.environment import Environment
-from refgs.model.surfels import activate, initial_parameters, to_splats
-from refgs.report import surface
-from refgs.report.pictures import maps
-from refgs.report.truth import GroundTruth
-from refgs.run import create_run, open_run
-from refgs.settings import load_settings
-
-TURN = Rotation.from_euler("zyx", [40, 25, -70], degrees=True).as_matrix()
-SCALE, MOVE = 3.0, np.array([5.0, -2.0, 1.0])
-BOX = trimesh.creation.box((1.0, 1.4, 0.8)).subdivide().subdivide()
+from refgs.run import open_run
+from tests.makers.ball import BOX, MOVE, SCALE, TURN, write_run
 
 
 def dusk(direction):
@@ -40,27 +30,6 @@ def dusk(direction):
 def turned(light, turn, height=64):
     """The panorama that shows in a frame, where `turn` leads to it, what `light` is in the frame it comes from."""
     return light(directions(height, 2 * height) @ turn)
-
-
-def write_run(folder, capture):
-    """A ball of surfels of a metal, rough above and smooth below, and a box for a mesh."""
-    create_run(folder, capture, load_settings("quick", ["environment.resolution=16"]), "quick", "cpu")
-    steps = np.arange(3000) + 0.5
-    z, azimuth = 1 - 2 * steps / len(steps), steps * np.pi * (3 - np.sqrt(5))
-    points = np.stack([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z], axis=1)
-    look = {"opacity": 0.95, "sh_degree": 0, "albedo": 0.7, "metallic": 0.9, "roughness": 0.3}
-    surfels = activate(initial_parameters(points, points, np.full(3000, 0.04), None, **look))
-    roughness = torch.where(torch.from_numpy(z) > 0, 0.6, 0.2).float()
-    splats = to_splats(surfels._replace(roughness=roughness, indirect_dc=surfels.indirect_dc[:, :0]))
-    write_splats(folder / "splats.ply", splats)
-    write_environment(folder / "environment.exr", sky(directions(64, 128)))
-    box = BOX.copy()
-    box.vertices = box.vertices[:, [0, 2, 1]] * [1, 1, -1]  # glTF's axes: Y up
-    box.export(folder / "mesh.glb")
-    cameras = json.loads((folder / "cameras.json").read_text())
-    cameras["to_capture"] = [*np.hstack([SCALE * TURN, MOVE[:, None]]).tolist(), [0, 0, 0, 1]]
-    (folder / "cameras.json").write_text(json.dumps(cameras))
-    return folder
 
 
 def write_truth(folder, run, views):
@@ -186,7 +155,7 @@ def test_normals_that_a_data_set_brings_are_the_truth_where_there_is_no_other(ma
         images = maps(there.render(view.camera))
         return np.where(images["alpha"][..., None] > 0.5, -images["normal"] @ TURN.T, 0), images["alpha"]
 
-    monkeypatch.setattr("refgs.report.truth.published_normals", published)
+    monkeypatch.setattr("refgs.compare.truth.published_normals", published)
     commands.evaluate(run, "test", None)
     assert len(asked) == 4 and figures(run)["normal_mae_degrees"] == pytest.approx(180, abs=0.1)
     commands.evaluate(run, "test", truth)
@@ -213,15 +182,3 @@ def test_a_missing_file_is_one_line(made, tmp_path):
     write_exr(tmp_path / "grey" / "normal" / f"{views[0].camera.name}.exr", np.ones((64, 64)))
     with pytest.raises(InputError, match="one channel where there should be 3"):
         GroundTruth(tmp_path / "grey", np.eye(4)).view("normal", views[0].camera)
-
-
-def test_true_maps_take_the_place_of_wrong_ones(made, tmp_path):
-    run, truth, _ = made
-    found = terms(run, truth)
-    assert list(found) == ["as it is", *PARTS, "all"] and min(found.values()) > 40, found
-    wrong = shutil.copytree(run, tmp_path / "wrong")
-    splats = read_splats(wrong / "splats.ply")
-    write_splats(wrong / "splats.ply", replace(splats, roughness=np.full_like(splats.roughness, 0.9)))
-    found = terms(wrong, truth)
-    assert found["materials"] > 40 and found["all"] > 40
-    assert max(found[name] for name in ("as it is", "normals", "light", "visibility")) < 35, found

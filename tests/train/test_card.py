@@ -8,14 +8,14 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake_temporarily
 
 from refgs.capture import read_capture
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.kernels import cuda
 from refgs.model import prefilter
 from refgs.render import raster_cuda, shade
 from refgs.settings import load_settings
 from refgs.train.trainer import Trainer
-from tests.kernels.emulate import emulate
+from tests.makers.emulate import emulate
 
 CARD = torch.device("cuda:0")
 
@@ -44,12 +44,14 @@ def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
         trainer = make_trainer(ball_capture, tmp_path / name, *changes)
         if "indirect.start=0" in changes:
             ring = trimesh.creation.torus(1.0, 0.3)
-            trainer.occluder = Occluder(Mesh(ring.vertices * trainer.capture.radius, np.asarray(ring.faces)))
+            trainer.state.occluder = Occluder(
+                Mesh(ring.vertices * trainer.state.capture.radius, np.asarray(ring.faces))
+            )
         if name == "card":
             emulate(monkeypatch)
         steps = [trainer.step() for _ in range(3)]
         figures.append([[float(step[name]) for name in ("loss", "square")] for step in steps])
-        learned.append({name: value.detach().clone() for name, value in trainer.parameters.items()})
+        learned.append({name: value.detach().clone() for name, value in trainer.state.parameters.items()})
     np.testing.assert_allclose(figures[0], figures[1], rtol=1e-3)
     for name, value in learned[0].items():
         # Adam's first steps are the gradients' signs, which rounding may turn where they are next to nothing.
@@ -129,12 +131,12 @@ def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, ind
             trainer._next_view()  # the views' order is drawn on the CPU
         if indirect:
             tree._boxes, tree._triangles = (torch.empty(v.shape, device=CARD) for v in (tree._boxes, tree._triangles))
-            trainer.occluder = occluder
+            trainer.state.occluder = occluder
         # Which part of the light the object shows is looked at when the training begins.
-        trainer.light_shown = torch.empty(len(trainer.light), device=CARD)
+        trainer.state.light_shown = torch.empty(len(trainer.state.light), device=CARD)
         figures = trainer.step()
         assert all(figure.device == CARD for figure in figures.values())
-        assert all(value.grad is None and value.device == CARD for value in trainer.parameters.values())
+        assert all(value.grad is None and value.device == CARD for value in trainer.state.parameters.values())
     stages = [
         "activate",
         "sparse",

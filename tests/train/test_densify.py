@@ -2,10 +2,11 @@ import numpy as np
 import torch
 
 from refgs.camera import Camera
+from refgs.model.adam import Adam
 from refgs.model.surfels import activate, initial_parameters
 from refgs.settings import load_settings
-from refgs.train.adam import Adam
-from refgs.train.densify import ScreenGradient, densify
+from refgs.train.densify import densify
+from refgs.train.motion import ScreenGradient
 
 SETTINGS = load_settings("quick").densify
 

@@ -95,19 +95,19 @@ def test_full_memory_lowers_the_budget_and_goes_on(ball_capture, tmp_path, monke
     whole, step = 1800, trainer.step
 
     def limited() -> dict:
-        if len(trainer.parameters["position"]) > whole:
+        if len(trainer.state.parameters["position"]) > whole:
             raise torch.OutOfMemoryError
         return step()
 
-    faintest = trainer.parameters["opacity"][:400]
+    faintest = trainer.state.parameters["opacity"][:400]
     with torch.no_grad():
         faintest -= 1
     monkeypatch.setattr(trainer, "step", limited)
     assert trainer.run()
     warnings = [facts["what"] for event, facts in reports if event == "warning"]
     assert len(warnings) == 1 and "1,600 surfels" in warnings[0]
-    assert trainer.budget == len(trainer.parameters["position"]) == 1600
-    assert trainer.parameters["opacity"].min() > 0
+    assert trainer.state.settings.surfels.budget == len(trainer.state.parameters["position"]) == 1600
+    assert trainer.state.parameters["opacity"].min() > 0
 
 
 def test_memory_that_is_far_too_small(ball_capture, tmp_path, monkeypatch):

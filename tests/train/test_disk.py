@@ -1,21 +1,16 @@
-"""Disks that fill up, or are taken out, while a run is made on them."""
+"""Disks that fill up or are taken out during a training or an export."""
 
 import pytest
 
 from refgs import jobs
 from refgs.errors import InputError
+from tests.makers.disk import fill
 
 SMALL = ["surfels.start=500", "surfels.budget=500", "surfels.hull=48", "environment.resolution=16"]
 
 
 def train(capture, run, attend, *changes, resume=False):
     return jobs.train(capture, run, "quick", "cpu", None, [*changes], resume, lambda event, facts: None, attend)
-
-
-def fill(file):
-    with pytest.raises(OSError), open(file, "wb", buffering=0) as opened:
-        while True:
-            opened.write(bytes(4096))
 
 
 def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
@@ -29,7 +24,7 @@ def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
 
     words = [*SMALL, "train.iterations=80", "train.checkpoint_every=20"]
     with pytest.raises(
-        InputError, match=r"run is no longer there: put its disk back, then go on with --resume"
+        InputError, match=r"run is no longer there: put its disk back, then resume with --resume"
     ) as said:
         train(ball_capture, disk / "run", take_out, *words)
     assert "\n" not in str(said.value)
@@ -41,7 +36,7 @@ def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
 
 
 def test_a_disk_that_is_full(ball_capture, small_disk):
-    """While what is written is no checkpoint: those say so themselves."""
+    """A write other than a checkpoint fails; failed checkpoints are reported elsewhere."""
     filler = small_disk / "filler"
 
     def later(trainer):
@@ -58,7 +53,7 @@ def test_a_disk_that_is_full(ball_capture, small_disk):
 
 
 def test_a_mesh_that_cannot_be_written(ball_capture, small_disk):
-    """The old files stay."""
+    """The old mesh and textures stay as they were."""
     run = small_disk / "run"
     words = ["train.iterations=60", "mesh.resolution=32", "mesh.triangles=500"]
     train(ball_capture, run, lambda trainer: False, *SMALL, *words)

@@ -32,12 +32,12 @@ def test_more_time_brings_more_of_all(ball_capture, tmp_path):
     for minutes in (0.2, 2, 6, 600):
         report = lambda event, facts: said.append(facts["what"])  # noqa: E731
         made = fitting(capture, ["surfels.hull=32"], tmp_path, Plan(minutes), "cpu", report)
-        found.append(made.settings)
-        assert made.total == made.settings.train.iterations and made.report is report
-        if made.settings.surfels.budget == QUICK.surfels.budget:  # the rehearsal was a part of it
-            assert made.iteration == REHEARSED and made.seconds > 0
+        found.append(made.state.settings)
+        assert made.state.total == made.state.settings.train.iterations and made.state.report is report
+        if made.state.settings.surfels.budget == QUICK.surfels.budget:  # the rehearsal was a part of it
+            assert made.state.iteration == REHEARSED and made.state.seconds > 0
         else:
-            assert made.iteration == 0 and made.seconds == 0
+            assert made.state.iteration == 0 and made.state.seconds == 0
     short, *_, long = found
     assert short.surfels.budget == QUICK.surfels.budget and short.train.iterations < QUICK.train.iterations
     assert short.densify.every < QUICK.densify.every and short.indirect.every < QUICK.indirect.every

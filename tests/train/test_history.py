@@ -9,12 +9,13 @@ import pytest
 
 from benchmarks.scenes.analytic import F0, ONE, meet, sky
 from refgs.capture import read_capture
-from refgs.export.environment import directions, write_environment, write_exr
+from refgs.formats.exr import write_exr
+from refgs.formats.panorama import directions, write_environment
 from refgs.run import create_run
 from refgs.settings import load_settings
 from refgs.train import history
 from refgs.train.trainer import Trainer
-from tests.kernels import scenes
+from tests.makers import scenes
 
 SMALL = [
     "surfels.start=600",
@@ -30,7 +31,7 @@ def make(capture, folder, *changes, total=40, report=lambda event, facts: None):
     read = read_capture(capture)
     trainer = Trainer(read, settings, folder, report)
     if not folder.exists():
-        create_run(folder, read, trainer.settings, "quick", "cpu")
+        create_run(folder, read, trainer.state.settings, "quick", "cpu")
     return trainer
 
 
@@ -89,8 +90,8 @@ def test_measuring_is_not_in_the_seconds(ball_capture, tmp_path, monkeypatch):
     assert ["psnr_test" in row for row in found] == [True, False, False, True], (
         "the first and the last, whatever it costs"
     )
-    assert found[-1]["seconds"] < 10 and trainer.seconds < 10
-    assert trainer.clock.seconds["measuring"] == pytest.approx(2000, abs=1)
+    assert found[-1]["seconds"] < 10 and trainer.state.seconds < 10
+    assert trainer.state.clock.seconds["measuring"] == pytest.approx(2000, abs=1)
     assert found[-1]["parts"]["measuring"] == pytest.approx(1000, abs=1), "what was spent before that line"
 
 
@@ -116,12 +117,12 @@ def test_a_resumed_run_records_the_same(ball_capture, tmp_path, monkeypatch):
     changes = ["train.checkpoint_every=20", "densify.every=15"]
     make(ball_capture, tmp_path / "whole", *changes).run()
     first = make(ball_capture, tmp_path / "cut", *changes)
-    first.run(stop=lambda: first.iteration >= 34)
+    first.run(stop=lambda: first.state.iteration >= 34)
     assert rows(tmp_path / "cut")[-1]["iteration"] == 32
     (tmp_path / "cut" / "checkpoints" / "00000034.toml").unlink()  # killed before that one was complete
     second = make(ball_capture, tmp_path / "cut", *changes)
     second.resume()
-    assert rows(tmp_path / "cut")[-1]["iteration"] == 20 == second.iteration
+    assert rows(tmp_path / "cut")[-1]["iteration"] == 20 == second.state.iteration
     second.run()
     whole, cut = (
         [
@@ -139,9 +140,9 @@ def test_a_training_that_is_ended_early_has_a_last_line(ball_capture, tmp_path):
     trainer = make(ball_capture, tmp_path / "run")
 
     def finish():
-        if trainer.iteration == 14:
-            trainer.total = 14
-        return trainer.ended
+        if trainer.state.iteration == 14:
+            trainer.state.total = 14
+        return trainer.state.ended
 
     trainer.run(stop=finish)
     assert [row["iteration"] for row in rows(tmp_path / "run")] == [10, 13, 14]
@@ -199,13 +200,13 @@ def test_errors_against_the_truth(known_capture, tmp_path):
     trainer = make(
         known_capture, tmp_path / "run", "surfels.metallic=0.9", "surfels.budget=1500", "surfels.start=1500", total=250
     )
-    start = trainer.measures.errors(trainer)
+    start = trainer.measures.errors(trainer.state)
     trainer.run()
     found = rows(tmp_path / "run")[-1]
     angles, roughness, metallic = [], [], []
-    for view in trainer.test:
+    for view in trainer.state.test:
         _, hit, _, normal = rays(view.camera)
-        seen = trainer.render(view.camera)
+        seen = trainer.state.render(view.camera)
         shown = seen.normal.double().numpy().reshape(-1, 3)[hit]
         there = (seen.alpha.numpy().reshape(-1)[hit] >= 0.1) & (np.linalg.norm(shown, axis=1) > 1e-6)
         cosine = (shown * normal[hit]).sum(-1) / np.maximum(np.linalg.norm(shown, axis=1), 1e-6)
@@ -215,7 +216,7 @@ def test_errors_against_the_truth(known_capture, tmp_path):
     assert found["normal_mae_degrees"] == pytest.approx(np.mean(angles), rel=1e-4)
     assert found["roughness_mae"] == pytest.approx(np.mean(roughness), abs=1e-4)
     assert found["metallic_mae"] == pytest.approx(np.mean(metallic), abs=1e-4)
-    light, true = (x(64) for x in (trainer.environment().panorama, lambda rows: sky(directions(rows, 2 * rows))))
+    light, true = (x(64) for x in (trainer.state.environment().panorama, lambda rows: sky(directions(rows, 2 * rows))))
     weight = np.cos(np.pi * (0.5 - (np.arange(64) + 0.5) / 64))[:, None, None]
     apart = np.log(light) - np.log(true)
     apart -= (apart * weight).sum() / (weight.sum() * 128 * 3)
@@ -232,18 +233,18 @@ def test_a_light_known_exactly_leaves_the_relit_picture_alone(known_capture, tmp
     logit = np.log(F0 / (1 - F0))
     settings = {"albedo": logit, "metallic": 9.0, "roughness": -9.0}
     for name, value in settings.items():
-        trainer.parameters[name].data[:] = trainer.parameters[name].new_tensor(value)
-    assert trainer.measures.errors(trainer)["relit_psnr"] > 20
-    trainer.parameters["albedo"].data[:] = trainer.parameters["albedo"].new_tensor(logit[::-1].copy())
-    assert trainer.measures.errors(trainer)["relit_psnr"] < 20, "of another metal"
+        trainer.state.parameters[name].data[:] = trainer.state.parameters[name].new_tensor(value)
+    assert trainer.measures.errors(trainer.state)["relit_psnr"] > 20
+    trainer.state.parameters["albedo"].data[:] = trainer.state.parameters["albedo"].new_tensor(logit[::-1].copy())
+    assert trainer.measures.errors(trainer.state)["relit_psnr"] < 20, "of another metal"
 
 
 def test_without_colour_that_is_material_there_is_none_to_compare(known_capture, tmp_path):
     sh = make(known_capture, tmp_path / "sh", "render.shading=sh")
-    assert sh.measures.errors(sh).keys() == {"psnr_test", "normal_mae_degrees"}
+    assert sh.measures.errors(sh.state).keys() == {"psnr_test", "normal_mae_degrees"}
     diffuse = make(known_capture, tmp_path / "diffuse", "render.diffuse=sh")
     expected = {"psnr_test", "normal_mae_degrees", "roughness_mae", "metallic_mae", "light_log_rmse"}
-    assert diffuse.measures.errors(diffuse).keys() == expected
+    assert diffuse.measures.errors(diffuse.state).keys() == expected
 
 
 def test_a_truth_that_does_not_fit_is_left_out_with_a_line(known_capture, tmp_path):
@@ -253,16 +254,16 @@ def test_a_truth_that_does_not_fit_is_left_out_with_a_line(known_capture, tmp_pa
     )
     warnings = [facts["what"] for event, facts in said if event == "warning"]
     assert len(warnings) == 1 and "its size is not the view's (32×32)" in warnings[0]
-    assert trainer.measures.errors(trainer).keys() == {"psnr_test"}
+    assert trainer.measures.errors(trainer.state).keys() == {"psnr_test"}
 
 
 def test_psnr_is_that_of_encoded_pictures(ball_capture, tmp_path):
     trainer = make(ball_capture, tmp_path / "run")
     square = []
-    for view in trainer.test:
+    for view in trainer.state.test:
         alpha = view.alpha[..., None] / 255
         photo = view.image / 255 * alpha + 1 - alpha
-        seen = trainer.render(view.camera)
+        seen = trainer.state.render(view.camera)
         square.append(((seen.color.double().numpy().clip(0, 1) - photo) ** 2).mean())
     expected = np.mean([-10 * np.log10(s) for s in square])
-    assert trainer.measures.errors(trainer)["psnr_test"] == pytest.approx(expected, abs=1e-4)
+    assert trainer.measures.errors(trainer.state)["psnr_test"] == pytest.approx(expected, abs=1e-4)

@@ -6,12 +6,13 @@ import torch
 
 from benchmarks.scenes.analytic import TWO, meet, write_ball_capture
 from refgs.capture import read_capture
-from refgs.report.pictures import composite
+from refgs.compare.pictures import composite
 from refgs.run import create_run, open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset
+from refgs.train.measures import held_out_psnr
 from refgs.train.trainer import Trainer
-from tests.kernels import scenes
+from tests.makers import scenes
 
 SMALL = ["surfels.start=3000", "surfels.budget=4000", "environment.resolution=16", "train.light_first=20"]
 SMALL += ["surfels.metallic=0.9", "train.iterations=600", "indirect.every=200", "indirect.resolution=64"]
@@ -27,15 +28,15 @@ def trained(tmp_path_factory):
         alone = "residual.start=1"  # which makes up for some of what is without
         settings = load_settings("quick", [*SMALL, f"indirect.start={start}", alone])
         run = Trainer(capture, settings, folder / str(start), lambda *_: None)
-        create_run(run.folder, capture, settings, "quick", "cpu")
+        create_run(run.state.folder, capture, settings, "quick", "cpu")
         if start < 1:
-            run.run(stop=lambda run=run: run.iteration == 199)
-            heard.append(run.test_psnr())
+            run.run(stop=lambda run=run: run.state.iteration == 199)
+            heard.append(held_out_psnr(run.state))
             run.step()
-            assert run.occluder is not None
-            heard.append(run.test_psnr())
+            assert run.state.occluder is not None
+            heard.append(held_out_psnr(run.state))
         run.run()
-        write_asset(run)
+        write_asset(run.state)
         made.append(run)
     return *made, heard
 
@@ -48,7 +49,7 @@ def test_pictures_gain_where_the_balls_mirror_each_other(trained):
         hidden = with_it.render(view.camera).visibility < 0.5
         photo = composite(view, with_it.background)
         for run, error in zip((with_it, without), errors, strict=True):
-            error.append((run.render(view.camera).color - photo)[hidden].square())
+            error.append((run.state.render(view.camera).color - photo)[hidden].square())
     one, other = (float(torch.cat(error).mean()) for error in errors)
     assert one < 0.8 * other
 
@@ -62,8 +63,8 @@ def test_joining_loses_nothing(trained):
 def test_visibility_is_that_of_the_balls(trained):
     run = trained[0]
     hidden, found, both, solid = 0, 0, 0, 0
-    for view in run.test:
-        rendering = run.render(view.camera)
+    for view in run.state.test:
+        rendering = run.state.render(view.camera)
         ray = scenes.camera_rays(view.camera).double().numpy().reshape(-1, 3)
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         hit, point, normal = meet(np.broadcast_to(view.camera.position, ray.shape), ray, TWO)
@@ -83,14 +84,14 @@ def test_visibility_is_that_of_the_balls(trained):
 def test_the_run_folder_has_it_all(trained):
     """Rendered from the files as it was in training; much the same where its light is taken for another."""
     made = trained[0]
-    run, view = open_run(made.folder), made.test[0]
-    shown, asset = made.render(view.camera), run.render(view.camera)
+    run, view = open_run(made.state.folder), made.state.test[0]
+    shown, asset = made.state.render(view.camera), run.state.render(view.camera)
     assert float((shown.color - asset.color).abs().mean()) < 2e-3
     assert run.splats.indirect.shape[1:] == (16, 3) and np.abs(run.splats.indirect).max() > 0
-    relit = run.render(view.camera, run.environment)
+    relit = run.state.render(view.camera, run.state.environment)
     torch.testing.assert_close(relit.visibility, asset.visibility)
     free = asset.visibility > 0.5
     assert float((relit.color - asset.color)[free].abs().mean()) < 5e-3
     assert float((relit.color - asset.color)[~free].abs().mean()) < 0.1
-    assert run.relit(run.environment) is run.relit(run.environment)
+    assert run.relit(run.state.environment) is run.relit(run.state.environment)
     assert open_run(trained[1].folder).occluder is None

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from benchmarks.scenes.analytic import BANDS, ONE, meet, sunny, write_ball_capture
 from refgs.capture import load_view, read_capture
-from refgs.export.environment import directions
+from refgs.compare.pictures import composite
+from refgs.formats.panorama import directions
 from refgs.model.environment import Environment
 from refgs.render.shade import shade
-from refgs.report.pictures import composite
-from tests.kernels import scenes
+from tests.makers import scenes
 
 STEPS, RESOLUTION = 500, 16
 

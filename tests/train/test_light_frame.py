@@ -11,11 +11,12 @@ from benchmarks.scenes.analytic import DISTANCE, F0, TWO, camera_matrix, sky, wr
 from refgs.camera import Camera
 from refgs.capture import read_capture
 from refgs.capture.poses import OPENGL_TO_OPENCV
-from refgs.export.environment import directions
+from refgs.formats.panorama import directions
 from refgs.model.environment import turn_between
 from refgs.run import create_run, open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset
+from refgs.train.measures import held_out_psnr
 from refgs.train.trainer import Trainer
 
 SMALL = ["surfels.start=1500", "surfels.budget=1800", "environment.resolution=16", "train.light_first=20"]
@@ -89,24 +90,31 @@ def test_a_light_that_turns_is_recovered(turntable, tmp_path):
     still = made(turntable, tmp_path / "still", "light.frame=world", "light.exposure=off", total=300)
     still.run()
     turning = made(turntable, tmp_path / "scratch", "light.exposure=off", total=300)
-    turning.folder = tmp_path / "run"
-    create_run(turning.folder, turning.capture, turning.settings, "quick", "cpu", turning.chosen)
+    turning.state.folder = tmp_path / "run"
+    create_run(
+        turning.state.folder,
+        turning.state.capture,
+        turning.state.settings,
+        "quick",
+        "cpu",
+        turning.state.effective.chosen(),
+    )
     turning.run()
-    write_asset(turning)
-    assert turning.test_psnr() > still.test_psnr() + 3
+    write_asset(turning.state)
+    assert held_out_psnr(turning.state) > held_out_psnr(still.state) + 3
 
-    run, view = open_run(turning.folder), turning.test[0]
+    run, view = open_run(turning.state.folder), turning.state.test[0]
     assert run.settings.light.frame == "camera"
-    assert float((turning.render(view.camera).color - run.render(view.camera).color).abs().mean()) < 2e-3
+    assert float((turning.state.render(view.camera).color - run.render(view.camera).color).abs().mean()) < 2e-3
     assert tomllib.loads((run.folder / "run.toml").read_text())["chosen"]["light.frame"].startswith("camera: ")
     left_out = {entry["what"]: entry["why"] for entry in json.loads((run.folder / "needs.json").read_text())}
     assert "turns with the camera" in left_out["inter-reflection"]
 
     # environment.exr is the light as it stood in the photo that cameras.json names.
     cameras = json.loads((run.folder / "cameras.json").read_text())
-    first = turning.views[0].camera
+    first = turning.state.views[0].camera
     assert cameras["light_of"] == f"images/{first.name}"
-    around, albedo = directions(16, 32), turning.surfels().albedo.mean(dim=0).detach().numpy()
+    around, albedo = directions(16, 32), turning.state.surfels().albedo.mean(dim=0).detach().numpy()
     mirrored = around @ (first.position * [1, 1, 0]) > 0  # the ball hides what is behind it
     found = (run.environment.panorama(16) * albedo)[mirrored].ravel()
 

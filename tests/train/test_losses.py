@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from refgs.kernels import reference as oracle
-from refgs.kernels.reference import unit
+from refgs.render import reference as oracle
+from refgs.render.reference import unit
 from refgs.render.renderer import COVERED, Rendering
 from refgs.settings import LossSettings
 from refgs.train.losses import Photo, objective
-from tests.kernels import scenes
-from tests.kernels.emulate import emulate
+from tests.makers import scenes
+from tests.makers.emulate import emulate
 
 DARK, FLAT = 0.1, 0.01
 ALL = LossSettings(

@@ -12,17 +12,20 @@ import torch
 
 from benchmarks.scenes.analytic import write_ball_capture
 from refgs.capture import read_capture
-from refgs.export.splats import read_splats
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
+from refgs.formats.splats import read_splats
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.run import open_run
 from refgs.train import needs, probe
 from refgs.train.asset import write_asset
-from refgs.train.densify import RESET
+from refgs.train.densify import RESET, SEEN, faint_now
 from refgs.train.losses import Photo, objective
+from refgs.train.measures import held_out_psnr
+from refgs.train.needs import lighting, photos, schedule
 from refgs.train.plan import Plan
-from tests.train.test_trainer import trainer as small
+from refgs.train.trace import why_not_traced
+from tests.makers.training import trainer as small
 
 DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # at the start: few iterations have to do
 SMALL = ["environment.resolution=32", "indirect.every=100", "indirect.resolution=32"]
@@ -50,39 +53,43 @@ def chalk(matte, tmp_path_factory):
     """Learned, with all that it wants, its asset written."""
     made = trainer(matte, tmp_path_factory.mktemp("runs") / "chalk", *DULL, total=300)
     made.run()
-    write_asset(made)
+    write_asset(made.state)
     return made
 
 
 def test_what_is_matte_goes_without_specular(chalk):
-    found = chalk.needs["specular"]
+    found = chalk.state.needs["specular"]
     assert not found["needed"] and found["statistic"] < found["threshold"] and found["megabytes"] > 0
-    assert chalk.settings.render.reflection == "none" and chalk.settings.environment.resolution == 16
+    assert chalk.state.settings.render.reflection == "none" and chalk.state.settings.environment.resolution == 16
     left = {"metallic", "roughness", "indirect_dc", "indirect_rest", "received"}
-    assert not left & {*chalk.parameters} and not left & {g["name"] for g in chalk.optimizer.param_groups}
-    assert chalk.test_psnr() > 35
+    assert not left & {*chalk.state.parameters} and not left & {g["name"] for g in chalk.state.optimizer.param_groups}
+    assert held_out_psnr(chalk.state) > 35
 
 
 def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
     """By a fifth of what was left, unless all is wanted, or a time was given to be used."""
-    found = chalk.needs["iterations"]
-    assert not found["needed"] and found["statistic"] == chalk.needs["specular"]["statistic"] and found["seconds"] > 0
-    assert chalk.iteration == chalk.total == found["total"] == 100 + round(needs.ENOUGH * 200)
+    found = chalk.state.needs["iterations"]
+    assert (
+        not found["needed"]
+        and found["statistic"] == chalk.state.needs["specular"]["statistic"]
+        and found["seconds"] > 0
+    )
+    assert chalk.state.iteration == chalk.state.total == found["total"] == 100 + round(schedule.Iterations.ENOUGH * 200)
     forced = trainer(matte, tmp_path / "off", "needs.specular=off", total=150)
-    assert forced.total == forced.needs["iterations"]["total"] == round(needs.ENOUGH * 150)
+    assert forced.state.total == forced.state.needs["iterations"]["total"] == round(schedule.Iterations.ENOUGH * 150)
     assert trainer(matte, tmp_path / "on", "needs.specular=off", "needs.iterations=on", total=150).total == 150
-    forced.needs.clear()
-    forced.plan = Plan(1.0)
-    needs.before(forced)
-    assert "iterations" not in forced.needs
+    forced.state.needs.clear()
+    forced.state.plan = Plan(1.0)
+    needs.evaluate_due(forced.state, "start")
+    assert "iterations" not in forced.state.needs
 
 
 def test_a_mirror_keeps_it(mirror, tmp_path):
     made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
-    made.run(stop=lambda: made.iteration == 110)
-    found = made.needs["specular"]
-    assert found["needed"] and found["statistic"] > 1 and "metallic" in made.parameters
-    assert made.settings.render.reflection == "microfacet" and made.total == 150
+    made.run(stop=lambda: made.state.iteration == 110)
+    found = made.state.needs["specular"]
+    assert found["needed"] and found["statistic"] > 1 and "metallic" in made.state.parameters
+    assert made.state.settings.render.reflection == "microfacet" and made.state.total == 150
 
 
 @pytest.mark.parametrize("word", ["on", "off"])
@@ -90,8 +97,8 @@ def test_forced_either_way(word, matte, mirror, tmp_path):
     """Against what the photos say."""
     made = trainer(matte if word == "on" else mirror, tmp_path / "run", f"needs.specular={word}", total=120)
     made.run()
-    assert ("metallic" in made.parameters) == (word == "on")
-    write_asset(made)
+    assert ("metallic" in made.state.parameters) == (word == "on")
+    write_asset(made.state)
     rows = {row.get("need"): row for row in json.loads((tmp_path / "run" / "needs.json").read_text())}
     assert (word == "off") == ("specular" in rows)
     if word == "off":
@@ -100,22 +107,22 @@ def test_forced_either_way(word, matte, mirror, tmp_path):
 
 def test_the_asset_says_so_once(chalk):
     """No columns, and the pictures that were learned."""
-    splats, run = read_splats(chalk.folder / "splats.ply"), open_run(chalk.folder)
+    splats, run = read_splats(chalk.state.folder / "splats.ply"), open_run(chalk.state.folder)
     assert splats.constants == {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
     assert (splats.metallic == 0).all() and (splats.roughness == 1).all()
-    head = (chalk.folder / "splats.ply").read_bytes().partition(b"end_header")[0]
+    head = (chalk.state.folder / "splats.ply").read_bytes().partition(b"end_header")[0]
     assert b"property float metallic" not in head and b"property float albedo_r" in head
-    camera = chalk.test[0].camera
-    assert float((run.render(camera).color - chalk.render(camera).color).abs().mean()) < 2e-3
+    camera = chalk.state.test[0].camera
+    assert float((run.render(camera).color - chalk.state.render(camera).color).abs().mean()) < 2e-3
     assert (run.render(camera).roughness[run.render(camera).alpha > 0.9] == 1).all()
 
 
 def test_needs_are_written_down(chalk):
-    rows = {row.get("need"): row for row in json.loads((chalk.folder / "needs.json").read_text())}
+    rows = {row.get("need"): row for row in json.loads((chalk.state.folder / "needs.json").read_text())}
     assert {"specular", "iterations", "light"} <= {*rows}
     for name in ("specular", "light"):
         assert math.isfinite(rows[name]["decibels"]) and rows[name]["seconds"] >= 0
-        assert rows[name]["saved"] and rows[name]["cost"] and name in chalk.decided
+        assert rows[name]["saved"] and rows[name]["cost"] and name in chalk.state.decided
     assert rows["light"]["side"] == 16
     assert "cost" not in rows["iterations"]  # that could not be measured
 
@@ -126,90 +133,96 @@ def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
     whole = trainer(matte, tmp_path / "whole", *more, total=150)
     whole.run()
     first = trainer(matte, tmp_path / "cut", *more, total=150)
-    first.run(stop=lambda: first.iteration == 115)
+    first.run(stop=lambda: first.state.iteration == 115)
     second = trainer(matte, tmp_path / "cut", *more, total=150)
     second.resume()
-    assert second.needs == first.needs and not second.needs["specular"]["needed"]
+    assert second.state.needs == first.state.needs and not second.state.needs["specular"]["needed"]
     second.run()
-    assert {*whole.parameters} == {*second.parameters} and whole.decided == second.decided
-    for name, value in whole.parameters.items():
-        assert torch.equal(value, second.parameters[name]), name
-    assert torch.equal(whole.light, second.light)
+    assert {*whole.state.parameters} == {*second.state.parameters} and whole.state.decided == second.state.decided
+    for name, value in whole.state.parameters.items():
+        assert torch.equal(value, second.state.parameters[name]), name
+    assert torch.equal(whole.state.light, second.state.light)
 
 
 def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
     """To a checkpoint of before they were made, as the guard has it."""
     made = trainer(matte, tmp_path / "run", *DULL, "train.light_first=0", total=200)
-    made.run(stop=lambda: made.iteration == 96)
-    assert "specular" not in made.needs
+    made.run(stop=lambda: made.state.iteration == 96)
+    assert "specular" not in made.state.needs
     for _ in range(10):
         made.step()
-    decided = dict(made.needs)
+    decided = dict(made.state.needs)
     assert not decided["specular"]["needed"]
     made.resume()
-    assert made.iteration == 96 and made.needs == decided and "metallic" not in made.parameters
-    assert made.total == decided["iterations"]["total"] < 200
+    assert made.state.iteration == 96 and made.state.needs == decided and "metallic" not in made.state.parameters
+    assert made.state.total == decided["iterations"]["total"] < 200
     made.step()
 
 
 def test_a_convex_mirror_does_without_reflections(mirror, tmp_path):
     made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
-    made.run(stop=lambda: made.iteration == 101)
-    found = made.needs["reflections"]
+    made.run(stop=lambda: made.state.iteration == 101)
+    found = made.state.needs["reflections"]
     assert not found["needed"] and found["statistic"] < found["threshold"]
-    assert made.occluder is None and "received" not in made.parameters and made.without_reflection()
+    assert made.state.occluder is None and "received" not in made.state.parameters and why_not_traced(made.state)
 
 
 def test_reflections_by_what_they_could_be_worth(mirror, tmp_path):
     """A mirror of which a fifth is said to be hidden keeps them; a rough dielectric, which would hardly be darker, does not."""
     made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
-    made.run(stop=lambda: made.iteration == 99)
+    made.run(stop=lambda: made.state.iteration == 99)
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-3, 3, 61)] * 2))
     at = np.arange(60 * 61).reshape(60, 61)[:, :-1].ravel()
     faces = np.concatenate([np.stack([at, at + 61, at + 1], axis=1), np.stack([at + 1, at + 61, at + 62], axis=1)])
-    made.occluder = Occluder(Mesh(np.stack([x, y, np.full_like(x, 1.5)], axis=1), faces))  # a lid, which faces down
-    needs.reflections(made, 0.2)
-    assert made.needs["reflections"]["needed"] and made.needs["reflections"]["statistic"] > needs.LEAST_REFLECTIONS
-    del made.needs["reflections"]
+    made.state.occluder = Occluder(
+        Mesh(np.stack([x, y, np.full_like(x, 1.5)], axis=1), faces)
+    )  # a lid, which faces down
+    needs.evaluate_mesh(made.state, 0.2)
+    assert (
+        made.state.needs["reflections"]["needed"]
+        and made.state.needs["reflections"]["statistic"] > lighting.Reflections.threshold
+    )
+    del made.state.needs["reflections"]
     with torch.no_grad():
-        made.parameters["metallic"][:], made.parameters["albedo"][:] = -10, 0
-        made.parameters["roughness"][:] = 5
-    needs.reflections(made, 0.2)
-    assert not made.needs["reflections"]["needed"]
+        made.state.parameters["metallic"][:], made.state.parameters["albedo"][:] = -10, 0
+        made.state.parameters["roughness"][:] = 5
+    needs.evaluate_mesh(made.state, 0.2)
+    assert not made.state.needs["reflections"]["needed"]
 
 
 def test_views_that_show_the_same_from_the_same_place(mirror, tmp_path):
     made = trainer(mirror, tmp_path / "run", total=10)
-    one = made.views[0]
+    one = made.state.views[0]
     noise = np.random.default_rng(0).normal(0, 1, one.image.shape)
     again = replace(one, image=(one.image + noise.round()).clip(0, 255).astype(np.uint8))
     other = replace(one, image=(one.image.astype(int) + 20).clip(0, 255).astype(np.uint8))
     pose = one.camera.world_to_camera.copy()
     pose[0, 3] += 4.0 * one.camera.position.dot(one.camera.position) ** 0.5 / one.camera.fx
     aside = replace(one, camera=replace(one.camera, world_to_camera=pose))
-    limits = made.capture.radius, needs.TWINS_PIXELS, needs.TWINS_DECIBELS
-    assert probe.twins([one, again], *limits) == [1]
-    assert probe.twins([one, other], *limits) == []
-    assert probe.twins([one, aside], *limits) == []
-    assert probe.twins(made.views, *limits) == []
+    radius = made.state.capture.radius
+    assert photos.duplicate_views([one, again], radius) == [1]
+    assert photos.duplicate_views([one, other], radius) == []
+    assert photos.duplicate_views([one, aside], radius) == []
+    assert photos.duplicate_views(made.state.views, radius) == []
 
 
 def test_the_part_about_the_mask_is_all_that_counts(mirror, tmp_path):
     """Loss and derivatives are the whole photo's where nothing is beyond it."""
     made, generator = trainer(mirror, tmp_path / "run", total=10), torch.Generator().manual_seed(0)
-    camera = made.photos[0].camera
+    camera = made.state.photos[0].camera
     camera = replace(camera, fx=0.6 * camera.fx, fy=0.6 * camera.fy)
-    mask = (made.render(camera).alpha > 0).byte() * 255
+    mask = (made.state.render(camera).alpha > 0).byte() * 255
     whole = Photo(torch.randint(255, (64, 64, 3), dtype=torch.uint8, generator=generator), mask, camera)
-    part = whole.part(*needs.about(mask.numpy(), needs.MARGIN))
+    part = whole.part(*photos.bounds(mask.numpy(), photos.MARGIN))
     assert part.image.shape[0] < 64 and part.mask.sum() == mask.sum()
     results = []
     for photo in (whole, part):
-        found = objective(made._render(*made.way()[:2], photo.camera), None, photo, made.background, made.losses, 0.5)
+        rendering = made.state.picture(made.state.inputs(), photo.camera)
+        found = objective(rendering, None, photo, made.state.background, made.state.losses, 0.5)
         found.loss.backward()
-        by = {name: value.grad.clone() for name, value in made.parameters.items() if value.grad is not None}
+        by = {name: value.grad.clone() for name, value in made.state.parameters.items() if value.grad is not None}
         results.append((found, by))
-        made.forget_gradients()
+        made.state.forget_gradients()
     (one, by_one), (other, by_other) = results
     torch.testing.assert_close(one.loss, other.loss, rtol=1e-5, atol=0)
     torch.testing.assert_close(one.square, other.square, rtol=1e-5, atol=0)
@@ -218,44 +231,46 @@ def test_the_part_about_the_mask_is_all_that_counts(mirror, tmp_path):
 
 
 def test_a_photo_that_its_object_fills_stays_whole(mirror, tmp_path, monkeypatch):
-    monkeypatch.setattr(needs, "MARGIN", 5)  # of 64 pixels the ball has 45
+    monkeypatch.setattr(photos, "MARGIN", 5)  # of 64 pixels the ball has 45
     made = trainer(mirror, tmp_path / "run", total=10)
-    assert made.crops is not None
-    for view in made.views:
+    assert made.state.crops is not None
+    for view in made.state.views:
         view.alpha[:] = 255
-    made.photos, made.crops = [Photo.of(view) for view in made.views], None
-    needs._outside(made)
-    assert made.crops is None
+    made.state.photos, made.state.crops = [Photo.of(view) for view in made.state.views], None
+    del made.state.needs["outside"]
+    needs.evaluate_due(made.state, "start")
+    assert made.state.crops is None
 
 
 def test_surfels_that_are_faint_decide_nothing_and_are_no_mesh(mirror, tmp_path):
     changes = ["densify.reset_every=5", "densify.stop=0.1", "rates.opacity=1.0", "rates.decay=1.0"]
     changes += ["needs.specular=on", "needs.reflections=on", "indirect.start=0", "indirect.every=8"]
     made = trainer(mirror, tmp_path / "run", *changes, total=60)
-    way = 4 * math.log(needs.SEEN / (1 - needs.SEEN) * (1 - RESET) / RESET)  # in iterations, by a rate of one
-    made.run(stop=lambda: made.iteration >= 5 + math.floor(way))
-    assert made.faint(needs.SEEN) and made.iteration > 60 * needs.SETTLED
-    assert "light" not in made.needs and made.occluder is None
-    made.run(stop=lambda: made.iteration >= 24)
-    assert not made.faint(needs.SEEN) and "light" in made.needs and made.occluder is not None
+    way = 4 * math.log(SEEN / (1 - SEEN) * (1 - RESET) / RESET)  # in iterations, by a rate of one
+    made.run(stop=lambda: made.state.iteration >= 5 + math.floor(way))
+    assert faint_now(made.state) and made.state.iteration > 60 * lighting.Light.SETTLED
+    assert "light" not in made.state.needs and made.state.occluder is None
+    made.run(stop=lambda: made.state.iteration >= 24)
+    assert not faint_now(made.state) and "light" in made.state.needs and made.state.occluder is not None
 
 
 def test_what_the_part_about_the_mask_saves_is_timed(mirror, tmp_path, monkeypatch):
-    monkeypatch.setattr(needs, "MARGIN", 5)
-    monkeypatch.setattr(needs, "SOONEST", 3)
+    monkeypatch.setattr(photos, "MARGIN", 5)
+    monkeypatch.setattr(photos, "TIMED", 3)
     made = trainer(mirror, tmp_path / "run", "needs.specular=on", total=20)
     asked = []
     monkeypatch.setattr(probe, "seconds_saved", lambda trainer, whole: asked.append(whole) or 8.0)
-    made.run(stop=lambda: made.iteration == 6)
-    assert asked == [True] and made.needs["outside"]["seconds"] == 7.0  # one iteration in eight sees the whole
-    assert next(row for row in needs.facts(made) if row["need"] == "outside")["saved"] == "7.0 s, 0.0 MB"
+    made.run(stop=lambda: made.state.iteration == 6)
+    assert asked == [True] and made.state.needs["outside"]["seconds"] == 7.0  # one iteration in eight sees the whole
+    assert next(row for row in needs.rows(made.state) if row["need"] == "outside")["saved"] == "7.0 s, 0.0 MB"
 
 
 def test_texels_by_the_lobe():
     """A quarter turn over so many texels is no more than half of the lobe's width, which is roughness squared."""
+    lobe = lighting.Light.LOBE
     for roughness, side in ((1.0, 16), (0.5, 16), (0.4, 32), (0.2, 128), (0.05, 256)):
-        assert probe.resolvable(roughness, needs.LOBE, 256, 16) == side
-        assert side in (16, 256) or math.pi / 2 / side <= needs.LOBE * roughness**2 < math.pi / side
+        assert lighting.resolvable(roughness, lobe, 256, 16) == side
+        assert side in (16, 256) or math.pi / 2 / side <= lobe * roughness**2 < math.pi / side
     light = Environment(torch.rand(6 * 32**2, 3))
     coarse = probe.pooled(light, 16)
     assert coarse.resolution == 16
@@ -270,16 +285,16 @@ def test_weighted_quantiles():
 def test_degrees_by_what_they_are_worth(mirror, tmp_path):
     """Harmonics of the first degree alone are kept where the others are nothing, and all where the third is something."""
     made = trainer(mirror, tmp_path / "run", "needs.specular=on", "residual.start=0.5", total=40)
-    made.run(stop=lambda: made.iteration == 30)
-    rest = made.parameters["sh_rest"]
+    made.run(stop=lambda: made.state.iteration == 30)
+    rest = made.state.parameters["sh_rest"]
     with torch.no_grad():
         rest[:, 3:] = 0
         rest[:, :3] = 0.3 * torch.rand(len(rest), 3, 3, generator=torch.Generator().manual_seed(0))
-    errors = probe.lost(made, lambda way: way._replace(surfels=way.surfels.without_directions()))
+    errors = probe.psnr_loss(made.state, lambda way: way._replace(surfels=way.surfels.without_directions()))
     assert abs(errors) > 0.01
-    made.needs.pop("degrees", None)
-    needs._degrees(made)
-    assert made.parameters["sh_rest"].shape[1] in (0, 3) and not made.needs["degrees"]["needed"]
+    made.state.needs.pop("degrees", None)
+    needs.evaluate_due(made.state, "iteration", progress=1.0)
+    assert made.state.parameters["sh_rest"].shape[1] in (0, 3) and not made.state.needs["degrees"]["needed"]
     made.step()
 
 
@@ -287,39 +302,41 @@ def test_what_all_have_alike_is_said_once(mirror, tmp_path):
     made = trainer(mirror, tmp_path / "run", "needs.specular=on", total=10)
     made.run()
     with torch.no_grad():
-        made.parameters["metallic"][:] = -20
-    write_asset(made)
+        made.state.parameters["metallic"][:] = -20
+    write_asset(made.state)
     splats = read_splats(tmp_path / "run" / "splats.ply")
     assert {*splats.constants} == {"metallic"} and splats.roughness.std() > 0
-    assert made.needs["constants"]["statistic"] == 1 and abs(made.needs["constants"]["decibels"]) < 0.01
+    assert made.state.needs["constants"]["statistic"] == 1 and abs(made.state.needs["constants"]["decibels"]) < 0.01
     assert open_run(tmp_path / "run").settings.render.reflection == "microfacet"
 
 
 def test_specular_on_synthetic_surfels(mirror, tmp_path):
     """Of pictures that the model itself made: a mirror's are lost without it, chalk's are not."""
     made = trainer(mirror, tmp_path / "run", total=10)
-    light = torch.randn(made.light.shape, generator=torch.Generator().manual_seed(1))
+    light = torch.randn(made.state.light.shape, generator=torch.Generator().manual_seed(1))
     for metallic, roughness, least, most in ((5.0, -3.0, 3.0, math.inf), (-20.0, 20.0, -math.inf, 0.3)):
         with torch.no_grad():
-            made.light.copy_(light)
-            made.parameters["metallic"][:], made.parameters["roughness"][:] = metallic, roughness
-            for view, photo in enumerate(made.photos):
-                rendering = made.render(photo.camera)
+            made.state.light.copy_(light)
+            made.state.parameters["metallic"][:], made.state.parameters["roughness"][:] = metallic, roughness
+            for view, photo in enumerate(made.state.photos):
+                rendering = made.state.render(photo.camera)
                 noise = 0.01 * torch.randn(rendering.color.shape, generator=torch.Generator().manual_seed(view))
                 image = ((rendering.color + noise).clamp(0, 1) * 255).round().byte()
-                made.photos[view] = photo._replace(image=image, mask=torch.full_like(photo.mask, 255))
-        assert least < probe.specular_explains(made) < most
+                made.state.photos[view] = photo._replace(image=image, mask=torch.full_like(photo.mask, 255))
+        assert least < probe.specular_explains(made.state) < most
 
 
 def test_shares_are_weights(mirror, tmp_path):
     """Those of all surfels make up the picture's alpha; means by them, of what is the same everywhere, are that."""
     made = trainer(mirror, tmp_path / "run", total=10)
-    photo, surfels = made.photo(0), made.surfels()
-    alpha = made.render(photo.camera).alpha
-    torch.testing.assert_close(probe.blended_shares(surfels, [photo], made.near).sum(), alpha.sum(), rtol=1e-3, atol=0)
+    photo, surfels = made.state.photo(0), made.state.surfels()
+    alpha = made.state.render(photo.camera).alpha
+    torch.testing.assert_close(
+        probe.blended_shares(surfels, [photo], made.state.near).sum(), alpha.sum(), rtol=1e-3, atol=0
+    )
     even = torch.full((*alpha.shape, 2), 0.3)
-    mean = probe.blended_shares(surfels, [photo], made.near, [even])
-    seen = probe.blended_shares(surfels, [photo], made.near)[0] > 1e-3
+    mean = probe.blended_shares(surfels, [photo], made.state.near, [even])
+    seen = probe.blended_shares(surfels, [photo], made.state.near)[0] > 1e-3
     torch.testing.assert_close(mean[seen], torch.full_like(mean[seen], 0.3), rtol=1e-3, atol=0)
 
 
@@ -329,10 +346,10 @@ def test_deciding_does_not_load_what_it_does_not_use(mirror, tmp_path):
 import sys
 from pathlib import Path
 from refgs.train import probe
-from tests.train.test_trainer import trainer
+from tests.makers.training import trainer
 made = trainer(Path(sys.argv[1]), Path(sys.argv[2]), total=10)
 made.run()
-probe.specular_explains(made), probe.seconds_saved(made)
+probe.specular_explains(made.state), probe.seconds_saved(made.state)
 assert not {"sympy", "torch._dynamo"} & {*sys.modules}
 """
     subprocess.run([sys.executable, "-c", program, mirror.folder, tmp_path / "run"], check=True)

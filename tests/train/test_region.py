@@ -11,8 +11,8 @@ from benchmarks.scenes.analytic import TWO, camera_matrix, photo, write_ball_cap
 from refgs import commands, jobs
 from refgs.capture import read_capture
 from refgs.errors import InputError
-from refgs.export.mesh import read_glb
-from refgs.export.splats import read_splats
+from refgs.formats.gltf import read_glb
+from refgs.formats.splats import read_splats
 from refgs.run import open_run
 from refgs.settings import load_settings
 from refgs.train.preview import write_preview
@@ -46,7 +46,7 @@ def balls(request, tmp_path_factory):
 
 def train(capture, out, *changes):
     return jobs.train(
-        capture, out, "quick", "cpu", None, [*SMALL, *changes], False, lambda *_: None, lambda trainer: False
+        capture, out, "quick", "cpu", None, [*SMALL, *changes], False, lambda *_: None, lambda state: False
     )
 
 
@@ -62,7 +62,7 @@ def test_only_what_is_in_the_box_comes_out(right, balls):
     box = read_capture(balls, trainer.settings.region).box
     assert box.contains(run.splats.positions).all()
     beside = int((~trainer.wanted()).sum())
-    assert 0 < beside <= AROUND * trainer.budget, "something has to show the other ball"
+    assert 0 < beside <= AROUND * trainer.settings.surfels.budget, "something has to show the other ball"
     said = {entry["why"]: entry["what"] for entry in json.loads((folder / "needs.json").read_text())}
     assert said["they show what is outside the region"] == f"{beside} surfels"
     assert quality > (20 if trainer.from_hull else 15)
@@ -92,10 +92,10 @@ def test_surfels_start_in_the_box_and_around_it(balls):
     settings = load_settings("quick", [*SMALL, *RIGHT])
     capture = read_capture(balls, settings.region)
     made = Trainer(capture, settings, balls / "none", lambda *_: None)
-    inside = made.wanted()
+    inside = made.state.wanted()
     assert 0.5 <= inside.float().mean() < 1 and len(inside) <= 1500
-    if made.from_hull:
-        parameters, shown, _ = start_parameters(capture, made.views, settings)
+    if made.state.from_hull:
+        parameters, shown, _ = start_parameters(capture, made.state.views, settings)
         faint = parameters["opacity"].sigmoid() < 0.2
         assert faint[shown:].all() and not faint[:shown].any() and 0.3 < shown / len(faint) < 0.7
 

@@ -40,27 +40,27 @@ def trainer(capture_folder, folder, *changes):
 def learned(ball_capture, tmp_path_factory):
     made = trainer(ball_capture, tmp_path_factory.mktemp("runs") / "ball")
     made.run()
-    write_asset(made)
+    write_asset(made.state)
     return made
 
 
 def test_it_learns_when_material_and_light_have(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run")
-    rest = made.parameters["sh_rest"]
+    rest = made.state.parameters["sh_rest"]
     for _ in range(30):
         made.step()
-        assert made.surfels().sh_rest.shape[1] == 0 or made.iteration == 30
-    assert not rest.any() and rest not in made.optimizer.state
-    stays = [made.parameters[name] for name in ("albedo", "metallic", "roughness")] + [made.light]
-    before = [value.detach().clone() for value in (*stays, made.parameters["position"])]
+        assert made.state.surfels().sh_rest.shape[1] == 0 or made.state.iteration == 30
+    assert not rest.any() and rest not in made.state.optimizer.state
+    stays = [made.state.parameters[name] for name in ("albedo", "metallic", "roughness")] + [made.state.light]
+    before = [value.detach().clone() for value in (*stays, made.state.parameters["position"])]
     made.step()
-    assert rest.any() and not torch.equal(made.parameters["position"], before.pop())
+    assert rest.any() and not torch.equal(made.state.parameters["position"], before.pop())
     assert all(torch.equal(value, was) for value, was in zip(stays, before, strict=True))
 
 
 def test_it_adds_its_blend_to_the_picture(learned):
     """In float64: Σ_k c_k Y_k(d) of each surfel, d the direction from the camera."""
-    run, camera = open_run(learned.folder), learned.test[0].camera
+    run, camera = open_run(learned.state.folder), learned.state.test[0].camera
     surfels = run.surfels()
     ways = surfels.positions.double() - torch.from_numpy(camera.position)
     basis = harmonics.basis(torch.nn.functional.normalize(ways, dim=-1), 3)[:, 1:]
@@ -77,7 +77,7 @@ def test_it_adds_its_blend_to_the_picture(learned):
 
 
 def test_another_light_is_without_it(learned):
-    run, camera = open_run(learned.folder), learned.test[0].camera
+    run, camera = open_run(learned.state.folder), learned.state.test[0].camera
     light = run.light(np.ones((16, 32, 3), np.float32))
     with_it = run.render(camera, light).color
     run.splats.sh = run.splats.sh[:, :1]
@@ -85,25 +85,25 @@ def test_another_light_is_without_it(learned):
 
 
 def test_a_run_shows_what_was_learned(learned):
-    camera = learned.test[0].camera
-    shown = open_run(learned.folder).render(camera)
-    assert float((shown.color - learned.render(camera).color).abs().mean()) < 1e-3
+    camera = learned.state.test[0].camera
+    shown = open_run(learned.state.folder).render(camera)
+    assert float((shown.color - learned.state.render(camera).color).abs().mean()) < 1e-3
 
 
 def test_one_that_ends_before_it_leaves_none(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run")
     for _ in range(3):
         made.step()
-    made.total = made.iteration  # good enough: stop here
-    write_asset(made)
+    made.state.total = made.state.iteration  # good enough: stop here
+    write_asset(made.state)
     assert open_run(tmp_path / "run").splats.sh.shape[1] == 1
 
 
 def test_without_it_no_harmonics_are_left(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", "residual.start=1", "train.iterations=10")
-    assert "sh_rest" not in made.parameters
+    assert "sh_rest" not in made.state.parameters
     made.run()
-    write_asset(made)
+    write_asset(made.state)
     assert open_run(tmp_path / "run").splats.sh.shape[1] == 1
     left = json.loads((tmp_path / "run" / "needs.json").read_text(encoding="utf-8"))
     assert "spherical harmonics" in [one["what"] for one in left]

@@ -7,6 +7,10 @@ from refgs.capture import read_capture
 from refgs.run import create_run, open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset
+from refgs.train.light import diffuse
+from refgs.train.measures import held_out_psnr
+from refgs.train.rates import set_rates
+from refgs.train.setup import start_deferred
 from refgs.train.start import GEOMETRY
 from refgs.train.trainer import Trainer
 
@@ -21,24 +25,24 @@ def trainer(capture_folder, folder, preset, *changes):
 
 def test_the_deferred_stage_keeps_the_geometry_alone(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", "quick", "train.iterations=60", "initial.until=0.5", "diffuse=sh")
-    start = {name: value.detach().clone() for name, value in made.parameters.items()}
-    light = made.light.detach().clone()
+    start = {name: value.detach().clone() for name, value in made.state.parameters.items()}
+    light = made.state.light.detach().clone()
     for _ in range(30):
         made.step()
-    learned = {name: value.detach().clone() for name, value in made.parameters.items()}
-    assert made.initial and all(
+    learned = {name: value.detach().clone() for name, value in made.state.parameters.items()}
+    assert made.state.initial and all(
         not torch.equal(learned[name], start[name]) for name in ("albedo", "sh_dc", "roughness")
     )
-    made._begin_deferred()
-    assert not made.initial
-    for name, value in made.parameters.items():
+    start_deferred(made.state)
+    assert not made.state.initial
+    for name, value in made.state.parameters.items():
         if name in GEOMETRY:
             assert torch.equal(value, learned[name]), name
         else:
             assert torch.equal(value, start[name][:1].expand_as(value)), name
-            assert value not in made.optimizer.state
-    assert torch.equal(made.light, light) and made.light not in made.optimizer.state
-    assert made.parameters["position"] in made.optimizer.state
+            assert value not in made.state.optimizer.state
+    assert torch.equal(made.state.light, light) and made.state.light not in made.state.optimizer.state
+    assert made.state.parameters["position"] in made.state.optimizer.state
 
 
 def test_the_stage_ends_where_the_preset_says(ball_capture, tmp_path):
@@ -46,7 +50,7 @@ def test_the_stage_ends_where_the_preset_says(ball_capture, tmp_path):
     stages = []
     for _ in range(10):
         made.step()
-        stages.append(made.initial)
+        stages.append(made.state.initial)
     assert stages == [True] * 4 + [False] * 6
 
 
@@ -63,10 +67,12 @@ def test_the_stage_ends_where_the_preset_says(ball_capture, tmp_path):
 def test_learns_and_renders_as_it_trained(ball_capture, tmp_path, changes):
     made = trainer(ball_capture, tmp_path / "run", "quick", "train.iterations=300", "surfels.metallic=0.9", *changes)
     made.run()
-    assert made.test_psnr() > (22 if "reflection=mirror" in changes else 25)  # a mirror has no colour of its own
-    write_asset(made)
-    asset, view = open_run(made.folder), made.test[0]
-    assert float((made.render(view.camera).color - asset.render(view.camera).color).abs().mean()) < 3e-3
+    assert held_out_psnr(made.state) > (
+        22 if "reflection=mirror" in changes else 25
+    )  # a mirror has no colour of its own
+    write_asset(made.state)
+    asset, view = open_run(made.state.folder), made.state.test[0]
+    assert float((made.state.render(view.camera).color - asset.render(view.camera).color).abs().mean()) < 3e-3
 
 
 def test_the_papers_schedule_runs_to_its_end(ball_capture, tmp_path):
@@ -74,25 +80,27 @@ def test_the_papers_schedule_runs_to_its_end(ball_capture, tmp_path):
     changes = ["train.iterations=300", "densify.every=20", "propagation.every=100", "rates.environment=0.05"]
     changes += ["propagation.rest=10", "indirect.every=60", "indirect.resolution=32"]
     made = trainer(ball_capture, tmp_path / "run", "paper", *changes)
-    before = made.test_psnr()
+    before = held_out_psnr(made.state)
     made.run()
-    assert not made.initial and made.test_psnr() > before + 4
+    assert not made.state.initial and held_out_psnr(made.state) > before + 4
 
 
 def test_all_grow_faint_and_mirrors_grow(ball_capture, tmp_path):
     changes = ["train.iterations=100", "densify.every=100", "densify.reset_every=6", "propagation.every=4"]
     made = trainer(ball_capture, tmp_path / "run", "quick", *changes, "propagation.rest=2")
     with torch.no_grad():  # half of them are mirrors
-        made.parameters["metallic"][::2], made.parameters["roughness"][::2] = 3.0, -5.0
-        made.parameters["metallic"][1::2], made.parameters["roughness"][1::2] = 3.0, 5.0
+        made.state.parameters["metallic"][::2], made.state.parameters["roughness"][::2] = 3.0, -5.0
+        made.state.parameters["metallic"][1::2], made.state.parameters["roughness"][1::2] = 3.0, 5.0
 
     def step():
         made.step()
-        return {name: value.detach().clone() for name, value in made.parameters.items()}
+        return {name: value.detach().clone() for name, value in made.state.parameters.items()}
 
     for _ in range(3):
         before = step()
-    made.optimizer.param_groups = [g for g in made.optimizer.param_groups if g["name"] not in ("metallic", "roughness")]
+    made.state.optimizer.param_groups = [
+        g for g in made.state.optimizer.param_groups if g["name"] not in ("metallic", "roughness")
+    ]
     after = step()
     grown = (after["scale"] - before["scale"]).exp().mean(dim=1)
     assert float(grown[::2].mean()) == pytest.approx(1.5, abs=0.05)
@@ -108,13 +116,13 @@ def test_the_light_diffuses_as_heat_does(ball_capture, tmp_path, waves):
     c is 0.5 · 6.4 · (16 / 64)²."""
     changes = ["environment.diffusion=6.4", "rates.environment=0.5", "train.iterations=10"]
     made = trainer(ball_capture, tmp_path / "run", "quick", *changes)
-    made._set_rates(0.0)
+    set_rates(made.state, 0.0)
     angle = torch.pi * waves / 16
     wave = torch.cos(angle * (torch.arange(16) + 0.5))
-    texels = made.light.detach().view(6, 16, 16, 3)
+    texels = made.state.light.detach().view(6, 16, 16, 3)
     texels[:] = 0.7 + wave[:, None, None]
     texels[1] = 0.7 + wave[:, None]
-    made._diffuse_light()
+    diffuse(made.state)
     faded = 0.7 + (1 - 4 * 0.2 * torch.sin(torch.tensor(angle / 2)) ** 2) * wave
     for face, expected in ((0, faded[:, None, None]), (1, faded[:, None])):
         assert torch.allclose(texels[face], expected.expand(16, 16, 3), atol=1e-6)

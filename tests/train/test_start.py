@@ -8,7 +8,7 @@ from refgs.capture import load_view, read_capture
 from refgs.model import harmonics
 from refgs.settings import load_settings
 from refgs.train.start import FAINT, start_parameters
-from tests.capture.makers import colmap
+from tests.makers.captures import colmap
 
 
 def start(folder, points: int, count: int = 1000):

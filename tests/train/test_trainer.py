@@ -14,30 +14,15 @@ import torch
 from benchmarks.scenes.analytic import F0, ONE, meet, sky
 from refgs.capture import read_capture
 from refgs.errors import InputError
-from refgs.export.environment import directions
+from refgs.formats.panorama import directions
 from refgs.model.surfels import to_splats
-from refgs.run import create_run, open_run
+from refgs.run import open_run
 from refgs.settings import load_settings
 from refgs.train.asset import write_asset
+from refgs.train.measures import held_out_psnr
 from refgs.train.trainer import Trainer
-from tests.kernels import scenes
-
-SMALL = [
-    "surfels.start=1500",
-    "surfels.budget=1800",
-    "surfels.hull=64",
-    "environment.resolution=16",
-    "train.light_first=20",
-]
-
-
-def trainer(capture_folder, folder, *changes, total=150):
-    settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
-    capture = read_capture(capture_folder, settings.region)
-    made = Trainer(capture, settings, folder, lambda event, facts: None)
-    if not folder.exists():
-        create_run(folder, capture, settings, "quick", "cpu")
-    return made
+from tests.makers import scenes
+from tests.makers.training import SMALL, trainer
 
 
 @pytest.fixture(scope="module")
@@ -46,15 +31,15 @@ def ball(ball_capture, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "ball"
     made = trainer(ball_capture, folder, "train.checkpoint_every=200", "surfels.metallic=0.9", total=700)
     made.run()
-    write_asset(made)
+    write_asset(made.state)
     return made
 
 
 def test_the_ball_is_recovered(ball):
     """Novel views, normals, light and metal, each against what the capture was made from."""
-    assert ball.test_psnr() > 30
-    for view in ball.test:
-        seen, ray = ball.render(view.camera), scenes.camera_rays(view.camera).double().numpy().reshape(-1, 3)
+    assert held_out_psnr(ball.state) > 30
+    for view in ball.state.test:
+        seen, ray = ball.state.render(view.camera), scenes.camera_rays(view.camera).double().numpy().reshape(-1, 3)
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         hit, point, normal = meet(np.broadcast_to(view.camera.position, ray.shape), ray, ONE)
         shown = torch.from_numpy(hit).view(seen.alpha.shape) & (seen.alpha > 0.5)
@@ -66,7 +51,7 @@ def test_the_ball_is_recovered(ball):
         assert float(seen.metallic[shown].mean()) > 0.8
         albedo = seen.albedo[shown].mean(dim=0).numpy()
     # Albedo and light share a scale: compare their product, and the light's shape.
-    panorama = ball.environment().panorama(32)
+    panorama = ball.state.environment().panorama(32)
     truth = sky(directions(32, 64))
     product = panorama.mean(axis=(0, 1)) * albedo / (truth.mean(axis=(0, 1)) * F0)
     np.testing.assert_allclose(product, 1, atol=0.12)
@@ -74,9 +59,9 @@ def test_the_ball_is_recovered(ball):
 
 
 def test_the_asset_renders_as_the_training_did(ball):
-    run = open_run(ball.folder)
-    view = ball.test[0]
-    trained, asset = ball.render(view.camera), run.render(view.camera)
+    run = open_run(ball.state.folder)
+    view = ball.state.test[0]
+    trained, asset = ball.state.render(view.camera), run.render(view.camera)
     assert float((trained.color - asset.color).abs().mean()) < 2e-3
 
 
@@ -85,11 +70,13 @@ def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", total=10)
     made.run()
     with torch.no_grad():
-        w, x, y, z = made.parameters["rotation"][::2].unbind(-1)
-        made.parameters["rotation"][::2] = torch.stack([-x, w, z, -y], dim=-1)  # every other surfel the other way round
-    write_asset(made)
-    run, camera = open_run(made.folder), made.test[0].camera
-    learned = made.render(camera).normal
+        w, x, y, z = made.state.parameters["rotation"][::2].unbind(-1)
+        made.state.parameters["rotation"][::2] = torch.stack(
+            [-x, w, z, -y], dim=-1
+        )  # every other surfel the other way round
+    write_asset(made.state)
+    run, camera = open_run(made.state.folder), made.state.test[0].camera
+    learned = made.state.render(camera).normal
     assert float((learned - run.render(camera).normal).abs().max()) < 1e-4
     assert ((run.splats.normals * run.splats.positions).sum(axis=1) > 0).mean() > 0.9
     inward = (run.surfels().normals() * torch.from_numpy(run.splats.normals)).sum(dim=-1) < 0
@@ -99,22 +86,22 @@ def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
 
 
 def test_what_a_ball_does_without(ball):
-    rows = json.loads((ball.folder / "needs.json").read_text())
+    rows = json.loads((ball.state.folder / "needs.json").read_text())
     left_out = {row["what"] for row in rows if not row.get("needed")}
     assert {"inter-reflection", "exposures"} <= left_out
     assert [row["what"] for row in rows if row.get("needed")][:1] == ["specular shading"]
-    assert ball.occluder is None and not (ball.folder / "occluder.ply").exists()
-    assert open_run(ball.folder).splats.indirect.shape[1] == 0
+    assert ball.state.occluder is None and not (ball.state.folder / "occluder.ply").exists()
+    assert open_run(ball.state.folder).splats.indirect.shape[1] == 0
 
 
 def test_the_assets_normals_point_outward(ball):
-    splats = open_run(ball.folder).splats
+    splats = open_run(ball.state.folder).splats
     solid = splats.opacities > 0.5
     assert ((splats.normals * splats.positions).sum(axis=1)[solid] > 0).mean() > 0.99
 
 
 def test_history_grows_with_time(ball):
-    rows = [json.loads(line) for line in (ball.folder / "history.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (ball.state.folder / "history.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows][-8:] == [159, 200, 252, 317, 399, 502, 631, 700]
     assert all(a["seconds"] < b["seconds"] for a, b in itertools.pairwise(rows))
     assert rows[-1]["psnr_test"] > rows[0]["psnr_test"]
@@ -143,39 +130,46 @@ def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
     whole = trainer(ball_capture, tmp_path / "whole", *changes, total=80)
     whole.run()
     first = trainer(ball_capture, tmp_path / "cut", *changes, total=80)
-    first.run(stop=lambda: first.iteration >= 47)
+    first.run(stop=lambda: first.state.iteration >= 47)
     (tmp_path / "cut" / "checkpoints" / "00000047.toml").unlink()  # killed before that one was complete
     second = trainer(ball_capture, tmp_path / "cut", *changes, total=80)
     second.resume()
-    assert second.iteration == 40
+    assert second.state.iteration == 40
     second.run()
-    assert whole.decided == second.decided
-    assert whole.parameters.keys() == second.parameters.keys()
-    for name, value in whole.parameters.items():
-        assert torch.equal(value, second.parameters[name]), name
-    assert torch.equal(whole.light, second.light)
+    assert whole.state.decided == second.state.decided
+    assert whole.state.parameters.keys() == second.state.parameters.keys()
+    for name, value in whole.state.parameters.items():
+        assert torch.equal(value, second.state.parameters[name]), name
+    assert torch.equal(whole.state.light, second.state.light)
     # By the stages all surfels are faint when exposures would be judged.
-    assert (second.exposures is not None) == (changes[0] in (TURNING[0], STAGES[0]))
-    if second.exposures is not None:
-        assert torch.equal(whole.exposures, second.exposures) and whole.exposures.any()
-    assert (second.occluder is not None) == (changes[0] == INDIRECT[0])
+    assert (second.state.exposures is not None) == (changes[0] in (TURNING[0], STAGES[0]))
+    if second.state.exposures is not None:
+        assert torch.equal(whole.state.exposures, second.state.exposures) and whole.state.exposures.any()
+    assert (second.state.occluder is not None) == (changes[0] == INDIRECT[0])
 
 
 def test_shading_sh_learns_colour_alone(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "sh", "shading=sh", total=150)
-    before = made.test_psnr()
+    before = held_out_psnr(made.state)
     made.run()
-    assert made.test_psnr() > before + 2 and made.surfels().sh_rest.any()
-    write_asset(made)
+    assert held_out_psnr(made.state) > before + 2 and made.state.surfels().sh_rest.any()
+    write_asset(made.state)
     assert not (tmp_path / "sh" / "environment.exr").exists()
     run = open_run(tmp_path / "sh")
-    assert float((made.render(made.test[0].camera).color - run.render(made.test[0].camera).color).abs().mean()) < 1e-3
+    assert (
+        float(
+            (made.state.render(made.state.test[0].camera).color - run.render(made.state.test[0].camera).color)
+            .abs()
+            .mean()
+        )
+        < 1e-3
+    )
 
 
 def test_sh_diffuse_leaves_an_albedo_that_relights(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", "diffuse=sh", "surfels.metallic=0.1", total=100)
     made.run()
-    write_asset(made)
+    write_asset(made.state)
     run = open_run(tmp_path / "run")
     received = run.environment.diffuse(torch.from_numpy(run.splats.normals))
     sent = 0.5 + 0.28209479 * run.splats.sh[:, 0]

@@ -18,7 +18,7 @@ import cv2
 import pytest
 
 from refgs_addon import jobs
-from tests.blender.runs import write_run
+from tests.makers.runs import write_run
 
 ROOT = Path(__file__).resolve().parents[2]
 

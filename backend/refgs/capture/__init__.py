@@ -1,4 +1,4 @@
-"""From a folder on disk to cameras and images: one module a layout."""
+"""Read captures: from a folder on disk to cameras and images. Each layout has a module."""
 
 import hashlib
 import os
@@ -17,7 +17,7 @@ from refgs.capture.nerf_blender import published_normals, read_nerf_blender
 from refgs.capture.nerfstudio import read_nerfstudio
 from refgs.capture.nero import read_nero
 from refgs.capture.poses import in_frame
-from refgs.capture.region import find_region, is_near, region_in, run_frame, sample_silhouettes, up_direction
+from refgs.capture.region import Region, find_region, is_near, region_in, run_frame, sample_silhouettes, up_direction
 from refgs.capture.types import Capture, View
 from refgs.errors import InputError, NoCameras
 from refgs.settings import RegionSettings
@@ -38,7 +38,7 @@ __all__ = [
 
 
 def find_layout(folder: Path) -> str | None:
-    """The layout of the cameras in a folder, by its name in `Capture.layout`; None where there are no cameras."""
+    """Return the layout of the cameras in a folder, as named in `Capture.layout`; None without cameras."""
     if (folder / "transforms_train.json").is_file():
         return "nerf-blender"
     if (folder / "transforms.json").is_file():
@@ -49,76 +49,30 @@ def find_layout(folder: Path) -> str | None:
 
 
 def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
-    """Reads the cameras of a capture, whatever its layout, and works out the run's frame.
+    """Read the cameras of a capture and find the run's frame.
 
-    `wanted` is the part of it that is wanted and which way is up, if that was said, in the frame that it would have without. Photos
-    are not decoded, only their headers read, and some masks. Raises InputError, one line for the artist.
+    `wanted` names a region, an up direction or both, in the frame that the run would have without them. Photos are not decoded:
+    only their headers and some masks are read. Raises InputError, one line for the artist.
     """
     folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
-    points = colors = None
-    warnings = []
-    layout = find_layout(folder)
-    match layout:
-        case "nerf-blender":
-            views = read_nerf_blender(folder)
-        case "nerfstudio":
-            views, points, colors, warnings = read_nerfstudio(folder)
-        case "colmap":
-            views, points, colors = read_colmap(*find_model(folder))
-        case "nero":
-            views, warnings = read_nero(folder)
-        case None:
-            if photos := find_photos(folder):
-                raise NoCameras(
-                    f"{folder}: {len(photos)} photos, but no cameras. Find them first: refgs poses {folder}"
-                )
-            raise InputError(
-                f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender), transforms.json (nerfstudio, "
-                "instant-ngp), sparse/0 (COLMAP), 0-camera.pkl (NeRO), and for photos, here and in images. "
-                "Name the folder that holds them."
-            )
-    photos = Counter((view.split, view.image_path) for view in views)
-    for (_, path), count in photos.items():
-        if count > 1:
-            raise InputError(f"{path}: the capture names this photo {count} times. Remove all of its frames but one.")
-    shared = {path for split, path in photos if split == "test"} & {path for split, path in photos if split == "train"}
-    if shared:
-        twice = f"{len(shared)} photos are both trained and tested on, first {min(shared).name}"
-        warnings.append(f"{twice}: the figures will be too good; name each in one of the two files")
+    layout = _check_layout(folder)
+    views, points, colors, warnings = _read(folder, layout)
+    _check_photos(views)
+    shared = _shared_photos(views)
     views = _hold_out(views)
-    _check(folder, views)
+    _check_cameras(folder, views)
     views = _unique_names(views)
-    silhouettes = sample_silhouettes(views)
-    if not silhouettes and any(view.masked for view in views):
-        warnings.append(
-            "the masks are white (opaque) everywhere, so they are not used: make them anew, the object white on black"
-        )
-        views = [replace(view, mask_path=None, has_alpha=False) for view in views]
+    views, silhouettes, white = _silhouettes(views)
     up = up_direction(views)
     region = find_region(views, up, points, silhouettes)
-    digest = _digest(folder, layout, views)
-    # What is at the origin with radius 1: in NeRF-Blender captures whatever is, if its size and place suit float32.
-    stays = layout == "nerf-blender" and is_near(region)
-    origin, unit = (np.zeros(3), 1.0) if stays else (region.centre, region.radius)
-    to_capture = run_frame(np.array([0.0, 0.0, 1.0]) if layout == "nerf-blender" else up, origin, unit)
+    to_capture, unit = _run_frame(layout, region, up)
     box, reach = None, region.radius
     if wanted is not None and any(wanted.size):
-        box, whole = Box.of(wanted).moved(to_capture), region
-        region = region_in(box, views, silhouettes)
-        reach = whole.radius + float(np.linalg.norm(whole.centre - region.centre))
-    turned = wanted is not None and any(wanted.up)
-    if turned:
+        box = Box.of(wanted).moved(to_capture)
+        region, reach = _narrow(region, box, views, silhouettes)
+    if wanted is not None and any(wanted.up):
         to_capture = to_capture @ run_frame(np.array(wanted.up) / np.linalg.norm(wanted.up), np.zeros(3), 1.0)
-    if turned or not stays:
-        to_run = np.linalg.inv(to_capture)
-        views = [replace(view, camera=in_frame(view.camera, to_run)) for view in views]
-        points = None if points is None else points @ to_run[:3, :3].T + to_run[:3, 3]
-        box = None if box is None else box.moved(to_run)
-        centre = to_run[:3, :3] @ (region.centre - origin)
-        region, reach = replace(region, centre=centre, radius=region.radius / unit), reach / unit
-    return Capture(
+    capture = Capture(
         folder=folder,
         layout=layout,
         views=views,
@@ -131,21 +85,79 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
         radius=region.radius,
         reach=reach,
         box=box,
-        digest=digest,
-        warnings=warnings,
+        digest=_digest(folder, layout, views),
+        warnings=[*warnings, *shared, *white],
+    )
+    return capture if np.array_equal(to_capture, np.eye(4)) else _in_run_frame(capture, unit)
+
+
+def _check_layout(folder: Path) -> str:
+    """Return the layout of a capture. Raise InputError if the folder holds none."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
+    layout = find_layout(folder)
+    if layout is not None:
+        return layout
+    if photos := find_photos(folder):
+        raise NoCameras(f"{folder}: {len(photos)} photos, but no cameras. Find them first: refgs poses {folder}")
+    raise InputError(
+        f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender), transforms.json (nerfstudio, "
+        "instant-ngp), sparse/0 (COLMAP), 0-camera.pkl (NeRO), and for photos, here and in images. "
+        "Name the folder that holds them."
     )
 
 
+def _read(folder: Path, layout: str) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
+    """Read the views, the points and their colours, None without points, and warnings."""
+    match layout:
+        case "nerf-blender":
+            return read_nerf_blender(folder), None, None, []
+        case "nerfstudio":
+            return read_nerfstudio(folder)
+        case "colmap":
+            return *read_colmap(*find_model(folder)), []
+    views, warnings = read_nero(folder)
+    return views, None, None, warnings
+
+
+def _check_photos(views: list[View]) -> None:
+    for (_, path), count in Counter((view.split, view.image_path) for view in views).items():
+        if count > 1:
+            raise InputError(f"{path}: the capture names this photo {count} times. Remove all of its frames but one.")
+
+
+def _shared_photos(views: list[View]) -> list[str]:
+    """Return a warning if photos are both trained and tested on."""
+    tested, trained = ({view.image_path for view in views if view.split == split} for split in ("test", "train"))
+    shared = tested & trained
+    if not shared:
+        return []
+    twice = f"{len(shared)} photos are both trained and tested on, first {min(shared).name}"
+    return [f"{twice}: the figures will be too good; name each in one of the two files"]
+
+
 def _hold_out(views: list[View]) -> list[View]:
-    """The capture's own split, else every eighth view by name held out for testing."""
+    """Keep the capture's own split; without one, hold out every eighth view by name."""
     if any(view.split == "test" for view in views):
         return views
     views = sorted(views, key=lambda view: view.image_path.as_posix())
     return [replace(view, split="train" if i % 8 else "test") for i, view in enumerate(views)]
 
 
+def _check_cameras(folder: Path, views: list[View]) -> None:
+    train = [view for view in views if view.split == "train"]
+    if len(train) < 3:
+        raise InputError(
+            f"{folder}: {len(train)} training views (of {len(views)}; the rest are held out for testing). "
+            "At least three are needed, thirty or more are good: add photos."
+        )
+    positions = np.array([view.camera.position for view in train])
+    if np.ptp(positions, axis=0).max() <= 1e-6 * np.abs(positions).max():
+        raise InputError(f"{folder}: all cameras are in one place, so no depth can be seen. Photograph from around it.")
+
+
 def _unique_names(views: list[View]) -> list[View]:
-    """Names that are unique in each split: photos of one name in two folders get their folders in front."""
+    """Make camera names unique in each split: photos of one name in two folders are prefixed with their folders."""
     names = Counter((view.split, view.camera.name) for view in views)
     top = os.path.commonpath([view.image_path.parent for view in views])
 
@@ -161,16 +173,47 @@ def _unique_names(views: list[View]) -> list[View]:
     return views
 
 
-def _check(folder: Path, views: list[View]) -> None:
-    train = [view for view in views if view.split == "train"]
-    if len(train) < 3:
-        raise InputError(
-            f"{folder}: {len(train)} training views (of {len(views)}; the rest are held out for testing). "
-            "At least three are needed, thirty or more are good: add photos."
-        )
-    positions = np.array([view.camera.position for view in train])
-    if np.ptp(positions, axis=0).max() <= 1e-6 * np.abs(positions).max():
-        raise InputError(f"{folder}: all cameras are in one place, so no depth can be seen. Photograph from around it.")
+def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.ndarray]], list[str]]:
+    """Return the views, small masks of some, and warnings. Masks that are opaque everywhere are dropped from the views."""
+    silhouettes = sample_silhouettes(views)
+    if silhouettes or not any(view.masked for view in views):
+        return views, silhouettes, []
+    what = "the masks are white (opaque) everywhere, so they are not used"
+    views = [replace(view, mask_path=None, has_alpha=False) for view in views]
+    return views, [], [f"{what}: make them anew, the object white on black"]
+
+
+def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return run → capture, (4, 4), and its scale. The region of interest is at the run's origin with radius 1, up is +Z.
+
+    A NeRF-Blender capture keeps its own frame, as long as size and place of the region suit float32.
+    """
+    if layout == "nerf-blender":
+        if is_near(region):
+            return np.eye(4), 1.0
+        up = np.array([0.0, 0.0, 1.0])
+    return run_frame(up, region.centre, region.radius), region.radius
+
+
+def _narrow(whole: Region, box: Box, views: list[View], silhouettes: list) -> tuple[Region, float]:
+    """Return the region of interest inside a box, and the radius of a ball about its centre that holds the whole region."""
+    region = region_in(box, views, silhouettes)
+    return region, whole.radius + float(np.linalg.norm(whole.centre - region.centre))
+
+
+def _in_run_frame(capture: Capture, unit: float) -> Capture:
+    """Move a capture from its own frame into the run's, which is smaller by `unit`."""
+    to_run = np.linalg.inv(capture.to_capture)
+    points = capture.points
+    return replace(
+        capture,
+        views=[replace(view, camera=in_frame(view.camera, to_run)) for view in capture.views],
+        points=None if points is None else points @ to_run[:3, :3].T + to_run[:3, 3],
+        box=None if capture.box is None else capture.box.moved(to_run),
+        centre=to_run[:3, :3] @ (capture.centre - capture.to_capture[:3, 3]),
+        radius=capture.radius / unit,
+        reach=capture.reach / unit,
+    )
 
 
 def _digest(folder: Path, layout: str, views: list[View]) -> str:
@@ -182,6 +225,6 @@ def _digest(folder: Path, layout: str, views: list[View]) -> str:
             if path is not None:
                 digest.update(f" {Path(os.path.relpath(path, folder)).as_posix()} {path.stat().st_size}".encode())
         numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
-        # Rounded, because the last bits differ from one processor's arithmetic to another's.
+        # Rounded: the last bits differ between processors.
         digest.update((np.round([*numbers, *camera.world_to_camera.ravel()], 6) + 0.0).tobytes())
     return digest.hexdigest()

@@ -1,4 +1,4 @@
-"""Camera files: the paths that `refgs render --cameras` follows, and a run folder's cameras.json."""
+"""Camera files: JSON for `refgs render --cameras`, and a run folder's cameras.json."""
 
 import json
 from pathlib import Path
@@ -12,15 +12,14 @@ from refgs.capture.poses import OPENGL_TO_OPENCV, in_frame
 from refgs.capture.transforms import frame_camera, read_frames
 from refgs.capture.types import Capture
 from refgs.errors import InputError
-from refgs.paths import whole
+from refgs.paths import write_text
 
 
 def read_cameras(file: Path) -> list[Camera]:
-    """The cameras of a NeRF-Blender or nerfstudio JSON in the capture's frame, named after their `file_path`.
+    """Read the cameras of a NeRF-Blender or nerfstudio JSON, in the capture's frame, named after their `file_path`.
 
-    Photos are looked at only for their size, and only where the file names none. Distorted lenses give the pinhole
-    that their photos are undistorted to. A run's own cameras.json is brought to the capture's frame as well.
-    Raises InputError.
+    Photos are opened only for their size, where the file names none. A distorted lens becomes the pinhole that its photo is
+    undistorted to. A run's cameras.json is moved to the capture's frame too. Raises InputError.
     """
     file = Path(file)
     shared, frames = read_frames(file)
@@ -40,11 +39,11 @@ def read_cameras(file: Path) -> list[Camera]:
 def write_cameras(
     file: Path, capture: Capture, light: str = "world", exposures: dict[str, float] | None = None
 ) -> None:
-    """Writes the run folder's cameras.json: the capture's undistorted cameras in the run's frame, OpenGL axes; `photo` is the file of
-    each, from the capture's folder.
+    """Write the run folder's cameras.json: undistorted cameras in the run's frame, with OpenGL axes.
 
-    With a light that stands with the "camera", `light_of` names the photo in which it is as environment.exr has it. The exposures
-    of those training photos that were found to have one are what radiance is to be multiplied by to be as bright as the photo.
+    `photo` is each photo's file, relative to the capture's folder. If the light is fixed to the "camera", `light_of` names the photo
+    in whose frame environment.exr is. `exposures` holds factors for some training photos: radiance times this factor is as bright
+    as the photo.
     """
     frames = []
     for view in capture.views:
@@ -69,9 +68,7 @@ def write_cameras(
     facts = {"frames": frames, "to_capture": capture.to_capture.tolist()}
     if light == "camera":
         facts["light_of"] = f"images/{capture.train_views[0].camera.name}"
-    text = json.dumps(facts, indent=1)
-    with whole(file) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(file, json.dumps(facts, indent=1))
 
 
 def _from(folder: Path, file: Path) -> Path:
@@ -79,8 +76,7 @@ def _from(folder: Path, file: Path) -> Path:
 
 
 def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float]]:
-    """The cameras of a run folder's cameras.json in the run's frame, their splits, run → capture (4, 4), and their exposures,
-    1 where none was found."""
+    """Read a run folder's cameras.json: cameras in the run's frame, their splits, run → capture (4, 4), and exposures (default 1)."""
     file = Path(file)
     shared, frames = read_frames(file)
     cameras = [frame_camera(frame)[0] for frame in frames]

@@ -1,4 +1,4 @@
-"""What `refgs check` says about a capture, and shows of it."""
+"""Check a capture: decode all of it, and list what it holds and what looks wrong."""
 
 import math
 from collections import Counter
@@ -15,8 +15,8 @@ from refgs.capture.types import Capture, View
 from refgs.errors import InputError
 from refgs.paths import whole
 
-THUMBNAILS, THUMBNAIL_SIDE = 12, 128  # how many at most; pixels
-BLURRED = 0.4  # of a capture's median sharpness. Sharp photos have 0.6 of it at least; blurred by 2 pixels of 512, 0.2 at most
+THUMBNAILS, THUMBNAIL_SIDE = 12, 128  # maximum number; pixels
+BLURRED = 0.4  # part of the capture's median sharpness. Sharp photos reach at least 0.6; blurred by 2 pixels of 512, at most 0.2
 
 LAYOUTS = {
     "nerf-blender": "NeRF-Blender",
@@ -27,11 +27,10 @@ LAYOUTS = {
 
 
 def check(capture: Capture, out: Path) -> dict[str, Any]:
-    """Write what another program needs to show a capture into the folder `out`: its cameras.json, as a run's, and small PNGs of some
-    photos, masked, spread over the views. What is there of an earlier check is replaced.
+    """Check a capture and write what another program needs to show it: a cameras.json as a run's, and masked thumbnails of some photos.
 
-    Returns `capture`, `cameras` and `thumbnails`, the paths of the capture and of what was written; `centre` and `radius` of what the
-    cameras look at, in the frame of cameras.json; and `lines`, as `describe` does. Raises InputError as it does.
+    Files of an earlier check in the folder `out` are replaced. Returns the paths `capture`, `cameras` and `thumbnails`; `centre` and
+    `radius` of the region of interest, in the frame of cameras.json; and `lines`, those of `describe`. Raises InputError as it does.
     """
     out.mkdir(parents=True, exist_ok=True)
     lines = describe(capture, out)
@@ -47,10 +46,10 @@ def check(capture: Capture, out: Path) -> dict[str, Any]:
 
 
 def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
-    """Lines about what the capture holds, then one `Warning: …` line for each thing that looks wrong.
+    """Describe what the capture holds, in lines; then add one `Warning: …` line for each thing that looks wrong.
 
-    Decodes every photo and mask; small pictures of some are left in the folder `thumbnails`, where one is named. Raises InputError where
-    any cannot be read: how many, and the first.
+    Decodes every photo and mask, and writes thumbnails of some to the folder `thumbnails`, if given. Raises InputError if any cannot
+    be read: how many, and the first.
     """
     statistics = _decode_all(capture, thumbnails)
     return [
@@ -67,7 +66,7 @@ def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
 
 
 class _Statistics:
-    """What decoding one photo told: mask coverage (None without one), clipped share, mean code value, greyscale, sharpness."""
+    """Statistics of a decoded photo: mask coverage (None without a mask), clipped part, mean code value, greyscale, sharpness."""
 
     def __init__(self, loaded: LoadedView):
         inside = np.ones(loaded.image.shape[:2], bool) if loaded.alpha is None else loaded.alpha > 127
@@ -80,8 +79,10 @@ class _Statistics:
 
 
 def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
-    """How much of what varies in a picture varies from pixel to pixel: the energy of its Laplacian by that of its gradient, which no
-    contrast changes. Inside the mask alone, away from its edge; 0 where nothing varies."""
+    """Measure sharpness inside the mask, away from its edge: energy of the Laplacian over energy of the gradient.
+
+    Contrast cancels out. A uniform picture has 0.
+    """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     inside = cv2.erode(inside.astype(np.uint8), np.ones((7, 7), np.uint8), borderValue=0) > 0
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *axis, scale=1 / 8)[inside] for axis in ((1, 0), (0, 1)))
@@ -90,7 +91,7 @@ def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
 
 
 def _spread(count: int) -> list[int]:
-    """The numbers of the views that thumbnails are made of."""
+    """Return the indices of the views with thumbnails."""
     return sorted({round(number) for number in np.linspace(0, count - 1, THUMBNAILS)})
 
 

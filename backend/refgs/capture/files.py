@@ -1,4 +1,4 @@
-"""Finding a capture's photos and masks on disk, and putting a view together from them."""
+"""Find a capture's photos and masks on disk, and make views of them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 
 
 def find_image(path: Path, any_suffix: bool = False) -> Path | None:
-    """The file at `path`, or at `path` with an image's extension added (or put in place of its own); None without."""
+    """Return the file at `path`, or at `path` with an image suffix added (with `any_suffix`: or replaced); None if absent."""
     if path.is_file():
         return path
     if any_suffix and path.suffix.lower() in IMAGE_SUFFIXES:
@@ -23,7 +23,7 @@ def find_image(path: Path, any_suffix: bool = False) -> Path | None:
 
 
 def find_photos(folder: Path) -> list[Path]:
-    """The photos in `images`, or in the folder itself where there is no such folder, by name; without masks beside them."""
+    """Return the photos in `images`, or in the folder itself without such a folder, sorted by name. NAME_alpha.png are masks."""
     top = folder / "images" if (folder / "images").is_dir() else folder
     found = {path.name: path for path in sorted(top.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES}
     masks = {f"{path.stem}_alpha.png" for path in found.values()}
@@ -31,7 +31,7 @@ def find_photos(folder: Path) -> list[Path]:
 
 
 def report_missing(source: Path, missing: list[str], total: int) -> None:
-    """Raises InputError where `source` names photos that are not there."""
+    """Raise InputError if `source` names photos that are missing."""
     if missing:
         raise InputError(
             f"{source}: {len(missing)} of the {total} images it names are missing, the first is {missing[0]}. "
@@ -40,9 +40,9 @@ def report_missing(source: Path, missing: list[str], total: int) -> None:
 
 
 class Masks:
-    """The masks of a capture: its folder `masks`, NAME.any or NAME.jpg.any, with the photos' sub-folders if any.
+    """Masks of a capture: NAME.any or NAME.jpg.any in its folder `masks`, in the photos' sub-folders if there are any.
 
-    Else NAME_alpha.png beside the photo, as in the scene `ball` of Shiny Blender.
+    Otherwise NAME_alpha.png beside the photo, as in the scene `ball` of Shiny Blender.
     """
 
     def __init__(self, folder: Path):
@@ -55,7 +55,7 @@ class Masks:
         }
 
     def find(self, image: Path, named: object, where: str) -> Path | None:
-        """The mask of a photo: the one `named` relative to the folder, else one of the same name; None without one."""
+        """Return a photo's mask: the file `named` relative to the folder, otherwise one of the photo's name; None if absent."""
         if named:
             path = find_image(self.folder / str(named).replace("\\", "/"))
             if path is None:
@@ -78,10 +78,9 @@ def photo_view(
     where: str,
     mask_below: float | None = None,
 ) -> View:
-    """The view of a photo: `as_given` is the camera and its lens as the capture's file has them.
+    """Make the view of a photo. `as_given` holds its camera and lens as the capture's file has them.
 
-    Intrinsics given for another resolution are scaled to the photo's. Raises InputError where the shapes or the
-    mask's size disagree.
+    Intrinsics for another resolution are scaled to the photo's. Raises InputError if the aspect ratio or the mask's size differs.
     """
     width, height, has_alpha = read_header(image)
     camera, lens = as_given

@@ -1,4 +1,4 @@
-"""Photos and masks from disk, as they are trained on: undistorted, downsized, 8-bit sRGB with straight alpha."""
+"""Load photos and masks for training: undistorted, reduced, 8-bit sRGB with straight alpha."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -16,9 +16,9 @@ from refgs.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class LoadedView:
-    """A view's pixels: `image` (H, W, 3) uint8 sRGB-encoded, `alpha` (H, W) uint8, None without a mask; straight.
+    """Pixels of a view: `image` (H, W, 3) uint8 sRGB-encoded, and straight `alpha` (H, W) uint8, None without a mask.
 
-    Where a photo had to be resampled, the colour of a fully transparent pixel is 0; `camera` has the loaded size.
+    `camera` has the loaded size. In a resampled photo fully transparent pixels are black.
     """
 
     image: np.ndarray
@@ -27,15 +27,15 @@ class LoadedView:
 
 
 def read_header(path: Path) -> tuple[int, int, bool]:
-    """Width, height and whether there is an alpha channel, without decoding. Raises InputError naming the file."""
+    """Read width, height and whether there is an alpha channel, without decoding. Raises InputError naming the file."""
     with _open(path) as picture:
         return *picture.size, picture.has_transparency_data
 
 
 def read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Decodes a photo as stored (no EXIF rotation, as COLMAP and nerfstudio do): RGB (H, W, 3) and alpha (H, W) uint8.
+    """Decode a photo to RGB (H, W, 3) and alpha (H, W) uint8. EXIF rotation is ignored, as in COLMAP and nerfstudio.
 
-    16-bit and greyscale files become 8-bit RGB. Raises InputError naming the file where it is cut short or unreadable.
+    16-bit and greyscale files become 8-bit RGB. Raises InputError naming a file that is truncated or unreadable.
     """
     with _open(path) as picture:
         pixels = np.asarray(_decode(picture, path))
@@ -43,9 +43,9 @@ def read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def read_mask(path: Path, below: float | None = None) -> np.ndarray:
-    """A mask file as alpha (H, W) uint8: white is the object. Cut-outs (alpha) and 0/1 masks are understood.
+    """Read a mask file as alpha (H, W) uint8: white is the object. Alpha channels and 0/1 masks are read too.
 
-    With `below` it is a depth map: the object is where it is below this part of its whole range.
+    With `below` the file is a depth map: the object is where depth is below this part of its range.
     """
     image, alpha = read_image(path)
     if below is not None:
@@ -56,17 +56,17 @@ def read_mask(path: Path, below: float | None = None) -> np.ndarray:
 
 
 def read_alpha(view: View) -> np.ndarray | None:
-    """The view's mask as stored, before undistortion: (H, W) uint8, or None where it has none."""
+    """Read a view's mask as stored, before undistortion: (H, W) uint8, None without a mask."""
     if view.mask_path is not None:
         return read_mask(view.mask_path, view.mask_below)
     return read_image(view.image_path)[1] if view.has_alpha else None
 
 
 def load_view(view: View, max_side: int | None = None) -> LoadedView:
-    """Decodes a view: masked, undistorted, its longer side brought down to `max_side` pixels (None: as it is).
+    """Load a view: decode, mask and undistort it, and reduce its longer side to `max_side` pixels (None: keep its size).
 
-    Pixels are averaged by area in linear light, weighted by alpha, as a coarser sensor would have seen them; so the
-    colours outside the mask do not bleed into its edge. Raises InputError naming the file.
+    Pixels are averaged by area in linear light, as by a coarser sensor. They are weighted by alpha, so that colours outside the mask
+    do not bleed into its edge. Raises InputError naming the file.
     """
     image, own_alpha = read_image(view.image_path)
     alpha = own_alpha if view.has_alpha else None
@@ -89,7 +89,7 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
         premultiplied[..., 3] = weight
         linear = premultiplied
     if view.lens is not None:
-        # Linear interpolation: a wider kernel overshoots at highlights, which a shiny object is full of.
+        # Linear, because wider kernels overshoot at highlights.
         linear = cv2.remap(linear, *view.lens.maps(camera), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     if fitted is not camera:
         linear = cv2.resize(linear, (fitted.width, fitted.height), interpolation=cv2.INTER_AREA)
@@ -111,7 +111,7 @@ def _open(path: Path) -> Image.Image:
 
 
 def _decode(picture: Image.Image, path: Path) -> Image.Image:
-    """8-bit RGB or RGBA. Pillow, unlike OpenCV, notices a file that is cut short."""
+    """Decode to 8-bit RGB or RGBA. Pillow, unlike OpenCV, detects a truncated file."""
     try:
         if picture.mode.startswith("I;16"):
             values = np.asarray(picture, dtype=np.float64) / 257
@@ -122,7 +122,7 @@ def _decode(picture: Image.Image, path: Path) -> Image.Image:
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"{path}: the image is cut short or broken ({_reason(error)}). Replace it.") from error
+        raise InputError(f"{path}: the image is truncated or broken ({_reason(error)}). Replace it.") from error
 
 
 def _reason(error: Exception) -> str:
@@ -131,7 +131,7 @@ def _reason(error: Exception) -> str:
 
 @cache
 def _decoding_table() -> np.ndarray:
-    """The 256 codes of a photo as linear float32."""
+    """Return the 256 codes of a photo as linear float32."""
     return srgb_decode(np.arange(256) / 255).astype(np.float32)
 
 

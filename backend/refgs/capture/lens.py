@@ -1,13 +1,12 @@
-"""Lens distortion: Brown's radial and tangential model, and the pinhole camera that replaces it.
+"""Undistort lenses: Brown's radial and tangential model, as in OpenCV, COLMAP and nerfstudio, and the pinhole that replaces it.
 
-The model is the one of OpenCV, COLMAP and nerfstudio. With (x, y) = (X/Z, Y/Z) and r² = x² + y²,
+With (x, y) = (X/Z, Y/Z) and r² = x² + y²,
     x' = x·(1 + k1·r² + k2·r⁴ + k3·r⁶ + k4·r⁸) + 2·p1·x·y + p2·(r² + 2x²)
     y' = y·(1 + k1·r² + k2·r⁴ + k3·r⁶ + k4·r⁸) + p1·(r² + 2y²) + 2·p2·x·y
 and the pixel is (fx·x' + cx, fy·y' + cy).
 
-Photos are undistorted onto a pinhole of the same size in pixels whose focal lengths are scaled by one factor: the
-smallest at which every pixel lies inside the photo. So there are no invented or black pixels to mask out; the photo
-loses a thin strip at its edges instead.
+Photos are undistorted onto a pinhole of the same size in pixels. Its focal lengths are scaled by the smallest factor at which every
+pixel lies inside the photo. So no invented or black pixels need masking; the photo loses a thin strip at its edges.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from refgs.errors import InputError
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of a distorted photo, in its pixels (centres at half-integers); radial k1..k4, tangential p1, p2."""
+    """Intrinsics of a distorted photo in pixels (centres at half-integers), with radial k1..k4 and tangential p1, p2."""
 
     fx: float
     fy: float
@@ -31,7 +30,7 @@ class Lens:
     tangential: tuple[float, float]
 
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the ray through (x, y, 1) lands on the distorted image plane at unit distance."""
+        """Return where the ray through (x, y, 1) meets the distorted image plane at unit distance."""
         k1, k2, k3, k4 = self.radial
         p1, p2 = self.tangential
         r2 = x * x + y * y
@@ -43,36 +42,36 @@ class Lens:
         )
 
     def pinhole(self, camera: Camera, where: str) -> Camera:
-        """The undistorted camera (module docstring) of a photo of `camera`'s size. Raises InputError naming `where`."""
+        """Return the undistorted camera for a photo of `camera`'s size. Raises InputError naming `where`."""
         factor = _focal_factor(self, camera.width, camera.height)
         if factor is None:
             raise InputError(f"{where}: the distortion is too strong for a perspective photo. Undistort it first.")
         return replace(camera, fx=self.fx * factor, fy=self.fy * factor, cx=self.cx, cy=self.cy)
 
     def maps(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """For each pixel of the pinhole `camera`, where to sample the photo: two float32 (H, W), for cv2.remap."""
+        """Return where each pixel of the pinhole `camera` samples the photo: two float32 (H, W) for cv2.remap."""
         return _maps(self, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 @lru_cache(maxsize=64)
 def _focal_factor(lens: Lens, width: int, height: int) -> float | None:
-    """The smallest factor on the focal lengths at which every pixel of the pinhole lies inside the photo."""
+    """Find the smallest factor on the focal lengths at which every pixel of the pinhole lies inside the photo; None above 2."""
     u, v = np.meshgrid(np.linspace(0, width, 65), np.linspace(0, height, 65))
 
     def fits(factor: float) -> bool:
         x, y = lens.distort((u - lens.cx) / (lens.fx * factor), (v - lens.cy) / (lens.fy * factor))
         u2, v2 = lens.fx * x + lens.cx, lens.fy * y + lens.cy
         inside = (u2 >= 0) & (u2 <= width) & (v2 >= 0) & (v2 <= height)
-        # Far from the axis a polynomial may fold back into the picture: the map must keep its orientation.
+        # Far from the axis the polynomial may fold back into the picture: the map must keep its orientation.
         (du_v, du_u), (dv_v, dv_u) = np.gradient(u2), np.gradient(v2)
         return bool(inside.all() and (du_u * dv_v - du_v * dv_u > 0).all())
 
     low, high = 0.25, 1.0
     while not fits(high):
         low, high = high, high * 1.1
-        if high > 2:  # more than half of the photo's width would be lost
+        if high > 2:  # would lose more than half of the photo's width
             return None
-    for _ in range(20):  # the region sampled shrinks as the factor grows, so `fits` changes only once
+    for _ in range(20):  # bisection: the sampled region shrinks as the factor grows, so `fits` changes once
         middle = (low + high) / 2
         low, high = (low, middle) if fits(middle) else (middle, high)
     return high
@@ -83,5 +82,5 @@ def _maps(lens: Lens, width: int, height: int, fx: float, fy: float, cx: float, 
     x = (np.arange(width) + 0.5 - cx) / fx
     y = (np.arange(height) + 0.5 - cy) / fy
     x, y = lens.distort(x[None, :], y[:, None])
-    # OpenCV counts pixel centres from 0, a Camera from 0.5.
+    # The first pixel's centre is at 0 in OpenCV, at 0.5 in a Camera.
     return (lens.fx * x + lens.cx - 0.5).astype(np.float32), (lens.fy * y + lens.cy - 0.5).astype(np.float32)

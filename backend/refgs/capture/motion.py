@@ -1,14 +1,14 @@
-"""Structure from motion: where photos were taken from, found from the photos alone, by COLMAP through pycolmap.
+"""Find the cameras of photos from the photos alone: structure from motion by COLMAP, through pycolmap.
 
-COLMAP works in a process of its own: it brings another OpenMP than torch's, which not every system lets live beside it, it hears
-of nothing while it works, and where it gives up it takes its process with it.
+COLMAP runs in its own process, because its OpenMP conflicts with torch's on some systems, it cannot be interrupted, and an abort
+ends its process.
 
-Masks are not used: surroundings that stand still with the object say most about where the camera is, and a shiny object alone says
-too little (of 66 photos of a polished head, five were placed by what is inside its masks). Behind a turntable the surroundings stand
-still with the camera and mislead. Matches at one place in both photos are dropped for that, which is not enough where the camera was
-moved a little as well: cameras are found that agree with what turns in some photos, and with what stands still in others (all 66 of
-that head, 19° wrong in the mean). What betrays them is that they contradict many of the matches that they were found from. Without the
-features that hardly move over many photos eight of the 66 are placed, rightly: so the artist is warned, and told what to do.
+Masks are not used. Surroundings fixed to the object determine the cameras best; a shiny object alone does so poorly (5 of 66 photos of a
+polished head were placed by what is inside its masks). Behind a turntable the surroundings are fixed to the camera and mislead.
+Matches at the same pixel in both photos are dropped for that, which is not enough if the camera moved a little, too: then some cameras
+fit the turntable and others the surroundings (all 66 of that head were placed, 19° wrong on average). Such cameras contradict many of
+the matches they were found from, so the artist is warned. Dropping features that hardly move over many photos places only 8 of the 66,
+correctly.
 """
 
 import hashlib
@@ -29,25 +29,25 @@ from refgs.capture.files import find_photos
 from refgs.capture.images import read_header
 from refgs.errors import InputError
 
-SIDE = 1600  # pixels: photos are reduced to this for finding features; presets train on fewer
-ALL_PAIRS = 150  # photos: up to so many, each is compared with each other
+SIDE = 1600  # pixels on the longer side for finding features; presets train on fewer
+ALL_PAIRS = 150  # photos; up to this many, every pair is matched
 CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential distortion only fit noise
 SEED = 1
-AGAINST = 8.0  # pixels from its epipolar line: a match contradicts the cameras; COLMAP itself allows 4
-CONTRADICTED = 0.2  # of the matches: cameras are not to be trusted
+MATCH_TOLERANCE = 8.0  # pixels from its epipolar line, above which a match contradicts the cameras; COLMAP allows 4
+CONTRADICTED = 0.2  # part of the matches, above which the cameras are not trusted
 DOUBTED = (
-    "as where an object turns before surroundings that stand still: look at them before you train (Show Cameras in Blender). If they are "
-    "wrong, put something plain behind the object, or walk around it, and take the photos anew"
+    "as happens if an object turns in front of still surroundings: look at the cameras before you train (Show Cameras in Blender). If they "
+    "are wrong, put something plain behind the object, or walk around it, and take the photos again"
 )
 
 
 def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) -> dict[str, Any]:
-    """Find the cameras of a folder's photos, which lie in it or in its `images`, and write its `sparse/0`.
+    """Find the cameras of the photos in a folder or in its `images`, and write its `sparse/0`.
 
-    `report` is told "progress" with `stage` ("features", "matching" or "mapping"), `done` and `total`, and "warning" with `what`.
-    Returns `placed` and `photos`, counts, and `error`, the mean reprojection error in pixels. What is stopped on the way leaves
-    `sparse.tmp`, from which the same photos go on. Raises InputError where there are no photos, cameras already, or where fewer than half
-    of the photos could be placed.
+    `report` gets "progress" with `stage` ("features", "matching" or "mapping"), `done` and `total`, and "warning" with `what`.
+    Returns the counts `placed` and `photos`, and `error`, the mean reprojection error in pixels. An interrupted run leaves
+    `sparse.tmp`, from which the next one resumes for the same photos. Raises InputError if there are no photos, if there are cameras
+    already, or if fewer than half of the photos could be placed.
     """
     folder = Path(folder)
     photos = find_photos(folder)
@@ -60,11 +60,11 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
     work = folder / "sparse.tmp"
     work.mkdir(exist_ok=True)
     database = work / f"{_digest(photos)}.db"
-    for path in list(work.iterdir()):  # of other photos, or half written
+    for path in list(work.iterdir()):  # from other photos, or half written
         if not path.name.startswith(database.name):
             _remove(path)
     model = work / "0"
-    placed, error, contradicted = _apart(photos, database, model, report)
+    placed, error, contradicted = _place_in_child(photos, database, model, report)
     if len(placed) < max(3, len(photos) / 2):
         shutil.rmtree(work)
         raise InputError(
@@ -85,9 +85,11 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
 
 
 def pairs(count: int) -> list[tuple[int, int]]:
-    """Which photos, by their numbers in the order of their names, are compared with each other: all up to ALL_PAIRS. Of more, each with
-    the ten that follow it and with some farther on, in a ring, as one walks around an object; and every tenth with every tenth, for
-    who walks around it again."""
+    """Choose the pairs of photos to match, by index in the order of names: every pair of up to ALL_PAIRS photos.
+
+    Of more photos, match each with the next ten and with some at powers of two, cyclically, as one walks around an object; and every
+    tenth with every tenth, for further rounds.
+    """
     if count <= ALL_PAIRS:
         return list(combinations(range(count), 2))
     steps = [*range(1, 11), *(2**k for k in range(4, count.bit_length() - 1))]
@@ -95,10 +97,10 @@ def pairs(count: int) -> list[tuple[int, int]]:
     return sorted(near | set(combinations(range(0, count, 10), 2)))
 
 
-def against(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """How far matches are from where two cameras allow them, (M,), in the units of the rays: the Sampson distance.
+def epipolar_distance(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return the Sampson distance of matches from their epipolar lines, (M,), in the units of the rays.
 
-    `ours` and `theirs` (M, 2) are where the rays meet the plane at depth 1, `pose` (3, 4) brings points from our camera to theirs.
+    `ours` and `theirs` (M, 2) are where the rays meet the plane at depth 1. `pose` (3, 4) maps points from our camera to theirs.
     """
     turn, shift = pose[:, :3], pose[:, 3]
     x, y = (np.column_stack([rays, np.ones(len(rays))]) for rays in (ours, theirs))
@@ -113,13 +115,13 @@ def _remove(path: Path) -> None:
 
 
 def _digest(photos: list[Path]) -> str:
-    """What tells these photos from others, and from themselves before they were edited."""
+    """Identify these photos by names, sizes and dates, so that edited photos differ."""
     facts = [(photo.name, photo.stat().st_size, photo.stat().st_mtime_ns) for photo in photos]
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
 
 
-def _apart(photos: list[Path], database: Path, model: Path, report: Callable) -> tuple[set[str], float, float]:
-    """`_place` in a process of its own, which ends with this call, however that ends."""
+def _place_in_child(photos: list[Path], database: Path, model: Path, report: Callable) -> tuple[set[str], float, float]:
+    """Run `_place` in its own process, which ends with this call however it ends."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_place, args=(photos, database, model, theirs), daemon=True)
@@ -127,7 +129,7 @@ def _apart(photos: list[Path], database: Path, model: Path, report: Callable) ->
     theirs.close()
     try:
         while True:
-            if ours.poll(0.2):  # no longer, for nothing else wakes it to be interrupted
+            if ours.poll(0.2):  # short, because an interrupt does not wake it
                 event = ours.recv()
                 if isinstance(event, tuple):
                     return event
@@ -141,23 +143,22 @@ def _apart(photos: list[Path], database: Path, model: Path, report: Callable) ->
 
 
 def _place(photos: list[Path], database: Path, model: Path, events: Connection) -> None:
-    """Sends how it goes; at last the names of the photos that were placed, the mean reprojection error, in pixels, and the part of
-    the matches that the cameras contradict."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who started this process ends it
+    """Place the photos. Send progress, and at the end (placed names, mean reprojection error in pixels, contradicted part of matches)."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     import pycolmap
 
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     pycolmap.set_random_seed(SEED)
 
-    def tell(stage: str, done: int, total: int) -> None:
+    def progress(stage: str, done: int, total: int) -> None:
         events.send({"stage": stage, "done": done, "total": total})
 
     with pycolmap.Database.open(database) as known:
-        described = known.num_images() > 0 and not any(known.exists_image(photo.name) for photo in photos)
-    if not described:
-        _describe(photos, database, tell)
-    _match(len(photos), database, tell)
-    found = _map(photos, database, tell)
+        extracted = known.num_images() > 0 and not any(known.exists_image(photo.name) for photo in photos)
+    if not extracted:
+        _extract(photos, database, progress)
+    _match(len(photos), database, progress)
+    found = _map(photos, database, progress)
     if found is None:
         events.send((set(), 0.0, 0.0))
         return
@@ -170,10 +171,10 @@ def _place(photos: list[Path], database: Path, model: Path, events: Connection) 
     events.send((placed, found.compute_mean_reprojection_error(), _contradicted(found, database)))
 
 
-def _describe(photos: list[Path], database: Path, tell: Callable) -> None:
-    """Features of all photos into the database; photos of one size and focal length (by EXIF) share a camera.
+def _extract(photos: list[Path], database: Path, progress: Callable) -> None:
+    """Extract the features of all photos into the database. Photos of one size and focal length (EXIF) share a camera.
 
-    When all are there the photos go by their numbers: a list of pairs, in a file, cannot name one with a space in its name.
+    Then rename the photos in it to their indices, because a file of pairs cannot hold names with spaces.
     """
     import pycolmap
 
@@ -193,11 +194,11 @@ def _describe(photos: list[Path], database: Path, tell: Callable) -> None:
     for lens, names in shared.items():
         reading.existing_camera_id = cameras[lens]
         for start in range(0, len(names), 2 * CORES):
-            tell("features", done, len(photos))
+            progress("features", done, len(photos))
             some = names[start : start + 2 * CORES]
             pycolmap.extract_features(
                 database, photos[0].parent, some, pycolmap.CameraMode.SINGLE, reading, extraction
-            )  # passes by what it has
+            )  # skips photos that have features already
             done += len(some)
     numbers = {photo.name: str(number) for number, photo in enumerate(photos)}
     with pycolmap.Database.open(database) as known, pycolmap.DatabaseTransaction(known):
@@ -210,8 +211,8 @@ def _lens(camera) -> tuple[int, int, float]:
     return camera.width, camera.height, camera.mean_focal_length()
 
 
-def _match(count: int, database: Path, tell: Callable) -> None:
-    """Matches between pairs of photos into the database."""
+def _match(count: int, database: Path, progress: Callable) -> None:
+    """Match pairs of photos, into the database."""
     import pycolmap
 
     verification = pycolmap.TwoViewGeometryOptions()
@@ -224,13 +225,13 @@ def _match(count: int, database: Path, tell: Callable) -> None:
         names = {image.name for image in known.read_all_images()}
     all_pairs = [f"{a} {b}" for a, b in pairs(count) if str(a) in names and str(b) in names]
     for start in range(0, len(all_pairs), 100):
-        tell("matching", start, len(all_pairs))
+        progress("matching", start, len(all_pairs))
         listed.write_text("\n".join(all_pairs[start : start + 100]), encoding="utf-8")
         pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
 
 
 def _contradicted(found: Any, database: Path) -> float:
-    """The part of the matches between photos of a model (a pycolmap.Reconstruction) that its cameras do not allow."""
+    """Return the part of the matches that a model's cameras (a pycolmap.Reconstruction) contradict."""
     import pycolmap
 
     placed = set(found.reg_image_ids())
@@ -244,13 +245,16 @@ def _contradicted(found: Any, database: Path) -> float:
         if {a, b} <= placed:
             ours, theirs = found.image(a), found.image(b)
             pose = (theirs.cam_from_world() * ours.cam_from_world().inverse()).matrix()
-            far = against(rays[a][matches[:, 0]], rays[b][matches[:, 1]], pose) * ours.camera.mean_focal_length()
-            wrong, total = wrong + int((far > AGAINST).sum()), total + len(far)
+            far = (
+                epipolar_distance(rays[a][matches[:, 0]], rays[b][matches[:, 1]], pose)
+                * ours.camera.mean_focal_length()
+            )
+            wrong, total = wrong + int((far > MATCH_TOLERANCE).sum()), total + len(far)
     return wrong / max(total, 1)
 
 
-def _map(photos: list[Path], database: Path, tell: Callable) -> Any:
-    """The model (a pycolmap.Reconstruction) that places most photos, None where none could be made."""
+def _map(photos: list[Path], database: Path, progress: Callable) -> Any:
+    """Return the model (a pycolmap.Reconstruction) that places most photos; None if none was found."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()
@@ -262,14 +266,14 @@ def _map(photos: list[Path], database: Path, tell: Callable) -> Any:
     def first() -> None:
         nonlocal placed
         placed = 2
-        tell("mapping", placed, len(photos))
+        progress("mapping", placed, len(photos))
 
     def another() -> None:
         nonlocal placed
         placed = min(placed + 1, len(photos))
-        tell("mapping", placed, len(photos))
+        progress("mapping", placed, len(photos))
 
-    written = database.with_name(database.name + ".models")  # where it leaves all models, the small ones too
+    written = database.with_name(database.name + ".models")  # COLMAP writes all models here, the small ones too
     written.mkdir(exist_ok=True)
     models = pycolmap.incremental_mapping(database, photos[0].parent, written, options, "", first, another)
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)

@@ -1,9 +1,9 @@
-"""NeRF-Blender: `transforms_train.json` and `transforms_test.json` beside folders of RGBA PNGs.
+"""Read NeRF-Blender captures: `transforms_train.json` and `transforms_test.json` beside folders of RGBA PNGs.
 
-The layout of NeRF-Synthetic (the README that comes with it) and of Shiny Blender, which adds NAME_normal.png (read by
-the class `Blender` in `internal/datasets.py` of multinerf, Ref-NeRF's code) and NAME_alpha.png, which its `ball` needs.
-Without a test file the validation file takes its place. Depth, disparity and other pictures that no frame names are
-passed over, among them NeRF-Synthetic's NAME_normal_0000.png, whose encoding is documented nowhere.
+NeRF-Synthetic has this layout (see its README), and Shiny Blender. The latter adds NAME_normal.png, read as by the class `Blender` in
+`internal/datasets.py` of multinerf, Ref-NeRF's code, and NAME_alpha.png, which its `ball` needs. Without a test file the validation
+file replaces it. Pictures that no frame names are ignored: depth, disparity, and NeRF-Synthetic's NAME_normal_0000.png, whose
+encoding is undocumented.
 """
 
 from dataclasses import replace
@@ -19,7 +19,7 @@ from refgs.errors import InputError
 
 
 def read_nerf_blender(folder: Path) -> list[View]:
-    """The views in the capture's frame. Raises InputError."""
+    """Read the views, in the capture's frame. Raises InputError."""
     views = _read(folder / "transforms_train.json", "train")
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():
@@ -28,10 +28,10 @@ def read_nerf_blender(folder: Path) -> list[View]:
 
 
 def published_normals(view: View, max_side: int | None = None) -> tuple[np.ndarray, np.ndarray] | None:
-    """The true normals that a data set brings for a view, and the object's coverage; None where it brings none.
+    """Read a view's true normals and alpha, where the data set publishes them; None otherwise.
 
-    Unit normals (H, W, 3) float32, zero where there is no surface, in the capture's frame; and alpha (H, W) float32
-    in 0..1; of the size that `load_view` gives. Raises InputError naming the file.
+    Unit normals (H, W, 3) float32 in the capture's frame, zero off the surface; alpha (H, W) float32 in 0..1. Both have the size
+    that `load_view` returns. Raises InputError naming the file.
     """
     if view.normal_path is None:
         return None

@@ -1,7 +1,7 @@
-"""nerfstudio and instant-ngp: one `transforms.json` with the intrinsics shared or per frame, and perhaps masks.
+"""Read nerfstudio and instant-ngp captures: one `transforms.json` with intrinsics, shared or per frame, and optional masks.
 
-`train_filenames`, `test_filenames` and `val_filenames` are nerfstudio's split (validation takes the place of a missing
-test list); `ply_file_path` names its structure-from-motion points.
+`train_filenames`, `test_filenames` and `val_filenames` are nerfstudio's split; validation replaces a missing test list.
+`ply_file_path` names its structure-from-motion points.
 """
 
 from pathlib import Path
@@ -16,10 +16,7 @@ from refgs.errors import InputError
 
 
 def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
-    """The views, points (M, 3) and their colours (M, 3) in 0..1, in the capture's frame, and warnings.
-
-    Raises InputError.
-    """
+    """Read the views, points (M, 3) and their colours (M, 3) in 0..1, in the capture's frame, and warnings. Raises InputError."""
     file = folder / "transforms.json"
     shared, frames = read_frames(file)
     train = shared.get("train_filenames")
@@ -40,10 +37,10 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.nda
 
 
 def _without_deleted(shared: dict, frames: list[Frame], file: Path) -> tuple[list[Frame], list[str]]:
-    """instant-ngp's files (they have an `aabb_scale`) keep the frames of photos deleted for being blurred: drop those.
+    """Drop frames whose photos are missing, and warn, in instant-ngp's files only.
 
-    That is instant-ngp's own rule, and its sample captures rely on it. Where more are gone than there, or in any
-    other file, missing photos are an error.
+    instant-ngp (its files have an `aabb_scale`) ignores frames of photos that were deleted as blurred, and its sample captures rely
+    on it. If more than half of the photos are missing, or in any other file, missing photos are an error.
     """
     missing = [frame.path for frame in frames if find_image(file.parent / frame.path) is None]
     if "aabb_scale" not in shared or not missing or 2 * len(missing) > len(frames):

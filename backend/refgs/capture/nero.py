@@ -1,10 +1,9 @@
-"""NeRO's Glossy Synthetic: `0.png`, `0-depth.png`, `0-camera.pkl` and so on in one folder.
+"""Read captures of NeRO's Glossy Synthetic: `0.png`, `0-depth.png`, `0-camera.pkl` and so on in one folder.
 
-The layout is what `GlossySyntheticDatabase` reads in `dataset/database.py` of NeRO (Liu et al. 2023). A camera is a
-pickle of two arrays: world to camera (3, 4) with OpenCV's axes, and the intrinsic matrix (3, 3). A depth map has 16 bits
-for 0 to 15 units; what lies beyond 14.5 is background, and the rest is the mask. `synthetic_split_128.pkl`, from
-NeRO's folder `configs`, holds the numbers of the test views and of the training views, in this order; it is looked
-for in the scene's folder and in the one around it.
+`GlossySyntheticDatabase` in `dataset/database.py` of NeRO (Liu et al. 2023) reads this layout. A camera is a pickle of two arrays:
+world to camera (3, 4) with OpenCV's axes, and the intrinsic matrix (3, 3). A depth map has 16 bits for 0 to 15 units; depth beyond
+14.5 is background, the rest is the mask. `synthetic_split_128.pkl`, from NeRO's folder `configs`, holds the numbers of the test
+views and then of the training views. It may lie in the scene's folder or in its parent.
 """
 
 from pathlib import Path
@@ -20,11 +19,11 @@ from refgs.capture.types import View
 from refgs.errors import InputError
 
 SPLIT = "synthetic_split_128.pkl"
-FAR = 14.5 / 15  # of a depth map's range: the background begins
+FAR = 14.5 / 15  # part of a depth map's range at which the background begins
 
 
 def read_nero(folder: Path) -> tuple[list[View], list[str]]:
-    """The views in NeRO's frame, and warnings. Raises InputError."""
+    """Read the views, in NeRO's frame, and warnings. Raises InputError."""
     names = (file.name.removesuffix("-camera.pkl") for file in folder.glob("*-camera.pkl"))
     numbers = sorted(int(name) for name in names if name.isdecimal())
     photos = [folder / f"{number}.png" for number in numbers]
@@ -51,12 +50,12 @@ def _camera(file: Path, name: str, width: int, height: int) -> Camera:
     try:
         inverse = np.linalg.inv(np.vstack([pose, [0, 0, 0, 1]]))
     except np.linalg.LinAlgError:
-        inverse = np.zeros((3, 4))  # which the check of poses reports
+        inverse = np.zeros((3, 4))  # `world_to_camera` reports it
     return Camera(name, width, height, fx, fy, cx, cy, world_to_camera(inverse, str(file)))
 
 
 def _tested(folder: Path, numbers: list[int]) -> tuple[set[int], list[str]]:
-    """The views to test on: NeRO's own where its split is there, else every eighth; and a warning then."""
+    """Return the test views by NeRO's split. Without it, return every eighth view, and a warning."""
     file = next((path for path in (folder / SPLIT, folder.parent / SPLIT) if path.is_file()), None)
     if file is None:
         warning = f"{SPLIT} of NeRO is neither in the scene's folder nor beside it: every eighth view is tested on"

@@ -1,7 +1,7 @@
-"""Pickles that hold NumPy arrays, read without running anything else that they may name.
+"""Read pickled NumPy arrays safely.
 
-`pickle.load` calls whatever a file tells it to, and a capture comes from anywhere. Here the few names that a pickled
-array consists of stand for plain containers, any other name is refused, and the numbers are taken from the bytes alone.
+`pickle.load` calls any function that a file names, and captures come from untrusted sources. Here the few names that a pickled array
+needs stand for plain containers, any other name is refused, and numbers come from the bytes alone.
 """
 
 import pickle
@@ -11,12 +11,12 @@ import numpy as np
 
 from refgs.errors import InputError
 
-LARGEST = 1 << 20  # bytes: a camera takes some hundred, a split a few thousand
+LARGEST = 1 << 20  # bytes; a camera takes a few hundred, a split a few thousand
 KINDS = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 
 
 def read_pair(file: Path) -> tuple[np.ndarray | list[int | str], np.ndarray | list[int | str]]:
-    """The two arrays or lists that a pickle holds. Raises InputError, one line, for anything else."""
+    """Read the two arrays or lists of a pickle. Raise InputError, one line, for anything else."""
     try:
         with file.open("rb") as source:
             data = source.read(LARGEST + 1)
@@ -41,7 +41,7 @@ class _Refused(Exception):
 
 
 class _Dtype:
-    """Stands for numpy.dtype: made from "f8" and the like, its byte order in the state."""
+    """Stand in for numpy.dtype: kinds as "f8"; the byte order is in the state."""
 
     def __init__(self, kind: str, *_):
         self.kind, self.order = kind, "="
@@ -51,7 +51,7 @@ class _Dtype:
 
 
 class _Array:
-    """Stands for numpy.ndarray: shape, type and bytes, made into an array only when all have been read."""
+    """Stand in for numpy.ndarray: shape, type and bytes, made into an array when all are read."""
 
     def __setstate__(self, state: tuple):
         _, self.shape, self.dtype, fortran, self.data = state
@@ -82,10 +82,10 @@ def _scalar(dtype, data) -> _Array:
 def _encode(text: str, encoding: str) -> bytes:
     if encoding != "latin1":
         raise _Refused(f"text in {encoding}")
-    return text.encode("latin1")  # how protocols before 3 write bytes
+    return text.encode("latin1")  # protocols before 3 write bytes as latin1 text
 
 
-# NumPy's own names as releases before and since 2 write them.
+# Names as written by NumPy before and since release 2.
 _NAMES = {("numpy", "ndarray"): _Array, ("numpy", "dtype"): _Dtype, ("_codecs", "encode"): _encode}
 for _core in ("numpy.core", "numpy._core"):
     _NAMES[f"{_core}.multiarray", "_reconstruct"] = _array

@@ -1,4 +1,4 @@
-"""Checking poses, and moving cameras between frames."""
+"""Check poses, and move cameras between frames."""
 
 from dataclasses import replace
 
@@ -12,10 +12,10 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def world_to_camera(camera_to_world: object, where: str) -> np.ndarray:
-    """The rigid inverse, (4, 4) float64, of a camera-to-world matrix from a file (4×4 or 3×4 numbers, same axes).
+    """Invert a camera-to-world matrix from a file (4×4 or 3×4 numbers, same axes) to a rigid pose, (4, 4) float64.
 
-    A uniform scale says nothing about what a camera sees and is dropped; rounding is orthonormalised away.
-    Raises InputError, naming `where`, for NaN, a matrix that has no inverse, mirrors, or stretches by more than 1 %.
+    A uniform scale does not change what a camera sees and is dropped; rounding is removed by orthonormalising. Raises InputError
+    naming `where` for NaN, and for a matrix that is singular, mirrors, or stretches by more than 1 %.
     """
     advice = "Export the cameras again, or remove this frame."
     try:
@@ -41,13 +41,13 @@ def world_to_camera(camera_to_world: object, where: str) -> np.ndarray:
 
 
 def split_similarity(matrix: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """The scale, rotation (3, 3) and translation (3,) of a 4×4 similarity."""
+    """Split a 4×4 similarity into its scale, rotation (3, 3) and translation (3,)."""
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     return scale, matrix[:3, :3] / scale, matrix[:3, 3]
 
 
 def in_frame(camera: Camera, to_frame: np.ndarray) -> Camera:
-    """The camera seen from another world frame: p_new = to_frame @ p_old, a 4×4 similarity; the image is the same."""
+    """Move a camera to another world frame: p_new = to_frame @ p_old, a 4×4 similarity. Its image stays the same."""
     scale, rotation, translation = split_similarity(to_frame)
     old = camera.world_to_camera
     pose = np.eye(4)

@@ -1,4 +1,4 @@
-"""What the cameras look at: the centre and radius of interest, object or room, and the run's frame."""
+"""Find the region of interest that the cameras look at, an object or a room, and the run's frame."""
 
 from dataclasses import dataclass
 
@@ -11,12 +11,12 @@ from refgs.capture.types import View
 from refgs.errors import InputError
 from refgs.geometry.project import inside, project
 
-NEAR = 100.0  # radii from the origin, and units that a radius may be or be a part of
+NEAR = 100.0  # largest distance from the origin in radii; largest radius, and inverse of the smallest
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A ball in the frame of the cameras it was found from; whether it is one object; and why, in words."""
+    """Ball in the cameras' frame. `bounded`: it holds one object; `because`: the reason in words."""
 
     centre: np.ndarray
     radius: float
@@ -27,11 +27,11 @@ class Region:
 def find_region(
     views: list[View], up: np.ndarray, points: np.ndarray | None, silhouettes: list[tuple[View, np.ndarray]]
 ) -> Region:
-    """The region of interest from poses alone, then made sharper by masks, else by structure-from-motion points."""
+    """Find the region of interest by the poses, then narrow it by masks, or without masks by structure-from-motion points."""
     centre, distances, miss = look_at_centre(views)
     ahead = float((distances > 0).mean())
     if ahead < 0.75:
-        # The axes meet behind the cameras: they look outwards, from the middle of a room.
+        # The axes meet behind the cameras: they look outwards from the middle of a room.
         positions = np.array([view.camera.position for view in views])
         centre = positions.mean(axis=0)
         spread = float(np.linalg.norm(positions - centre, axis=1).max())
@@ -53,13 +53,15 @@ def find_region(
 
 
 def is_near(region: Region) -> bool:
-    """Whether what is learned there, in float32, is as exact as in a ball of radius 1 about the origin, to a hundredth."""
+    """Tell whether float32 is as exact in the region as in a unit ball about the origin, up to a factor of 100."""
     return 1 / NEAR <= region.radius <= NEAR and float(np.linalg.norm(region.centre)) <= NEAR * region.radius
 
 
 def region_in(box: Box, views: list[View], silhouettes: list[tuple[View, np.ndarray]]) -> Region:
-    """The region of interest where a box was asked for: what the masks show in it, else all of it. Raises InputError where no photo
-    shows the box."""
+    """Find the region of interest inside a box: what the masks show in it, or without masks all of it.
+
+    Raises InputError if no photo shows the box.
+    """
     if not any(inside(view.camera, *project(view.camera, box.grid(5))).any() for view in views):
         raise InputError("no photo shows the region: put its box where the cameras look")
     carved = _carve(silhouettes, box.centre, box.radius, box) if silhouettes else None
@@ -67,10 +69,10 @@ def region_in(box: Box, views: list[View], silhouettes: list[tuple[View, np.ndar
 
 
 def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
-    """The point nearest to all optical axes (least squares), the depth of each camera to it, and the axes' misses.
+    """Return the point nearest to all optical axes (least squares), its depth from each camera, and how far the axes miss it.
 
-    The last is the median distance of the axes from the point over the median depth: 0 where they meet.
-    A weak pull towards the cameras' middle keeps parallel axes from sending the point to infinity.
+    The miss is the median distance of the axes from the point, over the median depth. A weak pull towards the cameras' mean
+    position keeps the point finite if the axes are parallel.
     """
     positions = np.array([view.camera.position for view in views])
     forward = np.array([view.camera.world_to_camera[2, :3] for view in views])
@@ -85,23 +87,23 @@ def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def up_direction(views: list[View]) -> np.ndarray:
-    """The world's up in the cameras' frame, (3,): near the cameras' mean up, and across their right axes.
+    """Find the world's up in the cameras' frame, (3,): perpendicular to the cameras' right axes, and close to their mean up.
 
-    Cameras that all look down tilt their mean up; a level camera's right axis is horizontal however it looks down.
+    The mean up alone is tilted if all cameras look down. A camera's right axis stays horizontal however it is pitched.
     """
     axes = np.array([view.camera.world_to_camera[:3, :3] for view in views])
     right, up = axes[:, 0], -axes[:, 1]
     mean = up.mean(axis=0)
-    if np.linalg.norm(mean) < 0.1:  # rolled every way: no up to be had
+    if np.linalg.norm(mean) < 0.1:  # cameras are rolled every way: there is no up
         mean = np.array([0.0, 0.0, 1.0])
-    weight = 0.02  # enough to choose among directions that the right axes leave open, too little to tilt the rest
+    weight = 0.02  # decides where the right axes leave directions open, and is too small to tilt up elsewhere
     result = np.linalg.solve(right.T @ right / len(right) + weight * np.eye(3), weight * mean)
     return result / np.linalg.norm(result)
 
 
 def run_frame(up: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    """run → capture, the 4×4 similarity that puts a ball at the origin with radius 1 and `up` along +Z."""
-    # The horizontal axes: as near to the capture's x as can be.
+    """Return run → capture, the 4×4 similarity under which the ball is at the run's origin with radius 1, and `up` is +Z."""
+    # The run's x is as close to the capture's x as possible.
     x = np.eye(3)[np.argmin(np.abs(up))] if abs(up[0]) > 0.9 else np.array([1.0, 0.0, 0.0])
     x = x - up * (up @ x)
     x /= np.linalg.norm(x)
@@ -112,9 +114,9 @@ def run_frame(up: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
 
 
 def sample_silhouettes(views: list[View], count: int = 24) -> list[tuple[View, np.ndarray]]:
-    """Small masks of some views spread over the capture; empty where masks are absent or fully opaque.
+    """Return small masks of some views, spread over the capture; none if masks are absent or fully opaque.
 
-    Raises InputError where masks are all empty.
+    Raises InputError if all masks are empty.
     """
     masked = [view for view in views if view.masked]
     chosen = masked[:: max(1, len(masked) // count)]
@@ -130,20 +132,20 @@ def sample_silhouettes(views: list[View], count: int = 24) -> list[tuple[View, n
 
 
 def _small(alpha: np.ndarray) -> np.ndarray:
-    """A mask at 128 pixels or so, true where any of its pixels is more than half opaque."""
+    """Reduce a mask to about 128 pixels; a cell is true if any of its pixels is more than half opaque."""
     step = max(1, max(alpha.shape) // 128)
     mask = (alpha > 127).astype(np.uint8)
     return cv2.dilate(mask, np.ones((step, step), np.uint8))[step // 2 :: step, step // 2 :: step] > 0
 
 
 def _half_view(view: View) -> float:
-    """The tangent of half the narrower field of view."""
+    """Return the tangent of half the narrower field of view."""
     camera = view.camera
     return min(camera.width / camera.fx, camera.height / camera.fy) / 2
 
 
 def _one_sided(views: list[View], centre: np.ndarray, up: np.ndarray) -> float:
-    """Length of the mean horizontal direction from the centre to the cameras: 0 all round, 1 on one side."""
+    """Return the length of the mean horizontal direction from the centre to the cameras: 0 all round, 1 on one side."""
     away = np.array([view.camera.position for view in views]) - centre
     away -= np.outer(away @ up, up)
     return float(np.linalg.norm((away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)).mean(axis=0)))
@@ -152,10 +154,9 @@ def _one_sided(views: list[View], centre: np.ndarray, up: np.ndarray) -> float:
 def _carve(
     silhouettes: list[tuple[View, np.ndarray]], centre: np.ndarray, half: float, box: Box | None = None
 ) -> tuple | None:
-    """Centre and radius of a coarse visual hull inside the cube centre ± half, of what is in the box if there is one; None where the
-    masks carve all away.
+    """Return centre and radius of a coarse visual hull in the cube centre ± half, and in the box if given; None if nothing is left.
 
-    Twice: over the cube, then over what was left of it. A cell may miss a tenth of the masks that see it.
+    Carves twice: the cube, then the bounds of what was left. A cell may lie outside a tenth of the masks that see it.
     """
     low, high = centre - half, centre + half
     for _ in range(2):
@@ -181,7 +182,7 @@ def _carve(
 
 
 def _foreground(views: list[View], points: np.ndarray, centre: np.ndarray, radius: float) -> tuple[np.ndarray, float]:
-    """Centre and radius of the points around the centre that at least half of the views have in the picture."""
+    """Return centre and radius of the points near the centre that at least half of the views show."""
     seen = np.zeros(len(points))
     for view in views:
         camera = view.camera

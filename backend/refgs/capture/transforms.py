@@ -1,9 +1,9 @@
-"""The JSON that NeRF-Blender, instant-ngp and nerfstudio share: cameras as `frames` with a `transform_matrix`.
+"""Read the JSON that NeRF-Blender, instant-ngp and nerfstudio share: cameras as `frames` with a `transform_matrix`.
 
-Poses are camera-to-world with OpenGL's axes. Intrinsics (`fl_x fl_y cx cy w h`, or `camera_angle_x` and
-`camera_angle_y` in radians) and distortion (`k1 k2 k3 k4 p1 p2`) stand at the top or in a frame, whose own value wins.
-The format is documented in nerfstudio's "Data conventions" and instant-ngp's "Tips for training NeRF models".
-instant-ngp's `aabb_scale`, `scale` and `offset` place the scene in its own cube and are not needed here.
+Poses are camera-to-world with OpenGL's axes. Intrinsics (`fl_x fl_y cx cy w h`, or `camera_angle_x` and `camera_angle_y` in radians)
+and distortion (`k1 k2 k3 k4 p1 p2`) are given at the top or in a frame; the frame's value wins. The format is documented in
+nerfstudio's "Data conventions" and instant-ngp's "Tips for training NeRF models". instant-ngp's `aabb_scale`, `scale` and `offset`
+place the scene in its own cube and are not needed here.
 """
 
 import json
@@ -24,14 +24,14 @@ from refgs.errors import InputError
 
 @dataclass(frozen=True)
 class Frame:
-    """One entry of `frames` with the values it shares with the others filled in."""
+    """Entry of `frames`, completed by the values shared by all."""
 
     values: dict
     file: Path
 
     @property
     def path(self) -> str:
-        """The photo's path as written, relative to the file, with forward slashes."""
+        """Photo's path as written, relative to the file, with forward slashes."""
         return str(self.values["file_path"]).replace("\\", "/")
 
     @property
@@ -39,7 +39,7 @@ class Frame:
         return f"{self.file}, frame {self.path}"
 
     def number(self, key: str) -> float | None:
-        """The value of a key, None where it is absent. Raises InputError where it is not a number."""
+        """Return the value of a key, None if absent. Raises InputError if it is not a number."""
         value = self.values.get(key)
         if value is None:
             return None
@@ -49,7 +49,7 @@ class Frame:
 
 
 def read_frames(file: Path) -> tuple[dict, list[Frame]]:
-    """The file's top level and its frames. Raises InputError for JSON that is not of this format."""
+    """Read the file's top level and its frames. Raises InputError for JSON of another format."""
     try:
         data = json.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
@@ -69,9 +69,9 @@ def read_frames(file: Path) -> tuple[dict, list[Frame]]:
 
 
 def frame_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> tuple[Camera, Lens | None]:
-    """The camera of a frame in the file's world, and its lens where it distorts.
+    """Return the camera of a frame in the file's world, and its lens if it distorts.
 
-    `image_size` (width, height) stands in where the frame names no size. Raises InputError naming the frame.
+    `image_size` (width, height) is used if the frame names no size. Raises InputError naming the frame.
     """
     if frame.values.get("is_fisheye") or str(frame.values.get("camera_model", "")).upper() in _NOT_PERSPECTIVE:
         raise InputError(f"{frame.where}: the camera is not a perspective one. Undistort the photos to pinholes first.")
@@ -100,7 +100,7 @@ def frame_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> tup
 
 
 def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> list[View]:
-    """The views of frames whose photos lie relative to `file`, in the file's world. Raises InputError."""
+    """Make the views of frames, in the file's world; photos are relative to `file`. Raises InputError."""
     folder = file.parent
     found = [(frame, split, find_image(folder / frame.path)) for frame, split in frames]
     report_missing(file, [frame.path for frame, _, path in found if path is None], len(found))
@@ -114,7 +114,7 @@ def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> list[View]:
 
 
 def camera_name(path: str) -> str:
-    """The last part of a frame's `file_path`, without an image's extension."""
+    """Return the last part of a frame's `file_path`, without an image suffix."""
     name = path.replace("\\", "/").rsplit("/", 1)[-1]
     stem, dot, suffix = name.rpartition(".")
     return stem if dot and suffix.lower() in _IMAGE_SUFFIXES else name
@@ -136,7 +136,7 @@ def _focal(frame: Frame, focal: str, angle: str, size: float) -> float | None:
 
 def _from_opengl(frame: Frame) -> object:
     try:
-        with np.errstate(invalid="ignore"):  # infinity is reported where the pose is checked
+        with np.errstate(invalid="ignore"):  # `world_to_camera` reports infinity
             return np.array(frame.values.get("transform_matrix"), dtype=np.float64) @ OPENGL_TO_OPENCV
     except (TypeError, ValueError):
         return None

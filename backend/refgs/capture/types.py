@@ -1,4 +1,4 @@
-"""What a capture is once it has been read, whatever layout it had on disk."""
+"""Captures as read, independent of their layout on disk."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +15,12 @@ Split = Literal["train", "test"]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One photo and the pinhole camera that sees it once it has been loaded with `load_view`.
+    """Photo and its pinhole camera.
 
-    `camera` covers the full-size photo after undistortion. Its name is the last part of the photo's path without the
-    extension, unique within a split. `lens` is the distorted lens of the file, None where the file is already a
-    pinhole's. `has_alpha` says that the photo's own alpha channel is its mask; a `mask_path` takes its place. With
-    `mask_below` that file is a depth map, and the object is where it is below this part of its whole range.
-    `normal_path` is a picture of the true normals where the data set brings one (see `published_normals`).
+    `camera` is that of the full-size photo as `load_view` undistorts it. Its name is the last part of the photo's path without suffix,
+    unique within a split. `lens` is the distorted lens of the file; None if the file is a pinhole's. `has_alpha` marks the photo's own
+    alpha channel as its mask; a `mask_path` replaces it. With `mask_below` that file is a depth map, and the object is where depth is
+    below this part of its range. `normal_path` is a picture of the true normals, if published (`published_normals`).
     """
 
     camera: Camera
@@ -35,22 +34,21 @@ class View:
 
     @property
     def masked(self) -> bool:
-        """Whether the view has a mask, of either kind."""
+        """Tell whether the view has a mask, of either kind."""
         return self.mask_path is not None or self.has_alpha
 
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Photos with cameras in the run's frame: Z up, and the capture's own frame back through `to_capture`.
+    """Photos with cameras in the run's frame, which has Z up.
 
-    `to_capture` is a 4×4 float64 similarity, p_capture = to_capture @ p_run: for NeRF-Blender the identity; elsewhere
-    it puts the region of interest at the origin with radius 1. Where a direction was named that is up, turned about the origin after that.
-    `points` (M, 3) are structure-from-motion points in the run's frame with `point_colors` (M, 3) sRGB-encoded in 0..1,
-    both None where the layout has none. `centre` (3,) and `radius` are the region of interest: the object, or a room's
-    foreground. `bounded` is a guess: the photos surround one object (True) or look at a place (False); `bounded_because` is
-    its reason in words. Where only what is in a `box`, in the run's frame, is wanted, it moves nothing, but the region of interest
-    lies in it then, and a ball of radius `reach` about `centre` holds what else the photos show; without one that is `radius`.
-    `warnings` are lines about what was left out or looks wrong but does not stop the reading.
+    `to_capture` is a 4×4 float64 similarity, p_capture = to_capture @ p_run. For most NeRF-Blender captures it is the identity;
+    otherwise the region of interest has radius 1 about the run's origin. A wanted up direction rotates the run about its origin.
+    `points` (M, 3) are structure-from-motion points with `point_colors` (M, 3), sRGB-encoded in 0..1; None if the layout has none.
+    `centre` (3,) and `radius` are the region of interest: the object, or a room's foreground. `bounded` is a guess: the photos surround
+    one object, or look at a place; `bounded_because` says why. A wanted `box` (in the run's frame) changes no frame, but narrows the
+    region of interest; a ball of radius `reach` about `centre` then holds all that the photos show. Without a box, `reach` is `radius`.
+    `warnings` are lines about what was left out or looks wrong.
     """
 
     folder: Path
@@ -78,9 +76,9 @@ class Capture:
 
     @property
     def masked(self) -> bool:
-        """Whether every training view has a mask."""
+        """Tell whether every training view has a mask."""
         return all(view.masked for view in self.train_views)
 
     def fingerprint(self) -> str:
-        """SHA-256 of the files' names and sizes and of the poses and intrinsics as they were read."""
+        """Return the SHA-256 of the files' names and sizes, and of the poses and intrinsics as read."""
         return self.digest

@@ -1,1 +1,1 @@
-"""What a run leaves behind: splats, light, and a textured mesh, in formats that other programs read."""
+"""Meshes, textures and splats, made from a run for other programs."""

@@ -1,7 +1,5 @@
 """Textures for a mesh, baked from the splats around it."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -10,32 +8,14 @@ from scipy.ndimage import distance_transform_edt
 
 from refgs.export.composite import Progress, composite
 from refgs.export.occlusion import openness
-from refgs.export.splats import Splats
-from refgs.export.tangents import vertex_tangents
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
+from refgs.formats.splats import Splats
+from refgs.formats.tangents import vertex_tangents
+from refgs.formats.textures import Textures
 
 FINE = 3  # texels at least that a splat's standard deviation is long where splats are composited; between them textures are linear
 _ROWS = 64  # of texels at a time
 _BESIDE = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]
-
-
-@dataclass
-class Textures:
-    """Square maps of S×S texels, float32, the first row at v = 1.
-
-    base_color (S, S, 3) linear Rec.709; metallic, roughness and occlusion (S, S); normal (S, S, 3), unit vectors in MikkTSpace
-    tangent space, y along v (OpenGL, glTF and Blender); mask (S, S), true where a texel's centre lies on the mesh or one
-    beside it does, so that look-ups on the mesh read nothing else: the rest is padding that repeats the nearest such texel.
-    specular is 1, or 0 where nothing is mirrored anywhere.
-    """
-
-    base_color: np.ndarray
-    metallic: np.ndarray
-    roughness: np.ndarray
-    occlusion: np.ndarray
-    normal: np.ndarray
-    mask: np.ndarray
-    specular: float = 1.0
 
 
 def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:

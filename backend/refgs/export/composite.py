@@ -7,7 +7,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from refgs.export.splats import Splats
+from refgs.formats.splats import Splats
 from refgs.model.surfels import axes
 
 NEIGHBOURS = 64  # splats that a ray is tried against

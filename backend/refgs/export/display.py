@@ -6,10 +6,10 @@ import numpy as np
 import torch
 
 from refgs.camera import Camera
-from refgs.export.splats import Splats
-from refgs.render.renderer import render
+from refgs.formats.splats import Splats
+from refgs.model.adam import Adam
+from refgs.render.baselines import draw_colors
 from refgs.run import Run
-from refgs.train.adam import Adam
 
 ITERATIONS = 600
 VIEWS = 120  # rendered to learn from, at most
@@ -53,6 +53,5 @@ def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, tota
 
 def _by_direction(run: Run, constant: torch.Tensor, rest: torch.Tensor, camera: Camera) -> torch.Tensor:
     surfels = run.surfels()._replace(sh_dc=constant, sh_rest=rest)
-    settings = run.settings.render.model_copy(update={"shading": "sh"})
     background = torch.tensor(run.settings.image.background)
-    return render(surfels, None, camera, background, settings, run.near).color
+    return draw_colors(surfels, None, camera, background, run.settings.render, run.near).color

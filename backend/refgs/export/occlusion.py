@@ -4,7 +4,7 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 
 RAYS = 64
 _LIFT = 1e-3  # of the mesh's size: rays start this far above it

@@ -13,7 +13,8 @@ from embreex.rtcore_scene import EmbreeScene
 from scipy.sparse import coo_matrix, diags, identity
 
 from refgs.camera import Camera
-from refgs.geometry.mesh import Mesh, smooth_normals
+from refgs.formats.mesh import Mesh
+from refgs.geometry.mesh import smooth_normals
 from refgs.render.renderer import Rendering
 
 VIEWS = 24  # of the cameras, evenly

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import torch
 
-from refgs.export.splats import Splats
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
+from refgs.formats.splats import Splats
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels

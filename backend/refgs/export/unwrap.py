@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import xatlas
 
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 
 PART = (
     800  # triangles: xatlas's time grows faster than linearly with those of a mesh, and it lays out meshes side by side

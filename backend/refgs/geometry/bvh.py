@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 from refgs.kernels.load import Shared, Work, run
 
 LEAF = 4  # triangles, as in trace.cu

@@ -3,7 +3,7 @@
 import numpy as np
 from skimage.measure import marching_cubes
 
-from refgs.geometry.mesh import Mesh
+from refgs.formats.mesh import Mesh
 
 BLOCK = 4  # voxels along a block's side
 _CHUNK = 16  # blocks along the side of what marching cubes takes at a time: 1 MB

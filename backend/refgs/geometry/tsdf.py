@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d
 
 from refgs.camera import Camera
+from refgs.formats.mesh import Mesh
 from refgs.geometry.isosurface import BLOCK as _BLOCK
 from refgs.geometry.isosurface import isosurface
-from refgs.geometry.mesh import Mesh
 
 _TRUNCATION = 4.0  # voxels: 3 halves the bias at sharp corners, 5 averages more noise away
 _CHUNK = 4096  # blocks projected at a time, so that they stay in the cache

@@ -5,8 +5,8 @@ import torch
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
+from refgs.formats.mesh import Mesh
 from refgs.geometry.bvh import Tree
-from refgs.geometry.mesh import Mesh
 
 _LIFT = 1.0  # of the mesh's mean edge: how far a ray starts above its surface, which the mesh only comes near to
 _PASSES = 3  # faces that a ray looks at: behind two back faces, the third

@@ -1,1 +1,1 @@
-"""The C++ kernels: sources, how they are built and loaded, and the reference that they are tested against."""
+"""The C++ kernels: sources, and how they are built and loaded."""

@@ -1,8 +1,8 @@
 """Cubemaps as flat lists of texels: directions, solid angles, seamless bilinear look-up.
 
-A cubemap of side R has 6·R² texels in the order face, row, column. Faces are +x, −x, +y, −y, +z, −z of the world; a
-face's (s, t) coordinates in [−1, 1] run along the two world axes that follow the face's own cyclically. There is no
-image convention to respect: cubemaps never leave the program (environment.exr is equirectangular).
+A cubemap of side R has 6·R² texels in the order face, row, column. Faces are +x, −x, +y, −y, +z, −z of the world. A face's (s, t)
+coordinates in [−1, 1] run along the two world axes that follow the face's own cyclically. Cubemaps never leave the program
+(environment.exr is equirectangular), so they follow no image convention.
 """
 
 import itertools
@@ -11,14 +11,14 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-SYMMETRIES = 24  # of the cube: every change of the axes' signs and every cyclic order of them
+SYMMETRIES = 24  # of the cube: all changes of the axes' signs, times all cyclic orders
 
 
 def _face_direction(face: Tensor, s: Tensor, t: Tensor) -> Tensor:
-    """Unnormalised direction of (s, t) on a face (see the module's text)."""
+    """The unnormalised direction of (s, t) on a face (see the module's docstring)."""
     face, s, t = torch.broadcast_tensors(face, s, t)
     axis, sign = face // 2, (1 - 2 * (face % 2)).to(s.dtype)
-    direction = torch.stack([sign, s, t], dim=-1)  # along the face's own axis and the two that follow it
+    direction = torch.stack([sign, s, t], dim=-1)  # along the face's axis and the two that follow it
     place = (torch.arange(3) - axis[..., None]) % 3
     direction = direction.gather(-1, place)
     return direction
@@ -52,7 +52,7 @@ def texel_directions(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=32)
 def texel_solid_angles(resolution: int) -> Tensor:
-    """Exact solid angles (6·R²,) in steradians, float64: they sum to 4π."""
+    """Exact solid angles (6·R²,) of the texels in steradians, float64; they sum to 4π."""
     edges = torch.arange(resolution + 1, dtype=torch.float64) * (2 / resolution) - 1
     s, t = edges[None, :], edges[:, None]
     corner = torch.atan2(s * t, torch.sqrt(s * s + t * t + 1))  # area of the rectangle from the face's centre to (s, t)
@@ -62,13 +62,14 @@ def texel_solid_angles(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=32)
 def orbits(resolution: int) -> Tensor:
-    """Texels (R²/4, 24), R even: those of the quarter s, t > 0 of face +x by row and column, each with its images by symmetry.
+    """Orbits of texels under the cube's symmetries (R²/4, 24), R even.
 
-    Symmetry 8·turn + signs is P^turn D: D changes the signs of x, y, z where `signs` has the bits 1, 2, 4, then P takes +x to
-    +y, +y to +z, +z to +x. None but the first leaves any texel where it is, so each texel is there once.
+    A row is a texel of the quarter s, t > 0 of face +x, by row and column, and its images. Symmetry 8·turn + signs is P^turn D: D changes
+    the signs of x, y, z where `signs` has the bits 1, 2, 4; then P takes +x to +y, +y to +z, +z to +x. Only the first symmetry maps a
+    texel to itself, so each texel occurs once.
     """
     texel = torch.arange(6 * resolution**2).reshape(3, 2, resolution, resolution)  # axis, its sign, t, s
-    for dim in (2, 4):  # each half from the face's middle outwards, the signs before it
+    for dim in (2, 4):  # count each half from the face's middle outwards; its sign is a dimension before it
         less, more = texel.chunk(2, dim=dim)
         texel = torch.stack([more, less.flip(dim)], dim=dim)
     axis, x, z, t, y, s = range(6)
@@ -77,38 +78,38 @@ def orbits(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def orbit_order(sides: tuple[int, ...]) -> Tensor:
-    """The texels of cubemaps one after another, in the order of each one's orbits (Σ 6·side²,)."""
+    """Indices (Σ 6·side²,) of the texels of stacked cubemaps, in the order of each one's orbits."""
     starts = itertools.accumulate((6 * side * side for side in sides), initial=0)
     return torch.cat([orbits(side).flatten() + start for side, start in zip(sides, starts, strict=False)])
 
 
 def in_texel_order(levels: Tensor, sides: tuple[int, ...]) -> Tensor:
-    """Cubemaps one after another (Σ 6·side², C) whose texels are in the order of orbits, as `sample` takes them."""
+    """Reorder stacked cubemaps (Σ 6·side², C) from the order of orbits to that of texels, as `sample` takes them."""
     return levels[orbit_order(sides).argsort()]
 
 
 @lru_cache(maxsize=1)
 def compositions() -> Tensor:
-    """(24, 24): which symmetry it is to apply the row's, then the column's."""
+    """Composition table (24, 24): the symmetry that applies the row's, then the column's."""
     first, then = torch.arange(SYMMETRIES)[:, None], torch.arange(SYMMETRIES)
     turn, signs = first // 8, then % 8
-    signs = signs >> turn | signs << 3 - turn  # D P^turn = P^turn D', of the axes that P^turn takes to D's
+    signs = signs >> turn | signs << 3 - turn  # D P^turn = P^turn D', where P^turn takes the axes of D' to those of D
     return (turn + then // 8) % 3 * 8 + ((signs ^ first) & 7)
 
 
 @lru_cache(maxsize=32)
 def _padded_texels(resolution: int) -> Tensor:
-    """Texel index of every texel of the faces padded by one, (6, R+2, R+2): the neighbour across the edge, so that look-up has no seams."""
+    """Texel index of every cell of the faces padded by one, (6, R+2, R+2). Padding is the neighbour across the edge: no seams."""
     centres = (torch.arange(-1, resolution + 1, dtype=torch.float64) + 0.5) * (2 / resolution) - 1
     face = torch.arange(6)[:, None, None]
     inside = centres.clamp(-1, 1)
-    # Fold what lies beyond the edge by direction; a point just outside one face is just inside its neighbour.
+    # Find cells beyond the edge by their direction: a point just outside one face is just inside its neighbour.
     direction = _face_direction(face, centres[None, None, :], centres[None, :, None])
     neighbour, s, t = face_coordinates(direction)
     column = ((s + 1) * (resolution / 2)).floor().long().clamp(0, resolution - 1)
     row = ((t + 1) * (resolution / 2)).floor().long().clamp(0, resolution - 1)
     index = (neighbour * resolution + row) * resolution + column
-    # At the cube's corners three faces meet and there is no fourth texel: repeat the face's own.
+    # Three faces meet at a corner, so there is no fourth texel: repeat the face's own.
     own_row = ((inside + 1) * (resolution / 2)).floor().long().clamp(0, resolution - 1)
     own = (face * resolution + own_row[None, :, None]) * resolution + own_row[None, None, :]
     for i in (0, -1):
@@ -119,7 +120,7 @@ def _padded_texels(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def padded(sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """For cubemaps stacked one after another: texel indices under their padded faces, where each level's start, the sides."""
+    """Of stacked cubemaps: texel indices of the padded faces' cells, the first cell of each level, the sides."""
     indices, starts, texels = [], [], 0
     for side in sides:
         starts.append(sum(len(i) for i in indices))
@@ -132,7 +133,7 @@ def _bilinear(face: Tensor, s: Tensor, t: Tensor, level: Tensor, sides: tuple[in
     table, starts, all_sides = padded(sides)
     side = all_sides[level]
     half = side.to(s.dtype) / 2
-    x = (s + 1) * half + 0.5  # in texels of the padded face
+    x = (s + 1) * half + 0.5  # in cells of the padded face
     y = (t + 1) * half + 0.5
     column = torch.minimum(x.detach().floor().long().clamp_min(0), side)
     row = torch.minimum(y.detach().floor().long().clamp_min(0), side)
@@ -145,9 +146,9 @@ def _bilinear(face: Tensor, s: Tensor, t: Tensor, level: Tensor, sides: tuple[in
 
 
 def sample(levels: Tensor, sides: tuple[int, ...], directions: Tensor, level: Tensor) -> Tensor:
-    """Trilinear look-up: bilinear in direction (P, 3), linear in level (P,) of [0, len(sides) − 1]; → (P, 3).
+    """Look up values (P, 3): bilinear in direction (P, 3), linear in level (P,) of [0, len(sides) − 1].
 
-    `levels` (Σ 6·side², 3) are cubemaps one after another. Differentiable in all of levels, directions and level.
+    `levels` (Σ 6·side², 3) are stacked cubemaps. Differentiable in levels, directions and level.
     """
     face, s, t = face_coordinates(directions)
     lower = level.detach().floor().long().clamp(0, max(len(sides) - 2, 0))

@@ -1,4 +1,4 @@
-"""The light: a cubemap of linear HDR radiance, prefiltered for the split sum, with the irradiance that lights the diffuse part."""
+"""The environment's light: a cubemap of linear HDR radiance, prefiltered for the split sum and for irradiance."""
 
 import math
 
@@ -7,24 +7,24 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
-from refgs.export.environment import directions as panorama_directions
-from refgs.export.environment import sample as sample_panorama
+from refgs.formats.panorama import directions as panorama_directions
+from refgs.formats.panorama import sample as sample_panorama
 from refgs.model import cubemap, harmonics, prefilter
 
 
 def turn_between(camera: Camera, reference: Camera) -> np.ndarray:
-    """The rotation (3, 3) about the world's z from a camera's heading to a reference's."""
+    """The rotation (3, 3) about the world's z axis from a camera's heading to a reference's."""
     angle = reference.heading - camera.heading
     sine, cosine = math.sin(angle), math.cos(angle)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
 class Environment:
-    """Light from afar. `radiance` (6·R², 3), linear, in the order of `refgs.model.cubemap`.
+    """Distant light: linear `radiance` (6·R², 3) in the order of `refgs.model.cubemap`.
 
-    It stands in the world; or, with a `reference`, with the camera, as on a turntable: where a camera has another heading
-    than the reference, the light is turned as far about the world's z. It does not tilt with the camera, for lamps stand in
-    the room, whatever height the photo was taken from. `radiance` is then as it is for the reference.
+    The light stands still in the world. With a `reference` camera it turns with the camera, as on a turntable: it is rotated about the
+    world's z axis by the difference in heading, and `radiance` is that of the reference. It does not tilt with the camera: lamps stand in
+    the room, whatever height a photo was taken from.
     """
 
     def __init__(self, radiance: Tensor, reference: Camera | None = None):
@@ -35,16 +35,16 @@ class Environment:
 
     @property
     def harmonics(self) -> Tensor:
-        """Coefficients (16, 3) of the radiance, up to degree 3."""
+        """Harmonic coefficients (16, 3) of the radiance, up to degree 3."""
         directions, area = cubemap.texel_directions(self.resolution), cubemap.texel_solid_angles(self.resolution)
         return (harmonics.basis(directions, 3) * area[:, None]).T.float().to(self.radiance.device) @ self.radiance
 
     def diffuse(self, normals: Tensor) -> Tensor:
-        """Irradiance / π (P, 3) about unit normals (P, 3): what a white matte surface sends out."""
+        """Irradiance / π (P, 3) for unit normals (P, 3): the radiance of a white matte surface."""
         return prefilter.irradiance(self.levels.cpu(), self.sides, normals.cpu()).to(normals)
 
     def turn(self, camera: Camera) -> np.ndarray:
-        """The rotation (3, 3) that takes the world's directions to the light's, in a camera's picture."""
+        """The rotation (3, 3) from world directions to the light's, for a camera."""
         return np.eye(3) if self.reference is None else turn_between(camera, self.reference)
 
     def panorama(self, height: int) -> np.ndarray:
@@ -56,8 +56,10 @@ class Environment:
 
     @classmethod
     def from_panorama(cls, panorama: np.ndarray, resolution: int, reference: Camera | None = None) -> "Environment":
-        """The light of an equirectangular picture (H, W, 3) in Blender's orientation, averaged over each texel."""
-        fine = max(1, math.ceil(panorama.shape[0] / (2 * resolution)))  # so that no pixel of the picture is passed over
+        """Make the light of an equirectangular picture (H, W, 3) in Blender's orientation: each texel is the mean over its area."""
+        fine = max(
+            1, math.ceil(panorama.shape[0] / (2 * resolution))
+        )  # samples a texel along each side, so that no pixel is skipped
         directions = cubemap.texel_directions(resolution * fine).numpy()
         colour = torch.from_numpy(np.ascontiguousarray(sample_panorama(panorama, directions), dtype=np.float32))
         colour = colour.reshape(6, resolution, fine, resolution, fine, 3).mean(dim=(2, 4))

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-DC = 0.5 / math.sqrt(math.pi)  # Y00
+from refgs.formats.splats import DC
 
 # Normalisation constants of the real harmonics (Sloan, "Stupid Spherical Harmonics Tricks", 2008, appendix A2).
 C1 = math.sqrt(3 / (4 * math.pi))
@@ -24,9 +24,9 @@ C3 = (
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """The (degree+1)² real harmonics at unit directions (..., 3) → (..., K).
+    """Evaluate the K = (degree + 1)² real harmonics at unit directions (..., 3): (..., K).
 
-    Odd orders carry the sign that 3D Gaussian splatting's files use: (−y, z, −x) at degree 1.
+    Odd orders have the sign that 3D Gaussian splatting's files use: (−y, z, −x) at degree 1.
     """
     x, y, z = directions.unbind(-1)
     values = [torch.full_like(x, DC)]

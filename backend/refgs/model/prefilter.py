@@ -1,10 +1,10 @@
 """GGX prefiltering of a cubemap: the second factor of the split sum (paper Eq. 8) at a few fixed roughnesses.
 
-With N = V = R (Karis, "Real Shading in Unreal Engine 4", 2013) the filtered radiance is Σ L(l) K(θ) / Σ K(θ),
-K(θ) = D(cos θ/2) cos θ, θ the angle between l and the lobe's axis. K depends on θ and roughness alone, so each level is
-one fixed sparse matrix over the texels of the cubemap and of its pooled mips: fine texels at the lobe's core,
-coarse ones in its tail. A matrix is as symmetric as the cube, so a 24th of it is made and kept; that takes 0.05 s for a
-cubemap of 6×64² texels and 0.25 s for 6×128², too little to want a file.
+With N = V = R (Karis, "Real Shading in Unreal Engine 4", 2013) the filtered radiance is Σ L(l) K(θ) / Σ K(θ), K(θ) = D(cos θ/2) cos θ,
+where θ is the angle between l and the lobe's axis. K depends on θ and roughness alone, so each level is one fixed sparse matrix
+over the texels of the cubemap and of its pooled mips: fine texels at the lobe's core, coarse ones in its tail. A matrix has the
+cube's symmetries, so only a 24th of it is computed and kept. That takes 0.05 s for 6×64² texels and 0.25 s for 6×128²: too little to
+cache on disk.
 """
 
 import ctypes
@@ -25,22 +25,22 @@ from refgs.model.cubemap import SYMMETRIES
 
 ROUGHNESS = (0.0, 0.08, 0.15, 0.25, 0.4, 0.65, 1.0)  # of the levels; level 0 is the cubemap itself
 DIVISOR = (1, 2, 2, 4, 4, 8, 8)  # a level's side is the cubemap's divided by this
-CELLS = 256  # a texel of the pyramid is split while it holds more than 1/CELLS of the lobe
-LEAST_SHARE = 1e-5  # of the lobe: a texel with less of it is left out
-LEAST_SIDE = 8  # of a level, where the cubemap is as fine
-IRRADIANCE_SIDE = 16  # of the last one: a sun's edge of shadow is as sharp as that
+CELLS = 256  # a pooled texel is split while it holds more than 1/CELLS of the lobe
+LEAST_SHARE = 1e-5  # of the lobe; texels that hold less are skipped
+LEAST_SIDE = 8  # of a level, unless the cubemap is coarser
+IRRADIANCE_SIDE = 16  # of the last level; it resolves the terminator of a sun's light
 COARSEST = 4  # side of the last pooled mip
 SAMPLES = 3  # sub-samples of the lobe along each side of a texel
 
 
 def level_sides(resolution: int) -> list[int]:
-    """Side of each prefiltered level, in texels: those of `ROUGHNESS`, and of irradiance."""
+    """Side of each prefiltered level, in texels: one for each of `ROUGHNESS`, then irradiance."""
     sides = [max(resolution // d, min(resolution, LEAST_SIDE)) for d in DIVISOR]
     return [*sides, min(resolution, IRRADIANCE_SIDE)]
 
 
 def level_of(roughness):
-    """Which of the levels a roughness lies at, linear in its square from one to the next; a float array or a number."""
+    """The fractional level of a roughness, a float array or a number: levels are interpolated linearly in roughness squared."""
     return np.interp(np.square(roughness), np.square(ROUGHNESS), np.arange(len(ROUGHNESS)))
 
 
@@ -52,14 +52,14 @@ def _pyramid_sides(resolution: int) -> list[int]:
 
 
 def ggx_lobe(cosine: np.ndarray, roughness: float) -> np.ndarray:
-    """K(θ) up to a factor, for cos θ; zero below the horizon."""
+    """K(θ) by cos θ, up to a factor; zero below the horizon."""
     a2 = roughness**4  # α² with α = roughness²
     half = (1 + cosine) / 2  # cos²(θ/2)
     return np.maximum(cosine, 0) / (half * (a2 - 1) + 1) ** 2
 
 
 def cosine_lobe(cosine: np.ndarray) -> np.ndarray:
-    """What irradiance weighs radiance by, up to a factor."""
+    """The weight of radiance in irradiance, by cos θ, up to a factor."""
     return np.maximum(cosine, 0)
 
 
@@ -68,9 +68,11 @@ LOBES = (*(partial(ggx_lobe, roughness=roughness) for roughness in ROUGHNESS[1:]
 
 
 def _level(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the pyramid's texels of the quarter s, t > 0 of face +x give to a level's, and by symmetry the others to the others:
-    (which of them, the level's texel in the order of orbits, weight). All that a level's texel is given sums to one, none from
-    pooled mips whose side is below `coarsest`."""
+    """Compute a level's matrix, of which symmetry gives the rest: rows for the pyramid's texels in the quarter s, t > 0 of face +x.
+
+    Returns those texels, the level's texels in the order of orbits, and weights. The weights of each texel of the level sum to one.
+    Pooled mips whose side is below `coarsest` are not used.
+    """
     axes = cubemap.texel_directions(side)[cubemap.orbits(side).flatten()].numpy()
     sides = _pyramid_sides(resolution)
     starts = np.cumsum([0] + [n * n // 4 for n in sides])
@@ -94,7 +96,7 @@ def _level(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.nd
 
 
 def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, side: int, lobe: Lobe) -> np.ndarray:
-    """The lobe about each axis, averaged over a texel, counted from the middle of face +x: it changes within one."""
+    """Average the lobe about each axis over a texel, which it varies within. Rows and columns count from the middle of face +x."""
     value = np.zeros(len(axes))
     x, y, z = np.ascontiguousarray(axes.T)
     for i in range(SAMPLES):
@@ -105,13 +107,13 @@ def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, sid
 
 
 class Matrix(NamedTuple):
-    """A sparse matrix over texels in the order of cubemap.orbits, that the cube's symmetries leave as it is.
+    """A sparse matrix over texels in the order of `cubemap.orbits`, invariant under the cube's symmetries.
 
-    Of an orbit's 24 rows the first is kept: the others have the same numbers, at the images of its columns.
+    Only the first of an orbit's 24 rows is kept: the others have the same numbers, at the images of its columns.
     """
 
-    starts: Tensor  # (orbits + 1), int32: where each row's numbers start
-    columns: Tensor  # int32, the numbers'; those that are images by one symmetry follow each other
+    starts: Tensor  # (orbits + 1), int32: the start of each row's numbers
+    columns: Tensor  # int32, of the numbers; images by the same symmetry are adjacent
     numbers: Tensor  # float32
     compositions: Tensor  # int32, cubemap.compositions()
 
@@ -130,8 +132,8 @@ class Matrix(NamedTuple):
 def _pair(
     shape: tuple[int, int], orbit: np.ndarray, column: np.ndarray, number: np.ndarray, device: torch.device
 ) -> tuple[Matrix, Matrix]:
-    """The matrix of these numbers in the first rows of orbits, and its transpose; `shape` in orbits."""
-    # A number at row 24 i, column 24 j + h is also at row 24 i + g, column 24 j, g being the inverse of h.
+    """Make the matrix that has these numbers in the first rows of orbits, and its transpose; `shape` is in orbits."""
+    # A number at row 24 i, column 24 j + h is also at row 24 i + g, column 24 j, where g is the inverse of h.
     inverse = (cubemap.compositions() == 0).int().argmax(dim=1).numpy()
     transpose = column // SYMMETRIES, SYMMETRIES * orbit + inverse[column % SYMMETRIES], number
     return Matrix.of(shape[0], orbit, column, number, device), Matrix.of(shape[1], *transpose, device)
@@ -139,11 +141,11 @@ def _pair(
 
 @lru_cache(maxsize=4)
 def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
-    """The levels stacked, as a matrix over the pyramid's texels, and its transpose."""
+    """The matrix from the pyramid's texels to the stacked levels, and its transpose."""
     itself = np.arange(resolution**2 // 4)  # level 0
     parts, start = [(itself, SYMMETRIES * itself, np.ones(len(itself)))], 6 * resolution**2
     for side, lobe in zip(level_sides(resolution)[1:], LOBES, strict=True):
-        # A sun's light falls off as evenly near the edge of its shadow as elsewhere: there, too, it needs its place.
+        # The cosine falls linearly to the horizon: coarse texels there would misplace the terminator of a sun's light.
         coarsest = side if lobe is cosine_lobe else COARSEST
         orbit, texel, weight = _level(resolution, side, lobe, coarsest)
         parts.append((orbit, start + texel, weight))
@@ -155,7 +157,7 @@ def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
 
 @lru_cache(maxsize=4)
 def _pyramid(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
-    """The cubemap and its pooled mips, means by solid angle, as a matrix over the cubemap's texels; and its transpose."""
+    """The matrix from the cubemap's texels to its pooled mips, means by solid angle, and its transpose."""
     mip = sparse.identity(resolution**2 // 4, format="csr")
     mips = [mip]
     for side in _pyramid_sides(resolution)[:-1]:
@@ -187,7 +189,7 @@ class _Work(Work):
 
 
 def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tensor:
-    """What goes in is in the order of orbits; so is what comes out, unless each texel goes to a row."""
+    """Multiply. Input and output are in the order of orbits, unless `rows` gives each output its row."""
     work = _Work(orbits=len(matrix.starts) - 1)
     out = dense.new_empty(SYMMETRIES * work.orbits, 3)
     work.attach(**matrix._asdict(), dense=dense, out=out, **({} if rows is None else {"rows": rows}))
@@ -213,14 +215,15 @@ class _Prefilter(torch.autograd.Function):
 
 
 def prefilter(radiance: Tensor, resolution: int) -> Tensor:
-    """Of a cubemap (6·R², 3) all levels one after another, (Σ 6·side², 3), each in the order of `cubemap.orbits`; the last is
-    irradiance / π. Linear radiance in, linear radiance out."""
+    """Prefilter a cubemap (6·R², 3) of linear radiance: all levels stacked (Σ 6·side², 3), each in the order of `cubemap.orbits`.
+
+    The last level is irradiance / π.
+    """
     check(radiance=(radiance, (6 * resolution**2, 3)))
     return _Prefilter.apply(radiance, resolution)
 
 
 def irradiance(levels: Tensor, sides: tuple[int, ...], normals: Tensor) -> Tensor:
-    """Irradiance / π (P, 3) about unit normals (P, 3), from all levels (Σ 6·side², 3), each in the order of `cubemap.orbits`. On the
-    CPU; differentiable."""
+    """Look up irradiance / π (P, 3) for unit normals (P, 3) in the levels that `prefilter` returns. On the CPU; differentiable."""
     last = cubemap.in_texel_order(levels, sides)[-6 * sides[-1] ** 2 :]
     return cubemap.sample(last, sides[-1:], normals, torch.zeros(len(normals), dtype=normals.dtype))

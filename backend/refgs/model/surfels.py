@@ -1,4 +1,4 @@
-"""The surfels: raw parameters as they are learned, and their activated values as they are rendered."""
+"""Surfels: raw parameters, which are learned, and activated values, which are rendered."""
 
 import ctypes
 import math
@@ -10,22 +10,22 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from refgs.clock import timed
-from refgs.export.splats import Splats
+from refgs.formats.splats import Splats
 from refgs.kernels.load import Shared, Work, run
 from refgs.model import harmonics
 
-FLAT = 0.3  # thickness of 3D Gaussians at the start, by their width
+FLAT = 0.3  # initial thickness of 3D Gaussians, as a part of their width
 _EXP, _SIGMOID, _SMOOTHSTEP = range(3)  # `enum Kind` of activate.cpp
 _KINDS = {"scale": _EXP, "opacity": _SIGMOID, "albedo": _SIGMOID, "metallic": _SMOOTHSTEP, "roughness": _SIGMOID}
 
 Parameters = dict[str, Tensor]
-"""Raw leaf tensors, one row a surfel: position (N, 3), rotation (N, 4) wxyz, scale (N, 2) log, or (N, 3) of 3D
-Gaussians, opacity (N,) logit, sh_dc (N, 1, 3), sh_rest (N, K−1, 3), albedo (N, 3) logit, metallic (N,) whose logistic s gives
-3 s² − 2 s³, roughness (N,) logit, received (N, 3), which does not learn, indirect_dc and indirect_rest as the SH."""
+"""Raw leaf tensors, one row a surfel: position (N, 3); rotation (N, 4) wxyz; scale (N, 2) log, (N, 3) for 3D Gaussians; opacity (N,)
+logit; sh_dc (N, 1, 3); sh_rest (N, K − 1, 3); albedo (N, 3) logit; metallic (N,), activated as 3 s² − 2 s³ of its logistic s; roughness
+(N,) logit; received (N, 3), which is traced, not learned; indirect_dc and indirect_rest, of the shapes of sh."""
 
 
 def axes(rotations: Tensor) -> list[Tensor]:
-    """The columns (N, 3) of the matrices of quaternions wxyz (N, 4) of any length."""
+    """The columns (N, 3) of the rotation matrices of quaternions wxyz (N, 4) of any length."""
     w, x, y, z = torch.nn.functional.normalize(rotations, dim=-1).unbind(-1)
     return [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1),
@@ -37,8 +37,8 @@ def axes(rotations: Tensor) -> list[Tensor]:
 class Surfels(NamedTuple):
     """Activated values of N surfels: world units, linear Rec.709 albedo, materials in 0..1, SH with colour = 0.5 + SH.
 
-    `received` (N, 3) is what part of the irradiance of an unhidden surface reaches a surfel; with the object's own light it can be
-    above 1. SH are taken apart into their constant (N, 1, 3) and the rest (N, K − 1, 3), as they are learned. `indirect` are those of
+    `received` (N, 3) is the irradiance of a surfel, divided by that of an unoccluded surface; light from the object itself can raise it
+    above 1. SH are split into the constant (N, 1, 3) and the rest (N, K − 1, 3), which learn at different rates. `indirect` are the SH of
     the linear radiance that reaches a surfel from the object itself (paper Eq. 10).
     """
 
@@ -56,21 +56,21 @@ class Surfels(NamedTuple):
     indirect_rest: Tensor
 
     def normals(self) -> Tensor:
-        """Unit normals t_u × t_v (N, 3): the third column of each rotation, if its axis is the shortest."""
+        """Unit normals t_u × t_v (N, 3): the third column of each rotation. 3D Gaussians need `with_normals_last` first."""
         return axes(self.rotations)[2]
 
     def without_directions(self) -> "Surfels":
-        """The same without harmonics beyond the constant."""
+        """Drop the harmonics beyond the constant."""
         return self._replace(sh_rest=self.sh_rest[:, :0])
 
     def chosen(self, which: Tensor) -> "Surfels":
-        """Some of them: by a mask (N,), or by their numbers."""
+        """Select surfels by a mask (N,) or by indices."""
         return Surfels(*(value[which] for value in self))
 
     def turned(self, which: Tensor) -> "Surfels":
-        """With the normals of some (N,) pointing the other way."""
+        """Flip the normals of those selected by a mask (N,)."""
         w, x, y, z = self.rotations.unbind(-1)
-        turned = torch.stack([-x, w, z, -y], dim=-1)  # q · (0, 1, 0, 0): half a turn about t_u
+        turned = torch.stack([-x, w, z, -y], dim=-1)  # q · (0, 1, 0, 0): a half turn about t_u
         return self._replace(rotations=torch.where(which[:, None], turned, self.rotations))
 
 
@@ -96,7 +96,7 @@ class _Work(Work):
 
 @timed("surfels")
 class _Activate(torch.autograd.Function):
-    """Each tensor by its kind."""
+    """Apply each tensor's activation."""
 
     @staticmethod
     def forward(ctx, *raw):
@@ -126,10 +126,10 @@ class _Activate(torch.autograd.Function):
 
 
 def activate(p: Parameters) -> Surfels:
-    """Raw parameters → values.
+    """Activate raw parameters.
 
-    The metallic nears its ends as the square of how others do: a hundredth of matt white left in a black metal would be as bright as
-    what the metal mirrors, and the light would have to make up for it.
+    Metallic approaches 0 and 1 faster than a logistic function does. One percent of matte white in a black metal would be as bright as
+    its mirror image, and the light would compensate for it.
     """
     scales, opacities, albedo, metallic, roughness = _Activate.apply(*(p[name] for name in _KINDS))
     return Surfels(
@@ -149,10 +149,10 @@ def activate(p: Parameters) -> Surfels:
 
 
 def quaternions_towards(normals: np.ndarray) -> np.ndarray:
-    """Unit quaternions wxyz (N, 4) that turn +z into the given unit normals (N, 3) the shortest way."""
+    """Unit quaternions wxyz (N, 4) of the shortest rotations from +z to unit normals (N, 3)."""
     x, y, z = normals.T
     q = np.stack([1 + z, -y, x, np.zeros_like(z)], axis=1)
-    q[1 + z < 1e-6] = (0, 1, 0, 0)  # straight down: half a turn about x
+    q[1 + z < 1e-6] = (0, 1, 0, 0)  # straight down: a half turn about x
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
@@ -169,10 +169,10 @@ def initial_parameters(
     metallic: float,
     roughness: float,
 ) -> Parameters:
-    """Round surfels at points (N, 3) facing along normals (N, 3), their standard deviation the spacing (N,).
+    """Make round surfels at points (N, 3) that face along normals (N, 3), with the spacing (N,) as standard deviation.
 
-    `colours` (N, 3), sRGB-encoded 0..1, start the SH; grey where there are none. With three `axes` they are 3D Gaussians,
-    FLAT along the normals.
+    `colours` (N, 3), sRGB-encoded 0..1, initialise the SH; the default is grey. With three `axes` they are 3D Gaussians, FLAT along the
+    normals.
     """
     n = len(positions)
 
@@ -201,7 +201,7 @@ def initial_parameters(
 
 
 def to_splats(surfels: Surfels) -> Splats:
-    """The asset's table, as `splats.ply` stores it."""
+    """Convert to the table that `splats.ply` stores."""
     with torch.no_grad():
         values = surfels._asdict() | {"normals": surfels.normals()}
         values["rotations"] = torch.nn.functional.normalize(surfels.rotations, dim=-1)
@@ -211,7 +211,7 @@ def to_splats(surfels: Surfels) -> Splats:
 
 
 def from_splats(splats: Splats) -> Surfels:
-    """The values to render, from the asset's table."""
+    """Convert from the table that `splats.ply` stores."""
     values = {name: getattr(splats, name) for name in Surfels._fields if hasattr(splats, name)}
     for name in ("sh", "indirect"):
         coefficients = getattr(splats, name)

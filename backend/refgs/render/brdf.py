@@ -1,9 +1,8 @@
-"""The first factor of the split sum (paper Eq. 7): what a metallic-roughness material reflects of an even light.
+"""The first factor of the split sum (paper Eq. 7): the reflectance of a metallic-roughness material under uniform light.
 
-The material is Blender's Principled BSDF, with whatever its defaults are: GGX, height-correlated Smith shadowing, and what
-microfacets pass on to each other, which a lobe of one bounce alone would lose (Kulla and Conty, "Revisiting Physically
-Based Shading at Imageworks", 2017); Schlick's Fresnel for metals, a dielectric's own for the index of refraction IOR. Below
-a dielectric's reflection lies a matte base, lit by what that leaves.
+The material is Blender's Principled BSDF with its defaults: GGX, height-correlated Smith shadowing, and multiple scattering between
+microfacets (Kulla and Conty, "Revisiting Physically Based Shading at Imageworks", 2017). Metals have Schlick's Fresnel term,
+dielectrics the exact one for the index of refraction IOR. Under a dielectric's coat lies a matte base, lit by what the coat transmits.
 """
 
 import itertools
@@ -18,30 +17,33 @@ LEAST_N_V = 1e-4  # as in light.h
 
 
 def fresnel(cosine: np.ndarray) -> np.ndarray:
-    """Of a dielectric, unpolarised light."""
+    """Fresnel reflectance of a dielectric for unpolarised light, by the cosine to the normal."""
     inside = np.sqrt(IOR**2 - 1 + cosine**2)  # IOR times the refracted ray's cosine
     across, along = (IOR**2 * cosine - inside) / (IOR**2 * cosine + inside), (cosine - inside) / (cosine + inside)
     return (across**2 + along**2) / 2
 
 
 def bounces(average_fresnel, energy, average_energy):
-    """By how much light that meets microfacets more than once adds to what meets one. `energy` is what one bounce off a white
-    lobe sends out, `average_energy` its mean over the cosine-weighted hemisphere, `average_fresnel` that of Fresnel's term."""
+    """The factor by which multiple scattering raises a lobe of one bounce (Kulla and Conty 2017).
+
+    `energy` is the albedo of a white lobe of one bounce, `average_energy` its mean over the cosine-weighted hemisphere, `average_fresnel`
+    the mean Fresnel term.
+    """
     again = average_fresnel * average_energy / (1 - average_fresnel * (1 - average_energy))
     return 1 + again * (1 - energy) / energy
 
 
 def _gauss(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points and weights over 0..1. They crowd towards both ends, where an integrand may have a root's slope."""
+    """Quadrature points and weights over 0..1, dense at both ends, where an integrand may behave like a square root."""
     x, weight = np.polynomial.legendre.leggauss(nodes)
     angle = np.pi / 4 * (x + 1)
     return np.sin(angle) ** 2, weight * np.pi / 4 * np.sin(2 * angle)
 
 
 def one_bounce(n_v: np.ndarray, roughness: float, nodes: int) -> np.ndarray:
-    """(3, P) at N·V (P,): ∫ D G2 F / (4 N·L N·V) N·L dL for F = 1 − (1 − V·H)⁵, (1 − V·H)⁵ and a dielectric's.
+    """Integrate ∫ D G2 F / (4 N·L N·V) N·L dL at N·V (P,), for F = 1 − (1 − V·H)⁵, (1 − V·H)⁵ and a dielectric's: (3, P).
 
-    Over the half vector's tangent, α tan ψ, in which D is smooth, and its azimuth, as far as L is above the horizon.
+    The variables are the half vector's tangent, α tan ψ, in which D is smooth, and its azimuth, as far as L is above the horizon.
     """
     at, weight = _gauss(nodes)
     alpha, s_v = roughness**2, np.sqrt(1 - n_v**2)
@@ -72,12 +74,12 @@ def one_bounce(n_v: np.ndarray, roughness: float, nodes: int) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def reflectance_table(size: int = 64, nodes: int = 16) -> Tensor:
-    """What is reflected of an even light, (size, size, 4), by the square roots of roughness (row) and N·V (column), each from 0
-    to 1: at small ones of both it changes fastest.
+    """Tabulate reflectance under uniform light: (size, size, 4), rows by √roughness, columns by √N·V, each from 0 to 1.
 
-    FG0 and FG1, of which F0·FG0 + FG1 is what one bounce gives with Schlick's Fresnel (Karis 2013); the mean of FG0 + FG1 over
-    the cosine-weighted hemisphere, which is the whole row's; what a dielectric reflects, with all its bounces. Between its
-    entries, where N·V and roughness are more than 0.02, linear interpolation is right to 0.001.
+    The square roots put more entries at small values, where reflectance changes fastest. The four channels: FG0 and FG1, where
+    F0·FG0 + FG1 is one bounce with Schlick's Fresnel (Karis 2013); the mean of FG0 + FG1 over the cosine-weighted hemisphere, equal along a
+    row; a dielectric's reflectance with multiple scattering. Linear interpolation errs by at most 0.001 where N·V and roughness
+    exceed 0.02.
     """
     root = np.linspace(0, 1, size)
     n_v = np.clip(root**2, LEAST_N_V, 1 - 1e-12)

@@ -1,4 +1,4 @@
-"""Colour by direction, of surfels."""
+"""Colour of surfels by viewing direction."""
 
 import ctypes
 
@@ -52,10 +52,11 @@ class _Directional(torch.autograd.Function):
 def directional(
     constant: Tensor, rest: Tensor, offset: float, positions: Tensor, camera: Camera, normals: Tensor | None = None
 ) -> Tensor:
-    """Colour (N, 3) = max(0, offset + Σ_k c_k Y_k(d)) of surfels at `positions` (N, 3). The coefficients of the harmonics in
-    `refgs.model.harmonics` are the `constant` (N, 1, 3) and the `rest` (N, K − 1, 3), K = (degree + 1)². d is the direction
-    from the camera; with unit `normals` (N, 3), it mirrored at the surfel (paper Eq. 10). float32; differentiable in the
-    coefficients alone.
+    """Evaluate colour (N, 3) = max(0, offset + Σ_k c_k Y_k(d)) of surfels at `positions` (N, 3).
+
+    The coefficients of the harmonics (`refgs.model.harmonics`) are `constant` (N, 1, 3) and `rest` (N, K − 1, 3), K = (degree + 1)². d is
+    the direction from the camera; with unit `normals` (N, 3) it is mirrored at the surfel (paper Eq. 10). float32; differentiable in
+    the coefficients alone.
     """
     count = len(positions)
     if constant.shape != (count, 1, 3) or rest.shape not in [(count, k - 1, 3) for k in (1, 4, 9, 16)]:

@@ -1,4 +1,4 @@
-"""Normals of surfels as a camera sees them."""
+"""Normals of surfels, turned towards a camera."""
 
 import ctypes
 
@@ -46,11 +46,12 @@ class _Facing(torch.autograd.Function):
 
 
 def facing_normals(rotations: Tensor, positions: Tensor, camera: Camera) -> Tensor:
-    """Unit normals (N, 3), from quaternions wxyz (N, 4) of any length and positions (N, 3), turned towards the camera where
-    they look well away from it. float32; differentiable in the rotations alone.
+    """Compute unit normals (N, 3) and turn those that clearly face away from the camera.
 
-    Not where they hardly do: on a closed surface those lie just past the horizon and show at the silhouette, where
-    turning them would point the blend anywhere. normals.cpp has the angle.
+    Takes quaternions wxyz (N, 4) of any length and positions (N, 3), float32; differentiable in the rotations alone.
+
+    Normals that face away only slightly stay. On a closed surface they lie just past the horizon and show at the silhouette; turning
+    them would scatter the blended normal. normals.cpp has the angle.
     """
     check(rotations=(rotations, (len(positions), 4)), positions=(positions, (len(positions), 3)))
     return _Facing.apply(rotations, positions.detach(), camera)

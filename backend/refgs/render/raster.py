@@ -1,4 +1,4 @@
-"""What the rasteriser of the CPU and that of CUDA cards have in common."""
+"""The part that the CPU's and CUDA's rasterisers share."""
 
 import ctypes
 
@@ -30,6 +30,6 @@ class Scene(Work):
         self.upper, self.lower = upper, lower
 
     def keep(self, **tensors: Tensor) -> None:
-        """Point at tensors, and have them live as long as this."""
+        """Attach tensors, and keep them alive as long as this object."""
         self.attach(**tensors)
         self.kept = getattr(self, "kept", {}) | tensors

@@ -7,16 +7,16 @@ import torch
 from refgs.kernels import cuda, load
 from refgs.render.raster import Scene
 
-SIZES = (4, 8, 12, 16, 20)  # channels that kernels are compiled for; other numbers are drawn by the next larger one
+SIZES = (4, 8, 12, 16, 20)  # channel counts that kernels are compiled for; others take the next larger one
 MOST = SIZES[-1]
 TILE, THREADS, PHASES = 16, 128, 8  # as in raster.cu
 PROJECTED = 128  # bytes of `struct Projected` of raster.h
 GEOMETRY = 16  # floats of a gradient row before its features, as there
-SHORT = 1 << 15  # tiles that 16 bits can number: they take half as long to sort
+SHORT = 1 << 15  # tiles that an int16 can number: such keys sort in half the time
 
 
 def how_many(ends: torch.Tensor) -> int:
-    """The last of some running sums: the one thing of a picture that the processor waits for, as it has to find the memory."""
+    """Read the last of some running sums. The CPU waits for the card here, once a picture, because it allocates by this number."""
     return int(ends[-1]) if len(ends) else 0
 
 

@@ -1,4 +1,4 @@
-"""Surfels to maps: the differentiable rasteriser."""
+"""The differentiable rasteriser: surfels to maps."""
 
 from typing import NamedTuple
 
@@ -14,10 +14,10 @@ from refgs.render.raster import Scene
 
 
 class Raster(NamedTuple):
-    """Sums over the splats of a pixel, front to back, with weights w = α Π (1 − α of those in front) (paper Eq. 5).
+    """Sums over the surfels of a pixel, front to back, with weights w = α Π (1 − α of those in front) (paper Eq. 5).
 
-    Premultiplied, without a background; divide by `alpha` for means. `depth` is along the camera's axis, at the ray–splat
-    intersection (paper Eq. 4), or the splat's centre where the screen-space filter draws it.
+    The maps are premultiplied and have no background; divide by `alpha` for means. `depth` is along the camera's axis: at the ray–surfel
+    intersection (paper Eq. 4), or at the surfel's centre where the low-pass filter draws it.
     """
 
     features: Tensor
@@ -26,7 +26,7 @@ class Raster(NamedTuple):
 
 
 def _draw(splats: dict[str, Tensor], camera: Camera, near: float, *trim: float) -> tuple[Scene, Raster]:
-    """What `rasterize` and `trimmed_depth` take; the maps, and the work that they came from, which points at all of them."""
+    """Draw splats, the arguments of `rasterize` or `trimmed_depth`; return the maps and the work, which points at all tensors."""
     features = splats["features"]
     rasteriser = raster_cuda if load.on_gpu(features) else raster_cpu
     work = rasteriser.Raster(splats=features.shape[0], channels=features.shape[1])
@@ -62,7 +62,10 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, by_features, by_depth, by_alpha):
-        work, saved = ctx.work, ctx.saved_tensors  # the latter also checks that nobody changed them
+        work, saved = (
+            ctx.work,
+            ctx.saved_tensors,
+        )  # reading saved_tensors also checks that nothing changed them in place
         upstream = {
             "by_features": by_features.contiguous(),
             "by_depth": by_depth.contiguous(),
@@ -89,16 +92,15 @@ def rasterize(
     camera: Camera,
     near: float,
 ) -> Raster:
-    """Blend surfels front to back (by their centres' depths) into maps of any number of features.
+    """Blend surfels front to back, sorted by their centres' depths, into maps (H, W, C), (H, W), (H, W).
 
-    `positions` (N, 3) in the world, `rotations` (N, 4) quaternions wxyz of any length, `scales` (N, 2) standard deviations
-    along the surfel's axes in world units, `opacities` (N,) in [0, 1], `features` (N, C); float32, all on the CPU or on one
-    CUDA card, differentiable in all five. Surfels whose centres are nearer than `near` (> 0, world units) are not drawn; of
-    the others, what the rays meet nearer than that is not. Returns maps (H, W, C), (H, W), (H, W).
+    `positions` (N, 3) in the world, `rotations` (N, 4) quaternions wxyz of any length, `scales` (N, 2) standard deviations along the
+    surfel's axes in world units, `opacities` (N,) in [0, 1], `features` (N, C). All are float32, on the CPU or on one CUDA card, and
+    differentiable. Surfels whose centres are nearer than `near` (> 0, world units) are skipped, as are intersections nearer than that.
 
-    The constants of the blending (alpha below 1/255 is nothing, alpha is at most 0.99, a pixel is finished at
-    transmittance 1e-4, screen-space filter of σ = √2/4 pixels, half of 2DGS's) are in kernels/splat.h. The result does not depend
-    on the number of threads, and a card's is the same each time.
+    kernels/splat.h has the constants of the blending: alpha below 1/255 is skipped, alpha is at most 0.99, a pixel is finished at
+    transmittance 1e-4, the low-pass filter has σ = √2/4 pixels, half of 2DGS's. The result does not depend on the number of threads, and
+    a card returns the same bits each time.
     """
     n, channels = features.shape[0], features.shape[1:2]
     load.check(
@@ -112,7 +114,7 @@ def rasterize(
         raise ValueError(f"images are at most 16,383 pixels wide and high, not {camera.width}×{camera.height}")
     if near <= 0:
         raise ValueError(f"near must be positive, got {near}")
-    # a card's kernels hold a pixel's channels in registers: of more than fit, some at a time
+    # A card's kernels hold a pixel's channels in registers: draw as many at a time as fit.
     parts = features.split(raster_cuda.MOST, dim=1) if load.on_gpu(features) else [features]
     maps = [_Rasterize.apply(positions, rotations, scales, opacities, part, camera, near) for part in parts]
     joined = maps[0][0] if len(maps) == 1 else torch.cat([features for features, *_ in maps], dim=-1)
@@ -130,12 +132,12 @@ def trimmed_depth(
     upper: float,
     lower: float,
 ) -> tuple[Tensor, Tensor]:
-    """Where surfels stop the rays (H, W), along the camera's axis, and their alpha (H, W); not differentiable.
+    """Compute the depth (H, W) of the surface along the camera's axis, and alpha (H, W); not differentiable.
 
-    A trimmed mean: the mean depth of what a ray meets while its transmittance falls from `upper` to `lower`, 1 ≥ upper > lower ≥ 0.
-    What is faint before the surface, and whatever shows through it, however far behind, has no part in it. It tends to the median
-    (2DGS's depth of unbounded scenes) as both near a half. Zero where the transmittance stays above `upper`.
-    Otherwise as `rasterize`.
+    The depth is a trimmed mean over the surfels that a ray meets while its transmittance falls from `upper` to `lower`, 1 ≥ upper >
+    lower ≥ 0. So neither faint surfels in front of the surface nor anything that shows through it counts. It tends to the median, 2DGS's
+    depth for unbounded scenes, as both near 0.5. It is 0 where the transmittance stays above `upper`. The other arguments are those of
+    `rasterize`.
     """
     splats = {"positions": positions, "rotations": rotations, "scales": scales, "opacities": opacities}
     splats = {name: value.contiguous() for name, value in splats.items()} | {

@@ -1,8 +1,8 @@
-"""Surfels under another light: what of it reaches each of them past the object, and what the object itself sends them.
+"""Light transport on the object under another light: shadows, and light that the object reflects onto itself.
 
-All surfels look in the same directions, each of which stands for its cell of the sphere, so that a small sun is in one of
-them, whole. These rays are traced once; each light then takes a few products. What a ray meets sends on what it reflects by
-the split sum: of light from afar, where that is what it mirrors, and of what was found a bounce before.
+All surfels trace rays in the same directions. Each direction stands for its cell of the sphere, so that a small sun falls into one
+of them, whole. Rays are traced once; each light then takes a few matrix products. The point that a ray hits reflects, by the split
+sum, the environment's light where its mirror direction is free, and the light of the bounce before.
 """
 
 import math
@@ -16,29 +16,29 @@ from torch import Tensor
 
 from refgs.geometry.mesh import smooth_normals
 from refgs.geometry.visibility import Occluder
-from refgs.kernels import reference
 from refgs.model import cubemap, harmonics, prefilter
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.render import reference
 
-DIRECTIONS = 1024  # of the whole sphere
+DIRECTIONS = 1024  # over the whole sphere
 BOUNCES = 4  # between the object's parts
 DEGREE = 3  # of harmonics
-PRIOR = 2.0  # rays that the object's mean radiance counts as, for surfels that see little of the object
-CONE = 0.3  # what roughness blurs a mirrored light as one of the directions does, which stands for a cell
-WHITE = 1.0  # as bright as on a screen: what is brighter harmonics would smear over all that a surfel sees
-ROUGHNESSES = 64  # for which a coat's dependence on the angle is known
-NEIGHBOURS = 8  # surfels that a point of the mesh is blended of
+PRIOR = 2.0  # weight, in rays, of the object's mean radiance, for surfels that see little of the object
+CONE = 0.3  # roughness whose lobe is as wide as a direction's cell
+WHITE = 1.0  # radiance is clamped here: harmonics would smear brighter light over the whole hemisphere
+ROUGHNESSES = 64  # entries of the table of a coat's transmission by angle
+NEIGHBOURS = 8  # surfels blended at a point of the mesh
 CHUNK = 512  # surfels at a time
-PROBES = 6000  # surfels that stand for all where irradiance alone is wanted
-PROBE_DIRECTIONS = 256  # that those look in
-MOST_RECEIVED = 4.0  # times what an unhidden surface would: where that is next to nothing
+PROBES = 6000  # surfels that are traced where only irradiance is needed; the others interpolate
+PROBE_DIRECTIONS = 256  # rays of each of these
+MOST_RECEIVED = 4.0  # upper bound of `received`, where the unoccluded irradiance is close to zero
 
 Progress = Callable[[int, int], None]
 
 
 def sphere(count: int) -> np.ndarray:
-    """Unit directions (count, 3) whose cells are about equal: a Fibonacci lattice (Swinbank and Purser 2006)."""
+    """Sample unit directions (count, 3) with about equal cells: a Fibonacci lattice (Swinbank and Purser 2006)."""
     z = 1 - (2 * np.arange(count) + 1) / count
     azimuth = np.pi * (3 - math.sqrt(5)) * np.arange(count)
     across = np.sqrt(1 - z * z)
@@ -50,26 +50,30 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def _mirror(directions, normals):
-    """Directions (P, 3) mirrored at surfaces with unit normals (P, 3)."""
+    """Mirror directions (P, 3) at surfaces with unit normals (P, 3)."""
     return directions - 2 * (directions * normals).sum(-1)[:, None] * normals
 
 
 def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
-    """What parts of the light from the mirrored direction and of irradiance / π (P, 3) materials (P, 3), (P,), (P,) send to
-    where `cosine` (P,) is that of the angle to the normal."""
+    """Reflectances (P, 3) of materials (P, 3), (P,), (P,): of the light from the mirror direction, and of irradiance / π.
+
+    `cosine` (P,) is that of the viewing direction to the normal.
+    """
     metal, dielectric = reference.reflectance(cosine, roughness, albedo)
     metallic = metallic[:, None]
     return metallic * metal + (1 - metallic) * dielectric, (1 - metallic) * (1 - dielectric) * albedo
 
 
 def _prefiltered(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor) -> Tensor:
-    """The light (P, 3) about unit directions (P, 3), as surfaces of these roughnesses (P,) mirror it; its levels by texel."""
+    """Look up prefiltered light (P, 3) at unit directions (P, 3) for roughnesses (P,). `levels` are in texel order."""
     return cubemap.sample(levels, sides, directions, torch.from_numpy(prefilter.level_of(roughness.numpy())).float())
 
 
 class Transport:
-    """What rays from surfels whose normals point outward meet, whatever the light. On the CPU. `progress` hears how many of
-    the surfels are done."""
+    """The hits of rays from surfels whose normals point outward; independent of the light. On the CPU.
+
+    `progress` is called with how many of the surfels are done.
+    """
 
     def __init__(
         self,
@@ -92,9 +96,9 @@ class Transport:
         degrees = torch.arange(DEGREE + 1)
         prior = torch.diag((degrees + 1.0).repeat_interleave(2 * degrees + 1) ** 2) * PRIOR * harmonics.DC**2
 
-        # H rays meet the mesh, in the surfels' order: where each surfel's begin; of each ray, the direction, the vertex next
-        # to what it meets, and whether light from afar reaches that, such as is mirrored to the surfel. Of each surfel, what
-        # takes sums of radiance times harmonics over its rays to the harmonics that fit best.
+        # H rays hit the mesh. They are kept in the surfels' order: `starts` says where each surfel's begin. Of each ray: its direction, the
+        # vertex nearest to the hit, and whether that vertex's mirror direction is free. Of each surfel: the matrix `fit` from sums of
+        # radiance times harmonics over its rays to the least-squares harmonics.
         counts, parts, fits = [torch.zeros(1, dtype=torch.int64)], [], []
         for start in range(0, len(points), CHUNK):
             at = slice(start, start + CHUNK)
@@ -115,11 +119,11 @@ class Transport:
         self.direction, self.vertex, self.free = (torch.cat(part) for part in zip(*parts, strict=True))
 
     def at_vertices(self, values: Tensor) -> Tensor:
-        """Values (N, C) of the surfels, blended at the mesh's vertices (V, C)."""
+        """Blend values (N, C) of the surfels at the mesh's vertices: (V, C)."""
         return torch.from_numpy(self._to_mesh @ values.numpy())
 
     def chunks(self):
-        """A slice of the surfels, that of their rays, and which surfel of the slice each ray is of."""
+        """Yield a slice of the surfels, the slice of their rays, and each ray's surfel within the slice."""
         for start in range(0, len(self.normals), CHUNK):
             end = min(start + CHUNK, len(self.normals))
             count = self.starts[start + 1 : end + 1] - self.starts[start:end]
@@ -128,22 +132,21 @@ class Transport:
 
 
 def _blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: np.ndarray) -> sparse.csr_matrix:
-    """Weights (P, N) of surfels at points (P, 3) of a surface with normals `outward` (P, 3)."""
+    """Compute weights (P, N) of surfels at points (P, 3) of a surface with normals `outward` (P, 3)."""
     positions = surfels.positions.double().numpy()
     near = min(NEIGHBOURS, len(positions))
     distance, at = cKDTree(positions).query(points, k=np.arange(1, near + 1))
     apart = distance / (surfels.scales.double().numpy().mean(axis=1)[at] + 1e-12)
     facing = np.einsum("pka,pa->pk", normals[at], outward).clip(0)
     weight = facing * surfels.opacities.numpy()[at] * np.exp(-0.5 * apart**2)
-    weight += 1e-5 / (1 + apart**2)  # where none reaches
+    weight += 1e-5 / (1 + apart**2)  # for points that no surfel covers
     weight /= weight.sum(axis=1, keepdims=True)
     rows = near * np.arange(len(points) + 1)
     return sparse.csr_matrix((weight.ravel().astype(np.float32), at.ravel(), rows), (len(points), len(positions)))
 
 
 def relit(t: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
-    """The surfels with their `sh` and `indirect` as they are under `light`, to be rendered with the occluder that was
-    traced and diffuse = "sh"."""
+    """Compute the surfels' `sh` and `indirect` under `light`. Render them with the occluder that was traced and diffuse = "sh"."""
     received, indirect = _gather(t, light, bounces)
     sh = _colour(t.surfels, t.normals, received)
     return t.surfels._replace(
@@ -152,8 +155,10 @@ def relit(t: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
 
 
 def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor:
-    """What of the irradiance of unhidden surfaces reaches the surfels past the object, and from the object itself, (N, 3). Their
-    normals may point either way. Traced from some of them, between which it is interpolated."""
+    """Compute the ratio (N, 3) of the irradiance that surfels receive, shadowed and lit by the object, to that of unoccluded surfaces.
+
+    Normals may point either way. Rays are traced from a subset of the surfels; the others interpolate.
+    """
     mesh, positions = occluder.mesh, surfels.positions.double().numpy()
     near = cKDTree(mesh.vertices).query(positions)[1]
     outward = smooth_normals(mesh.vertices, mesh.faces)[near]
@@ -170,15 +175,14 @@ def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor
 
 
 def _gather(t: Transport, light: Environment, bounces: int) -> tuple[Tensor, Tensor]:
-    """What surfels receive of the light and of each other: irradiance / π (N, 3); harmonics (N, 16, 3) of the radiance that
-    comes from the object."""
+    """Gather light over `bounces`: irradiance / π (N, 3), and harmonics (N, 16, 3) of the radiance that comes from the object."""
     past = _past_the_object(t, light)
     levels = cubemap.in_texel_order(light.levels, light.sides)
     firsts = [_first(t, rays, levels, light.sides) for _, rays, _ in t.chunks()]
     basis, count = harmonics.basis(t.directions, DEGREE), (t.starts[1:] - t.starts[:-1]).clamp_min(1)[:, None]
 
     def sums(received: Tensor, mean: Tensor, most: float) -> Tensor:
-        """Radiance up to `most` times harmonics, over each surfel's rays (N, 16, 3)."""
+        """Sum radiance, clamped at `most`, times harmonics over each surfel's rays: (N, 16, 3)."""
         there = t.at_vertices(torch.cat([received, mean], dim=1))
         of_surfels = []
         for (surfels, rays, surfel), (first, share, matte) in zip(t.chunks(), firsts, strict=True):
@@ -201,14 +205,14 @@ def _gather(t: Transport, light: Environment, bounces: int) -> tuple[Tensor, Ten
 
 
 def _first(t: Transport, rays: slice, levels: Tensor, sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Of what rays meet: the light from afar that it mirrors to the surfel (P, 3); the parts that it mirrors of other light, and
-    that it scatters of irradiance / π (P, 3)."""
+    """Shade the hits of rays (P, 3): the environment's light that they mirror to the surfel; their reflectances of other light that they
+    mirror, and of irradiance / π."""
     vertex, ray, free = t.vertex[rays], t.directions[t.direction[rays]], t.free[rays]
     albedo, metallic, roughness = t.material[vertex].split((3, 1, 1), dim=1)
     normals = torch.from_numpy(t.vertex_normals[vertex.numpy()]).float()
     share, matte = _split_sum(albedo, metallic[:, 0], roughness[:, 0], -(ray * normals).sum(dim=1))
     first = torch.zeros_like(share)
-    # Lobes that follow each other add up as Gaussians do; a lobe's width is roughness².
+    # Widths of successive lobes add as Gaussians' do: by their squares. A lobe's width is roughness².
     blurred = (roughness[free, 0] ** 4 + CONE**4) ** 0.25
     first[free] = share[free] * _prefiltered(levels, sides, _mirror(ray, normals)[free], blurred)
     share[free] = 0
@@ -216,7 +220,7 @@ def _first(t: Transport, rays: slice, levels: Tensor, sides: tuple[int, ...]) ->
 
 
 def _past_the_object(t: Transport, light: Environment) -> Tensor:
-    """Irradiance / π (N, 3) from afar: as it is without the object, times the part that is free."""
+    """Irradiance / π (N, 3) from the environment: unoccluded, times the part of it that the object does not block."""
     texels, area = cubemap.texel_directions(light.resolution), cubemap.texel_solid_angles(light.resolution)
     cell = torch.from_numpy(cKDTree(t.directions.numpy()).query(texels.numpy())[1])
     power = torch.zeros(len(t.directions), 3).index_add_(0, cell, light.radiance * area[:, None].float())
@@ -230,14 +234,14 @@ def _past_the_object(t: Transport, light: Environment) -> Tensor:
 
 
 def _colour(surfels: Surfels, normals: Tensor, received: Tensor) -> Tensor:
-    """Harmonics (N, 16, 3) of the colour of the surfels' diffuse part, as the renderer takes them.
+    """Compute harmonics (N, 16, 3) of the diffuse colour, as the renderer takes them.
 
-    A coat that mirrors lets less through at a grazing angle: that is a function of the angle to the normal alone, and so is
+    A coat transmits less at grazing angles. That depends on the angle to the normal alone, so it is a zonal function:
     Σ_m Y_lm(n) Y_lm(d) = (2l + 1) / 4π P_l(n·d).
     """
     size, degrees = ROUGHNESSES, torch.arange(4)
-    middle = (torch.arange(size).double() + 0.5) / size  # of cosines and of roughnesses
-    # d leads from the camera to the surfel
+    middle = (torch.arange(size).double() + 0.5) / size  # centres of the table's cells, in cosine and roughness
+    # d points from the camera to the surfel.
     legendre = torch.from_numpy(np.polynomial.legendre.legvander(-middle.numpy(), 3))
     coat = 1 - reference.table(middle.repeat(size), middle.repeat_interleave(size))[:, 3].view(size, size)
     zonal = torch.linalg.lstsq(legendre, coat.T).solution.T * 4 * math.pi / (2 * degrees + 1)

@@ -1,4 +1,4 @@
-"""Maps to a picture, or surfels to their colours: differentiable shading."""
+"""Differentiable shading: of blended maps, or of each surfel."""
 
 import ctypes
 from functools import lru_cache
@@ -16,15 +16,17 @@ from refgs.model import cubemap, prefilter
 from refgs.model.environment import Environment
 from refgs.render.brdf import reflectance_table
 
-CHANNELS = 11  # normal, albedo, metallic, roughness, position; before the position those that not every scene has
-INDIRECT = 6  # more of them with inter-reflection
-MATTE = 6  # where nothing is mirrored: normal and albedo
+CHANNELS = 11  # normal, albedo, metallic, roughness, position; optional channels come before the position
+INDIRECT = 6  # additional channels with inter-reflection
+MATTE = 6  # without specular shading: normal and albedo
 
 
 class Shaded(NamedTuple):
-    """A picture (H, W, 3), sRGB-encoded, over the background; and what it was made of: blended normals (H, W, 3), not
-    normalised, albedo, metallic and roughness (H, W, 5), linear radiance (H, W, 3) before the background: zero where
-    nothing is. Differentiable but for the radiance."""
+    """A picture (H, W, 3), sRGB-encoded, over the background, and its maps, zero where nothing is.
+
+    The maps are blended normals (H, W, 3), not normalised; albedo, metallic and roughness (H, W, 5); linear radiance (H, W, 3) before the
+    background, which is not differentiable.
+    """
 
     color: Tensor
     normal: Tensor
@@ -68,7 +70,7 @@ class _Work(Work):
 
     @classmethod
     def of(cls, features: Tensor, alpha: Tensor, camera: Camera) -> "_Work":
-        """The work of one picture, with what all of its kernels read."""
+        """Make the work of one picture, with the fields that all of its kernels read."""
         height, width, channels = features.shape
         work = cls(width=width, height=height, channels=channels, chunk_rows=max(32, -(-height // 16)))
         work.view[:] = camera.world_to_camera[:3].reshape(-1).tolist()
@@ -82,9 +84,11 @@ class _Work(Work):
 
 
 class _Padding(NamedTuple):
-    """Of cubemaps one after another, their faces padded by one: the texel under each cell, as a place in the order of orbits, and
-    the cells of each texel, int32: `cell` from starts[i] to starts[i + 1]. Where each level starts, in cells and in rows of
-    cells, and how many rows there are."""
+    """Index tables of stacked cubemaps whose faces are padded by one cell.
+
+    `texel` is the texel under each cell, in the order of orbits. The cells of texel i are `cell[starts[i]:starts[i + 1]]`, int32.
+    `first_cells` and `first_lines` say where each level starts, in cells and in rows of cells; there are `lines` rows.
+    """
 
     texel: Tensor
     starts: Tensor
@@ -182,8 +186,11 @@ class _Shade(torch.autograd.Function):
 
 
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
-    """Where `shade` looks for light (H, W, 3): the ways to the camera, mirrored at the blended normals; unit vectors in
-    world space, zero where nothing is. `features` and `alpha` as `shade` takes them beside a visibility; without gradients."""
+    """Compute the mirror directions (H, W, 3) in which `shade` looks up light: unit vectors in world space, zero where nothing is.
+
+    They are the directions to the camera, mirrored at the blended normals. `features` and `alpha` are those that `shade` takes with a
+    visibility. Without gradients.
+    """
     if features.shape != (*alpha.shape, CHANNELS + INDIRECT):
         raise ValueError(f"expected {CHANNELS + INDIRECT} features a pixel, got {tuple(features.shape)}")
     features, alpha = features.detach().contiguous(), alpha.detach().contiguous()
@@ -206,20 +213,25 @@ def shade(
     by_direction: bool = False,
     matte: bool = False,
 ) -> Shaded:
-    """Shade what the rasteriser blended by the split sum (paper Eq. 5–10), over a background (3,), sRGB-encoded.
+    """Shade blended maps by the split sum (paper Eq. 5–10), over a background (3,), sRGB-encoded.
 
-    `features` (H, W, C) are sums over a pixel's splats of, in this order: normal in world space, albedo, metallic,
-    roughness; with `by_direction`, three of colour by direction, which takes the place of integrated diffuse light (the paper's
-    substitute); where there is a `visibility` (H, W) in 0..1, three by which integrated diffuse light is multiplied, unless
-    colour by direction stands in their place, and three of radiance from the object itself, which gives way by the visibility
-    to the environment's (Eq. 9); position. `alpha` (H, W). The picture's radiance is multiplied by the
-    `exposure`, a scalar, before it is encoded; 1 where there is none. float32, all on the CPU or on one card, differentiable
-    in features, alpha, the light and the exposure. What the blend's mean position says of its bias towards the camera is
-    undone first: blended.h has how. With `display` light and materials are of a screen's numbers, and nothing is encoded. With
-    `mirror` the sharp light is mirrored, and metallic is its share (Ye et al., 3DGS-DR, 2024). What is `matte` mirrors nothing,
-    albedo times irradiance: its features are normal and albedo, and it is shaded as it was blended; the material that comes out has
-    metallic 0, roughness 1. The result does not depend on the number of threads, nor, on a card, does it differ from one call to the
-    next. Where a derivative to hand back is not finite, on a card none is a number.
+    `features` (H, W, C) are sums over a pixel's surfels, in this order:
+
+    - normal in world space, albedo, metallic, roughness;
+    - with `by_direction`, colour by direction (3), which replaces integrated diffuse light (the paper's substitute);
+    - with a `visibility` (H, W) in 0..1: the received part of the irradiance (3), unless colour by direction is there, and radiance from
+      the object itself (3), which replaces the environment's where the visibility is 0 (Eq. 9);
+    - position.
+
+    With `matte` they are normal and albedo alone. The picture is then albedo times irradiance, and its material has metallic 0,
+    roughness 1.
+
+    Radiance is multiplied by `exposure`, a scalar (default 1), before it is encoded. With `display`, light and materials are a screen's
+    numbers and nothing is encoded. With `mirror`, the sharp light is mirrored and metallic is its share (Ye et al., 3DGS-DR, 2024). The
+    blended normal's bias towards the camera is removed first, by the blended position: see blended.h.
+
+    All tensors are float32, on the CPU or on one card. Differentiable in features, alpha, the light and the exposure. The result does not
+    depend on the number of threads, and a card returns the same bits each time. On a card, if any derivative is not finite, all are NaN.
     """
     expected = MATTE if matte else CHANNELS + (3 * by_direction if visibility is None else INDIRECT)
     if features.shape != (*alpha.shape, expected):
@@ -230,11 +242,10 @@ def shade(
 
 
 def shade_splats(features: Tensor, environment: Environment, camera: Camera, mirror: bool = False) -> Tensor:
-    """What surfels send to a camera, (N, 3): the split sum of each, before they are blended (paper §3.3, the initial stage).
+    """Shade each surfel by the split sum before blending (paper §3.3, the initial stage): radiance (N, 3) to the camera.
 
-    `features` (N, C) are, in this order: normal in world space, albedo, metallic, roughness; three of colour by direction,
-    where that takes the place of integrated diffuse light; position. Of what mirrors nothing, normal and albedo alone.
-    Differentiable in features and the light.
+    `features` (N, C) are, in this order: normal in world space, albedo, metallic, roughness; colour by direction (3), where that replaces
+    integrated diffuse light; position. Without specular shading they are normal and albedo alone. Differentiable in features and light.
     """
     count, channels = features.shape
     if channels not in (MATTE, CHANNELS, CHANNELS + 3):

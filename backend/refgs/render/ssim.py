@@ -1,4 +1,4 @@
-"""The structural dissimilarity of two images."""
+"""Structural dissimilarity of two images."""
 
 import ctypes
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from refgs.kernels import cuda, load
 from refgs.kernels.load import Shared, Work, check, kernels, run
 
-TILE = 224, 6  # numbers of a row, and rows, that a block of ssim.cpp has on CUDA
+TILE = 224, 6  # floats of a row, and rows, of a CUDA block in ssim.cpp
 
 
 class _Work(Work):
@@ -25,11 +25,10 @@ class _Work(Work):
 
 @torch.no_grad()
 def dssim(image: Tensor, target: Tensor, weight: float = 1.0) -> tuple[Tensor, Tensor]:
-    """1 − mean SSIM (Wang et al. 2004) of two float32 images (H, W, 3) with values of about [0, 1], a scalar; and `weight`
-    times its derivative by `image`.
+    """Compute 1 − mean SSIM (Wang et al. 2004), a scalar, and `weight` times its derivative by `image`.
 
-    Each channel by itself, 11×11 Gaussian window with σ 1.5, C1 = 0.01², C2 = 0.03², zeros beyond the border, mean over all
-    pixels. Raises ValueError for other images.
+    Takes two float32 images (H, W, 3) in about [0, 1]. Each channel is compared by itself, with an 11×11 Gaussian window of σ 1.5, C1 =
+    0.01², C2 = 0.03² and zeros beyond the border; the mean is over all pixels. Raises ValueError for other shapes.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.numel() == 0:
         raise ValueError(f"expected images (H, W, 3), got {tuple(image.shape)}")

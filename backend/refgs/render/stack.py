@@ -1,4 +1,4 @@
-"""Features of surfels, side by side."""
+"""Concatenation of the surfels' features."""
 
 import ctypes
 from collections.abc import Sequence
@@ -59,6 +59,6 @@ class _Stack(torch.autograd.Function):
 
 
 def stack(parts: Sequence[Tensor]) -> Tensor:
-    """Up to eight float32 tensors of N rows, (N,) or (N, C), side by side: (N, ΣC). Differentiable."""
+    """Concatenate up to eight float32 tensors, (N,) or (N, C), into (N, ΣC). Differentiable."""
     check(**{f"part {i}": (part, (len(parts[0]), *part.shape[1:2])) for i, part in enumerate(parts)})
     return _Stack.apply(*parts)

@@ -1,8 +1,8 @@
-"""3D Gaussians through the rasteriser of surfels, for comparison with them (paper Tables 3 and 7).
+"""3D Gaussians, drawn by the rasteriser of surfels, to compare with (paper Tables 3 and 7).
 
 EWA splatting (Zwicker et al. 2001, as in Kerbl et al. 2023) projects a Gaussian's covariance by the projection's derivative at its
-centre. The picture of that is a disc's across the camera's axis, at the centre's depth: of such a disc the projection is
-affine, so the rasteriser draws it exactly.
+centre. A disc perpendicular to the camera's axis, at the centre's depth, has the same picture. Its projection is affine, so the
+rasteriser draws it exactly.
 """
 
 import torch
@@ -14,13 +14,13 @@ from refgs.camera import Camera
 from refgs.clock import timed
 from refgs.model.surfels import Surfels, axes
 
-SIDE = 1.3  # in half pictures: beyond that the projection's derivative is that of the border, or it would grow without bound
-# Turns that bring axis 0, 1 or 2 to the third place, as quaternions wxyz.
+SIDE = 1.3  # half pictures from the centre; the projection's derivative, which grows without bound, is clamped there
+# Quaternions wxyz of the rotations that move axis 0, 1 or 2 to the third place.
 TO_THIRD = ((0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1.0, 0.0, 0.0, 0.0))
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Of quaternions wxyz (..., 4): b first, then a."""
+    """Multiply quaternions wxyz (..., 4): rotate by b, then by a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(
@@ -35,7 +35,7 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def shortest_last(rotations: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
-    """The same Gaussians with their shortest axis, which is their normal, in the third place: quaternions (N, 4), (N, 3)."""
+    """Reorder the axes of Gaussians so that the shortest, their normal, is the third: quaternions (N, 4), scales (N, 3)."""
     shortest = scales.argmin(dim=1)
     turns = rotations.new_tensor(TO_THIRD)[shortest]
     order = (shortest[:, None] + torch.arange(1, 4, device=scales.device)) % 3
@@ -43,7 +43,7 @@ def shortest_last(rotations: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def with_normals_last(surfels: Surfels) -> Surfels:
-    """3D Gaussians with their normal as the third axis, where flat surfels have it; those as they are."""
+    """Reorder the axes of 3D Gaussians so that the normal is the third, as it is for surfels, which are returned unchanged."""
     if surfels.scales.shape[1] == 2:
         return surfels
     rotations, scales = shortest_last(surfels.rotations, surfels.scales)
@@ -52,7 +52,7 @@ def with_normals_last(surfels: Surfels) -> Surfels:
 
 @timed("surfels")
 class _Angle(torch.autograd.Function):
-    """Half the angle of (x, y). Round Gaussians have none, and feel no turn: no derivative there."""
+    """Half the angle of (x, y). Round Gaussians have no such angle: their derivative is damped to zero."""
 
     @staticmethod
     def forward(ctx, y, x, size):
@@ -68,7 +68,7 @@ class _Angle(torch.autograd.Function):
 
 
 def discs(surfels: Surfels, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """What `rasterize` takes of surfels' geometry: their own, or of 3D Gaussians that of discs with the same picture."""
+    """The first four arguments of `rasterize`: the geometry of surfels, or for 3D Gaussians that of discs with the same picture."""
     positions, rotations, scales, opacities, *_ = surfels
     if scales.shape[1] == 3:
         rotations, scales = across_the_axis(positions, rotations, scales, camera)
@@ -76,9 +76,9 @@ def discs(surfels: Surfels, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Ten
 
 
 def across_the_axis(positions: Tensor, rotations: Tensor, scales: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Discs with the pictures of Gaussians: quaternions wxyz (N, 4) and standard deviations (N, 2) in world units.
+    """Make discs that have the pictures of 3D Gaussians: quaternions wxyz (N, 4) and standard deviations (N, 2) in world units.
 
-    Of `positions` (N, 3), `rotations` (N, 4) of any length and `scales` (N, 3); differentiable in all three.
+    Takes `positions` (N, 3), `rotations` (N, 4) of any length and `scales` (N, 3); differentiable in all three.
     """
     columns = [axis.unbind(-1) for axis in axes(rotations)]
     view = camera.world_to_camera.tolist()
@@ -89,7 +89,7 @@ def across_the_axis(positions: Tensor, rotations: Tensor, scales: Tensor, camera
         max(camera.cy, camera.height - camera.cy) / camera.fy,
     )
     slope = [(p / depth).clamp(-SIDE * most, SIDE * most) for p, most in zip(point, (wide, high), strict=False)]
-    # How the three axes move along the camera's plane at that depth: the projection's derivative, times the depth.
+    # The three axes projected to the camera's plane: the projection's derivative, times the depth.
     moves = []
     for column, scale in zip(columns, scales.unbind(-1), strict=True):
         a = [scale * sum(view[i][j] * column[j] for j in range(3)) for i in range(3)]
@@ -105,6 +105,6 @@ def across_the_axis(positions: Tensor, rotations: Tensor, scales: Tensor, camera
 
 
 def _from_camera(camera: Camera) -> Tensor:
-    """The quaternion wxyz (4,) of the turn from the camera's axes to the world's."""
+    """The quaternion wxyz (4,) of the rotation from the camera's axes to the world's."""
     x, y, z, w = Rotation.from_matrix(camera.world_to_camera[:3, :3].T).as_quat()
     return torch.tensor([w, x, y, z])

@@ -1,1 +1,1 @@
-"""Figures, and the page that shows them."""
+"""Evaluation of runs, and the report page."""

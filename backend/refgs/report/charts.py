@@ -1,4 +1,4 @@
-"""The report's charts, as SVG that takes on the page's own text colour."""
+"""The report's charts, as SVG in the page's text colour."""
 
 import io
 from collections.abc import Iterator
@@ -12,10 +12,10 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from refgs.report.curves import Curve, front, knee
 
-INK = "#010203"  # stands for the page's text colour, light or dark
-ACROSS = 3  # charts
-LETTERS = 50  # of a legend, over one of them
-PARTS = {  # of a training's work, from the first on, and what they are called
+INK = "#010203"  # replaced by the page's text colour, light or dark
+ACROSS = 3  # charts in a row
+LETTERS = 50  # of the legend, per chart's width
+PARTS = {  # parts of a training's time and their titles, in the order of the bar
     "raster": "raster",
     "shading": "shading",
     "prefilter": "prefilter of the light",
@@ -37,7 +37,7 @@ PARTS = {  # of a training's work, from the first on, and what they are called
 
 @contextmanager
 def _drawing(width: float, height: float) -> Iterator[tuple[Figure, list[str]]]:
-    """A figure to draw into, and a list that gets its SVG when that is done."""
+    """Yield a figure to draw into, and a list that receives its SVG afterwards."""
     style = {"svg.fonttype": "none", "svg.hashsalt": "refgs", "font.family": "sans-serif", "font.size": 10}
     style |= dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK)
     made: list[str] = []
@@ -55,7 +55,7 @@ def _color(index: int) -> tuple[float, ...]:
 
 
 def error_chart(groups: list[list[Curve]], runs: list[str]) -> str:
-    """A chart for each quantity, its error against seconds of training, both axes logarithms; "" where there is nothing."""
+    """Draw a chart for each quantity: error against seconds of training, both logarithmic. Returns "" without groups."""
     if not groups:
         return ""
     rows, columns = -(-len(groups) // ACROSS), min(len(groups), ACROSS)
@@ -67,7 +67,7 @@ def error_chart(groups: list[list[Curve]], runs: list[str]) -> str:
         for axes in grid[len(groups) :]:
             axes.axis("off")
         handles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
-        handles = dict(sorted(handles.items(), key=lambda item: item[0] not in runs))  # they come first
+        handles = dict(sorted(handles.items(), key=lambda item: item[0] not in runs))  # runs come first
         figure.legend(handles.values(), handles, loc="outside upper left", ncols=beside, frameon=False, fontsize=9)
     return made[0]
 
@@ -88,7 +88,7 @@ def _errors(axes: Axes, curves: list[Curve], runs: list[str]) -> None:
     axes.set_title(curves[0].quantity.title, fontsize=10, loc="left")
     axes.grid(alpha=0.25, color=INK, lw=0.5)
     axes.spines[["top", "right"]].set_visible(False)
-    for axis in (axes.xaxis, axes.yaxis):  # plain numbers, also where there is less than a decade
+    for axis in (axes.xaxis, axes.yaxis):  # plain numbers, even within a decade
         low, high = axis.get_view_interval()
         axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high > 3 * low else range(1, 10)))
         axis.set_major_formatter("{x:g}")
@@ -96,7 +96,7 @@ def _errors(axes: Axes, curves: list[Curve], runs: list[str]) -> None:
 
 
 def parts_chart(parts: dict[str, dict[str, float]]) -> str:
-    """A bar for each run of how its seconds split by part; "" where that is not known."""
+    """Draw a bar for each run: its seconds by part. Returns "" if no run has them."""
     if not parts:
         return ""
     with _drawing(11.7, 0.9 + 0.42 * len(parts)) as (figure, made):

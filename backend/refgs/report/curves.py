@@ -1,6 +1,6 @@
-"""Error against run time: what a history says of it, and what follows.
+"""Curves of error against run time: Pareto fronts, knees, times to given errors.
 
-Errors are compared by their logarithms, and so are times: a tenth less counts the same wherever it is.
+Errors and times are compared by their logarithms, so that a 10 % change counts the same everywhere.
 """
 
 import csv
@@ -12,13 +12,15 @@ from matplotlib.ticker import MaxNLocator
 
 from refgs.report.figures import flatten, is_number
 
-LEVELS = 6  # errors that a table says the time to, about
-LEAST_KNEE = 0.1  # of the chord's height: what is less bent has no knee
+LEVELS = 6  # about so many errors have their times listed in a table
+LEAST_KNEE = 0.1  # of the chord's height; a curve that bends less has no knee
 
 
 class Quantity(NamedTuple):
-    """A key of history.jsonl, what its error is called, and that error, less being better. Peaks being 1, a PSNR in dB is −20 log₁₀ of
-    the root of the mean squared error."""
+    """A key of history.jsonl, the title of its error, and how to compute the error; less is better.
+
+    With a peak of 1, a PSNR in dB is −20 log₁₀ of the RMS error.
+    """
 
     key: str
     title: str
@@ -28,7 +30,7 @@ class Quantity(NamedTuple):
         return 10 ** (-value / 20) if self.decibels else value
 
     def text(self, error: float) -> str:
-        """An error in words, in decibels where those are what it is known by."""
+        """Format an error; in decibels if the quantity is a PSNR."""
         return f"{-20 * np.log10(error):.4g} dB" if self.decibels else f"{error:.3g}"
 
 
@@ -47,7 +49,7 @@ QUANTITIES = (
 
 
 class Curve(NamedTuple):
-    """Errors of a run against its seconds of training, ascending: (n,) each."""
+    """Errors of a run against its seconds of training, (n,) each, ascending in time."""
 
     run: str
     quantity: Quantity
@@ -57,7 +59,7 @@ class Curve(NamedTuple):
 
 
 def curve(run: str, history: list[dict], quantity: Quantity) -> Curve:
-    """What the lines of a history say of a quantity; lines without it, or with none that has a logarithm, are passed over."""
+    """Make the curve of a quantity from a history. Lines without the quantity, or without a logarithm of it, are skipped."""
     found = [
         (line.get("iteration", 0), line["seconds"], quantity.error(line[quantity.key]))
         for line in history
@@ -68,8 +70,10 @@ def curve(run: str, history: list[dict], quantity: Quantity) -> Curve:
 
 
 def front(curves: list[Curve]) -> list[np.ndarray]:
-    """Which points of each curve (n,) are on the Pareto front of them all: no other has a smaller error in as little time, nor as small an
-    error in less."""
+    """Mark the points of each curve (n,) that lie on the Pareto front of all curves.
+
+    No other point has a smaller error in the same time, or the same error in less time.
+    """
     seconds, errors = (np.concatenate([getattr(c, name) for c in curves]) for name in ("seconds", "errors"))
     order = np.lexsort((errors, seconds))
     best = np.minimum.accumulate(np.concatenate([[np.inf], errors[order]]))[:-1]
@@ -79,9 +83,11 @@ def front(curves: list[Curve]) -> list[np.ndarray]:
 
 
 def knee(found: Curve) -> int | None:
-    """The point from which on time brings the least more: that furthest below the chord from the first point to the best one, both axes
-    being logarithms brought to 0..1 (Kneedle, Satopää et al. 2011, of the best error so far, not smoothed). None where the curve has
-    fewer than five points, or bends by less than LEAST_KNEE: a power law is a straight line, and has no knee."""
+    """Find the knee of a curve, after which more time brings little (Kneedle, Satopää et al. 2011, without smoothing).
+
+    The knee is the point of the best error so far that lies furthest below the chord from the first point to the best; both axes are
+    logarithms scaled to 0..1. Returns None for fewer than five points, and for a bend below LEAST_KNEE: a power law is a straight line.
+    """
     if len(found.errors) < 5:
         return None
     x, y = np.log(found.seconds), np.log(np.minimum.accumulate(found.errors))
@@ -93,7 +99,7 @@ def knee(found: Curve) -> int | None:
 
 
 def time_to(found: Curve, error: float) -> float | None:
-    """Seconds to an error, by logarithms between the points about it; None where it was not reached."""
+    """Seconds until an error was reached, interpolated between logarithms; None if it was not reached."""
     reached = np.flatnonzero(found.errors <= error)
     if not len(reached):
         return None
@@ -105,7 +111,7 @@ def time_to(found: Curve, error: float) -> float | None:
 
 
 def levels(curves: list[Curve]) -> list[float]:
-    """A few round errors, in decibels where those are what it is known by, that the curves pass, the largest first."""
+    """Choose a few round errors that the curves pass, the largest first; round in decibels if the quantity is a PSNR."""
     quantity = curves[0].quantity
     worst, best = max(c.errors[0] for c in curves), min(c.errors.min() for c in curves)
     if best >= worst:
@@ -117,10 +123,10 @@ def levels(curves: list[Curve]) -> list[float]:
 
 
 def as_csv(histories: dict[str, list[dict]], groups: list[list[Curve]]) -> str:
-    """All that the charts and tables show: the columns run, iteration, seconds, quantity, value, mark.
+    """Write all that the charts and tables show as CSV: run, iteration, seconds, quantity, value, mark.
 
-    A line for each point of a curve, which is marked "front" and "knee", and for the seconds of each part; and for the times to given
-    errors, "reaches".
+    Each point of a curve has a row, with the marks "front" and "knee". So has the seconds of each part, and each time to a given error,
+    marked "reaches".
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

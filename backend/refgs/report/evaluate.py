@@ -1,4 +1,4 @@
-"""A run's figures: its views against photos, and what it recovered against ground truth where there is some."""
+"""Evaluation of a run: its views against photos, and its maps, light and mesh against ground truth."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -12,26 +12,27 @@ import torch
 from refgs.camera import Camera
 from refgs.capture import LoadedView, View, load_view
 from refgs.color import srgb_encode
-from refgs.export.environment import read_environment
-from refgs.export.mesh import read_glb
+from refgs.compare import metrics, surface
+from refgs.compare.pictures import as_bytes, composite, maps, over_white, picture, write_png
+from refgs.compare.truth import PASSES, GroundTruth, errors, known_maps
+from refgs.formats.gltf import read_glb
+from refgs.formats.panorama import read_environment
 from refgs.kernels import cuda
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.render.baselines import method_of
 from refgs.render.renderer import render
-from refgs.report import metrics, surface
-from refgs.report.pictures import as_bytes, composite, maps, over_white, picture, write_png
-from refgs.report.truth import PASSES, GroundTruth, errors, known_maps
 from refgs.run import Run
 
-PANORAMA = 256  # rows of the pictures of the light
-FRAMES = 20  # of which the speed is the median
+PANORAMA = 256  # rows of the light's pictures, at most
+FRAMES = 20  # timed; the speed is their median
 
 Step = Callable[[int, str, int], None]
-"""Called with how many are done, a few words, and of how many."""
+"""Called with the number done, a note, and the total."""
 
 
 def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None, step: Step) -> dict[str, Any]:
-    """Measure a run on views of its capture and against ground truth; write pictures/ of both. Returns the figures."""
+    """Measure a run on views of its capture and against ground truth. Writes pictures/ and returns the figures."""
     pictures, lit = run.folder / "pictures", run.environment is not None
     hdris = truth.hdris if truth and lit else []
     total, done, cameras = len(views) * (1 + 2 * len(hdris)), 0, []
@@ -69,18 +70,17 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
 def _view(
     run: Run, view: View, loaded: LoadedView, truth: GroundTruth | None, pictures: Path, with_lpips: bool
 ) -> dict[str, Any]:
-    """The figures of one view, and its pictures. Where no pass of it is in the ground truth, the normals that its data set
-    brings are the truth."""
+    """Measure one view and write its pictures. Without a pass in the ground truth, the data set's own normals are the truth."""
     camera, background = loaded.camera, np.array(run.settings.image.background, dtype=np.float32)
     rendering = run.render(camera)
     color = np.clip(rendering.color.numpy(), 0, 1)
-    if any(run.settings.region.size):  # the photo shows more than is wanted: only what the run covers of it is compared
+    if any(run.settings.region.size):  # compare only what the run covers: the photo shows more than the region
         shown = np.rint(255 * rendering.alpha.numpy()).astype(np.uint8)
         loaded = replace(loaded, alpha=shown if loaded.alpha is None else np.minimum(shown, loaded.alpha))
     photo = composite(loaded, torch.from_numpy(background)).numpy()
     figures = {measure.__name__: measure(color, photo) for measure in (metrics.psnr, metrics.ssim, metrics.flip)}
-    if run.exposed and run.settings.render.color_space == "linear":
-        # A held-out photo's exposure is not known: it is fitted, in linear radiance, for a second figure.
+    if run.exposed and not method_of(run.settings.render).light.display:
+        # A held-out photo's exposure is unknown: fit it, in linear radiance, for a second figure.
         exposure = metrics.fitted_exposure(rendering.radiance.numpy(), rendering.alpha.numpy(), photo)
         fitted = run.render(camera, exposure=exposure).color.numpy()
         figures["psnr_exposure_fitted"] = metrics.psnr(np.clip(fitted, 0, 1), photo)
@@ -107,7 +107,7 @@ def _view(
 
 
 def _light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dict[str, float]]:
-    """The recovered panorama's figures, and pictures of it and of the true one at one exposure."""
+    """Measure the recovered light, and write pictures of it and of the true light."""
 
     def write(name: str, panorama: np.ndarray) -> None:
         small = metrics.resized(panorama, min(PANORAMA, len(panorama)))
@@ -115,7 +115,9 @@ def _light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dic
 
     light = read_environment(run.folder / "environment.exr")
     write("environment", light)
-    if truth is None or not truth.has_light or run.settings.light.frame == "camera":  # the true light stands still
+    if (
+        truth is None or not truth.has_light or run.settings.light.frame == "camera"
+    ):  # the true light stands in the world
         return {}
     true = truth.panorama("light")
     write("environment_truth", true)
@@ -135,10 +137,12 @@ def _relit(
     pictures: Path,
     next_step: Callable[[str], None],
 ) -> dict[str, float]:
-    """The figures of views under another light, and pictures of both."""
+    """Measure views under another light, and write pictures of both."""
     light = run.light(truth.panorama(f"relight/{hdri}"))
 
-    def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:  # rendered again each time: so many pictures aren't kept
+    def pairs() -> Iterator[
+        tuple[np.ndarray, np.ndarray]
+    ]:  # renders anew at each pass: keeping all pictures takes too much memory
         for camera in cameras:
             image, true = maps(run.render(camera, light))["color"], truth.relit(hdri, camera)
             for kind, pixels in (("refgs", image), ("truth", true)):
@@ -150,13 +154,13 @@ def _relit(
 
 
 def _speed(run: Run, cameras: list[Camera]) -> dict[str, float | str]:
-    """Frames a second of the renderer on what there is to render with: the median frame's, each waited for."""
+    """Measure the renderer's frames a second, on the card if there is one. Each frame is waited for."""
     device = torch.device("cuda" if cuda.unusable() is None else "cpu")
     surfels = Surfels(*(value.to(device) for value in run.surfels()))
     light = run.environment and Environment(run.environment.radiance.to(device), run.environment.reference)
     background = torch.tensor(run.settings.image.background, device=device)
     seconds = []
-    for i in range(-2, FRAMES):  # the first ones are not counted
+    for i in range(-2, FRAMES):  # frames below 0 warm up
         started = time.perf_counter()
         with torch.no_grad():
             camera = cameras[i % len(cameras)]

@@ -1,4 +1,4 @@
-"""How figures are said, on the console and on the page."""
+"""Names and formats of figures, for the console and the page."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +13,7 @@ RELIT = {
 
 
 class Quantity(NamedTuple):
-    """A key of metrics.json, nested ones joined by dots; what it is; how its value is written; which way is better."""
+    """A key of metrics.json (nested keys joined by dots), its heading, its format, and which direction is better."""
 
     key: str
     heading: str
@@ -22,7 +22,7 @@ class Quantity(NamedTuple):
 
 
 def duration(seconds: float) -> str:
-    """A time in words."""
+    """Format a time."""
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
 
@@ -63,7 +63,7 @@ def is_number(value: object) -> bool:
 
 
 def flatten(values: object, prefix: str = "") -> Iterator[tuple[str, float]]:
-    """("a.b", number) for each finite number in nested dicts."""
+    """Yield ("a.b", number) for each finite number in nested dicts."""
     if isinstance(values, dict):
         for key, value in values.items():
             yield from flatten(value, f"{prefix}.{key}" if prefix else str(key))
@@ -72,13 +72,13 @@ def flatten(values: object, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 
 def in_words(metrics: dict, figures: list[Quantity]) -> list[str]:
-    """Those of the figures that there are, each with its name."""
+    """Format those of the figures that are known, each with its name."""
     known = dict(flatten(metrics))
     return [f"{heading} {text(known[key])}" for key, heading, text, _ in figures if key in known]
 
 
 def relit_pair(figures: dict[str, float], prefix: str) -> str:
-    """What is known of a picture under another light, e.g. of "relight.studio.mesh": raw / after one scale."""
+    """Format the figures of relit pictures, e.g. of "relight.studio.mesh": raw / after one scale."""
     parts = []
     for name, text in (("psnr", "{:.2f}"), ("flip", "{:.3f}")):
         found = [figures.get(f"{prefix}.{name}_{which}") for which in ("raw", "aligned")]
@@ -88,7 +88,7 @@ def relit_pair(figures: dict[str, float], prefix: str) -> str:
 
 
 def relit_in_words(metrics: dict) -> list[str]:
-    """A line for each light and what was lit."""
+    """Format a line for each light and each kind of asset that was lit."""
     known = dict(flatten(metrics))
     lit = [(hdri, kind) for hdri, kinds in metrics.get("relight", {}).items() for kind in kinds]
     return [

@@ -1,10 +1,10 @@
-"""What runs side by side are called: by what differs between them."""
+"""Labels of runs that are shown side by side: the settings in which they differ."""
 
 from collections import Counter, defaultdict
 from collections.abc import Hashable
 
 MOST = 4  # settings that a label names
-BY_NAME = {  # in this order; the other settings come after, under their own names
+BY_NAME = {  # in this order; other settings follow, under their own names
     "run.capture": "{}",
     "run.preset": "{}",
     "run.device": "{}",
@@ -18,10 +18,10 @@ BY_NAME = {  # in this order; the other settings come after, under their own nam
 
 
 def labels(names: list[str], facts: list[dict]) -> list[str]:
-    """A label for each run, no two alike, of its folder's name and the tables of its run.toml.
+    """Make a unique label for each run, from its folder's name and the tables of its run.toml.
 
-    What runs of one preset have alike is not named where another preset has it otherwise: the preset's name says it. Settings are named
-    without their section where no other has a setting of that name.
+    A setting that only differs between presets is not named: the preset's name says it. A setting is named without its section if no
+    other section has a setting of that name.
     """
     known = [_settings(tables) for tables in facts]
     groups = defaultdict(list)
@@ -48,9 +48,9 @@ def labels(names: list[str], facts: list[dict]) -> list[str]:
 
 
 def _settings(tables: dict) -> dict[str, Hashable]:
-    """By dotted names, what of run.toml may tell runs apart."""
+    """Collect the values of run.toml that can tell runs apart, by dotted names."""
     found = {f"run.{key}": value for key, value in tables.get("run", {}).items() if f"run.{key}" in BY_NAME}
-    for name in ("run.capture", "run.preset"):  # the last part of a path says enough
+    for name in ("run.capture", "run.preset"):  # only the last part of a path
         if name in found:
             found[name] = str(found[name]).replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
     for section, values in tables.get("settings", {}).items():

@@ -1,15 +1,15 @@
-"""The report: one HTML file that holds all it shows, for one run folder or several side by side.
+"""The report: one self-contained HTML file for one run folder, or several side by side.
 
-What is read of a run folder, each part left out where it is absent:
+Files that are read from a run folder; a section without its file is left out:
 
-    metrics.json     numbers, nested at will; those of `refgs.report.figures` are named, ambiguities.NAME.what are words, and
+    metrics.json     numbers, nested to any depth: the figures of `refgs.report.figures`, ambiguities.NAME.what (text),
                      relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}
     history.jsonl    one object a line: seconds, iteration, parts, and the quantities of `refgs.report.curves`
-    needs.json       a list of {"what", "why"}, and "saved", "cost", "needed" where they are known
-    run.toml         the settings, and what was trained on
-    pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png, and true_normal/VIEW.png … where it is known
+    needs.json       a list of {"what", "why"}, with "saved", "cost", "needed" if known
+    run.toml         the settings, and the capture's folder
+    pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png, and true_normal/VIEW.png … if known
     pictures/relight/{truth,refgs,splats,mesh}/HDRI_VIEW.png
-    pictures/environment.png, and environment_truth.png where the true light is known
+    pictures/environment.png, and environment_truth.png if the true light is known
 """
 
 import base64
@@ -25,12 +25,12 @@ import numpy as np
 
 from refgs import __version__
 from refgs.errors import InputError
+from refgs.formats import history
 from refgs.paths import whole
 from refgs.report.charts import PARTS, error_chart, parts_chart
 from refgs.report.curves import QUANTITIES, Curve, as_csv, curve, knee, levels, time_to
 from refgs.report.figures import DETAILS, HEADLINE, RELIT, Quantity, duration, flatten, is_number, relit_pair
 from refgs.report.labels import labels
-from refgs.train import history
 
 PASSES = {
     "photo": "photo",
@@ -45,12 +45,12 @@ PASSES = {
     "true_metallic": "true metallic",
 }
 MOST_VIEWS, MOST_RELIT = 4, 8
-LARGEST_SIDE = 512  # pixels; a page of full-size photos would be too heavy to open
+LARGEST_SIDE = 512  # pixels, so that the page stays small enough to open
 
 
 @dataclass
 class RunPage:
-    """What the page shows of one run. Its label is what it is called beside others."""
+    """The data of one run on the page. `label` names it beside other runs."""
 
     name: str
     label: str
@@ -68,8 +68,10 @@ class RunPage:
 
 
 def write_report(runs: list[Path], out: Path) -> None:
-    """Write the page of these run folders to `out`, and the figures of its charts beside it, as CSV; both are replaced. Raises InputError
-    where a folder isn't there."""
+    """Write the page of these run folders to `out`, and the charts' figures beside it as CSV. Both files are replaced.
+
+    Raises InputError for a folder that does not exist.
+    """
     pages = [_read_run(folder) for folder in runs]
     if len(pages) > 1:
         for page, label in zip(pages, labels([p.name for p in pages], [p.facts for p in pages]), strict=True):
@@ -154,20 +156,22 @@ def _read_run(folder: Path) -> RunPage:
 
 
 def _untold(metrics: dict) -> list[str]:
-    """What the photos do not tell, in words."""
+    """The explanations of what the photos cannot tell apart."""
     trades = metrics.get("ambiguities")
     known = trades.values() if isinstance(trades, dict) else ()
     return [facts["what"] for facts in known if isinstance(facts, dict) and "what" in facts]
 
 
 def _lines(text: str) -> list[dict]:
-    """The lines of history.jsonl that have a place on the axis of seconds."""
+    """The lines of history.jsonl that have seconds."""
     return [line for line in history.read(text) if is_number(line.get("seconds"))]
 
 
 def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[str, str]]:
-    """{name: {kind: data address}} of the pictures in folder/KIND/NAME.png: of the names that there are most kinds of, at
-    most so many, evenly chosen."""
+    """Embed the pictures folder/KIND/NAME.png: {name: {kind: data URL}}.
+
+    Only names with the most kinds are taken, and at most `most` of them, evenly chosen.
+    """
     count = Counter(path.stem for kind in kinds for path in folder.glob(f"{kind}/*.png"))
     names = sorted(name for name in count if count[name] == max(count.values()))
     if len(names) > most:
@@ -177,7 +181,7 @@ def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[
 
 
 def _embed(path: Path) -> str:
-    """The picture as a data address, made smaller if it is large; "" if there is none that can be read."""
+    """Embed a picture as a data URL, reduced if it is large; "" if it cannot be read."""
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.exists() else None
     if image is None:
         return ""
@@ -190,12 +194,12 @@ def _embed(path: Path) -> str:
 
 
 def _names(groups) -> list[str]:
-    """Every name once, in the order of the runs."""
+    """List every name once, in the order of the runs."""
     return list(dict.fromkeys(name for group in groups for name in group))
 
 
 def _columns(pages: list[RunPage], figures: list[Quantity]) -> list[dict]:
-    """The figures that some run has: heading, and for each run the text and whether it is the best of several."""
+    """Columns of the figures that any run has: the heading, and for each run the text and whether it is the best."""
     columns = []
     for key, heading, text, better in figures:
         values = [page.figures.get(key) for page in pages]
@@ -209,7 +213,7 @@ def _columns(pages: list[RunPage], figures: list[Quantity]) -> list[dict]:
 
 
 def _relit_table(pages: list[RunPage]) -> list[dict]:
-    """Rows of what was lit by an HDRI, and how well for each run."""
+    """Rows of the relit pictures' figures: a light and a kind of asset, with a cell for each run."""
     found = _names({key.rsplit(".", 1)[0] for key in sorted(page.figures) if _is_relit(key)} for page in pages)
     rows = []
     for prefix in sorted(found):
@@ -225,7 +229,7 @@ def _is_relit(key: str) -> bool:
 
 
 def _rest(pages: list[RunPage]) -> list[dict]:
-    """Every figure that no other table has."""
+    """Rows of the figures that no other table shows."""
     shown = {figure.key for figure in HEADLINE + DETAILS}
     keys = [key for key in _names(page.figures for page in pages) if key not in shown and not _is_relit(key)]
     texts = {key: [page.figures.get(key) for page in pages] for key in keys}
@@ -233,7 +237,7 @@ def _rest(pages: list[RunPage]) -> list[dict]:
 
 
 def _curves(pages: list[RunPage]) -> list[list[Curve]]:
-    """Of each quantity that some run has, the runs' curves."""
+    """Group the runs' curves by quantity."""
     groups = []
     for quantity in QUANTITIES:
         curves = [curve(page.label, page.history, quantity) for page in pages]
@@ -243,7 +247,7 @@ def _curves(pages: list[RunPage]) -> list[list[Curve]]:
 
 
 def _times(groups: list[list[Curve]]) -> list[dict]:
-    """A table for each quantity of the times to given errors, and of the knees, with a row for every run that has it."""
+    """A table for each quantity: times to given errors, and the knee, with a row for each run."""
     tables = []
     for curves in groups:
         quantity, errors = curves[0].quantity, levels(curves)
@@ -264,12 +268,12 @@ def _said(seconds: float | None) -> str:
 
 
 def _parts(page: RunPage) -> dict[str, float]:
-    """Seconds by part when the run was last looked at."""
+    """Seconds by part, from the last line of the history that has them."""
     return next((dict(flatten(line["parts"])) for line in reversed(page.history) if line.get("parts")), {})
 
 
 def _parts_table(parts: dict[str, dict[str, float]]) -> list[dict]:
-    """Rows of parts, each with seconds and part of the whole for every run."""
+    """Rows of parts: seconds and percentage for each run."""
     rows = []
     for name, title in PARTS.items():
         seconds = [spent.get(name, 0.0) for spent in parts.values()]

@@ -1,1 +1,1 @@
-"""From a capture to a run: the start, the losses, the loop, densification, checkpoints."""
+"""Train a capture into a run folder."""

@@ -1,4 +1,4 @@
-"""What photos do not tell: changes of light and materials that make up for one another in all of the pictures."""
+"""Ambiguities: changes of light and materials that cancel in all of the pictures, so that photos cannot tell them apart."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,14 +6,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from refgs.compare.pictures import composite
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
-from refgs.render.renderer import render
-from refgs.train.trainer import Trainer, composite
+from refgs.train.state import RenderInputs, State
 
 VIEWS = 6  # at the most
-SMALL = 0.02  # the part of a change that its derivative is taken over
-UNSEEN = 0.25  # of the error that the pictures have: a change that leaves less adds 6 % to its square
+SMALL = 0.02  # part of a change over which its derivative is taken
+UNSEEN = 0.25  # of the pictures' own error: a smaller change adds at most 6 % to its square
 
 Explanation = tuple[Surfels, Tensor]
 """Surfels, and radiance (6·R², 3)."""
@@ -29,7 +29,7 @@ def _redder(of: Explanation, size: float) -> Explanation:
 
 
 def _blurred(of: Explanation, size: float) -> Explanation:
-    """By so much of the way to a mean over neighbours on the face, a tenth of it or so about."""
+    """Blend this much of a mean over neighbours on the face into each texel; it reaches a sixteenth of the face's side."""
     side = round((len(of[1]) // 6) ** 0.5)
     faces = of[1].view(6, side, side, 3).permute(0, 3, 1, 2)
     reach = max(1, side // 16)
@@ -51,11 +51,11 @@ def _rougher(of: Explanation, size: float) -> Explanation:
 
 
 def _more_metal(of: Explanation, size: float) -> Explanation:
-    return of[0]._replace(metallic=of[0].metallic + size * (1 - 2 * of[0].metallic)), of[1]  # away from what it is
+    return of[0]._replace(metallic=of[0].metallic + size * (1 - 2 * of[0].metallic)), of[1]  # towards the other kind
 
 
 class Trade(NamedTuple):
-    """A change of such a size, in words, and another change that may make up for it."""
+    """A change of a size, in words, and another change that may cancel it."""
 
     words: str
     change: Change
@@ -72,23 +72,26 @@ TRADES = {
 }
 
 
-def ambiguities(trainer: Trainer) -> dict[str, dict]:
-    """Of each trade: by how much the pictures change, `alone`, and what is `left` of that where the other change makes up for it, as well
-    as that goes (root mean squares of encoded colours); `answer` is by how much that is; the pictures' own `error`; and `what` there
-    is to say, where less is left than a quarter of that, else none. Derivatives are taken by differences at the end of the training."""
-    light = trainer.environment()
+def ambiguities(state: State) -> dict[str, dict]:
+    """Measure each trade by differences at the end of the training; empty where nothing is lit.
+
+    `alone` is how far the pictures change; `left` is what remains where the other change cancels it as well as it can, with the size
+    `answer`; `error` is the pictures' own (all root mean squares of encoded colours). `what` is a line for the artist, present only where
+    less is left than UNSEEN of the error.
+    """
+    light = state.environment()
     if light is None:
         return {}
-    chosen = range(0, len(trainer.views), max(1, -(-len(trainer.views) // VIEWS)))
+    chosen = range(0, len(state.views), max(1, -(-len(state.views) // VIEWS)))
     with torch.no_grad():
-        now = trainer.surfels(), light.radiance
-        before = _pictures(trainer, now, chosen)
-        photos = torch.cat([composite(trainer.views[i], trainer.background).flatten() for i in chosen])
+        now = state.surfels(), light.radiance
+        before = _pictures(state, now, chosen)
+        photos = torch.cat([composite(state.views[i], state.background).flatten() for i in chosen])
         error = float((before - photos).square().mean().sqrt())
         found = {}
         for name, trade in TRADES.items():
-            alone = (_pictures(trainer, trade.change(now, SMALL * trade.size), chosen) - before) / SMALL
-            other = (_pictures(trainer, trade.made_up(now, SMALL), chosen) - before) / SMALL
+            alone = (_pictures(state, trade.change(now, SMALL * trade.size), chosen) - before) / SMALL
+            other = (_pictures(state, trade.made_up(now, SMALL), chosen) - before) / SMALL
             answer = -float((alone * other).sum() / other.square().sum().clamp_min(1e-20))
             left = float((alone + answer * other).square().mean().sqrt())
             facts = {"alone": float(alone.square().mean().sqrt()), "left": left, "answer": answer, "error": error}
@@ -98,13 +101,9 @@ def ambiguities(trainer: Trainer) -> dict[str, dict]:
     return found
 
 
-def _pictures(trainer: Trainer, of: Explanation, chosen: range) -> Tensor:
-    """What photos would be, all of their numbers side by side."""
-    reference, exposures = trainer.environment().reference, trainer.exposures
-    light, found = Environment(of[1].contiguous(), reference), []
-    for i in chosen:
-        exposure = None if exposures is None else exposures[i].exp()
-        settings = trainer.settings.render, trainer.near, trainer.occluder, exposure
-        picture = render(of[0], light, trainer.views[i].camera, trainer.background, *settings)
-        found.append(picture.color.clamp(0, 1).flatten())
-    return torch.cat(found)
+def _pictures(state: State, of: Explanation, chosen: range) -> Tensor:
+    """Render what the photos would be, flattened into one vector."""
+    light = Environment(of[1].contiguous(), state.environment().reference)
+    inputs = RenderInputs(of[0], light, state.settings.render, state.occluder)
+    pictures = (state.picture(inputs, state.views[i].camera, state.exposure(i)) for i in chosen)
+    return torch.cat([picture.color.clamp(0, 1).flatten() for picture in pictures])

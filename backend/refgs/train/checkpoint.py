@@ -1,4 +1,4 @@
-"""Checkpoints: safetensors for the tensors, TOML for the rest; the last two complete ones."""
+"""Checkpoint files: safetensors for the tensors, TOML for the rest; the last two complete ones are kept."""
 
 import errno
 import os
@@ -16,9 +16,9 @@ KEPT = 2
 
 
 def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
-    """Write a checkpoint of an iteration; it counts as complete once its TOML file is there.
+    """Write a checkpoint of an iteration. It is complete once its TOML file is there.
 
-    Raises InputError when the disk is full: the checkpoints before it stay whole.
+    Raises InputError when the disk is full: earlier checkpoints stay complete.
     """
     folder.mkdir(exist_ok=True)
     data, note = folder / f"{iteration:08d}.safetensors", folder / f"{iteration:08d}.toml"
@@ -34,7 +34,7 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
     except Exception as error:
         for file in temporary:
             file.unlink(missing_ok=True)
-        # safetensors wraps the system's error in its own and keeps only its text.
+        # safetensors wraps the system's error and keeps only its text.
         if (
             getattr(error, "errno", None) == errno.ENOSPC
             or "No space left" in str(error)
@@ -50,7 +50,7 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
 
 
 def complete(folder: Path) -> list[int]:
-    """Iterations of the complete checkpoints, ascending."""
+    """List the iterations of the complete checkpoints, ascending."""
     return sorted(
         int(file.stem)
         for file in folder.glob("*.toml")
@@ -59,7 +59,7 @@ def complete(folder: Path) -> list[int]:
 
 
 def load(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """The last complete checkpoint's tensors and facts. Raises InputError where there is none."""
+    """Read the last complete checkpoint's tensors and facts. Raises InputError where there is none."""
     iterations = complete(folder)
     if not iterations:
         raise InputError(f"{folder} holds no complete checkpoint: train without --resume into a new folder")

@@ -1,59 +1,63 @@
-"""Adding surfels where the picture asks for them, and removing those that nobody sees."""
+"""Densification: divide surfels where the picture asks for more, remove faint ones, reset opacities, propagate normals."""
 
-import ctypes
 import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from refgs.camera import Camera
-from refgs.clock import timed
-from refgs.kernels.load import Shared, Work, check, run
+from refgs.errors import InputError
+from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters, activate, axes
 from refgs.settings import DensifySettings, PropagationSettings, RateSettings
-from refgs.train.adam import Adam
+from refgs.train.start import AROUND
+from refgs.train.state import State
 
 RESET = 0.01  # opacity
+SEEN = 0.2  # opacity from which on surfels explain a picture: nothing is decided, and no mesh is made, of fainter ones
+FEWER = 0.8  # of the surfels, where there is no memory for all
+LEAST_SURFELS = 1000
 
 
-class _Work(Work):
-    """`struct Motion` of motion.cpp."""
-
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        *((n, ctypes.c_void_p) for n in ("positions", "gradients")),
-        ("view", ctypes.c_double * 12),
-        ("accepted", ctypes.c_void_p),
-        ("scale", ctypes.c_double),
-        *((n, ctypes.c_void_p) for n in ("total", "views", "scratch")),
-        ("shared", Shared),
-    )
+def faint_now(state: State, opacity: float = SEEN) -> bool:
+    """Tell whether an opacity reset is too recent for surfels to be back at an opacity."""
+    return faint(state.settings.densify, state.settings.rates, state.iteration, state.total, opacity)
 
 
-class ScreenGradient:
-    """Mean gradient of the loss by a surfel's motion on the screen, in half image widths (as 3D Gaussian splatting counts it)."""
+def densify_due(state: State, progress: float) -> None:
+    """Remove and divide surfels at the iterations that are due for it."""
+    settings, budget = state.settings.densify, state.settings.surfels.budget
+    if state.iteration % settings.every or progress < settings.start or faint_now(state, settings.prune_opacity):
+        return
+    gradient = state.motion.mean()
+    if state.capture.box is not None:  # surfels beside the region get no more than their share of the budget
+        wanted = state.wanted()
+        ranked = torch.where(wanted, torch.inf, gradient).argsort(descending=True)
+        count = int(wanted.sum())
+        room = max(int(AROUND * budget) - (len(wanted) - count), 0)
+        gradient[ranked[count + room :]] = 0
+    with state.clock.part("densification"):
+        densify(state.parameters, state.optimizer, gradient, settings, budget, divide=progress < settings.stop)
+    state.reset_motion()
 
-    def __init__(self, count: int, device: torch.device):
-        self.total = torch.zeros(count, device=device)
-        self.views = torch.zeros(count, device=device)
 
-    @timed("densification")
-    @torch.no_grad()
-    def add(self, position: Tensor, gradient: Tensor, camera: Camera, accepted: Tensor | None = None) -> None:
-        """Account for one view's gradient (N, 3) by the world position (N, 3), unless `accepted`, a float32 scalar, is zero."""
-        surfels = len(self.total)
-        check(total=(self.total, (surfels,)), position=(position, (surfels, 3)), gradient=(gradient, (surfels, 3)))
-        position, gradient, work = position.contiguous(), gradient.contiguous(), _Work(count=len(position))
-        work.view[:], work.scale = camera.world_to_camera[:3].reshape(-1).tolist(), camera.width / 2 / camera.fx
-        work.attach(positions=position, gradients=gradient, total=self.total, views=self.views)
-        if accepted is not None:
-            work.attach(accepted=accepted)
-        run("refgs_motion", work, position, items=work.count)
+def since_propagation(state: State) -> int | None:
+    """Count the iterations since normals were last propagated; None before the first time and after the last."""
+    settings, iteration = state.settings.propagation, state.iteration
+    if not settings.every or iteration < settings.every or not state.method.lit:
+        return None
+    last = iteration // settings.every * settings.every
+    return iteration - last if last / state.total < settings.stop else None
 
-    def mean(self) -> Tensor:
-        """(N,), zero where a surfel was never seen."""
-        return self.total / self.views.clamp_min(1)
+
+def reshape_due(state: State) -> None:
+    """Propagate normals or reset opacities at the iterations that are due for it."""
+    settings, iteration = state.settings.densify, state.iteration
+    if since_propagation(state) == 0:
+        with state.clock.part("densification"):
+            propagate_normals(state.constant | state.parameters, state.optimizer, state.settings.propagation)
+    elif settings.reset_every and iteration % settings.reset_every == 0 and iteration / state.total < settings.stop:
+        reset_opacity(state.parameters, state.optimizer)
 
 
 @torch.no_grad()
@@ -65,13 +69,13 @@ def densify(
     budget: int,
     divide: bool,
 ) -> int:
-    """Remove faint surfels; divide those with the largest screen gradient in two along their longer axis, up to the budget.
+    """Remove faint surfels; divide those with the largest screen gradients in two along their longer axis, up to the budget.
 
-    Parameters are replaced in the dictionary and in the optimiser; the moments of the survivors are kept, those of the
-    new ones are zero. Returns how many were divided. At least one surfel is kept.
+    Parameters are replaced in the dictionary and in the optimiser. Survivors keep their moments, new surfels start without.
+    Returns how many were divided. At least one surfel is kept.
     """
     opacity = parameters["opacity"].sigmoid()
-    keep = ~(opacity < settings.prune_opacity)  # one that is no number is guard.py's to remove, and to say so
+    keep = ~(opacity < settings.prune_opacity)  # NaN is kept here: guard.py removes it, with a warning
     if not keep.any():
         keep[opacity.argmax()] = True
     chosen = torch.zeros(0, dtype=torch.long, device=keep.device)
@@ -93,16 +97,19 @@ def densify(
 
 @torch.no_grad()
 def reset_opacity(parameters: Parameters, optimizer: Adam) -> None:
-    """Make all surfels faint: those that the picture needs come back, the others are removed later (Kerbl et al. 2023)."""
+    """Reset all opacities: surfels that the picture needs come back, the others are removed later (Kerbl et al. 2023)."""
     parameters["opacity"].clamp_(max=math.log(RESET / (1 - RESET)))
     optimizer.state.pop(parameters["opacity"], None)
 
 
 def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total: int, opacity: float) -> bool:
-    """Whether surfels were made faint so lately that, with opacity's rate, those that the picture needs may not be back at an `opacity`.
-    Adam moves a logit by about its rate, which decays, in an iteration that sees the surfel; they get four times as long as that takes."""
+    """Tell whether the last opacity reset is too recent for needed surfels to be back at an `opacity`.
+
+    Adam moves a logit by about its rate, which decays, in each iteration that sees the surfel. Surfels get four times as long as
+    that takes.
+    """
     every = settings.reset_every
-    last = min(iteration, math.ceil(settings.stop * total)) - 1  # not what is done at the end of this iteration
+    last = min(iteration, math.ceil(settings.stop * total)) - 1  # a reset at the end of this iteration does not count
     if not every or last < every:
         return False
     since, decay = last // every * every, rates.decay
@@ -117,8 +124,11 @@ def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total:
 
 @torch.no_grad()
 def propagate_normals(parameters: Parameters, optimizer: Adam, settings: PropagationSettings) -> None:
-    """Have what mirrors grow over what surrounds it, all of it being opaque (paper §3.3). The surfels in front then lend their
-    normals to the pixels around, and the others give way or follow."""
+    """Propagate normals from mirrors to their surroundings (paper §3.3).
+
+    All surfels become opaque and mirrors grow. Surfels in front then lend their normals to the pixels around; those behind give way
+    or follow.
+    """
     parameters["opacity"].clamp_(min=math.log(settings.opacity / (1 - settings.opacity)))
     optimizer.state.pop(parameters["opacity"], None)
     surfels = activate(parameters)
@@ -132,11 +142,31 @@ def thin(parameters: Parameters, optimizer: Adam, count: int) -> None:
     take(parameters, optimizer, parameters["opacity"].topk(count).indices.sort().values)
 
 
+def full_card() -> InputError:
+    """Say what helps where a card's memory is too small."""
+    return InputError("the card's memory is too small: close what else uses it, or take --device cpu")
+
+
+def fewer_surfels(state: State) -> None:
+    """Lower the budget and keep the most opaque surfels. Raises InputError where too few would be left."""
+    budget = int(FEWER * len(state.parameters["position"]))
+    if budget < LEAST_SURFELS:
+        raise full_card()
+    state.forget_gradients()
+    torch.cuda.empty_cache()
+    state.change("surfels.budget", budget, "memory", "the card's memory is full")
+    thin(state.parameters, state.optimizer, budget)
+    state.reset_motion()
+    state.report("warning", {"what": f"the card's memory is full: going on with {budget:,} surfels at the most"})
+
+
 def take(parameters: Parameters, optimizer: Adam, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
-    """Replace the surfels by those of an index, with their moments; those at `fresh` begin without. Adam's steps of these are then
-    several times its rate for a while, which sets the picture back at first but finds them their places: a capture without masks
-    ends better for it. All of them or, where there is no memory for that, none."""
-    groups = [group for group in optimizer.param_groups if group["name"] in parameters]  # not the light
+    """Replace the surfels by those of an index, with their moments; rows at `fresh` start with zero moments.
+
+    Adam then moves fresh rows by several times its rate for a while. The picture gets worse at first, but surfels find their places:
+    captures without masks end better. Where memory does not suffice, nothing is replaced.
+    """
+    groups = [group for group in optimizer.param_groups if group["name"] in parameters]  # without light and exposures
     made = []
     for group in groups:
         old = group["params"][0]
@@ -154,7 +184,7 @@ def take(parameters: Parameters, optimizer: Adam, index: Tensor, fresh: Sequence
 
 
 def _divide(parameters: Parameters, first: Tensor, second: Tensor) -> None:
-    """Move two copies apart along the longer axis, so that together they cover what the one did."""
+    """Move two copies of a surfel apart along its longer axis, so that together they cover what it did."""
     scale = parameters["scale"][first]
     longer = scale.argmax(dim=1)
     rows = torch.arange(len(first), device=first.device)

@@ -1,26 +1,28 @@
-"""A training that is given nothing but a time: its settings as far from `quick` to `standard`, and on, as fits into it."""
+"""Fit settings to a time: as far from `quick` to `standard`, and beyond, as fits into it."""
 
 import math
 from pathlib import Path
 
 from refgs.capture import Capture
 from refgs.settings import RATES, Settings, load_settings, validate
+from refgs.train.effective import Effective
 from refgs.train.plan import END, END_A_VIEW, OTHERS, Plan, growth, iterations_time
-from refgs.train.trainer import Report, Trainer
+from refgs.train.state import Report
+from refgs.train.trainer import Trainer
 
-WARM, REHEARSED = 5, 25  # iterations, from the first to the second of which the pace is taken
+WARM, REHEARSED = 5, 25  # iterations: the pace is that from the first to the second
 BY_PIXELS = 0.8  # an iteration's time grows as the photos' pixels do, to this power: 0.7 to 0.9 on three captures
-SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")  # they go with the iterations
+SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")  # scaled with the iterations
 FASTEST = 2.0  # times a preset's rates
-STEPS, MOST = 64, 2.0  # in which settings are looked for from quick on, how far: standard is one
+STEPS, MOST = 64, 2.0  # steps in which settings richer than quick are tried, and how far: standard is at one
 
 
 def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, device: str, report: Report) -> Trainer:
-    """What trains a capture into a run folder in the time of a `plan`. Between the presets, and as far beyond `standard`, every number
-    goes by their ratio; with less time than `quick` takes, or more than that, there are fewer iterations or more.
+    """Make a trainer of a capture whose settings fit the time of a `plan`.
 
-    The pace is that of a rehearsal, some iterations by `quick`, which take a few seconds of the time. Where nothing but their number is
-    to be another, these are the first ones.
+    Between the presets, and as far again beyond `standard`, every number is interpolated geometrically. With less time than `quick` takes,
+    or more than the richest settings do, the number of iterations changes. The pace is measured by a rehearsal, some iterations by `quick`.
+    Where only their number changes, the rehearsal's iterations are the training's first.
     """
     quick, standard = (load_settings(preset, changes) for preset in ("quick", "standard"))
     begun, said = plan.spent, []
@@ -28,25 +30,25 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
     started = plan.spent
     marks = []
     for _ in range(REHEARSED):
-        float(trainer.iterate()["loss"])  # a card is waited for
+        float(trainer.iterate()["loss"])  # waits for a card
         marks.append(plan.spent)
     pace = (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM)
-    views, first = len(capture.train_views) + len(capture.test_views), len(trainer.parameters["position"])
+    views, first = len(capture.train_views) + len(capture.test_views), len(trainer.state.parameters["position"])
     pixels = _pixels(capture, quick)
 
     def iterations(settings: Settings) -> float:
-        """How many of these fit."""
+        """Count the iterations by these settings that fit."""
         larger = _pixels(capture, settings) / pixels
-        start = (
-            settings.surfels.start if first == quick.surfels.start else first
-        )  # there may be fewer points to start from
+        # There may be fewer points to start from than the settings ask for.
+        start = settings.surfels.start if first == quick.surfels.start else first
         one = pace * (OTHERS + start) / (OTHERS + first) * larger**BY_PIXELS
         left = 60 * plan.minutes - plan.spent
         if settings is not quick:
-            left -= (started - begun) * larger  # they have a start of their own
+            left -= (started - begun) * larger  # for another start
         more = growth(start, settings.surfels.budget)
         return (left / one - more * (END_A_VIEW * views + END)) / iterations_time(more, 1.0)
 
+    why = f"{plan.minutes:g} minutes were given"
     found, count = quick, iterations(quick)
     for step in range(1, STEPS + 1):
         richer = between(quick, standard, MOST * step / STEPS)
@@ -55,16 +57,18 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
             break
         found, count = richer, fit
     if found is quick:
-        trainer.report = report
+        state = trainer.state
+        state.report = report
         for event in said:
             report(*event)
-        trainer.settings = _scheduled(trainer.settings, max(count, 1.0) + REHEARSED, quick.train.iterations)
-        trainer.total = trainer.settings.train.iterations
+        settings = _scheduled(state.settings, max(count, 1.0) + REHEARSED, quick.train.iterations)
+        state.effective = state.effective.moved_to(settings, "plan", why)
+        state.total = settings.train.iterations
     else:
-        del trainer  # before there is another, for its memory
+        del trainer  # first, for its memory
         settings = _scheduled(found, count, min(count, standard.train.iterations))
-        trainer = Trainer(capture, settings, folder, report, plan, device)
-    settings = trainer.settings
+        trainer = Trainer(capture, Effective.of(quick).moved_to(settings, "plan", why), folder, report, plan, device)
+    settings = trainer.state.settings
     found = f"{settings.train.iterations:,} iterations, {settings.surfels.budget:,} surfels at most"
     what = f"planned for {plan.minutes:g} minutes: about {found}, photos of {settings.image.max_side} pixels at most"
     report("stage", {"what": what})
@@ -72,7 +76,7 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
 
 
 def between(quick: Settings, standard: Settings, part: float) -> Settings:
-    """Settings so much of the way from the one to the other, or beyond; the light's texels, a power of two along a side, the fewer."""
+    """Interpolate two presets geometrically, or extrapolate; the cubemap's side is rounded down to a power of two."""
     tables, ends = quick.model_dump(), standard.model_dump()
     for section, values in tables.items():
         for name, value in values.items():
@@ -84,8 +88,10 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
 
 
 def _scheduled(settings: Settings, iterations: float, usual: float) -> Settings:
-    """So many iterations, and what is done at some of them as much apart. With more than are `usual`, or fewer, rates go by the inverse
-    root of how many: what is chance in all those steps, each of one view, then adds up to as much."""
+    """Scale a schedule to a number of iterations, and the rates by the inverse root of their ratio to the `usual` number.
+
+    The steps' noise, each being of one view, then adds up to the same.
+    """
     tables, part = settings.model_dump(), iterations / settings.train.iterations
     for section, name in (("train", "iterations"), *SCHEDULE):
         tables[section][name] = max(1, round(part * tables[section][name]))

@@ -1,47 +1,108 @@
-"""What is known of the light before training: whether it stood still or turned with the camera, as the photos tell; and which part of
-it the object can show."""
+"""The light as it learns: its resolution, diffusion between texels, and the mean that is held grey."""
 
-import cv2
-import numpy as np
+import math
+
 import torch
 from torch import Tensor
 
 from refgs.camera import Camera
-from refgs.capture import LoadedView
-from refgs.color import srgb_decode
-from refgs.geometry.project import inside, project, sample
-from refgs.model import cubemap, harmonics
-from refgs.model.environment import Environment, turn_between
+from refgs.clock import timed
+from refgs.model import cubemap
+from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.render.channels import channels
 from refgs.render.rasterize import rasterize
-from refgs.render.renderer import channels
 from refgs.render.shade import mirror_directions
 from refgs.render.stack import stack
 from refgs.render.volume import discs
-from refgs.settings import RenderSettings
+from refgs.settings import RenderSettings, Settings
+from refgs.train.state import State
 
-SIDE = 96  # pixels: finer than this the hull is not the object
-POINTS = 2000
-FACING = 0.3  # cosine to the camera above which a point is looked at
-BEHIND = 0.1  # scene radii behind the foremost point at which a point is hidden
-DEGREE = 3  # of the harmonics
-DARK = 0.01  # radiance beside which less is as good as black
-FOLDS = 4
-FEWEST = 3  # photos of a point from which its own brightness is known
-RIDGE = 1e-4
-SWEEPS = 4
+REFINED = 0.2  # part of the training after which the light has all its texels
+LEAST = 16  # texels along a side
+DIFFUSED = (
+    64  # texels along a side at which `environment.diffusion` holds; it reaches as far on the sphere at other sides
+)
+VIEWS = 24  # that say which part of the light the object mirrors
 PART = 16  # texels along a side of the cubemap that says which directions are mirrored
 SOLID = 0.5  # alpha
-LESS = 0.95  # of the error under a light that stands still, below which it turns: where in doubt, it stands
+
+
+def start_value(state: State) -> float:
+    """Raw value of a texel at the start."""
+    return state.method.light.raw(state.settings.environment.radiance)
+
+
+def resolution(settings: Settings, progress: float) -> int:
+    """Texels along a side: half of them at first, for each is then seen more often and learns sooner."""
+    finest = settings.environment.resolution
+    return finest if progress >= REFINED else max(finest // 2, LEAST)
+
+
+@torch.no_grad()
+def refine_due(state: State, progress: float) -> None:
+    """Double the texels along a side when it is time."""
+    if not state.method.lit or len(state.light) >= 6 * resolution(state.settings, progress) ** 2:
+        return
+    side = math.isqrt(len(state.light) // 6)
+    directions = cubemap.texel_directions(2 * side).float()
+    finer = cubemap.sample(state.light.cpu(), (side,), directions, torch.zeros(len(directions)))
+    _replace(state, finer.to(state.device))
+
+
+@torch.no_grad()
+def coarsen(state: State, side: int) -> None:
+    """Keep means of the texels, so many along a side."""
+    fine = math.isqrt(len(state.light) // 6) // side
+    _replace(state, state.light.view(6, side, fine, side, fine, 3).mean(dim=(2, 4)).reshape(-1, 3))
+
+
+def _replace(state: State, texels: Tensor) -> None:
+    state.optimizer.state.pop(state.light, None)
+    state.light = texels.requires_grad_()
+    state.group("environment")["params"] = [state.light]
+
+
+@timed("optimiser")
+@torch.no_grad()
+def diffuse(state: State) -> None:
+    """Let texels flow into their neighbours on the face, in proportion to the light's rate.
+
+    As decoupled weight decay does (Loshchilov and Hutter 2019), it acts beside the optimiser's step. Texels that photos agree on move
+    by the whole rate and stay sharp; texels that only noise moves even out. The mean stays.
+    """
+    side = math.isqrt(len(state.light) // 6)
+    rate = state.group("environment")["lr"]
+    part = min(rate * state.settings.environment.diffusion * (side / DIFFUSED) ** 2, 0.25)
+    if part == 0:
+        return
+    texels = state.light.view(6, side, side, 3)
+    for axis in (1, 2):
+        flow = part * texels.diff(dim=axis)
+        texels.narrow(axis, 0, side - 1).add_(flow)
+        texels.narrow(axis, 1, side - 1).sub_(flow)
+
+
+def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
+    """Average the light (3,) over what the object mirrors of it; None where the objective does not hold it grey."""
+    if light is None or state.settings.loss.light == 0:
+        return None
+    if state.light_shown is None or len(state.light_shown) != len(light.radiance):
+        cameras = state.spread_cameras(VIEWS)
+        with torch.no_grad():
+            state.light_shown = mirrored(state.surfels(), cameras, light, state.settings.render, state.near)
+    return state.light_shown @ light.radiance
 
 
 def mirrored(
     surfels: Surfels, cameras: list[Camera], light: Environment, settings: RenderSettings, near: float
 ) -> Tensor:
-    """Which part of the light is seen mirrored by some camera: weights of its texels (6·R²,), their solid angles there and zero
-    elsewhere, that sum to one. Where nothing is seen all of it counts."""
+    """Weigh the light's texels (6·R²,) by their solid angles where a camera sees them mirrored; zero elsewhere.
+
+    The weights sum to one. All texels count where none is seen.
+    """
     seen = torch.zeros(6 * PART * PART, dtype=torch.bool)
-    settings = settings.model_copy(update={"reflection": "microfacet"})  # where a matte surface would, if it were not
+    settings = settings.model_copy(update={"reflection": "microfacet"})  # treat matte surfaces as reflective here
     for camera in cameras:
         lit = stack(channels(surfels, camera, settings, indirect=True))
         features, _, alpha = rasterize(*discs(surfels, camera), lit, camera, near=near)
@@ -54,105 +115,7 @@ def mirrored(
 
 
 def _cells(directions: Tensor) -> Tensor:
-    """Which texels of a cubemap of PART texels along a side directions (P, 3) lie in."""
+    """Find the texels of a cubemap, PART along a side, that directions (P, 3) lie in."""
     face, s, t = cubemap.face_coordinates(directions)
     column, row = (((x + 1) / 2 * PART).long().clamp(0, PART - 1) for x in (s, t))
     return (face * PART + row) * PART + column
-
-
-def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple[str, str]:
-    """ "world" or "camera", and why: from points (N, 3) on an object's visual hull, their normals, and the photos.
-
-    A point's brightness is its own times what the light makes of it. Under a light in the world that changes from photo to
-    photo by the mirror direction alone; under one that turns with the camera, by normal and mirror direction in its frame. Its
-    logarithm is fitted by smooth functions of those, harmonics, by a number a point and by one a photo, its exposure, in three
-    quarters of the photos, and foretold in the others but for their exposure: whichever light foretells them better it was.
-    Seconds; no chance in it.
-    """
-    points, photos, brightness, still, turning = _observations(views, positions, normals, radius)
-    if len(np.unique(photos)) < 2 * FOLDS or len(points) < 100:
-        return "world", "there are too few photos to tell"
-    alone = np.zeros((len(points), 0))
-    around, world, camera = (_unforeseen(brightness, x, points, photos) for x in (alone, still, turning))
-    if around < 1e-6:
-        return "world", "all photos are alike"
-    told = [f"{max(0.0, 1 - error / around):.0%}" for error in (world, camera)]
-    why = (
-        f"of how the object's brightness changes from photo to photo, a light that stands still explains {told[0]}, one that "
-        f"turns with the camera {told[1]}"
-    )
-    return ("camera" if camera < LESS**2 * world else "world"), why
-
-
-def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple:
-    """What was seen of the points: which point and which photo (M,), the logarithm of its radiance (M,), and what that may
-    depend on under either light (M, K)."""
-    some = np.arange(0, len(positions), max(1, len(positions) // POINTS))
-    coarse = int(np.clip(0.75 * np.sqrt(len(positions)), 16, SIDE))  # so that points leave no holes to see through
-    reference, rows = views[0].camera, []
-    for number, view in enumerate(views):
-        camera = view.camera.fitted(SIDE)
-        shown = cv2.resize(view.image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        radiance = srgb_decode(shown.astype(np.float32) / 255).mean(axis=-1)
-        ahead, behind = _in_front(camera.fitted(coarse), positions, some)
-        towards = camera.position - positions[some]
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        cosine = (normals[some] * towards).sum(axis=1)
-        seen = np.flatnonzero(ahead & (cosine > FACING) & (behind < BEHIND * radius))
-        normal = normals[some][seen]
-        mirrored = 2 * cosine[seen, None] * normal - towards[seen]
-        turn = turn_between(camera, reference)
-        pixels = project(camera, positions[some][seen])[0]
-        rows.append(
-            (
-                seen,
-                np.full(len(seen), number),
-                np.log(sample(radiance, pixels, clamp=True).astype(np.float64) + DARK),
-                _harmonics(mirrored),
-                np.concatenate([_harmonics(normal @ turn.T), _harmonics(mirrored @ turn.T)], axis=1),
-            )
-        )
-    return tuple(np.concatenate(column) for column in zip(*rows, strict=True))
-
-
-def _in_front(camera: Camera, positions: np.ndarray, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which of some points are in the picture, and how far each is behind the foremost there."""
-    pixels, depth = project(camera, positions)
-    ahead = inside(camera, pixels, depth)
-    limits = camera.height - 1, camera.width - 1
-    row, column = (np.clip(np.nan_to_num(pixels[:, i]), 0, limits[1 - i]).astype(int) for i in (1, 0))
-    foremost = np.full((camera.height, camera.width), np.inf, np.float32)
-    np.minimum.at(foremost, (row[ahead], column[ahead]), depth[ahead])
-    foremost = cv2.erode(foremost, np.ones((3, 3)))
-    return ahead[some], (depth - foremost[row, column])[some]
-
-
-def _harmonics(directions: np.ndarray) -> np.ndarray:
-    return harmonics.basis(torch.from_numpy(directions.astype(np.float64)), DEGREE)[:, 1:].numpy()
-
-
-def _unforeseen(values: np.ndarray, terms: np.ndarray, points: np.ndarray, photos: np.ndarray) -> float:
-    """Mean squared error of values (M,) in photos that a fit by terms (M, K) and a number a point and a photo has not seen."""
-    total = count = 0
-    for fold in range(FOLDS):
-        known = photos % FOLDS != fold
-        often = np.bincount(points[known], minlength=points.max() + 1) >= FEWEST
-        asked = ~known & often[points]
-        columns = np.column_stack([values, terms])
-        of_photo = np.zeros((photos.max() + 1, columns.shape[1]))
-        for _ in range(SWEEPS):  # what points and photos account for alone, one after the other
-            of_point = _means(columns[known] - of_photo[photos[known]], points[known], points.max() + 1)
-            of_photo = _means(columns[known] - of_point[points[known]], photos[known], photos.max() + 1)
-        columns = columns - of_point[points] - of_photo[photos]  # of those asked for that is nothing yet
-        y, x = columns[:, 0], columns[:, 1:]
-        normal = x[known].T @ x[known] + RIDGE * known.sum() * np.eye(x.shape[1])
-        error = (y - x @ np.linalg.solve(normal, x[known].T @ y[known]))[asked]
-        error -= _means(error[:, None], photos[asked], photos.max() + 1)[photos[asked], 0]
-        total, count = total + float(error @ error), count + len(error)
-    return total / max(count, 1)
-
-
-def _means(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
-    """Of rows (M, K) that belong to a group (M,): (groups, K), zero where nothing does."""
-    sums = np.stack([np.bincount(group, column, groups) for column in values.T], axis=1)
-    return sums / np.maximum(np.bincount(group, minlength=groups), 1)[:, None]

@@ -22,8 +22,10 @@ SUMS = 3  # of a row or a block: of the loss, of the pixels with a surface, of s
 
 
 class Photo(NamedTuple):
-    """What a view's rendering should look like: `image` (H, W, 3) uint8, sRGB-encoded, and its `mask` (H, W) uint8, or None,
-    where training is. They may be a part of a photo of the size `whole` (H, W), the rest of which is background."""
+    """Photo of a view on the training's device: `image` (H, W, 3) uint8, sRGB-encoded, and `mask` (H, W) uint8 or None.
+
+    They may be a crop of a photo of the size `whole` (H, W), which is background beyond the crop.
+    """
 
     image: Tensor
     mask: Tensor | None
@@ -36,7 +38,7 @@ class Photo(NamedTuple):
         return cls(torch.from_numpy(view.image).to(device), mask, view.camera)
 
     def part(self, rows: slice, columns: slice) -> "Photo":
-        """These rows and columns of it."""
+        """Crop to these rows and columns."""
         image = self.image[rows, columns].contiguous()
         mask = None if self.mask is None else self.mask[rows, columns].contiguous()
         camera = self.camera.cropped(columns.start, rows.start, image.shape[1], image.shape[0])
@@ -44,8 +46,10 @@ class Photo(NamedTuple):
 
 
 class Objective(NamedTuple):
-    """The training loss of a view, a differentiable scalar; and the mean squared error of the picture, clipped to 0..1. Means are over the
-    whole photo, where what is beyond the part of it that is compared is right."""
+    """Training loss of a view, a differentiable scalar, and mean squared error of the picture, clipped to 0..1.
+
+    Means are over the full photo; pixels outside the crop count as error-free.
+    """
 
     loss: Tensor
     square: Tensor
@@ -75,7 +79,7 @@ class _Work(Work):
 
 @timed("loss")
 class _Objective(torch.autograd.Function):
-    """The derivatives are had with the value."""
+    """Objective as an autograd function. Derivatives are computed with the value."""
 
     DIFFERENTIABLE = "color", "normal", "depth", "alpha", "material", "light"
 
@@ -148,15 +152,17 @@ class _Objective(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, by_loss, _):
-        one = not load.on_gpu(by_loss) and by_loss == 1  # nearly always, but a card would have to wait to know
+        one = not load.on_gpu(by_loss) and by_loss == 1  # nearly always; on a card, reading it would wait
         scaled = ctx.gradients if one else [None if g is None else by_loss * g for g in ctx.gradients]
         return *scaled, None, None, None, None
 
 
 def departure(exposure: Tensor) -> Tensor:
-    """What it costs a photo to have an exposure, the natural logarithm given, other than one: its magnitude, rounded off below
-    2 %. Nothing tells a brighter light from longer exposures, so one of them has to be held: by magnitudes, unlike by squares, a
-    few photos that differ do not move the rest."""
+    """Penalise an exposure other than one, given its natural logarithm: its magnitude, rounded off below 2 %.
+
+    Photos cannot tell a brighter light from longer exposures, so one of them must be held. Magnitudes, unlike squares, let a few photos
+    differ without moving the rest.
+    """
     return torch.sqrt(exposure * exposure + ROUND_OFF**2) - ROUND_OFF
 
 
@@ -168,26 +174,23 @@ def objective(
     weights: LossSettings,
     progress: float,
 ) -> Objective:
-    """What training lowers, of one view, at a progress of 0..1.
+    """Compute the objective of one view, at a progress of 0..1. Its terms, each with a weight in `weights`:
 
-    Colour: (1 − λ) L1 + λ D-SSIM on sRGB, against the photo over the background. The rendering is clipped only where the
-    photo is: elsewhere an over-bright pixel must feel its gradient. Normals: 1 − ÑᵀN, Ñ from the depth by central
-    differences, where the surface is opaque around the pixel. Smoothness: ‖∇N‖ exp(−‖∇C_gt‖), forward differences, where
-    the surface is opaque; with a weight of its own, of metallic and roughness too, which no photo tells where all that is mirrored
-    there is even. The mask: |α − mask|.
-
-    The light: squared departure from grey of its mean radiance (3,), where one is given. Warm metal under a neutral light and
-    neutral metal under a warm light look almost alike; without a word for one of them, white balance drifts between the two. Only
-    the mean is held: the light's colours may differ by direction. It is to be the mean over what is seen mirrored, for the rest would
-    take on whatever colour the mean lacks.
-
-    And m (1 − m) of the metallic m, over the object: nothing real is half a metal. Where the metallic is decided, the
-    highlights of dielectrics, 4 % of the light and without colour, fix the light's scale and white balance, which metals
-    alone cannot. Not before it is known which is which, hence with the square of the progress. From the start, though, m of what
-    is darker than any metal, by how much it is: a metal of 4 % would mirror as dark glass does.
-
-    And the roughness, by how much it is above 0.3, over the object: where photos are clipped, or show nothing bright, a broad lobe
-    explains all that a sharp one does, and forgives wrong normals.
+    - Colour: (1 − λ) L1 + λ D-SSIM on sRGB, against the photo over the background. The rendering is clipped only where the photo is
+      clipped: elsewhere an over-bright pixel must feel its gradient.
+    - Normals: 1 − ÑᵀN, Ñ from the depth by central differences, where the surface is opaque around the pixel.
+    - Smoothness: ‖∇N‖ exp(−‖∇C_gt‖), forward differences, where the surface is opaque. Metallic and roughness have a weight of their
+      own: no photo tells them where all that is mirrored is even.
+    - Mask: |α − mask|.
+    - Light: squared departure from grey of its mean radiance (3,), where `light` is given. Warm metal under neutral light looks almost like
+      neutral metal under warm light: without this term white balance drifts. Only the mean is held, so that colours may differ by
+      direction. It must be the mean over what is seen mirrored: unseen texels would take on whatever colour the mean lacks.
+    - Metallic m: m (1 − m) over the object, for nothing real is half a metal. Dielectrics' highlights, 4 % of the light and colourless,
+      then fix the light's scale and white balance, which metals cannot. The weight grows with the square of the progress, for at first
+      it is not known which is which.
+    - Dark metals: m of what is darker than any metal, by how much it is, from the start. A metal of 4 % would mirror as dark glass does.
+    - Roughness: by how much it exceeds 0.3, over the object. Where photos are clipped, or show nothing bright, a broad lobe explains as
+      much as a sharp one, and forgives wrong normals.
     """
     material = rendering.material if max(weights.metallic, weights.even, weights.matte) > 0 else None
     maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material

@@ -1,30 +1,32 @@
-"""A look at a training while it runs."""
+"""Preview of a training while it runs."""
 
 import numpy as np
 import torch
 
-from refgs.export.splats import write_splats
+from refgs.compare.pictures import color_picture, write_png
+from refgs.formats.splats import write_splats
 from refgs.model.surfels import to_splats
 from refgs.render.volume import with_normals_last
-from refgs.report.pictures import color_picture, write_png
-from refgs.train.trainer import Trainer
+from refgs.train.state import State
 
 FOLDER = "preview"  # in the run folder
 
 
-def write_preview(trainer: Trainer) -> dict[str, str | int]:
-    """Write RUN/preview/view.png, a view as it is rendered now, and RUN/preview/splats.ply, the surfels as they are, each whole or not
-    at all. Returns their names, and the iteration that they are of."""
-    folder = trainer.folder / FOLDER
-    view = (trainer.test or trainer.views)[0]
+def write_preview(state: State) -> dict[str, str | int]:
+    """Write RUN/preview/view.png, a view as it is rendered now, and RUN/preview/splats.ply, each whole or not at all.
+
+    Returns their paths, and the iteration.
+    """
+    folder = state.folder / FOLDER
+    view = (state.test or state.views)[0]
     with torch.no_grad():
-        wanted = trainer.wanted()
-        surfels = trainer.surfels().chosen(wanted if wanted.any() else ~wanted)  # all, where the region is empty by now
-        rendering = trainer.render(view.camera, surfels)
-        write_png(folder / "view.png", color_picture(rendering, np.array(trainer.settings.image.background)))
+        wanted = state.wanted()
+        surfels = state.surfels().chosen(wanted if wanted.any() else ~wanted)  # all, where the region is empty by now
+        rendering = state.render(view.camera, surfels)
+        write_png(folder / "view.png", color_picture(rendering, np.array(state.settings.image.background)))
         write_splats(folder / "splats.ply", to_splats(with_normals_last(surfels)))
     return {
-        "iteration": trainer.iteration,
+        "iteration": state.iteration,
         "view": str((folder / "view.png").resolve()),
         "splats": str((folder / "splats.ply").resolve()),
     }

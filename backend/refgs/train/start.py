@@ -12,13 +12,16 @@ from refgs.model.surfels import Parameters, initial_parameters
 from refgs.settings import Settings, SurfelSettings
 
 GEOMETRY = ("position", "rotation", "scale", "opacity")
-FAINT = 0.1  # opacity, at the most, of points that may lie anywhere
-AROUND = 0.5  # part of the surfels, at the most, that show what is beside the region that is wanted
+FAINT = 0.1  # opacity at the most, of points that may not lie on the surface
+AROUND = 0.5  # part of the surfels, at the most, that lie outside the region
 
 
 def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings) -> tuple[Parameters, int, str]:
-    """Initial parameters; how many of the surfels, the first ones, lie on what is known of the surface; and one line that says where they
-    came from. Those that follow start inside the visual hull, where it has hollows that no mask shows."""
+    """Make the initial parameters.
+
+    Returns with them how many of the surfels, the first ones, lie on the known surface, and a line that says where all came from. The
+    others start inside the visual hull, for hollows that no mask shows.
+    """
     count, seed = min(settings.surfels.start, settings.surfels.budget), settings.train.seed
     colours, opacity, shown = None, settings.surfels.opacity, count
     if all(view.alpha is not None for view in views):
@@ -39,7 +42,7 @@ def start_parameters(capture: Capture, views: list[LoadedView], settings: Settin
 
 
 def start_appearance(settings: Settings) -> Parameters:
-    """Colour and material as they start, one row for all surfels; without gradients."""
+    """Make the initial colour and material, one row for all surfels, without gradients."""
     one = _initial(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.ones(1), None, settings.surfels, 0.5)
     return {name: value.detach() for name, value in one.items() if name not in GEOMETRY}
 
@@ -60,7 +63,7 @@ def _initial(positions, normals, spacing, colours, surfels: SurfelSettings, opac
 
 
 def _hull(capture: Capture, views: list[LoadedView], count: int, settings: Settings):
-    """On the visual hull of the masks and inside it: positions, normals, spacing; how many are on it, which come first."""
+    """Place points on the masks' visual hull and inside it. Returns positions, normals, spacing, and how many are on it: the first."""
     alphas, cameras = [view.alpha for view in views], [view.camera for view in views]
     surfels, seed = settings.surfels, settings.train.seed
 
@@ -93,8 +96,10 @@ def _hull(capture: Capture, views: list[LoadedView], count: int, settings: Setti
 def _in_and_around(
     box: Box, near: np.ndarray, around: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which of the points `near` (N, 3) lie in the box, and which of those `around` (M, 3) do not: so many in all at the most, at random,
-    and AROUND of that of the latter. Raises InputError where none is in the box."""
+    """Choose at random points `near` (N, 3) that lie in the box and points `around` (M, 3) that do not.
+
+    Returns their indices, at most `count` in all, of which AROUND are outside. Raises InputError where none is in the box.
+    """
     rng = np.random.default_rng(seed)
     inner, outer = np.flatnonzero(box.contains(near)), np.flatnonzero(~box.contains(around))
     if len(inner) == 0:
@@ -104,7 +109,7 @@ def _in_and_around(
 
 
 def _has_points(capture: Capture) -> bool:
-    """Whether there are enough points from structure from motion, of what is wanted, to start from."""
+    """Tell whether structure from motion found enough points in the region to start from."""
     if capture.points is None:
         return False
     return len(capture.points if capture.box is None else capture.points[capture.box.contains(capture.points)]) >= 100
@@ -120,8 +125,10 @@ def _thinned(capture: Capture, count: int, seed: int):
 
 
 def _random(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """Uniform in the ball of interest; where the capture is a room, half of them beyond it, uniform in inverse distance. Where a box is
-    wanted, uniform in that, and beyond it in the same way."""
+    """Place points at random: uniform in the ball of interest, or in the region where there is one.
+
+    In a room, or around a region, a part lies beyond, uniform in inverse distance.
+    """
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -139,14 +146,14 @@ def _random(capture: Capture, count: int, seed: int) -> np.ndarray:
 
 
 def _towards_cameras(positions: np.ndarray, views: list[LoadedView]) -> np.ndarray:
-    """Unit vectors (N, 3) from each point to the nearest camera: a surface that was seen faces someone."""
+    """Point unit vectors (N, 3) from each point to the nearest camera: a surface that was seen faces a camera."""
     cameras = np.stack([view.camera.position for view in views])
     towards = cameras[cKDTree(cameras).query(positions)[1]] - positions
     return towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
 
 
 def _spacing(positions: np.ndarray) -> np.ndarray:
-    """Mean distance (N,) to the three nearest neighbours."""
+    """Compute the mean distance (N,) to the three nearest neighbours."""
     k = min(4, len(positions))
     distance = cKDTree(positions).query(positions, k=k)[0][:, 1:] if k > 1 else np.ones((len(positions), 1))
     return np.maximum(distance.mean(axis=1), 1e-7)

@@ -1,0 +1,1 @@
+"""Metrics, pictures and ground truth: errors of renderings, light and meshes."""

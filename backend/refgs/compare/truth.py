@@ -1,0 +1,112 @@
+"""Ground truth of a capture, and errors of renderings against it."""
+
+from pathlib import Path
+
+import numpy as np
+
+from refgs.camera import Camera
+from refgs.capture import View, published_normals
+from refgs.capture.poses import split_similarity
+from refgs.compare import metrics
+from refgs.errors import InputError
+from refgs.formats.exr import read_exr
+from refgs.formats.mesh import Mesh, read_mesh
+from refgs.formats.panorama import directions, read_environment, sample
+
+FOLDER = "ground_truth"  # in a capture that has its own
+PASSES = ("normal", "albedo", "roughness", "metallic", "visibility")
+
+
+class GroundTruth:
+    """A folder of ground truth, read in the run's frame. Every part is optional.
+
+    light.exr; mesh.ply; normal, albedo, roughness, metallic, visibility/NAME.exr of the views with alpha/NAME.exr;
+    relight/HDRI.exr with relight/HDRI/NAME.exr (see `scripts.demo.capture`).
+    """
+
+    def __init__(self, folder: Path, to_capture: np.ndarray):
+        self.folder, self._to_run = folder, np.linalg.inv(to_capture)
+        self._turn = self._to_run[:3, :3] / np.cbrt(np.linalg.det(self._to_run[:3, :3]))
+        self.passes = [name for name in PASSES if (folder / name).is_dir()]
+        relit = (folder / "relight").iterdir() if (folder / "relight").is_dir() else ()
+        self.hdris = sorted({file.stem for file in relit if file.is_dir() or file.suffix == ".exr"})
+        self.has_light, self.has_mesh = ((folder / name).exists() for name in ("light.exr", "mesh.ply"))
+        if not (self.passes or self.hdris or self.has_light or self.has_mesh):
+            known = ", ".join([f"{name}/" for name in PASSES] + ["relight/", "light.exr", "mesh.ply"])
+            raise InputError(f"{folder}: there is no ground truth in it; known are {known}")
+
+    def maps(self, camera: Camera) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """All passes of a view in the folder, and its alpha."""
+        if not self.passes:
+            return {}, np.zeros((camera.height, camera.width), np.float32)
+        return {name: self.view(name, camera) for name in self.passes}, self.view("alpha", camera)
+
+    def view(self, name: str, camera: Camera) -> np.ndarray:
+        """Read a pass of a view, float32 (h, w) or (h, w, channels)."""
+        file = self.folder / name / f"{camera.name}.exr"
+        pixels = read_exr(file)
+        if pixels.shape[:2] != (camera.height, camera.width):
+            raise InputError(f"{file}: its size is not the view's ({camera.width}×{camera.height})")
+        channels = {"normal": 3, "albedo": 3}.get(name, 1)
+        if pixels.ndim == 2 and channels > 1:
+            raise InputError(f"{file}: it has one channel where there should be {channels}")
+        if channels == 1:
+            return pixels if pixels.ndim == 2 else pixels[..., 0]
+        return pixels[..., :3] @ self._turn.T.astype(np.float32) if name == "normal" else pixels[..., :3]
+
+    def panorama(self, name: str) -> np.ndarray:
+        """Read a light, equirectangular in Blender's orientation."""
+        panorama = read_environment(self.folder / f"{name}.exr")
+        return sample(panorama, directions(*panorama.shape[:2]) @ self._turn.astype(np.float32))
+
+    def mesh(self) -> Mesh:
+        mesh = read_mesh(self.folder / "mesh.ply")
+        return Mesh(mesh.vertices @ self._to_run[:3, :3].T + self._to_run[:3, 3], mesh.faces)
+
+    def relit(self, hdri: str, camera: Camera) -> np.ndarray:
+        """Read a view under another light, premultiplied linear RGBA."""
+        file = self.folder / "relight" / hdri / f"{camera.name}.exr"
+        return read_relit(file, (camera.height, camera.width))
+
+
+def read_relit(file: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Read a premultiplied linear RGBA picture. Raises InputError if it has no alpha or another (height, width) than `size`."""
+    pixels = read_exr(file)
+    if pixels.ndim != 3 or pixels.shape[2] != 4:
+        raise InputError(f"{file} has no alpha: an RGBA picture is needed to put it over a background")
+    if size is not None and pixels.shape[:2] != size:
+        raise InputError(f"{file} is {pixels.shape[1]}×{pixels.shape[0]}, it should be {size[1]}×{size[0]}")
+    return pixels
+
+
+def known_maps(
+    truth: GroundTruth | None, view: View, camera: Camera, to_capture: np.ndarray
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The true maps of a view, as `GroundTruth.maps` returns them; without any, the data set's own normals.
+
+    `camera` is the view's, at the size that is rendered.
+    """
+    known, alpha = truth.maps(camera) if truth else ({}, np.zeros((camera.height, camera.width), np.float32))
+    if not known and (published := published_normals(view, max(camera.width, camera.height))):
+        turn = split_similarity(to_capture)[1].astype(np.float32)
+        known, alpha = {"normal": published[0] @ turn}, published[1]
+    return known, alpha
+
+
+def errors(images: dict[str, np.ndarray], known: dict[str, np.ndarray], true_alpha: np.ndarray) -> dict:
+    """Errors of a view's maps (`pictures.maps`) against the true ones; {} if the object covers no pixel.
+
+    For base colour these are the `channel_products` that `metrics.aligned_psnr` takes of all views together.
+    """
+    figures, covered, alpha = {}, true_alpha >= metrics.COVERED, images["alpha"]
+    for name, true in known.items() if covered.any() else ():
+        if name == "normal":
+            figures["normal_mae_degrees"] = metrics.normal_mae_degrees(images["normal"], true, alpha, true_alpha)
+        elif name == "visibility":
+            free, truly = (v[covered] >= 0.5 for v in (images.get(name, np.ones_like(alpha)), true))
+            figures |= {"visibility_agreement": float((free == truly).mean()), "visibility_free": float(truly.mean())}
+        elif name == "albedo" and name in images:
+            figures[name] = metrics.channel_products(images[name], true, covered)
+        elif name in images:
+            figures[f"{name}_mae"] = float(np.abs(images[name] - true)[covered].mean(dtype=np.float64))
+    return figures

@@ -1,0 +1,1 @@
+"""File formats, and the plain arrays that they hold: PLY, EXR, glTF, OBJ, COLMAP's model, history.jsonl. No torch."""

@@ -1,0 +1,170 @@
+"""Read COLMAP's sparse models, binary or text, as its documentation describes them under "Output Format".
+
+COLMAP's own reader answers a truncated file with an unrelated message, or asks for terabytes of memory; this one names the file.
+"""
+
+import re
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from refgs.errors import InputError
+
+T = TypeVar("T")
+
+# COLMAP's "Camera Models" by number: name and count of parameters. Text files use the names.
+MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+}
+SUPPORTED = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Image:
+    name: str
+    camera_id: int
+    pose: tuple[float, ...]  # qw qx qy qz tx ty tz, world to camera
+
+
+def model_files(folder: Path) -> tuple[Path, Path, Path]:
+    """A model's files of cameras, images and points: binary where its images are, else text. They may be missing."""
+    suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
+    cameras, images, points = (folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
+    return cameras, images, points
+
+
+def read_cameras(file: Path) -> dict[int, Intrinsics]:
+    """Read the cameras by their numbers. Raises InputError for a file that is broken."""
+    return _parse(file, _binary_cameras, _text_cameras)
+
+
+def read_images(file: Path) -> list[Image]:
+    """Read the names, cameras and poses of the images. Raises InputError for a file that is broken."""
+    return _parse(file, _binary_images, _text_images)
+
+
+def read_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read the points (M, 3) that are finite, and their colours (M, 3) in 0..1. Raises InputError for a file that is broken."""
+    return _parse(file, _binary_points, _text_points)
+
+
+def _parse(file: Path, binary: Callable[[Path], T], text: Callable[[Path], T]) -> T:
+    try:
+        return (binary if file.suffix == ".bin" else text)(file)
+    except (struct.error, ValueError, IndexError, OverflowError) as error:
+        raise InputError(f"{file}: the file is truncated or not COLMAP's. Export the sparse model again.") from error
+
+
+class _Bytes:
+    """A binary file read from front to back; struct.error where it ends too early."""
+
+    def __init__(self, file: Path):
+        self.data, self.at = file.read_bytes(), 0
+
+    def take(self, layout: str) -> tuple:
+        layout = "<" + layout
+        values = struct.unpack_from(layout, self.data, self.at)
+        self.at += struct.calcsize(layout)
+        return values
+
+    def name(self) -> str:
+        end = self.data.index(b"\0", self.at)
+        text = self.data[self.at : end].decode("utf-8")
+        self.at = end + 1
+        return text
+
+    def skip(self, count: int) -> None:
+        self.at += count
+        if self.at > len(self.data):
+            raise ValueError("truncated")
+
+
+def _binary_cameras(file: Path) -> dict[int, Intrinsics]:
+    source, cameras = _Bytes(file), {}
+    for _ in range(source.take("Q")[0]):
+        number, model, width, height = source.take("iiQQ")
+        if model not in MODELS:
+            raise InputError(f"{file}: camera model number {model} is not supported, only {', '.join(SUPPORTED)}.")
+        name, count = MODELS[model]
+        cameras[number] = Intrinsics(name, width, height, source.take(f"{count}d"))
+    return cameras
+
+
+def _binary_images(file: Path) -> list[Image]:
+    source, images = _Bytes(file), []
+    for _ in range(source.take("Q")[0]):
+        _, *pose, camera_id = source.take("I7di")
+        images.append(Image(source.name(), camera_id, tuple(pose)))
+        source.skip(24 * source.take("Q")[0])  # keypoints: x, y, point id
+    return images
+
+
+def _binary_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    source, rows = _Bytes(file), []
+    for _ in range(source.take("Q")[0]):
+        rows.append(source.take("Q3d3Bd")[1:7])
+        source.skip(8 * source.take("Q")[0])  # track: image id, keypoint
+    return _points(rows)
+
+
+def _points(rows: list) -> tuple[np.ndarray, np.ndarray]:
+    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    table = table[np.isfinite(table).all(axis=1)]
+    return table[:, :3], table[:, 3:] / 255.0
+
+
+def _entries(file: Path, lines_each: int = 1) -> list[str]:
+    """The first line of each entry; ValueError where there are fewer than the file's own header counts."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    entries = [line for line in lines if not line.startswith("#") and (lines_each > 1 or line.strip())]
+    while entries and not entries[-1].strip():  # an image's line of keypoints may be empty
+        entries.pop()
+    entries = entries[::lines_each]
+    counted = next((match for line in lines if (match := re.match(r"# Number of \w+: (\d+)", line))), None)
+    if counted and len(entries) < int(counted[1]):
+        raise ValueError("fewer entries than counted")
+    return entries
+
+
+def _text_cameras(file: Path) -> dict[int, Intrinsics]:
+    cameras = {}
+    for line in _entries(file):
+        number, model, width, height, *params = line.split()
+        if len(params) != dict(MODELS.values()).get(model, len(params)):
+            raise ValueError("parameters missing")
+        cameras[int(number)] = Intrinsics(model, int(width), int(height), tuple(map(float, params)))
+    return cameras
+
+
+def _text_images(file: Path) -> list[Image]:
+    images = []
+    for line in _entries(file, lines_each=2):  # the second line holds keypoints
+        _, *pose, camera_id, name = line.split(maxsplit=9)
+        images.append(Image(name.strip(), int(camera_id), tuple(map(float, pose))))
+    return images
+
+
+def _text_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
+    return _points([[float(value) for value in line.split()[1:7]] for line in _entries(file)])

@@ -1,0 +1,71 @@
+"""Textured meshes as binary glTF 2.0, with their textures beside them."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.visual.material import PBRMaterial
+
+from refgs.errors import InputError
+from refgs.formats.mesh import Y_UP, Mesh
+from refgs.formats.tangents import vertex_tangents
+from refgs.formats.textures import FOLDER, Textures, write_textures
+from refgs.paths import whole
+
+SPECULAR = "KHR_materials_specular"
+
+
+def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
+    """Write the mesh (Z up; with normals and uv) as Y-up binary glTF with a metallic-roughness material.
+
+    Embedded: base colour (sRGB), occlusion, roughness and metallic (R, G and B, linear), the tangent-space normal map and the
+    tangents that `bake` assumed, MikkTSpace's: not every reader makes these. What mirrors nothing says so by KHR_materials_specular.
+    Beside the file what `write_textures` writes.
+    """
+    path = Path(path)
+    pictures = write_textures(path.parent / FOLDER, textures)
+    packed = Image.fromarray(np.dstack([pictures[name] for name in ("occlusion", "roughness", "metallic")]))
+    material = PBRMaterial(
+        name="RefGS",
+        baseColorTexture=Image.fromarray(pictures["base_color"]),
+        metallicRoughnessTexture=packed,
+        occlusionTexture=packed,
+        normalTexture=Image.fromarray(pictures["normal"]),
+        metallicFactor=1.0,
+        roughnessFactor=1.0,
+        doubleSided=True,  # a capture from above leaves a mesh without a bottom
+    )
+    model = trimesh.Trimesh(
+        mesh.vertices @ Y_UP.T,
+        mesh.faces,
+        vertex_normals=mesh.normals @ Y_UP.T,
+        visual=trimesh.visual.TextureVisuals(uv=mesh.uv, material=material),
+        process=False,
+    )
+    tangents, signs = vertex_tangents(mesh)
+    model.vertex_attributes["TANGENT"] = np.column_stack([tangents @ Y_UP.T, signs]).astype(np.float32)
+
+    def finish(tree: dict) -> None:
+        # trimesh takes tangents for an attribute of ours, and puts an underscore before it.
+        attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+        attributes["TANGENT"] = attributes.pop("_TANGENT")
+        if textures.specular < 1:
+            tree["materials"][0]["extensions"] = {SPECULAR: {"specularFactor": textures.specular}}
+            tree["extensionsUsed"] = [SPECULAR]
+
+    scene = trimesh.Scene()
+    scene.add_geometry(model, node_name="RefGS", geom_name="RefGS")
+    with whole(path) as temporary:
+        temporary.write_bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=finish))
+
+
+def read_glb(path: str | os.PathLike) -> Mesh:
+    """Vertices and faces, Z up, of what `write_glb` wrote. Raises InputError for a file that is broken."""
+    try:
+        model = trimesh.load_mesh(path, file_type="glb", process=False, skip_materials=True)
+        vertices, faces = np.asarray(model.vertices, np.float64), np.asarray(model.faces)
+    except Exception as error:  # trimesh raises what its parsing ran into
+        raise InputError(f"{path} is not a whole binary glTF file of a mesh ({error}): export it again") from None
+    return Mesh(vertices @ Y_UP, faces)

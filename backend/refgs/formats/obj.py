@@ -1,0 +1,37 @@
+"""Textured meshes as Wavefront OBJ, with their textures beside them."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from refgs.formats.mesh import Y_UP, Mesh
+from refgs.formats.textures import FOLDER, Textures, write_textures
+from refgs.paths import whole
+
+
+def write_obj(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
+    """Write the mesh (Z up; with normals and uv) as Y-up Wavefront OBJ, its material beside it as MTL with what is customary for
+    metallic and roughness (map_Pm, map_Pr, norm), which name the pictures that `write_textures` writes."""
+    path = Path(path)
+    write_textures(path.parent / FOLDER, textures)
+    maps = {"map_Kd": "base_color", "map_Pr": "roughness", "map_Pm": "metallic", "norm": "normal"}
+    specular = [] if textures.specular == 1 else ["Ks 0 0 0"]
+    lines = [
+        "newmtl RefGS",
+        "Kd 1 1 1",
+        *specular,
+        "Pr 1",
+        "Pm 1",
+        *(f"{key} {FOLDER}/{name}.png" for key, name in maps.items()),
+    ]
+    with whole(path.with_suffix(".mtl")) as temporary:
+        temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    corner = (mesh.faces + 1).repeat(3, axis=1).reshape(-1, 9)  # one number for place, uv and normal
+    with whole(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        file.write(f"mtllib {path.with_suffix('.mtl').name}\no RefGS\n")
+        np.savetxt(file, mesh.vertices @ Y_UP.T, "v %.9g %.9g %.9g")
+        np.savetxt(file, mesh.uv, "vt %.9g %.9g")
+        np.savetxt(file, mesh.normals @ Y_UP.T, "vn %.6g %.6g %.6g")
+        file.write("usemtl RefGS\n")
+        np.savetxt(file, corner, "f" + " %d/%d/%d" * 3)

@@ -1,0 +1,58 @@
+"""Light as an equirectangular panorama in Blender's orientation."""
+
+import os
+import warnings
+
+import numpy as np
+
+from refgs.errors import InputError, InputWarning
+from refgs.formats.exr import read_exr, write_exr
+
+
+def write_environment(path: str | os.PathLike, radiance: np.ndarray) -> None:
+    """Write a panorama (H, W, 3) of linear Rec.709 radiance, in Blender's orientation (see `directions`)."""
+    write_exr(path, radiance)
+
+
+def read_environment(path: str | os.PathLike) -> np.ndarray:
+    """Read a panorama (H, W, 3), float32 linear radiance. Raises InputError where `path` does not hold one.
+
+    Overflown pixels (half-float suns) become the largest half float; negative radiance becomes 0, and so do NaN, with an InputWarning.
+    """
+    pixels = read_exr(path)
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[..., None], 3, axis=2)
+    height, width = pixels.shape[:2]
+    if width != 2 * height:
+        raise InputError(f"{path} is {width}×{height}: an equirectangular panorama is twice as wide as it is high")
+    if missing := int(np.isnan(pixels[..., :3]).any(axis=-1).sum()):
+        warnings.warn(InputWarning(f"{path}: {missing:,} pixels are no numbers; they give no light"), stacklevel=2)
+    return np.nan_to_num(pixels[..., :3], nan=0, posinf=65504, neginf=0).clip(min=0)
+
+
+def directions(height: int, width: int) -> np.ndarray:
+    """Unit directions (height, width, 3), float32, of the panorama's pixel centres, Z up.
+
+    Blender's orientation: u = 0.5 − atan2(y, x)/2π from the left, v = asin(z)/π + 0.5 from the bottom; the first row is
+    the top.
+    """
+    azimuth = 2 * np.pi * (0.5 - (np.arange(width) + 0.5) / width)
+    elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
+    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    return np.stack([x, y, np.broadcast_to(np.sin(elevation), x.shape)], axis=-1).astype(np.float32)
+
+
+def sample(panorama: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Radiance (..., C) of a panorama (H, W, C) in directions (..., 3) of any length: bilinear, wrapping sideways."""
+    height, width = panorama.shape[:2]
+    x, y, z = np.moveaxis(np.asarray(directions, np.float32), -1, 0)
+    column = (0.5 - np.arctan2(y, x) / (2 * np.pi)) * width - 0.5
+    row = np.clip((0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * height - 0.5, 0, height - 1)
+    left = np.floor(column).astype(int)
+    top = np.minimum(np.floor(row).astype(int), max(height - 2, 0))
+    bottom = np.minimum(top + 1, height - 1)
+    s, t = (column - left)[..., None], (row - top)[..., None]
+    left, right = left % width, (left + 1) % width
+    above = panorama[top, left] * (1 - s) + panorama[top, right] * s
+    below = panorama[bottom, left] * (1 - s) + panorama[bottom, right] * s
+    return (above * (1 - t) + below * t).astype(np.float32)

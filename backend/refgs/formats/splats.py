@@ -1,0 +1,285 @@
+"""splats.ply: one row a splat, in the property names of 3D Gaussian splatting, with materials."""
+
+import math
+import os
+import re
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.lib.recfunctions import repack_fields, structured_to_unstructured
+from plyfile import PlyElement, PlyListProperty, PlyProperty
+
+from refgs.color import srgb_decode
+from refgs.errors import InputError, InputWarning
+from refgs.formats.ply import read_ply, write_ply
+
+DC = 0.5 / math.sqrt(math.pi)  # Y00: a constant harmonic f_dc shows the colour 0.5 + DC · f_dc
+
+
+@dataclass
+class Splats:
+    """N surfels with appearance and materials; float32 numpy arrays.
+
+    positions (N, 3), normals (N, 3) unit and pointing outward where that is known, sh (N, K, 3) spherical harmonics
+    with K = (degree + 1)² and colour = 0.5 + SH (the 3DGS convention), opacities (N,) in 0..1, scales (N, 2) standard
+    deviations in world units, or (N, 3) of 3D Gaussians with the normal's last, rotations (N, 4) unit quaternions wxyz,
+    albedo (N, 3) linear Rec.709, metallic (N,) and perceptual roughness (N,) in 0..1, received (N, 3) the part of the recovered
+    light's irradiance that reaches a surfel, with what comes from the object itself, indirect (N, K', 3) spherical harmonics
+    of the linear radiance that comes from the object itself; K' is 0 where a scene does without, all of `received` is 1 then.
+    `constants` are those of CONSTANTS that all splats have alike: a file then has no column of them.
+    `beside` is what else a file held: its elements, `vertex` with the properties that are none of these.
+    """
+
+    positions: np.ndarray
+    normals: np.ndarray
+    sh: np.ndarray
+    opacities: np.ndarray
+    scales: np.ndarray
+    rotations: np.ndarray
+    albedo: np.ndarray
+    metallic: np.ndarray
+    roughness: np.ndarray
+    received: np.ndarray
+    indirect: np.ndarray
+    constants: dict[str, float] = field(default_factory=dict)
+    beside: tuple[PlyElement, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+_HEAD = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+_TAIL = ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
+THIN = 0.05  # of a surfel's smaller scale: the third, for viewers of 3D Gaussians
+CHUNK = 4096  # rows, which the processor's cache holds
+_RECEIVED = ["received_r", "received_g", "received_b"]
+_MATERIAL = ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
+CONSTANTS = (
+    "metallic",
+    "roughness",
+    "specular",
+)  # the last, the Principled BSDF's Specular IOR Level, is 0.5 where nothing is said
+_CONSTANT = re.compile(rf"constant ({'|'.join(CONSTANTS)}) ([0-9.e+-]+)")  # in a comment of the head
+_REFERENCE = ["ori_color_0", "ori_color_1", "ori_color_2", "refl_strength", "roughness"]  # Ref-Gaussian's, as logits
+MATTE = 0.0, 1.0  # metallic and roughness of splats that come without materials
+# Turns that bring axis 0, 1 or 2 to the third place, as quaternions wxyz.
+_TO_THIRD = np.array([(0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1, 0, 0, 0)], np.float32)
+
+
+def write_splats(path: str | os.PathLike, splats: Splats) -> None:
+    """Write a binary little-endian PLY with one `vertex` element, and what `splats.beside` holds; see docs for the properties.
+
+    Opacity is stored as a logit and scales as logarithms, as 3DGS viewers expect; spherical harmonics of the first
+    degree and above are channel-major; materials are stored as they are. Opacities are clipped to 1e-6 .. 1 - 1e-6.
+    """
+    names, columns = _common(splats, splats.scales)
+    names += _MATERIAL[:3]
+    columns.append(splats.albedo)
+    for name in ("metallic", "roughness"):
+        if name not in splats.constants:
+            names.append(name)
+            columns.append(getattr(splats, name))
+    if splats.indirect.shape[1]:
+        names += [*_RECEIVED, *(f"ind_{i}" for i in range(3 * splats.indirect.shape[1]))]
+        columns += [splats.received, splats.indirect.transpose(0, 2, 1)]
+    _write(
+        path, names, columns, splats.beside, [f"constant {name} {value:g}" for name, value in splats.constants.items()]
+    )
+
+
+def write_display_splats(path: str | os.PathLike, splats: Splats) -> None:
+    """Write a binary little-endian PLY as 3D Gaussian splatting's viewers expect it: harmonics, opacity, three scales, of which a
+    surfel's third is THIN of its smaller one (zero would hide it), rotation; no materials."""
+    scales = splats.scales
+    if scales.shape[1] == 2:
+        scales = np.column_stack([scales, THIN * scales.min(axis=1)])
+    _write(path, *_common(splats, scales))
+
+
+def _common(splats: Splats, scales: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
+    """The properties that all splats' files have, and their columns."""
+    opacity = np.clip(splats.opacities.astype(np.float64), 1e-6, 1 - 1e-6)
+    rest = splats.sh[:, 1:].transpose(0, 2, 1)
+    columns = [
+        splats.positions,
+        splats.normals,
+        splats.sh[:, 0],
+        rest,
+        np.log(opacity / (1 - opacity)),
+        np.log(np.maximum(scales.astype(np.float64), 1e-30)),
+        splats.rotations,
+    ]
+    names = [*_HEAD, *(f"f_rest_{i}" for i in range(3 * rest.shape[2])), *_TAIL]
+    if scales.shape[1] == 3:
+        names.insert(names.index("scale_1") + 1, "scale_2")
+    return names, columns
+
+
+def _write(
+    path: str | os.PathLike,
+    names: list[str],
+    columns: list[np.ndarray],
+    beside: tuple[PlyElement, ...] = (),
+    comments: list[str] = (),
+) -> None:
+    count = len(columns[0])
+    table = np.empty((count, len(names)), "<f4")
+    start = 0
+    for column in columns:
+        width = int(np.prod(column.shape[1:]))
+        for rows in range(0, count, CHUNK):
+            part = column[rows : rows + CHUNK]
+            table[rows : rows + CHUNK, start : start + width] = part.reshape(len(part), width)
+        start += width
+    rows = table.view([(name, "<f4") for name in names]).reshape(count)
+    properties = [PlyProperty(name, "float") for name in names]
+    unknown = next((element for element in beside if element.name == "vertex"), None)
+    if unknown is not None:
+        more = [p for p in unknown.properties if p.name not in names]
+        both = np.empty(count, [*rows.dtype.descr, *((p.name, p.dtype("<")) for p in more)])
+        for source, which in ((rows, names), (unknown.data, [p.name for p in more])):
+            for name in which:
+                both[name] = source[name]
+        rows, properties = both, [*properties, *more]
+    vertex = PlyElement("vertex", properties, count)
+    vertex.data = rows
+    write_ply(path, [vertex, *(element for element in beside if element.name != "vertex")], comments)
+
+
+def read_splats(path: str | os.PathLike) -> Splats:
+    """Read splats: what `write_splats` wrote, and the PLY files of 3DGS (three scales), 2DGS (two) and Ref-Gaussian.
+
+    Where there are no materials, base colour is the colour that the constant harmonic shows, and the rest is matte: MATTE. Where there
+    are no normals, they are the rotation's third axis, to either side; of three scales the least becomes the last. Rows with a value
+    that is not finite are left out, with an InputWarning. Raises InputError for a file that is missing, broken, or not of splats.
+    """
+    data = read_ply(path)
+    if "vertex" not in data:
+        raise InputError(f"{path} has no element vertex: it is not a PLY file of splats")
+    vertex = data["vertex"]
+    names = [p.name for p in vertex.properties if not isinstance(p, PlyListProperty)]
+    if "packed_position" in names:
+        raise InputError(f"{path} is a compressed PLY: make a plain one of it, with splat-transform or SuperSplat")
+    ours = not {*_MATERIAL[:4]}.isdisjoint(names)
+    found = [_CONSTANT.fullmatch(comment.strip()) for comment in data.comments] if ours else []
+    constants = {match[1]: float(match[2]) for match in found if match and match[1] not in names}
+    material = [name for name in _MATERIAL if name not in constants]
+    normals = {*_HEAD[3:6]} <= {*names}
+    needed = [*_HEAD, *_TAIL, *(material if ours else [])]
+    missing = [name for name in needed if name not in names and (ours or name not in _HEAD[3:6])]
+    if missing:
+        raise InputError(f"{path} lacks {', '.join(missing)}: it is not a PLY file of splats, or not a whole one")
+    rows, known = np.asarray(vertex.data), set()
+
+    def columns(*wanted: str) -> np.ndarray:
+        known.update(wanted)
+        if not wanted:
+            return np.empty((vertex.count, 0), np.float32)
+        part = rows[[*wanted]]  # a view, which lists beside it would be in the way of
+        return structured_to_unstructured(repack_fields(part) if rows.dtype.hasobject else part, np.float32, copy=True)
+
+    def harmonics(prefix: str, *degrees: int) -> np.ndarray:
+        """(N, K, 3) from the channel-major values of a name, which must be as many as some degree has."""
+        found = sum(re.fullmatch(rf"{prefix}\d+", name) is not None for name in names)
+        wanted = [f"{prefix}{i}" for i in range(found)]
+        if found not in degrees or not {*wanted} <= {*names}:
+            numbers = ", ".join(map(str, degrees))
+            raise InputError(f"{path} has {found} {prefix} values a splat: spherical harmonics have {numbers}")
+        return columns(*wanted).reshape(vertex.count, 3, found // 3).transpose(0, 2, 1)
+
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        sh = np.concatenate(
+            [columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], harmonics("f_rest_", 0, 9, 24, 45)], axis=1
+        )
+        scales = np.exp(columns(*(name for name in ("scale_0", "scale_1", "scale_2") if name in names)))
+        rotations = columns("rot_0", "rot_1", "rot_2", "rot_3")
+        length = np.linalg.norm(rotations, axis=1, keepdims=True)
+        rotations = np.where(np.abs(length - 1) < 1e-4, rotations, rotations / length)  # to the last bit, if they are
+        if scales.shape[1] == 3:
+            rotations, scales = _shortest_last(rotations, scales)
+        if ours:
+            albedo = columns(*_MATERIAL[:3])
+            metallic, roughness = (
+                np.full(vertex.count, constants[name], np.float32) if name in constants else columns(name)[:, 0]
+                for name in _MATERIAL[3:]
+            )
+        elif {*_REFERENCE} <= {*names}:
+            *albedo, metallic, roughness = _logistic(columns(*_REFERENCE)).T
+            albedo = srgb_decode(np.stack(albedo, axis=1))
+        else:
+            albedo = srgb_decode((0.5 + DC * sh[:, 0]).clip(0, 1))
+            metallic, roughness = (np.full(vertex.count, value, np.float32) for value in MATTE)
+        splats = Splats(
+            positions=columns("x", "y", "z"),
+            normals=columns("nx", "ny", "nz") if normals else np.zeros((vertex.count, 3), np.float32),
+            sh=sh,
+            opacities=_logistic(columns("opacity")[:, 0]),
+            scales=scales,
+            rotations=rotations,
+            albedo=albedo,
+            metallic=metallic,
+            roughness=roughness,
+            received=columns(*_RECEIVED) if {*_RECEIVED} <= {*names} else np.ones((vertex.count, 3), np.float32),
+            indirect=harmonics("ind_", 0, 3, 12, 27, 48),
+            constants=constants,
+        )
+    none = ~splats.normals.any(axis=1)  # 3DGS writes zeros
+    splats.normals[none] = _third_axis(rotations[none])
+    splats.beside = _beside(data.elements, known)
+    return _finite(splats, Path(path))
+
+
+def _logistic(values: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-values))
+
+
+def _third_axis(rotations: np.ndarray) -> np.ndarray:
+    w, x, y, z = rotations.T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+
+
+def _shortest_last(rotations: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same Gaussians with their shortest axis, which is their normal, in the third place."""
+    shortest = np.where(scales[:, 2] <= scales.min(axis=1), 2, scales.argmin(axis=1))
+    w, x, y, z = rotations.T
+    a, b, c, d = _TO_THIRD[shortest].T
+    turned = [
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    ]
+    return np.stack(turned, axis=1), np.take_along_axis(scales, (shortest[:, None] + [1, 2, 3]) % 3, axis=1)
+
+
+def _beside(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[PlyElement, ...]:
+    """A file's elements without the known properties of `vertex`, in memory of their own."""
+    left = []
+    for element in elements:
+        more = [p for p in element.properties if element.name != "vertex" or p.name not in known]
+        if more:
+            copy = PlyElement(element.name, more, element.count)
+            copy.data = np.array(element.data[[p.name for p in more]])
+            left.append(copy)
+    return tuple(left)
+
+
+def _finite(splats: Splats, path: Path) -> Splats:
+    """Those of the splats all of whose values are finite. A warning says how many others there were; further elements, which may
+    number the rows, go with them."""
+    values = {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
+    wrong = [name for name, value in values.items() if not np.isfinite(value).all()]
+    if not wrong:
+        return splats
+    fine = np.logical_and.reduce([np.isfinite(v).reshape(len(splats), -1).all(axis=1) for v in values.values()])
+    what = f"{path}: {(~fine).sum():,} of {len(splats):,} splats have {', '.join(wrong)} that are not finite: left out"
+    warnings.warn(what, InputWarning, stacklevel=3)
+    beside = []
+    for element in splats.beside:
+        if element.name == "vertex":
+            copy = PlyElement(element.name, element.properties, int(fine.sum()))
+            copy.data = element.data[fine]
+            beside.append(copy)
+    return replace(splats, **{name: value[fine] for name, value in values.items()}, beside=tuple(beside))

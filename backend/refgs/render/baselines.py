@@ -1,0 +1,183 @@
+"""Methods of other papers, to compare with: the settings that only they use, and how their pictures are made.
+
+`method_of` is the one place that reads these settings. Its other results are RefGS's own: deferred shading in linear radiance.
+
+- `shading = "splat"`: each surfel is shaded before blending, as in the paper's initial stage (§3.3).
+- `shading = "sh"`: colour by direction of each surfel, as in 2DGS; there is neither material nor light.
+- `reflection = "mirror"`: a sharp mirror image, of which metallic is the share (Ye et al., 3DGS-DR, 2024).
+- `color_space = "display"`: light and materials are a screen's numbers in 0..1, as in the paper.
+- `primitive = "3dgs"`: 3D Gaussians in place of surfels (`refgs.render.volume`).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from refgs.camera import Camera
+from refgs.color import srgb_decode, srgb_encode
+from refgs.model.environment import Environment
+from refgs.model.surfels import Surfels
+from refgs.render.channels import channels
+from refgs.render.directional import directional
+from refgs.render.facing import facing_normals
+from refgs.render.rasterize import rasterize
+from refgs.render.rendering import COVERED, Rendering
+from refgs.render.shade import shade_splats
+from refgs.render.stack import stack
+from refgs.render.volume import discs, with_normals_last
+from refgs.settings import RenderSettings, SurfelSettings
+
+MIRROR_LOGIT = 7.0  # of a perfect mirror: the logit of its base colour, and the negated one of its roughness
+
+
+class LinearLight:
+    """Light in linear, HDR radiance; pictures are sRGB-encoded."""
+
+    display = False
+    brightest = 1e8  # raw texel; beyond it, sums lose what is small
+
+    def radiance(self, raw: Tensor) -> Tensor:
+        """Radiance of raw texels, as they are learned."""
+        return torch.nn.functional.softplus(raw)
+
+    def raw(self, radiance: float) -> float:
+        """The raw texel of a radiance: the inverse of `radiance`."""
+        return math.log(math.expm1(radiance))
+
+    def encode(self, radiance: Tensor) -> Tensor:
+        """The colour in a picture of a radiance."""
+        return srgb_encode(radiance)
+
+    def to_linear(self, panorama):
+        """Linear radiance of a panorama of this light, a float array."""
+        return panorama
+
+    def from_linear(self, panorama):
+        """The inverse of `to_linear`."""
+        return panorama
+
+
+class ScreenLight(LinearLight):
+    """Light in a screen's numbers, 0..1; pictures show them as they are."""
+
+    display = True
+    brightest = 12.0  # raw texel; beyond it, float32's logistic function has no slope
+
+    def radiance(self, raw: Tensor) -> Tensor:
+        return torch.sigmoid(raw)
+
+    def raw(self, radiance: float) -> float:
+        return math.log(radiance / (1 - radiance))
+
+    def encode(self, radiance: Tensor) -> Tensor:
+        return radiance
+
+    def to_linear(self, panorama):
+        return srgb_decode(panorama)
+
+    def from_linear(self, panorama):
+        return srgb_encode(panorama)
+
+
+LINEAR, SCREEN = LinearLight(), ScreenLight()
+
+
+@dataclass(frozen=True)
+class Method:
+    """How surfels and light become pictures. The defaults are RefGS's own.
+
+    `draw` replaces the deferred path of `render`; it takes the same arguments. `unread` are parameters that no picture reads, `constants`
+    raw values of those that are the same for all surfels; neither learns. `left_out` are rows of needs.json.
+    """
+
+    lit: bool = True
+    deferred: bool = True
+    mirror: bool = False
+    light: LinearLight = LINEAR
+    draw: Callable[..., Rendering] | None = None
+    unread: tuple[str, ...] = ()
+    constants: dict[str, float] = field(default_factory=dict)
+    left_out: tuple[dict[str, str], ...] = ()
+
+
+@lru_cache
+def method_of(settings: RenderSettings) -> Method:
+    """The method that these settings ask for."""
+    method = Method()
+    if settings.shading == "sh":
+        row = {"what": "materials and light", "why": "shading = sh", "saved": "shading and the light's prefilter"}
+        unread = ("albedo", "metallic", "roughness")
+        method = Method(lit=False, deferred=False, draw=draw_colors, unread=unread, left_out=(row,))
+    if settings.color_space == "display":
+        why = "color_space = display: light and base colour are a screen's numbers"
+        row = {"what": "linear radiance", "why": why, "saved": "nothing: relit pictures are off"}
+        method = replace(method, light=SCREEN, left_out=(*method.left_out, row))
+    if settings.reflection == "mirror" and method.lit:
+        saved = "four parameters a surfel, and the table of reflectances"
+        row = {"what": "base colour and roughness", "why": "reflection = mirror", "saved": saved}
+        constants = {"albedo": MIRROR_LOGIT, "roughness": -MIRROR_LOGIT}
+        method = replace(method, mirror=True, constants=constants, left_out=(*method.left_out, row))
+    if settings.shading == "splat":
+        saved = "shading pixels; tracing rays"
+        row = {"what": "deferred shading and inter-reflection", "why": "shading = splat", "saved": saved}
+        method = replace(method, deferred=False, draw=draw_shaded_surfels, left_out=(*method.left_out, row))
+    return method
+
+
+def initial_stage(settings: RenderSettings) -> RenderSettings:
+    """These settings with each surfel shaded before blending: the paper's initial stage (§3.3)."""
+    return settings.model_copy(update={"shading": "splat"})
+
+
+def axes_of(settings: SurfelSettings) -> int:
+    """How many axes of a surfel have a scale."""
+    return 3 if settings.primitive == "3dgs" else 2
+
+
+def draw_colors(
+    surfels: Surfels,
+    environment: None,
+    camera: Camera,
+    background: Tensor,
+    settings: RenderSettings,
+    near: float,
+    occluder: None = None,
+    exposure: None = None,
+) -> Rendering:
+    """Blend each surfel's colour by direction, sRGB-encoded. The arguments are those of `render`; light and exposure are not read."""
+    normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
+    colors = directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera)
+    features, depth, alpha = rasterize(*discs(surfels, camera), stack([normals, colors]), camera, near=near)
+    over = (1 - alpha[..., None]) * background
+    normal, color = features.split(3, dim=-1)
+    mean = normal / alpha.clamp_min(COVERED)[..., None]
+    return Rendering(color + over, alpha, depth, mean, background=background)
+
+
+def draw_shaded_surfels(
+    surfels: Surfels,
+    environment: Environment,
+    camera: Camera,
+    background: Tensor,
+    settings: RenderSettings,
+    near: float,
+    occluder: None = None,
+    exposure: Tensor | None = None,
+) -> Rendering:
+    """Shade each surfel, then blend (paper §3.3). The arguments are those of `render`; no rays are traced."""
+    method, matte = method_of(settings), settings.reflection == "none"
+    lit = channels(surfels, camera, settings, indirect=False)
+    blended = [lit[0], shade_splats(stack(lit), environment, camera, method.mirror), *lit[1 : 2 if matte else 4]]
+    features, depth, alpha = rasterize(*discs(surfels, camera), stack(blended), camera, near=near)
+    over = (1 - alpha[..., None]) * background
+    means = features / alpha.clamp_min(COVERED)[..., None]
+    normal, mean, material = means.split((3, 3, 3 if matte else 5), dim=-1)
+    if matte:  # metallic 0, roughness 1
+        material = torch.cat([material, alpha.new_tensor([0.0, 1.0]).expand(*alpha.shape, 2)], dim=-1)
+    encoded = method.light.encode(mean if exposure is None else exposure * mean)
+    color = encoded * alpha[..., None] + over
+    return Rendering(color, alpha, depth, normal, material, None, background, exposure)

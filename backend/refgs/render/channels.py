@@ -1,0 +1,29 @@
+"""The features of surfels that are blended before they are shaded."""
+
+from torch import Tensor
+
+from refgs.camera import Camera
+from refgs.model.surfels import Surfels
+from refgs.render.directional import directional
+from refgs.render.facing import facing_normals
+from refgs.render.volume import with_normals_last
+from refgs.settings import RenderSettings
+
+
+def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirect: bool) -> list[Tensor]:
+    """Features (N, C) of surfels as a camera sees them, in the order that `shade` reads them.
+
+    Normals and albedo; then, unless nothing is reflected: metallic, roughness; colour by direction with `diffuse = "sh"`, or else the
+    received part of the irradiance with `indirect`; radiance from the object itself with `indirect`; positions.
+    """
+    normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
+    if settings.reflection == "none":
+        return [normals, surfels.albedo]
+    lit = [normals, surfels.albedo, surfels.metallic, surfels.roughness]
+    if settings.diffuse == "sh":
+        lit.append(directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera))
+    elif indirect:
+        lit.append(surfels.received)
+    if indirect:
+        lit.append(directional(surfels.indirect_dc, surfels.indirect_rest, 0.0, surfels.positions, camera, normals))
+    return [*lit, surfels.positions]

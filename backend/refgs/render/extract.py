@@ -1,0 +1,55 @@
+"""The surface of surfels as a mesh: depth maps of the cameras that saw them, fused."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from refgs.camera import Camera
+from refgs.formats.mesh import Mesh
+from refgs.geometry.project import inside, project
+from refgs.geometry.tsdf import fuse
+from refgs.model.surfels import Surfels
+from refgs.render.rasterize import trimmed_depth
+from refgs.render.volume import discs
+
+UPPER, LOWER = 0.75, 0.25  # transmittance: the surface is where it falls from the one to the other
+REACH = 2.0  # radii of the region of interest: as far as its surroundings may be part of what most photos show
+SHOWN = 0.5  # part of the cameras that have these in the picture
+NEARLY_ALL = 0.99  # of the surfels: what the cube holds
+
+
+@torch.no_grad()
+def extract(
+    surfels: Surfels, cameras: Sequence[Camera], near: float, centre: np.ndarray, radius: float, resolution: int
+) -> tuple[Mesh, float]:
+    """The surface that the foreground's surfels show to cameras: as `refgs.geometry.tsdf.fuse` makes it, not cleaned.
+
+    The foreground is what lies in the region of interest, the ball of `radius` about `centre`, and so much of what is around it as half of
+    the cameras show. The rest is left out, whether it stands before the foreground or behind it. Voxels are the foreground's width /
+    `resolution` wide, but no finer than pixels are there, in the median; how wide comes with it. Surfels nearer than `near` (world
+    units) are not seen."""
+    shown, half = _foreground(surfels.positions.numpy(force=True), cameras, centre, radius)
+    surfels = surfels.chosen(torch.from_numpy(shown).to(surfels.positions.device))
+    maps = [trimmed_depth(*discs(surfels, camera), camera, near, UPPER, LOWER) for camera in cameras]
+    depths, alphas = zip(*maps, strict=True)
+    pixels = []
+    for depth, alpha, camera in zip(depths, alphas, cameras, strict=True):
+        middle = float(camera.world_to_camera[2, :3] @ centre + camera.world_to_camera[2, 3])
+        solid = depth[(alpha > 0.5) & ((depth - middle).abs() < half)]
+        if len(solid):
+            pixels.append(float(solid.median()) / camera.fx)
+    across = min(resolution, max(int(2 * half / float(np.median(pixels))), 1)) if pixels else resolution
+    return fuse(depths, alphas, cameras, centre, half, across), 2 * half / across
+
+
+def _foreground(
+    points: np.ndarray, cameras: Sequence[Camera], centre: np.ndarray, radius: float
+) -> tuple[np.ndarray, float]:
+    """Which of the points (N, 3) belong to it, and the half-side of a cube about the centre that holds nearly all of them, and the ball."""
+    distance = np.linalg.norm(points - centre, axis=1)
+    shows = np.mean([inside(camera, *project(camera, points)) for camera in cameras], axis=0)
+    shown = (distance < radius) | ((distance < REACH * radius) & (shows >= SHOWN))
+    if not shown.any():
+        return shown, radius
+    return shown, max(radius, float(np.quantile(np.abs(points[shown] - centre).max(axis=1), NEARLY_ALL)))

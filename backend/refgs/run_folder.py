@@ -1,0 +1,46 @@
+"""Check a run folder and read its run.toml, without torch."""
+
+import tomllib
+from pathlib import Path
+
+from refgs import __version__
+from refgs.errors import InputError
+from refgs.settings import Settings, recorded_settings
+
+
+def check_free(folder: Path) -> None:
+    """Raise InputError unless a new run can go into the folder."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        what = "holds another run" if (folder / "run.toml").exists() else "is not empty"
+        raise InputError(f"{folder} {what}: choose another folder with --out, or resume that run with --resume")
+
+
+def check_finished(folder: Path) -> tuple[dict, Settings]:
+    """Return what `read_run_facts` does. Raise InputError unless the folder holds a run whose training has ended."""
+    facts, settings = read_run_facts(folder)
+    if not (folder / "splats.ply").exists():
+        raise InputError(
+            f"{folder}: the training has not ended: resume it with `refgs train … --out {folder} --resume`"
+        )
+    return facts, settings
+
+
+def read_run_facts(folder: Path) -> tuple[dict, Settings]:
+    """Read the [run] table and the settings of run.toml. Raise InputError without a run.toml, and for one by a newer release."""
+    file = folder / "run.toml"
+    try:
+        facts = tomllib.loads(file.read_text(encoding="utf-8"))
+        made_by = facts["run"]["refgs"]
+        if _release(made_by) > _release(__version__):
+            raise InputError(
+                f"{folder} was made by RefGS {made_by}, which is newer than this, {__version__}: update RefGS"
+            )
+        return facts["run"], recorded_settings(facts["settings"], str(file))
+    except FileNotFoundError:
+        raise InputError(f"{folder} is not a run folder: there is no run.toml in it") from None
+    except (OSError, KeyError, TypeError, AttributeError, ValueError) as error:
+        raise InputError(f"{file} is broken ({error}): train again") from None
+
+
+def _release(version: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in version.split(".")[:2])  # a patch release changes no file format

@@ -1,0 +1,162 @@
+"""Needs of the lighting: inter-reflection, the light's texels, harmonics' degrees."""
+
+import math
+from typing import Any
+
+import torch
+
+from refgs.model.prefilter import IRRADIANCE_SIDE
+from refgs.train import light, probe
+from refgs.train.needs.materials import INDIRECT
+from refgs.train.needs.need import ASKED, MEGA, NUMBER, Decision, Moment, Need, megabytes
+from refgs.train.state import RenderInputs, State
+
+
+class Reflections(Need):
+    """Inter-reflection of the object in itself."""
+
+    name, what = "reflections", "inter-reflection"
+    threshold = 0.1  # dB
+    reason = "it is between mirroring black and mirroring the light: more than the object's own light can be worth"
+    moments = ("start", "mesh")
+
+    def due(self, state: State, moment: Moment, progress: float) -> bool:
+        return moment == "mesh" or self.asked(state) == "off"
+
+    @torch.no_grad()
+    def measure(self, state: State, hidden: float = 0.0) -> Decision:
+        """Decide by the part of the object's pixels in whose mirror direction the object itself stands."""
+        if self.asked(state) == "off":
+            return Decision(False, ASKED)
+        why, least = share_hidden(hidden), state.settings.indirect.least
+        if hidden < least:
+            return Decision(False, why, self._saved(state), hidden, least)
+        explained = probe.reflections_explain(state)
+        why += f", where mirroring black would change the pictures by {explained:.2f} dB"
+        needed = explained >= self.threshold
+        return Decision(needed, why, {} if needed else self._saved(state), explained)
+
+    def _saved(self, state: State) -> dict[str, float]:
+        def without(inputs: RenderInputs) -> RenderInputs:
+            return inputs._replace(occluder=None)
+
+        seconds, size = probe.seconds_saved(state, without), megabytes(state, INDIRECT)
+        return {"seconds": seconds, "decibels": probe.psnr_loss(state, without), "megabytes": size}
+
+    def apply(self, state: State, found: dict[str, Any]) -> None:
+        state.occluder = None
+        state.leave_out(*INDIRECT)
+
+
+def share_hidden(hidden: float) -> str:
+    """Say how much of the object mirrors the object."""
+    return f"the object mirrors itself on {hidden:.1%} of it"
+
+
+class Light(Need):
+    """Texels of the light finer than the sharpest image of it on the object."""
+
+    name, what = "light", "all of the light's texels"
+    threshold, reason = 0.01, "dB; a coarser light that costs more is not taken, whatever the roughness"
+    moments = ("iteration",)
+    SETTLED = 0.19  # part of the training after which roughness hardly changes; before the light has all its texels
+    GLOSSIEST = 0.05  # part of the picture that may be glossier than the roughness that texels are chosen for
+    LOBE = 0.5  # part of a lobe's width that a texel may take
+
+    def due(self, state: State, moment: Moment, progress: float) -> bool:
+        return progress - state.settings.initial.until >= self.SETTLED
+
+    @torch.no_grad()
+    def measure(self, state: State) -> Decision:
+        inputs, finest = state.inputs(), state.settings.environment.resolution
+        coarsest, least = min(IRRADIANCE_SIDE, finest), None
+        if inputs.settings.reflection == "none":
+            side, roughness = coarsest, None
+            why = f"nothing is mirrored: irradiance has {coarsest} texels along a side"
+        else:
+            photos = [state.photo(view) for view in probe.spread_views(state)]
+            weight = probe.blended_shares(inputs.surfels, photos, state.near).sum(dim=0)
+            roughness = probe.quantile(inputs.surfels.roughness, weight, self.GLOSSIEST)
+            side = resolvable(roughness, self.LOBE, finest, coarsest)
+            rougher = f"{1 - self.GLOSSIEST:.0%} of the pictures are rougher than {roughness:.2f}"
+            why = f"{rougher}, whose lobe {side} texels along a side show"
+            least = math.sqrt(math.pi / 2 / (finest // 2) / self.LOBE)
+        if side >= finest:
+            return Decision(True, why, {}, roughness, least)
+        side = min(side, inputs.environment.resolution)
+
+        def coarse(inputs: RenderInputs) -> RenderInputs:
+            return inputs._replace(environment=probe.pooled(inputs.environment, side))
+
+        loss = probe.psnr_loss(state, coarse)
+        if loss > self.threshold and self.asked(state) == "auto":
+            return Decision(
+                True, f"{why}, and yet the photos know {loss:.2f} dB of the finer ones", {}, roughness, least
+            )
+        figures = {"side": side, "seconds": probe.seconds_saved(state, coarse)}
+        figures |= {"megabytes": 6 * (finest**2 - side**2) * 3 * NUMBER / MEGA, "decibels": loss}
+        return Decision(False, why, figures, roughness, least, lambda: light.coarsen(state, side))
+
+    def apply(self, state: State, found: dict[str, Any]) -> None:
+        state.change("environment.resolution", int(found["side"]), "needs", found["why"])
+
+
+def resolvable(roughness: float, part: float, finest: int, coarsest: int) -> int:
+    """Choose the fewest texels along a side that show a roughness's lobe, between `coarsest` and `finest`.
+
+    A texel may take this part of the lobe's width, the square of the roughness in radians.
+    """
+    side = coarsest
+    while side < finest and math.pi / 2 / side > part * roughness**2:
+        side *= 2
+    return side
+
+
+class Degrees(Need):
+    """Higher degrees of harmonics, of the residual and of the light that the object sends itself."""
+
+    name, what = "degrees", "all degrees of harmonics"
+    threshold, reason = 0.01, "dB of the training views: nobody sees it"
+    moments = ("iteration",)
+    LEARNED = 0.7  # part of the time in which harmonics learn after which it is known which degrees do
+
+    def due(self, state: State, moment: Moment, progress: float) -> bool:
+        late = state.residual_start
+        return late < 1 and progress >= late + self.LEARNED * (1 - late)
+
+    @torch.no_grad()
+    def measure(self, state: State) -> Decision:
+        figures, why, counts = {"seconds": 0.0, "megabytes": 0.0, "decibels": 0.0}, [], {}
+        inputs = state.inputs()
+        for field, name in (("sh_rest", "what is left over"), ("indirect_rest", "inter-reflection")):
+            if field not in state.parameters:
+                continue
+            whole, errors = state.parameters[field].shape[1], probe.squared_errors(state, inputs)
+            count, loss, shorter = whole, 0.0, inputs
+            for degree in reversed(range(math.isqrt(whole + 1) - 1)):
+                fewer = _shortened(inputs, field, (degree + 1) ** 2 - 1)
+                worse = probe.decibels_lost(errors, probe.squared_errors(state, fewer))
+                if worse > self.threshold:
+                    break
+                count, loss, shorter, last = (degree + 1) ** 2 - 1, worse, fewer, degree
+            if count == whole:
+                continue
+            inputs, counts[field] = shorter, count
+            figures["seconds"] += probe.seconds_saved(state, lambda i, f=field, c=count: _shortened(i, f, c))
+            numbers = len(state.parameters["position"]) * 3 * (whole - count)
+            figures["megabytes"] += numbers * NUMBER / MEGA
+            figures["decibels"] += loss
+            why.append(f"of {name} degree {last} is the last that is worth {self.threshold} dB")
+
+        def shorten() -> None:
+            for field, count in counts.items():
+                state.shorten(field, count)
+
+        why = "; ".join(why) or "the last degree is worth more"
+        return Decision(not counts, why, {"threshold": self.threshold, **figures}, once=shorten)
+
+
+def _shortened(inputs: RenderInputs, field: str, count: int) -> RenderInputs:
+    """Keep only the first coefficients of a field."""
+    values = {field: getattr(inputs.surfels, field)[:, :count]}
+    return inputs._replace(surfels=inputs.surfels._replace(**values))

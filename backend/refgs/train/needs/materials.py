@@ -1,0 +1,87 @@
+"""Needs of the materials: specular shading, and columns of splats.ply where all surfels have the same value."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from refgs.model.surfels import Surfels
+from refgs.train import probe
+from refgs.train.needs.need import ASKED, MEGA, Decision, Moment, Need, megabytes
+from refgs.train.state import RenderInputs, State
+
+KNOWN = 0.05  # part of the training after which it is known what mirrors: materials learn faster than shapes
+SOONEST = 100  # iterations: a mirror that has learned for fewer looks dull
+RARE = 1e-3  # part of the pictures, at either end, whose surfels do not count for a common value
+INDIRECT = "indirect_dc", "indirect_rest", "received"
+
+
+class Specular(Need):
+    """Specular shading: metallic, roughness and inter-reflection."""
+
+    name, what = "specular", "specular shading"
+    threshold = 0.3  # dB
+    reason = (
+        "at a twentieth of a training matte clay has none; a polished plate has 0.8 dB, glossy paint 2.6, a mirror 5.6"
+    )
+    moments = ("start", "iteration")
+
+    def due(self, state: State, moment: Moment, progress: float) -> bool:
+        settings = state.settings
+        if settings.render.reflection != "microfacet":
+            return False
+        if moment == "start":
+            return self.asked(state) == "off"
+        return progress - settings.initial.until >= KNOWN and state.iteration >= SOONEST
+
+    def measure(self, state: State) -> Decision:
+        if self.asked(state) == "off":
+            return Decision(False, ASKED)
+        explained = probe.specular_explains(state)
+        why = f"what is mirrored explains {explained:.2f} dB of the photos beyond one colour a surfel"
+        if explained >= self.threshold:
+            return Decision(True, why, statistic=explained)
+        saved = probe.seconds_saved(state, probe.without_specular)
+        size = megabytes(state, ("metallic", "roughness", *INDIRECT))
+        return Decision(False, why, {"seconds": saved, "megabytes": size, "decibels": explained}, explained)
+
+    def apply(self, state: State, found: dict[str, Any]) -> None:
+        state.change("render.reflection", "none", "needs", found["why"])
+        state.occluder = None
+        state.leave_out("metallic", "roughness", *INDIRECT)
+
+
+class Constants(Need):
+    """Columns of splats.ply for metallic and roughness."""
+
+    name, what = "constants", "columns for metallic and roughness"
+    threshold, reason = 1 / 255, "no 8-bit texture shows a smaller spread"
+    moments = ("asset",)
+
+    def measure(self, state: State, common: dict[str, tuple[float, float]], count: int) -> Decision | None:
+        if not common:
+            return None
+
+        def same(inputs: RenderInputs) -> RenderInputs:
+            surfels = inputs.surfels
+            values = {name: torch.full_like(getattr(surfels, name), value) for name, (value, _) in common.items()}
+            return inputs._replace(surfels=surfels._replace(**values))
+
+        why = "; ".join(f"{name} is {value:.3f}, within {spread:.4f}" for name, (value, spread) in common.items())
+        figures = {"megabytes": 4 * len(common) * count / MEGA, "decibels": probe.psnr_loss(state, same)}
+        return Decision(False, why, figures, len(common))
+
+    @torch.no_grad()
+    def common(self, state: State, surfels: Surfels, kept: Tensor) -> dict[str, tuple[float, float]]:
+        """Find the value, and its spread, of metallic and roughness where all surfels kept (N,) have about the same."""
+        if self.asked(state) == "on" or not state.method.lit:
+            return {}
+        photos = [state.photo(view) for view in probe.spread_views(state)]
+        weight = probe.blended_shares(surfels, photos, state.near).sum(dim=0) * kept
+        found = {}
+        for name in ("metallic", "roughness"):
+            values = getattr(surfels, name)
+            low, middle, high = (probe.quantile(values, weight, part) for part in (RARE, 0.5, 1 - RARE))
+            if self.asked(state) == "off" or high - low <= self.threshold:
+                found[name] = middle, high - low
+        return found

@@ -1,0 +1,62 @@
+"""Shape of a need: a part of the method that a scene may do without, and how that is decided."""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar, Literal, NamedTuple
+
+from refgs.train.state import State
+
+Moment = Literal["photos", "start", "iteration", "mesh", "asset"]
+"""When needs are decided: the photos are read, parameters are ready, an iteration is done, a mesh is made, the asset is written."""
+
+ASKED = "its setting leaves it out"
+NUMBER = 4 * 4  # bytes: a float, its derivative and Adam's two moments
+MEGA = 1e6
+
+
+class Decision(NamedTuple):
+    """What was found about a need.
+
+    `statistic` was compared with `threshold`, the need's own unless another is given. `figures` say what is saved, in `seconds` and
+    `megabytes`, and what it cost, in `decibels` of the training views' PSNR; and what `Need.apply` reads.
+    """
+
+    needed: bool
+    why: str
+    figures: Mapping[str, float] = MappingProxyType({})
+    statistic: float | None = None
+    threshold: float | None = None
+    once: Callable[[], None] = (
+        lambda: None
+    )  # done when it is decided; its result is in checkpoints, or made by each start
+
+
+class Need:
+    """One entry of the table in `refgs.train.needs`."""
+
+    name: ClassVar[str]  # also in the settings' `needs`
+    what: ClassVar[str]  # words for the artist
+    threshold: ClassVar[float | None] = None
+    reason: ClassVar[str] = ""  # for the threshold
+    moments: ClassVar[tuple[Moment, ...]]
+    follows: ClassVar[str] = ""  # a need after whose decision this one is asked, too
+
+    def due(self, state: State, moment: Moment, progress: float) -> bool:
+        """Tell whether to decide now, at one of the moments. `on` in the settings, and what is decided already, is never asked."""
+        return True
+
+    def measure(self, state: State, *given: Any) -> Decision | None:
+        """Measure and decide, from what the moment gives besides the state. None where there is nothing to record."""
+        raise NotImplementedError
+
+    def apply(self, state: State, found: dict[str, Any]) -> None:
+        """Do without; when it is decided, and again when a run is resumed."""
+
+    def asked(self, state: State) -> str:
+        """The setting: "auto", "on" or "off"."""
+        return getattr(state.settings.needs, self.name)
+
+
+def megabytes(state: State, names: tuple[str, ...]) -> float:
+    """Memory of these parameters while they learn."""
+    return sum(state.parameters[name].numel() for name in names if name in state.parameters) * NUMBER / MEGA

@@ -1,0 +1,105 @@
+"""Needs of the photos: views that show the same as others, pixels beyond the masks."""
+
+import math
+
+import numpy as np
+
+from refgs.capture import LoadedView
+from refgs.compare.metrics import psnr
+from refgs.train import probe
+from refgs.train.needs.need import MEGA, Decision, Moment, Need
+from refgs.train.state import State
+
+MARGIN = 10  # pixels about the mask: no D-SSIM window, whose radius is 5, then sees both the object and the border
+WHOLE_EVERY = 8  # iterations: one of these sees its whole photo, so that nothing stays beyond the margin
+TIMED = 100  # iterations after which the time that crops save is measured
+ALIKE_PIXELS, ALIKE_DECIBELS = 0.5, 40.0  # duplicates move by less, and differ by no more than 8-bit photos' noise
+
+
+class Views(Need):
+    """Training views that duplicate others."""
+
+    name, what = "views", "all photos"
+    threshold, reason = 1, "each duplicate costs as much as a photo that adds something"
+    moments = ("photos",)
+
+    def measure(self, state: State) -> Decision | None:
+        found = duplicate_views(state.views, state.capture.radius)
+        if not found:
+            return None
+        size = sum(state.views[view].image.nbytes for view in found)
+        count = f"{len(found)} of {len(state.views)}"
+        why = f"{count} show what another shows, from less than {ALIKE_PIXELS} pixels away"
+
+        def remove() -> None:
+            state.views = [view for number, view in enumerate(state.views) if number not in found]
+
+        return Decision(False, why, {"megabytes": size / MEGA}, len(found), once=remove)
+
+
+class Outside(Need):
+    """Pixels that lie beyond the masks' bounds."""
+
+    name, what = "outside", "the pixels beyond the masks"
+    threshold, reason = 0.1, "a part of the pixels; the time that less saves could not be measured"
+    moments = ("start",)
+
+    def due(self, state: State, moment: Moment, progress: float) -> bool:
+        return state.from_hull and state.settings.loss.alpha > 0
+
+    def measure(self, state: State) -> Decision | None:
+        crops = [bounds(view.alpha, MARGIN) for view in state.views]
+        within = sum((rows.stop - rows.start) * (columns.stop - columns.start) for rows, columns in crops)
+        part = 1 - within / sum(photo.image[..., 0].numel() for photo in state.photos)
+        if self.asked(state) == "auto" and part < self.threshold:
+            return None
+        beyond = f"{part:.0%} of the photos' pixels lie more than {MARGIN} pixels beyond the masks' bounds"
+
+        def crop() -> None:
+            state.crops = crops
+
+        return Decision(False, f"{beyond}; one photo in {WHOLE_EVERY} is whole", statistic=part, once=crop)
+
+
+def time_crops(state: State) -> None:
+    """Add to the decision about `outside` the seconds that it saves, once there are iterations to time."""
+    if state.crops is not None and state.iteration >= TIMED and "seconds" not in state.needs["outside"]:
+        state.needs["outside"]["seconds"] = (1 - 1 / WHOLE_EVERY) * probe.seconds_saved(state, whole=True)
+
+
+def bounds(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """Rows and columns of a mask (H, W) and so many pixels about them; all of them where it is empty."""
+    shown = []
+    for axis, size in ((1, mask.shape[0]), (0, mask.shape[1])):
+        there = np.flatnonzero(mask.any(axis=axis)) if mask.any() else np.array([0, size - 1])
+        shown.append(slice(max(int(there[0]) - margin, 0), min(int(there[-1]) + 1 + margin, size)))
+    return tuple(shown)
+
+
+def duplicate_views(views: list[LoadedView], radius: float) -> list[int]:
+    """Find views that add nothing to an earlier one: no point of the object moves between them, and they show the same."""
+    found, kept = [], []
+    for number, view in enumerate(views):
+        alike = any(
+            motion(views[other], view, radius) < ALIKE_PIXELS and _agreement(views[other], view) > ALIKE_DECIBELS
+            for other in kept
+        )
+        (found if alike else kept).append(number)
+    return found
+
+
+def motion(one: LoadedView, other: LoadedView, radius: float) -> float:
+    """Bound how far, in pixels, a point of the object moves from one photo to the other; infinite between photos of two sizes."""
+    a, b = one.camera, other.camera
+    if (a.width, a.height) != (b.width, b.height) or (one.alpha is None) != (other.alpha is None):
+        return math.inf
+    distance = float(np.linalg.norm(a.position))
+    shift = float(np.linalg.norm(a.position - b.position)) / max(distance - radius, 0.1 * radius)
+    turn = float(np.linalg.norm(a.world_to_camera[:3, :3] - b.world_to_camera[:3, :3]))
+    lens = abs(a.fx - b.fx) + abs(a.fy - b.fy) + abs(a.cx - b.cx) + abs(a.cy - b.cy)
+    return (shift + turn) * max(a.fx, a.fy) + lens
+
+
+def _agreement(one: LoadedView, other: LoadedView) -> float:
+    """PSNR in dB between two photos of the same size."""
+    return psnr(one.image / np.float32(255), other.image / np.float32(255))

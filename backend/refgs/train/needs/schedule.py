@@ -1,0 +1,58 @@
+"""Needs of the schedule: the first stage, and how many iterations there are."""
+
+from typing import Any
+
+from refgs.train.needs.need import ASKED, Decision, Moment, Need
+from refgs.train.state import State
+
+
+class Initial(Need):
+    """First stage, in which each surfel is shaded by itself."""
+
+    name, what = "initial", "a first stage of surfels shaded one by one"
+    moments = ("start",)
+
+    def due(self, state: State, moment: Moment, progress: float) -> bool:
+        # From the hull, deferred shading finds better normals alone than after this stage: docs/measurements.md.
+        left_out = state.from_hull or self.asked(state) == "off"
+        return left_out and state.settings.initial.until > 0 and state.method.deferred
+
+    def measure(self, state: State) -> Decision:
+        return Decision(False, ASKED if self.asked(state) == "off" else "surfels start on the hull of the masks")
+
+    def apply(self, state: State, found: dict[str, Any]) -> None:
+        state.change("initial.until", 0.0, "needs", found["why"])
+        state.initial = False
+
+
+class Iterations(Need):
+    """Last fifth of the iterations, where there is no specular part to learn, unless a time was given to be used."""
+
+    name, what = "iterations", "all iterations"
+    moments, follows = ("start",), "specular"
+    ENOUGH = 0.8  # part of the iterations left after which matte scenes are as good as after all: docs/measurements.md
+
+    def due(self, state: State, moment: Moment, progress: float) -> bool:
+        matte = not state.needs.get("specular", {"needed": True})["needed"]
+        asked = moment == "start" and self.asked(state) == "off"
+        return (asked or matte) and state.plan.minutes is None
+
+    def measure(self, state: State) -> Decision:
+        specular = state.needs.get("specular", {})
+        total, left = (
+            state.iteration + round(self.ENOUGH * (state.total - state.iteration)),
+            state.total - state.iteration,
+        )
+        one, why = 0.0, ASKED  # seconds of an iteration
+        if "statistic" in specular:
+            one, why = (
+                state.seconds / state.iteration - specular["seconds"] / max(left, 1),
+                "what mirrors nothing has less to learn",
+            )
+        figures = {"total": total, "seconds": max(one, 0.0) * (state.total - total)}
+        why = f"{why}: {total:,} in place of {state.total:,}"
+        return Decision(False, why, figures, specular.get("statistic"), specular.get("threshold"))
+
+    def apply(self, state: State, found: dict[str, Any]) -> None:
+        state.total = min(state.total, int(found["total"]))
+        state.effective = state.effective.noted("train.iterations", state.total, "needs", found["why"])

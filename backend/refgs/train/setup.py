@@ -1,0 +1,100 @@
+"""Setting up a training: photos, the light's frame, surfels, the optimiser; and setting up anew for the deferred stage."""
+
+from pathlib import Path
+
+import torch
+
+from refgs.capture import Capture
+from refgs.model.adam import Adam
+from refgs.model.surfels import Parameters, activate
+from refgs.train import light, needs
+from refgs.train.effective import Effective
+from refgs.train.guard import limits
+from refgs.train.light_frame import light_frame
+from refgs.train.losses import Photo
+from refgs.train.plan import Plan
+from refgs.train.start import start_appearance, start_parameters
+from refgs.train.state import Report, State
+from refgs.train.trace import why_not_traced
+
+
+def set_up(capture: Capture, effective: Effective, folder: Path, report: Report, plan: Plan, device: str) -> State:
+    """Read a capture's photos and make all that learns, ready for the first iteration."""
+    state = State(capture, effective, folder, report, plan, device)
+    needs.evaluate_due(state, "photos")
+    state.photos = [Photo.of(view, state.device) for view in state.views]
+    with state.clock.part("start"):
+        start, shown, source = start_parameters(capture, state.views, state.settings)
+    _choose_light_frame(state, start, shown)
+    state.parameters = {name: value.detach().to(state.device).requires_grad_() for name, value in start.items()}
+    report("stage", {"what": source})
+    _start_learning(state)
+    needs.evaluate_due(state, "start")
+    return state
+
+
+def _choose_light_frame(state: State, start: Parameters, shown: int) -> None:
+    """Ask the photos for the light's frame, where the settings leave it to them. The first surfels, `shown`, lie on the hull."""
+    lit = state.method.lit
+    if state.settings.light.frame != "auto":
+        return
+    frame, why = "world", "there is no light" if not lit else "not every photo has a mask of the object"
+    if lit and state.from_hull:
+        with torch.no_grad():
+            points = activate(start)
+            found = points.positions[:shown].numpy(), points.normals()[:shown].numpy()
+        frame, why = light_frame(state.views, *found, state.capture.radius)
+    state.change("light.frame", frame, "photos", why)
+    if lit:
+        where = "turns with the camera" if frame == "camera" else "stands still"
+        state.announce("light", f"the light {where}: {why}")
+
+
+def _start_learning(state: State) -> None:
+    """Make light, exposures and the optimiser; set parameters aside that this run's shading never reads."""
+    settings, method = state.settings, state.method
+    texels = torch.empty(6 * light.resolution(settings, 0) ** 2, 3, device=state.device)
+    state.light = texels.fill_(light.start_value(state)).requires_grad_()
+    _set_constants_aside(state)
+    learned = dict(state.parameters)
+    if method.lit:
+        learned["environment"] = state.light
+        if settings.light.exposure != "off":
+            learned["exposure"] = state.exposures = torch.zeros(len(state.views), device=state.device).requires_grad_()
+    radius, brightest = state.capture.radius, method.light.brightest
+    groups = [{"params": [value], "name": name} for name, value in learned.items()]
+    state.optimizer = Adam([group | {"limits": limits(group["name"], radius, brightest)} for group in groups])
+    state.reset_motion()
+
+
+def _set_constants_aside(state: State) -> None:
+    """Move parameters that the shading never reads to the constants, one row each."""
+    method, diffuse = state.method, state.settings.render.diffuse
+    unused = [*method.unread]
+    if method.lit and diffuse == "irradiance":
+        unused += ["sh_dc"] if state.residual_start < 1 else ["sh_dc", "sh_rest"]
+    if why := why_not_traced(state):
+        unused += ["indirect_dc", "indirect_rest"]
+        if method.deferred and state.settings.indirect.start < 1:
+            state.announce("reflections", f"without inter-reflection: {why}")
+    if why or diffuse == "sh":
+        unused += ["received"]
+    state.constant = {name: state.parameters.pop(name).detach()[:1] for name in [*unused, *method.constants]}
+    for name, value in method.constants.items():
+        state.constant[name].fill_(value)
+
+
+@torch.no_grad()
+def start_deferred(state: State) -> None:
+    """End the stage in which surfels are shaded one by one: colour, material and light start anew on its geometry (paper §3.3)."""
+    state.initial = False
+    for name, row in start_appearance(state.settings).items():
+        if name in state.parameters:
+            state.parameters[name][:] = row
+            state.optimizer.state.pop(state.parameters[name], None)
+    state.light.fill_(light.start_value(state))
+    state.optimizer.state.pop(state.light, None)
+    if state.exposures is not None:  # learned against the light before
+        state.exposures.zero_()
+        state.optimizer.state.pop(state.exposures, None)
+    state.report("stage", {"what": "shading what is blended: colour, material and light start anew"})

@@ -1,0 +1,207 @@
+"""State of a training: what it works on, what it learns, and what was decided about it."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from refgs.camera import Camera
+from refgs.capture import Capture, load_view
+from refgs.clock import Clock
+from refgs.geometry.visibility import Occluder
+from refgs.model.adam import Adam
+from refgs.model.environment import Environment
+from refgs.model.surfels import Parameters, Surfels, activate
+from refgs.render.baselines import Method, initial_stage, method_of
+from refgs.render.renderer import Rendering, near_plane, render
+from refgs.settings import LossSettings, RenderSettings, Settings
+from refgs.train.effective import Effective
+from refgs.train.losses import Photo
+from refgs.train.motion import ScreenGradient
+from refgs.train.plan import Plan
+
+Report = Callable[[str, dict[str, Any]], None]
+"""Called with an event's name and its facts: "stage", "decided", "progress", "measured", "warning"."""
+
+
+def spread(items: Sequence, most: int) -> Sequence:
+    """Choose at most this many items, evenly."""
+    return items[:: max(1, len(items) // most)][:most]
+
+
+class RenderInputs(NamedTuple):
+    """All that a picture is rendered from, except the camera and its exposure."""
+
+    surfels: Surfels
+    environment: Environment | None
+    settings: RenderSettings
+    occluder: Occluder | None
+
+
+class State:
+    """A training as it stands: read from a capture here, made ready by `train/setup.py`, moved on by `train/trainer.py`.
+
+    The second block of attributes is what a checkpoint holds (`train/snapshot.py`); the first is made anew when a run is resumed.
+    """
+
+    def __init__(
+        self, capture: Capture, effective: Effective, folder: Path, report: Report, plan: Plan, device: str
+    ) -> None:
+        self.capture, self.effective, self.folder, self.report = capture, effective, folder, report
+        self.device, self.near = torch.device(device), near_plane(capture.radius)
+        self.background = torch.tensor(self.settings.image.background, device=self.device)
+        self.clock, self.plan = Clock(self.device), plan
+        with self.clock.part("reading"):
+            side = self.settings.image.max_side
+            self.views = [load_view(view, side) for view in capture.train_views]
+            self.test = [load_view(view, side) for view in capture.test_views]
+        self.from_hull = all(view.alpha is not None for view in self.views)  # surfels start on the masks' hull
+        self.photos: list[Photo] = []  # of the views
+        self.crops: list[tuple[slice, slice]] | None = (
+            None  # the parts of the photos that are trained on; None: all of them
+        )
+
+        self.iteration, self.total = 0, self.settings.train.iterations
+        self.seconds, self.processor_seconds = 0.0, 0.0  # the latter of all threads, which other programs hardly change
+        self.decided: dict[str, str] = {}  # lines for the artist, by what was decided
+        self.needs: dict[str, dict[str, Any]] = {}  # the decisions of `train/needs`, by the need's name
+        self.initial = self.method.deferred and self.settings.initial.until > 0  # its stage is not over
+        self.parameters: Parameters = {}  # one row a surfel
+        self.constant: Parameters = {}  # parameters that do not learn: one row for all surfels
+        self.light = torch.empty(0, 3)  # raw texels; `environment` makes radiance of them
+        self.light_shown: Tensor | None = None  # the weight of each texel in the light's mean
+        self.exposures: Tensor | None = (
+            None  # natural logarithms, one a view; None: photos have no exposures of their own
+        )
+        self.optimizer = Adam([])
+        self.motion = ScreenGradient(0, self.device)
+        self.occluder: Occluder | None = None
+
+    @property
+    def settings(self) -> Settings:
+        """The settings in effect."""
+        return self.effective.settings
+
+    @property
+    def method(self) -> Method:
+        """How surfels and light become pictures."""
+        return method_of(self.settings.render)
+
+    @property
+    def ended(self) -> bool:
+        return self.iteration >= self.total
+
+    @property
+    def residual_start(self) -> float:
+        """The part of the training after which colour by direction learns what material and light leave over; 1: it never does."""
+        settings = self.settings
+        return settings.residual.start if self.method.deferred and settings.render.diffuse == "irradiance" else 1.0
+
+    @property
+    def losses(self) -> LossSettings:
+        """The objective's weights. Matte surfels have no metallic or roughness to weigh."""
+        weights = self.settings.loss
+        if self.settings.render.reflection == "none":
+            return weights.model_copy(update={"even": 0.0, "metallic": 0.0, "matte": 0.0})
+        return weights
+
+    def surfels(self) -> Surfels:
+        """Activate the surfels, with the values of what does not learn filled in."""
+        count, late = len(self.parameters["position"]), self.residual_start
+        values = activate({**self.parameters, **self.constant})
+        unlearned = late == 1 or self.iteration < late * self.total
+        if self.method.lit and self.settings.render.diffuse == "irradiance" and unlearned:
+            values = values.without_directions()
+        return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
+
+    def environment(self) -> Environment | None:
+        """Make the light of its raw texels; None where nothing is lit."""
+        if not self.method.lit:
+            return None
+        reference = self.views[0].camera if self.settings.light.frame == "camera" else None
+        return Environment(self.method.light.radiance(self.light), reference)
+
+    def inputs(self) -> RenderInputs:
+        """Gather what pictures are rendered from at this stage."""
+        settings = self.settings.render
+        settings = initial_stage(settings) if self.initial else settings
+        return RenderInputs(self.surfels(), self.environment(), settings, self.occluder)
+
+    def picture(self, inputs: RenderInputs, camera: Camera, exposure: Tensor | None = None) -> Rendering:
+        """Render a camera, with gradients."""
+        surfels, environment, settings, occluder = inputs
+        return render(surfels, environment, camera, self.background, settings, self.near, occluder, exposure)
+
+    @torch.no_grad()
+    def render(self, camera: Camera, surfels: Surfels | None = None) -> Rendering:
+        """Render a camera without gradients: all surfels, or those given."""
+        inputs = self.inputs()
+        return self.picture(inputs if surfels is None else inputs._replace(surfels=surfels), camera)
+
+    def photo(self, view: int, whole: bool = False) -> Photo:
+        """Give the part of a view's photo that is trained on, or all of it."""
+        return self.photos[view] if whole or self.crops is None else self.photos[view].part(*self.crops[view])
+
+    def exposure(self, view: int) -> Tensor | None:
+        """Give the factor of a photo's radiance; None where photos have no exposures of their own."""
+        return None if self.exposures is None else self.exposures[view].exp()
+
+    def spread_cameras(self, least: int) -> list[Camera]:
+        """Cameras of at least this many training views, evenly chosen; of all where there are fewer."""
+        return [view.camera for view in self.views[:: max(1, len(self.views) // least)]]
+
+    def wanted(self) -> Tensor:
+        """Tell which surfels (N,) lie in the region, all where there is none. The others show what photos show beside it."""
+        position, box = self.parameters["position"], self.capture.box
+        if box is None:
+            return torch.ones(len(position), dtype=torch.bool, device=self.device)
+        return torch.from_numpy(box.contains(position.numpy(force=True))).to(self.device)
+
+    def announce(self, about: str, what: str) -> None:
+        """Report a decision once, and again only where it changes."""
+        if self.decided.get(about) != what:
+            self.decided[about] = what
+            self.report("decided", {"about": about, "what": what})
+
+    def change(self, key: str, value: Any, by: str, why: str) -> None:
+        """Change a setting, `section.name`, from here on."""
+        self.effective = self.effective.changed(key, value, by, why)
+
+    def group(self, name: str) -> dict[str, Any]:
+        """Give the optimiser's group of a parameter."""
+        return next(group for group in self.optimizer.param_groups if group["name"] == name)
+
+    def leave_out(self, *names: str) -> None:
+        """Stop learning these parameters; the first surfel's values stand for all."""
+        for name in names:
+            if name in self.parameters:
+                value = self.parameters.pop(name)
+                self.optimizer.state.pop(value, None)
+                self.constant[name] = value.detach()[:1].clone()
+        self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] not in names]
+
+    def shorten(self, name: str, count: int) -> None:
+        """Keep only the first harmonics' coefficients of a parameter."""
+        old, new = self.parameters[name], self.parameters[name].detach()[:, :count].contiguous().requires_grad_()
+        state = self.optimizer.state.pop(old, {})
+        self.group(name)["params"][0] = self.parameters[name] = new
+        if state:
+            moments = {key: state[key][:, :count].contiguous() for key in ("exp_avg", "exp_avg_sq")}
+            self.optimizer.state[new] = state | moments
+
+    def without_exposures(self) -> None:
+        """Stop learning exposures: each photo's is one."""
+        self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
+        self.optimizer.state.pop(self.exposures, None)
+        self.exposures = None
+
+    def reset_motion(self) -> None:
+        """Forget the gradients by which surfels are divided: they are of other surfels."""
+        self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
+
+    def forget_gradients(self) -> None:
+        """Drop the last backward pass's gradients."""
+        for group in self.optimizer.param_groups:
+            group["params"][0].grad = None

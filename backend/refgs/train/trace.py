@@ -1,0 +1,81 @@
+"""Inter-reflection: the mesh that it is traced on, and whether a training has it at all."""
+
+import torch
+
+from refgs.errors import InputError
+from refgs.geometry.mesh import clean
+from refgs.geometry.visibility import Occluder
+from refgs.model.environment import Environment
+from refgs.model.surfels import Surfels
+from refgs.render.extract import extract
+from refgs.render.relight import received
+from refgs.render.volume import with_normals_last
+from refgs.train import needs
+from refgs.train.densify import faint_now
+from refgs.train.state import State
+
+VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer
+
+
+def why_not_traced(state: State) -> str:
+    """Say why this run looks for no inter-reflection; "" where it does."""
+    settings = state.settings
+    if not state.method.deferred:
+        return f"shading = {settings.render.shading}"
+    if settings.indirect.start >= 1:
+        return "its setting leaves it out (indirect.start = 1)"
+    if not state.needs.get("reflections", {}).get("needed", True):
+        return state.needs["reflections"]["why"]
+    if settings.render.reflection == "none":
+        return "nothing is mirrored"
+    if not state.from_hull:  # the mesh would be of the surroundings too
+        return "not every photo has a mask of the object"
+    if settings.light.frame == "camera":  # surfels have no light of their own to show others
+        return "the light turns with the camera: what the object mirrors of itself changes from photo to photo"
+    return ""
+
+
+def trace_due(state: State, progress: float) -> None:
+    """Make a new mesh at the iterations that are due for one."""
+    settings = state.settings.indirect
+    # Materials would no longer adapt to a mesh that is made after the residual has started to learn.
+    learns = settings.start <= progress < state.residual_start
+    if not learns or state.iteration % settings.every or state.initial or state.ended or faint_now(state):
+        return
+    if not why_not_traced(state):
+        with state.clock.part("visibility"):
+            _trace(state)
+
+
+@torch.no_grad()
+def _trace(state: State) -> None:
+    """Extract the mesh, decide by it whether inter-reflection is needed, and trace the irradiance that surfels receive."""
+    capture, cameras = state.capture, state.spread_cameras(VIEWS)
+    state.occluder = None
+    inputs = state.inputs()
+    surfels, environment = inputs.surfels, inputs.environment
+    inside = surfels.chosen(state.wanted())
+    with state.clock.part("mesh"):
+        side = state.settings.indirect.resolution
+        mesh, _ = extract(inside, cameras, state.near, capture.centre, capture.radius, side)
+        try:
+            state.occluder = Occluder(clean(mesh, triangles=len(mesh.faces)))
+        except InputError:  # there is no surface yet
+            return
+    inputs, hidden, solid = inputs._replace(surfels=inside, occluder=state.occluder), 0.0, 1e-9
+    for camera in cameras[::3]:
+        seen = state.picture(inputs, camera)
+        opaque = seen.alpha > 0.5
+        hidden += float((1 - seen.visibility)[opaque].sum())
+        solid += float(opaque.sum())
+    if not state.optimizer.state.get(state.parameters["indirect_dc"]):
+        # Start from the light that the surfels mirrored until now, so that the picture changes little.
+        start, rest = environment.harmonics, state.parameters["indirect_rest"]
+        state.parameters["indirect_dc"][:], rest[:] = start[:1], start[1 : 1 + rest.shape[1]]
+    with state.clock.part("deciding"):
+        needs.evaluate_mesh(state, hidden / solid)
+    if state.occluder is not None and "received" in state.parameters:
+        # Traced anew with each mesh, for light and mesh are better known by then.
+        traced = Surfels(*(value.cpu() for value in with_normals_last(surfels)))
+        light = Environment(environment.radiance.cpu())  # in the world's frame: in the camera's nothing is traced
+        state.parameters["received"][:] = received(traced, state.occluder, light)

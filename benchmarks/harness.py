@@ -1,0 +1,264 @@
+"""The harness of all benchmarks: scenes, runs, rows of figures, tables of rows.
+
+A benchmark trains what is not trained yet, records rows, and names tables. Its tables are printed with the kept figure in brackets, and
+`--csv FILE` writes the rows. docs/measurements.csv keeps them; `refgs bench page` makes docs/measurements.md from it.
+"""
+
+import argparse
+import csv
+import json
+import platform
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import date
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.table import Table as Printed
+
+from benchmarks.scenes import NAMES
+from refgs import CORES
+from refgs.errors import InputError
+from refgs.kernels.load import supported
+from refgs.paths import clone_root, whole
+from refgs.settings import load_settings
+
+KEPT = clone_root() / "docs" / "measurements.csv"
+console = Console(soft_wrap=True, width=None if sys.stdout.isatty() else 200)  # files get whole tables
+
+
+class Row(NamedTuple):
+    """One figure. A number is a float; a word, such as the name of a preset, a string."""
+
+    benchmark: str
+    scene: str
+    variant: str
+    figure: str
+    value: float | str
+    unit: str
+    machine: str
+    date: str
+    commit: str
+
+
+class Column(NamedTuple):
+    """A column of a table: its heading, figure and format. Without a variant the table has a line for each variant."""
+
+    heading: str
+    figure: str
+    form: str = ".1f"
+    variant: str | None = None
+
+
+class Table(NamedTuple):
+    """How rows of a benchmark become a table: a line for each scene, or scene and variant; then the mean over the scenes `mean`."""
+
+    title: str
+    benchmark: str
+    columns: tuple[Column, ...]
+    line: str = "scene"
+    variant: str = ""  # heading of the variants, where lines are told apart by them
+    mean: tuple[str, ...] = ()
+
+    def lines(self, rows: Sequence[Row], kept: Sequence[Row] = ()) -> list[list[str]]:
+        """Headings, then a line a scene; kept figures stand in brackets. Lines and columns without a figure are left out."""
+        found, before = ({r[1:4]: r.value for r in some if r.benchmark == self.benchmark} for some in (rows, kept))
+        lines = dict.fromkeys(
+            (r.scene, r.variant if self.variant else "") for r in rows if r.benchmark == self.benchmark
+        )
+        columns = [c for c in self.columns if any(self._key(line, c) in found for line in lines)]
+        result, counted = [[self.line, *([self.variant] if self.variant else []), *(c.heading for c in columns)]], []
+        for line in lines:
+            cells = [(found.get(key), before.get(key)) for key in (self._key(line, c) for c in columns)]
+            if any(value is not None for value, _ in cells):
+                shown = [_cell(*cell, c.form) for cell, c in zip(cells, columns, strict=True)]
+                result.append([line[0], *([line[1]] if self.variant else []), *shown])
+                counted += [[value for value, _ in cells]] if line[0] in self.mean else []
+        if len(counted) > 1:
+            means = map(mean, zip(*counted, strict=True))
+            result.append(["mean", *(_cell(value, None, c.form) for value, c in zip(means, columns, strict=True))])
+        return result
+
+    def _key(self, line: tuple[str, str], column: Column) -> tuple[str, str, str]:
+        return line[0], line[1] if column.variant is None else column.variant, column.figure
+
+
+def _cell(value: float | str | None, kept: float | str | None, form: str) -> str:
+    if value is None:
+        return "–"
+    now, *before = [v if isinstance(v, str) else format(v, form) for v in (value, kept) if v is not None]
+    return f"{now} ({before[0]})" if before else now
+
+
+def mean(values: Sequence[float | str | None]) -> float | None:
+    """Average the values; None where one is unknown or a word, for scenes beside it would differ."""
+    return sum(values) / len(values) if values and all(isinstance(v, float | int) for v in values) else None
+
+
+class Way(NamedTuple):
+    """A way to train: words of `refgs train`, and minutes, if any: a number, or those that another way took."""
+
+    words: tuple[object, ...]
+    minutes: float | str | None = None
+
+
+class Bench:
+    """One benchmark while it runs: its options, the rows that it measured, and the runs that failed."""
+
+    def __init__(self, name: str, parser: argparse.ArgumentParser, arguments: Sequence[str] | None):
+        parser.prog = f"refgs bench {name}"
+        parser.add_argument("--csv", type=Path, metavar="FILE", help="write the figures into this file, too")
+        self.name, self.options = name, parser.parse_args(arguments)
+        self.rows: list[Row] = []
+        self.failed: list[Path] = []
+        self.where = this_machine(), date.today().isoformat(), commit()
+
+    def record(self, scene: str, variant: str, unit: str, **figures: float | str | None) -> None:
+        """Keep figures of a scene in a variant; one that is None was not measured."""
+        for figure, value in figures.items():
+            if value is not None:
+                self.rows.append(Row(self.name, scene, variant, figure, value, unit, *self.where))
+
+    def runs(self, ways: dict[str, Way]) -> Iterator[tuple[str, dict[str, Path]]]:
+        """Train and evaluate each scene in each way, in OUT/[PRESET/]WAY/SCENE; yield the scene and the runs that succeeded."""
+        options = self.options
+        preset = getattr(options, "preset", "")
+        if preset:
+            load_settings(preset)  # a wrong one is said before anything is trained
+        out = (options.out or clone_root() / "demo" / self.name) / Path(preset).stem
+        for capture in find_scenes(options.scenes, options.only):
+            done: dict[str, Path] = {}
+            for name, (words, minutes) in ways.items():
+                if isinstance(minutes, str):
+                    if minutes not in done:
+                        continue
+                    minutes = figures(done[minutes])["total_seconds"] / 60
+                run = out / name.replace(" ", "_") / capture.name
+                if train(capture, run, words, minutes, capture / "ground_truth"):
+                    done[name] = run
+                else:
+                    self.failed.append(run)
+            yield capture.name, done
+
+    def finish(self, *tables: Table) -> None:
+        """Print the tables, write the CSV; end with status 1 where a run failed."""
+        kept = read(KEPT) if KEPT.exists() else []
+        for table in tables:
+            headings, *lines = table.lines(self.rows, kept)
+            shown = any(row.benchmark == self.name for row in kept)
+            printed = Printed(title=table.title, caption="in brackets: the kept figure" if shown else None)
+            for index, heading in enumerate(headings):
+                printed.add_column(heading, justify="right" if index > bool(table.variant) else "left")
+            for line in lines:
+                printed.add_row(*line)
+            if lines:
+                console.print(printed)
+        if self.options.csv:
+            write(self.options.csv, self.rows)
+        if self.failed:
+            console.print(f"not measured, see above: {', '.join(map(str, self.failed))}")
+            raise SystemExit(1)
+
+
+def scene_options(parser: argparse.ArgumentParser, preset: str | None = None) -> argparse.ArgumentParser:
+    """Add the options of a benchmark that trains scenes with ground truth."""
+    parser.add_argument("--scenes", type=Path, required=True, help="folder of captures by benchmarks.scenes")
+    parser.add_argument("--out", type=Path, help="folder for the runs (default: demo/BENCHMARK)")
+    parser.add_argument("--only", nargs="+", metavar="SCENE", help="measure these scenes")
+    if preset:
+        parser.add_argument("--preset", default=preset, help=f"a preset's name or a TOML file ({preset})")
+    return parser
+
+
+def find_scenes(folder: Path, only: list[str] | None = None) -> list[Path]:
+    """Find the captures in a folder, or those that are named. Raises InputError where there are none."""
+    found = [folder / name for name in NAMES if (folder / name / "ground_truth").is_dir()]
+    if not found:
+        raise InputError(f"{folder}: no scene is here: render them with python -m benchmarks.scenes all --out {folder}")
+    chosen = [scene for scene in found if not only or scene.name in only]
+    if not chosen:
+        raise InputError(f"{folder} has none of {', '.join(only)}")
+    return chosen
+
+
+def call(*arguments: object) -> int:
+    """Run a command of refgs in a process of its own, which gives all memory back; return its exit status."""
+    process = subprocess.Popen([sys.executable, "-m", "refgs.cli", *map(str, arguments)])
+    try:
+        status = process.wait()
+    except KeyboardInterrupt:
+        process.send_signal(signal.SIGINT)
+        process.wait()  # a training writes a checkpoint first
+        raise
+    if status == 130:
+        raise KeyboardInterrupt
+    return status
+
+
+def train(
+    capture: Path, run: Path, words: Iterable[object], minutes: float | None = None, truth: Path | None = None
+) -> bool:
+    """Train and evaluate a run, resuming what was interrupted and leaving what is finished; return whether that succeeded."""
+    if figures(run) is not None:
+        return True
+    if not (run / "splats.ply").exists():
+        console.rule(str(run))
+        begun = ["--resume"] if (run / "run.toml").exists() else words
+        limit = [] if minutes is None else ["--minutes", minutes]
+        if call("train", capture, "--out", run, *begun, *limit) != 0:
+            return False
+    return call("evaluate", run, *([] if truth is None else ["--ground-truth", truth])) == 0
+
+
+def figures(run: Path) -> dict | None:
+    """Read the held-out figures of a finished run; None if it is not finished."""
+    try:
+        found = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if "psnr" in found and found.get("split") == "test" else None
+
+
+def relit(found: dict, figure: str) -> float | None:
+    """Average a figure over the lights that a run was relit by."""
+    return mean([light.get("refgs", {}).get(figure) for light in found.get("relight", {}).values()])
+
+
+def this_machine() -> str:
+    """Name this machine by what CPU figures depend on."""
+    return f"{platform.machine()}, {CORES} cores, {supported()[0]}"
+
+
+def commit() -> str:
+    """Name the commit that is measured."""
+    command = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
+    done = subprocess.run(command, cwd=clone_root(), capture_output=True, text=True)
+    return done.stdout.strip()
+
+
+def read(path: Path) -> list[Row]:
+    """Read rows of a CSV."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = [Row(**row) for row in csv.DictReader(file)]
+    return [row._replace(value=_number(row.value)) for row in rows]
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def write(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows into a CSV, in place of those of the same benchmark, scene, variant and figure."""
+    merged = {row[:4]: row for row in ([*read(path), *rows] if path.exists() else rows)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(Row._fields)
+        for row in merged.values():
+            table.writerow(f"{value:.6g}" if isinstance(value, float) else value for value in row)

@@ -1,0 +1,120 @@
+"""Check the imports of the trainer and of the extension: floors, circles, and who may import bpy and torch.
+
+    python scripts/check_imports.py [FOLDER]      # the clone, or another that is laid out like it
+
+Every import counts: at the top, inside a function, and under TYPE_CHECKING. Prints a line for each that is wrong, and exits with 1
+where there is one.
+"""
+
+import ast
+import sys
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+# The trainer's floors, the lowest first: a module imports its own floor and those below. CONTRIBUTING's map says what each has.
+FLOORS = (
+    ("", "camera", "clock", "color", "errors", "paths", "settings"),
+    ("formats",),
+    ("kernels",),
+    ("model",),
+    ("geometry",),
+    ("render",),
+    ("capture",),
+    ("lock", "run", "run_folder"),
+    ("compare",),
+    ("train",),
+    ("export",),
+    ("report",),
+    ("cli", "commands", "demo", "jobs", "worker"),
+)
+FORBIDDEN = {"backend": ("bpy", "refgs_addon"), "refgs_addon": ("torch", "refgs")}
+
+
+class Import(NamedTuple):
+    """Import of the module `target` by the module `source`, at `place`: file and line."""
+
+    source: str
+    target: str
+    place: str
+
+
+def modules(root: Path, package: str) -> dict[str, Path]:
+    """Find the files of a package that lies in `root`, by the names of their modules."""
+    files = sorted((root / package).rglob("*.py"))
+    return {".".join(f.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): f for f in files}
+
+
+def imports(files: dict[str, Path], root: Path) -> Iterator[Import]:
+    """Find all imports in files. A name imported from a module of theirs counts as an import of that module."""
+    for source, file in files.items():
+        package = source if file.name == "__init__.py" else source.rpartition(".")[0]
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), str(file))):
+            if isinstance(node, ast.Import):
+                targets = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+                base = ".".join([*above, *filter(None, [node.module])])
+                targets = [name if (name := f"{base}.{alias.name}") in files else base for alias in node.names]
+            else:
+                continue
+            for target in dict.fromkeys(targets):
+                yield Import(source, target, f"{file.relative_to(root).as_posix()}:{node.lineno}")
+
+
+def circles(found: list[Import]) -> Iterator[list[Import]]:
+    """Find circles, each as a list of imports. One import of each is taken out, until no circle is left."""
+    places = {(i.source, i.target): i for i in found if i.source != i.target}
+    while True:
+        graph: dict[str, list[str]] = {}
+        for source, target in places:
+            graph.setdefault(source, []).append(target)
+        try:
+            TopologicalSorter(graph).prepare()
+            return
+        except CycleError as error:
+            way = error.args[1][::-1]  # graphlib lists what is imported first
+            circle = [places[pair] for pair in pairwise(way)]
+            yield circle
+            del places[circle[-1].source, circle[-1].target]
+
+
+def floor(module: str) -> int | None:
+    """Number the floor of a module of `refgs` from below; None where FLOORS does not have it."""
+    part = [*module.split("."), ""][1]
+    return next((height for height, names in enumerate(FLOORS) if part in names), None)
+
+
+def check(root: Path) -> list[str]:
+    """Describe each import that breaks a rule."""
+    wrong = []
+    for half, folder, package in (("backend", root / "backend", "refgs"), ("refgs_addon", root, "refgs_addon")):
+        files = modules(folder, package)
+        found = list(imports(files, root))
+        for source, target, place in found:
+            if (name := target.split(".")[0]) in FORBIDDEN[half]:
+                wrong.append(f"{place}: {source} imports {target}: nothing under {half}/ imports {name}")
+        inside = [i for i in found if i.target in files]
+        if package == "refgs":
+            lost = [name for name in files if floor(name) is None]
+            wrong += [f"{files[name].relative_to(root).as_posix()}: {name} has no floor in FLOORS" for name in lost]
+            for source, target, place in inside:
+                if None not in (low := floor(source), high := floor(target)) and low < high:
+                    wrong.append(f"{place}: {source} imports {target}, which is on a floor above its own")
+        for circle in circles(inside):
+            steps = [f"{place} {source} -> {target}" for source, target, place in circle]
+            wrong.append("\n  ".join(["these import each other in a circle:", *steps]))
+    return wrong
+
+
+def main() -> None:
+    root = Path(sys.argv[1]).resolve() if len(sys.argv) > 1 else Path(__file__).resolve().parents[1]
+    wrong = check(root)
+    print(*wrong, sep="\n", end="\n" if wrong else "")
+    sys.exit(bool(wrong))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,69 @@
+"""Photograph objects from a command line: `NAME --out DIR` writes a capture with ground truth, `all` each into DIR/NAME.
+
+Standard output carries JSON lines: {"event": "progress", "done": 3, "total": 104, "what": "train views"}. Blender's own messages go to
+standard error. Exit status 2 and one line: the input is wrong.
+"""
+
+import argparse
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from refgs.errors import InputError
+from scripts.demo.shapes import Scene
+
+
+def main(program: str, scenes: dict[str, Callable[[], Scene]]) -> None:
+    """Photograph one of the scenes, or all, and end the process."""
+    status = _run(program, scenes)
+    sys.stderr.flush()
+    os._exit(status)  # Blender sometimes hangs when it cleans up at the end of a process
+
+
+def _run(program: str, scenes: dict[str, Callable[[], Scene]]) -> int:
+    parser = argparse.ArgumentParser(prog=f"python -m {program}", description="Photograph an object by Cycles.")
+    help = f"{', '.join(scenes)}; all: those that DIR doesn't hold yet"
+    parser.add_argument("name", choices=[*scenes, "all"], metavar="NAME", help=help)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder")
+    parser.add_argument("--size", type=int, default=256, help="width and height in pixels (256)")
+    parser.add_argument("--train", type=int, default=80, help="training views (80)")
+    parser.add_argument("--test", type=int, default=8, help="held-out views, which get ground truth (8)")
+    parser.add_argument("--samples", type=int, default=16, help="Cycles samples a pixel, before denoising (16)")
+    parser.add_argument("--relight", nargs="*", default=[], metavar="HDRI", help="Blender's HDRIs by name")
+    options = parser.parse_args()
+
+    # Blender prints to the file descriptor: events keep a copy of it, Blender gets standard error.
+    events = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    # A signal is obeyed after the current view, so that the half-written folder is removed: Blender hangs when an exception leaves
+    # one of its callbacks.
+    ended: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda number, _: ended.append(number))
+
+    captures = {options.name: options.out}
+    if options.name == "all":
+        captures = {name: options.out / name for name in scenes if not (options.out / name).exists()}
+
+    def progress(done: int, total: int, what: str) -> None:
+        if ended:
+            raise InterruptedError
+        done, total = done + total * list(captures).index(name), total * len(captures)
+        what = f"{name}: {what}" if options.name == "all" else what
+        print(json.dumps({"event": "progress", "done": done, "total": total, "what": what}), file=events)
+
+    from scripts.demo.capture import write_capture  # after the descriptors are moved: importing bpy may print
+
+    numbers = (options.size, options.train, options.test, options.samples)
+    try:
+        for name, out in captures.items():
+            write_capture(scenes[name](), out, *numbers, options.relight, progress)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except InterruptedError:
+        return 128 + ended[0]
+    return 0

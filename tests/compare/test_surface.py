@@ -1,0 +1,77 @@
+"""Meshes against the true one."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from refgs.camera import Camera
+from refgs.compare import surface
+from refgs.formats.mesh import Mesh
+
+
+def ball(radius=1.0, subdivisions=5, centre=(0, 0, 0)):
+    sphere = trimesh.creation.icosphere(subdivisions, radius)
+    return Mesh(np.array(sphere.vertices) + centre, np.array(sphere.faces))
+
+
+def camera(axis, distance=6.0):
+    """Looks at the origin from ±axis · distance."""
+    forward = -np.asarray(axis, float)
+    right = np.cross(forward, [0.3, 0.5, 0.8])
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    matrix[:3, 3] = -matrix[:3, :3] @ (distance * np.asarray(axis, float))
+    return Camera("view", 64, 64, 100.0, 100.0, 32.0, 32.0, matrix)
+
+
+ALL_ROUND = [camera(sign * axis) for axis in np.eye(3) for sign in (1, -1)]
+
+
+@pytest.fixture(autouse=True)
+def fewer_points(monkeypatch):
+    monkeypatch.setattr(surface, "POINTS", 10_000)
+
+
+def test_balls_of_nearly_one_radius_are_apart_by_the_difference():
+    figures = surface.compare(ball(1.01), ball(), ALL_ROUND)
+    assert figures["chamfer"] == pytest.approx(0.01, rel=0.02)
+    assert figures["normal_consistency"] > 0.999
+    # In radii: four times the size is the same figure. And the unit is the true mesh's.
+    larger = [camera(c.position / 6, 24.0) for c in ALL_ROUND]
+    assert surface.compare(ball(4.04), ball(4.0), larger) == pytest.approx(figures, rel=1e-3)
+
+
+def test_the_same_mesh_is_nowhere_off_however_it_is_cut_into_triangles():
+    box = trimesh.creation.box((1, 1.2, 0.8))
+    fine = box.subdivide().subdivide().subdivide().subdivide()
+    meshes = [Mesh(np.array(m.vertices), np.array(m.faces)) for m in (box, fine)]
+    figures = surface.compare(*meshes, ALL_ROUND)
+    assert figures["chamfer"] < 1e-4 and figures["normal_consistency"] > 0.995
+
+
+def test_what_no_camera_sees_is_left_out():
+    truth = ball()
+    inner = ball(0.4)
+    hollow = Mesh(
+        np.concatenate([truth.vertices, inner.vertices]),
+        np.concatenate([truth.faces, inner.faces + len(truth.vertices)]),
+    )
+    assert surface.compare(hollow, truth, ALL_ROUND)["chamfer"] < 1e-3
+    # From above alone, half a ball is as good as a whole one; from all round it is not.
+    upper = truth.faces[truth.vertices[truth.faces][..., 2].min(axis=1) > -0.05]
+    half = Mesh(truth.vertices, upper)
+    assert surface.compare(half, truth, [camera(np.eye(3)[2])])["chamfer"] < 1e-3
+    assert surface.compare(half, truth, ALL_ROUND)["chamfer"] > 0.05
+    assert surface.compare(truth, truth, [camera(np.eye(3)[2], -6.0)]) == {}, "it looks away"
+
+
+def test_seen_points_are_those_on_the_cameras_side():
+    mesh = ball()
+    points = mesh.vertices
+    seen = surface.seen(mesh, points, [camera(np.eye(3)[0])], 1e-3)
+    assert seen[points[:, 0] > 1 / 6 + 0.05].all() and not seen[points[:, 0] < 1 / 6 - 0.05].any()
+    near = surface.seen(mesh, points, [camera(np.eye(3)[0], 2.0)], 1e-3)
+    # A tangent of 0.32 to either side, of 0.45 to the corners: what is outside the picture is not seen.
+    aside = np.linalg.norm(points[:, 1:], axis=1) / (2.0 - points[:, 0])
+    assert near[(points[:, 0] > 0.6) & (aside < 0.31)].all() and not near[aside > 0.46].any()

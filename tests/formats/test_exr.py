@@ -1,0 +1,61 @@
+import numpy as np
+import OpenEXR
+import pytest
+
+from refgs.errors import InputError
+from refgs.formats.exr import read_exr, write_exr
+from refgs.formats.panorama import read_environment, write_environment
+
+RNG = np.random.default_rng(5)
+
+
+@pytest.mark.parametrize("shape", [(9, 7), (9, 7, 3), (9, 7, 4)])
+def test_round_trip(tmp_path, shape):
+    pixels = RNG.normal(size=shape).astype(np.float32) * 1e5
+    path = tmp_path / "un été.exr"
+    write_exr(path, pixels)
+    np.testing.assert_array_equal(read_exr(path), pixels)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_file_says_what_it_is(tmp_path):
+    write_environment(tmp_path / "e.exr", np.ones((4, 8, 3), np.float32))
+    with OpenEXR.File(str(tmp_path / "e.exr")) as file:
+        header = file.header()
+        assert list(file.channels()) == ["RGB"]
+        assert header["compression"] == OpenEXR.ZIP_COMPRESSION
+        np.testing.assert_allclose(
+            header["chromaticities"], (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329), rtol=1e-6
+        )
+
+
+def test_of_several_parts_the_first_in_colour_is_read(tmp_path):
+    """As renderers write depth, and stereo cameras two eyes, beside each other."""
+
+    def part(name, channels):
+        header = {"name": name, "type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+        return OpenEXR.Part(header, channels, name)
+
+    left, right = (np.full((4, 8, 3), value, np.float32) for value in (1, 2))
+    depth = {name: np.ones((4, 8), np.float32) for name in "ZA"}
+    parts = [part("depth", depth), part("left", {"RGB": left}), part("right", {"RGB": right})]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    np.testing.assert_array_equal(read_exr(tmp_path / "parts.exr"), left)
+    OpenEXR.File(parts[:1]).write(str(tmp_path / "depth.exr"))
+    with pytest.raises(InputError, match="has the channels A, Z"):
+        read_exr(tmp_path / "depth.exr")
+
+
+def test_bad_files_are_named(tmp_path):
+    with pytest.raises(InputError, match="missing"):
+        read_exr(tmp_path / "none.exr")
+    path = tmp_path / "a.exr"
+    write_exr(path, RNG.random((64, 64, 3)))
+    whole = path.read_bytes()
+    for broken in (b"", b"text", whole[:100], whole[: len(whole) // 2]):
+        path.write_bytes(broken)
+        with pytest.raises(InputError, match="not a whole OpenEXR"):
+            read_exr(path)
+    write_exr(path, np.ones((10, 10, 3)))
+    with pytest.raises(InputError, match="10×10"):
+        read_environment(path)

@@ -1,0 +1,117 @@
+import io
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from scipy.spatial import cKDTree
+
+from refgs.color import srgb_encode
+from refgs.formats.exr import read_exr
+from refgs.formats.gltf import write_glb
+from refgs.formats.tangents import vertex_tangents
+from tests.makers.box import textured_box
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("a run, été")
+    mesh, textures = textured_box()
+    write_glb(folder / "mesh.glb", mesh, textures)
+    return folder, mesh, textures
+
+
+def test_what_mirrors_nothing_is_written_so(written, tmp_path):
+    _, mesh, textures = written
+    write_glb(tmp_path / "mesh.glb", mesh, replace(textures, specular=0.0))
+    data = (tmp_path / "mesh.glb").read_bytes()
+    gltf = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    assert gltf["materials"][0]["extensions"] == {"KHR_materials_specular": {"specularFactor": 0.0}}
+    assert gltf["extensionsUsed"] == ["KHR_materials_specular"] and "extensionsRequired" not in gltf
+
+
+def test_the_folder_holds_what_it_should(written):
+    folder, _, textures = written
+    names = {"base_color", "metallic", "roughness", "occlusion", "normal"}
+    files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    assert files == {"mesh.glb"} | {f"textures/{n}.{e}" for n in names for e in ("png", "exr")}
+    np.testing.assert_array_equal(read_exr(folder / "textures" / "base_color.exr"), textures.base_color)
+    encoded = np.asarray(Image.open(folder / "textures" / "base_color.png")) / 255
+    assert np.abs(encoded - srgb_encode(textures.base_color)).max() < 0.51 / 255
+    normal = np.asarray(Image.open(folder / "textures" / "normal.png")) / 255 * 2 - 1
+    assert np.abs(normal - textures.normal).max() < 0.005
+
+
+def test_gltf_is_y_up_and_routes_its_channels(written):
+    folder, mesh, textures = written
+    data = (folder / "mesh.glb").read_bytes()
+    length = struct.unpack("<I", data[12:16])[0]
+    gltf, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
+    material = gltf["materials"][0]
+    assert material["doubleSided"] and material["name"] == "RefGS"
+    surface = material["pbrMetallicRoughness"]
+    assert surface.get("metallicFactor", 1) == 1 and surface.get("roughnessFactor", 1) == 1
+
+    def picture(reference):
+        view = gltf["bufferViews"][gltf["images"][gltf["textures"][reference["index"]]["source"]]["bufferView"]]
+        start = view.get("byteOffset", 0)
+        return np.asarray(Image.open(io.BytesIO(binary[start : start + view["byteLength"]])))
+
+    np.testing.assert_array_equal(
+        picture(surface["metallicRoughnessTexture"])[5, 5], [round(0.9 * 255), round(0.3 * 255), round(0.75 * 255)]
+    )
+    np.testing.assert_array_equal(picture(material["normalTexture"])[5, 5], [204, 128, 230])
+    assert np.abs(picture(surface["baseColorTexture"]) / 255 - srgb_encode(textures.base_color)).max() < 0.51 / 255
+    primitive = gltf["meshes"][0]["primitives"][0]["attributes"]
+    assert {"POSITION", "NORMAL", "TEXCOORD_0"} <= primitive.keys()
+
+    again = trimesh.load(folder / "mesh.glb", process=False).to_geometry()
+    np.testing.assert_allclose(again.bounds, [[-1, 0, -2], [1, 6, 2]], atol=1e-6)
+    np.testing.assert_allclose(again.vertices, mesh.vertices[:, [0, 2, 1]] * [1, 1, -1], atol=1e-6)
+    np.testing.assert_allclose(again.visual.uv, mesh.uv, atol=1e-6)
+
+
+def test_blender_imports_it_upright_with_the_right_material(written):
+    bpy = pytest.importorskip("bpy")
+    folder, mesh, _ = written
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.import_scene.gltf(filepath=str(folder / "mesh.glb"))
+    found = next(o for o in bpy.data.objects if o.type == "MESH")
+    world = np.array([found.matrix_world @ v.co for v in found.data.vertices])
+    np.testing.assert_allclose([world.min(0), world.max(0)], [[-1, -2, 0], [1, 2, 6]], atol=1e-5)
+
+    nodes = found.data.materials[0].node_tree.nodes
+    shader = next(n for n in nodes if n.type == "BSDF_PRINCIPLED")
+
+    def source(socket):
+        link = socket.links[0]
+        if link.from_node.type == "SEPARATE_COLOR":
+            return link.from_socket.name, link.from_node.inputs[0].links[0].from_node.image
+        return link.from_socket.name, link.from_node.image
+
+    assert source(shader.inputs["Base Color"])[1].colorspace_settings.name == "sRGB"
+    for name, channel in (("Metallic", "Blue"), ("Roughness", "Green")):
+        socket, image = source(shader.inputs[name])
+        assert socket == channel and image.colorspace_settings.name == "Non-Color"
+    bend = shader.inputs["Normal"].links[0].from_node
+    assert bend.type == "NORMAL_MAP" and bend.space == "TANGENT"
+    assert source(bend.inputs["Color"])[1].colorspace_settings.name == "Non-Color"
+
+    # The tangents that Blender makes are those that the normal map was baked for.
+    data = found.data
+    data.calc_tangents()
+    turn = np.array(found.matrix_world.to_3x3())
+    tangents, signs = vertex_tangents(mesh)
+    place = cKDTree(np.concatenate([mesh.vertices, mesh.uv], axis=1))
+    checked = 0
+    for loop, uv in zip(data.loops, data.uv_layers[0].uv, strict=True):
+        position = found.matrix_world @ data.vertices[loop.vertex_index].co
+        distance, index = place.query([*position, *uv.vector])
+        assert distance < 1e-4
+        assert np.dot(loop.tangent, tangents[index] @ turn) > 0.999
+        assert loop.bitangent_sign == signs[index]
+        checked += 1
+    assert checked == 3 * len(mesh.faces)

@@ -1,0 +1,148 @@
+"""What other people's programs make of our files: those that tests/tools/package.json names."""
+
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from refgs.formats.gltf import write_glb
+from refgs.formats.splats import Splats, read_splats, write_display_splats
+from tests.makers.box import textured_box
+
+TOOLS = Path(__file__).parents[1] / "tools"
+NODE = shutil.which("node")
+COUNT = 600
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed():
+    if NODE is None or not (TOOLS / "node_modules").is_dir():
+        pytest.skip("needs node, and `npm install --no-package-lock --ignore-scripts --prefix tests/tools`")
+
+
+def said(*words, folder=TOOLS):
+    command = [NODE, *map(str, words)]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, encoding="utf-8")
+    assert done.returncode == 0, done.stderr or done.stdout
+    return done.stdout
+
+
+def transform(source, target, *words):
+    """By PlayCanvas's splat-transform, without a graphics card."""
+    program = TOOLS / "node_modules" / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
+    return said(program, "-q", "-w", "-g", "cpu", "--max-workers", "0", source, *words, target)
+
+
+def discs(count=COUNT, degree=3):
+    """Surfels of all sizes, turned in all ways, with colours by direction."""
+    rng = np.random.default_rng(5)
+    turn = Rotation.random(count, random_state=5)
+    values = {
+        "positions": rng.uniform(-1, 1, (count, 3)),
+        "normals": turn.as_matrix()[:, :, 2],
+        "sh": np.concatenate([rng.uniform(-1.5, 1.5, (count, 1, 3)), rng.normal(0, 0.1, (count, 15, 3))], axis=1),
+        "opacities": rng.uniform(0.1, 0.95, count),
+        "scales": np.exp(rng.uniform(-5, -3, (count, 2))),
+        "rotations": turn.as_quat()[:, [3, 0, 1, 2]],
+        "albedo": np.zeros((count, 3)),
+        "metallic": np.zeros(count),
+        "roughness": np.zeros(count),
+        "received": np.ones((count, 3)),
+        "indirect": np.zeros((count, 0, 3)),
+    }
+    values["sh"] = values["sh"][:, : (degree + 1) ** 2]
+    return Splats(**{name: value.astype(np.float32) for name, value in values.items()})
+
+
+# A format's ending, and how far off its numbers may be: positions, log scales, degrees, opacities, the picture's constant colour, and the
+# root mean square of what harmonics add to it. By what its numbers are written with:
+QUANTISED = {
+    # 32-bit floats
+    ".ply": (0, 1e-5, 0.02, 1e-5, 0, 0),
+    # 11 bits of a chunk's 2 units; 10 and 11 of its log scales; quaternions of 10; 8 of opacity, colour and harmonics
+    ".compressed.ply": (1e-3, 1e-3, 0.2, 2e-3, 2e-3, 0.01),
+    # 16 bits of log positions; 256 log scales and colours, and 256 kinds of harmonics for all; quaternions and opacity of 8 bits
+    ".sog": (5e-5, 0.02, 2.2, 4e-3, 5e-3, 0.05),
+    # 12 bits of a unit; sixteenths of log scales; quaternions of 10 bits; 8 of opacity and colour; 4 and 5 of harmonics
+    ".spz": (1.25e-4, 0.032, 0.2, 2e-3, 4e-3, 0.05),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("ending", QUANTISED)
+def test_display_splats_in_other_formats_and_back(tmp_path, ending):
+    write_display_splats(tmp_path / "des éclats.ply", discs())
+    there = tmp_path / f"made of it{ending}"
+    transform(tmp_path / "des éclats.ply", there)
+    if ending != ".ply":
+        assert there.stat().st_size < 0.6 * (tmp_path / "des éclats.ply").stat().st_size
+    transform(there, tmp_path / "back.ply")
+    before, after = (read_splats(tmp_path / name) for name in ("des éclats.ply", "back.ply"))
+    # Formats put the splats in an order of their own.
+    nearest = cKDTree(after.positions).query(before.positions)[1]
+    assert len(after) == COUNT and len(np.unique(nearest)) == COUNT
+    position, scale, angle, opacity, colour, direction = QUANTISED[ending]
+    assert np.abs(after.positions[nearest] - before.positions).max() <= position
+    assert np.abs(np.log(after.scales[nearest]) - np.log(before.scales)).max() <= scale
+    turns = [Rotation.from_quat(s.rotations[:, [1, 2, 3, 0]]) for s in (after, before)]
+    assert np.degrees((turns[0][nearest].inv() * turns[1]).magnitude()).max() <= angle
+    assert np.abs(after.opacities[nearest] - before.opacities).max() <= opacity
+    off = 0.2820948 * (after.sh[nearest] - before.sh)
+    assert np.abs(off[:, 0]).max() <= colour
+    assert np.sqrt(np.square(off[:, 1:] / 0.2820948).mean()) <= direction
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_splats_open_too(tmp_path, count):
+    write_display_splats(tmp_path / "a.ply", discs(count, degree=0))
+    transform(tmp_path / "a.ply", tmp_path / "b.spz")
+    transform(tmp_path / "b.spz", tmp_path / "c.ply")
+    assert len(read_splats(tmp_path / "c.ply")) == count
+
+
+def test_gltf_of_splats(tmp_path):
+    """KHR_gaussian_splatting as splat-transform writes it: activated values, and upright where docs/formats.md's turn is asked for."""
+    splats = discs()
+    write_display_splats(tmp_path / "a.ply", splats)
+    transform(tmp_path / "a.ply", tmp_path / "a.glb", "-r", "-90,0,0")
+    data = (tmp_path / "a.glb").read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    gltf, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
+    assert "KHR_gaussian_splatting" in gltf["extensionsUsed"]
+    (primitive,) = gltf["meshes"][0]["primitives"]
+    rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+
+    def values(name, width):
+        accessor = gltf["accessors"][primitive["attributes"][name]]
+        assert accessor["componentType"] == 5126 and accessor["count"] == COUNT
+        view = gltf["bufferViews"][accessor["bufferView"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        assert view.get("byteStride", 4 * width) == 4 * width
+        return np.frombuffer(binary, "<f4", COUNT * width, start).reshape(COUNT, width)
+
+    scales = np.exp(np.stack([rows[f"scale_{i}"] for i in range(3)], axis=1))
+    order = cKDTree(values("KHR_gaussian_splatting:SCALE", 3)).query(scales)[1]
+    np.testing.assert_allclose(values("KHR_gaussian_splatting:SCALE", 3)[order], scales, rtol=1e-5)
+    x, y, z = splats.positions.T
+    np.testing.assert_allclose(
+        values("POSITION", 3)[order], np.stack([-x, z, y], axis=1), atol=1e-6
+    )  # +Y is up in glTF
+    np.testing.assert_allclose(values("KHR_gaussian_splatting:OPACITY", 1)[order, 0], splats.opacities, atol=1e-5)
+    np.testing.assert_allclose(
+        values("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0", 3)[order], splats.sh[:, 0], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("specular", [1.0, 0.0])
+def test_the_mesh_is_valid_gltf(tmp_path, specular):
+    mesh, textures = textured_box()
+    write_glb(tmp_path / "un maillage.glb", mesh, replace(textures, specular=specular))
+    report = json.loads(said("validate.js", tmp_path / "un maillage.glb"))
+    issues = [(m["code"], m["message"], m.get("pointer")) for m in report["issues"]["messages"] if m["severity"] < 2]
+    assert report["info"]["totalTriangleCount"] == len(mesh.faces) and not issues

@@ -1,0 +1,38 @@
+import json
+
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from benchmarks.scenes.analytic import sky
+from refgs.formats.panorama import directions, write_environment
+from refgs.formats.splats import write_splats
+from refgs.model.surfels import activate, initial_parameters, to_splats
+from refgs.run import create_run
+from refgs.settings import load_settings
+
+TURN = Rotation.from_euler("zyx", [40, 25, -70], degrees=True).as_matrix()
+SCALE, MOVE = 3.0, np.array([5.0, -2.0, 1.0])
+BOX = trimesh.creation.box((1.0, 1.4, 0.8)).subdivide().subdivide()
+
+
+def write_run(folder, capture):
+    """Write the run of a metal ball, rough above and smooth below, with a box for its mesh."""
+    create_run(folder, capture, load_settings("quick", ["environment.resolution=16"]), "quick", "cpu")
+    steps = np.arange(3000) + 0.5
+    z, azimuth = 1 - 2 * steps / len(steps), steps * np.pi * (3 - np.sqrt(5))
+    points = np.stack([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z], axis=1)
+    look = {"opacity": 0.95, "sh_degree": 0, "albedo": 0.7, "metallic": 0.9, "roughness": 0.3}
+    surfels = activate(initial_parameters(points, points, np.full(3000, 0.04), None, **look))
+    roughness = torch.where(torch.from_numpy(z) > 0, 0.6, 0.2).float()
+    splats = to_splats(surfels._replace(roughness=roughness, indirect_dc=surfels.indirect_dc[:, :0]))
+    write_splats(folder / "splats.ply", splats)
+    write_environment(folder / "environment.exr", sky(directions(64, 128)))
+    box = BOX.copy()
+    box.vertices = box.vertices[:, [0, 2, 1]] * [1, 1, -1]  # glTF's axes: Y up
+    box.export(folder / "mesh.glb")
+    cameras = json.loads((folder / "cameras.json").read_text())
+    cameras["to_capture"] = [*np.hstack([SCALE * TURN, MOVE[:, None]]).tolist(), [0, 0, 0, 1]]
+    (folder / "cameras.json").write_text(json.dumps(cameras))
+    return folder

@@ -1,0 +1,23 @@
+import numpy as np
+import trimesh
+
+from refgs.export.unwrap import unwrap
+from refgs.formats.mesh import Mesh
+from refgs.formats.textures import Textures
+from refgs.geometry.mesh import smooth_normals
+
+SIZE = 64
+
+
+def textured_box():
+    """Make a box of 2 × 4 × 6 that stands on the ground, with one value a texture."""
+    box = trimesh.creation.box((2, 4, 6)).subdivide()
+    vertices = np.array(box.vertices) + np.array([0, 0, 3])
+    mesh = unwrap(Mesh(vertices, np.array(box.faces), smooth_normals(vertices, box.faces)))
+
+    def full(*value):
+        return np.full((SIZE, SIZE, *([len(value)] if len(value) > 1 else [])), value, np.float32)
+
+    ramp = np.broadcast_to(np.linspace(0, 1, SIZE, dtype=np.float32), (SIZE, SIZE))
+    colour = np.dstack([ramp, full(0.2), ramp.T])
+    return mesh, Textures(colour, full(0.75), full(0.3), full(0.9), full(0.6, 0, 0.8), np.ones((SIZE, SIZE), bool))

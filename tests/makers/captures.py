@@ -1,0 +1,182 @@
+"""Make tiny captures of every layout: photos around a ball with a red top and a green bottom."""
+
+import json
+import pickle
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+CENTRE = np.array([1.0, 2.0, 3.0])
+RADIUS = 0.5
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return camera-to-world with OpenGL axes; +Z is up."""
+    back = (position - target) / np.linalg.norm(position - target)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(back, right), back, position], axis=1)
+    return pose
+
+
+def ring(count: int = 16, distance: float = 3.0, centre: np.ndarray = CENTRE) -> list[np.ndarray]:
+    """Return poses around the ball at alternating heights."""
+    poses = []
+    for i in range(count):
+        azimuth, elevation = 2 * np.pi * i / count, (0.2, 0.9)[i % 2]
+        away = [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+        poses.append(look_at(centre + distance * np.array(away), centre))
+    return poses
+
+
+def ball(pose: np.ndarray, width: int, height: int, focal: float, centre: np.ndarray = CENTRE) -> np.ndarray:
+    """Ray-cast the ball to RGBA (H, W, 4) uint8, with the principal point in the middle."""
+    normals = ball_normals(pose, width, height, focal, centre)
+    image = np.zeros((height, width, 4), np.uint8)
+    image[..., :3] = np.where(normals[..., 2:] > 0, (220, 0, 0), (20, 200, 0))
+    image[..., 3] = 255
+    image[np.isnan(normals[..., 0])] = 0
+    return image
+
+
+def ball_normals(pose: np.ndarray, width: int, height: int, focal: float, centre: np.ndarray = CENTRE) -> np.ndarray:
+    """Return the ball's normals (H, W, 3) in the world, NaN off the ball."""
+    u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    rays = np.stack([u / focal, -v / focal, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    offset = pose[:3, 3] - centre
+    along = rays @ offset
+    root = along**2 - (offset @ offset - RADIUS**2)
+    point = offset + rays * (-along - np.sqrt(np.maximum(root, 0)))[..., None]
+    return np.where(root[..., None] > 0, point / RADIUS, np.nan)
+
+
+def write(path: Path, image: np.ndarray) -> None:
+    """Write an image, RGB(A) or grey, 8 or 16 bits, in the format of the path's suffix. Non-ASCII paths work, too."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if image.ndim == 3:
+        image = image[..., [2, 1, 0, 3][: image.shape[2]]]
+    cv2.imencode(path.suffix, image, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tofile(path)
+
+
+def edit(file: Path, change) -> None:
+    """Rewrite a JSON file after `change(data)`."""
+    data = json.loads(file.read_text())
+    change(data)
+    file.write_text(json.dumps(data))
+
+
+def nerf_blender(folder: Path, splits: dict[str, int] | None = None) -> Path:
+    focal = 60.0
+    for split, count in (splits or {"train": 12, "test": 4}).items():
+        frames = []
+        for i, pose in enumerate(ring(count)):
+            write(folder / split / f"r_{i}.png", ball(pose, 64, 48, focal))
+            frames.append({"file_path": f"./{split}/r_{i}", "rotation": 0.1, "transform_matrix": pose.tolist()})
+        data = {"camera_angle_x": 2 * np.arctan(32 / focal), "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(data))
+    return folder
+
+
+def nerfstudio(folder: Path, count: int = 16, poses: list[np.ndarray] | None = None) -> Path:
+    """Make a capture with shared intrinsics and PNGs without alpha or masks."""
+    frames = []
+    for i, pose in enumerate(poses or ring(count)):
+        write(folder / "images" / f"{i:04d}.png", ball(pose, 64, 48, 60.0)[..., :3])
+        frames.append({"file_path": f"images/{i:04d}.png", "transform_matrix": pose.tolist()})
+    data = {"fl_x": 60.0, "fl_y": 60.0, "cx": 32.0, "cy": 24.0, "w": 64, "h": 48, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(data))
+    return folder
+
+
+def colmap(
+    folder: Path,
+    binary: bool = True,
+    model: tuple[int, str, list[float]] = (1, "PINHOLE", [60.0, 60.0, 32.0, 24.0]),
+    count: int = 16,
+) -> Path:
+    """Make a sparse model with one camera, `count` images and 50 points on the ball."""
+    sparse = folder / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(50, 3))
+    points = CENTRE + RADIUS * points / np.linalg.norm(points, axis=1, keepdims=True)
+    images = []
+    for i, pose in enumerate(ring(count)):
+        write(folder / "images" / f"{i:04d}.png", ball(pose, 64, 48, 60.0)[..., :3])
+        world_to_camera = np.linalg.inv(pose @ FLIP)
+        images.append((i + 1, *quaternion(world_to_camera[:3, :3]), *world_to_camera[:3, 3], 7, f"{i:04d}.png"))
+    number, name, params = model
+    if binary:
+        data = struct.pack("<QiiQQ", 1, 7, number, 64, 48) + struct.pack(f"<{len(params)}d", *params)
+        (sparse / "cameras.bin").write_bytes(data)
+        data = struct.pack("<Q", count)
+        for image in images:
+            data += struct.pack("<I7di", *image[:9]) + image[9].encode() + b"\0" + struct.pack("<Q", 2)
+            data += struct.pack("<ddqddq", 1, 2, -1, 3, 4, 5)
+        (sparse / "images.bin").write_bytes(data)
+        data = struct.pack("<Q", 50)
+        for i, point in enumerate(points):
+            data += struct.pack("<Q3d3BdQ", i, *point, 255, 128, 0, 0.5, 2) + struct.pack("<iiii", 1, 0, 2, 1)
+        (sparse / "points3D.bin").write_bytes(data)
+    else:
+        text = f"# Camera list\n# Number of cameras: 1\n7 {name} 64 48 {' '.join(map(repr, params))}\n"
+        (sparse / "cameras.txt").write_text(text)
+        text = f"# Image list\n# Number of images: {count}, mean observations per image: 1\n"
+        for image in images:
+            text += " ".join(map(str, image)) + "\n" + ("1 2 -1 3 4 5" if image[0] % 2 else "") + "\n"
+        (sparse / "images.txt").write_text(text)
+        rows = (f"{i} {x!r} {y!r} {z!r} 255 128 0 0.5 1 0 2 1\n" for i, (x, y, z) in enumerate(points.tolist()))
+        (sparse / "points3D.txt").write_text("# Number of points: 50, mean track length: 2\n" + "".join(rows))
+    return folder
+
+
+def shiny_blender(folder: Path) -> Path:
+    """Make a capture like Ref-NeRF's scene `ball`: opaque photos, with NAME_alpha.png, world-space normals and disparities."""
+    nerf_blender(folder)
+    for split in ("train", "test"):
+        frames = json.loads((folder / f"transforms_{split}.json").read_text())["frames"]
+        for frame in frames:
+            photo = folder / f"{frame['file_path']}.png"
+            pose = np.array(frame["transform_matrix"])
+            image = ball(pose, 64, 48, 60.0)
+            inside = image[..., 3] > 0
+            write(photo, np.where(inside[..., None], image[..., :3], 40).astype(np.uint8))
+            write(photo.with_name(f"{photo.stem}_alpha.png"), image[..., 3])
+            normal = np.where(inside[..., None], ball_normals(pose, 64, 48, 60.0), 0)
+            write(photo.with_name(f"{photo.stem}_normal.png"), np.rint(127.5 * (normal + 1)).astype(np.uint8))
+            write(photo.with_name(f"{photo.stem}_disp.tiff"), image[..., 3])
+    return folder
+
+
+def nero(folder: Path, count: int = 16, split: tuple[list, list] | None = None, protocol: int = 4) -> Path:
+    """Make a scene of Glossy Synthetic: opaque photos, 16-bit depth, cameras as pickles; the split lies beside it."""
+    folder.mkdir(parents=True)
+    for i, pose in enumerate(ring(count)):
+        image = ball(pose, 64, 48, 60.0)
+        inside = image[..., 3] > 0
+        write(folder / f"{i}.png", np.where(inside[..., None], image[..., :3], 40).astype(np.uint8))
+        depth = np.where(inside, 2.5 / 15 * 65535, 65535)
+        write(folder / f"{i}-depth.png", np.rint(depth).astype(np.uint16))
+        world_to_camera = np.linalg.inv(pose @ FLIP)[:3]
+        matrix = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)
+        (folder / f"{i}-camera.pkl").write_bytes(pickle.dumps((world_to_camera, matrix), protocol))
+    if split is not None:
+        (folder.parent / "synthetic_split_128.pkl").write_bytes(pickle.dumps(split, protocol))
+    return folder
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Return the quaternion wxyz of a rotation matrix, as the eigenvector of its symmetric 4×4 form."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    matrix = [
+        [a + e + i, h - f, c - g, d - b],
+        [h - f, a - e - i, b + d, c + g],
+        [c - g, b + d, e - a - i, f + h],
+        [d - b, c + g, f + h, i - a - e],
+    ]
+    return np.linalg.eigh(np.array(matrix))[1][:, -1]

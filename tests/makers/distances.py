@@ -1,0 +1,67 @@
+"""Shapes with a signed distance, and the maps that cameras around them see."""
+
+import numpy as np
+
+from refgs.camera import Camera
+
+
+def sphere(p: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(p, axis=-1) - 1
+
+
+def box(p: np.ndarray) -> np.ndarray:
+    q = np.abs(p) - np.array([0.8, 0.5, 0.6])
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
+
+
+def torus(p: np.ndarray) -> np.ndarray:
+    return np.hypot(np.hypot(p[..., 0], p[..., 1]) - 0.8, p[..., 2]) - 0.3
+
+
+def gradient(sdf, p: np.ndarray) -> np.ndarray:
+    """Compute the outward normal at points of the surface."""
+    step = 1e-4 * np.eye(3)
+    g = np.stack([sdf(p + step[a]) - sdf(p - step[a]) for a in range(3)], axis=-1)
+    return g / np.linalg.norm(g, axis=-1, keepdims=True)
+
+
+def look_at(eye, size: int, name: str = "view") -> Camera:
+    """Place a camera at `eye`, looking at the origin, 40 degrees wide."""
+    eye = np.asarray(eye, float)
+    forward = -eye / np.linalg.norm(eye)
+    up = np.array([0, 0, 1.0]) if abs(forward[2]) < 0.99 else np.array([0, 1.0, 0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    matrix = np.eye(4)
+    matrix[:3, :3] = [right, np.cross(forward, right), forward]
+    matrix[:3, 3] = -matrix[:3, :3] @ eye
+    focal = 0.5 * size / np.tan(np.radians(20))
+    return Camera(name, size, size, focal, focal, size / 2, size / 2, matrix)
+
+
+def around(count: int, size: int, distance: float = 4.5) -> list[Camera]:
+    """Spread cameras over a whole sphere."""
+    i = np.arange(count) + 0.5
+    z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
+    ring = np.sqrt(1 - z * z)
+    eyes = distance * np.stack([np.cos(phi) * ring, np.sin(phi) * ring, z], axis=1)
+    return [look_at(eye, size, f"view{k}") for k, eye in enumerate(eyes)]
+
+
+def depth(camera: Camera, sdf) -> tuple[np.ndarray, np.ndarray]:
+    """Trace spheres through pixel centres: depth along the camera's axis and coverage, (H, W) float32 each."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    rays = rays @ camera.world_to_camera[:3, :3]
+    length = np.linalg.norm(rays, axis=-1)
+    t = np.full(u.shape, 1.0)
+    for _ in range(80):
+        t = t + sdf(camera.position + t[..., None] * rays) / length
+    hit = np.abs(sdf(camera.position + t[..., None] * rays)) < 1e-3
+    return np.where(hit, t, 0).astype(np.float32), hit.astype(np.float32)
+
+
+def mask(camera: Camera, sdf) -> np.ndarray:
+    """Compute coverage (H, W) with edges a pixel wide."""
+    fine = depth(camera.resized(2 * camera.width, 2 * camera.height), sdf)[1]
+    return fine.reshape(camera.height, 2, camera.width, 2).mean((1, 3))

@@ -1,0 +1,68 @@
+"""Make a ball of splats whose paint is a formula, and read textures as a renderer does."""
+
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from refgs.formats.mesh import Mesh
+from refgs.formats.splats import Splats
+from refgs.geometry.mesh import smooth_normals
+
+
+def paint(p: np.ndarray) -> np.ndarray:
+    """Paint points of the unit sphere smoothly (P, 3)."""
+    return 0.5 + 0.4 * np.sin(2 * p + [0, 1, 2])
+
+
+def sphere_of_splats(count: int = 4000, radius: float = 1.0, outward: float = 1.0) -> Splats:
+    """Cover a sphere with painted splats, each as large as their spacing."""
+    i = np.arange(count) + 0.5
+    z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
+    ring = np.sqrt(1 - z * z)
+    n = np.stack([np.cos(phi) * ring, np.sin(phi) * ring, z], axis=1)
+    u = np.cross(n, [0.3, 0.5, 0.8])
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    rotations = Rotation.from_matrix(np.stack([u, np.cross(n, u), n], axis=2)).as_quat()[:, [3, 0, 1, 2]]
+    f = np.float32
+    return Splats(
+        positions=(radius * n).astype(f),
+        normals=(outward * n).astype(f),
+        sh=np.zeros((count, 1, 3), f),
+        opacities=np.full(count, 0.8, f),
+        scales=np.full((count, 2), radius * np.sqrt(4 * np.pi / count), f),
+        rotations=rotations.astype(f),
+        albedo=paint(n).astype(f),
+        metallic=(0.5 + 0.5 * n[:, 2]).astype(f),
+        roughness=(0.5 - 0.4 * n[:, 0]).astype(f),
+        received=np.ones((count, 3), f),
+        indirect=np.zeros((count, 0, 3), f),
+    )
+
+
+def ball(level: int = 3) -> Mesh:
+    """Make a unit sphere of triangles with smooth normals."""
+    sphere = trimesh.creation.icosphere(level)
+    return Mesh(np.array(sphere.vertices), np.array(sphere.faces), smooth_normals(sphere.vertices, sphere.faces))
+
+
+def on_surface(mesh: Mesh, count: int = 3000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Draw random faces with barycentric weights, and their uv."""
+    rng = np.random.default_rng(2)
+    faces = mesh.faces[rng.integers(len(mesh.faces), size=count)]
+    weights = rng.dirichlet([1, 1, 1], size=count)
+    return faces, weights, np.einsum("nk,nkc->nc", weights, mesh.uv[faces])
+
+
+def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Read a texture bilinearly, as a renderer does; v points up."""
+    size = len(texture)
+    x, y = uv[:, 0] * size - 0.5, (1 - uv[:, 1]) * size - 0.5
+    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
+    s, t = (x - x0).reshape(-1, *[1] * (texture.ndim - 2)), (y - y0).reshape(-1, *[1] * (texture.ndim - 2))
+
+    def at(row, column):
+        return texture[row.clip(0, size - 1), column.clip(0, size - 1)]
+
+    return (at(y0, x0) * (1 - s) + at(y0, x0 + 1) * s) * (1 - t) + (
+        at(y0 + 1, x0) * (1 - s) + at(y0 + 1, x0 + 1) * s
+    ) * t

@@ -1,0 +1,107 @@
+import refgs  # noqa: F401, I001  before torch
+import numpy as np
+import torch
+import trimesh
+from tests.makers.distances import around, look_at
+
+from refgs.render import extract as module
+from refgs.render.extract import extract
+from refgs.geometry.mesh import clean
+from refgs.model.surfels import Surfels
+
+VIEWS = around(24, 96)
+NEAR = 0.01
+
+
+def sheet(positions, normals, size, opacity):
+    """Round surfels of one size where the positions (N, 3) are."""
+    turn = np.stack(
+        [1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1
+    )  # from +Z to the normal
+    count = len(positions)
+    rows = [positions, turn, np.full((count, 2), size), np.broadcast_to(opacity, count)]
+    tensors = [torch.tensor(row, dtype=torch.float32) for row in rows]
+    nothing = torch.zeros(count, 0, 3)
+    return Surfels(
+        *tensors, *[nothing] * 2, torch.ones(count, 3), *[torch.ones(count)] * 2, torch.ones(count, 3), nothing, nothing
+    )
+
+
+def joined(*parts):
+    return Surfels(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def spread(count):
+    """Unit vectors, even over the sphere."""
+    i = np.arange(count) + 0.5
+    z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
+    ring = np.sqrt(1 - z * z)
+    return np.stack([np.cos(phi) * ring, np.sin(phi) * ring, z], axis=1)
+
+
+def ball(opacity, thickness, count=12000):
+    """Surfels of a ball of radius 1 that lie up to so deep below its surface."""
+    normals = spread(count)
+    depth = thickness * np.random.default_rng(0).uniform(size=(count, 1))
+    return sheet((1 - depth) * normals, normals, 0.03, opacity)
+
+
+def radii(surfels, resolution=64):
+    mesh, _ = extract(surfels, VIEWS, NEAR, np.zeros(3), 1.3, resolution)
+    return np.linalg.norm(mesh.vertices, axis=1)
+
+
+def test_a_ball_of_one_layer():
+    surfels = ball(0.95, 0.0)
+    coarse, fine = (radii(surfels, resolution) - 1 for resolution in (32, 64))
+    assert np.abs(fine).max() < 0.015 and abs(fine.mean()) < 0.7 * abs(coarse.mean())
+
+
+def test_what_is_hardly_there_has_no_surface():
+    """What covers is as dense as it is, not as the surfels that tell the depth."""
+    assert len(radii(ball(0.004, 0.1))) == 0
+
+
+def test_voxels_are_no_finer_than_pixels():
+    """96 of them show 3.3 units at the middle of the ball, 2.5 where it is nearest: 2.6 units have 78 to 104 of them across."""
+    layer = ball(0.95, 0.0)
+    fine, finer, coarse = (len(radii(layer, resolution)) for resolution in (120, 240, 75))
+    assert coarse < fine == finer == len(radii(layer, 104))
+
+
+ARC = [
+    look_at([4.5 * np.cos(turn) * np.cos(0.4), 4.5 * np.sin(turn) * np.cos(0.4), 4.5 * np.sin(0.4)], 96)
+    for turn in np.linspace(-1.2, 1.2, 16)
+]
+
+
+def place():
+    """A ball on the ground, far walls around, seen from one side through fog: no masks."""
+    rng = np.random.default_rng(1)
+    grid = np.stack(np.meshgrid(*[np.linspace(-5, 5, 100)] * 2, [-1.0]), axis=-1).reshape(-1, 3)
+    ground = sheet(grid, np.tile([0.0, 0, 1], (len(grid), 1)), 0.08, 0.95)
+    walls = spread(1500)
+    eyes = np.stack([camera.position for camera in ARC])
+    fog = eyes[rng.integers(len(eyes), size=400)] * rng.uniform(0.35, 0.9, (400, 1)) + 0.3 * rng.normal(size=(400, 3))
+    fog = sheet(fog, spread(400), 0.1, rng.uniform(0.03, 0.15, 400))
+    return joined(ball(0.8, 0.02), ground, sheet(60 * walls, walls, 3.0, 0.95), fog)
+
+
+def test_a_foreground_without_masks(monkeypatch):
+    def found():
+        mesh, voxel = extract(place(), ARC, NEAR, np.zeros(3), 1.1, 64)
+        distance, height = np.linalg.norm(mesh.vertices, axis=1), mesh.vertices[:, 2]
+        high = height > -0.7
+        around = np.abs(height[~high & (distance > 1.3)] + 1)
+        return clean(mesh, 10**6), voxel, distance.max(), np.abs(distance[high] - 1), around
+
+    mesh, voxel, farthest, ball, ground = found()
+    assert 1.2 * 2.2 / 64 < voxel < 2 * 2.2 / 64  # of the ground, so much as most cameras show, but not the walls
+    assert 1.5 < farthest < module.REACH * 1.1 + voxel
+    assert np.quantile(ball, 0.9) < voxel and np.quantile(ground, 0.9) < 0.1 * voxel
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).body_count == 1  # the fog has no surface
+    # What is faint before the surface, and walls that show through, move the mean.
+    monkeypatch.setattr(module, "UPPER", 1.0)
+    monkeypatch.setattr(module, "LOWER", 0.0)
+    *_, mean, _ = found()
+    assert np.median(ball) < 0.15 * voxel and np.quantile(ball, 0.9) < 0.65 * np.quantile(mean, 0.9)

@@ -1,0 +1,77 @@
+"""Floors, circles and forbidden imports: scripts/check_imports.py finds each, and none in this clone."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def check(root):
+    """Run the script. Returns its exit status and what it prints."""
+    command = [sys.executable, ROOT / "scripts" / "check_imports.py", root]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    return done.returncode, done.stdout
+
+
+def write(root, files):
+    """Write a small clone that keeps the rules, then these files."""
+    right = {
+        "backend/refgs/__init__.py": "",
+        "backend/refgs/camera.py": "import numpy",
+        "backend/refgs/model/__init__.py": "",
+        "backend/refgs/model/surfels.py": "import torch\nfrom refgs.camera import Camera",
+        "backend/refgs/train/__init__.py": "",
+        "backend/refgs/train/loop.py": "from refgs.model import surfels\nfrom refgs.train.adam import Adam",
+        "backend/refgs/train/adam.py": "from refgs.model.surfels import Surfels",
+        "refgs_addon/__init__.py": "import bpy",
+        "refgs_addon/jobs.py": "from . import errors",
+        "refgs_addon/errors.py": "",
+        "refgs_addon/scene/__init__.py": "",
+        "refgs_addon/scene/run.py": "from ..jobs import start",
+    }
+    for name, text in (right | files).items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+
+
+def test_this_clone_keeps_the_rules():
+    status, said = check(ROOT)
+    assert status == 0, said
+
+
+def test_imports_of_lower_floors_are_allowed(tmp_path):
+    write(tmp_path, {})
+    assert check(tmp_path) == (0, "")
+
+
+UP = "def f():\n    from refgs.train.loop import Loop\n"
+HIDDEN = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from refgs.train.loop import Loop\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "expected"),
+    [
+        ("backend/refgs/model/surfels.py", UP, ["surfels.py:2", "refgs.train.loop, which is on a floor above"]),
+        ("backend/refgs/model/light.py", HIDDEN, ["light.py:3", "refgs.train.loop, which is on a floor above"]),
+        ("backend/refgs/model/light.py", "from refgs import train", ["light.py:1", "refgs.train, which is on a floor"]),
+        ("backend/refgs/train/adam.py", "import refgs.train.loop", ["circle", "loop.py:2", "adam.py:1"]),
+        ("backend/refgs/train/adam.py", UP, ["circle", "loop.py:2", "adam.py:2"]),
+        ("backend/refgs/train/adam.py", HIDDEN, ["circle", "loop.py:2", "adam.py:3"]),
+        ("backend/refgs/train/adam.py", "from .loop import Loop", ["circle", "loop.py:2", "adam.py:1"]),
+        ("refgs_addon/errors.py", "from .scene.run import f", ["circle", "jobs.py:1", "run.py:1", "errors.py:1"]),
+        ("backend/refgs/camera.py", "def f():\n    import bpy", ["camera.py:2", "nothing under backend/ imports bpy"]),
+        ("backend/refgs/camera.py", "from bpy.types import A", ["camera.py:1", "nothing under backend/ imports bpy"]),
+        ("refgs_addon/jobs.py", "import torch.cuda", ["jobs.py:1", "nothing under refgs_addon/ imports torch"]),
+        ("refgs_addon/jobs.py", "from refgs import run", ["jobs.py:1", "nothing under refgs_addon/ imports refgs"]),
+        ("backend/refgs/new.py", "", ["new.py", "refgs.new has no floor"]),
+    ],
+)
+def test_each_rule_finds_what_breaks_it(tmp_path, name, text, expected):
+    write(tmp_path, {name: text})
+    status, said = check(tmp_path)
+    assert status == 1
+    for words in expected:
+        assert words in said

@@ -1,0 +1,203 @@
+"""What is done where a step would not be finite."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.stability.optimisation import nan_gradient, nan_value, resumed
+from benchmarks.stability.training import trainer
+from refgs.capture import read_capture
+from refgs.errors import InputError
+from refgs.model.adam import Adam
+from refgs.model.environment import Environment
+from refgs.render.baselines import LINEAR, SCREEN
+from refgs.render.directional import directional
+from refgs.render.rasterize import rasterize
+from refgs.render.shade import shade
+from refgs.settings import load_settings
+from refgs.train.densify import faint
+from refgs.train.guard import MOST_IN_A_ROW, Guard, limits, remove_broken, running
+from refgs.train.motion import ScreenGradient
+from tests.makers import scenes
+
+
+def learner(device):
+    values = [torch.randn(50, 3, device=device).requires_grad_(), torch.randn(20, device=device).requires_grad_()]
+    return values, Adam([{"params": [v], "name": n, "lr": 0.1} for v, n in zip(values, "ab", strict=True)])
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e30])
+def test_a_step_that_is_not_finite_leaves_all_as_it_was(device, wrong):
+    """Bit for bit, moments too; 1e30 is a number, but its square, which Adam keeps, is none in float32."""
+    values, optimizer = learner(device)
+    guard, motion = Guard(torch.device(device)), ScreenGradient(50, torch.device(device))
+    for step in range(3):
+        before = [v.detach().clone() for v in values]
+        moments = [{k: torch.as_tensor(v).clone() for k, v in optimizer.state[p].items()} for p in values]
+        loss = sum((v**2).sum() for v in values)
+        loss.backward()
+        if step == 1:
+            values[0].grad[7, 1] = wrong
+        accepted = guard.judge(loss, optimizer)
+        motion.add(values[0].detach(), values[0].grad, scenes.camera(), accepted)
+        optimizer.step(accepted)
+        assert float(accepted) == (step != 1)
+        same = all(torch.equal(a, b) for a, b in zip(values, before, strict=True))
+        assert same == (step == 1)
+        if step == 1:
+            for value, was in zip(values, moments, strict=True):
+                assert all(torch.equal(optimizer.state[value][k], was[k]) for k in ("exp_avg", "exp_avg_sq"))
+        for value in values:
+            value.grad = None
+    assert motion.total.isfinite().all() and float(motion.views.max()) <= 2
+
+
+def test_a_loss_that_is_no_number_is_not_stepped_on():
+    values, optimizer = learner("cpu")
+    sum((v**2).sum() for v in values).backward()
+    assert float(Guard(torch.device("cpu")).judge(torch.tensor(math.nan), optimizer)) == 0
+
+
+def test_no_kernel_hides_what_is_no_number(device):
+    """Colour by direction, shading, the rasteriser's derivatives: NaN in, NaN out."""
+    camera, nan = scenes.camera(20, 16), math.nan
+    constant, rest, position = torch.ones(3, 1, 3), torch.ones(3, 3, 3), torch.rand(3, 3)
+    constant[1, 0, 2] = rest[2, 1, 0] = nan
+    color = directional(*(v.to(device) for v in (constant, rest)), 0.5, position.to(device), camera).cpu()
+    assert color.isnan().tolist() == [[False] * 3, [False, False, True], [True, False, False]]
+
+    features, alpha = torch.full((16, 20, 11), 0.5), torch.ones(16, 20)
+    features[..., -3:] = torch.from_numpy(camera.position).float() + scenes.camera_rays(camera)
+    for channel in range(8):  # normal, base colour, metallic, roughness
+        features[channel, 10, channel] = nan
+    light = Environment(torch.ones(6 * 16**2, 3, device=device))
+    color = shade(features.to(device), alpha.to(device), light, camera, torch.zeros(3)).color.cpu()
+    assert color[range(8), 10].isnan().any(dim=-1).all() and color[8:].isfinite().all()
+
+    inputs = [v.to(device).requires_grad_() for v in scenes.surfels("plain", 3)]
+    maps = rasterize(*inputs, camera, near=0.1)
+    by = torch.autograd.grad(maps, inputs, [torch.full_like(m, nan) for m in maps])
+    seen = torch.autograd.grad(rasterize(*inputs, camera, near=0.1).alpha.sum(), inputs[3])[0] != 0
+    assert all(g[seen].isnan().any() and not g.isinf().any() and not (g.abs() > 1e30).any() for g in by)
+
+
+def test_values_stay_within_limits(device):
+    value = torch.zeros(40, device=device).requires_grad_()
+    optimizer = Adam([{"params": [value], "lr": 5.0, "limits": (-12.0, 3.0)}])
+    for _ in range(20):
+        value.grad = torch.linspace(-1, 1, 40, device=device)
+        optimizer.step()
+    assert float(value.min()) == -12 and float(value.max()) == 3
+    for _ in range(20):  # the slope there counts: they come back
+        value.grad = -torch.linspace(-1, 1, 40, device=device)
+        optimizer.step()
+    assert abs(float(value[0].detach())) < 12 or float(value[0].detach()) == -12
+
+
+def test_limits_keep_to_the_scenes_size():
+    assert limits("position", 2.0, LINEAR.brightest) == (-math.inf, math.inf)
+    low, high = limits("scale", 2.0, LINEAR.brightest)
+    assert math.exp(low) == pytest.approx(2e-6) and math.exp(high) == pytest.approx(200)
+    assert limits("environment", 1.0, SCREEN.brightest)[1] < limits("environment", 1.0, LINEAR.brightest)[1]
+
+
+def test_a_mean_passes_over_what_is_no_number():
+    none, mean = torch.tensor(math.nan), torch.tensor(2.0)
+    assert float(running(mean, none)) == 2 and float(running(none, mean)) == 2
+    assert float(running(mean, torch.tensor(3.0))) == pytest.approx(2.05)
+
+
+@pytest.mark.parametrize(("decay", "opacity"), [(1.0, 0.05), (0.1, 0.2)])
+def test_surfels_are_faint_until_what_the_picture_needs_can_be_back(decay, opacity):
+    changes = ["densify.reset_every=100", "densify.stop=0.5", "rates.opacity=0.2", f"rates.decay={decay}"]
+    settings = load_settings("paper", changes)
+    moved = np.cumsum(0.2 * decay ** (np.arange(1000) / 1000))  # by Adam, at the most
+    way = 4 * math.log(opacity / (1 - opacity) * 0.99 / 0.01)
+
+    def found(opacity: float, settings=settings) -> list[int]:
+        return [i for i in range(1, 1000) if faint(settings.densify, settings.rates, i, 1000, opacity)]
+
+    for last in (100, 200, 300, 400):
+        those = [i for i in found(opacity) if last < i <= (last + 100 if last < 400 else 1000)]
+        end = min(int(np.searchsorted(moved, moved[last] + way)), last + 101 if last < 400 else 1000)
+        assert those == list(range(last + 1, last + 1 + len(those))) and those[-1] == pytest.approx(end, abs=2)
+    assert not found(0.0) and not found(opacity, load_settings("paper", [*changes, "densify.reset_every=0"]))
+
+
+def test_broken_surfels_are_removed_and_that_is_said(ball_capture, tmp_path):
+    said = []
+    made = trainer(ball_capture, "densify.every=1000", total=60, said=said, folder=tmp_path)
+    made.run(stop=lambda: made.state.iteration >= 15)
+    nan_value("roughness")(made)
+    nan_value("position")(made)  # not drawn, and so not felt
+    count = len(made.state.parameters["position"])
+    made.run(stop=lambda: made.state.iteration >= 30)
+    broken = count - len(made.state.parameters["position"])
+    assert 4 <= broken <= 6 and all(v.isfinite().all() for v in made.state.parameters.values())
+    assert any("not taken" in line for line in said) and any("removed" in line for line in said)
+    assert len(made.state.motion.total) == len(made.state.parameters["position"])
+
+
+def test_a_broken_light_goes_back_to_the_checkpoint(ball_capture, tmp_path):
+    said = []
+    made = trainer(ball_capture, total=60, said=said, folder=tmp_path)
+    made.run(stop=lambda: made.state.iteration >= 20)
+    nan_value("light")(made)
+    assert made.run() and made.state.light.isfinite().all()
+    assert any("going back to that of 20" in line for line in said)
+
+
+def test_a_training_that_cannot_go_on_ends_with_one_line(ball_capture, tmp_path):
+    made = trainer(ball_capture, "train.checkpoint_every=1000", folder=tmp_path)
+    nan_gradient("albedo", every=True)(made)
+    with pytest.raises(InputError, match="no checkpoint yet") as error:
+        made.run()
+    assert "\n" not in str(error.value) and made.state.iteration <= MOST_IN_A_ROW + 10
+    again = trainer(ball_capture, folder=tmp_path / "again")
+    (tmp_path / "again").mkdir()
+    again.run(stop=lambda: again.state.iteration >= 20)
+    nan_gradient("albedo", every=True)(again)
+    with pytest.raises(InputError, match="again after going back"):
+        again.run()
+
+
+def test_no_surfel_left_is_said():
+    parameters = {"position": torch.full((3, 3), math.nan, requires_grad=True)}
+    with pytest.raises(InputError, match="no surfel"):
+        remove_broken(parameters, Adam([{"params": [parameters["position"]], "name": "position"}]))
+
+
+def test_resumed_in_every_stage_it_is_the_same_run():
+    found = resumed()
+    assert found.finite and found.error == 0
+
+
+def moved(folder, target, scale, offset):
+    """The capture in another unit and place."""
+    target.mkdir()
+    for split in ("train", "test"):
+        (target / split).symlink_to(folder / split)
+        frames = json.loads((folder / f"transforms_{split}.json").read_text())
+        for frame in frames["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, 3] = scale * matrix[:3, 3] + offset
+            frame["transform_matrix"] = matrix.tolist()
+        (target / f"transforms_{split}.json").write_text(json.dumps(frames))
+    return target
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e-6, 1.0), (1e6, 0.0), (1.0, 1e5), (1e3, -1e7)])
+def test_a_capture_anywhere_is_learned_about_the_origin(ball_capture, tmp_path, scale, offset):
+    """The same cameras in the run's frame, to what float64 leaves of them; and the way back."""
+    usual, found = (read_capture(c) for c in (ball_capture, moved(ball_capture, tmp_path / "moved", scale, offset)))
+    assert np.array_equal(usual.to_capture, np.eye(4))  # NeRF-Blender's own frame, where that will do
+    assert np.abs(found.centre).max() < 1e-9 and found.radius == pytest.approx(1)
+    lost = 1e-15 * (abs(offset) / scale + 1) + 1e-9
+    for before, after in zip(usual.views, found.views, strict=True):
+        there = found.to_capture @ np.append(after.camera.position, 1)
+        assert np.abs((there[:3] - offset) / scale - before.camera.position).max() < 10 * lost
+        assert np.abs(after.camera.position * usual.radius + usual.centre - before.camera.position).max() < 1e-3
+        assert np.abs(after.camera.world_to_camera[:3, :3] - before.camera.world_to_camera[:3, :3]).max() < 1e-12
