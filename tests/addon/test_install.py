@@ -1,4 +1,4 @@
-"""Installing the trainer and removing it, by a uv that only speaks as one."""
+"""Install and remove the trainer, with a fake uv."""
 
 import json
 import os
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def home(tmp_path, monkeypatch):
-    """Where to install, with an add-on that brings a trainer and the fake uv."""
+    """Make a folder to install into, for an add-on with a bundled trainer and the fake uv."""
     monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     yield tmp_path / "user" / "trainer"
     jobs.stop_all()
@@ -109,7 +109,7 @@ def test_killed_in_the_middle(home, monkeypatch, how):
     monkeypatch.setenv("FAKE_UV", "hang")
     job = install(home)
     until(lambda: job.fraction > 0)
-    if how == "Blender":  # of whose end the process hears as its input ends
+    if how == "Blender":  # the process notices the end of its input
         job._process.stdin.close()
     else:
         job._process.send_signal(signal.SIGKILL)
@@ -168,12 +168,12 @@ def test_removing(home):
 
 
 def test_a_disk_that_is_too_full(home, monkeypatch):
-    assert installation.free_bytes(home) > 0  # of the folder above, while there is none yet
+    assert installation.free_bytes(home) > 0  # the folder does not exist yet: its parent's disk counts
     monkeypatch.setattr(installation, "free_bytes", lambda home: 1.2e9)
     monkeypatch.setattr(installation.shutil, "which", lambda name: None)
     said = installation.disk_full_line(home)
     assert str(home) in said and "it needs about 2 GB; 1 GB are free" in said
-    monkeypatch.setattr(installation, "folder_bytes", lambda folder: 1e9)  # half of it is here already
+    monkeypatch.setattr(installation, "folder_bytes", lambda folder: 1e9)  # half is downloaded already
     assert installation.disk_full_line(home) == ""
     monkeypatch.setattr(installation.shutil, "which", lambda name: f"/bin/{name}")
     assert "it needs about 7 GB" in installation.disk_full_line(home)

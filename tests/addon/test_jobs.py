@@ -1,4 +1,4 @@
-"""Following the trainer's processes, by one that only speaks as it does."""
+"""Follow the trainer's processes, with a fake worker."""
 
 import json
 import subprocess
@@ -36,7 +36,7 @@ def test_a_training_to_its_end(start, tmp_path):
 
 
 def test_one_that_is_silent_is_not_waited_for(tmp_path):
-    """Between its last word and its end a process takes its time, in which the window must not stand still."""
+    """Do not block the window between a process's last output and its end."""
     ends_with_its_input = "import os, sys; print('{}', flush=True); os.close(1); sys.stdin.read(); os._exit(3)"
     arguments, commands = ("-c", ends_with_its_input), [{"command": "rest"}]
     job = jobs._add(jobs.Job("slow", Path(sys.executable), commands, tmp_path / "log.txt", arguments=arguments))
@@ -130,7 +130,7 @@ time.sleep(600)
 
 @pytest.fixture
 def killed(python, tmp_path):
-    """The run folder of a Blender that trained, and was killed."""
+    """Kill a Blender that trains, and return the run folder."""
 
     def killed(kept: str) -> Path:
         capture, run = tmp_path / "slow photos", tmp_path / "run"
@@ -171,7 +171,7 @@ def test_what_fails_is_said_and_what_was_done_before_it_stays(start):
     job = start(mesh=True)
     until(lambda: job.ended)
     assert job.state == "failed" and job.line == "the mesh is crumbs" and "train" in job.results
-    assert job.progress["psnr"] == 30  # the panel shows it beside the curve, the mesh's own progress notwithstanding
+    assert job.progress["psnr"] == 30  # the mesh's progress does not replace it in the panel
 
 
 def test_a_trainer_that_dies(start):

@@ -1,4 +1,4 @@
-"""Rendering in another Blender: a picture of the file as it is, and a line where there is none."""
+"""Render in another Blender: the file as it is now, or one line of error."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""USD and FBX of a run's mesh: written, moved with their pictures, and read by Blender's own importers, they are what the run has."""
+"""Export a run's mesh as USD and FBX, move it with its textures, and import it again with Blender's importers."""
 
 import shutil
 from dataclasses import replace
@@ -77,14 +77,14 @@ def test_it_comes_back_as_it_was(textured, scene, tmp_path, ending, read):
 
 
 def level(item):
-    """The Specular IOR Level of an object's material."""
+    """Read the Specular IOR Level of an object's material."""
     nodes = item.data.materials[0].node_tree.nodes
     return next(node for node in nodes if node.type == "BSDF_PRINCIPLED").inputs["Specular IOR Level"].default_value
 
 
 @pytest.mark.parametrize("specular", [1.0, 0.0])
 def test_what_mirrors_nothing_is_not_given_gloss(run_folder, scene, tmp_path, specular):
-    """Of the two importers of FBX the one in Python reads that."""
+    """Specular 0 survives the export. Of the two FBX importers only the one in Python reads it."""
     ending, read = IMPORTERS[1]
     mesh, textures = textured_box()
     write_glb(run_folder / "mesh.glb", mesh, replace(textures, specular=specular))

@@ -1,4 +1,4 @@
-"""What leaves Blender: the edits are in it, the run itself is as it was."""
+"""Export a run with its edits; the run itself does not change."""
 
 import json
 import shutil
@@ -30,7 +30,7 @@ def test_splats_without_edits_are_those_of_the_run(run, run_folder, tmp_path):
 
 @pytest.mark.parametrize("part", ["splats", "mesh"])
 def test_edits_are_written_and_nothing_else_changes(run, run_folder, tmp_path, part):
-    show(run.collection, part)  # hidden splats are not evaluated by Blender
+    show(run.collection, part)  # Blender does not evaluate hidden splats
     before = read_rows(run_folder / "splats.ply").copy()
     edit = add_edit(run.collection, "Box", "Gold")
     export_splats(run.collection, tmp_path / "a.ply")

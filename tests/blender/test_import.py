@@ -1,4 +1,4 @@
-"""Importing a run: what lies in Blender's data, against numpy."""
+"""Import a run, and compare Blender's data with numpy."""
 
 import json
 
@@ -36,7 +36,7 @@ def stacked(columns, *names):
 
 
 def evaluated_mesh(item):
-    """The quads that the modifier makes of a point cloud."""
+    """Evaluate the modifier that turns a point cloud into quads."""
     graph = bpy.context.evaluated_depsgraph_get()
     graph.update()
     for instance in graph.object_instances:
@@ -149,7 +149,7 @@ def test_normals_bend_as_a_sphere_does(tmp_path):
 
 
 def others(scales, normals):
-    """The columns of splats as other programs train them: no materials, quaternions of any length, normals of zeros or none."""
+    """Make columns as other programs write them: no materials, quaternions of any length, zero or missing normals."""
     rng = np.random.default_rng(4)
     columns = {name: value for name, value in random_columns().items() if name not in MATERIALS}
     for i in range(4):
@@ -165,7 +165,7 @@ def others(scales, normals):
 @pytest.mark.parametrize("normals", [False, True])
 @pytest.mark.parametrize("scales", [2, 3])
 def test_other_programs_splats(scene, tmp_path, scales, normals):
-    """They lie as flat discs across their shortest axis, matte, in the colours that they show."""
+    """Splats of other programs become discs across their shortest axis, matte, in their displayed colours."""
     columns = others(scales, normals)
     folder = tmp_path / "d'un autre été"
     folder.mkdir()
@@ -180,7 +180,7 @@ def test_other_programs_splats(scene, tmp_path, scales, normals):
     flat = turn[:, :, :scales] * size[:, None] * (np.arange(scales) != shortest[:, None])[:, None]
     np.testing.assert_allclose(
         found @ found.transpose(0, 2, 1), flat @ flat.transpose(0, 2, 1), atol=1e-6
-    )  # their covariances
+    )  # covariances
     look = (0.5 + stacked(columns, "f_dc_0", "f_dc_1", "f_dc_2") / np.sqrt(4 * np.pi)).clip(0, 1)
     np.testing.assert_allclose(
         values(cloud, "base_color", 4, "color")[:, :3],
@@ -191,7 +191,7 @@ def test_other_programs_splats(scene, tmp_path, scales, normals):
 
 
 def test_splats_that_are_not_finite_are_left_out(run_folder, scene, tmp_path, capfd):
-    """As many as `refgs` leaves out, and what RefGS does not know goes with its splat."""
+    """Leave out the same splats as `refgs`, and keep unknown columns."""
     columns = {**random_columns(), "semantic": np.arange(COUNT), "weight": np.linspace(0, 1, COUNT)}
     columns |= {f"f_rest_{i}": np.zeros(COUNT) for i in range(9)}
     columns["x"][3], columns["roughness"][[5, 6]], columns["f_rest_4"][7] = np.nan, np.inf, np.nan
@@ -247,7 +247,7 @@ def test_one_splat_alone_is_flat(tmp_path):
 
 
 def test_one_splat_and_a_mesh_without_faces(run_folder, scene, tmp_path):
-    """They come in, are edited, and leave."""
+    """Both can be imported, edited and exported."""
     write_ply(run_folder / "splats.ply", random_columns(1))
     trimesh.Scene(trimesh.PointCloud(np.eye(3))).export(run_folder / "mesh.glb")
     run = import_run(run_folder, scene)
@@ -291,7 +291,7 @@ def test_cameras_project_as_the_photos_did(run_folder, scene):
 
 
 def with_photos(run_folder, capture):
-    """Have a run folder say that it is of a capture with photos."""
+    """Link a run folder to a capture with photos."""
     file = run_folder / "cameras.json"
     content = json.loads(file.read_text())
     for frame in content["frames"]:

@@ -1,4 +1,4 @@
-"""A training's surfels in the 3D view while it runs."""
+"""Show a training's surfels in the 3D view while it runs."""
 
 import time
 
@@ -13,7 +13,7 @@ from tests.makers.runs import random_columns, write_ply
 
 @pytest.fixture
 def job(tmp_path):
-    """A training that has shown nothing yet."""
+    """Make a training without a preview yet."""
     return jobs.Job("pot", tmp_path, [], tmp_path / "log.txt", run=tmp_path / "run", state="running")
 
 
@@ -44,7 +44,7 @@ def test_the_surfels_come_change_and_go(job, scene, tmp_path):
     preview(job, tmp_path, 20, 50)
     until(lambda: len(item.data.points) == 50)
     assert clouds() == [item] and len(bpy.data.pointclouds) == 1 and len(item.data.materials) == 1
-    (tmp_path / "30.ply").write_bytes(b"half")  # a preview that cannot be read is left out
+    (tmp_path / "30.ply").write_bytes(b"half")  # an unreadable preview is skipped
     job.preview = {"iteration": 30, "splats": str(tmp_path / "30.ply")}
     preview(job, tmp_path, 40, 20)
     until(lambda: len(item.data.points) == 20)

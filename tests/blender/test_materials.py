@@ -1,4 +1,4 @@
-"""Materials to start from: those of the add-on and those of the artist, in one list of presets."""
+"""Material presets of the add-on and of the artist, in one list."""
 
 import bpy
 import pytest
@@ -21,7 +21,7 @@ OURS = ["Brushed Steel", "Chrome", "Clay", "Copper", "Glazed Ceramic", "Gold", "
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """The artist's folder of presets, which is not there yet."""
+    """Path of the artist's presets, which does not exist yet."""
     (tmp_path / "scripts").mkdir()
     monkeypatch.setenv("BLENDER_USER_SCRIPTS", str(tmp_path / "scripts"))
     return tmp_path / "scripts" / "presets" / "refgs_material"
@@ -104,7 +104,7 @@ def test_the_buttons(edit, own):
     try:
         (folder,) = bpy.utils.preset_paths("refgs_material")
         which = {"splats": edit.id_data.name, "edit": edit.name}
-        file = f"{folder}/Brushed_Steel.py"  # as Blender's list of presets says it
+        file = f"{folder}/Brushed_Steel.py"  # as Blender's list of presets passes it
         bpy.ops.refgs.set_material(**which, material=file)
         assert values(edit)["Roughness"] == pytest.approx(0.4)
         bpy.ops.refgs.keep_material(**which, name="Steel of mine")

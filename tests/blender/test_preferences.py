@@ -1,4 +1,4 @@
-"""The preferences: the trainer is installed, stopped, gone on with, used and removed by buttons, with a uv that only speaks as one."""
+"""Install, stop, resume, use and remove the trainer with the preferences' buttons and a fake uv."""
 
 import sys
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is 
 
 @pytest.fixture
 def online(scene, tmp_path, monkeypatch):
-    """The add-on, enabled, with a trainer to install, a folder of its own, and leave to use the network."""
+    """Enable the add-on with a bundled trainer, a folder of its own, and online access."""
     monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     monkeypatch.setattr(preferences, "_folder", lambda name: tmp_path / name)
     enabled = bpy.context.preferences.addons.new()

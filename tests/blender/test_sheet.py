@@ -1,4 +1,4 @@
-"""The contact sheet: each picture is what a preview under that light is, and nothing of the scene changes."""
+"""Contact sheet: each picture equals a preview under its light, and the scene does not change."""
 
 import bpy
 import numpy as np
@@ -41,7 +41,7 @@ def test_a_view_under_each_light(run_folder, scene, tmp_path):
     relight(scene, tmp_path / "green.exr")
     render_preview(scene, tmp_path / "b.png", size=24, samples=4)
     alone = np.asarray(Image.open(tmp_path / "b.png")).astype(int)
-    np.testing.assert_allclose(shown["green"], alone, atol=12)  # samples are drawn by chance
+    np.testing.assert_allclose(shown["green"], alone, atol=12)  # samples are random
 
 
 def test_without_lights_or_a_place_to_write(run_folder, scene, tmp_path):

@@ -1,4 +1,4 @@
-"""Training from Blender: the scene's settings, the buttons, and what a file remembers, with a trainer that only speaks as one."""
+"""Train from Blender with a fake worker: the scene's settings, the buttons, and the runs that a file lists."""
 
 import json
 import math
@@ -26,7 +26,7 @@ from tests.makers.waiting import until
 
 @pytest.fixture
 def addon(scene, python):
-    """The add-on, enabled, with the trainer chosen in its preferences."""
+    """Enable the add-on with the fake trainer chosen in its preferences."""
     enabled = bpy.context.preferences.addons.new()
     enabled.module = preferences.PACKAGE
     ui.register()
@@ -69,10 +69,10 @@ def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
     bpy.ops.refgs.tell(number=number, command="cancel")
     until(lambda: job.state == "cancelled")
     asked = json.loads((out / "started").read_text())
-    assert asked["minutes"] == 3.0 and asked["preset"] is None  # all is chosen for the time
+    assert asked["minutes"] == 3.0 and asked["preset"] is None  # the minutes choose everything
     bpy.ops.refgs.put_away(number=number)
     assert job not in jobs.JOBS
-    # Saved and opened again, the file knows of the run; it is gone on with.
+    # Saved and opened again, the file lists the run, which is resumed.
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     addon.refgs.runs.clear()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
@@ -128,7 +128,7 @@ def test_a_capture_that_is_not_there(addon):
 
 @pytest.fixture
 def checked(addon, capture):
-    """A capture that was checked, and the number of the job."""
+    """Check a capture; return the job and its number."""
     job = training.check(addon)
     until(lambda: job.ended)
     for number in range(2):
@@ -137,7 +137,7 @@ def checked(addon, capture):
 
 
 def test_the_curve_in_the_panel():
-    """PSNR that grows as time's logarithm is a straight line, the views held out are dots on it; more of either is drawn as it comes."""
+    """PSNR that is linear in log time is a straight line, and held-out views are dots on it."""
     height, width = CURVE[1], CURVE[0]
     seconds = np.geomspace(0.5, 200, 60)
     trained = [(s, 20 + 5 * np.log10(s)) for s in seconds]
@@ -157,7 +157,7 @@ def test_the_curve_in_the_panel():
 
 
 class Drawn:
-    """Stands for a layout: notes the icons that are drawn in it, and whether its buttons are pressed."""
+    """Fake layout that records drawn icons and pressed buttons."""
 
     def __init__(self):
         self.pictures, self.icons, self.pressed = [], [], []
@@ -180,7 +180,7 @@ class Drawn:
 def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
     job, number = checked
     drawn = Drawn()
-    monkeypatch.setattr(checked_capture, "thumbnail", drawn.thumbnail)  # without a window Blender gives no icons
+    monkeypatch.setattr(checked_capture, "thumbnail", drawn.thumbnail)  # Blender has no icons without a window
     checked_capture.draw_capture(drawn, addon, number, job)
     assert drawn.icons == [1, 2] and drawn.pressed == [False]
     assert drawn.pictures == [("0000.png", job.serial), ("0001.png", job.serial)]
@@ -200,7 +200,7 @@ def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
 
 
 def test_a_run_brings_its_own_cameras(addon, checked, capture, run_folder):
-    """Those of the capture go; what was looked through stays."""
+    """Cameras of the run replace the capture's; the scene's camera stays on the same photo."""
     _, number = checked
     file = run_folder / "cameras.json"
     content = json.loads(file.read_text())
@@ -249,7 +249,7 @@ def test_display_splats_are_made_by_the_trainer(addon, run_folder, tmp_path):
     until(lambda: job.ended)
     assert job.state == "done" and job.results["export"]["display_splats"] == str(tmp_path / "a.ply")
     assert job.progress["stage"] == "colours" and (tmp_path / "a.ply").read_text() == str(run_folder)
-    # The edits are in what the trainer is given, and the run is as it was.
+    # The trainer gets the edits, and the run does not change.
     before = (run_folder / "splats.ply").read_bytes()
     bpy.ops.refgs.add_edit(where="Everywhere", material="Rubber")
     bpy.ops.refgs.export_display_splats(filepath=str(tmp_path / "a.ply"))
@@ -267,7 +267,7 @@ def test_display_splats_are_made_by_the_trainer(addon, run_folder, tmp_path):
 
 
 def test_taken_away_while_it_trains(addon, capture):
-    """Disabling the add-on ends what it started."""
+    """Disabling the add-on ends its jobs."""
     training.train(addon)
     job = jobs.JOBS[-1]
     until(lambda: job.progress)
@@ -277,7 +277,7 @@ def test_taken_away_while_it_trains(addon, capture):
 
 
 def told(out):
-    """The settings that the trainer was told, by their names."""
+    """Read the settings that the trainer got, by name."""
     until(lambda: (out / "started").is_file() and (out / "started").read_text())
     words = dict(word.split("=", 1) for word in json.loads((out / "started").read_text())["settings"])
     return {key: value if value.isalpha() else json.loads(value) for key, value in words.items()}
@@ -304,7 +304,7 @@ def test_a_box_is_the_region_and_its_up_the_results(addon, capture):
         np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]]),
         np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]]),
     ]
-    np.testing.assert_allclose(np.abs(about[2] @ about[1] @ about[0]), matrix, atol=1e-6)  # axes, either way round
+    np.testing.assert_allclose(np.abs(about[2] @ about[1] @ about[0]), matrix, atol=1e-6)  # axes, up to their signs
     assert words["region.up"] == pytest.approx([1, 0, 0], abs=1e-6)
 
     box.scale.x = 0
@@ -348,7 +348,7 @@ def test_a_box_of_another_capture_stays(addon, capture, run_folder):
 def test_a_box_that_is_deleted_or_cleared_is_no_region(addon, capture):
     bpy.ops.refgs.add_training_region()
     box = addon.refgs.region
-    bpy.ops.object.delete()  # the settings still know of it
+    bpy.ops.object.delete()  # the settings still refer to it
     assert regions.training_region(addon) is None and regions.region_settings(addon) == {}
     bpy.ops.refgs.add_training_region()
     assert addon.refgs.region != box and regions.region_settings(addon)
@@ -377,7 +377,7 @@ def test_closing_asks_only_while_something_trains(addon, capture):
     assert first.kept and second.kept
     second.stop()
     assert quit_question() == "A training is running"
-    # As when Blender closes, which takes its add-ons away: what is kept goes on.
+    # Blender disables its add-ons when it closes: kept jobs continue.
     ui.unregister()
     assert not jobs.JOBS and first._process.wait(timeout=20) == 0
     assert jobs.run_state(first.run) == "finished" and not second.run.exists()
