@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from refgs.errors import InputError
+from refgs.export.export_job import export
 from refgs.formats.exr import write_exr
 from refgs.formats.gltf import write_glb
 from refgs.formats.splats import write_display_splats, write_splats
 from refgs.formats.textures import Textures
-from refgs.jobs import export
 from tests.makers.box import textured_box
 from tests.makers.disk import fill
 from tests.makers.splats import make

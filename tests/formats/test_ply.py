@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from refgs.color import srgb_decode
 from refgs.errors import InputError, InputWarning
+from refgs.export.export_job import export
 from refgs.formats.ply import read_ply
 from refgs.formats.splats import read_splats, write_display_splats, write_splats
-from refgs.jobs import export
 from tests.makers.splats import arrays, make
 
 COUNT = 50

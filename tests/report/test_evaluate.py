@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scenes.analytic import sky
-from refgs import commands, jobs
+from refgs import commands
 from refgs.capture import read_capture
 from refgs.color import srgb_encode
 from refgs.compare import surface
@@ -19,6 +19,7 @@ from refgs.formats.exr import write_exr
 from refgs.formats.panorama import directions
 from refgs.model.environment import Environment
 from refgs.run import open_run
+from refgs.run_folder import update_metrics
 from tests.makers.ball import BOX, MOVE, SCALE, TURN, write_run
 
 
@@ -73,7 +74,7 @@ def figures(run):
 
 def test_a_run_that_is_the_truth_has_no_error_in_whatever_frame(made, capsys):
     run, truth, views = made
-    jobs.update_metrics(run, {"relight": {"dusk": {"mesh": {"psnr_raw": 20.0}}}, "psnr": 1.0})
+    update_metrics(run, {"relight": {"dusk": {"mesh": {"psnr_raw": 20.0}}}, "psnr": 1.0})
     commands.evaluate(run, "test", truth)
     found = figures(run)
     assert found["views"] == len(views) == 4 and found["splats"] == 3000 and found["frames_per_second"] > 0
