@@ -22,7 +22,7 @@ from refgs.capture.motion import find_cameras
 from refgs.errors import InputError, NoCameras
 from refgs.export.export_job import export as export_run
 from refgs.kernels import cuda
-from refgs.train.preview import write_preview
+from refgs.train.live_view import write_preview
 from refgs.train.state import State
 
 PROTOCOL = 1

@@ -15,7 +15,7 @@ from refgs.formats.gltf import read_glb
 from refgs.formats.splats import read_splats
 from refgs.run import open_run
 from refgs.settings import load_settings
-from refgs.train.preview import write_preview
+from refgs.train.live_view import write_preview
 from refgs.train.start import AROUND, start_parameters
 from refgs.train.trainer import Trainer
 
