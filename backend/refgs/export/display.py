@@ -12,7 +12,7 @@ from refgs.render.baselines import draw_colors
 from refgs.run import Run
 
 ITERATIONS = 600
-VIEWS = 120  # most training cameras
+VIEWS = 120  # training cameras at most
 SIDE = 400  # longest side of a rendering, in pixels
 RATE, RATE_OF_REST = 0.02, 2e-3  # initial learning rates of the constant and the other harmonics; they decay to a tenth
 DEGREE = 3

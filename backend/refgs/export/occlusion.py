@@ -16,7 +16,7 @@ def openness(mesh: Mesh) -> np.ndarray:
 
     Rays about the vertex's normal are distributed as the cosine.
     """
-    middle = mesh.vertices.mean(axis=0)  # rays are traced in single precision
+    middle = mesh.vertices.mean(axis=0)  # subtracted, because rays are traced in single precision
     vertices = (mesh.vertices - middle).astype(np.float32)
     scene = EmbreeScene()
     TriangleMesh(scene, vertices, mesh.faces.astype(np.int32))

@@ -17,7 +17,7 @@ from refgs.formats.mesh import Mesh
 from refgs.geometry.mesh import smooth_normals
 from refgs.render.renderer import Rendering
 
-VIEWS = 24  # most cameras, evenly chosen
+VIEWS = 24  # cameras at most, evenly chosen
 UPSAMPLING = 4  # of alpha, each way, so that outlines have subpixel precision
 LARGEST_MOVE = 3.0  # largest displacement of a vertex, in voxels
 SMOOTHING_STEPS = 4

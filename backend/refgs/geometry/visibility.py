@@ -32,7 +32,7 @@ class Occluder:
         TriangleMesh(self._scene, ((corners - self._centre) / self._size).astype(np.float32))
 
     def tree(self, device: torch.device) -> Tree:
-        """The tree that a CUDA card traces in place of Embree; built at the first call."""
+        """Return the tree that a CUDA card traces in place of Embree. The first call builds it."""
         if self._tree is None:
             self._tree = Tree(self.mesh, self._centre, self._size, self.lift / self._size, device)
         return self._tree
