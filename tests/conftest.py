@@ -1,6 +1,12 @@
+import os
+
+if (
+    "PYTEST_XDIST_WORKER" in os.environ
+):  # two processes share the cores: of more threads some would wait for others' ends
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
 
-import os
 import shutil
 import subprocess
 import sys

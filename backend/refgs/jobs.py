@@ -348,7 +348,7 @@ def _write_mesh(run: "Run", target: Path, texture: int | None, report: Report) -
 
 def _make_mesh(run: "Run", report: Report) -> Any:
     """Return the simplified mesh with texture coordinates."""
-    from refgs.export.outline import bring_out
+    from refgs.export.outline import fit_to_outlines
     from refgs.export.unwrap import layout, unwrap
     from refgs.geometry.mesh import clean, is_crumbs
     from refgs.render.extract import extract
@@ -358,7 +358,7 @@ def _make_mesh(run: "Run", report: Report) -> Any:
     report("stage", {"what": f"fused {len(mesh.faces):,} triangles"})
     mesh = clean(mesh, settings.triangles)
     report("stage", {"what": f"simplified to {len(mesh.faces):,} triangles; fitting it to the outlines"})
-    mesh = bring_out(mesh, run.render, cameras, voxel)
+    mesh = fit_to_outlines(mesh, run.render, cameras, voxel)
     report("stage", {"what": "unwrapping"})
     if is_crumbs(mesh):
         what = "the mesh is in pieces, none of them half of it: the photos do not agree on a surface"

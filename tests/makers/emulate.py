@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from refgs.kernels import cuda, load
 from refgs.kernels.build import HERE
@@ -22,23 +23,13 @@ def _library(source: str) -> ctypes.CDLL:
     parts = [(HERE / name).read_bytes() for name in (source, *cuda.HEADERS)] + [EMULATOR.read_bytes()]
     digest = hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
     file = Path(tempfile.gettempdir()) / "refgs-emulated" / f"{Path(source).stem}-{digest}.so"
-    if not file.exists():
-        file.parent.mkdir(exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=file.parent) as folder:
-            made = Path(folder) / file.name
-            command = [
-                sys.executable,
-                "-m",
-                "ziglang",
-                "c++",
-                *FLAGS,
-                "-include",
-                str(EMULATOR),
-                "-x",
-                "c++",
-                str(HERE / source),
-            ]
-            done = subprocess.run([*command, "-o", str(made)], capture_output=True, text=True)
+    file.parent.mkdir(exist_ok=True)
+    with FileLock(file.with_suffix(".lock")):  # another process of the same run compiles them too
+        if not file.exists():
+            made = file.with_suffix(".part")
+            words = ["-include", str(EMULATOR), "-x", "c++", str(HERE / source), "-o", str(made)]
+            command = [sys.executable, "-m", "ziglang", "c++", *FLAGS, *words]
+            done = subprocess.run(command, capture_output=True, text=True)
             assert done.returncode == 0, done.stderr
             made.replace(file)
     return ctypes.CDLL(str(file))

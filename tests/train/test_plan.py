@@ -44,7 +44,9 @@ def _train(
 
 @pytest.mark.parametrize("minutes", [2, 5, 20])
 @pytest.mark.parametrize(
-    "pace", [lambda i: 0.1, lambda i: 0.05 + 0.1 * min(i / 1000, 1), lambda i: 0.2 if i < 300 else 0.1], ids=str
+    "pace",
+    [lambda i: 0.1, lambda i: 0.05 + 0.1 * min(i / 1000, 1), lambda i: 0.2 if i < 300 else 0.1],
+    ids=["even", "slower", "faster"],
 )
 def test_it_ends_on_time_whatever_an_iteration_takes(clock, pace, minutes):
     _, seconds = _train(clock, Plan(minutes), pace)
