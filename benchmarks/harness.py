@@ -148,8 +148,9 @@ class Bench:
         kept = read(KEPT) if KEPT.exists() else []
         for table in tables:
             headings, *lines = table.lines(self.rows, kept)
-            shown = any(row.benchmark == self.name for row in kept)
-            printed = Printed(title=table.title, caption="in brackets: the kept figure" if shown else None)
+            machines = ", ".join(sorted({row.machine for row in kept if row.benchmark == self.name}))
+            caption = f"in brackets: kept, of {machines}" if machines else None
+            printed = Printed(title=table.title, caption=caption)
             for index, heading in enumerate(headings):
                 printed.add_column(heading, justify="right" if index > bool(table.variant) else "left")
             for line in lines:

@@ -12,8 +12,8 @@ HEAD = """# Measurements
 
 Machine: {machine}. Date: {date}.
 
-These are figures of today's program. `refgs bench page` writes this page from [measurements.csv](measurements.csv), which has the date and
-commit of each. [The notebook](notebook/README.md) tells how they came about; [run-folder.md](run-folder.md#what-the-figures-mean) says
+`refgs bench page` writes this page from [measurements.csv](measurements.csv), which has the date and commit of each
+figure. [The notebook](notebook/README.md) tells how they came about; [run-folder.md](run-folder.md#what-the-figures-mean) says
 what they mean. No CUDA card has been measured yet; `refgs bench gpu` does that.
 """
 SECTIONS = (

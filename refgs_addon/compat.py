@@ -1,26 +1,26 @@
-"""Every difference between Blender 4.3, 4.5 LTS and 5.2 LTS that the add-on meets."""
+"""Differences between Blender 4.3, 4.5 LTS and 5.2 LTS, all of them here."""
 
 import bpy
 
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
 
-# The image settings that make up a file format, in the order to set them; from 5.0 it is one of a medium's.
+# Image settings of a file format, in the order to set them; from 5.0 a format belongs to a medium.
 FORMAT = (["media_type"] if bpy.app.version >= (5, 0, 0) else []) + ["file_format", "color_mode", "color_depth"]
 
 
 def set_format(settings: bpy.types.ImageFormatSettings, kind: str, depth: str) -> None:
-    """Save RGBA pictures as `kind` ("PNG", "OPEN_EXR") with `depth` bits."""
+    """Set the format of saved RGBA pictures: `kind` is "PNG" or "OPEN_EXR", `depth` the bits."""
     for name, value in zip(FORMAT, ["IMAGE"] * (len(FORMAT) - 3) + [kind, "RGBA", depth], strict=True):
         setattr(settings, name, value)
 
 
 def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
-    """A point cloud of `count` points at the origin."""
+    """Make a point cloud of `count` points at the origin."""
     if hasattr(bpy.types.PointCloud, "resize"):  # from 5.1
         cloud = bpy.data.pointclouds.new(name)
         cloud.resize(count)
         return cloud
-    # Before that only geometry nodes make one of a given size: a copy of what they make is ours to keep.
+    # Before 5.1 only geometry nodes make a cloud of a given size; a copy of their result is real data.
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     points, output = tree.nodes.new("GeometryNodePoints"), tree.nodes.new("NodeGroupOutput")
@@ -37,15 +37,15 @@ def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
 
 
 def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
-    """The node tree of a material or a world, emptied."""
-    if data.node_tree is None:  # from 5.0 there is always one, and `use_nodes` is deprecated
+    """Clear the node tree of a material or a world, and return it."""
+    if data.node_tree is None:  # from 5.0 a tree always exists, and `use_nodes` is deprecated
         data.use_nodes = True
     data.node_tree.nodes.clear()
     return data.node_tree
 
 
 def modifier_input(modifier: bpy.types.NodesModifier, name: str) -> tuple[bpy.types.bpy_struct, str]:
-    """Where the value of a geometry-nodes modifier's input lives: what `layout.prop` takes to draw it."""
+    """Find the owner and property of a geometry-nodes modifier's input, as `layout.prop` takes them."""
     identifier = modifier.node_group.interface.items_tree[name].identifier
     if hasattr(modifier, "properties"):  # from 5.2
         return getattr(modifier.properties.inputs, identifier), "value"
@@ -53,14 +53,14 @@ def modifier_input(modifier: bpy.types.NodesModifier, name: str) -> tuple[bpy.ty
 
 
 def set_modifier_input(modifier: bpy.types.NodesModifier, name: str, value) -> None:
-    """Set an input by its name; for a menu, `value` is the item's name."""
+    """Set a modifier's input by its name. For a menu, `value` is the item's name."""
     owner, path = modifier_input(modifier, name)
     if path == "value":
         owner.value = value
     else:
         key = path[2:-2]
         if modifier.node_group.interface.items_tree[name].socket_type == "NodeSocketMenu":
-            # Before 5.2 it is kept as its item's number.
+            # Before 5.2 a menu is stored as its item's number.
             items = modifier.id_properties_ui(key).as_dict()["items"]
             value = next(item[4] for item in items if item[0] == value)
         owner[key] = value
@@ -68,7 +68,7 @@ def set_modifier_input(modifier: bpy.types.NodesModifier, name: str, value) -> N
 
 
 def get_modifier_input(modifier: bpy.types.NodesModifier, name: str):
-    """The value of an input; of a menu the item's name. An object may be None."""
+    """Return a modifier's input; for a menu, the item's name. An object may be None."""
     owner, path = modifier_input(modifier, name)
     if path == "value":
         return owner.value
@@ -81,7 +81,7 @@ def get_modifier_input(modifier: bpy.types.NodesModifier, name: str):
 
 
 def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
-    """The curves of an object's keyframes."""
+    """List the curves of an object's keyframes."""
     animation = item.animation_data
     if hasattr(animation.action, "fcurves"):  # until 5.0
         return list(animation.action.fcurves)
@@ -90,6 +90,6 @@ def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
 
 
 def usd_keeps_textures() -> dict[str, str | bool]:
-    """What tells the USD exporter to name pictures where they lie. Raises KeyError where there is none: Debian's Blender has no USD."""
+    """Options that make the USD exporter refer to textures where they are. Raises KeyError where Blender has no USD, as Debian's."""
     known = bpy.ops.wm.usd_export.get_rna_type().properties
     return {"export_textures_mode": "KEEP"} if "export_textures_mode" in known else {"export_textures": False}

@@ -1,5 +1,5 @@
-"""Errors that are the artist's to mend."""
+"""Errors that the artist can fix."""
 
 
 class InputError(Exception):
-    """One line for the artist: what is wrong, where, what to do. Operators report it; the command line prints it."""
+    """Report one line to the artist: what is wrong, where, what to do. Operators show it, the command line prints it."""

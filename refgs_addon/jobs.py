@@ -1,8 +1,8 @@
-"""The backend's processes: started, told and heard without the window ever waiting for them. Nothing here needs bpy.
+"""Start the backend's processes and follow them without blocking the window. Needs no bpy.
 
-A job is a `refgs worker` (docs/job-protocol.md) of its own. A thread reads what it says into a queue; `poll`, called now and then,
-takes it from there. The process ends by itself when Blender does, for then its standard input closes; a job that is kept is one
-whose process was told to go on to its end. A run folder says by a lock whether any process works in it.
+Each job has a `refgs worker` process of its own (docs/job-protocol.md). A thread reads its events into a queue; `poll` handles them.
+When Blender ends, the process's standard input closes and the process stops. A job that is kept was told to finish all the same.
+A lock in the run folder shows whether any process works in it.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 
-from . import environment
+from . import installation
 from .errors import InputError
 
 if sys.platform == "win32":
@@ -26,45 +26,45 @@ else:
     import fcntl
 
 PROTOCOL = 1
-TRAINER, BLENDER = "the trainer", "Blender"  # the programs that jobs are done by
+TRAINER, BLENDER = "the trainer", "Blender"  # programs that run jobs
 ENDED = ("done", "cancelled", "failed")
-LOCK, PROGRESS, STOP = "run.lock", "progress.json", "stop"  # in a run folder, as in backend/refgs/lock.py
+LOCK, PROGRESS, STOP = "run.lock", "progress.json", "stop"  # files in a run folder, as in backend/refgs/lock.py
 
 
 @dataclass
 class Job:
-    """What a worker is asked to do, one command after another, and what it has said so far.
+    """Commands for one worker process, in order, and the events it has sent so far.
 
-    `state` is "waiting" (for the jobs before it), "starting", "running", "paused", or one of ENDED. With no commands it is asked for
-    its version alone.
+    `state` is "waiting" (for earlier jobs), "starting", "running", "paused", or one of ENDED. A job without commands asks only for the
+    worker's version.
     """
 
     name: str
     python: Path
     commands: list[dict]
     log: Path
-    run: Path | None = None  # the folder that is trained into; such jobs run one at a time
-    words: tuple[str, ...] = ("-E", "-m", "refgs.cli", "worker")  # that start it in that Python
+    run: Path | None = None  # run folder that the job works in; such jobs run one at a time
+    arguments: tuple[str, ...] = ("-E", "-m", "refgs.cli", "worker")  # of that Python
     program: str = TRAINER
     state: str = "waiting"
-    line: str = ""  # what is being done; at the end, what was wrong
-    part: float = 0.0  # how much of it is done, where that is said with the line
+    line: str = ""  # current step; at the end, the error
+    fraction: float = 0.0  # of the current step, where a stage event has it
     warnings: list[str] = field(default_factory=list)
-    decided: dict[str, str] = field(default_factory=dict)  # how what was left to the photos came out, and why
-    progress: dict = field(default_factory=dict)  # the newest event of its kind, as are the next
+    decided: dict[str, str] = field(default_factory=dict)  # result and reason of each automatic setting
+    progress: dict = field(default_factory=dict)  # newest event; so are the next two
     preview: dict = field(default_factory=dict)
     ready: dict = field(default_factory=dict)
-    results: dict[str, dict] = field(default_factory=dict)  # "done" events by their jobs
-    no_cameras: bool = False  # it failed because the capture has photos but no cameras: `poses` finds them
-    curve: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR of training views
-    held_out: list[tuple[float, float]] = field(default_factory=list)  # the same of views that are not trained on
-    serial: int = field(default_factory=count().__next__)  # no other job has it
-    kept: bool = False  # it goes on to its end when Blender closes
+    results: dict[str, dict] = field(default_factory=dict)  # "done" events by command
+    no_cameras: bool = False  # failed because the photos have no cameras: `find_cameras` finds them
+    curve: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR of the training views
+    held_out: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR of the held-out views
+    serial: int = field(default_factory=count().__next__)  # unique
+    kept: bool = False  # finishes even if Blender closes
     _stopped: bool = False
-    _silent: bool = False  # the process says nothing more
-    _asked_only: bool = False
+    _output_closed: bool = False
+    _query_only: bool = False
     _process: subprocess.Popen | None = None
-    _heard: queue.SimpleQueue = field(default_factory=queue.SimpleQueue)
+    _events: queue.SimpleQueue = field(default_factory=queue.SimpleQueue)
 
     @property
     def ended(self) -> bool:
@@ -72,82 +72,82 @@ class Job:
 
     @property
     def active(self) -> bool:
-        """Whether it has a process to do something."""
+        """True while its process works."""
         return not self.ended and self.state != "waiting"
 
     def start(self) -> None:
-        """Start the process; where that fails the job has failed."""
+        """Start the process. If that fails, the job fails."""
         self.state, self.line = "starting", "Starting"
         try:
             self.log.parent.mkdir(parents=True, exist_ok=True)
             with open(self.log, "wb") as log:
                 self._process = subprocess.Popen(
-                    [str(self.python), *self.words],
+                    [str(self.python), *self.arguments],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=log,
                     cwd=self.log.parent,
-                    start_new_session=True,  # a terminal that Blender was started from takes it along by its input alone
+                    start_new_session=True,  # Ctrl-C in Blender's terminal must not reach it
                     creationflags=subprocess.CREATE_NO_WINDOW if sys.platform == "win32" else 0,
                 )
         except OSError as error:
             self._fail(f"{self.python} cannot be started ({error.strerror}): choose another Python in the preferences")
             return
-        threading.Thread(target=_listen, args=(self._process, self._heard), daemon=True).start()
+        threading.Thread(target=_read_events, args=(self._process, self._events), daemon=True).start()
         if self.kept:
             self.tell("keep", on=True)
-        for command in self.commands:  # all at once, for one that is kept has nobody to tell it the next
+        for command in self.commands:  # all at once: a kept job cannot get the next one later
             self.tell(**command)
         if not self.commands:
-            self._asked_only = True
+            self._query_only = True
             self._close()
 
     def tell(self, command: str, **facts) -> None:
-        """Send a command. One that nobody hears is no matter: that the process has ended is heard too."""
+        """Send a command. Write errors are ignored: `poll` reports a process that has ended."""
         with contextlib.suppress(OSError, ValueError):
             self._process.stdin.write(json.dumps({"command": command} | facts).encode() + b"\n")
             self._process.stdin.flush()
 
     def keep(self, on: bool) -> None:
-        """Have it go on to its end, or no longer, when Blender closes or is killed. One that waits still has to be started by then."""
+        """Choose whether the job finishes after Blender closes or is killed. A job that still waits then never starts."""
         self.kept = on
         if self.active:
             self.tell("keep", on=on)
 
     def poll(self) -> bool:
-        """Take in what was said since; whether that was anything."""
+        """Handle new events; return whether there were any."""
         heard = False
-        while not self._heard.empty():
-            heard, event = True, self._heard.get()
+        while not self._events.empty():
+            heard, event = True, self._events.get()
             if event is None:
-                self._silent = True
+                self._output_closed = True
             elif not self.ended:
                 try:
-                    self._take(event)
-                except (KeyError, TypeError, AttributeError):  # from a program that speaks otherwise
+                    self._handle(event)
+                except (KeyError, TypeError, AttributeError):  # from a program with another protocol
                     self.warnings.append(f"not an event: {event}")
-        # Silence comes a while before the end, torch being slow to go: the window does not wait for it.
-        if self._silent and (status := self._process.poll()) is not None:
-            heard, self._silent = True, False
-            self._gone(status)
+        # Output closes some time before the process ends, as torch is slow to exit: do not wait for it.
+        if self._output_closed and (status := self._process.poll()) is not None:
+            heard, self._output_closed = True, False
+            self._process_ended(status)
         return heard
 
-    def _take(self, event: dict) -> None:
+    def _handle(self, event: dict) -> None:
         match event.get("event"):
             case "ready":
                 self.ready = event
                 if event["protocol"] != PROTOCOL:
-                    newer = "older" if event["protocol"] < PROTOCOL else "newer"
-                    self._fail(f"the trainer, {event['refgs']}, is {newer} than this add-on: install the same release")
+                    age = "older" if event["protocol"] < PROTOCOL else "newer"
+                    self._fail(f"the trainer, {event['refgs']}, is {age} than this add-on: install the same release")
             case "started":
                 self.state, self.line = "running", {"train": "Reading the photos"}.get(event["job"], "")
             case "stage":
-                self.line, self.part = event["what"], event.get("part", self.part)
+                self.line, self.fraction = event["what"], event.get("part", self.fraction)
             case "warning":
                 self.warnings.append(event["what"])
             case "decided":
                 self.decided[event["about"]] = event["what"]
-            case "progress" if self.curve and "stage" in event:  # of the mesh: what the training reached stays shown
+            case "progress" if self.curve and "stage" in event:  # of the mesh: keep the training's figures
                 self.line = ""
             case "progress":
                 self.progress, self.line = event, ""
@@ -177,36 +177,35 @@ class Job:
         self._close()
 
     def _close(self) -> None:
-        """Have the process end."""
+        """Make the process exit."""
         if self._process is not None:
             if self.kept:
                 self.tell("keep", on=False)
-            self.let_go()
+            self.close_input()
 
-    def let_go(self) -> None:
-        """Say nothing more to the process, which ends unless the job is kept."""
+    def close_input(self) -> None:
+        """Close the process's input. It then stops, unless the job is kept."""
         with contextlib.suppress(OSError):
             self._process.stdin.close()
 
-    def _gone(self, status: int) -> None:
-        """The process has ended."""
-        if self.ready and self._asked_only and not self.ended:
+    def _process_ended(self, status: int) -> None:
+        if self.ready and self._query_only and not self.ended:
             self.state, self.line = "done", ""
         elif self._stopped and not self.ended:
             self.state, self.line = "cancelled", "Stopped"
         elif not self.ended:
-            self._fail(f"{self.program} ended unexpectedly (status {status}): its log says more")
+            self._fail(f"{self.program} ended unexpectedly (status {status}): see its log")
 
     def stop(self) -> None:
-        """End cleanly: a training with a checkpoint, after its iteration."""
+        """Stop cleanly. A training stops after its iteration, with a checkpoint."""
         if self.state == "waiting":
-            self.state, self.line = "cancelled", "Taken back"
+            self.state, self.line = "cancelled", "Cancelled"
         elif not self.ended:
             self._stopped = True
             self._close()
 
 
-def _listen(process: subprocess.Popen, heard: queue.SimpleQueue) -> None:
+def _read_events(process: subprocess.Popen, heard: queue.SimpleQueue) -> None:
     with process.stdout:
         for line in process.stdout:
             try:
@@ -217,17 +216,19 @@ def _listen(process: subprocess.Popen, heard: queue.SimpleQueue) -> None:
 
 
 JOBS: list[Job] = []
-"""All jobs of this session that have not been put away, the oldest first. Of those that train one runs at a time."""
+"""Jobs of this session that have not been dismissed, oldest first. One training runs at a time."""
 
 
 def check(python: Path, capture: Path, out: Path, log: Path) -> Job:
-    """Have a capture read, beside whatever else runs. `results["check"]` has `lines` about it, its `cameras` and `thumbnails`, which are
-    written into the folder `out`, and more: docs/job-protocol.md."""
+    """Check a capture at once, whatever else runs. `out` gets its cameras.json and thumbnails.
+
+    `results["check"]` has `lines`, `cameras`, `thumbnails` and more: docs/job-protocol.md.
+    """
     return _add(Job(capture.name, python, [_check(capture, out)], log))
 
 
-def poses(python: Path, capture: Path, out: Path, log: Path) -> Job:
-    """Have the cameras of a folder's photos found, then have it read as `check` does, beside whatever else runs."""
+def find_cameras(python: Path, capture: Path, out: Path, log: Path) -> Job:
+    """Find the cameras of a folder's photos, then check it as `check` does, at once."""
     return _add(Job(capture.name, python, [{"command": "poses", "capture": str(capture)}, _check(capture, out)], log))
 
 
@@ -235,26 +236,26 @@ def _check(capture: Path, out: Path) -> dict:
     return {"command": "check", "capture": str(capture), "out": str(out)}
 
 
-def ask(python: Path, log: Path) -> Job:
-    """Ask a Python whether RefGS's trainer is in it, which one, and what it would train on: `ready`, when the job is done."""
+def query_trainer(python: Path, log: Path) -> Job:
+    """Ask a Python for its trainer. `ready` then has the release and the device."""
     return _add(Job("trainer", python, [], log))
 
 
 def install(home: Path, log: Path) -> Job:
-    """Install the trainer that the add-on brings into an environment of its own, or go on with that: `ready`, when the job is done."""
-    words = {"uv": str(environment.wheel("uv")), "trainer": str(environment.wheel("refgs"))}
-    return _by_blender("install", home, log, words)
+    """Install the bundled trainer into its own environment, or resume that. `ready` then has the release and the device."""
+    arguments = {"uv": str(installation.wheel("uv")), "trainer": str(installation.wheel("refgs"))}
+    return _run_installation("install", home, log, arguments)
 
 
 def remove(home: Path, log: Path) -> Job:
-    """Remove that environment, or what there is of it."""
-    return _by_blender("remove", home, log, {})
+    """Remove the trainer's environment, complete or not."""
+    return _run_installation("remove", home, log, {})
 
 
-def _by_blender(command: str, home: Path, log: Path, words: dict[str, str]) -> Job:
-    """By Blender's own Python, which needs nothing but its own library for it."""
-    told = {"command": command, "home": str(home)} | words
-    return _add(Job(command, Path(sys.executable), [told], log, words=("-I", environment.__file__)))
+def _run_installation(command: str, home: Path, log: Path, arguments: dict[str, str]) -> Job:
+    """Run installation.py in Blender's own Python: it needs only the standard library."""
+    commands = [{"command": command, "home": str(home)} | arguments]
+    return _add(Job(command, Path(sys.executable), commands, log, arguments=("-I", installation.__file__)))
 
 
 def train(
@@ -269,10 +270,10 @@ def train(
     mesh: bool = True,
     resume: bool = False,
 ) -> Job:
-    """Train a capture into a run folder, and make its mesh, after the jobs that wait already.
+    """Train a capture into a run folder and make its mesh, after the trainings that wait already.
 
-    Without a preset all is chosen for the minutes; without either it is the standard one. `settings` are those of a preset by their
-    names, `{"train.iterations": 2000}`. Raises InputError where there is nothing to train from, or a run in the folder already.
+    Without a preset the minutes choose all settings; without either the preset is "standard". `settings` override a preset's values by
+    name: `{"train.iterations": 2000}`. Raises InputError where there is no capture, or the run folder is not empty.
     """
     if not capture.is_dir():
         raise InputError(f"{capture} is not a folder: choose the folder of a capture")
@@ -280,29 +281,29 @@ def train(
         raise InputError(f"{out} is not empty: choose another folder for the run")
     if any(job.run == out and not job.ended for job in JOBS):
         raise InputError(f"{out} is being trained already")
-    words = {"preset": preset, "minutes": minutes, "settings": [f"{k}={v}" for k, v in (settings or {}).items()]}
+    arguments = {"preset": preset, "minutes": minutes, "settings": [f"{k}={v}" for k, v in (settings or {}).items()]}
     if resume:
-        words = {"minutes": minutes, "resume": True}
-    commands = [{"command": "train", "capture": str(capture), "out": str(out)} | words]
+        arguments = {"minutes": minutes, "resume": True}
+    commands = [{"command": "train", "capture": str(capture), "out": str(out)} | arguments]
     if mesh:
         commands.append({"command": "export", "run": str(out)})
     return _add(Job(out.name, python, commands, log, out))
 
 
 def export(python: Path, run: Path, log: Path) -> Job:
-    """Make the mesh and the textures of a run, after the jobs that wait already."""
+    """Make a run's mesh and textures, after the trainings that wait already."""
     return _add(Job(run.name, python, [{"command": "export", "run": str(run)}], log, run))
 
 
 def display_splats(python: Path, run: Path, file: Path, log: Path) -> Job:
-    """Have a run written as splats for viewers that know no light, in place of what the file holds, beside whatever else runs."""
+    """Write a run as display splats, for viewers without lights, at once. Replaces the file."""
     command = {"command": "export", "run": str(run), "display_splats": str(file)}
     return _add(Job(file.name, python, [command], log))
 
 
-def render(blender: Path, words: tuple[str, ...], command: Mapping[str, object], log: Path) -> Job:
-    """Have another Blender render, as `background.main` says, beside whatever else runs; the picture is `results["render"]["png"]`."""
-    return _add(Job(Path(command["png"]).name, blender, [dict(command)], log, words=words, program=BLENDER))
+def render(blender: Path, arguments: tuple[str, ...], command: Mapping[str, object], log: Path) -> Job:
+    """Render in another Blender (`render_worker`), at once. `results["render"]["png"]` is the picture."""
+    return _add(Job(Path(command["png"]).name, blender, [dict(command)], log, arguments=arguments, program=BLENDER))
 
 
 def _add(job: Job) -> Job:
@@ -312,7 +313,7 @@ def _add(job: Job) -> Job:
 
 
 def poll() -> bool:
-    """Take in what all jobs have said, start the one whose turn it is; whether anything changed."""
+    """Handle all new events and start the next job; return whether anything changed."""
     changed = [job.poll() for job in JOBS]
     busy = any(job.run and job.active for job in JOBS)
     for job in JOBS:
@@ -323,40 +324,40 @@ def poll() -> bool:
 
 
 def trainings() -> list[Job]:
-    """Jobs that work in a run folder, or wait to: those that can be kept."""
+    """List the jobs that work in a run folder or wait to. Only these can be kept."""
     return [job for job in JOBS if job.run and not job.ended]
 
 
 def keep_all(on: bool) -> None:
-    """Have all trainings go on when Blender closes, or none. Those that wait for another by then have not begun, and do not."""
+    """Keep all trainings when Blender closes, or none. Those that still wait then never start."""
     for job in trainings():
         job.keep(on)
 
 
 def stop_all() -> None:
-    """End everything cleanly but what is kept, and forget it."""
+    """Stop all jobs cleanly except those that are kept, and clear the list."""
     for job in JOBS:
         if job.kept and job.active:
-            job.let_go()
+            job.close_input()
         else:
             job.stop()
     JOBS.clear()
 
 
 def run_state(folder: Path) -> str:
-    """What a run folder holds: "training" (a process works in it), "finished", "stopped" (it can be gone on with), or "" where it is
-    none."""
+    """State of a run folder: "training" (a process works in it), "finished", "stopped" (can be resumed), or "" for no run."""
     if _locked(folder / LOCK):
         return "training"
     if (folder / "splats.ply").is_file():
         return "finished"
-    notes = folder / "checkpoints"
-    return "stopped" if notes.is_dir() and any(file.endswith(".toml") for file in os.listdir(notes)) else ""
+    return "stopped" if any((folder / "checkpoints").glob("*.toml")) else ""
 
 
 def run_progress(folder: Path) -> dict:
-    """How far the training in a folder is, whichever process trains: `iteration`, `total`, `seconds_left`. Empty where it says nothing
-    yet, or makes the mesh by now."""
+    """Progress of the training in a folder, of whichever process: `iteration`, `total`, `seconds_left`.
+
+    Empty before the first iteration and while the mesh is made.
+    """
     try:
         return json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -364,23 +365,22 @@ def run_progress(folder: Path) -> dict:
 
 
 def stop_run(folder: Path) -> None:
-    """Have the process that trains in a folder stop, whoever started it; the training can be gone on with. Raises InputError where
-    there is none."""
+    """Stop the training in a folder, whichever process runs it; it can be resumed. Raises InputError where none runs."""
     if run_state(folder) != "training":
         raise InputError(f"{folder} is not being trained")
     (folder / STOP).touch()
 
 
-def stops(folder: Path) -> bool:
-    """Whether the training in a folder has been asked to stop."""
+def stop_requested(folder: Path) -> bool:
+    """Check whether the training in a folder was asked to stop."""
     return (folder / STOP).exists()
 
 
 def _locked(file: Path) -> bool:
-    """Whether a process holds a lock on the first byte of a file. It goes with the process, however that ends."""
+    """Check whether a process locks the first byte of a file. The system frees the lock when the process ends."""
     try:
         descriptor = os.open(file, os.O_RDONLY)
-    except OSError:  # mostly that there is none
+    except OSError:  # usually there is no such file
         return False
     try:
         if sys.platform == "win32":

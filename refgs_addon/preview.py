@@ -1,10 +1,10 @@
-"""A run folder, imported, saved as a .blend and rendered relit, without a window.
+"""Import a run folder, save it as a .blend and render it under other lights, without a window.
 
     python -m refgs_addon.preview RUN --hdri A.exr --hdri B.exr --out DIR --blend FILE.blend [--views NAME …] [--size N]
 
-renders each view of {splats, mesh} under each HDRI into DIR/HDRI_{splats,mesh}_VIEW.png and .exr, and prints one JSON
-object a line: {"event": "progress", "done": 1, "total": 8, "what": "…"}, and at the end {"event": "done", "files": […]}.
-Exit status 2 and one line on stderr where the input or the machine lacks something.
+renders each view of {splats, mesh} under each HDRI into DIR/HDRI_{splats,mesh}_VIEW.png and .exr. It prints one JSON object
+a line: {"event": "progress", "done": 1, "total": 8, "what": "…"}, and at the end {"event": "done", "files": […]}.
+If the input or a system library is missing, it prints one line to stderr and exits with status 2.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from pathlib import Path
 
 from .errors import InputError
 
-# What Blender links against, and Mesa, which draws Eevee's pictures where there is neither screen nor GPU.
+# Blender links against these; Mesa renders Eevee's pictures on machines without a screen or GPU.
 APT = (
     "apt-get install libegl1 libgl1 libgl1-mesa-dri libsm6 libxext6 libxfixes3 libxi6 libxkbcommon0 libxrender1"
     " (Debian 12 and later, Ubuntu 22.04 and later)"
@@ -27,13 +27,17 @@ APT = (
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="refgs_addon.preview", description="Render a run in Blender, relit.")
-    parser.add_argument("run", type=Path, help="the run folder")
-    parser.add_argument("--hdri", type=Path, action="append", required=True, help="a panorama to light it with; repeat")
-    parser.add_argument("--out", type=Path, required=True, help="the folder for the pictures")
-    parser.add_argument("--blend", type=Path, required=True, help="the .blend to save")
-    parser.add_argument("--views", nargs="+", help="views to render, by photo name; the first by default")
-    parser.add_argument("--size", type=int, help="longer side in pixels; the photo's by default")
+    parser = argparse.ArgumentParser(
+        prog="refgs_addon.preview", description="Render a run in Blender under other lights."
+    )
+    parser.add_argument("run", type=Path, help="run folder")
+    parser.add_argument(
+        "--hdri", type=Path, action="append", required=True, help="panorama to light the run with; may be repeated"
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder for the pictures")
+    parser.add_argument("--blend", type=Path, required=True, help=".blend to save")
+    parser.add_argument("--views", nargs="+", help="views to render, by photo name; default: the first")
+    parser.add_argument("--size", type=int, help="longer side in pixels; default: the photo's")
     options = parser.parse_args(arguments)
     try:
         check_libraries()
@@ -47,12 +51,12 @@ def main(arguments: list[str] | None = None) -> int:
 def preview(options: argparse.Namespace) -> None:
     import bpy
 
-    from .scene.parts import show
-    from .scene.preview import render_preview
-    from .scene.relight import relight
-    from .scene.run import import_run
+    from .scene.import_run import import_run
+    from .scene.render_eevee import render_preview
+    from .scene.run_parts import show
+    from .scene.world_light import relight
 
-    # Blender and its add-ons print to standard output what they like: that goes to standard error, the events do not.
+    # Blender and its add-ons print to stdout: send that to stderr, so that only events are on stdout.
     events = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
 
@@ -79,7 +83,7 @@ def preview(options: argparse.Namespace) -> None:
     except (OSError, RuntimeError) as error:
         raise InputError(f"cannot write {options.blend} and {options.out}: {str(error).strip()}") from None
 
-    # There are no lamps, so no shadows; in software Eevee spends most of a frame on preparing for some.
+    # There are no lamps, so no shadows; software Eevee spends most of a frame on preparing for them.
     scene.eevee.use_shadows = False
     shown = ["splats", "mesh"] if run.mesh else ["splats"]
     total, files = len(options.hdri) * len(shown) * len(views), []
@@ -97,9 +101,9 @@ def preview(options: argparse.Namespace) -> None:
 
 
 def check_libraries() -> None:
-    """Raise InputError naming the system libraries that Blender needs and this machine lacks.
+    """Raise InputError with the names of the system libraries that Blender needs and this machine lacks.
 
-    Blender's module links against X; Eevee loads EGL only when it draws, and ends the process without it.
+    Blender's module links against X. Eevee loads EGL when it first draws, and ends the process where there is none.
     """
     spec = importlib.util.find_spec("bpy")
     if spec is None:
@@ -123,4 +127,4 @@ def check_libraries() -> None:
 if __name__ == "__main__":
     status = main()
     sys.stderr.flush()
-    os._exit(status)  # Blender's own clean-up at the end of a process has been seen to hang
+    os._exit(status)  # Blender's own clean-up at exit can hang

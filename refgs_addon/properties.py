@@ -1,4 +1,4 @@
-"""What a .blend file keeps of RefGS: the capture, how to train it, and where its runs are."""
+"""Properties stored in the .blend: the capture, its training settings and the runs trained from it."""
 
 import bpy
 from bpy.props import (
@@ -13,7 +13,7 @@ from bpy.props import (
 
 
 class KnownRun(bpy.types.PropertyGroup):
-    """A run folder that was trained from this file."""
+    """Run folder that was trained from this file."""
 
     folder: StringProperty(subtype="DIR_PATH")
     capture: StringProperty(subtype="DIR_PATH")
@@ -22,12 +22,12 @@ class KnownRun(bpy.types.PropertyGroup):
 class Training(bpy.types.PropertyGroup):
     capture: StringProperty(
         name="Capture",
-        description="The folder with the photos, and their cameras if there are any: NeRF-Blender, nerfstudio or COLMAP",
+        description="Folder with the photos, and with their cameras if there are any: NeRF-Blender, nerfstudio or COLMAP",
         subtype="DIR_PATH",
     )
     out: StringProperty(
         name="Run Folder",
-        description="Where the result goes: a new or an empty folder. Left empty, one beside the capture",
+        description="New or empty folder for the result. If left empty, a folder beside the capture",
         subtype="DIR_PATH",
     )
     preset: EnumProperty(
@@ -35,28 +35,28 @@ class Training(bpy.types.PropertyGroup):
         items=[
             ("quick", "Quick", "A few minutes on a laptop: photos of 400 pixels, a coarse mesh"),
             ("standard", "Standard", "Finer light, mesh and textures, photos of 800 pixels; several times as long"),
-            ("paper", "Paper", "The published schedule, 58,000 iterations: for a graphics card"),
+            ("paper", "Paper", "The published schedule of 58,000 iterations: for a graphics card"),
         ],
         default="quick",
     )
     limited: BoolProperty(
         name="Limit Time",
-        description="Be done after so many minutes: splats, the photos' size and iterations are chosen for that, in place of the quality",
+        description="Finish within a number of minutes: it chooses the splats, photo size and iterations in place of the quality",
     )
     minutes: FloatProperty(
         name="Minutes",
-        description="When all but the mesh is to be done",
+        description="Time for the training; the mesh comes after it",
         default=5.0,
         min=0.05,
         soft_min=1.0,
         soft_max=120.0,
     )
     mesh: BoolProperty(
-        name="Make Mesh", description="Fuse a mesh and bake its textures when the training has ended", default=True
+        name="Make Mesh", description="Fuse a mesh and bake its textures after the training", default=True
     )
     splats: IntProperty(
         name="Splats at Most",
-        description="More of them show finer detail, and take as much longer and as much more memory. 0 leaves it to the quality",
+        description="Maximum number of splats. More show finer detail, but need more time and memory. 0 takes the quality's number",
         min=0,
         max=10_000_000,
         soft_max=200_000,
@@ -68,42 +68,42 @@ class Training(bpy.types.PropertyGroup):
             (
                 "auto",
                 "Auto",
-                "The photos tell which it is, and what they told is shown while it trains; with Paper it stands still",
+                "Find out from the photos, and show the answer during training. Paper assumes that it stands still",
             ),
             ("world", "Stands Still", "You walked around the object"),
-            ("camera", "Turns with the Camera", "The object stood on a turntable, or the lamp on the camera"),
+            ("camera", "Turns with the Camera", "The object stood on a turntable, or the lamp was fixed to the camera"),
         ],
     )
     exposures: EnumProperty(
         name="Exposure",
         items=[
-            ("auto", "Auto", "Each photo's own is left out where they turn out to agree; with Paper they all have one"),
+            ("auto", "Auto", "Learn each photo's exposure, unless they agree. Paper assumes one for all"),
             ("on", "Each Photo's", "The camera chose an exposure for each photo"),
             ("off", "One for All", "The exposure was locked"),
         ],
     )
     specular: EnumProperty(
         name="Gloss",
-        description="What surfaces mirror of the light",
+        description="Specular reflection of the light",
         items=[
-            ("auto", "Auto", "Left out where it explains nothing that the photos show, but with Paper"),
-            ("on", "Glossy", "Learn metallic and roughness, whatever the photos show"),
-            ("off", "Matte", "Nothing mirrors: faster, and the splats have a base colour alone"),
+            ("auto", "Auto", "Leave it out where it explains nothing in the photos. Paper always learns it"),
+            ("on", "Glossy", "Learn metallic and roughness in any case"),
+            ("off", "Matte", "No specular reflection: faster, and the splats have only a base colour"),
         ],
     )
     reflections: EnumProperty(
         name="Reflections",
-        description="Of the object in itself",
+        description="Reflections of the object in itself",
         items=[
-            ("auto", "Auto", "Left out where the object turns out hardly to mirror itself, but with Paper"),
-            ("on", "Of the Object Too", "Trace the object's reflections in itself, however few there are"),
-            ("off", "Of the Light Only", "Leave the object's reflections in itself out: faster"),
+            ("auto", "Auto", "Leave them out where the object hardly reflects itself. Paper always traces them"),
+            ("on", "Of the Object Too", "Trace the object's reflections in itself, however faint"),
+            ("off", "Of the Light Only", "Do not trace the object's reflections in itself: faster"),
         ],
     )
     region: PointerProperty(
         name="Region",
-        description="A box, among the photos' cameras: only what lies in it comes out, and its own up, its Z axis, is the result's up. "
-        "Without one everything that the photos show does",
+        description="Box among the photos' cameras: only what is inside is trained. Its Z axis is the result's up. "
+        "Without a box, everything in the photos is trained",
         type=bpy.types.Object,
         poll=lambda self, item: item.type == "EMPTY",
     )

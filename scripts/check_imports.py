@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 # The trainer's floors, the lowest first: a module imports its own floor and those below. CONTRIBUTING's map says what each has.
 FLOORS = (
-    ("", "camera", "clock", "color", "errors", "paths", "settings"),
+    ("", "camera", "clock", "color", "errors", "events", "paths", "settings"),
     ("formats",),
     ("kernels",),
     ("model",),
@@ -28,7 +28,7 @@ FLOORS = (
     ("train",),
     ("export",),
     ("report",),
-    ("cli", "commands", "demo", "jobs", "worker"),
+    ("cli", "commands", "demo", "train_job", "worker"),
 )
 FORBIDDEN = {"backend": ("bpy", "refgs_addon"), "refgs_addon": ("torch", "refgs")}
 

@@ -47,7 +47,7 @@ def refgs(tmp_path, *words) -> tuple[int, str, set[str]]:
         (WRONG, "evaluate run", "run is not a run folder"),
         (WRONG, "export run", "run is not a run folder"),
         (WRONG, "export splats.ply", "there is no mesh"),
-        (WRONG, "bench nonsense", "no benchmark nonsense"),
+        (WRONG, "bench nonsense", "no benchmark 'nonsense'"),
     ],
 )
 def test_torch_is_not_imported(tmp_path, status, words, says):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from refgs_addon import environment, jobs
+from refgs_addon import installation, jobs
 from tests.makers.waiting import until
 
 pytest.importorskip("bpy", reason="the extension is built with the tool in Blender's Python module")
@@ -52,7 +52,7 @@ def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
     monkeypatch.setenv("UV_PYTHON_PREFERENCE", "only-system")
     monkeypatch.setenv("UV_TORCH_BACKEND", "")
     zipfile.ZipFile(archive).extractall(tmp_path / "extension")
-    monkeypatch.setattr(environment, "WHEELS", tmp_path / "extension" / "wheels")
+    monkeypatch.setattr(installation, "WHEELS", tmp_path / "extension" / "wheels")
     home = tmp_path / "user folder" / "trainer"
     job, lines = jobs.install(home, tmp_path / "log.txt"), []
 
@@ -63,14 +63,14 @@ def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
 
     until(done, seconds=2900)
     assert job.state == "done", job.line + "\n" + job.log.read_text()[-3000:]
-    print("\n".join(lines), f"\n{environment.size(home) / environment.GB:.2f} GB")
-    assert job.ready["refgs"] == environment.brought() == environment.installed(home)
+    print("\n".join(lines), f"\n{installation.folder_bytes(home) / installation.GB:.2f} GB")
+    assert job.ready["refgs"] == installation.bundled_version() == installation.installed(home)
     assert any(line.startswith("Fetching ") for line in lines)
-    asked = jobs.ask(environment.python(home), tmp_path / "asked.txt")
+    asked = jobs.query_trainer(installation.python(home), tmp_path / "asked.txt")
     until(lambda: asked.ended, seconds=200)
     assert asked.state == "done" and asked.ready == job.ready
     program = "from refgs.settings import load_settings; print(load_settings('quick').train.iterations)"
-    subprocess.run([environment.python(home), "-E", "-c", program], check=True, cwd=tmp_path)
+    subprocess.run([installation.python(home), "-E", "-c", program], check=True, cwd=tmp_path)
     removed = jobs.remove(home, tmp_path / "removed.txt")
     until(lambda: removed.ended, seconds=200)
     assert removed.state == "done" and not home.exists()

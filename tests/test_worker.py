@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from refgs import jobs
+from refgs import train_job
 from refgs.errors import InputError
 from refgs.lock import LOCK, PROGRESS, STOP, RunLock
 
@@ -253,7 +253,7 @@ def test_a_folder_that_is_trained_in(talk, ball_capture, tmp_path):
     assert json.loads((run / PROGRESS).read_text()).keys() == {"iteration", "total", "seconds_left"}
     words = (ball_capture, run, "quick", "cpu", None, [], True, lambda event, facts: None, lambda trainer: True)
     with pytest.raises(InputError, match="is in use: another process trains it") as refused:
-        jobs.train(*words)
+        train_job.train(*words)
     assert "\n" not in str(refused.value)
     (run / STOP).touch()
     stopped = talk.until("cancelled")["iteration"]
@@ -264,5 +264,5 @@ def test_a_folder_that_is_trained_in(talk, ball_capture, tmp_path):
     talk.process.kill()
     talk.process.wait(timeout=PATIENCE)
     assert free(run)
-    state, _ = jobs.train(*words)
+    state, _ = train_job.train(*words)
     assert state.iteration >= stopped

@@ -10,12 +10,13 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from refgs import jobs
+from refgs import train_job
 from refgs.capture import read_cameras, read_capture
 from refgs.capture.poses import in_frame
 from refgs.errors import InputError
+from refgs.export.export_job import export as export_run
 from refgs.paths import clone_root
-from refgs.run_folder import check_finished
+from refgs.run_folder import check_finished, update_metrics
 
 console = Console(highlight=False, soft_wrap=True)
 PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha", "visibility")
@@ -93,7 +94,7 @@ def train(
 
         before = signal.signal(signal.SIGINT, stop)
         try:
-            trainer, quality = jobs.train(
+            trainer, quality = train_job.train(
                 capture_folder, out, preset, device, minutes, changes, resume, report, lambda _: bool(stopped)
             )
         finally:
@@ -185,7 +186,7 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     truth = GroundTruth(ground_truth, run.to_capture) if ground_truth else None
     with progress_bar("evaluating", len(views)) as bar:
         figures = measure(run, split, views, truth, bar)
-    jobs.update_metrics(folder, figures)
+    update_metrics(folder, figures)
     console.print(f"{len(views)} {split} views: {', '.join(in_words(figures, HEADLINE))}")
     for line in [*in_words(figures, DETAILS), *relit_in_words(figures)]:
         console.print(f"  {line}")
@@ -201,7 +202,7 @@ def export(
 ) -> None:
     """Write the mesh with its textures, or splats."""
     with job_report("exporting") as report:
-        files = jobs.export(folder, mesh_file, texture, splats_file, display_file, overwrite, report)
+        files = export_run(folder, mesh_file, texture, splats_file, display_file, overwrite, report)
     for file in files:
         console.print(f"wrote {file}")
 

@@ -9,12 +9,13 @@ import tempfile
 import time
 from pathlib import Path
 
-from refgs import commands, jobs
+from refgs import commands, train_job
 from refgs.compare import metrics
 from refgs.compare.truth import read_relit
 from refgs.errors import InputError
 from refgs.paths import clone_root
 from refgs.report.page import write_report
+from refgs.run_folder import update_metrics
 
 SCENE = "jar"
 HDRIS = ("studio", "courtyard")  # shipped with Blender; the capture is lit by another one
@@ -107,12 +108,12 @@ def _compare(folder: Path, truth: Path, previews: Path) -> None:
                 shutil.copyfile(preview.with_suffix(".png"), pictures / kind / f"{hdri}_{view}.png")
             pairs = [(read_relit(image), read_relit(true)) for image, true in files]
             result.setdefault(hdri, {})[kind] = metrics.relit(lambda pairs=pairs: pairs)
-    jobs.update_metrics(folder, {"relight": result})
+    update_metrics(folder, {"relight": result})
 
 
 def _record(folder: Path, seconds: float) -> None:
     """Add the demo's time and the peak memory of its processes to metrics.json."""
-    facts, largest = {"seconds": seconds}, [jobs.peak_memory(children) for children in (False, True)]
+    facts, largest = {"seconds": seconds}, [train_job.peak_memory(children) for children in (False, True)]
     if None not in largest:
         facts["peak_memory_bytes"] = max(largest)
-    jobs.update_metrics(folder, facts)
+    update_metrics(folder, facts)

@@ -1,5 +1,6 @@
 """Paths of the program's own files, and writing files whole or not at all."""
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from refgs.errors import InputError
 PACKAGE = Path(__file__).resolve().parent
 ROOT = PACKAGE.parents[1]
 PRESETS = PACKAGE / "presets" if (PACKAGE / "presets").is_dir() else ROOT / "presets"  # in a wheel, in a clone
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES)
 
 
 @contextmanager
@@ -28,6 +30,22 @@ def write_text(file: Path, text: str) -> None:
     """Write a text file whole or not at all."""
     with whole(file) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
+    """Raise InputError if the disk of these folders is full, read-only or gone."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        if gone := next((folder for folder in folders if not folder.is_dir()), None):
+            raise InputError(f"{gone} is no longer there: put its disk back, then {again}") from error
+        if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+            why = f"{error.filename or folders[0]} cannot be written ({error.strerror})"
+            raise InputError(f"{why}: mend that, then {again}; files written before are complete") from error
+        raise
 
 
 def clone_root() -> Path:

@@ -1,10 +1,13 @@
-"""Check a run folder and read its run.toml, without torch."""
+"""Check a run folder, read its run.toml and add to its metrics.json, without torch."""
 
+import json
 import tomllib
 from pathlib import Path
+from typing import Any
 
 from refgs import __version__
 from refgs.errors import InputError
+from refgs.paths import write_text
 from refgs.settings import Settings, recorded_settings
 
 
@@ -44,3 +47,15 @@ def read_run_facts(folder: Path) -> tuple[dict, Settings]:
 
 def _release(version: str) -> tuple[int, ...]:
     return tuple(int(number) for number in version.split(".")[:2])  # a patch release changes no file format
+
+
+def update_metrics(folder: Path, facts: dict[str, Any]) -> None:
+    """Merge figures into a run's metrics.json; one of the same name, at any depth, is replaced."""
+
+    def merged(known: dict, new: dict) -> dict:
+        both = {key: merged(known[key], new[key]) for key in new if isinstance(known.get(key), dict)}
+        return known | new | both
+
+    file = folder / "metrics.json"
+    known = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    write_text(file, json.dumps(merged(known, facts), indent=1))

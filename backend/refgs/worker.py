@@ -15,13 +15,14 @@ from typing import IO, Annotated, Any, Literal
 import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from refgs import __version__, jobs
+from refgs import __version__, train_job
 from refgs.capture import read_capture
 from refgs.capture.check import check, describe
 from refgs.capture.motion import find_cameras
 from refgs.errors import InputError, NoCameras
+from refgs.export.export_job import export as export_run
 from refgs.kernels import cuda
-from refgs.train.preview import write_preview
+from refgs.train.live_view import write_preview
 from refgs.train.state import State
 
 PROTOCOL = 1
@@ -169,7 +170,7 @@ class Worker:
 
     def _train(self, command: Train) -> tuple[str, dict]:
         out = Path(command.out)
-        state, quality = jobs.train(
+        state, quality = train_job.train(
             Path(command.capture),
             out,
             command.preset,
@@ -216,7 +217,7 @@ class Worker:
     def _export(self, command: Export) -> tuple[str, dict]:
         display = None if command.display_splats is None else Path(command.display_splats)
         run = Path(command.run)
-        files = jobs.export(run, None, command.texture, None, display, overwrite=display is not None, report=self.send)
+        files = export_run(run, None, command.texture, None, display, overwrite=display is not None, report=self.send)
         return "done", {"mesh" if display is None else "display_splats": str(files[0].resolve())}
 
 

@@ -1,24 +1,24 @@
-"""Node trees, built in Python: one module a tree."""
+"""Build node trees in Python, one module for each tree."""
 
 import bpy
 
 
 def modifier_tree(name: str) -> bpy.types.NodeTree:
-    """A new geometry-nodes tree for a modifier, with nothing but its geometry in and out."""
+    """Make a geometry-nodes tree for a modifier, with a geometry input and output."""
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     tree.is_modifier = True
-    for way in ("INPUT", "OUTPUT"):
-        tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    for in_out in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=in_out, socket_type="NodeSocketGeometry")
     return tree
 
 
 def add(tree: bpy.types.NodeTree, kind: str, inputs: dict | None = None, **properties) -> bpy.types.Node:
-    """Add a node. `inputs` maps a socket's name or index to what feeds it: another node's output, or a value."""
+    """Add a node. `inputs` maps the name or index of a socket to another node's output or to a value."""
     node = tree.nodes.new(kind)
     for name, value in properties.items():
         setattr(node, name, value)
     for key, value in (inputs or {}).items():
-        # Nodes of many types keep one socket a type under the same name, and enable the one in use.
+        # Nodes of many data types have a socket of the same name for each, and enable the one in use.
         socket = (
             node.inputs[key] if isinstance(key, int) else next(s for s in node.inputs if s.name == key and s.enabled)
         )
@@ -29,26 +29,54 @@ def add(tree: bpy.types.NodeTree, kind: str, inputs: dict | None = None, **prope
     return node
 
 
+def add_input(tree: bpy.types.NodeTree, name: str, kind: str, description: str = "", **properties):
+    """Add an input socket of a type ("Float", "Object" …) to a tree, and return it."""
+    socket = tree.interface.new_socket(name, in_out="INPUT", socket_type=f"NodeSocket{kind}", description=description)
+    for key, value in properties.items():
+        setattr(socket, key, value)
+    return socket
+
+
 def out(node: bpy.types.Node, name: str | None = None) -> bpy.types.NodeSocket:
-    """The output of this name that is in use; the first in use without a name."""
+    """Find the enabled output of this name; without a name, the first."""
     return next(s for s in node.outputs if s.enabled and name in (None, s.name))
 
 
 def math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
-    """What a node of arithmetic makes of sockets and numbers."""
+    """Add a math node for sockets and numbers; return its output."""
     return out(add(tree, "ShaderNodeMath", dict(enumerate(inputs)), operation=operation))
 
 
-def seen_from(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[bpy.types.Node, bpy.types.NodeSocket]:
-    """The Object Info of an object, and where points are in its own frame."""
+def vector_math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
+    """Add a vector math node for sockets and vectors; return its output."""
+    return out(add(tree, "ShaderNodeVectorMath", dict(enumerate(inputs)), operation=operation))
+
+
+def scaled(tree: bpy.types.NodeTree, vector, factor) -> bpy.types.NodeSocket:
+    """Add a node that multiplies a vector by a factor; return its output."""
+    return out(add(tree, "ShaderNodeVectorMath", {"Vector": vector, "Scale": factor}, operation="SCALE"))
+
+
+def read_attribute(tree: bpy.types.NodeTree, name: str, kind: str) -> bpy.types.NodeSocket:
+    """Add a node that reads a named attribute of the geometry; return its output."""
+    return out(add(tree, "GeometryNodeInputNamedAttribute", {"Name": name}, data_type=kind))
+
+
+def store_attribute(tree: bpy.types.NodeTree, geometry, name: str, kind: str, value) -> bpy.types.NodeSocket:
+    """Add a node that stores a named attribute of the geometry; return the geometry."""
+    inputs = {"Geometry": geometry, "Name": name, "Value": value}
+    return out(add(tree, "GeometryNodeStoreNamedAttribute", inputs, data_type=kind))
+
+
+def object_frame(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[bpy.types.Node, bpy.types.NodeSocket]:
+    """Add an Object Info node, and compute the points' positions in that object's frame."""
     info = add(tree, "GeometryNodeObjectInfo", {"Object": item}, transform_space="RELATIVE")
     inverse = add(tree, "FunctionNodeInvertMatrix", {"Matrix": info.outputs["Transform"]}).outputs["Matrix"]
     position = out(add(tree, "GeometryNodeInputPosition"))
     return info, out(add(tree, "FunctionNodeTransformPoint", {"Vector": position, "Transform": inverse}))
 
 
-def largest(tree: bpy.types.NodeTree, vector: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """The largest of a vector's absolute components: at most 1 in a cube of radius 1."""
-    absolute = out(add(tree, "ShaderNodeVectorMath", {0: vector}, operation="ABSOLUTE"))
-    x, y, z = add(tree, "ShaderNodeSeparateXYZ", {0: absolute}).outputs
+def max_component(tree: bpy.types.NodeTree, vector: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Compute a vector's largest absolute component: at most 1 inside a cube of radius 1."""
+    x, y, z = add(tree, "ShaderNodeSeparateXYZ", {0: vector_math(tree, "ABSOLUTE", vector)}).outputs
     return math(tree, "MAXIMUM", math(tree, "MAXIMUM", x, y), z)

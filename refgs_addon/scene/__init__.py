@@ -1,1 +1,1 @@
-"""Plain functions that write Blender data: a script can do all that a button does."""
+"""Plain functions that read and write Blender data. Operators call them, and scripts can."""

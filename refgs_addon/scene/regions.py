@@ -1,4 +1,4 @@
-"""Regions: Empties that say which splats are meant, or what of a capture is to be trained."""
+"""Regions: Empties that mark splats to edit or crop, or the part of a capture to train."""
 
 import math
 from pathlib import Path
@@ -8,13 +8,13 @@ from mathutils import Matrix, Vector
 
 from .. import compat, jobs
 from ..errors import InputError
-from ..nodes.splats import NAME
+from ..nodes.splats_tree import NAME
 
-REGION = "refgs_region"  # the custom property of what was made to mark a region
+REGION = "refgs_region"  # custom property of an object that marks a region
 
 
 def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name: str, shape: str) -> bpy.types.Object:
-    """An Empty, drawn as "CUBE", "SPHERE" or "ARROWS", whose unit box holds nearly all of the splats."""
+    """Add an Empty, drawn as "CUBE", "SPHERE" or "ARROWS", whose unit box contains nearly all splats."""
     region = bpy.data.objects.new(name, None)
     region[REGION] = True
     region.empty_display_type = shape
@@ -31,7 +31,7 @@ def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name:
 
 
 def crop(splats: bpy.types.Object, collection: bpy.types.Collection, on: bool) -> bpy.types.Object | None:
-    """Draw only the splats in a box, which is made the first time and kept when it is switched off; all of them where not `on`."""
+    """Draw only the splats in a box, or all of them. The box is made the first time, and kept when cropping is off."""
     modifier = splats.modifiers[NAME]
     box = compat.get_modifier_input(modifier, "Crop Box")
     if on and box is None:
@@ -44,15 +44,17 @@ def crop(splats: bpy.types.Object, collection: bpy.types.Collection, on: bool) -
 
 
 def training_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """The box of what is to be trained; none where the settings name none, or one that has been deleted."""
+    """Find the box to train in; None if the settings have none, or it was deleted."""
     box = scene.refgs.region
     return box if box is not None and scene in box.users_scene else None
 
 
 def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
-    """The box of what is to be trained, shown. It is made where there is none: about what the cameras look at, as the capture's last
-    check found it; else of 2 m about the origin, where the trainer puts that, with a radius of 1 m, but in captures of NeRF-Blender's
-    layout."""
+    """Show the box to train in, and make it if there is none.
+
+    A new box surrounds what the cameras look at, as the capture's last check found it. Without a check it is 2 m wide around the
+    origin: there the trainer puts what the cameras look at, with a radius of 1 m, except for captures in NeRF-Blender's layout.
+    """
     box = training_region(scene)
     if box is None:
         box = bpy.data.objects.new("RefGS Region", None)
@@ -75,20 +77,22 @@ def _looked_at(scene: bpy.types.Scene) -> tuple[Vector, float]:
 
 
 def region_settings(scene: bpy.types.Scene) -> dict[str, list[float]]:
-    """What the trainer is to be told of the scene's region, by the settings' names: its box, and the box's Z axis as the result's up. Empty
-    where there is none. Raises InputError for a box that holds nothing."""
+    """Settings for the trainer from the scene's region: the box, and its Z axis as the result's up. Empty without a region.
+
+    Raises InputError for a box without volume.
+    """
     box = training_region(scene)
     if box is None:
         return {}
-    hidden, box.hide_viewport = box.hide_viewport, False  # what is hidden is not evaluated
+    hidden, box.hide_viewport = box.hide_viewport, False  # Blender does not evaluate hidden objects
     for layer in scene.view_layers:
-        layer.update()  # what was moved a moment ago
+        layer.update()  # the box may have just been moved
     matrix = box.matrix_world.copy()
     box.hide_viewport = hidden
     centre, turn, scale = matrix.decompose()
     size = [2 * abs(x) * box.empty_display_size for x in scale]
     if min(size) < 1e-6 * max(size) or not max(size):
-        raise InputError(f"{box.name} is flat: scale it so that it holds what is to be trained")
+        raise InputError(f"{box.name} is flat: scale it until it contains what is to be trained")
     return {
         "region.centre": list(centre),
         "region.size": size,

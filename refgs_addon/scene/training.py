@@ -1,4 +1,4 @@
-"""Training from a scene's settings: what the buttons of the Train panel do."""
+"""Train from a scene's settings: functions behind the buttons of the Train panel."""
 
 import tempfile
 from pathlib import Path
@@ -7,32 +7,32 @@ import bpy
 
 from .. import jobs
 from ..errors import InputError
-from ..follow import follow
+from ..job_timers import follow_jobs
 from ..preferences import capture_folder, log_file, python, set_up
 from .regions import region_settings
 
 
 def check(scene: bpy.types.Scene) -> jobs.Job:
-    """Have the scene's capture read; `results["check"]` of the job has what was found."""
+    """Check the scene's capture. The job's `results["check"]` has the findings."""
     capture = _capture(scene)
     job = jobs.check(python(), capture, capture_folder(capture), log_file(f"check {capture.name}"))
-    follow()
+    follow_jobs()
     return job
 
 
 def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
-    """Have the cameras of the scene's photos found, in place of what said that they are missing; then the capture is read."""
+    """Find the cameras of the scene's photos, then check the capture. Drops the jobs that failed without cameras."""
     capture = _capture(scene)
-    job = jobs.poses(python(), capture, capture_folder(capture), log_file(f"cameras {capture.name}"))
+    job = jobs.find_cameras(python(), capture, capture_folder(capture), log_file(f"cameras {capture.name}"))
     jobs.JOBS[:] = [known for known in jobs.JOBS if not known.no_cameras]
-    follow()
+    follow_jobs()
     return job
 
 
 def train(scene: bpy.types.Scene) -> jobs.Job:
-    """Train the scene's capture as its settings say, after what is being trained already. The scene remembers the run folder.
+    """Train the scene's capture with its settings, after the trainings that wait already. The scene lists the run folder.
 
-    Raises InputError where the trainer, the capture or a free folder is missing, or the region is flat.
+    Raises InputError where the trainer or the capture is missing, the run folder is not empty, or the region is flat.
     """
     settings, capture = scene.refgs, _capture(scene)
     out = Path(bpy.path.abspath(settings.out)) if settings.out else _free_folder(capture, scene)
@@ -44,58 +44,62 @@ def train(scene: bpy.types.Scene) -> jobs.Job:
     }
     job = jobs.train(python(), capture, out, log_file(out.name), **words)
     _remember(scene, out, capture)
-    follow()
+    follow_jobs()
     return job
 
 
 def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: Path) -> jobs.Job | None:
-    """Write a run with its edits as a new run folder, which the scene remembers; the trainer makes its mesh and textures, where there
-    is one, and the job is returned. Raises InputError."""
-    from .export import export_run
+    """Write a run with its edits as a new run folder, which the scene lists. Raises InputError.
+
+    If a trainer is set up, it makes the mesh and textures; its job is returned.
+    """
+    from .export_run import export_run
 
     export_run(collection, out)
     _remember(scene, out)
     if (out / "mesh.glb").exists() or not set_up():
         return None
     job = jobs.export(python(), out, log_file(out.name))
-    follow()
+    follow_jobs()
     return job
 
 
 def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.Job:
-    """Have the trainer write a run with its edits as splats for viewers that know no light: they show what the run shows under its
-    recovered light. What the file holds is replaced. Raises InputError where there is no trainer, no run or no folder to write to."""
+    """Let the trainer write a run with its edits as display splats: in the colours under its recovered light, for viewers without lights.
+
+    Replaces the file. Raises InputError where the trainer, the run or the file's folder is missing.
+    """
     from .edit import edits, splats_of
-    from .export import export_run, run_folder
+    from .export_run import export_run, run_folder
 
     trainer, folder = python(), run_folder(collection)
     if not file.parent.is_dir():
-        raise InputError(f"cannot write {file}: its folder is not there")
+        raise InputError(f"cannot write {file}: its folder does not exist")
     if edits(splats_of(collection)):
-        edited = Path(tempfile.mkdtemp(dir=bpy.app.tempdir), folder.name)  # Blender removes it when it ends
+        edited = Path(tempfile.mkdtemp(dir=bpy.app.tempdir), folder.name)  # Blender deletes tempdir when it ends
         export_run(collection, edited)
         folder = edited
     job = jobs.display_splats(trainer, folder, file, log_file(f"export {file.stem}"))
-    follow()
+    follow_jobs()
     return job
 
 
 def resume(scene: bpy.types.Scene, folder: Path) -> jobs.Job:
-    """Go on with a run of the scene's that was stopped."""
+    """Resume a stopped run that the scene lists."""
     known = next((known for known in scene.refgs.runs if Path(known.folder) == folder), None)
     state = jobs.run_state(folder)
     if state == "training":
-        raise InputError(f"{folder} is being trained already, by another process: stop that first, or wait for it")
+        raise InputError(f"{folder} is being trained already by another process: stop that or wait for it")
     if known is None or state != "stopped":
-        raise InputError(f"{folder} holds no training that was stopped: start a new one")
+        raise InputError(f"{folder} has no stopped training to resume: start a new one")
     mesh = scene.refgs.mesh
     job = jobs.train(python(), Path(known.capture), folder, log_file(folder.name), mesh=mesh, resume=True)
-    follow()
+    follow_jobs()
     return job
 
 
 def forget(scene: bpy.types.Scene, folder: Path) -> None:
-    """No longer list a run; its folder stays as it is."""
+    """Remove a run from the scene's list. Its folder stays."""
     runs = scene.refgs.runs
     for number in reversed(range(len(runs))):
         if Path(runs[number].folder) == folder:
@@ -104,7 +108,7 @@ def forget(scene: bpy.types.Scene, folder: Path) -> None:
 
 
 def _choices(settings: bpy.types.PropertyGroup) -> dict[str, object]:
-    """What a scene's settings have otherwise than the quality does, by the trainer's names."""
+    """Settings for the trainer that the scene overrides in the preset."""
     chosen = {
         "surfels.budget": settings.splats or "auto",
         "light.frame": settings.light,
@@ -131,7 +135,7 @@ def _capture(scene: bpy.types.Scene) -> Path:
 
 
 def _free_folder(capture: Path, scene: bpy.types.Scene) -> Path:
-    """A folder beside the capture that is not there yet, nor about to be."""
+    """Find a folder name beside the capture that is neither used nor reserved by a waiting training."""
     taken = {Path(known.folder) for known in scene.refgs.runs}
     number, out = 1, capture.with_name(f"{capture.name} RefGS")
     while out in taken or out.exists():

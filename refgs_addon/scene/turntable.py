@@ -1,4 +1,4 @@
-"""A turntable: a run turns once about itself, before a camera and under a light that stand still."""
+"""Turntable: a run rotates once about itself, in front of a fixed camera and under a fixed light."""
 
 import math
 
@@ -6,21 +6,21 @@ import bpy
 
 from .. import compat
 from ..errors import InputError
-from .parts import parts
+from .run_parts import parts
 
-KEY = "refgs_turntable"  # the custom property of the Empty that turns
+KEY = "refgs_turntable"  # custom property of the Empty that rotates
 
 
 def add_turntable(scene: bpy.types.Scene, collection: bpy.types.Collection, seconds: float = 4.0) -> bpy.types.Object:
-    """Put a run's splats, mesh and regions on an Empty that turns once in the scene's frames, which become so many seconds.
+    """Parent a run's splats, mesh and regions to an Empty that rotates once; the scene's frame range becomes `seconds` long.
 
-    The last frame is the one before the first, so that a loop does not stand still. Raises InputError where the run is on one already.
+    The turn ends one frame after the last, so that a loop does not pause. Raises InputError where the run has a turntable already.
     """
     found = parts(collection)
     if not found:
-        raise InputError(f"{collection.name} is no imported run: import one first")
+        raise InputError(f"{collection.name} is not an imported run: import one first")
     if any(KEY in item for item in collection.objects):
-        raise InputError(f"{collection.name} is on a turntable already: delete its Empty to take it off")
+        raise InputError(f"{collection.name} is on a turntable already: delete its Empty to remove it")
     items = [item for item in collection.objects if item.parent is None]
     low, high = (
         [f(corner[axis] for item in found["splats"] for corner in item.bound_box) for axis in range(3)]
@@ -28,10 +28,8 @@ def add_turntable(scene: bpy.types.Scene, collection: bpy.types.Collection, seco
     )
     table = bpy.data.objects.new(f"{collection.name} turntable", None)
     table[KEY] = True
-    table.empty_display_type, table.empty_display_size = (
-        "CIRCLE",
-        0.6 * max(b - a for a, b in zip(low, high, strict=True)),
-    )
+    table.empty_display_type = "CIRCLE"
+    table.empty_display_size = 0.6 * max(b - a for a, b in zip(low, high, strict=True))
     table.location = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
     collection.objects.link(table)
     frames = max(2, round(seconds * scene.render.fps / scene.render.fps_base))

@@ -1,47 +1,40 @@
-"""Buttons and panels. They call the functions of `scene`, and hold no work of their own."""
+"""Register the operators and panels. They only call functions of `scene`."""
 
 import bpy
 
-from .. import follow, preferences, properties
-from . import capture, closing, drop, export, light, materials, operators, panels, pictures, trainer, training
-
-CLASSES = (
-    *preferences.CLASSES,
-    *properties.CLASSES,
-    *operators.CLASSES,
-    *trainer.CLASSES,
-    *capture.CLASSES,
-    *training.CLASSES,
-    *closing.CLASSES,
-    *panels.CLASSES,
-    *materials.CLASSES,
-    *light.CLASSES,
-    *export.CLASSES,
-    *drop.CLASSES,
+from .. import job_timers, preferences, properties
+from . import (
+    checked_capture,
+    closing,
+    drop,
+    export_menu,
+    icons,
+    light_panel,
+    materials_panel,
+    operators,
+    panels,
+    train_panel,
+    trainer_buttons,
 )
+
+_MODULES = (preferences, properties, operators, trainer_buttons, icons, checked_capture, train_panel, closing, panels)
+_MODULES += (materials_panel, light_panel, export_menu, drop)
+CLASSES = [cls for module in _MODULES for cls in getattr(module, "CLASSES", ())]
 
 
 def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
-    properties.register()
-    pictures.register()
-    materials.register()
-    light.register()
-    export.register()
-    training.register()
-    closing.register()
+    for module in _MODULES:
+        if hasattr(module, "register"):
+            module.register()
 
 
 def unregister() -> None:
-    preferences.forget()
-    follow.unregister()
-    closing.unregister()
-    training.unregister()
-    export.unregister()
-    light.unregister()
-    materials.unregister()
-    pictures.unregister()
-    properties.unregister()
+    preferences.forget_queries()
+    job_timers.unregister()
+    for module in reversed(_MODULES):
+        if hasattr(module, "unregister"):
+            module.unregister()
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

@@ -1,69 +1,66 @@
-"""Closing Blender while it trains. Blender asks no add-on whether it may close, so only the key that quits and an entry of the File menu
-ask first; for all other ways each training says beforehand whether it goes on."""
+"""Close Blender during a training.
+
+Blender does not ask add-ons before it closes. So only the quit key and an entry in the File menu ask; for all other ways, each
+training has a checkbox that keeps it running.
+"""
 
 import sys
 from pathlib import Path
 from typing import ClassVar
 
 import bpy
-from bpy.props import EnumProperty, IntProperty, StringProperty
+from bpy.props import EnumProperty
 
 from .. import jobs
-from .operators import Door
+from .operators import OnJob, OnRunFolder, ReportsErrors
 
 _keys: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
 
 
-class Keep(Door, bpy.types.Operator):
+class KeepTraining(OnJob, bpy.types.Operator):
     bl_idname = "refgs.keep"
     bl_label = "Keep Training when Blender Closes"
     bl_description = (
-        "Go on to the end, mesh included, when Blender closes; opened again, the file finds the run. Otherwise the "
-        "training stops then, and can be gone on with. One that still waits for another by then does not begin"
+        "Finish the training and its mesh even if Blender closes; the file finds the run when opened again. Otherwise "
+        "the training stops, and can be resumed. A training that still waits never starts"
     )
-    bl_options: ClassVar = {"REGISTER"}
-
-    number: IntProperty(name="Number", description="Of the job in the list")
 
     def work(self, context: bpy.types.Context) -> None:
-        job = jobs.JOBS[self.number]
-        job.keep(not job.kept)
+        self.job.keep(not self.job.kept)
 
 
-class StopRun(Door, bpy.types.Operator):
+class StopRun(OnRunFolder, bpy.types.Operator):
     bl_idname = "refgs.stop_run"
     bl_label = "Stop"
-    bl_description = "Have this training stop, which goes on without this Blender; it can be gone on with later"
+    bl_description = "Stop this training, which another process runs; it can be resumed later"
     bl_options: ClassVar = {"REGISTER"}
-
-    folder: StringProperty(name="Run Folder")
 
     def work(self, context: bpy.types.Context) -> None:
         jobs.stop_run(Path(self.folder))
 
 
 CHOICES = {
-    "ASK": "Quit Blender, after asking whether trainings go on without it",
-    "LEAVE": "Quit Blender; what is being trained goes on to its end. What waits for another training does not begin",
-    "STOP": "Quit Blender; trainings stop with all that they have learned, and can be gone on with",
+    "ASK": "Quit Blender after asking whether the trainings continue",
+    "LEAVE": "Quit Blender. Running trainings finish, waiting ones never start",
+    "STOP": "Quit Blender. Trainings stop with a checkpoint, and can be resumed",
 }
 
 
-class Quit(Door, bpy.types.Operator):
+class Quit(ReportsErrors, bpy.types.Operator):
     bl_idname = "refgs.quit"
     bl_label = "Quit Blender"
     bl_options: ClassVar = {"INTERNAL"}
 
     choice: EnumProperty(
         name="Trainings",
-        description="What becomes of them",
+        description="Continue or stop the trainings",
         items=[(key, key.title(), what) for key, what in CHOICES.items()],
         options={"SKIP_SAVE"},
     )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Where nothing trains, the key is Blender's own."""
+        """Leave the key to Blender while nothing trains."""
         cls.poll_message_set("Nothing is being trained")
         return bool(jobs.trainings())
 
@@ -74,7 +71,7 @@ class Quit(Door, bpy.types.Operator):
     def invoke(self, context, event):
         if self.choice != "ASK":
             return self.execute(context)
-        return context.window_manager.invoke_props_dialog(self, title=question())
+        return context.window_manager.invoke_props_dialog(self, title=quit_question())
 
     def draw(self, context: bpy.types.Context) -> None:
         column = self.layout.column()
@@ -85,28 +82,28 @@ class Quit(Door, bpy.types.Operator):
     def work(self, context: bpy.types.Context) -> None:
         if self.choice != "ASK":
             jobs.keep_all(self.choice == "LEAVE")
-            bpy.ops.wm.quit_blender("INVOKE_DEFAULT")  # which asks whether to save
+            bpy.ops.wm.quit_blender("INVOKE_DEFAULT")  # asks whether to save
 
 
-def question() -> str:
-    """The title of what is asked."""
+def quit_question() -> str:
+    """Title of the question before quitting."""
     number = len(jobs.trainings())
     return "A training is running" if number == 1 else f"{number} trainings are running or waiting"
 
 
 def draw_quit(self, context: bpy.types.Context) -> None:
-    """An entry below Blender's own Quit, while there is something to ask."""
+    """Draw an entry below Blender's own Quit while a training runs or waits."""
     if jobs.trainings():
         self.layout.operator_context = "INVOKE_DEFAULT"
         self.layout.operator(Quit.bl_idname, text="Quit with Trainings Running…", icon="QUIT")
 
 
-CLASSES = (Keep, StopRun, Quit)
+CLASSES = (KeepTraining, StopRun, Quit)
 
 
 def register() -> None:
     bpy.types.TOPBAR_MT_file.append(draw_quit)
-    if (keys := bpy.context.window_manager.keyconfigs.addon) is not None:  # there is none without a window
+    if (keys := bpy.context.window_manager.keyconfigs.addon) is not None:  # None without a window
         keymap = keys.keymaps.new("Window")
         mac = sys.platform == "darwin"
         _keys.append((keymap, keymap.keymap_items.new(Quit.bl_idname, "Q", "PRESS", ctrl=not mac, oskey=mac)))

@@ -1,4 +1,4 @@
-"""Files dropped on the 3D view: the run.toml of a run, or the transforms.json of a capture, stand for the folder that they are in."""
+"""Drop files on the 3D view: a run's run.toml imports its folder, a capture's transforms.json chooses its folder."""
 
 from pathlib import Path
 
@@ -8,26 +8,28 @@ from bpy.props import StringProperty
 from ..errors import InputError
 from ..preferences import set_up
 from ..scene import training
-from .operators import Door, import_run_folder
+from .operators import ReportsErrors, import_run_folder
 
 
-class _Drop(Door):
-    """Takes a dropped file."""
+class _Drop(ReportsErrors):
+    """Base of operators on a dropped file."""
 
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
 
     def folder(self, name: str) -> Path:
-        """The folder of the file. Raises InputError where it is not called NAME… ."""
+        """Return the file's folder. Raises InputError where its name does not begin with `name`."""
         file = Path(bpy.path.abspath(self.filepath))
         if not file.name.startswith(name):
-            raise InputError(f"{file.name} is no {name}: drop the one in the folder of a RefGS run or capture")
+            raise InputError(
+                f"{file.name} is not a {name} file: drop run.toml of a run or transforms.json of a capture"
+            )
         return file.parent
 
 
 class DropRun(_Drop, bpy.types.Operator):
     bl_idname = "refgs.drop_run"
     bl_label = "Import RefGS Run"
-    bl_description = "Import the run that this run.toml belongs to"
+    bl_description = "Import the run of this run.toml"
 
     def work(self, context: bpy.types.Context) -> None:
         import_run_folder(self, context, self.folder("run"))
@@ -36,7 +38,7 @@ class DropRun(_Drop, bpy.types.Operator):
 class DropCapture(_Drop, bpy.types.Operator):
     bl_idname = "refgs.drop_capture"
     bl_label = "Choose RefGS Capture"
-    bl_description = "Choose the capture that this transforms.json belongs to, and check it"
+    bl_description = "Choose the capture of this transforms.json, and check it"
 
     def work(self, context: bpy.types.Context) -> None:
         context.scene.refgs.capture = str(self.folder("transforms"))
@@ -45,7 +47,7 @@ class DropCapture(_Drop, bpy.types.Operator):
 
 
 class _OnView:
-    """A file dropped on the 3D view."""
+    """Base of handlers for files dropped on the 3D view."""
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:

@@ -1,15 +1,15 @@
-"""The RefGS tab in the 3D viewport's sidebar."""
+"""Run and Preview panels, and the RefGS tab in the 3D view's sidebar that all panels are in."""
 
 from pathlib import Path
 
 import bpy
 
 from .. import compat, jobs
-from ..nodes.splats import NAME as MODIFIER
-from ..scene.cameras import photo_shown
-from ..scene.parts import parts
+from ..nodes.splats_tree import NAME as MODIFIER
+from ..scene.camera_objects import photo_shown
+from ..scene.run_parts import parts
 from . import operators
-from .pictures import thumbnail
+from .icons import thumbnail
 
 
 class Tab:
@@ -88,7 +88,7 @@ class PreviewPanel(Tab, bpy.types.Panel):
             box.label(text=job.line)
             box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
         else:
-            box.progress(factor=job.part, text=job.line)
+            box.progress(factor=job.fraction, text=job.line)
 
 
 CLASSES = (RunPanel, PreviewPanel)

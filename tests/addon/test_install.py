@@ -1,4 +1,4 @@
-"""Installing the trainer and removing it, by a uv that only speaks as one."""
+"""Install and remove the trainer, with a fake uv."""
 
 import json
 import os
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from refgs_addon import environment, jobs
+from refgs_addon import installation, jobs
 from tests.makers.bring import bring
 from tests.makers.waiting import until
 
@@ -19,8 +19,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def home(tmp_path, monkeypatch):
-    """Where to install, with an add-on that brings a trainer and the fake uv."""
-    monkeypatch.setattr(environment, "WHEELS", bring(tmp_path))
+    """Make a folder to install into, for an add-on with a bundled trainer and the fake uv."""
+    monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     yield tmp_path / "user" / "trainer"
     jobs.stop_all()
 
@@ -50,20 +50,24 @@ def alive(pid):
 def test_an_installation_to_its_end(home, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/nowhere")
     monkeypatch.setenv("UV_DEFAULT_INDEX", "mirror")
-    assert environment.brought() == "9.9" and not environment.installed(home) and not environment.begun(home)
+    assert (
+        installation.bundled_version() == "9.9"
+        and not installation.installed(home)
+        and not installation.interrupted(home)
+    )
     job = install(home)
     assert ended(job)[0] == "done" and job.ready["refgs"] == "9.9"
-    assert environment.installed(home) == "9.9" and environment.python(home).is_file()
+    assert installation.installed(home) == "9.9" and installation.python(home).is_file()
     until(lambda: not (home / "cache").exists())
-    assert not (home / "uv").exists() and not environment.begun(home)
+    assert not (home / "uv").exists() and not installation.interrupted(home)
     make, fill = calls(home)
-    assert make["words"][-4:] == ["venv", "--python", environment.PYTHONS, str(home / "env")]
+    assert make["words"][-4:] == ["venv", "--python", installation.PYTHONS, str(home / "env")]
     assert fill["words"][-1].endswith("refgs-9.9-py3-none-any.whl") and "--no-build" in fill["words"]
     variables = fill["variables"]
     assert variables["UV_DEFAULT_INDEX"] == "mirror" and variables["UV_TORCH_BACKEND"] == "auto"
     assert variables["UV_PYTHON_PREFERENCE"] == "only-managed" and "PYTHONPATH" not in variables
     assert "torch==2.14.0" in job.log.read_text()
-    asked = jobs.ask(environment.python(home), home.parent / "logs" / "trainer.txt")
+    asked = jobs.query_trainer(installation.python(home), home.parent / "logs" / "trainer.txt")
     assert ended(asked)[0] == "done"
 
 
@@ -78,25 +82,25 @@ def test_what_the_studio_has_set_stays(home, monkeypatch):
 def test_progress_stopping_and_going_on(home, monkeypatch):
     monkeypatch.setenv("FAKE_UV", "hang")
     job = install(home)
-    until(lambda: job.part > 0)
-    assert job.line.startswith("Fetching torch (850.5MiB) and 1 more: 0.1 of about ") and 0.005 < job.part < 0.03
+    until(lambda: job.fraction > 0)
+    assert job.line.startswith("Fetching torch (850.5MiB) and 1 more: 0.1 of about ") and 0.005 < job.fraction < 0.03
     job.stop()
     assert ended(job) == ("cancelled", "Stopped")
     until(lambda: not alive(calls(home)[-1]["pid"]))
-    assert environment.begun(home) and not environment.installed(home) and (home / "cache" / "torch").exists()
+    assert installation.interrupted(home) and not installation.installed(home) and (home / "cache" / "torch").exists()
     monkeypatch.delenv("FAKE_UV")
     half = home / "env" / "half"
     half.touch()
-    assert ended(install(home))[0] == "done" and environment.installed(home) == "9.9" and not half.exists()
+    assert ended(install(home))[0] == "done" and installation.installed(home) == "9.9" and not half.exists()
 
 
 def test_two_blenders_do_not_install_at_once(home, monkeypatch):
     monkeypatch.setenv("FAKE_UV", "hang")
     first = install(home)
-    until(lambda: first.part > 0)
+    until(lambda: first.fraction > 0)
     for second in (install(home), jobs.remove(home, home.parent / "logs" / "removal.txt")):
         state, line = ended(second)
-        assert state == "failed" and line.startswith("another Blender installs the trainer")
+        assert state == "failed" and line.startswith("another Blender installs or removes the trainer")
     assert not first.ended and (home / "cache" / "torch").exists()
 
 
@@ -104,19 +108,19 @@ def test_two_blenders_do_not_install_at_once(home, monkeypatch):
 def test_killed_in_the_middle(home, monkeypatch, how):
     monkeypatch.setenv("FAKE_UV", "hang")
     job = install(home)
-    until(lambda: job.part > 0)
-    if how == "Blender":  # of whose end the process hears as its input ends
+    until(lambda: job.fraction > 0)
+    if how == "Blender":  # the process notices the end of its input
         job._process.stdin.close()
     else:
         job._process.send_signal(signal.SIGKILL)
     state, line = ended(job)
-    assert state == "failed" and "its log says more" in line
+    assert state == "failed" and "see its log" in line
     uv = calls(home)[-1]["pid"]
     if how == "Blender":
         until(lambda: not alive(uv))
     else:
         os.kill(uv, signal.SIGKILL)
-    assert environment.begun(home)
+    assert installation.interrupted(home)
     monkeypatch.delenv("FAKE_UV")
     assert ended(install(home))[0] == "done"
 
@@ -126,60 +130,60 @@ def test_killed_in_the_middle(home, monkeypatch, how):
     [
         (
             "network",
-            "wheels.example cannot be reached: see to the connection, or have the firewall allow it, and go on",
+            "wheels.example cannot be reached: check the connection and the firewall, and resume",
         ),
-        ("full", "the disk that {home} is on is full: free some of it and go on"),
-        ("mute", "all is installed, but the trainer does not start on this machine: the log says why"),
+        ("full", "the disk of {home} is full: free some space and resume"),
+        ("mute", "the trainer is installed but does not start on this machine: see the log"),
     ],
 )
 def test_what_fails_is_said_in_one_line(home, monkeypatch, fate, line):
     monkeypatch.setenv("FAKE_UV", fate)
     job = install(home)
     assert ended(job) == ("failed", line.format(home=home)) and job.log.stat().st_size > 0
-    assert environment.begun(home)
+    assert installation.interrupted(home)
 
 
 def test_what_else_uv_may_say():
-    assert "none of for this machine" in environment.explain(
+    assert "does not exist for this machine" in installation.explain_uv_error(
         "error: No solution found when resolving\n cause: torch", "/a"
     )
-    assert environment.explain("error: Access is denied. (os error 5)", "/a").startswith("/a cannot be written to")
-    assert environment.explain("error: something else", "/a") == ""
+    assert installation.explain_uv_error("error: Access is denied. (os error 5)", "/a").startswith("cannot write to /a")
+    assert installation.explain_uv_error("error: something else", "/a") == ""
 
 
 def test_a_newer_release_goes_into_what_is_there(home, tmp_path, monkeypatch):
     ended(install(home))
     kept = home / "env" / "torch"
     kept.touch()
-    monkeypatch.setattr(environment, "WHEELS", bring(tmp_path, "9.10"))
-    assert environment.installed(home) == "9.9" and environment.brought() == "9.10"
-    assert ended(install(home))[0] == "done" and environment.installed(home) == "9.10" and kept.exists()
+    monkeypatch.setattr(installation, "WHEELS", bring(tmp_path, "9.10"))
+    assert installation.installed(home) == "9.9" and installation.bundled_version() == "9.10"
+    assert ended(install(home))[0] == "done" and installation.installed(home) == "9.10" and kept.exists()
 
 
 def test_removing(home):
     ended(install(home))
     job = jobs.remove(home, home.parent / "logs" / "installation.txt")
-    assert ended(job)[0] == "done" and not home.exists() and not environment.installed(home)
+    assert ended(job)[0] == "done" and not home.exists() and not installation.installed(home)
     assert ended(jobs.remove(home, job.log))[0] == "done"
 
 
 def test_a_disk_that_is_too_full(home, monkeypatch):
-    assert environment.free(home) > 0  # of the folder above, while there is none yet
-    monkeypatch.setattr(environment, "free", lambda home: 1.2e9)
-    monkeypatch.setattr(environment.shutil, "which", lambda name: None)
-    said = environment.too_full(home)
+    assert installation.free_bytes(home) > 0  # the folder does not exist yet: its parent's disk counts
+    monkeypatch.setattr(installation, "free_bytes", lambda home: 1.2e9)
+    monkeypatch.setattr(installation.shutil, "which", lambda name: None)
+    said = installation.disk_full_line(home)
     assert str(home) in said and "it needs about 2 GB; 1 GB are free" in said
-    monkeypatch.setattr(environment, "size", lambda folder: 1e9)  # half of it is here already
-    assert environment.too_full(home) == ""
-    monkeypatch.setattr(environment.shutil, "which", lambda name: f"/bin/{name}")
-    assert "it needs about 7 GB" in environment.too_full(home)
+    monkeypatch.setattr(installation, "folder_bytes", lambda folder: 1e9)  # half is downloaded already
+    assert installation.disk_full_line(home) == ""
+    monkeypatch.setattr(installation.shutil, "which", lambda name: f"/bin/{name}")
+    assert "it needs about 7 GB" in installation.disk_full_line(home)
 
 
 def test_a_clone_brings_no_trainer(monkeypatch, tmp_path):
-    monkeypatch.setattr(environment, "WHEELS", tmp_path)
-    assert environment.brought() == ""
+    monkeypatch.setattr(installation, "WHEELS", tmp_path)
+    assert installation.bundled_version() == ""
 
 
 def test_the_pythons_are_those_of_the_package():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["requires-python"] == environment.PYTHONS
+    assert project["requires-python"] == installation.PYTHONS

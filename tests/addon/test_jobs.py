@@ -1,4 +1,4 @@
-"""Following the trainer's processes, by one that only speaks as it does."""
+"""Follow the trainer's processes, with a fake worker."""
 
 import json
 import subprocess
@@ -36,13 +36,13 @@ def test_a_training_to_its_end(start, tmp_path):
 
 
 def test_one_that_is_silent_is_not_waited_for(tmp_path):
-    """Between its last word and its end a process takes its time, in which the window must not stand still."""
+    """Do not block the window between a process's last output and its end."""
     ends_with_its_input = "import os, sys; print('{}', flush=True); os.close(1); sys.stdin.read(); os._exit(3)"
-    words = ("-c", ends_with_its_input)
-    job = jobs._add(jobs.Job("slow", Path(sys.executable), [{"command": "rest"}], tmp_path / "log.txt", words=words))
-    until(lambda: job._silent)
+    arguments, commands = ("-c", ends_with_its_input), [{"command": "rest"}]
+    job = jobs._add(jobs.Job("slow", Path(sys.executable), commands, tmp_path / "log.txt", arguments=arguments))
+    until(lambda: job._output_closed)
     assert not jobs.poll() and not job.ended and job._process.poll() is None
-    job.let_go()
+    job.close_input()
     until(lambda: job.ended)
     assert job.state == "failed" and "status 3" in job.line
 
@@ -130,7 +130,7 @@ time.sleep(600)
 
 @pytest.fixture
 def killed(python, tmp_path):
-    """The run folder of a Blender that trained, and was killed."""
+    """Kill a Blender that trains, and return the run folder."""
 
     def killed(kept: str) -> Path:
         capture, run = tmp_path / "slow photos", tmp_path / "run"
@@ -155,9 +155,9 @@ def test_a_training_that_a_killed_blender_left_is_found_and_stopped(killed):
     run = killed("kept")
     before = jobs.run_progress(run)["iteration"]
     until(lambda: jobs.run_progress(run).get("iteration", 0) > before)
-    assert jobs.run_state(run) == "training" and not jobs.stops(run)
+    assert jobs.run_state(run) == "training" and not jobs.stop_requested(run)
     jobs.stop_run(run)
-    assert jobs.stops(run)
+    assert jobs.stop_requested(run)
     until(lambda: jobs.run_state(run) == "stopped")
 
 
@@ -171,7 +171,7 @@ def test_what_fails_is_said_and_what_was_done_before_it_stays(start):
     job = start(mesh=True)
     until(lambda: job.ended)
     assert job.state == "failed" and job.line == "the mesh is crumbs" and "train" in job.results
-    assert job.progress["psnr"] == 30  # the panel shows it beside the curve, the mesh's own progress notwithstanding
+    assert job.progress["psnr"] == 30  # the mesh's progress does not replace it in the panel
 
 
 def test_a_trainer_that_dies(start):
@@ -197,14 +197,14 @@ def test_a_line_that_is_no_event(start):
 
 
 def test_a_python_that_is_not_there(start, tmp_path):
-    job = jobs.ask(tmp_path / "nothing", tmp_path / "log.txt")
+    job = jobs.query_trainer(tmp_path / "nothing", tmp_path / "log.txt")
     assert job.state == "failed" and "cannot be started" in job.line and "preferences" in job.line
 
 
 def test_a_python_without_the_trainer(tmp_path):
     import sys
 
-    job = jobs.ask(sys._base_executable, tmp_path / "log.txt")
+    job = jobs.query_trainer(sys._base_executable, tmp_path / "log.txt")
     until(lambda: job.ended)
     assert job.state == "failed" and "log" in job.line
 
@@ -215,7 +215,7 @@ def test_cameras_are_found_then_checked(python, tmp_path):
     checked = jobs.check(python, capture, tmp_path / "found", tmp_path / "check.txt")
     until(lambda: checked.ended)
     assert checked.state == "failed" and checked.no_cameras
-    found = jobs.poses(python, capture, tmp_path / "found", tmp_path / "poses.txt")
+    found = jobs.find_cameras(python, capture, tmp_path / "found", tmp_path / "poses.txt")
     until(lambda: found.ended)
     assert found.state == "done" and found.progress["stage"] == "matching" and not found.curve
     assert found.results["poses"]["placed"] == 3 and found.results["check"]["lines"][0] == "Views: 3"
@@ -223,7 +223,7 @@ def test_cameras_are_found_then_checked(python, tmp_path):
 
 def test_asking_and_checking_run_beside_a_training(start, python, tmp_path):
     training = start()
-    asked = jobs.ask(python, tmp_path / "log.txt")
+    asked = jobs.query_trainer(python, tmp_path / "log.txt")
     checked = jobs.check(python, tmp_path, tmp_path / "found", tmp_path / "check.txt")
     until(lambda: asked.ended and checked.ended)
     assert asked.state == "done" and asked.ready["refgs"] == "9.9"

@@ -1,4 +1,4 @@
-"""Blender as a Python module: one process holds one file, so each test starts an empty one."""
+"""Blender as a Python module. A process has one file, so each test starts with an empty one."""
 
 import pytest
 
@@ -14,6 +14,6 @@ def run_folder(tmp_path):
 
 @pytest.fixture
 def scene():
-    """The scene of an empty file."""
+    """Open an empty file, and return its scene."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     return bpy.context.scene

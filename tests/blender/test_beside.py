@@ -1,4 +1,4 @@
-"""Rendering in another Blender: a picture of the file as it is, and a line where there is none."""
+"""Render in another Blender: the file as it is now, or one line of error."""
 
 import time
 
@@ -9,8 +9,8 @@ from PIL import Image
 
 from refgs_addon import jobs
 from refgs_addon.errors import InputError
-from refgs_addon.scene.beside import render_beside
-from refgs_addon.scene.run import import_run
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.render_process import render_in_background
 from tests.makers.runs import write_panorama
 from tests.makers.waiting import until
 
@@ -26,30 +26,30 @@ def test_a_preview_and_a_sheet_of_the_file_as_it_is(run_folder, scene, tmp_path)
     write_panorama(tmp_path / "red.exr", np.broadcast_to((1, 0.05, 0.05), (8, 16, 3)))
     folder = tmp_path / "été 'a'"
     folder.mkdir()
-    alone = render_beside(scene, folder / "a.png", size=24, samples=2)
-    sheet = render_beside(scene, folder / "b.png", [tmp_path / "red.exr"], size=24, samples=2)
+    alone = render_in_background(scene, folder / "a.png", size=24, samples=2)
+    sheet = render_in_background(scene, folder / "b.png", [tmp_path / "red.exr"], size=24, samples=2)
     until(lambda: alone.ended and sheet.ended, 120)
     assert (alone.state, sheet.state) == ("done", "done"), (alone.line, sheet.line)
     assert alone.results["render"]["png"] == str(folder / "a.png")
     assert Image.open(folder / "a.png").size == (24, 24)
     assert Image.open(folder / "b.png").size == (24, 52)
-    assert sheet.part == 1 and not bpy.data.filepath
+    assert sheet.fraction == 1 and not bpy.data.filepath
 
 
 def test_what_cannot_be_rendered_is_said_in_one_line(run_folder, scene, tmp_path):
     with pytest.raises(InputError, match="no camera"):
-        render_beside(scene, tmp_path / "a.png")
+        render_in_background(scene, tmp_path / "a.png")
     import_run(run_folder, scene)
-    with pytest.raises(InputError, match="its folder is not there"):
-        render_beside(scene, tmp_path / "not there" / "a.png")
-    job = render_beside(scene, tmp_path / "a.png", [tmp_path / "missing.exr"], size=8, samples=1)
+    with pytest.raises(InputError, match="its folder does not exist"):
+        render_in_background(scene, tmp_path / "not there" / "a.png")
+    job = render_in_background(scene, tmp_path / "a.png", [tmp_path / "missing.exr"], size=8, samples=1)
     until(lambda: job.ended, 120)
     assert job.state == "failed" and "cannot read the light" in job.line
 
 
 def test_it_ends_when_it_is_put_away(run_folder, scene, tmp_path):
     import_run(run_folder, scene)
-    job = render_beside(scene, tmp_path / "a.png", size=2000, samples=4096)
+    job = render_in_background(scene, tmp_path / "a.png", size=2000, samples=4096)
     until(lambda: job.state == "running", 120)
     time.sleep(0.2)
     job.stop()

@@ -1,4 +1,4 @@
-"""python -m refgs_addon.preview, as another program calls it."""
+"""Run python -m refgs_addon.preview as another program does."""
 
 import json
 import os
@@ -35,7 +35,7 @@ def test_previews_and_blend(run_folder, tmp_path):
     assert events[-1]["files"] == [str(out / name) for name in names if name.endswith("png")]
     assert read_exr(out / names[1]).shape == (20, 32, 4)
 
-    # The .blend stands alone: with the run folder gone, the light is still in it.
+    # The .blend is self-contained: it has the light without the run folder.
     (run_folder / "environment.exr").unlink()
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     light = bpy.context.scene.world["refgs_recovered"]
@@ -62,7 +62,7 @@ def test_bad_input_is_one_line(run_folder, tmp_path, capfd, monkeypatch, argumen
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names the shared libraries of Linux")
 def test_missing_libraries_are_named(run_folder, tmp_path):
-    """An `ldd` that cannot find X stands before the real one: the loader's words, and what is made of them."""
+    """Put an `ldd` that reports a missing library before the real one."""
     tool = tmp_path / "bin" / "ldd"
     tool.parent.mkdir()
     tool.write_text("#!/bin/sh\nprintf '\\tlibXfixes.so.3 => not found\\n\\tlibm.so.6 => /lib/libm.so.6 (0x1)\\n'\n")

@@ -1,4 +1,4 @@
-"""A run whose splats mirror nothing, or have a metallic or a roughness alike: said once in the file, read by no node."""
+"""Runs with constant metallic, roughness or specular: stored once in the file, and read by no node."""
 
 import numpy as np
 import pytest
@@ -7,15 +7,15 @@ from plyfile import PlyData
 from refgs.formats.splats import read_splats as backend_splats
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.export import edited_materials, export_splats
-from refgs_addon.scene.run import import_run
-from refgs_addon.scene.splats import read_constants
+from refgs_addon.scene.export_run import edited_materials, export_splats
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.splat_cloud import read_constants
 
 MATTE = {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
 
 
 def say_once(folder, constants):
-    """Leave the columns out of the run's splats.ply, and say them in its head."""
+    """Move columns of the run's splats.ply to constants in its header."""
     file = folder / "splats.ply"
     data = PlyData.read(str(file))["vertex"].data
     rows = data[[name for name in data.dtype.names if name not in constants]].copy()
@@ -48,7 +48,7 @@ def test_the_material_reads_what_varies_alone(constants, run_folder, scene):
 
 
 def test_an_edit_has_it_read_all(run_folder, scene):
-    """Gold on what is matte: the material follows, and the rest stays as dull as it was."""
+    """Editing with gold makes a matte run's material read all attributes."""
     say_once(run_folder, MATTE)
     run = import_run(run_folder, scene)
     add_edit(run.collection, "Everywhere", "Gold")
@@ -62,7 +62,7 @@ def test_an_edit_has_it_read_all(run_folder, scene):
 
 
 def test_what_is_exported_says_it_as_the_run_did(run_folder, scene, tmp_path):
-    """Once for all, until an edit makes some of them otherwise."""
+    """Constants stay constants until an edit makes the splats differ."""
     say_once(run_folder, MATTE)
     run = import_run(run_folder, scene)
     export_splats(run.collection, tmp_path / "same.ply")
@@ -81,5 +81,5 @@ def test_a_column_has_the_last_word(run_folder):
     assert read_constants(file) == {} and backend_splats(file).constants == {}
     say_once(run_folder, {"metallic": 0.25})
     file.write_bytes(file.read_bytes().replace(b"metallic 0.25", b"metallic much", 1))
-    with pytest.raises(InputError, match="metallic is much"):
+    with pytest.raises(InputError, match="metallic is much, not a number"):
         read_constants(file)

@@ -1,4 +1,4 @@
-"""Edits of materials: what they change, where, and what they leave as it was learned."""
+"""Edit materials: what an edit changes, where, and that the learned values stay."""
 
 import bpy
 import numpy as np
@@ -7,12 +7,12 @@ from mathutils import Matrix
 
 from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
-from refgs_addon.nodes.edit import AMOUNT, COLOR, SURFACE
+from refgs_addon.nodes.edit_tree import AMOUNT, COLOR, SURFACE
 from refgs_addon.scene.edit import add_edit, edits, remove_edit
-from refgs_addon.scene.materials import set_material
-from refgs_addon.scene.parts import show
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.material_presets import set_material
 from refgs_addon.scene.regions import crop
-from refgs_addon.scene.run import import_run
+from refgs_addon.scene.run_parts import show
 
 GOLD = (1.0, 0.766, 0.336), 1.0, 0.15  # base colour, metallic, roughness
 CHROME_ROUGHNESS = 0.02
@@ -24,7 +24,7 @@ def run(run_folder, scene):
 
 
 def drawn(run, name, field="value", width=1):
-    """An attribute of the splats as they are drawn: of the first corner of each quad."""
+    """Read an attribute of the drawn splats, at the first corner of each quad."""
     bpy.context.view_layer.update()
     graph = bpy.context.evaluated_depsgraph_get()
     mesh = next(
@@ -83,7 +83,7 @@ def test_a_region_is_moved_turned_and_scaled(run, where, size):
     assert 3 < inside.sum() < 37
     expected = np.where(inside, CHROME_ROUGHNESS, learned(run, "roughness"))
     np.testing.assert_allclose(drawn(run, "roughness"), expected, atol=1e-5)
-    # The splats' own place takes part: what is moved along keeps its edit.
+    # Splats and region that move together keep the edit.
     run.splats.location = region.location = (5, 0, 0)
     run.splats.location.x, region.location = 5.0, (5.3, -0.2, 0.1)
     np.testing.assert_allclose(drawn(run, "roughness"), expected, atol=1e-5)
@@ -116,7 +116,7 @@ def test_what_is_like_the_splat_at_the_region(run):
 
 
 def test_the_mesh_follows_all_edits(run):
-    """What is stored for the mesh, put over any material, is what the edits one after another make of it."""
+    """Compositing the stored attributes over the learned material gives the edited material."""
     first = add_edit(run.collection, material="Gold")
     compat.set_modifier_input(first, "Color Amount", 0.7)
     second = add_edit(run.collection, "Sphere", "Rubber")
@@ -131,7 +131,7 @@ def test_the_mesh_follows_all_edits(run):
     for column, name in enumerate(("metallic", "roughness")):
         made = learned(run, name) * (1 - amount[:, column + 1]) + surface[:, column]
         np.testing.assert_allclose(made, drawn(run, name), atol=1e-5)
-    # Each corner of the mesh has the nearest splat's.
+    # Each corner of the mesh has the nearest splat's amount.
     (box,) = run.mesh
     show(run.collection, "mesh")
     bpy.context.view_layer.update()
@@ -163,7 +163,7 @@ def test_the_buttons(run):
         assert bpy.ops.refgs.add_edit(where="Sphere", material="Chrome") == {"FINISHED"}
         (edit,) = edits(run.splats)
         region = compat.get_modifier_input(edit, "Region")
-        assert bpy.context.view_layer.objects.active == region  # a click and it can be moved
+        assert bpy.context.view_layer.objects.active == region  # selected, ready to be moved
         bpy.ops.refgs.set_material(splats=run.splats.name, edit=edit.name, material="Rubber")
         assert compat.get_modifier_input(edit, "Metallic") == 0
         bpy.ops.refgs.remove_edit(splats=run.splats.name, edit=edit.name)
@@ -175,7 +175,7 @@ def test_the_buttons(run):
 
 
 def test_what_is_painted_on_the_mesh(run):
-    """Weights of 1 on the corners of one side of the mesh: the splats nearest to it change, and the mesh there."""
+    """Weights of 1 on one side of the mesh edit the nearest splats, and the mesh there."""
     run.mesh[0].data.transform(Matrix.Translation((-1, 3, -2)))  # into the middle of the splats
     add_edit(run.collection, "Painted", "Gold")
     canvas = next(item for item in run.collection.objects if item.get("refgs_region"))
@@ -209,7 +209,7 @@ def test_painting_needs_a_mesh(run_folder, scene):
 def test_a_crop_hides_what_is_outside_of_its_box(run):
     box = crop(run.splats, run.collection, True)
     places = positions(run)
-    assert len(drawn(run, "metallic")) > 0.8 * len(places)  # it holds nearly all at first
+    assert len(drawn(run, "metallic")) > 0.8 * len(places)  # a new box contains nearly all splats
     box.location, box.scale = (0.5, 0, 0), (0.5, 2, 2)
     inside = (np.abs(places - [0.5, 0, 0]) <= [0.5, 2, 2]).all(axis=1)
     assert len(drawn(run, "metallic")) == inside.sum() > 0

@@ -1,4 +1,4 @@
-"""USD and FBX of a run's mesh: written, moved with their pictures, and read by Blender's own importers, they are what the run has."""
+"""Export a run's mesh as USD and FBX, move it with its textures, and import it again with Blender's importers."""
 
 import shutil
 from dataclasses import replace
@@ -13,8 +13,8 @@ from refgs.formats.gltf import write_glb
 from refgs_addon import ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.export import export_mesh, export_run
-from refgs_addon.scene.run import data_blocks, import_run
+from refgs_addon.scene.export_run import export_mesh, export_run
+from refgs_addon.scene.import_run import data_blocks, import_run
 from tests.makers.box import textured_box
 
 IMPORTERS = [
@@ -77,14 +77,14 @@ def test_it_comes_back_as_it_was(textured, scene, tmp_path, ending, read):
 
 
 def level(item):
-    """The Specular IOR Level of an object's material."""
+    """Read the Specular IOR Level of an object's material."""
     nodes = item.data.materials[0].node_tree.nodes
     return next(node for node in nodes if node.type == "BSDF_PRINCIPLED").inputs["Specular IOR Level"].default_value
 
 
 @pytest.mark.parametrize("specular", [1.0, 0.0])
 def test_what_mirrors_nothing_is_not_given_gloss(run_folder, scene, tmp_path, specular):
-    """Of the two importers of FBX the one in Python reads that."""
+    """Specular 0 survives the export. Of the two FBX importers only the one in Python reads it."""
     ending, read = IMPORTERS[1]
     mesh, textures = textured_box()
     write_glb(run_folder / "mesh.glb", mesh, replace(textures, specular=specular))
@@ -107,14 +107,14 @@ def test_what_is_in_the_way_is_said_in_one_line(textured, scene, tmp_path, endin
     with pytest.raises(InputError, match=r"cannot write .*b\."):
         export_mesh(run.collection, tmp_path / f"b{ending}")
     (folder / "textures" / "metallic.png").unlink()
-    with pytest.raises(InputError, match=r"metallic\.png is not there: make the run's mesh again"):
+    with pytest.raises(InputError, match=r"metallic\.png does not exist: make the run's mesh again"):
         export_mesh(run.collection, tmp_path / f"a{ending}")
     (folder / "mesh.glb").unlink()
     with pytest.raises(InputError, match="make the run's mesh first"):
         export_mesh(run.collection, tmp_path / f"a{ending}")
     assert data_blocks() == before
     add_edit(run.collection)
-    with pytest.raises(InputError, match="without the edits"):
+    with pytest.raises(InputError, match="lacks the edits"):
         export_mesh(run.collection, tmp_path / f"a{ending}")
     assert not (tmp_path / f"a{ending}").exists()
 

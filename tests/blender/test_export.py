@@ -1,4 +1,4 @@
-"""What leaves Blender: the edits are in it, the run itself is as it was."""
+"""Export a run with its edits; the run itself does not change."""
 
 import json
 import shutil
@@ -10,10 +10,10 @@ import pytest
 from refgs_addon import ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.export import SH_DC, edited_materials, export_light, export_mesh, export_run, export_splats
-from refgs_addon.scene.parts import show
-from refgs_addon.scene.run import import_run
-from refgs_addon.scene.splats import read_rows
+from refgs_addon.scene.export_run import SH_DC, edited_materials, export_light, export_mesh, export_run, export_splats
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.run_parts import show
+from refgs_addon.scene.splat_cloud import read_rows
 from tests.makers.runs import write_ply
 
 
@@ -30,7 +30,7 @@ def test_splats_without_edits_are_those_of_the_run(run, run_folder, tmp_path):
 
 @pytest.mark.parametrize("part", ["splats", "mesh"])
 def test_edits_are_written_and_nothing_else_changes(run, run_folder, tmp_path, part):
-    show(run.collection, part)  # hidden splats are not evaluated by Blender
+    show(run.collection, part)  # Blender does not evaluate hidden splats
     before = read_rows(run_folder / "splats.ply").copy()
     edit = add_edit(run.collection, "Box", "Gold")
     export_splats(run.collection, tmp_path / "a.ply")
@@ -90,7 +90,7 @@ def test_without_edits_the_mesh_comes_along(run, tmp_path, scene):
     export_mesh(run.collection, tmp_path / "a.glb")
     export_light(run.collection, tmp_path / "a.exr")
     add_edit(run.collection)
-    with pytest.raises(InputError, match="without the edits"):
+    with pytest.raises(InputError, match="lacks the edits"):
         export_mesh(run.collection, tmp_path / "b.glb")
 
 
@@ -103,7 +103,7 @@ def test_what_is_not_there_is_said_in_one_line(run, run_folder, tmp_path):
     with pytest.raises(InputError, match="has no light"):
         export_light(run.collection, tmp_path / "a.exr")
     shutil.rmtree(run_folder)
-    with pytest.raises(InputError, match="import it again from where it is now"):
+    with pytest.raises(InputError, match="import it again from its new place"):
         export_splats(run.collection, tmp_path / "a.ply")
     assert list(tmp_path.iterdir()) == []
 

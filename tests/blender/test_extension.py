@@ -1,4 +1,4 @@
-"""The extension: it registers cleanly, builds and validates with Blender's own tool, and its buttons work."""
+"""Register the extension, build and validate it with Blender's own tool, and press its buttons."""
 
 import shutil
 import subprocess
@@ -35,17 +35,17 @@ def test_registers_and_unregisters_twice(scene):
 
 
 def test_registers_and_draws_without_numpy():
-    """As Debian's Blender comes: what needs it says so when it is pressed, and a training's curve is not drawn."""
+    """Debian's Blender may lack numpy: buttons that need it report that, and a training's curve is not drawn."""
     code = """if True:
         import sys
         sys.modules["numpy"] = None
         from types import SimpleNamespace
         import bpy
         from refgs_addon import ui
-        from refgs_addon.ui import pictures
+        from refgs_addon.ui import icons
         ui.register()
         job = SimpleNamespace(serial=1, curve=[(1.0, 20.0), (2.0, 21.0)], held_out=[])
-        assert pictures.curve(job) == 0
+        assert icons.curve_icon(job) == 0
         ui.unregister()
         print("registered")
     """
@@ -54,7 +54,7 @@ def test_registers_and_draws_without_numpy():
 
 
 def test_builds_and_validates(tmp_path):
-    """From a clone that has been used, with runs and captures in it."""
+    """Build from a clone that contains runs and captures."""
     clone, archive = tmp_path / "refgs", tmp_path / "refgs.zip"
     shutil.copytree(ROOT / "refgs_addon", clone / "refgs_addon")
     for name in ("__init__.py", "blender_manifest.toml", "LICENSE", "README.md"):
@@ -111,7 +111,7 @@ def test_dropped_files_stand_for_their_folders(run_folder, addon, tmp_path):
     assert bpy.data.objects["pot splats"]
     bpy.ops.refgs.drop_capture(filepath=str(tmp_path / "transforms_train.json"))
     assert addon.refgs.capture == str(tmp_path)
-    with pytest.raises(RuntimeError, match=r"^Error: settings\.json is no transforms"):
+    with pytest.raises(RuntimeError, match=r"^Error: settings\.json is not a transforms"):
         bpy.ops.refgs.drop_capture(filepath=str(tmp_path / "settings.json"))
 
 

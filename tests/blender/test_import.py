@@ -1,4 +1,4 @@
-"""Importing a run: what lies in Blender's data, against numpy."""
+"""Import a run, and compare Blender's data with numpy."""
 
 import json
 
@@ -14,14 +14,14 @@ from refgs.errors import InputWarning
 from refgs.formats.splats import read_splats as read_by_refgs
 from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
-from refgs_addon.nodes.splats import EXTENT, NAME
-from refgs_addon.scene.cameras import frame_camera, next_camera, photo_shown, show_photo
+from refgs_addon.nodes.splats_tree import EXTENT, NAME
+from refgs_addon.scene.camera_objects import frame_camera, next_camera, photo_shown, show_photo
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.export import export_mesh, export_splats
-from refgs_addon.scene.notes import newer
-from refgs_addon.scene.parts import parts, show
-from refgs_addon.scene.run import import_run
-from refgs_addon.scene.splats import MATERIALS, normal_slopes, read_splats
+from refgs_addon.scene.export_run import export_mesh, export_splats
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.run_parts import parts, show
+from refgs_addon.scene.run_toml import newer_release
+from refgs_addon.scene.splat_cloud import MATERIALS, normal_slopes, read_splats
 from tests.makers.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
 
 
@@ -36,7 +36,7 @@ def stacked(columns, *names):
 
 
 def evaluated_mesh(item):
-    """The quads that the modifier makes of a point cloud."""
+    """Evaluate the modifier that turns a point cloud into quads."""
     graph = bpy.context.evaluated_depsgraph_get()
     graph.update()
     for instance in graph.object_instances:
@@ -59,9 +59,9 @@ def test_a_light_that_turned_is_said_to(run_folder, scene):
 )
 def test_a_run_of_a_newer_release(run_folder, made_by, is_newer):
     (run_folder / "run.toml").write_text(f"[run]\nrefgs = {made_by}\n")
-    assert newer(run_folder) == (json.loads(made_by) if is_newer else "")
+    assert newer_release(run_folder) == (json.loads(made_by) if is_newer else "")
     (run_folder / "run.toml").unlink()
-    assert newer(run_folder) == ""
+    assert newer_release(run_folder) == ""
 
 
 def test_points_hold_what_the_file_holds(run_folder, scene):
@@ -149,7 +149,7 @@ def test_normals_bend_as_a_sphere_does(tmp_path):
 
 
 def others(scales, normals):
-    """The columns of splats as other programs train them: no materials, quaternions of any length, normals of zeros or none."""
+    """Make columns as other programs write them: no materials, quaternions of any length, zero or missing normals."""
     rng = np.random.default_rng(4)
     columns = {name: value for name, value in random_columns().items() if name not in MATERIALS}
     for i in range(4):
@@ -165,7 +165,7 @@ def others(scales, normals):
 @pytest.mark.parametrize("normals", [False, True])
 @pytest.mark.parametrize("scales", [2, 3])
 def test_other_programs_splats(scene, tmp_path, scales, normals):
-    """They lie as flat discs across their shortest axis, matte, in the colours that they show."""
+    """Splats of other programs become discs across their shortest axis, matte, in their displayed colours."""
     columns = others(scales, normals)
     folder = tmp_path / "d'un autre été"
     folder.mkdir()
@@ -180,7 +180,7 @@ def test_other_programs_splats(scene, tmp_path, scales, normals):
     flat = turn[:, :, :scales] * size[:, None] * (np.arange(scales) != shortest[:, None])[:, None]
     np.testing.assert_allclose(
         found @ found.transpose(0, 2, 1), flat @ flat.transpose(0, 2, 1), atol=1e-6
-    )  # their covariances
+    )  # covariances
     look = (0.5 + stacked(columns, "f_dc_0", "f_dc_1", "f_dc_2") / np.sqrt(4 * np.pi)).clip(0, 1)
     np.testing.assert_allclose(
         values(cloud, "base_color", 4, "color")[:, :3],
@@ -191,7 +191,7 @@ def test_other_programs_splats(scene, tmp_path, scales, normals):
 
 
 def test_splats_that_are_not_finite_are_left_out(run_folder, scene, tmp_path, capfd):
-    """As many as `refgs` leaves out, and what RefGS does not know goes with its splat."""
+    """Leave out the same splats as `refgs`, and keep unknown columns."""
     columns = {**random_columns(), "semantic": np.arange(COUNT), "weight": np.linspace(0, 1, COUNT)}
     columns |= {f"f_rest_{i}": np.zeros(COUNT) for i in range(9)}
     columns["x"][3], columns["roughness"][[5, 6]], columns["f_rest_4"][7] = np.nan, np.inf, np.nan
@@ -208,7 +208,7 @@ def test_splats_that_are_not_finite_are_left_out(run_folder, scene, tmp_path, ca
     ui.register()
     try:
         bpy.ops.refgs.import_run(directory=f"{run_folder}/")
-        assert "5 splats with numbers that are not finite are left out" in capfd.readouterr().out
+        assert "5 splats with values that are not finite were left out" in capfd.readouterr().out
     finally:
         ui.unregister()
     run = import_run(run_folder, scene)
@@ -236,7 +236,7 @@ def test_edits_of_what_has_no_materials_cannot_be_written(scene, tmp_path):
     (tmp_path / "other").mkdir()
     write_ply(tmp_path / "other" / "splats.ply", others(3, True))
     run = import_run(tmp_path / "other", scene)
-    with pytest.raises(InputError, match=r"has no materials that edits could be written to: make one .* --splats"):
+    with pytest.raises(InputError, match=r"has no materials to edit: add them .* --splats"):
         export_splats(run.collection, tmp_path / "edited.ply")
     assert not (tmp_path / "edited.ply").exists()
 
@@ -247,7 +247,7 @@ def test_one_splat_alone_is_flat(tmp_path):
 
 
 def test_one_splat_and_a_mesh_without_faces(run_folder, scene, tmp_path):
-    """They come in, are edited, and leave."""
+    """Both can be imported, edited and exported."""
     write_ply(run_folder / "splats.ply", random_columns(1))
     trimesh.Scene(trimesh.PointCloud(np.eye(3))).export(run_folder / "mesh.glb")
     run = import_run(run_folder, scene)
@@ -291,7 +291,7 @@ def test_cameras_project_as_the_photos_did(run_folder, scene):
 
 
 def with_photos(run_folder, capture):
-    """Have a run folder say that it is of a capture with photos."""
+    """Link a run folder to a capture with photos."""
     file = run_folder / "cameras.json"
     content = json.loads(file.read_text())
     for frame in content["frames"]:
@@ -329,7 +329,7 @@ def test_a_photo_that_is_gone_is_said_in_one_line(run_folder, scene, tmp_path):
     with_photos(run_folder, tmp_path / "capture")
     run = import_run(run_folder, scene)
     (tmp_path / "capture" / "photos" / "front.png").unlink()
-    with pytest.raises(InputError, match=r"front\.png is not there: put the capture back"):
+    with pytest.raises(InputError, match=r"front\.png does not exist: move the capture back"):
         show_photo(run.cameras["front.001"] if "front.001" in run.cameras else run.cameras["front"])
 
 
@@ -416,20 +416,20 @@ def bent_camera(path):
     ("name", "spoil", "says"),
     [
         ("splats.ply", lambda path: path.unlink(), "cannot read"),
-        ("splats.ply", cut, "cut short"),
-        ("splats.ply", no_number, "head that is broken"),
-        ("splats.ply", twice, "head that is broken"),
+        ("splats.ply", cut, "truncated"),
+        ("splats.ply", no_number, "broken header"),
+        ("splats.ply", twice, "broken header"),
         ("splats.ply", negative, "is empty"),
         ("splats.ply", without_properties, "is empty"),
-        ("splats.ply", listed, "is not a PLY file of splats"),
-        ("splats.ply", other_first, "is not a PLY file of splats"),
-        ("splats.ply", unknown_type, "head that is broken"),
+        ("splats.ply", listed, "is not a PLY of splats"),
+        ("splats.ply", other_first, "is not a PLY of splats"),
+        ("splats.ply", unknown_type, "broken header"),
         ("splats.ply", not_json, "not a binary little-endian PLY"),
-        ("splats.ply", infinite, "holds no splat whose numbers are all finite"),
+        ("splats.ply", infinite, "has no splat with finite values"),
         ("splats.ply", without_materials, "has no metallic, roughness"),
         ("cameras.json", not_json, "not the cameras.json"),
         ("cameras.json", bent_camera, "not the cameras.json"),
-        ("environment.exr", not_json, "not a whole EXR"),
+        ("environment.exr", not_json, "not a complete EXR"),
         ("mesh.glb", cut, "glTF"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Which panorama lights the scene: those at hand, the chooser, and the match with the recovered light."""
+"""Light the scene: list the panoramas, choose one, and match it with the recovered light."""
 
 import math
 
@@ -8,22 +8,22 @@ import pytest
 
 from refgs_addon import ui
 from refgs_addon.errors import InputError
-from refgs_addon.nodes.world import IMAGE, ROTATION, STRENGTH
-from refgs_addon.scene.panorama import turn_between
-from refgs_addon.scene.relight import hdris, load_panorama, match_light, relight
-from refgs_addon.scene.run import import_run
-from refgs_addon.ui import light
+from refgs_addon.nodes.panorama_world import IMAGE, ROTATION, STRENGTH
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.panorama import best_rotation
+from refgs_addon.scene.world_light import hdris, load_panorama, match_light, relight
+from refgs_addon.ui import light_panel
 from tests.makers.runs import write_panorama
 
 
 def room(height=48, seed=0):
-    """A sky of lamps over a floor, smooth enough to be turned by parts of a pixel."""
+    """Make a sky of lamps over a floor, smooth enough for rotations by fractions of a pixel."""
     rng = np.random.default_rng(seed)
     azimuth = math.pi * (1 - 2 * (np.arange(2 * height) + 0.5) / (2 * height))
     elevation = math.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
 
     def at(turn):
-        """The panorama, turned counter-clockwise seen from above."""
+        """Rotate the panorama, counter-clockwise seen from above."""
         values = 0.2 + 0.1 * np.sin(elevation) + 0 * azimuth
         for where, up, bright in lamps:
             cosine = np.cos(azimuth - turn - where) * np.cos(elevation) * np.cos(up) + np.sin(elevation) * np.sin(up)
@@ -40,11 +40,11 @@ def test_the_turn_between_two_panoramas_is_found(turn, scene, tmp_path):
     write_panorama(tmp_path / "a.exr", panorama(0))
     write_panorama(tmp_path / "b.exr", 2.5 * panorama(turn))
     a, b = (load_panorama(tmp_path / f"{name}.exr") for name in "ab")
-    found, scale = turn_between(a, b)
+    found, scale = best_rotation(a, b)
     assert abs((found - turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(0.5)
     assert scale == pytest.approx(2.5, rel=0.01)
-    write_panorama(tmp_path / "finer.exr", 2.5 * room(100)(turn))  # another size, no whole multiple of any
-    found, scale = turn_between(a, load_panorama(tmp_path / "finer.exr"))
+    write_panorama(tmp_path / "finer.exr", 2.5 * room(100)(turn))  # another size, not an integer multiple
+    found, scale = best_rotation(a, load_panorama(tmp_path / "finer.exr"))
     assert abs((found - turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(1)
     assert scale == pytest.approx(2.5, rel=0.02)
 
@@ -77,13 +77,13 @@ def test_blenders_own_and_the_artists_hdris_are_at_hand(scene, tmp_path):
 
 def test_the_chooser_says_and_sets_what_lights_the_scene(run_folder, scene, monkeypatch, tmp_path):
     write_panorama(tmp_path / "my room.exr", np.ones((8, 16, 3)))
-    monkeypatch.setattr(light, "hdri_folder", lambda: tmp_path)
+    monkeypatch.setattr(light_panel, "hdri_folder", lambda: tmp_path)
     ui.register()
     try:
         manager = bpy.context.window_manager
         assert manager.refgs_light == "OTHER"
         manager.refgs_light = str(hdris()[0])
-        assert scene.world.node_tree.nodes[IMAGE].image.name == hdris()[0].name  # a world of its own
+        assert scene.world.node_tree.nodes[IMAGE].image.name == hdris()[0].name  # in a new world
         import_run(run_folder, scene)
         assert manager.refgs_light == "RECOVERED"
         nodes = scene.world.node_tree.nodes

@@ -1,4 +1,4 @@
-"""A training's surfels in the 3D view while it runs."""
+"""Show a training's surfels in the 3D view while it runs."""
 
 import time
 
@@ -6,14 +6,14 @@ import bpy
 import pytest
 
 from refgs_addon import jobs
-from refgs_addon.nodes.splats import NAME
-from refgs_addon.scene import live
+from refgs_addon.nodes.splats_tree import NAME
+from refgs_addon.scene import live_splats
 from tests.makers.runs import random_columns, write_ply
 
 
 @pytest.fixture
 def job(tmp_path):
-    """A training that has shown nothing yet."""
+    """Make a training without a preview yet."""
     return jobs.Job("pot", tmp_path, [], tmp_path / "log.txt", run=tmp_path / "run", state="running")
 
 
@@ -26,7 +26,7 @@ def until(condition):
     end = time.monotonic() + 30
     while not condition():
         assert time.monotonic() < end
-        live.update()
+        live_splats.update()
         time.sleep(0.005)
 
 
@@ -35,36 +35,36 @@ def clouds():
 
 
 def test_the_surfels_come_change_and_go(job, scene, tmp_path):
-    live.watch(job, scene)
-    live.update()
+    live_splats.watch(job, scene)
+    live_splats.update()
     (item,) = clouds()
-    assert live.is_watched(job) and len(item.data.points) == 0 and item.modifiers[NAME].node_group
+    assert live_splats.is_watched(job) and len(item.data.points) == 0 and item.modifiers[NAME].node_group
     preview(job, tmp_path, 10, 30)
     until(lambda: len(item.data.points) == 30)
     preview(job, tmp_path, 20, 50)
     until(lambda: len(item.data.points) == 50)
     assert clouds() == [item] and len(bpy.data.pointclouds) == 1 and len(item.data.materials) == 1
-    (tmp_path / "30.ply").write_bytes(b"half")  # a preview that cannot be read is left out
+    (tmp_path / "30.ply").write_bytes(b"half")  # an unreadable preview is skipped
     job.preview = {"iteration": 30, "splats": str(tmp_path / "30.ply")}
     preview(job, tmp_path, 40, 20)
     until(lambda: len(item.data.points) == 20)
     job.state = "done"
-    live.update()
-    assert not clouds() and not bpy.data.pointclouds and not live.is_watched(job)
+    live_splats.update()
+    assert not clouds() and not bpy.data.pointclouds and not live_splats.is_watched(job)
 
 
 def test_what_is_deleted_or_switched_off_stays_away(job, scene, tmp_path):
     preview(job, tmp_path, 10, 30)
-    live.watch(job, scene)
+    live_splats.watch(job, scene)
     until(lambda: len(clouds()[0].data.points) == 30)
-    live.watch(job, scene, False)
-    assert not clouds() and not live.is_watched(job)
-    live.watch(job, scene)
+    live_splats.watch(job, scene, False)
+    assert not clouds() and not live_splats.is_watched(job)
+    live_splats.watch(job, scene)
     bpy.data.objects.remove(clouds()[0])
-    live.update()
-    assert not live.is_watched(job)
-    live.watch(job, scene)
+    live_splats.update()
+    assert not live_splats.is_watched(job)
+    live_splats.watch(job, scene)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.context.scene.name = "another file"
-    live.update()
-    assert not live.is_watched(job) and not clouds()
+    live_splats.update()
+    assert not live_splats.is_watched(job) and not clouds()

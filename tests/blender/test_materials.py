@@ -1,4 +1,4 @@
-"""Materials to start from: those of the add-on and those of the artist, in one list of presets."""
+"""Material presets of the add-on and of the artist, in one list."""
 
 import bpy
 import pytest
@@ -6,15 +6,22 @@ import pytest
 from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit, edits
-from refgs_addon.scene.materials import INPUTS, materials, read_material, remove_material, save_material, set_material
-from refgs_addon.scene.run import import_run
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.material_presets import (
+    INPUTS,
+    materials,
+    read_material,
+    remove_material,
+    save_material,
+    set_material,
+)
 
 OURS = ["Brushed Steel", "Chrome", "Clay", "Copper", "Glazed Ceramic", "Gold", "Polished", "Rubber", "Silver"]
 
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """The artist's folder of presets, which is not there yet."""
+    """Path of the artist's presets, which does not exist yet."""
     (tmp_path / "scripts").mkdir()
     monkeypatch.setenv("BLENDER_USER_SCRIPTS", str(tmp_path / "scripts"))
     return tmp_path / "scripts" / "presets" / "refgs_material"
@@ -56,11 +63,11 @@ def test_one_is_saved_used_and_removed(edit, own):
 
 def test_what_cannot_be_is_said_and_leaves_all_as_it_was(edit, own):
     ours = read_material("Gold")
-    for name, said in (("gold", "gold already"), ("Brushed_Steel", "already"), (" ", "type one first")):
+    for name, said in (("gold", "gold exists already"), ("Brushed_Steel", "already"), (" ", "type one first")):
         with pytest.raises(InputError, match=said):
             save_material(edit, name)
     for name in ("Gold", "Nothing"):
-        with pytest.raises(InputError, match="stays"):
+        with pytest.raises(InputError, match="only those can be removed"):
             remove_material(name)
     assert read_material("Gold") == ours and not own.exists()
     own.mkdir(parents=True)
@@ -70,10 +77,10 @@ def test_what_cannot_be_is_said_and_leaves_all_as_it_was(edit, own):
         lambda: set_material(edit, "Broken"),
         lambda: add_edit(edit.id_data.users_collection[0], "Box", "Broken"),
     ):
-        with pytest.raises(InputError, match=r"Broken\.py cannot be read .*save it anew"):
+        with pytest.raises(InputError, match=r"Broken\.py cannot be read .*save it again"):
             call()
     assert len(edits(edit.id_data)) == count and values(edit)["Metallic"] == before
-    with pytest.raises(InputError, match="there is no material Marble: take one of Broken"):
+    with pytest.raises(InputError, match="there is no material Marble: choose one of Broken"):
         set_material(edit, "Marble")
 
 
@@ -97,7 +104,7 @@ def test_the_buttons(edit, own):
     try:
         (folder,) = bpy.utils.preset_paths("refgs_material")
         which = {"splats": edit.id_data.name, "edit": edit.name}
-        file = f"{folder}/Brushed_Steel.py"  # as Blender's list of presets says it
+        file = f"{folder}/Brushed_Steel.py"  # as Blender's list of presets passes it
         bpy.ops.refgs.set_material(**which, material=file)
         assert values(edit)["Roughness"] == pytest.approx(0.4)
         bpy.ops.refgs.keep_material(**which, name="Steel of mine")
@@ -106,7 +113,7 @@ def test_the_buttons(edit, own):
         with pytest.raises(RuntimeError, match="already"):
             bpy.ops.refgs.keep_material(**which, name="Steel of mine")
         bpy.ops.refgs.keep_material(name="Steel of mine", remove_name=True)
-        with pytest.raises(RuntimeError, match="stays"):
+        with pytest.raises(RuntimeError, match="only those can be removed"):
             bpy.ops.refgs.keep_material(name="Gold", remove_name=True)
         assert list(materials()) == OURS
     finally:

@@ -40,7 +40,7 @@ def test_its_material_has_its_pictures(imported):
     (material,) = found.data.materials
     shader = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
 
-    for name in ("Base Color", "Roughness", "Metallic"):  # Blender knows no `norm`
+    for name in ("Base Color", "Roughness", "Metallic"):  # Blender ignores `norm`
         image = shader.inputs[name].links[0].from_node.image
         assert image.filepath.endswith(f"{name.lower().replace(' ', '_')}.png") and tuple(image.size) == (64, 64)
 

@@ -1,11 +1,11 @@
-"""The preferences: the trainer is installed, stopped, gone on with, used and removed by buttons, with a uv that only speaks as one."""
+"""Install, stop, resume, use and remove the trainer with the preferences' buttons and a fake uv."""
 
 import sys
 
 import bpy
 import pytest
 
-from refgs_addon import environment, jobs, preferences, ui
+from refgs_addon import installation, jobs, preferences, ui
 from refgs_addon.errors import InputError
 from tests.makers.bring import bring
 from tests.makers.waiting import until
@@ -15,8 +15,8 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is 
 
 @pytest.fixture
 def online(scene, tmp_path, monkeypatch):
-    """The add-on, enabled, with a trainer to install, a folder of its own, and leave to use the network."""
-    monkeypatch.setattr(environment, "WHEELS", bring(tmp_path))
+    """Enable the add-on with a bundled trainer, a folder of its own, and online access."""
+    monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     monkeypatch.setattr(preferences, "_folder", lambda name: tmp_path / name)
     enabled = bpy.context.preferences.addons.new()
     enabled.module = preferences.PACKAGE
@@ -28,66 +28,70 @@ def online(scene, tmp_path, monkeypatch):
 
 
 def test_installed_used_and_removed(online):
-    assert "not set up" in preferences.state()[1] and not preferences.set_up()
+    assert "not set up" in preferences.status()[1] and not preferences.set_up()
     assert bpy.ops.refgs.install_trainer() == {"FINISHED"}
-    assert preferences.state() == ("SORTTIME", "The trainer is being installed")
+    assert preferences.status() == ("SORTTIME", "The trainer is being installed")
     assert not bpy.ops.refgs.install_trainer.poll()
     job = preferences.installing()
     until(lambda: job.ended)
-    assert preferences.state() == ("CHECKMARK", "RefGS 9.9, training on the processor: it is a fake")
-    assert preferences.set_up() and preferences.python() == environment.python(preferences.home())
+    assert preferences.status() == ("CHECKMARK", "RefGS 9.9, training on the processor: it is a fake")
+    assert preferences.set_up() and preferences.python() == installation.python(preferences.home())
     bpy.ops.refgs.ask_trainer()
-    until(lambda: preferences.asked()[0].ended)
-    assert preferences.state()[0] == "CHECKMARK"
+    until(lambda: preferences.own_jobs()[0].ended)
+    assert preferences.status()[0] == "CHECKMARK"
     assert bpy.ops.refgs.remove_trainer() == {"FINISHED"}
     until(lambda: not preferences.installing())
-    assert "not set up" in preferences.state()[1] and not preferences.home().exists()
+    assert "not set up" in preferences.status()[1] and not preferences.home().exists()
 
 
 def test_stopped_and_gone_on_with(online, monkeypatch):
     monkeypatch.setenv("FAKE_UV", "hang")
     bpy.ops.refgs.install_trainer()
     job = preferences.installing()
-    until(lambda: job.part > 0)
+    until(lambda: job.fraction > 0)
     bpy.ops.refgs.stop_installing()
     until(lambda: job.ended)
-    assert job.state == "cancelled" and environment.begun(preferences.home()) and "not set up" in preferences.state()[1]
+    assert (
+        job.state == "cancelled"
+        and installation.interrupted(preferences.home())
+        and "not set up" in preferences.status()[1]
+    )
     monkeypatch.setenv("FAKE_UV", "network")
     bpy.ops.refgs.install_trainer()
     until(lambda: not preferences.installing())
-    assert preferences.state()[0] == "ERROR" and "Wheels.example cannot be reached" in preferences.state()[1]
+    assert preferences.status()[0] == "ERROR" and "Wheels.example cannot be reached" in preferences.status()[1]
     monkeypatch.delenv("FAKE_UV")
     bpy.ops.refgs.install_trainer()
     until(lambda: not preferences.installing())
-    assert preferences.state()[0] == "CHECKMARK"
+    assert preferences.status()[0] == "CHECKMARK"
 
 
 def test_why_it_cannot_be_installed(online, python, monkeypatch, tmp_path):
-    assert bpy.ops.refgs.install_trainer.poll() and not preferences.why_no_installation()
+    assert bpy.ops.refgs.install_trainer.poll() and not preferences.installation_problem()
     bpy.context.preferences.system.use_online_access = False
-    assert not bpy.ops.refgs.install_trainer.poll() and "allow online access" in preferences.why_no_installation()
+    assert not bpy.ops.refgs.install_trainer.poll() and "allow online access" in preferences.installation_problem()
     bpy.context.preferences.system.use_online_access = True
     preferences.preferences().python = str(python)
-    assert not bpy.ops.refgs.install_trainer.poll() and "A Python is chosen" in preferences.why_no_installation()
+    assert not bpy.ops.refgs.install_trainer.poll() and "A Python is chosen" in preferences.installation_problem()
     preferences.preferences().python = ""
     (tmp_path / "photos").mkdir()
     jobs.train(python, tmp_path / "photos", tmp_path / "run", tmp_path / "log.txt")
-    assert not bpy.ops.refgs.install_trainer.poll() and "at work" in preferences.why_no_installation()
-    with pytest.raises(InputError, match="at work"):
+    assert not bpy.ops.refgs.install_trainer.poll() and "trainer is running" in preferences.installation_problem()
+    with pytest.raises(InputError, match="trainer is running"):
         preferences.remove()
     jobs.stop_all()
-    monkeypatch.setattr(environment, "free", lambda home: 1e9)
-    with pytest.raises(RuntimeError, match=r"too full \(it needs about"):
+    monkeypatch.setattr(installation, "free_bytes", lambda home: 1e9)
+    with pytest.raises(RuntimeError, match=r"too little space .*\(it needs about"):
         bpy.ops.refgs.install_trainer()
-    monkeypatch.setattr(environment, "WHEELS", tmp_path)
-    assert not bpy.ops.refgs.install_trainer.poll() and "brings no trainer" in preferences.why_no_installation()
+    monkeypatch.setattr(installation, "WHEELS", tmp_path)
+    assert not bpy.ops.refgs.install_trainer.poll() and "contains no trainer" in preferences.installation_problem()
 
 
 def test_taken_away_while_it_installs(online, monkeypatch):
     monkeypatch.setenv("FAKE_UV", "hang")
     bpy.ops.refgs.install_trainer()
     job = preferences.installing()
-    until(lambda: job.part > 0)
+    until(lambda: job.fraction > 0)
     ui.unregister()
-    assert job._process.wait(timeout=20) == 1 and not environment.installed(preferences.home())
+    assert job._process.wait(timeout=20) == 1 and not installation.installed(preferences.home())
     ui.register()

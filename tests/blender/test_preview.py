@@ -1,4 +1,4 @@
-"""Light and pictures: Eevee's pixels against the panorama's orientation and the camera's formula."""
+"""Compare Eevee's pixels with the panorama's orientation and the camera's formula."""
 
 import math
 
@@ -8,12 +8,12 @@ import pytest
 from mathutils import Matrix
 
 from refgs_addon.errors import InputError
-from refgs_addon.nodes.splats import NAME
-from refgs_addon.scene.cameras import add_camera
-from refgs_addon.scene.parts import show
-from refgs_addon.scene.preview import render_preview
-from refgs_addon.scene.relight import relight
-from refgs_addon.scene.run import import_run
+from refgs_addon.nodes.splats_tree import NAME
+from refgs_addon.scene.camera_objects import add_camera
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.render_eevee import render_preview
+from refgs_addon.scene.run_parts import show
+from refgs_addon.scene.world_light import relight
 from tests.makers.runs import COLUMNS, look_at, read_exr, write_panorama, write_ply
 
 SIZE = 64
@@ -21,17 +21,17 @@ SIZE = 64
 
 @pytest.fixture
 def scene(scene):
-    scene.eevee.use_shadows = False  # there are no lamps, and in software it is most of a frame's time
+    scene.eevee.use_shadows = False  # no lamps; shadows are most of a frame's time in software
     return scene
 
 
 def coloured_sky(direction):
-    """A linear radiance that tells every direction from every other."""
+    """Linear radiance that is different for every direction."""
     return 0.5 + 0.4 * np.asarray(direction)
 
 
 def sky_pixels(height=64):
-    """The sky as a panorama in Blender's orientation: u = 0.5 - atan2(y, x) / 2π, v = asin(z) / π + 0.5 from below."""
+    """Make the sky's panorama in Blender's orientation: u = 0.5 - atan2(y, x) / 2π, v = asin(z) / π + 0.5 from below."""
     u, v = np.meshgrid((np.arange(2 * height) + 0.5) / (2 * height), 1 - (np.arange(height) + 0.5) / height)
     azimuth, elevation = 2 * np.pi * (0.5 - u), np.pi * (v - 0.5)
     return coloured_sky(
@@ -45,7 +45,7 @@ def frame(matrix, name="view"):
 
 
 def one_mirror(folder, normal):
-    """A run of one large opaque mirror splat at the origin: white, metallic, almost smooth."""
+    """Write a run of one large opaque mirror splat at the origin: white, metallic, almost smooth."""
     folder.mkdir()
     z = np.asarray(normal, float)
     quaternion = np.array([1 + z[2], -z[1], z[0], 0]) / np.linalg.norm([1 + z[2], -z[1], z[0]])  # z to the normal
@@ -70,7 +70,7 @@ def test_a_mirror_splat_shows_the_sky_it_should(tmp_path, scene):
     mirrored = 2 * (normal @ toward) * normal - toward
     np.testing.assert_allclose(seen(), [*coloured_sky(mirrored), 1], atol=0.03)
 
-    # The light turned by 90° counter-clockwise, at twice the strength: look the direction up a quarter turn back.
+    # Rotated by 90° counter-clockwise, at twice the strength: the radiance comes from a quarter turn back.
     write_panorama(tmp_path / "hdri.exr", sky_pixels())
     relight(scene, tmp_path / "hdri.exr", rotation=math.pi / 2, strength=2.0)
     x, y, z = mirrored
@@ -124,7 +124,7 @@ def test_relight_leaves_the_artists_own_world_alone(scene, tmp_path):
 
 
 def snapshot(owner):
-    """Every plain property of a settings struct."""
+    """Read every plain property of a settings struct."""
     kinds = (bool, int, float, str)
     names = [p.identifier for p in owner.bl_rna.properties if not p.is_readonly]
     return {name: getattr(owner, name) for name in names if isinstance(getattr(owner, name), kinds)}

@@ -1,4 +1,4 @@
-"""The contact sheet: each picture is what a preview under that light is, and nothing of the scene changes."""
+"""Contact sheet: each picture equals a preview under its light, and the scene does not change."""
 
 import bpy
 import numpy as np
@@ -6,11 +6,11 @@ import pytest
 from PIL import Image
 
 from refgs_addon.errors import InputError
-from refgs_addon.nodes.world import IMAGE, ROTATION, STRENGTH
-from refgs_addon.scene.preview import render_preview
-from refgs_addon.scene.relight import relight
-from refgs_addon.scene.run import import_run
-from refgs_addon.scene.sheet import GAP, contact_sheet
+from refgs_addon.nodes.panorama_world import IMAGE, ROTATION, STRENGTH
+from refgs_addon.scene.contact_sheet import GAP, contact_sheet
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.render_eevee import render_preview
+from refgs_addon.scene.world_light import relight
 from tests.makers.runs import write_panorama
 
 
@@ -41,13 +41,13 @@ def test_a_view_under_each_light(run_folder, scene, tmp_path):
     relight(scene, tmp_path / "green.exr")
     render_preview(scene, tmp_path / "b.png", size=24, samples=4)
     alone = np.asarray(Image.open(tmp_path / "b.png")).astype(int)
-    np.testing.assert_allclose(shown["green"], alone, atol=12)  # samples are drawn by chance
+    np.testing.assert_allclose(shown["green"], alone, atol=12)  # samples are random
 
 
 def test_without_lights_or_a_place_to_write(run_folder, scene, tmp_path):
     (run_folder / "environment.exr").unlink()
     import_run(run_folder, scene)
-    with pytest.raises(InputError, match="no light to show"):
+    with pytest.raises(InputError, match="no light to render under"):
         contact_sheet(scene, tmp_path / "a.png", [])
     write_panorama(tmp_path / "grey.exr", np.ones((8, 16, 3)))
     with pytest.raises(InputError, match="cannot write"):

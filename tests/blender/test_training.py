@@ -1,4 +1,4 @@
-"""Training from Blender: the scene's settings, the buttons, and what a file remembers, with a trainer that only speaks as one."""
+"""Train from Blender with a fake worker: the scene's settings, the buttons, and the runs that a file lists."""
 
 import json
 import math
@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
-from refgs_addon import follow, jobs, preferences, ui
+from refgs_addon import job_timers, jobs, preferences, ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene import regions, training
-from refgs_addon.scene.cameras import photo_shown
-from refgs_addon.scene.capture import cameras_of
-from refgs_addon.scene.run import import_run
-from refgs_addon.scene.splats import read_rows
-from refgs_addon.ui import capture as capture_ui
-from refgs_addon.ui.closing import question
-from refgs_addon.ui.pictures import CURVE, DOTS, GRID, LINE, plot
-from refgs_addon.ui.training import how_far_elsewhere
+from refgs_addon.scene.camera_objects import photo_shown
+from refgs_addon.scene.capture_cameras import cameras_of
+from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.splat_cloud import read_rows
+from refgs_addon.ui import checked_capture
+from refgs_addon.ui.closing import quit_question
+from refgs_addon.ui.icons import CURVE, DOTS, GRID, LINE, plot
+from refgs_addon.ui.train_panel import other_process_status
 from tests.makers.waiting import until
 
 
 @pytest.fixture
 def addon(scene, python):
-    """The add-on, enabled, with the trainer chosen in its preferences."""
+    """Enable the add-on with the fake trainer chosen in its preferences."""
     enabled = bpy.context.preferences.addons.new()
     enabled.module = preferences.PACKAGE
     ui.register()
@@ -45,13 +45,13 @@ def capture(addon, tmp_path):
 
 
 def test_the_trainer_is_asked_when_it_is_chosen(addon):
-    assert preferences.state()[1] == "Asking …"
+    assert preferences.status()[1] == "Querying …"
     until(lambda: all(job.ended for job in jobs.JOBS))
-    assert preferences.state() == ("CHECKMARK", "RefGS 9.9, training on the processor: it is a fake")
+    assert preferences.status() == ("CHECKMARK", "RefGS 9.9, training on the processor: it is a fake")
     preferences.preferences().python = "/no/python"
-    assert preferences.state()[0] == "ERROR" and "cannot be started" in preferences.state()[1]
+    assert preferences.status()[0] == "ERROR" and "cannot be started" in preferences.status()[1]
     preferences.preferences().python = ""
-    assert "not set up" in preferences.state()[1]
+    assert "not set up" in preferences.status()[1]
     with pytest.raises(InputError, match="no trainer is set up"):
         preferences.python()
 
@@ -69,10 +69,10 @@ def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
     bpy.ops.refgs.tell(number=number, command="cancel")
     until(lambda: job.state == "cancelled")
     asked = json.loads((out / "started").read_text())
-    assert asked["minutes"] == 3.0 and asked["preset"] is None  # all is chosen for the time
+    assert asked["minutes"] == 3.0 and asked["preset"] is None  # the minutes choose everything
     bpy.ops.refgs.put_away(number=number)
     assert job not in jobs.JOBS
-    # Saved and opened again, the file knows of the run; it is gone on with.
+    # Saved and opened again, the file lists the run, which is resumed.
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "a.blend"))
     addon.refgs.runs.clear()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "a.blend"))
@@ -81,7 +81,7 @@ def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
     bpy.ops.refgs.resume(folder=str(out))
     until(lambda: jobs.JOBS[-1].ended)
     assert jobs.run_state(out) == "finished"
-    with pytest.raises(InputError, match="no training that was stopped"):
+    with pytest.raises(InputError, match="no stopped training"):
         training.resume(scene, out)
     training.forget(scene, out)
     assert not scene.refgs.runs and out.is_dir()
@@ -128,7 +128,7 @@ def test_a_capture_that_is_not_there(addon):
 
 @pytest.fixture
 def checked(addon, capture):
-    """A capture that was checked, and the number of the job."""
+    """Check a capture; return the job and its number."""
     job = training.check(addon)
     until(lambda: job.ended)
     for number in range(2):
@@ -137,7 +137,7 @@ def checked(addon, capture):
 
 
 def test_the_curve_in_the_panel():
-    """PSNR that grows as time's logarithm is a straight line, the views held out are dots on it; more of either is drawn as it comes."""
+    """PSNR that is linear in log time is a straight line, and held-out views are dots on it."""
     height, width = CURVE[1], CURVE[0]
     seconds = np.geomspace(0.5, 200, 60)
     trained = [(s, 20 + 5 * np.log10(s)) for s in seconds]
@@ -157,7 +157,7 @@ def test_the_curve_in_the_panel():
 
 
 class Drawn:
-    """Stands for a layout: notes the icons that are drawn in it, and whether its buttons are pressed."""
+    """Fake layout that records drawn icons and pressed buttons."""
 
     def __init__(self):
         self.pictures, self.icons, self.pressed = [], [], []
@@ -180,8 +180,8 @@ class Drawn:
 def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
     job, number = checked
     drawn = Drawn()
-    monkeypatch.setattr(capture_ui, "thumbnail", drawn.thumbnail)  # without a window Blender gives no icons
-    capture_ui.draw_capture(drawn, addon, number, job)
+    monkeypatch.setattr(checked_capture, "thumbnail", drawn.thumbnail)  # Blender has no icons without a window
+    checked_capture.draw_capture(drawn, addon, number, job)
     assert drawn.icons == [1, 2] and drawn.pressed == [False]
     assert drawn.pictures == [("0000.png", job.serial), ("0001.png", job.serial)]
     assert bpy.ops.refgs.show_cameras(number=number) == {"FINISHED"}
@@ -192,7 +192,7 @@ def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
     assert bpy.ops.refgs.next_camera() == {"FINISHED"}
     assert addon.camera == cameras.objects[1] and photo_shown(addon.camera) == 1
     assert addon.camera.data.background_images[0].image.filepath == str(capture / "1.png")
-    capture_ui.draw_capture(drawn, addon, number, job)
+    checked_capture.draw_capture(drawn, addon, number, job)
     assert drawn.pressed == [False, True]
     bpy.ops.refgs.show_cameras(number=number)
     assert cameras_of(addon, capture) is None and not bpy.data.cameras and addon.camera is None
@@ -200,7 +200,7 @@ def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
 
 
 def test_a_run_brings_its_own_cameras(addon, checked, capture, run_folder):
-    """Those of the capture go; what was looked through stays."""
+    """Cameras of the run replace the capture's; the scene's camera stays on the same photo."""
     _, number = checked
     file = run_folder / "cameras.json"
     content = json.loads(file.read_text())
@@ -249,7 +249,7 @@ def test_display_splats_are_made_by_the_trainer(addon, run_folder, tmp_path):
     until(lambda: job.ended)
     assert job.state == "done" and job.results["export"]["display_splats"] == str(tmp_path / "a.ply")
     assert job.progress["stage"] == "colours" and (tmp_path / "a.ply").read_text() == str(run_folder)
-    # The edits are in what the trainer is given, and the run is as it was.
+    # The trainer gets the edits, and the run does not change.
     before = (run_folder / "splats.ply").read_bytes()
     bpy.ops.refgs.add_edit(where="Everywhere", material="Rubber")
     bpy.ops.refgs.export_display_splats(filepath=str(tmp_path / "a.ply"))
@@ -258,7 +258,7 @@ def test_display_splats_are_made_by_the_trainer(addon, run_folder, tmp_path):
     assert given != run_folder and (given / "cameras.json").is_file()
     assert read_rows(given / "splats.ply")["roughness"] == pytest.approx(0.9)
     assert (run_folder / "splats.ply").read_bytes() == before
-    with pytest.raises(RuntimeError, match="its folder is not there"):
+    with pytest.raises(RuntimeError, match="its folder does not exist"):
         bpy.ops.refgs.export_display_splats(filepath=str(tmp_path / "not there" / "a.ply"))
     preferences.preferences().python = ""
     assert not bpy.ops.refgs.export_display_splats.poll()
@@ -267,7 +267,7 @@ def test_display_splats_are_made_by_the_trainer(addon, run_folder, tmp_path):
 
 
 def test_taken_away_while_it_trains(addon, capture):
-    """Disabling the add-on ends what it started."""
+    """Disabling the add-on ends its jobs."""
     training.train(addon)
     job = jobs.JOBS[-1]
     until(lambda: job.progress)
@@ -277,7 +277,7 @@ def test_taken_away_while_it_trains(addon, capture):
 
 
 def told(out):
-    """The settings that the trainer was told, by their names."""
+    """Read the settings that the trainer got, by name."""
     until(lambda: (out / "started").is_file() and (out / "started").read_text())
     words = dict(word.split("=", 1) for word in json.loads((out / "started").read_text())["settings"])
     return {key: value if value.isalpha() else json.loads(value) for key, value in words.items()}
@@ -304,7 +304,7 @@ def test_a_box_is_the_region_and_its_up_the_results(addon, capture):
         np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]]),
         np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]]),
     ]
-    np.testing.assert_allclose(np.abs(about[2] @ about[1] @ about[0]), matrix, atol=1e-6)  # axes, either way round
+    np.testing.assert_allclose(np.abs(about[2] @ about[1] @ about[0]), matrix, atol=1e-6)  # axes, up to their signs
     assert words["region.up"] == pytest.approx([1, 0, 0], abs=1e-6)
 
     box.scale.x = 0
@@ -348,7 +348,7 @@ def test_a_box_of_another_capture_stays(addon, capture, run_folder):
 def test_a_box_that_is_deleted_or_cleared_is_no_region(addon, capture):
     bpy.ops.refgs.add_training_region()
     box = addon.refgs.region
-    bpy.ops.object.delete()  # the settings still know of it
+    bpy.ops.object.delete()  # the settings still refer to it
     assert regions.training_region(addon) is None and regions.region_settings(addon) == {}
     bpy.ops.refgs.add_training_region()
     assert addon.refgs.region != box and regions.region_settings(addon)
@@ -368,7 +368,7 @@ def test_closing_asks_only_while_something_trains(addon, capture):
     assert not bpy.ops.refgs.quit.poll()
     first, second = training.train(addon), training.train(addon)
     until(lambda: first.progress)
-    assert bpy.ops.refgs.quit.poll() and question() == "2 trainings are running or waiting"
+    assert bpy.ops.refgs.quit.poll() and quit_question() == "2 trainings are running or waiting"
     bpy.ops.refgs.keep(number=jobs.JOBS.index(first))
     assert first.kept and not second.kept
     bpy.ops.refgs.keep(number=jobs.JOBS.index(first))
@@ -376,8 +376,8 @@ def test_closing_asks_only_while_something_trains(addon, capture):
     jobs.keep_all(True)
     assert first.kept and second.kept
     second.stop()
-    assert question() == "A training is running"
-    # As when Blender closes, which takes its add-ons away: what is kept goes on.
+    assert quit_question() == "A training is running"
+    # Blender disables its add-ons when it closes: kept jobs continue.
     ui.unregister()
     assert not jobs.JOBS and first._process.wait(timeout=20) == 0
     assert jobs.run_state(first.run) == "finished" and not second.run.exists()
@@ -392,16 +392,16 @@ def test_a_run_that_another_process_trains(addon, capture, tmp_path):
     run = job.run
     jobs.JOBS.clear()
     with FileLock(run / "run.lock"):
-        assert jobs.run_state(run) == "training" and follow._look_elsewhere() == follow.ELSEWHERE
+        assert jobs.run_state(run) == "training" and job_timers._poll_other_processes() == job_timers.OTHER_SECONDS
         (run / "progress.json").write_text('{"iteration": 250, "total": 1000, "seconds_left": 190.0}')
-        assert how_far_elsewhere(run) == (0.25, "25%, 3:10 left")
+        assert other_process_status(run) == (0.25, "25%, 3:10 left")
         with pytest.raises(InputError, match="is being trained already"):
             training.resume(addon, run)
         bpy.ops.refgs.stop_run(folder=str(run))
-        assert (run / "stop").exists() and how_far_elsewhere(run)[1] == "Stopping"
+        assert (run / "stop").exists() and other_process_status(run)[1] == "Stopping"
         (run / "progress.json").unlink()
         (run / "splats.ply").touch()
-        assert how_far_elsewhere(run)[1] == "Making the mesh"
-    assert jobs.run_state(run) == "finished" and follow._look_elsewhere() is None
+        assert other_process_status(run)[1] == "Making the mesh"
+    assert jobs.run_state(run) == "finished" and job_timers._poll_other_processes() is None
     with pytest.raises(RuntimeError, match="is not being trained"):
         bpy.ops.refgs.stop_run(folder=str(run))

@@ -1,4 +1,4 @@
-"""A run on a turntable: one turn, and nothing moves that should not."""
+"""Turntable: the run rotates once, and nothing else moves."""
 
 import math
 
@@ -8,7 +8,7 @@ import pytest
 
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
-from refgs_addon.scene.run import import_run
+from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.turntable import add_turntable
 
 
@@ -36,7 +36,7 @@ def test_one_turn_about_the_upright(run_folder, scene):
     np.testing.assert_allclose(angles[:4], [0, math.pi / 2, math.pi, 3 * math.pi / 2], atol=1e-4)
     scene.frame_set(13)
     place = matrix(table)[:3, 3]
-    run.mesh[0].hide_viewport = False  # what is hidden does not move until it is seen
+    run.mesh[0].hide_viewport = False  # hidden objects are not evaluated
     bpy.context.view_layer.update()
     for item, was in zip(items, before, strict=True):
         expected = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ (was[:3, 3] - place) + place

@@ -11,8 +11,8 @@ from refgs.capture import read_capture
 from refgs.compare.metrics import psnr
 from refgs.errors import InputError
 from refgs.export.display import displayed
+from refgs.export.export_job import export
 from refgs.formats.splats import THIN, Splats, read_splats, write_display_splats, write_splats
-from refgs.jobs import export
 from refgs.model.surfels import from_splats
 from refgs.render.renderer import render
 from refgs.run import open_run

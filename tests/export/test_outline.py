@@ -6,7 +6,7 @@ import torch
 import trimesh
 
 from refgs.camera import Camera
-from refgs.export.outline import bring_out
+from refgs.export.outline import fit_to_outlines
 from refgs.formats.mesh import Mesh
 from refgs.geometry.mesh import smooth_normals
 from refgs.render.renderer import Rendering
@@ -44,7 +44,7 @@ def ball(radius):
 
 @pytest.mark.parametrize("radius", [0.965, 0.99, 1.0])
 def test_a_mesh_grows_to_its_outlines(radius):
-    grown = bring_out(ball(radius), unit_sphere, cameras(), VOXEL)
+    grown = fit_to_outlines(ball(radius), unit_sphere, cameras(), VOXEL)
     reached = np.linalg.norm(grown.vertices, axis=1)
     assert abs(reached.mean() - 1) < 0.1 * VOXEL and reached.std() < 0.1 * VOXEL
     np.testing.assert_allclose(grown.normals, grown.vertices / reached[:, None], atol=0.04)
@@ -54,7 +54,7 @@ def test_what_sticks_out_is_pulled_in():
     mesh = ball(0.98)
     bump = mesh.vertices[:, 2] > 0.9
     mesh.vertices[bump] *= 1.05
-    grown = bring_out(mesh, unit_sphere, cameras(24), VOXEL)
+    grown = fit_to_outlines(mesh, unit_sphere, cameras(24), VOXEL)
     reached = np.linalg.norm(grown.vertices, axis=1)
     assert abs(reached[~bump].mean() - 1) < 0.15 * VOXEL
     assert reached[bump].mean() < 1 + VOXEL  # it would be 2.5 voxels out if it moved as far as the rest
@@ -70,5 +70,5 @@ def test_without_a_background_nothing_moves():
         return Rendering(None, alpha, None, None)
 
     mesh = ball(0.9)
-    assert bring_out(mesh, full, cameras(3), VOXEL) is mesh
-    assert bring_out(mesh, with_a_gap, cameras(3), VOXEL) is mesh
+    assert fit_to_outlines(mesh, full, cameras(3), VOXEL) is mesh
+    assert fit_to_outlines(mesh, with_a_gap, cameras(3), VOXEL) is mesh

@@ -4,7 +4,7 @@ import pytest
 
 from refgs.errors import InputError
 from refgs.formats.exr import read_exr, write_exr
-from refgs.formats.panorama import read_environment, write_environment
+from refgs.formats.panorama import read_environment
 
 RNG = np.random.default_rng(5)
 
@@ -19,7 +19,7 @@ def test_round_trip(tmp_path, shape):
 
 
 def test_the_file_says_what_it_is(tmp_path):
-    write_environment(tmp_path / "e.exr", np.ones((4, 8, 3), np.float32))
+    write_exr(tmp_path / "e.exr", np.ones((4, 8, 3), np.float32))
     with OpenEXR.File(str(tmp_path / "e.exr")) as file:
         header = file.header()
         assert list(file.channels()) == ["RGB"]

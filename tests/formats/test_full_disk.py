@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from refgs.errors import InputError
+from refgs.export.export_job import export
+from refgs.formats.exr import write_exr
 from refgs.formats.gltf import write_glb
-from refgs.formats.panorama import write_environment
 from refgs.formats.splats import write_display_splats, write_splats
 from refgs.formats.textures import Textures
-from refgs.jobs import export
 from tests.makers.box import textured_box
 from tests.makers.disk import fill
 from tests.makers.splats import make
@@ -31,7 +31,7 @@ def noisy_box(path, side):
 WRITERS = {  # `size` is in thousands of bytes, at least
     "splats.ply": lambda path, size: write_splats(path, make(10 * size)),
     "display.ply": lambda path, size: write_display_splats(path, make(10 * size)),
-    "environment.exr": lambda path, size: write_environment(path, RNG.random((2 * size, 4 * size, 3))),
+    "environment.exr": lambda path, size: write_exr(path, RNG.random((2 * size, 4 * size, 3))),
     "mesh.glb": lambda path, size: noisy_box(path, 4 * size),
 }
 

@@ -2,8 +2,8 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from refgs.formats.exr import read_exr
-from refgs.formats.panorama import directions, read_environment, sample, write_environment
+from refgs.formats.exr import read_exr, write_exr
+from refgs.formats.panorama import directions, read_environment, sample
 
 RNG = np.random.default_rng(5)
 
@@ -79,7 +79,7 @@ def seen(tmp_path):
 
     def look(panorama, direction, degrees):
         if texture.image is None:
-            write_environment(tmp_path / "une lumière.exr", panorama)
+            write_exr(tmp_path / "une lumière.exr", panorama)
             texture.image = bpy.data.images.load(str(tmp_path / "une lumière.exr"))
             assert texture.image.colorspace_settings.name == "Linear Rec.709"
         camera.data.angle = np.radians(degrees)

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from refgs.color import srgb_decode
 from refgs.errors import InputError, InputWarning
+from refgs.export.export_job import export
 from refgs.formats.ply import read_ply
 from refgs.formats.splats import read_splats, write_display_splats, write_splats
-from refgs.jobs import export
 from tests.makers.splats import arrays, make
 
 COUNT = 50
@@ -160,7 +160,7 @@ def test_rows_that_are_not_finite_are_left_out(tmp_path):
         assert len(read_splats(tmp_path / "b.ply")) == len(kept)
 
 
-def in_head(old, new):
+def in_header(old, new):
     return lambda data: data.replace(old, new, 1)
 
 
@@ -168,31 +168,31 @@ def in_head(old, new):
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda data: data[:-300], "cut short|not a whole PLY"),
-        (lambda data: data[:60], "its head is broken"),
+        (lambda data: data[:-300], "truncated|not a whole PLY"),
+        (lambda data: data[:60], "its header is broken"),
         (lambda data: b"", "not a PLY file"),
         (lambda data: b"not a ply file", "not a PLY file"),
         (lambda data: b"\xff\xfe\x00" * 50, "not a PLY file"),
-        (in_head(b"vertex 50", b"vertex 49"), "more rows than its head says"),
-        (in_head(b"vertex 50", b"vertex 51"), "cut short|not a whole PLY"),
-        (in_head(b"vertex 50", b"vertex 999999999999999999999"), "cut short"),
-        (in_head(b"vertex 50", b"vertex -50"), "broken line in its head, “element vertex -50”"),
-        (in_head(b"vertex 50", b"vertex"), "broken line in its head"),
-        (in_head(b"element vertex", b"element vertices"), "no element vertex"),
-        (in_head(b"float x", b"floaty x"), "unknown type, floaty"),
-        (in_head(b"property float x\n", b"property list uchar strange x\n"), "unknown type, strange"),
-        (in_head(b"property float x\n", b"property list x\n"), "unknown type, list"),
-        (in_head(b"property float x\n", b"property list uchar x\n"), "broken line in its head"),
-        (in_head(b"property float x\n", b"property float y\n"), "two properties with same name"),
-        (in_head(b"property float x\n", b"\n"), "lacks x|more rows|not a whole PLY"),
-        (in_head(b"property float x\n", b"comment \xe9t\xe9\nproperty float x\n"), "not plain ASCII"),
-        (in_head(b" 1.0\n", b" 3.0\n"), "not a whole PLY"),
-        (in_head(b"format ", b"shape "), "format|PLY"),
-        (in_head(b"end_header", b"element empty 999999999\nend_header"), "element without properties"),
-        (in_head(b"property float f_rest_44\n", b"property float f_rest_45\n"), "45 f_rest_ values"),
-        (in_head(b"property float f_dc_0\n", b"property float packed_position\n"), "compressed PLY"),
-        (in_head(b"property float opacity\n", b"property float opacities\n"), "lacks opacity"),
-        (in_head(b"property float opacity\n", b"property float metallic\n"), "lacks opacity, albedo_r"),
+        (in_header(b"vertex 50", b"vertex 49"), "more rows than its header says"),
+        (in_header(b"vertex 50", b"vertex 51"), "truncated|not a whole PLY"),
+        (in_header(b"vertex 50", b"vertex 999999999999999999999"), "truncated"),
+        (in_header(b"vertex 50", b"vertex -50"), "broken line in its header, “element vertex -50”"),
+        (in_header(b"vertex 50", b"vertex"), "broken line in its header"),
+        (in_header(b"element vertex", b"element vertices"), "no element vertex"),
+        (in_header(b"float x", b"floaty x"), "unknown type, floaty"),
+        (in_header(b"property float x\n", b"property list uchar strange x\n"), "unknown type, strange"),
+        (in_header(b"property float x\n", b"property list x\n"), "unknown type, list"),
+        (in_header(b"property float x\n", b"property list uchar x\n"), "broken line in its header"),
+        (in_header(b"property float x\n", b"property float y\n"), "two properties with same name"),
+        (in_header(b"property float x\n", b"\n"), "lacks x|more rows|not a whole PLY"),
+        (in_header(b"property float x\n", b"comment \xe9t\xe9\nproperty float x\n"), "not plain ASCII"),
+        (in_header(b" 1.0\n", b" 3.0\n"), "not a whole PLY"),
+        (in_header(b"format ", b"shape "), "format|PLY"),
+        (in_header(b"end_header", b"element empty 999999999\nend_header"), "element without properties"),
+        (in_header(b"property float f_rest_44\n", b"property float f_rest_45\n"), "45 f_rest_ values"),
+        (in_header(b"property float f_dc_0\n", b"property float packed_position\n"), "compressed PLY"),
+        (in_header(b"property float opacity\n", b"property float opacities\n"), "lacks opacity"),
+        (in_header(b"property float opacity\n", b"property float metallic\n"), "lacks opacity, albedo_r"),
     ],
 )
 def test_broken_files_are_named(tmp_path, text, spoil, says):
@@ -225,12 +225,12 @@ def test_no_damage_is_a_fault_of_ours(tmp_path, format):
     face = PlyElement.describe(np.array([([0, 1, 2],)], [("vertex_indices", "O")]), "face")
     path = save(tmp_path / "a.ply", rows, face, text=format == "text", byte_order="<" if format == "text" else format)
     whole = path.read_bytes()
-    head = whole.index(b"end_header") + 12
+    header = whole.index(b"end_header") + 12
     refused = 0
     for _ in range(400):
         data = bytearray(whole)
         for _ in range(rng.integers(1, 4)):
-            at = int(rng.integers(head if rng.random() < 0.7 else len(data)))
+            at = int(rng.integers(header if rng.random() < 0.7 else len(data)))
             match rng.integers(4):
                 case 0:
                     data[at : at + 1] = bytes(rng.integers(256, size=1, dtype=np.uint8))
@@ -258,7 +258,7 @@ def test_a_giant_count_reserves_nothing(tmp_path):
     path = save(tmp_path / "a.ply", table(LAYOUTS["3DGS"]), text=True)
     path.write_bytes(path.read_bytes().replace(b"vertex 50", b"vertex 4000000000"))
     tracemalloc.start()
-    with pytest.raises(InputError, match="cut short"):
+    with pytest.raises(InputError, match="truncated"):
         read_ply(path)
     assert tracemalloc.get_traced_memory()[1] < 2e6
     tracemalloc.stop()

@@ -15,7 +15,7 @@ def test_round_trip(tmp_path, count, coefficients, indirect):
     write_splats(path, splats)
     again = read_splats(path)
     assert list(tmp_path.iterdir()) == [path]
-    assert again.beside == ()
+    assert again.others == ()
     for name, value in arrays(splats).items():
         read = getattr(again, name)
         assert read.dtype == np.float32 and read.shape == value.shape

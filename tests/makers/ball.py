@@ -6,7 +6,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scenes.analytic import sky
-from refgs.formats.panorama import directions, write_environment
+from refgs.formats.exr import write_exr
+from refgs.formats.panorama import directions
 from refgs.formats.splats import write_splats
 from refgs.model.surfels import activate, initial_parameters, to_splats
 from refgs.run import create_run
@@ -28,7 +29,7 @@ def write_run(folder, capture):
     roughness = torch.where(torch.from_numpy(z) > 0, 0.6, 0.2).float()
     splats = to_splats(surfels._replace(roughness=roughness, indirect_dc=surfels.indirect_dc[:, :0]))
     write_splats(folder / "splats.ply", splats)
-    write_environment(folder / "environment.exr", sky(directions(64, 128)))
+    write_exr(folder / "environment.exr", sky(directions(64, 128)))
     box = BOX.copy()
     box.vertices = box.vertices[:, [0, 2, 1]] * [1, 1, -1]  # glTF's axes: Y up
     box.export(folder / "mesh.glb")

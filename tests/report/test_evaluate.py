@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.scenes.analytic import sky
-from refgs import commands, jobs
+from refgs import commands
 from refgs.capture import read_capture
 from refgs.color import srgb_encode
 from refgs.compare import surface
@@ -16,9 +16,10 @@ from refgs.compare.pictures import maps
 from refgs.compare.truth import GroundTruth
 from refgs.errors import InputError
 from refgs.formats.exr import write_exr
-from refgs.formats.panorama import directions, write_environment
+from refgs.formats.panorama import directions
 from refgs.model.environment import Environment
 from refgs.run import open_run
+from refgs.run_folder import update_metrics
 from tests.makers.ball import BOX, MOVE, SCALE, TURN, write_run
 
 
@@ -37,7 +38,7 @@ def write_truth(folder, run, views):
     lights = {"light": sky, "relight/dusk": dusk}
     for name, light in lights.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        write_environment(folder / f"{name}.exr", turned(light, TURN))
+        write_exr(folder / f"{name}.exr", turned(light, TURN))
     box = BOX.copy()
     box.vertices = SCALE * box.vertices @ TURN.T + MOVE
     box.export(folder / "mesh.ply")
@@ -73,7 +74,7 @@ def figures(run):
 
 def test_a_run_that_is_the_truth_has_no_error_in_whatever_frame(made, capsys):
     run, truth, views = made
-    jobs.update_metrics(run, {"relight": {"dusk": {"mesh": {"psnr_raw": 20.0}}}, "psnr": 1.0})
+    update_metrics(run, {"relight": {"dusk": {"mesh": {"psnr_raw": 20.0}}}, "psnr": 1.0})
     commands.evaluate(run, "test", truth)
     found = figures(run)
     assert found["views"] == len(views) == 4 and found["splats"] == 3000 and found["frames_per_second"] > 0
@@ -122,7 +123,7 @@ def test_known_errors_are_found(made, tmp_path):
         write_exr(truth / "normal" / name, np.cos(0.2) * normal + np.sin(0.2) * np.cross(axis, normal))
         image = maps(there.render(view.camera, Environment.from_panorama(dusk(directions(64, 128)), 16)))["color"]
         write_exr(truth / "relight" / "dusk" / name, image * np.float32([0.5, 0.5, 0.5, 1]))
-    write_environment(truth / "light.exr", 2 * turned(sky, TURN @ tilt))
+    write_exr(truth / "light.exr", 2 * turned(sky, TURN @ tilt))
     commands.evaluate(run, "test", truth)
     found = figures(run)
     assert found["albedo"]["psnr_aligned"] > 90 and found["albedo"]["scale"] == pytest.approx([0.5, 0.8, 1], abs=1e-4)

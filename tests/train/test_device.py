@@ -5,7 +5,7 @@ import warnings
 import pytest
 import torch
 
-from refgs import jobs
+from refgs import train_job
 from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.kernels import cuda
@@ -16,7 +16,7 @@ from refgs.train.trainer import Trainer
 def chosen(device: str) -> tuple[str, list[str]]:
     """Choose a device; return it and the warnings."""
     said = []
-    return jobs.choose_device(device, lambda event, facts: said.append(facts["what"])), said
+    return train_job.choose_device(device, lambda event, facts: said.append(facts["what"])), said
 
 
 def card(monkeypatch, capability: tuple[int, int], driver: str | None = None) -> None:

@@ -2,15 +2,16 @@
 
 import pytest
 
-from refgs import jobs
+from refgs import train_job
 from refgs.errors import InputError
+from refgs.export.export_job import export
 from tests.makers.disk import fill
 
 SMALL = ["surfels.start=500", "surfels.budget=500", "surfels.hull=48", "environment.resolution=16"]
 
 
 def train(capture, run, attend, *changes, resume=False):
-    return jobs.train(capture, run, "quick", "cpu", None, [*changes], resume, lambda event, facts: None, attend)
+    return train_job.train(capture, run, "quick", "cpu", None, [*changes], resume, lambda event, facts: None, attend)
 
 
 def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
@@ -57,12 +58,12 @@ def test_a_mesh_that_cannot_be_written(ball_capture, small_disk):
     run = small_disk / "run"
     words = ["train.iterations=60", "mesh.resolution=32", "mesh.triangles=500"]
     train(ball_capture, run, lambda trainer: False, *SMALL, *words)
-    export = [run, None, 64, None, None, True, lambda event, facts: None]
-    jobs.export(*export)
+    given = [run, None, 64, None, None, True, lambda event, facts: None]
+    export(*given)
     before = {file: file.read_bytes() for file in [run / "mesh.glb", *(run / "textures").iterdir()]}
     with pytest.raises(InputError, match=r"name that ends so"):
-        jobs.export(run, run / "mesh.stl", *export[2:])
+        export(run, run / "mesh.stl", *given[2:])
     fill(small_disk / "filler")
     with pytest.raises(InputError, match=r"No space left on device\): mend that, then export again"):
-        jobs.export(*export)
+        export(*given)
     assert before == {file: file.read_bytes() for file in [run / "mesh.glb", *(run / "textures").iterdir()]}

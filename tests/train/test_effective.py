@@ -2,7 +2,7 @@
 
 import tomllib
 
-from refgs import jobs
+from refgs import train_job
 from refgs.capture import read_capture
 from refgs.run import create_run, open_run, record_changes
 from refgs.run_folder import read_run_facts
@@ -46,7 +46,7 @@ def test_a_plan_changes_each_number_that_differs():
 def test_a_run_says_what_changed_its_settings(ball_capture, tmp_path):
     """The photos at the start, the needs when they are decided; a resumed run keeps what the first process recorded."""
     out, words = tmp_path / "run", [*SMALL, "train.iterations=40", "needs.specular=off"]
-    jobs.train(
+    train_job.train(
         ball_capture, out, "quick", "cpu", None, words, False, lambda *_: None, lambda state: state.iteration == 30
     )
     rows, settings = changed(out), read_run_facts(out)[1]
@@ -55,7 +55,7 @@ def test_a_run_says_what_changed_its_settings(ball_capture, tmp_path):
     assert rows["render.reflection"]["asked"] == "microfacet" and rows["render.reflection"]["by"] == "needs"
     assert (rows["train.iterations"]["asked"], rows["train.iterations"]["became"]) == (40, 32)
     assert "environment.resolution" not in rows
-    jobs.train(ball_capture, out, None, "cpu", None, [], True, lambda *_: None, lambda _: False)
+    train_job.train(ball_capture, out, None, "cpu", None, [], True, lambda *_: None, lambda _: False)
     ended = changed(out)
     assert {key: ended[key] for key in rows} == rows and read_run_facts(out)[1] == settings
     assert open_run(out).splats is not None

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from refgs import jobs
+from refgs import train_job
 from refgs.capture import read_capture
 from refgs.settings import load_settings
 from refgs.train.fit import FASTEST, REHEARSED, between, fitting
@@ -59,7 +59,7 @@ def test_a_training_with_nothing_but_a_time_is_planned(ball_capture, tmp_path):
     said = []
     report = lambda event, facts: said.append(facts.get("what", ""))  # noqa: E731
     out, few = tmp_path / "run", ["surfels.hull=32", "surfels.start=800", "surfels.budget=1000"]
-    made, _ = jobs.train(ball_capture, out, None, "cpu", 0.15, few, False, report, lambda _: False)
+    made, _ = train_job.train(ball_capture, out, None, "cpu", 0.15, few, False, report, lambda _: False)
     assert made.ended and sum(line.startswith("planned for 0.15 minutes") for line in said) == 1
     facts = tomllib.loads((out / "run.toml").read_text(encoding="utf-8"))
     assert facts["run"]["preset"] == "0.15 minutes"

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.scenes.analytic import F0, ONE, meet, sky
 from refgs.capture import read_capture
 from refgs.formats.exr import write_exr
-from refgs.formats.panorama import directions, write_environment
+from refgs.formats.panorama import directions
 from refgs.run import create_run
 from refgs.settings import load_settings
 from refgs.train import history
@@ -165,8 +165,8 @@ def write_truth(capture):
     truth = capture / "ground_truth"
     for name in ("alpha", "normal", "albedo", "roughness", "metallic", "relight/dusk"):
         (truth / name).mkdir(parents=True)
-    write_environment(truth / "light.exr", sky(directions(64, 128)))
-    write_environment(truth / "relight" / "dusk.exr", dusk(directions(64, 128)))
+    write_exr(truth / "light.exr", sky(directions(64, 128)))
+    write_exr(truth / "relight" / "dusk.exr", dusk(directions(64, 128)))
     for view in read_capture(capture).test_views:
         camera, name = view.camera, f"{view.camera.name}.exr"
         size = camera.height, camera.width

@@ -43,11 +43,11 @@ def trained(tmp_path_factory):
 
 def test_pictures_gain_where_the_balls_mirror_each_other(trained):
     with_it, without, _ = trained
-    assert with_it.test_psnr() > without.test_psnr()
+    assert held_out_psnr(with_it.state) > held_out_psnr(without.state)
     errors = [[], []]
-    for view in with_it.test:
-        hidden = with_it.render(view.camera).visibility < 0.5
-        photo = composite(view, with_it.background)
+    for view in with_it.state.test:
+        hidden = with_it.state.render(view.camera).visibility < 0.5
+        photo = composite(view, with_it.state.background)
         for run, error in zip((with_it, without), errors, strict=True):
             error.append((run.state.render(view.camera).color - photo)[hidden].square())
     one, other = (float(torch.cat(error).mean()) for error in errors)
@@ -85,13 +85,13 @@ def test_the_run_folder_has_it_all(trained):
     """The files render as the training did, and nearly so where the run's own light is passed as another light."""
     made = trained[0]
     run, view = open_run(made.state.folder), made.state.test[0]
-    shown, asset = made.state.render(view.camera), run.state.render(view.camera)
+    shown, asset = made.state.render(view.camera), run.render(view.camera)
     assert float((shown.color - asset.color).abs().mean()) < 2e-3
     assert run.splats.indirect.shape[1:] == (16, 3) and np.abs(run.splats.indirect).max() > 0
-    relit = run.state.render(view.camera, run.state.environment)
+    relit = run.render(view.camera, run.environment)
     torch.testing.assert_close(relit.visibility, asset.visibility)
     free = asset.visibility > 0.5
     assert float((relit.color - asset.color)[free].abs().mean()) < 5e-3
     assert float((relit.color - asset.color)[~free].abs().mean()) < 0.1
-    assert run.relit(run.state.environment) is run.relit(run.state.environment)
-    assert open_run(trained[1].folder).occluder is None
+    assert run.relit(run.environment) is run.relit(run.environment)
+    assert open_run(trained[1].state.folder).occluder is None

@@ -8,14 +8,14 @@ import torch
 from PIL import Image
 
 from benchmarks.scenes.analytic import TWO, camera_matrix, photo, write_ball_capture
-from refgs import commands, jobs
+from refgs import commands, train_job
 from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.formats.gltf import read_glb
 from refgs.formats.splats import read_splats
 from refgs.run import open_run
 from refgs.settings import load_settings
-from refgs.train.preview import write_preview
+from refgs.train.live_view import write_preview
 from refgs.train.start import AROUND, start_parameters
 from refgs.train.trainer import Trainer
 
@@ -45,7 +45,7 @@ def balls(request, tmp_path_factory):
 
 
 def train(capture, out, *changes):
-    return jobs.train(
+    return train_job.train(
         capture, out, "quick", "cpu", None, [*SMALL, *changes], False, lambda *_: None, lambda state: False
     )
 

@@ -1,4 +1,4 @@
-"""Runs inside Blender with its window: trains, and closes Blender by its key, as a hand on the keyboard does.
+"""Train in a Blender window, and close Blender with simulated key presses.
 
 blender --enable-event-simulate --python close.py -- EXTENSION.zip PYTHON CAPTURE LETTER OUT
 """
@@ -33,20 +33,20 @@ def press(letter, **held):
 
 
 def artist():
-    """Yields what to wait for."""
+    """Yield conditions to wait for."""
     bpy.ops.extensions.package_install_files(filepath=ARCHIVE, repo="user_default", enable_on_install=True)
     bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
     settings = bpy.context.scene.refgs
     settings.capture, settings.preset, settings.limited, settings.minutes = CAPTURE, "quick", True, 1.5
     yield lambda: True
     bpy.ops.refgs.train()
-    bpy.ops.wm.save_as_mainfile(filepath=str(Path(OUT, "file.blend")))  # or Blender would ask whether to
+    bpy.ops.wm.save_as_mainfile(filepath=str(Path(OUT, "file.blend")))  # otherwise Blender asks to save
     yield lambda: job().progress
     press("Q", ctrl=True)
     yield lambda: True
     if shutil.which("import"):
         subprocess.run(["import", "-window", "root", str(Path(OUT, "asked.png"))], check=True)
-    press("C")  # Cancel, by the letter that is underlined
+    press("C")  # Cancel: its underlined letter
     yield lambda: True
     iteration = job().progress["iteration"]
     yield lambda: job().progress["iteration"] > iteration
@@ -72,7 +72,7 @@ def tick() -> float | None:
         if waiting is None or waiting():
             with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
                 waiting, begun = next(steps), time.monotonic()
-            return 1.0  # until what was pressed has come
+            return 1.0  # until Blender has handled the key
         assert time.monotonic() < begun + PATIENCE, "waited in vain"
     except Exception:
         report["error"] = traceback.format_exc()

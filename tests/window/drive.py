@@ -1,4 +1,4 @@
-"""Runs inside Blender with its window: installs the extension, opens its tab, says what it saw, takes a picture.
+"""Install the extension in a Blender window, open its tab, take a screenshot and write a report.
 
 blender --python drive.py -- EXTENSION.zip RUN_FOLDER OUT
 """
@@ -23,7 +23,7 @@ def install() -> float:
     bpy.ops.extensions.package_install_files(filepath=str(ARCHIVE), repo="user_default", enable_on_install=True)
     report["enabled"] = MODULE in bpy.context.preferences.addons
     for panel in ("REFGS_PT_train", "REFGS_PT_run", "REFGS_PT_materials", "REFGS_PT_light", "REFGS_PT_preview"):
-        # Functions appended to a panel run each time Blender draws it, after its own.
+        # Blender calls functions appended to a panel each time it draws it.
         getattr(bpy.types, panel).append(lambda self, context: report["drawn"].append(self.bl_idname))
     return 1.0
 
@@ -58,7 +58,7 @@ def choose_tab() -> float:
 
 
 def photograph() -> float:
-    # Blender's own screenshot is black on a virtual screen (it reads a front buffer); ImageMagick's reads the screen.
+    # Blender's own screenshot reads a front buffer, which is black on a virtual screen; ImageMagick reads the screen.
     if shutil.which("import"):
         subprocess.run(["import", "-window", "root", str(OUT / "window.png")], check=True)
     else:

@@ -1,4 +1,4 @@
-"""The extension in a real Blender window: it builds, installs, shows its tab, and goes away again.
+"""Build and install the extension in a real Blender window, show its tab, and remove it.
 
 Blender is the command in REFGS_BLENDER (one that runs Blender with a window), else `blender` in the PATH, under
 xvfb-run where there is no DISPLAY.
@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def blender_command():
-    """The command that opens a Blender window, or the reason why there is none."""
+    """Find the command that opens a Blender window, or skip the test with the reason."""
     if "REFGS_BLENDER" in os.environ:
         return shlex.split(os.environ["REFGS_BLENDER"])
     if not shutil.which("blender"):
@@ -41,7 +41,7 @@ def blender_command():
 
 
 def in_window(script, tmp_path, *words):
-    """What a script said of what it did in a Blender that has the extension to install."""
+    """Run a script in a Blender window with the extension's zip; return its report."""
     command = blender_command()
     bpy = pytest.importorskip("bpy", reason="the extension is built with the tool in Blender's Python module")
     tool = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg", "cli", "blender_ext.py")
@@ -82,8 +82,11 @@ def test_the_tab_shows_in_a_window(tmp_path):
 
 @pytest.mark.window
 def test_an_artist_trains(tmp_path, ball_capture):
-    """With the real trainer: checked, trained, watched, paused, stopped, gone on with, finished, imported; then compared with a photo,
-    relit, edited, written anew, and rendered by a Blender beside."""
+    """Act as an artist with the real trainer.
+
+    Check, train, show live surfels, pause, stop, resume, finish, import; then compare with a photo, relight, edit, apply, and render in
+    another Blender.
+    """
     capture = tmp_path / "ball photos"
     shutil.copytree(ball_capture, capture)
     report = in_window("train.py", tmp_path, sys.executable, capture)
@@ -100,7 +103,7 @@ def test_an_artist_trains(tmp_path, ball_capture):
     assert run == tmp_path / "ball photos RefGS" and (run / "splats.ply").exists() and (run / "mesh.glb").exists()
     assert report["imported"] == ["FINISHED"] or "Blender's Python lacks numpy" in report["imported"]
     if report["imported"] == ["FINISHED"]:
-        assert report["left"] == []  # what was shown while it learned
+        assert report["left"] == []  # the live surfels are removed
         assert {"splats.ply", "mesh.glb", "textures", "environment.exr"} <= set(report["applied"])
         assert report["preview"] == ["done", ""] and cv2.imread(str(tmp_path / "preview.png")).std() > 5
     for name in report["steps"]:
@@ -114,7 +117,7 @@ def test_an_artist_trains(tmp_path, ball_capture):
 @pytest.mark.window
 @pytest.mark.parametrize("letter", ["S", "L"])
 def test_closing_asks(tmp_path, ball_capture, letter):
-    """Ctrl-Q, then Cancel, Stop Cleanly or Leave Running, by their letters."""
+    """Press Ctrl-Q, then the letters of Cancel, Stop Cleanly or Leave Running."""
     capture = tmp_path / "photos"
     shutil.copytree(ball_capture, capture)
     report = in_window("close.py", tmp_path, sys.executable, capture, letter)

@@ -1,4 +1,4 @@
-"""Runs inside Blender with its window: acts as an artist who trains a capture with the real trainer, and takes pictures of each step.
+"""Act as an artist in a Blender window: train a capture with the real trainer, and take a screenshot of each step.
 
 blender --python train.py -- EXTENSION.zip PYTHON CAPTURE OUT
 """
@@ -39,10 +39,10 @@ def tell(command):
 
 
 def artist():
-    """Yields what to wait for, and the name of the picture then: each step is what a click does."""
+    """Yield a condition to wait for and a screenshot's name, after each click."""
     bpy.ops.extensions.package_install_files(filepath=str(ARCHIVE), repo="user_default", enable_on_install=True)
     area().spaces.active.show_region_ui = True
-    bpy.data.objects.remove(bpy.data.objects["Cube"])  # it stands where the object will
+    bpy.data.objects.remove(bpy.data.objects["Cube"])  # it is where the object will be
     yield lambda: True, None
     next(region for region in area().regions if region.type == "UI").active_panel_category = "RefGS"
     area().tag_redraw()
@@ -58,7 +58,7 @@ def artist():
     bpy.ops.refgs.show_cameras(number=len(jobs()) - 1)
     bpy.ops.refgs.add_training_region()
     yield lambda: True, "cameras"
-    report["cameras"] = sum(item.type == "CAMERA" for item in bpy.data.objects) - 1  # Blender's own is there, too
+    report["cameras"] = sum(item.type == "CAMERA" for item in bpy.data.objects) - 1  # without Blender's default camera
     bpy.ops.refgs.put_away(number=len(jobs()) - 1)
     bpy.ops.refgs.train()
     yield lambda: len(jobs()[-1].curve) > 4 and jobs()[-1].preview, "training"
@@ -86,7 +86,7 @@ def artist():
 
 
 def work_with_it(folder):
-    """What is done with a run: its light, its materials, its photos, and a picture of it all."""
+    """Compare the run with photos, relight, edit, apply and render it."""
     report["left"] = [item.name for item in bpy.data.objects if "in training" in item.name]
     scene, manager = bpy.context.scene, bpy.context.window_manager
     area().spaces.active.shading.type = "MATERIAL"
@@ -97,7 +97,7 @@ def work_with_it(folder):
     yield lambda: True, "photo"
     with view():
         bpy.ops.refgs.photo()
-    manager.refgs_light = next(str(file) for file in addon("scene.relight").hdris() if file.stem == "city")
+    manager.refgs_light = next(str(file) for file in addon("scene.world_light").hdris() if file.stem == "city")
     bpy.ops.refgs.match_light()
     yield lambda: True, "relit"
     bpy.ops.refgs.add_edit(where="Sphere", material="Gold")
@@ -111,7 +111,7 @@ def work_with_it(folder):
     report["scene"] = scene.render.engine, scene.world.name
 
 
-ours = 0.0  # seconds, the longest that the window waited for the add-on since the last step
+ours = 0.0  # seconds: longest wait of the window for the add-on since the last step
 
 
 @contextlib.contextmanager
@@ -123,22 +123,22 @@ def measured():
 
 
 def measure_ours():
-    """Measure what the add-on does when no button was pressed: its timer, and its panels being drawn."""
-    follow = addon("follow")
-    look = follow._look
+    """Measure the add-on's time without clicks: its timer and the drawing of its panels."""
+    timers = addon("job_timers")
+    look = timers._poll_jobs
 
     def measured_look():
         with measured():
             return look()
 
-    follow._look = measured_look
+    timers._poll_jobs = measured_look
     for cls in addon("ui").CLASSES:
         if issubclass(cls, bpy.types.Panel):
             cls.draw = measured_draw(cls.draw)
 
 
 def measured_draw(draw):
-    def measured_one(self, context):  # Blender counts the words that it takes
+    def measured_one(self, context):  # Blender checks the number of arguments
         with measured():
             draw(self, context)
 
@@ -154,7 +154,7 @@ def addon(name):
 
 
 def view():
-    """The 3D view, as a button in its sidebar has it."""
+    """Override the context with the 3D view, as for a button in its sidebar."""
     region = next(region for region in area().regions if region.type == "WINDOW")
     return bpy.context.temp_override(area=area(), region=region)
 
@@ -175,7 +175,7 @@ steps, waiting, due, longest = artist(), None, time.perf_counter() + 3.0, 0.0
 
 
 def tick() -> float | None:
-    """Ten times a second: go on where what was waited for has come. How late it comes is how long the window was busy."""
+    """Continue ten times a second once the condition holds. The delay of a tick is the time that the window was busy."""
     global waiting, due, longest, ours
     now = time.perf_counter()
     longest = max(longest, now - due)
@@ -190,8 +190,8 @@ def tick() -> float | None:
             waiting = (*found, now + PATIENCE)
             if found[1]:
                 report["clicks"][found[1]] = click
-            due = time.perf_counter() + 3.0  # the click itself is not in the time, but what comes of it is
-            return 3.0  # so that it is drawn
+            due = time.perf_counter() + 3.0  # exclude the click itself, include its effects
+            return 3.0  # time to draw
         condition, name, until = waiting
         if condition():
             waiting = None

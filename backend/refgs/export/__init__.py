@@ -1,1 +1,1 @@
-"""Meshes, textures and splats, made from a run for other programs."""
+"""Export a run as meshes, textures and splats for other programs."""

@@ -1,4 +1,4 @@
-"""Textures for a mesh, baked from the splats around it."""
+"""Bake a mesh's textures from the splats around it."""
 
 import cv2
 import numpy as np
@@ -13,28 +13,30 @@ from refgs.formats.splats import Splats
 from refgs.formats.tangents import vertex_tangents
 from refgs.formats.textures import Textures
 
-FINE = 3  # texels at least that a splat's standard deviation is long where splats are composited; between them textures are linear
-_ROWS = 64  # of texels at a time
-_BESIDE = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]
+# Least texels along a splat's standard deviation where splats are composited. Larger textures are interpolated from these texels.
+FINE = 3
+_ROWS = 64  # rows of texels at a time
+_NEIGHBOURS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]
 
 
 def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:
-    """What the splats (`composite`) are at each texel's point of the mesh, and how open that is to light (`openness`).
+    """Bake base colour, materials and normals (`composite`) and occlusion (`openness`) at the point of each texel on the mesh.
 
-    `mesh` has normals and uv (`unwrap`). Texels that a chart covers in part have the point of the mesh's plane beyond its edge.
+    `mesh` has normals and uv (`unwrap`). If a texel's centre lies just beyond a chart's edge, its point is on the extended plane of the
+    face. `progress` is called with the points done and their total.
     """
     coarse = _composited(mesh, splats, size, progress)
     tangents, signs = vertex_tangents(mesh)
-    free, scene = openness(mesh), _flat(mesh, size)
+    free, scene = openness(mesh), _uv_scene(mesh, size)
     widths = (3, 1, 1, 1, 3)
     maps = [np.zeros((size, size, width) if width > 1 else (size, size), np.float32) for width in widths]
     color, metallic, roughness, occlusion, normal = maps
     mask = np.zeros((size, size), bool)
-    for rows in _blocks(size):
+    for rows in _row_blocks(size):
         face, weights, _ = _rasterise(mesh, scene, size, rows)
         on = mask[rows] = face >= 0
-        corners, weights, texels = mesh.faces[face[on]], weights[on], _enlarged(coarse, size, rows)[on]
-        normals, tangent, open_ = (_mean(weights, x[corners]) for x in (mesh.normals, tangents, free[:, None]))
+        corners, weights, texels = mesh.faces[face[on]], weights[on], _enlarged_rows(coarse, size, rows)[on]
+        normals, tangent, open_ = (_interpolate(weights, x[corners]) for x in (mesh.normals, tangents, free[:, None]))
         bitangent = signs[corners[:, :1]].astype(np.float32) * np.cross(normals, tangent)
         color[rows][on], metallic[rows][on], roughness[rows][on] = texels[:, :3], texels[:, 3], texels[:, 4]
         occlusion[rows][on] = open_[:, 0]
@@ -44,19 +46,19 @@ def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done
 
 
 def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
-    """Base colour, metallic, roughness, normal (C, C, 8), of as many texels C up to `size` as the splats need."""
+    """Composite base colour, metallic, roughness and normal (C, C, 8). C is the resolution that the splats need, `size` at most."""
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-    covered = np.abs(_area(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0])).sum()
+    covered = np.abs(_cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0])).sum()
     texel = np.sqrt(area / max(covered, 1e-12)) / size
     deviation = float(np.median(splats.scales[:, :2].min(axis=1)))
-    # Two charts, 1/128 apart, must not reach each other by the texel that each goes beyond its edge.
+    # At least 256 texels: charts are 1/128 apart, and each extends a texel beyond its edge.
     coarse = min(size, max(int(np.ceil(size * FINE * texel / deviation)), min(size, 256)))
-    scene, mask, found = _flat(mesh, coarse), np.zeros((coarse, coarse), bool), []
-    for rows in _blocks(coarse):
+    scene, mask, found = _uv_scene(mesh, coarse), np.zeros((coarse, coarse), bool), []
+    for rows in _row_blocks(coarse):
         face, weights, points = _rasterise(mesh, scene, coarse, rows)
         on = mask[rows] = face >= 0
-        found.append((points[on].astype(np.float32), _mean(weights[on], mesh.normals[mesh.faces[face[on]]])))
+        found.append((points[on].astype(np.float32), _interpolate(weights[on], mesh.normals[mesh.faces[face[on]]])))
     points, normals = map(np.concatenate, zip(*found, strict=True))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     blended = np.zeros((coarse, coarse, 8), np.float32)
@@ -65,13 +67,13 @@ def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np
     return blended
 
 
-def _blocks(size: int) -> list[slice]:
-    """All rows, some at a time."""
+def _row_blocks(size: int) -> list[slice]:
+    """Split all rows into blocks of _ROWS."""
     return [slice(start, min(start + _ROWS, size)) for start in range(0, size, _ROWS)]
 
 
-def _enlarged(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
-    """Rows of a square picture (C, C, 8) that is enlarged to `size`, bilinearly."""
+def _enlarged_rows(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
+    """Enlarge a square picture (C, C, 8) to `size` bilinearly, and return some of its rows."""
     place = ((np.arange(rows.start, rows.stop) + 0.5) * len(picture) / size - 0.5).clip(0, len(picture) - 1)
     above = place.astype(int)
     below, part = np.minimum(above + 1, len(picture) - 1), (place - above).astype(np.float32)[:, None, None]
@@ -80,22 +82,22 @@ def _enlarged(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
 
 
 def _pad(maps: list[np.ndarray], mask: np.ndarray) -> None:
-    """Give each texel outside the mask the values of the nearest one in it."""
+    """Fill texels outside the mask with the values of the nearest one in it."""
     nearest = distance_transform_edt(~mask, return_distances=False, return_indices=True)
-    for rows in _blocks(len(mask)):
+    for rows in _row_blocks(len(mask)):
         for values in maps:
             values[rows] = values[tuple(nearest[:, rows])]
 
 
-def _mean(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
+def _interpolate(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.einsum("nk,nkc->nc", weights, values).astype(np.float32)
 
 
 def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
-    """Unit vectors (N, 3) in terms of tangents, bitangents and normals (N, 3).
+    """Solve for unit vectors' coordinates (N, 3) in the basis of tangents, bitangents and normals (N, 3).
 
-    A shader forms x·tangent + y·bitangent + z·normal from interpolated vectors that are neither of unit length nor
-    orthogonal: what it needs is the solution, not three dot products.
+    A shader forms x·tangent + y·bitangent + z·normal from interpolated vectors that are neither of unit length nor orthogonal. So the
+    coordinates are the solution of a linear system, not three dot products.
     """
     a, b, c = basis
     across = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
@@ -103,13 +105,13 @@ def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
     regular = np.abs(volume) > 1e-3
     local = np.einsum("nkc,nc->nk", across, vectors) / np.where(regular, volume, 1)[:, None]
     local[~regular] = (0, 0, 1)
-    # A normal below the horizon of the mesh cannot be encoded.
+    # Tangent-space maps cannot encode a normal below the mesh's horizon.
     local[:, 2] = np.maximum(local[:, 2], 0.05)
     return local / np.linalg.norm(local, axis=1, keepdims=True)
 
 
-def _flat(mesh: Mesh, size: int) -> EmbreeScene:
-    """The mesh's charts, in texels."""
+def _uv_scene(mesh: Mesh, size: int) -> EmbreeScene:
+    """Lay the mesh's charts flat, in units of texels, for ray tracing."""
     flat = np.concatenate([mesh.uv * size, np.zeros((len(mesh.uv), 1))], axis=1).astype(np.float32)
     scene = EmbreeScene()
     TriangleMesh(scene, flat, mesh.faces.astype(np.int32))
@@ -117,8 +119,11 @@ def _flat(mesh: Mesh, size: int) -> EmbreeScene:
 
 
 def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The face (R, S) at each texel's centre, or beside it, -1 where there is none, its barycentric weights (R, S, 3) and the point
-    (R, S, 3): that of the face's plane where the centre lies beyond an edge, with the weights of the nearest texel on the face."""
+    """Find the face (R, S) at each texel's centre, its barycentric weights (R, S, 3), and the point (R, S, 3) on the mesh.
+
+    A texel beside a face takes that face. Its point is then on the face's extended plane, its weights are those of the neighbour on the
+    face. Other texels have face −1.
+    """
     first, last = max(rows.start - 1, 0), min(rows.stop + 1, size)
     y, x = np.mgrid[first:last, :size].astype(np.float32) + np.float32(0.5)
     origins = np.stack([x, size - y, np.ones_like(x)], axis=-1).reshape(-1, 3)
@@ -127,7 +132,7 @@ def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[
     weights = np.stack([1 - hit["u"] - hit["v"], hit["u"], hit["v"]], axis=-1).reshape(*x.shape, 3)
     inside = face >= 0
     around, row, column = face.copy(), *np.indices(face.shape)
-    for down, right in _BESIDE:
+    for down, right in _NEIGHBOURS:
         r, c = (np.clip(i + d, 0, n - 1) for i, d, n in ((row, down, face.shape[0]), (column, right, size)))
         empty = (around < 0) & (face[r, c] >= 0)
         around[empty], weights[empty] = face[r, c][empty], weights[r, c][empty]
@@ -144,15 +149,15 @@ def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[
 
 
 def _barycentric(points: np.ndarray, corners: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """Weights (N, 3) of triangles' corners (N, 3, 2) at points (N, 2) that need not lie inside; `otherwise` in slivers."""
+    """Compute barycentric weights (N, 3) of points (N, 2), also outside of triangles (N, 3, 2). Slivers have the weights `otherwise`."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    c, area = points - corners[:, 0], _area(a, b)
+    c, area = points - corners[:, 0], _cross(a, b)
     good = np.abs(area) > 0.05 * ((a * a).sum(axis=1) + (b * b).sum(axis=1))
     area = np.where(good, area, 1)
-    s, t = _area(c, b) / area, _area(a, c) / area
+    s, t = _cross(c, b) / area, _cross(a, c) / area
     return np.where(good[:, None], np.stack([1 - s - t, s, t], axis=1), otherwise)
 
 
-def _area(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The signed areas (N,) of parallelograms of plane vectors (N, 2)."""
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Compute signed areas (N,) of parallelograms of plane vectors (N, 2): the 2D cross product."""
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

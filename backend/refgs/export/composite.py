@@ -1,4 +1,4 @@
-"""Splats blended at points of a surface, as the renderer would in front of each."""
+"""Blend splats at points of a surface, as a renderer in front of each point would."""
 
 from collections.abc import Callable
 
@@ -10,33 +10,33 @@ from torch import Tensor
 from refgs.formats.splats import Splats
 from refgs.model.surfels import axes
 
-NEIGHBOURS = 64  # splats that a ray is tried against
-FADED = 1 / 255  # alpha that is nothing
-REACH = 3.0  # standard deviations of a splat: what lies farther before or behind the surface is not of it
-RIDGE = 0.1  # of the spread of the splats' positions: keeps the slope of the normals tame where they lie in a line
+NEAREST = 64  # splats tested per ray
+LEAST_ALPHA = 1 / 255  # alpha at or below which a splat is transparent
+REACH = 3.0  # largest distance of a splat from the surface, in its standard deviations
+RIDGE = 0.1  # part of the positions' total variance: bounds the normals' slope where splats lie in a line
 _CHUNK = 1 << 13  # points at a time: about 100 MB
 
 Progress = Callable[[int, int], None]
 
 
 def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress: Progress) -> np.ndarray:
-    """Base colour, metallic, roughness and unit normal (N, 8), float32, of splats at points (N, 3) of a surface with unit normals
-    (N, 3).
+    """Composite splats at points (N, 3) of a surface with unit normals (N, 3): base colour, metallic, roughness, unit normal (N, 8).
 
-    Along the normal, from outside, the splats near the surface are composited front to back, each with its opacity times its Gaussian
-    where the ray meets its plane, those that look inwards left out; then divided by the sum of their weights. The blended normal
-    belongs to the mean of the positions, not to the point: it is taken there by the slope of the normals, by weighted least squares.
-    Where no splat reaches, the nearest ones decide. `progress` hears how many points are done.
+    The ray of a point comes from outside, against the normal. Splats near the surface that face outwards are composited front to back.
+    Alpha is the opacity times the Gaussian where the ray meets the splat's plane. The blend is divided by the sum of weights. The
+    blended normal is that of the splats' mean position: it is extrapolated to the point by the normals' slope, fitted by weighted least
+    squares. Where no splat reaches the ray, the nearest ones decide. `progress` is called with the points done and their total.
     """
-    table, values = _table(splats), _values(splats)
+    table, values = _geometry(splats), _appearance(splats)
     spread = float(np.median(splats.scales[:, :2].mean(axis=1))) or 1.0
-    count = min(NEIGHBOURS, len(splats))
-    # Points that share a cell of half a splat share neighbours.
+    count = min(NEAREST, len(splats))
+    # Points in one cell, half a splat wide, share their neighbours.
     cell = np.floor(points / (spread / 2)).astype(np.int64)
     cell -= cell.min(axis=0)
     _, first, cell = np.unique(np.ravel_multi_index(cell.T, cell.max(0) + 1), return_index=True, return_inverse=True)
     tree, near = cKDTree(splats.positions), np.empty((len(first), count), np.int32)
-    for start in range(0, len(first), _CHUNK):  # of distances and places it would be four times as much
+    # Query in chunks: float64 distances and int64 indices take four times the memory of `near`.
+    for start in range(0, len(first), _CHUNK):
         at = slice(start, start + _CHUNK)
         near[at] = tree.query(points[first[at]], k=np.arange(1, count + 1), workers=-1)[1]
     result = np.empty((len(points), values.shape[1]), np.float32)
@@ -44,13 +44,13 @@ def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress:
         for start in range(0, len(points), _CHUNK):
             at = slice(start, start + _CHUNK)
             given = (torch.from_numpy(np.asarray(x[at], np.float32)) for x in (points, normals))
-            result[at] = _composite(table, values, torch.from_numpy(near[cell[at]]), *given, spread).numpy()
+            result[at] = _blend(table, values, torch.from_numpy(near[cell[at]]), *given, spread).numpy()
             progress(min(start + _CHUNK, len(points)), len(points))
     return result
 
 
-def _table(splats: Splats) -> Tensor:
-    """(N, 15): position, both axes over their standard deviations, plane's normal, outward normal, opacity, mean deviation."""
+def _geometry(splats: Splats) -> Tensor:
+    """Return (N, 17): position, axes divided by their standard deviations, plane's normal, outward normal, opacity, mean deviation."""
     u, v, normal = (axis.numpy() for axis in axes(torch.from_numpy(splats.rotations)))
     scales = np.maximum(splats.scales[:, :2], 1e-12)
     columns = [splats.positions, u / scales[:, :1], v / scales[:, 1:], normal, splats.normals]
@@ -58,30 +58,30 @@ def _table(splats: Splats) -> Tensor:
     return torch.from_numpy(np.concatenate(columns, axis=1).astype(np.float32))
 
 
-def _values(splats: Splats) -> Tensor:
+def _appearance(splats: Splats) -> Tensor:
     columns = [splats.albedo, splats.metallic[:, None], splats.roughness[:, None], splats.normals]
     return torch.from_numpy(np.concatenate(columns, axis=1).astype(np.float32))
 
 
-def _composite(table: Tensor, values: Tensor, near: Tensor, points: Tensor, normals: Tensor, spread: float) -> Tensor:
+def _blend(table: Tensor, values: Tensor, near: Tensor, points: Tensor, normals: Tensor, spread: float) -> Tensor:
     rows = table[near.flatten()].view(*near.shape, -1)
     center, u, v, plane, outward, opacity, deviation = rows.split((3, 3, 3, 3, 3, 1, 1), dim=-1)
     offset, ray = center - points[:, None], normals[:, None]
 
     slant = (plane * ray).sum(dim=-1)
     slant = torch.where(slant.abs() < 1e-3, 1e-3, slant)
-    height = (plane * offset).sum(dim=-1) / slant  # of where the ray meets the splat, above the surface
+    height = (plane * offset).sum(dim=-1) / slant  # of the ray's intersection with the splat, above the surface
     met = height[..., None] * ray - offset
     apart = (u * met).sum(dim=-1) ** 2 + (v * met).sum(dim=-1) ** 2
     alpha = opacity[..., 0] * torch.exp(-0.5 * apart)
-    counts = (alpha > FADED) & ((outward * ray).sum(dim=-1) > 0) & (height.abs() < REACH * deviation[..., 0])
-    alpha = torch.where(counts, alpha, 0)
+    contributes = (alpha > LEAST_ALPHA) & ((outward * ray).sum(dim=-1) > 0) & (height.abs() < REACH * deviation[..., 0])
+    alpha = torch.where(contributes, alpha, 0)
     order = height.argsort(dim=1, descending=True)
     passed = (1 - alpha.gather(1, order)).cumprod(dim=1)
     before = torch.cat([torch.ones_like(passed[:, :1]), passed[:, :-1]], dim=1)
     weight = alpha * torch.empty_like(alpha).scatter_(1, order, before)
     covered = weight.sum(dim=1, keepdim=True)
-    # The last term decides only where no splat reaches.
+    # Add tiny weights by distance, which decide where no splat reaches.
     weight = weight + 1e-5 / (1 + (offset * offset).sum(dim=-1) / spread**2) ** 4
     weight = (weight / weight.sum(dim=1, keepdim=True))[:, None]
 

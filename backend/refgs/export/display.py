@@ -1,4 +1,4 @@
-"""Splats for viewers that know no light: what the run shows, learned as colour by direction."""
+"""Make splats for viewers without lights: learn the run's renderings as colour by direction."""
 
 from collections.abc import Callable
 
@@ -12,18 +12,18 @@ from refgs.render.baselines import draw_colors
 from refgs.run import Run
 
 ITERATIONS = 600
-VIEWS = 120  # rendered to learn from, at most
-SIDE = 400  # pixels
-RATE, RATE_OF_REST = 0.02, 2e-3  # of the constant and of the rest; they fall to a tenth
+VIEWS = 120  # training cameras at most
+SIDE = 400  # longest side of a rendering, in pixels
+RATE, RATE_OF_REST = 0.02, 2e-3  # initial learning rates of the constant and the other harmonics; they decay to a tenth
 DEGREE = 3
 
 
 def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Splats:
-    """The run's splats with spherical harmonics of the third degree that show, sRGB-encoded, what the run's training cameras see under
-    its light: mirrored light as far as such smooth functions can. Their geometry stays.
+    """Replace the splats' harmonics by harmonics of degree 3 that reproduce, sRGB-encoded, the run's renderings. Geometry is unchanged.
 
-    The harmonics are those that repeat renderings of the run with the least squared error, by Adam; `progress` hears how many
-    iterations of how many are done. Where colour was learned by direction they are there already.
+    Adam minimises the squared error to renderings of the training cameras under the run's light. Mirror images are as sharp as degree 3
+    allows. `progress` is called with the iterations done and their total. A run that learned colour by direction has such harmonics
+    already: its splats are returned.
     """
     splats = run.splats
     if run.environment is None:

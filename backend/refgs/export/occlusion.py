@@ -1,4 +1,4 @@
-"""How open a mesh is to the light around it, vertex by vertex."""
+"""Measure ambient occlusion at a mesh's vertices."""
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -7,18 +7,20 @@ from embreex.rtcore_scene import EmbreeScene
 from refgs.formats.mesh import Mesh
 
 RAYS = 64
-_LIFT = 1e-3  # of the mesh's size: rays start this far above it
+_LIFT = 1e-3  # height of rays' start above the mesh, as a part of its size
 _CHUNK = 1 << 14  # vertices at a time
 
 
 def openness(mesh: Mesh) -> np.ndarray:
-    """The part (V,) of a uniform light that reaches each vertex past the mesh, by rays about its normal weighted by the cosine: glTF's
-    occlusion, 1 where nothing is in the way."""
-    middle = mesh.vertices.mean(axis=0)  # rays are traced in single precision
+    """Measure the part (V,) of a uniform light that reaches each vertex past the mesh: glTF's occlusion, 1 where nothing occludes.
+
+    Rays about the vertex's normal are distributed as the cosine.
+    """
+    middle = mesh.vertices.mean(axis=0)  # subtracted, because rays are traced in single precision
     vertices = (mesh.vertices - middle).astype(np.float32)
     scene = EmbreeScene()
     TriangleMesh(scene, vertices, mesh.faces.astype(np.int32))
-    # A spiral over the disc, lifted to the hemisphere: its points are as dense as the cosine.
+    # Points of a spiral over the disc, lifted to the hemisphere, have the density of the cosine.
     place = np.arange(RAYS) + 0.5
     radius, turn = np.sqrt(place / RAYS), place * np.pi * (3 - 5**0.5)
     ways = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - radius**2)], axis=1)

@@ -1,7 +1,7 @@
-"""A mesh brought out to the outlines that the renderer shows.
+"""Fit a mesh to the outlines in renderings.
 
-Surfels are many and faint: where a ray meets them lies inside the shell they make, which is what is seen against the background. A mesh
-fused from depth is too small by that, half a voxel and more.
+A mesh fused from depth is too small, by half a voxel and more. Surfels are faint, so blended depth lies inside the shell that they form,
+while the outline against the background is that of the shell.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,87 +17,95 @@ from refgs.formats.mesh import Mesh
 from refgs.geometry.mesh import smooth_normals
 from refgs.render.renderer import Rendering
 
-VIEWS = 24  # of the cameras, evenly
-FINER = 4  # times a picture's pixels: to this outlines are told from alpha
-MOST = 3.0  # voxels
-ROUNDS = 4  # of smoothing
-TURNS = 2  # of looking at the outlines: first all is moved by the median
-PRIOR = 0.05  # pixels of an outline that what is not on one counts as
+VIEWS = 24  # cameras at most, evenly chosen
+UPSAMPLING = 4  # of alpha, each way, so that outlines have subpixel precision
+LARGEST_MOVE = 3.0  # largest displacement of a vertex, in voxels
+SMOOTHING_STEPS = 4
+ITERATIONS = 2  # the first moves all vertices by the median gap
+PRIOR = 0.05  # weight of a zero displacement, in outline pixels: vertices off the outlines stay
 
 
-def bring_out(mesh: Mesh, render: Callable[[Camera], Rendering], cameras: Sequence[Camera], voxel: float) -> Mesh:
-    """A mesh with its vertices moved along their normals: all by what its outlines lack in the median, those along outlines by what is
-    lacking there, and none out of an outline. As it was where pictures do not show the object before a background. `voxel`, in world
-    units, is how fine it was fused: none moves by more than three."""
+def fit_to_outlines(mesh: Mesh, render: Callable[[Camera], Rendering], cameras: Sequence[Camera], voxel: float) -> Mesh:
+    """Move vertices along their normals until the mesh's outlines match those in renderings.
+
+    First all vertices move by the median gap between the outlines; then vertices along outlines move by the gap there. Vertices outside
+    of an outline move back inside. No vertex moves by more than LARGEST_MOVE times `voxel`, the size in world units of the voxels that the
+    mesh was fused from. The mesh is returned unchanged if renderings do not show the object before a background.
+    """
     chosen = [cameras[i] for i in np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).astype(int)]
-    views = [(camera, _inside(render(camera).alpha.numpy())) for camera in chosen]
-    views = [(camera, inside) for camera, inside in views if (inside < 0).any() and (inside > 0).any()]
-    smooth, most = _smoother(mesh), MOST * voxel
+    views = [(camera, _signed_distance(render(camera).alpha.numpy())) for camera in chosen]
+    views = [(camera, distance) for camera, distance in views if (distance < 0).any() and (distance > 0).any()]
+    smooth, most = _smoother(mesh), LARGEST_MOVE * voxel
     step = np.zeros(len(mesh.vertices))
-    for turn in range(TURNS):
+    for iteration in range(ITERATIONS):
         moved = Mesh(mesh.vertices + step[:, None] * mesh.normals, mesh.faces)
-        found = [_lacking(moved, camera, inside) for camera, inside in views]
+        found = [_gaps(moved, camera, distance) for camera, distance in views]
         if not found or not sum(len(vertex) for vertex, _ in found):
             return mesh
-        vertex, lacking = (np.concatenate(part) for part in zip(*found, strict=True))
-        near = np.abs(lacking) <= most + voxel  # farther is an outline of something else: a gap in the background
+        vertex, gap = (np.concatenate(part) for part in zip(*found, strict=True))
+        near = np.abs(gap) <= most + voxel  # larger gaps are to other outlines, as of a hole in the background
         if near.mean() < 0.5:
             return mesh
-        vertex, lacking = vertex[near], lacking[near]
-        if turn == 0:
-            step += np.clip(np.median(lacking), 0, most)
+        vertex, gap = vertex[near], gap[near]
+        if iteration == 0:
+            step += np.clip(np.median(gap), 0, most)
         else:
-            total, count = (np.bincount(vertex, x, len(step)) for x in (lacking.clip(-voxel, voxel), None))
+            total, count = (np.bincount(vertex, x, len(step)) for x in (gap.clip(-voxel, voxel), None))
             step += smooth(total) / (smooth(count.astype(float)) + PRIOR)
         vertices = mesh.vertices + step[:, None] * mesh.normals
-        step -= smooth(_beyond(vertices, views))
+        step -= smooth(_overshoot(vertices, views))
         step = step.clip(-most, most)
     vertices = mesh.vertices + step[:, None] * mesh.normals
     return Mesh(vertices, mesh.faces, smooth_normals(vertices, mesh.faces))
 
 
-def _beyond(vertices: np.ndarray, views: list[tuple[Camera, np.ndarray]]) -> np.ndarray:
-    """How far (V,), in world units, vertices lie outside of the outlines, in the view where that is most."""
-    beyond = np.zeros(len(vertices))
-    for camera, inside in views:
+def _overshoot(vertices: np.ndarray, views: list[tuple[Camera, np.ndarray]]) -> np.ndarray:
+    """Measure how far (V,) vertices lie outside of the outlines, in world units: the maximum over views."""
+    overshoot = np.zeros(len(vertices))
+    for camera, distance in views:
         x, y, z = camera.world_to_camera[:3, :3] @ vertices.T + camera.world_to_camera[:3, 3:]
         x, y = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         seen = (z > 0) & (x > 0) & (x < camera.width) & (y > 0) & (y < camera.height)
-        beyond[seen] = np.maximum(beyond[seen], -_at(inside, x[seen], y[seen]) * z[seen] / camera.fx)
-    return beyond
+        overshoot[seen] = np.maximum(overshoot[seen], -_look_up(distance, x[seen], y[seen]) * z[seen] / camera.fx)
+    return overshoot
 
 
 def _smoother(mesh: Mesh) -> Callable[[np.ndarray], np.ndarray]:
-    """What averages values (V,) with those of the vertices next to them, a few times: outlines are told to a part of a pixel only."""
+    """Make a function that smooths values (V,): it averages each vertex with its neighbours, SMOOTHING_STEPS times.
+
+    Outlines have an error of a part of a pixel, which smoothing reduces.
+    """
     a, b = np.concatenate([mesh.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]).T
     count = len(mesh.vertices)
     near = coo_matrix((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), (count, count)).tocsr() + identity(count)
     near = diags(1 / np.asarray(near.sum(axis=1)).ravel()) @ near
 
     def smooth(values: np.ndarray) -> np.ndarray:
-        for _ in range(ROUNDS):
+        for _ in range(SMOOTHING_STEPS):
             values = near @ values
         return values
 
     return smooth
 
 
-def _inside(alpha: np.ndarray) -> np.ndarray:
-    """How many pixels (h, w), FINER each way, it is to the outline; negative outside."""
-    fine = cv2.resize(alpha, None, fx=FINER, fy=FINER, interpolation=cv2.INTER_LINEAR) >= 0.5
+def _signed_distance(alpha: np.ndarray) -> np.ndarray:
+    """Compute the signed distance to the outline in pixels, negative outside, on a grid UPSAMPLING times as dense each way."""
+    fine = cv2.resize(alpha, None, fx=UPSAMPLING, fy=UPSAMPLING, interpolation=cv2.INTER_LINEAR) >= 0.5
     inner, outer = (cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) for mask in (fine, ~fine))
-    return np.where(fine, inner - 0.5, 0.5 - outer) / FINER
+    return np.where(fine, inner - 0.5, 0.5 - outer) / UPSAMPLING
 
 
-def _at(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A picture FINER than pixels at pixel positions."""
-    row, column = ((FINER * v).astype(int) for v in (y, x))
+def _look_up(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Look up an upsampled picture at pixel positions."""
+    row, column = ((UPSAMPLING * v).astype(int) for v in (y, x))
     return picture[row.clip(0, len(picture) - 1), column.clip(0, picture.shape[1] - 1)]
 
 
-def _lacking(mesh: Mesh, camera: Camera, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each pixel along the mesh's outline in a view, a vertex that is there, and how far, in world units, the outline lies inside the
-    one that is wanted."""
+def _gaps(mesh: Mesh, camera: Camera, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Measure the gap at each pixel along the mesh's outline in a view: a vertex there, and the gap in world units.
+
+    The gap is positive where the mesh's outline lies inside the rendering's.
+    """
     scene = EmbreeScene()  # rays are traced in single precision about the mesh's middle
     middle = mesh.vertices.mean(axis=0)
     TriangleMesh(scene, (mesh.vertices - middle).astype(np.float32), mesh.faces.astype(np.int32))
@@ -109,6 +117,6 @@ def _lacking(mesh: Mesh, camera: Camera, inside: np.ndarray) -> tuple[np.ndarray
     depth = np.where(hit["tfar"] < 1e30, hit["tfar"], np.inf).reshape(x.shape)  # rays have depth 1
     covered = np.isfinite(depth).astype(np.uint8)
     along = (covered > 0) & (cv2.erode(covered, np.ones((3, 3), np.uint8), borderValue=1) == 0)
-    # The centres of the outermost pixels lie half a pixel inside in the mean.
-    lacking = (_at(inside, x[along], y[along]) - 0.5) * depth[along] / camera.fx
-    return mesh.faces[hit["primID"].reshape(x.shape)[along], 0], lacking
+    # On average the centres of the outermost pixels lie half a pixel inside the outline.
+    gap = (_look_up(distance, x[along], y[along]) - 0.5) * depth[along] / camera.fx
+    return mesh.faces[hit["primID"].reshape(x.shape)[along], 0], gap

@@ -1,4 +1,4 @@
-"""Base colours without the object's own shadow, for a mesh on which every renderer casts it again."""
+"""Remove the object's shadows from base colours: renderers cast shadows on the exported mesh again."""
 
 from dataclasses import replace
 
@@ -11,14 +11,18 @@ from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.relight import received
 
-LEAST = 0.25  # of the light of an open surface, that one is taken to receive: of deeper hollows light and mesh say too little
-PASSES = 3  # for what surfaces send each other goes by the base colours that are looked for: each takes two thirds of the error at least
+# Lower limit of the received part of the irradiance: in deeper hollows the light and the mesh are too uncertain.
+LEAST = 0.25
+# Inter-reflection depends on the base colours sought: iterate. Each pass removes two thirds of the error at least.
+PASSES = 3
 
 
 def unshadowed(splats: Splats, surfels: Surfels, mesh: Mesh, light: Environment) -> Splats:
-    """The splats with the base colour of what is matt divided by the part of the irradiance that reaches it past the `mesh`, and
-    from it, under the `light` that they were learned in: where no mesh was traced then, the shadow is in their colour. `surfels` are
-    the same as tensors."""
+    """Divide the base colour of matte splats by the received part of the irradiance: direct light past the `mesh`, and light from it.
+
+    Metals are unchanged. Shadows are in the colours if the training traced no mesh. `light` is that of the training; `surfels` are the
+    splats as tensors.
+    """
     shadowed, occluder = surfels.albedo, Occluder(mesh)
     matt = 1 - surfels.metallic[:, None]
     for _ in range(PASSES):

@@ -1,4 +1,4 @@
-"""A mesh laid out in a square, for textures."""
+"""Unwrap a mesh into charts in the unit square, for textures."""
 
 from dataclasses import dataclass
 
@@ -7,15 +7,17 @@ import xatlas
 
 from refgs.formats.mesh import Mesh
 
-PART = (
-    800  # triangles: xatlas's time grows faster than linearly with those of a mesh, and it lays out meshes side by side
-)
+# Most triangles of a part. xatlas's time grows faster than linearly with a mesh's triangles, and it unwraps meshes in parallel.
+PART = 800
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How well charts are laid out: the part of the square that they fill; the texels that a unit of surface gets against the mean,
-    at the 5th and 95th percentile of the surface; the mean angle in degrees by which corners of triangles are bent, by surface."""
+    """Quality of a layout of charts.
+
+    `used` is the filled part of the square. `density` is the texel density relative to the mean, at the 5th and 95th percentile of the
+    surface. `bend` is the area-weighted mean distortion of the triangles' angles, in degrees.
+    """
 
     used: float
     density: tuple[float, float]
@@ -23,10 +25,10 @@ class Layout:
 
 
 def unwrap(mesh: Mesh) -> Mesh:
-    """The mesh cut into charts with uv, by xatlas; charts keep 1/128 of the texture's side from each other.
+    """Cut the mesh into charts with uv, by xatlas. Charts are at least 1/128 of the texture's side apart.
 
-    Vertices on seams are doubled; their normals are those of `mesh`. It is cut into parts of at most PART triangles first, halved where
-    they are longest, each of which has charts of its own; all are packed at once.
+    Vertices on seams are doubled, with the normals of `mesh`. First the mesh is halved across its longest axis until no part has more
+    than PART triangles. Each part has its own charts; all charts are packed together.
     """
     atlas, parts = xatlas.Atlas(), []
     for part in _parts(mesh):
@@ -38,7 +40,7 @@ def unwrap(mesh: Mesh) -> Mesh:
     pack.resolution = 1024
     pack.padding = 8
     atlas.generate(pack_options=pack)
-    side = np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)  # no longer one way than the other
+    side = np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)  # equal scale in u and v
     sources, uvs, faces, count = [], [], np.empty_like(mesh.faces), 0
     for i, (part, vertices) in enumerate(parts):
         source, corners, uv = atlas[i]
@@ -51,7 +53,7 @@ def unwrap(mesh: Mesh) -> Mesh:
 
 
 def _parts(mesh: Mesh) -> list[np.ndarray]:
-    """The numbers of the faces of each part."""
+    """Split the mesh: the face indices of each part."""
     middle, done, left = mesh.vertices[mesh.faces].mean(axis=1), [], [np.arange(len(mesh.faces))]
     while left:
         part = left.pop()
@@ -65,7 +67,7 @@ def _parts(mesh: Mesh) -> list[np.ndarray]:
 
 
 def layout(mesh: Mesh) -> Layout:
-    """What `Layout` says of a mesh with uv."""
+    """Measure the layout of a mesh with uv."""
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
@@ -79,7 +81,7 @@ def layout(mesh: Mesh) -> Layout:
 
 
 def _angles(corners: np.ndarray) -> np.ndarray:
-    """The angles (F, 3) of triangles (F, 3, 2 or 3), radians."""
+    """Compute the angles (F, 3) of triangles (F, 3, 2 or 3) in radians."""
     after, before = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     lengths = np.linalg.norm(after, axis=-1) * np.linalg.norm(before, axis=-1)
     return np.arccos(np.clip((after * before).sum(axis=-1) / np.maximum(lengths, 1e-30), -1, 1))

@@ -1,1 +1,1 @@
-"""File formats, and the plain arrays that they hold: PLY, EXR, glTF, OBJ, COLMAP's model, history.jsonl. No torch."""
+"""Read and write files and the plain arrays they hold: PLY, EXR, glTF, OBJ, COLMAP's models, history.jsonl. No torch."""

@@ -1,6 +1,7 @@
-"""Read COLMAP's sparse models, binary or text, as its documentation describes them under "Output Format".
+"""Read COLMAP's sparse models, binary or text (COLMAP's documentation, "Output Format").
 
-COLMAP's own reader answers a truncated file with an unrelated message, or asks for terabytes of memory; this one names the file.
+COLMAP's own reader is not used: on a truncated file it gives an unrelated message or asks for terabytes of memory. This one names
+the file.
 """
 
 import re
@@ -16,7 +17,7 @@ from refgs.errors import InputError
 
 T = TypeVar("T")
 
-# COLMAP's "Camera Models" by number: name and count of parameters. Text files use the names.
+# COLMAP's "Camera Models": number, name, count of parameters. Text files use the names.
 MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -49,24 +50,24 @@ class Image:
 
 
 def model_files(folder: Path) -> tuple[Path, Path, Path]:
-    """A model's files of cameras, images and points: binary where its images are, else text. They may be missing."""
+    """Name the files of a model's cameras, images and points: binary if images.bin exists, else text. They may be missing."""
     suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
     cameras, images, points = (folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
     return cameras, images, points
 
 
 def read_cameras(file: Path) -> dict[int, Intrinsics]:
-    """Read the cameras by their numbers. Raises InputError for a file that is broken."""
+    """Read the cameras, keyed by number. Raises InputError for a broken file."""
     return _parse(file, _binary_cameras, _text_cameras)
 
 
 def read_images(file: Path) -> list[Image]:
-    """Read the names, cameras and poses of the images. Raises InputError for a file that is broken."""
+    """Read the images' names, cameras and poses. Raises InputError for a broken file."""
     return _parse(file, _binary_images, _text_images)
 
 
 def read_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the points (M, 3) that are finite, and their colours (M, 3) in 0..1. Raises InputError for a file that is broken."""
+    """Read the finite points (M, 3) and their colours (M, 3), sRGB-encoded 0..1. Raises InputError for a broken file."""
     return _parse(file, _binary_points, _text_points)
 
 
@@ -77,8 +78,8 @@ def _parse(file: Path, binary: Callable[[Path], T], text: Callable[[Path], T]) -
         raise InputError(f"{file}: the file is truncated or not COLMAP's. Export the sparse model again.") from error
 
 
-class _Bytes:
-    """A binary file read from front to back; struct.error where it ends too early."""
+class _Reader:
+    """Binary file, read from front to back. Raises struct.error or ValueError where it is truncated."""
 
     def __init__(self, file: Path):
         self.data, self.at = file.read_bytes(), 0
@@ -102,7 +103,7 @@ class _Bytes:
 
 
 def _binary_cameras(file: Path) -> dict[int, Intrinsics]:
-    source, cameras = _Bytes(file), {}
+    source, cameras = _Reader(file), {}
     for _ in range(source.take("Q")[0]):
         number, model, width, height = source.take("iiQQ")
         if model not in MODELS:
@@ -113,7 +114,7 @@ def _binary_cameras(file: Path) -> dict[int, Intrinsics]:
 
 
 def _binary_images(file: Path) -> list[Image]:
-    source, images = _Bytes(file), []
+    source, images = _Reader(file), []
     for _ in range(source.take("Q")[0]):
         _, *pose, camera_id = source.take("I7di")
         images.append(Image(source.name(), camera_id, tuple(pose)))
@@ -122,7 +123,7 @@ def _binary_images(file: Path) -> list[Image]:
 
 
 def _binary_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    source, rows = _Bytes(file), []
+    source, rows = _Reader(file), []
     for _ in range(source.take("Q")[0]):
         rows.append(source.take("Q3d3Bd")[1:7])
         source.skip(8 * source.take("Q")[0])  # track: image id, keypoint
@@ -136,10 +137,10 @@ def _points(rows: list) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _entries(file: Path, lines_each: int = 1) -> list[str]:
-    """The first line of each entry; ValueError where there are fewer than the file's own header counts."""
+    """Return the first line of each entry. Raises ValueError where the header counts more entries than there are."""
     lines = file.read_text(encoding="utf-8").splitlines()
     entries = [line for line in lines if not line.startswith("#") and (lines_each > 1 or line.strip())]
-    while entries and not entries[-1].strip():  # an image's line of keypoints may be empty
+    while entries and not entries[-1].strip():  # the line of keypoints may be empty
         entries.pop()
     entries = entries[::lines_each]
     counted = next((match for line in lines if (match := re.match(r"# Number of \w+: (\d+)", line))), None)

@@ -1,4 +1,4 @@
-"""OpenEXR pictures."""
+"""Read and write OpenEXR pictures."""
 
 import errno
 import os
@@ -10,14 +10,14 @@ import OpenEXR
 from refgs.errors import InputError
 from refgs.paths import whole
 
-# Rec.709 / sRGB: x and y of red, green, blue and the D65 white (ITU-R BT.709-6, table 1).
+# Chromaticities x, y of Rec.709 / sRGB: red, green, blue, D65 white (ITU-R BT.709-6, table 1).
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 
 def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
     """Write float32 linear Rec.709: (H, W, 4) as premultiplied RGBA, (H, W, 3) as RGB, (H, W) as Y; ZIP, scan lines.
 
-    Raises OSError where the disk does not take it.
+    Raises OSError where the disk is full or refuses the file.
     """
     pixels = np.ascontiguousarray(pixels, np.float32)
     name = "Y" if pixels.ndim == 2 else {3: "RGB", 4: "RGBA"}[pixels.shape[2]]
@@ -29,7 +29,7 @@ def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
     with whole(path) as temporary:
         try:
             OpenEXR.File(header, {name: pixels}).write(str(temporary))
-        except RuntimeError as error:  # of the disk, for one, which says why in words alone
+        except RuntimeError as error:  # the binding reports a full disk by its text alone: find its code
             code = next((code for code in errno.errorcode if os.strerror(code) in str(error)), None)
             if code is None:
                 raise
@@ -37,9 +37,10 @@ def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
 
 
 def read_exr(path: str | os.PathLike) -> np.ndarray:
-    """Read an EXR as float32: (H, W, 4) RGBA, (H, W, 3) RGB, or (H, W) where it has one channel; of several parts the first in colour.
+    """Read an EXR as float32: (H, W, 4) RGBA, (H, W, 3) RGB, or (H, W) for a single channel.
 
-    Raises InputError for a file that is missing, broken, or has none of these.
+    Of several parts the first with R, G and B is read, else the first. Raises InputError for a file that is missing or broken, or has
+    other channels.
     """
     path = Path(path)
     if not path.is_file():
@@ -49,7 +50,7 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
             parts = [file.channels(i) for i in range(len(file.parts))]
             part = next((part for part in parts if {"R", "G", "B"} <= part.keys()), parts[0])
             channels = {name: channel.pixels for name, channel in part.items()}
-    except Exception:  # the binding raises RuntimeError, ValueError or its own, by what is broken
+    except Exception:  # the binding raises RuntimeError, ValueError or its own errors
         raise InputError(f"{path} is not a whole OpenEXR file: write or copy it again") from None
     if {"R", "G", "B"} <= channels.keys():
         names = [name for name in "RGBA" if name in channels]

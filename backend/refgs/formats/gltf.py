@@ -1,4 +1,4 @@
-"""Textured meshes as binary glTF 2.0, with their textures beside them."""
+"""Read and write textured meshes as binary glTF 2.0. Textures are also written beside the mesh."""
 
 import os
 from pathlib import Path
@@ -20,9 +20,9 @@ SPECULAR = "KHR_materials_specular"
 def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     """Write the mesh (Z up; with normals and uv) as Y-up binary glTF with a metallic-roughness material.
 
-    Embedded: base colour (sRGB), occlusion, roughness and metallic (R, G and B, linear), the tangent-space normal map and the
-    tangents that `bake` assumed, MikkTSpace's: not every reader makes these. What mirrors nothing says so by KHR_materials_specular.
-    Beside the file what `write_textures` writes.
+    Embedded are: base colour (sRGB); occlusion, roughness and metallic as R, G and B (linear); the tangent-space normal map; the
+    MikkTSpace tangents of `bake`, because not every reader computes them. A material without specular reflection has
+    KHR_materials_specular. `write_textures` writes the maps beside the file.
     """
     path = Path(path)
     pictures = write_textures(path.parent / FOLDER, textures)
@@ -35,7 +35,7 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
         normalTexture=Image.fromarray(pictures["normal"]),
         metallicFactor=1.0,
         roughnessFactor=1.0,
-        doubleSided=True,  # a capture from above leaves a mesh without a bottom
+        doubleSided=True,  # a capture from above leaves the mesh open below
     )
     model = trimesh.Trimesh(
         mesh.vertices @ Y_UP.T,
@@ -48,7 +48,7 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     model.vertex_attributes["TANGENT"] = np.column_stack([tangents @ Y_UP.T, signs]).astype(np.float32)
 
     def finish(tree: dict) -> None:
-        # trimesh takes tangents for an attribute of ours, and puts an underscore before it.
+        # trimesh treats tangents as a custom attribute and prefixes an underscore.
         attributes = tree["meshes"][0]["primitives"][0]["attributes"]
         attributes["TANGENT"] = attributes.pop("_TANGENT")
         if textures.specular < 1:
@@ -62,10 +62,10 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
 
 
 def read_glb(path: str | os.PathLike) -> Mesh:
-    """Vertices and faces, Z up, of what `write_glb` wrote. Raises InputError for a file that is broken."""
+    """Read the vertices and faces, Z up, of a file by `write_glb`. Raises InputError for a broken file."""
     try:
         model = trimesh.load_mesh(path, file_type="glb", process=False, skip_materials=True)
         vertices, faces = np.asarray(model.vertices, np.float64), np.asarray(model.faces)
-    except Exception as error:  # trimesh raises what its parsing ran into
+    except Exception as error:  # trimesh raises errors of many types
         raise InputError(f"{path} is not a whole binary glTF file of a mesh ({error}): export it again") from None
     return Mesh(vertices @ Y_UP, faces)

@@ -1,4 +1,4 @@
-"""history.jsonl: the errors of a training as it goes, an object a line (docs/run-folder.md)."""
+"""Read history.jsonl: the errors during a training, one JSON object a line (docs/run-folder.md)."""
 
 import json
 
@@ -6,7 +6,7 @@ FILE = "history.jsonl"  # in the run folder
 
 
 def read(text: str) -> list[dict]:
-    """The lines that are whole: a training that was killed can leave half of one."""
+    """Parse the complete lines. A killed training can leave a truncated one."""
     found = []
     for line in text.splitlines():
         try:

@@ -1,4 +1,4 @@
-"""Triangle meshes, and the PLY files of their vertices and faces."""
+"""Triangle meshes, read from and written to PLY files."""
 
 import os
 from dataclasses import dataclass
@@ -9,13 +9,16 @@ import trimesh
 from refgs.errors import InputError
 from refgs.paths import whole
 
-Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # from ours, Z up, to glTF's (2.0, 3.4) and OBJ's
+Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # rotation from Z up to the Y up of glTF (2.0, 3.4) and OBJ
 
 
 @dataclass
 class Mesh:
-    """Triangles. vertices (V, 3) float64 in world units, faces (F, 3) integers, counter-clockwise seen from outside;
-    smooth unit normals (V, 3) and uv (V, 2) in 0..1 with v upward, where they have been made."""
+    """Triangle mesh.
+
+    vertices (V, 3) are float64 in world units; faces (F, 3) are integers, counter-clockwise seen from outside. Optional are smooth unit
+    normals (V, 3) and uv (V, 2) in 0..1 with v upward.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -34,9 +37,9 @@ def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
 
 
 def read_mesh(path: str | os.PathLike) -> Mesh:
-    """Read what `write_mesh` wrote. Raises InputError for a file that is broken."""
+    """Read a file by `write_mesh`. Raises InputError for a broken file."""
     try:
         mesh = trimesh.load_mesh(path, file_type="ply", process=False)
         return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces))
-    except Exception as error:  # trimesh raises what its parsing ran into
+    except Exception as error:  # trimesh raises errors of many types
         raise InputError(f"{path} is not a whole PLY file of a mesh ({error}): train again") from None

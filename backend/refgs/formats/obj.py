@@ -1,4 +1,4 @@
-"""Textured meshes as Wavefront OBJ, with their textures beside them."""
+"""Write textured meshes as Wavefront OBJ, with their textures beside them."""
 
 import os
 from pathlib import Path
@@ -11,8 +11,10 @@ from refgs.paths import whole
 
 
 def write_obj(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
-    """Write the mesh (Z up; with normals and uv) as Y-up Wavefront OBJ, its material beside it as MTL with what is customary for
-    metallic and roughness (map_Pm, map_Pr, norm), which name the pictures that `write_textures` writes."""
+    """Write the mesh (Z up; with normals and uv) as Y-up Wavefront OBJ, and its material beside it as MTL.
+
+    The material names the pictures of `write_textures`, by the customary PBR keys map_Pm (metallic), map_Pr (roughness) and norm.
+    """
     path = Path(path)
     write_textures(path.parent / FOLDER, textures)
     maps = {"map_Kd": "base_color", "map_Pr": "roughness", "map_Pm": "metallic", "norm": "normal"}
@@ -27,7 +29,7 @@ def write_obj(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
     ]
     with whole(path.with_suffix(".mtl")) as temporary:
         temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")
-    corner = (mesh.faces + 1).repeat(3, axis=1).reshape(-1, 9)  # one number for place, uv and normal
+    corner = (mesh.faces + 1).repeat(3, axis=1).reshape(-1, 9)  # position, uv and normal share an index
     with whole(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write(f"mtllib {path.with_suffix('.mtl').name}\no RefGS\n")
         np.savetxt(file, mesh.vertices @ Y_UP.T, "v %.9g %.9g %.9g")

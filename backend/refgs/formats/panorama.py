@@ -1,4 +1,4 @@
-"""Light as an equirectangular panorama in Blender's orientation."""
+"""Equirectangular panoramas of radiance, in Blender's orientation (see `directions`). `write_exr` writes them."""
 
 import os
 import warnings
@@ -6,18 +6,14 @@ import warnings
 import numpy as np
 
 from refgs.errors import InputError, InputWarning
-from refgs.formats.exr import read_exr, write_exr
-
-
-def write_environment(path: str | os.PathLike, radiance: np.ndarray) -> None:
-    """Write a panorama (H, W, 3) of linear Rec.709 radiance, in Blender's orientation (see `directions`)."""
-    write_exr(path, radiance)
+from refgs.formats.exr import read_exr
 
 
 def read_environment(path: str | os.PathLike) -> np.ndarray:
-    """Read a panorama (H, W, 3), float32 linear radiance. Raises InputError where `path` does not hold one.
+    """Read a panorama (H, W, 3) of linear radiance, float32. Raises InputError where `path` does not hold one.
 
-    Overflown pixels (half-float suns) become the largest half float; negative radiance becomes 0, and so do NaN, with an InputWarning.
+    Infinite pixels (a sun that overflowed half floats) become the largest half float. Negative radiance becomes 0. NaN becomes 0 too,
+    with an InputWarning.
     """
     pixels = read_exr(path)
     if pixels.ndim == 2:
@@ -26,15 +22,14 @@ def read_environment(path: str | os.PathLike) -> np.ndarray:
     if width != 2 * height:
         raise InputError(f"{path} is {width}×{height}: an equirectangular panorama is twice as wide as it is high")
     if missing := int(np.isnan(pixels[..., :3]).any(axis=-1).sum()):
-        warnings.warn(InputWarning(f"{path}: {missing:,} pixels are no numbers; they give no light"), stacklevel=2)
+        warnings.warn(InputWarning(f"{path}: {missing:,} pixels are not a number and give no light"), stacklevel=2)
     return np.nan_to_num(pixels[..., :3], nan=0, posinf=65504, neginf=0).clip(min=0)
 
 
 def directions(height: int, width: int) -> np.ndarray:
-    """Unit directions (height, width, 3), float32, of the panorama's pixel centres, Z up.
+    """Compute the unit directions (height, width, 3), float32, of a panorama's pixel centres, Z up.
 
-    Blender's orientation: u = 0.5 − atan2(y, x)/2π from the left, v = asin(z)/π + 0.5 from the bottom; the first row is
-    the top.
+    Blender's orientation is u = 0.5 − atan2(y, x)/2π from the left and v = asin(z)/π + 0.5 from the bottom. The first row is the top.
     """
     azimuth = 2 * np.pi * (0.5 - (np.arange(width) + 0.5) / width)
     elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
@@ -43,7 +38,7 @@ def directions(height: int, width: int) -> np.ndarray:
 
 
 def sample(panorama: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Radiance (..., C) of a panorama (H, W, C) in directions (..., 3) of any length: bilinear, wrapping sideways."""
+    """Look up a panorama (H, W, C) in directions (..., 3) of any length: radiance (..., C), bilinear, wrapped horizontally."""
     height, width = panorama.shape[:2]
     x, y, z = np.moveaxis(np.asarray(directions, np.float32), -1, 0)
     column = (0.5 - np.arctan2(y, x) / (2 * np.pi)) * width - 0.5

@@ -1,4 +1,4 @@
-"""splats.ply: one row a splat, in the property names of 3D Gaussian splatting, with materials."""
+"""Read and write splats.ply: one row a splat, with materials, in the property names of 3D Gaussian splatting (3DGS)."""
 
 import math
 import os
@@ -15,21 +15,25 @@ from refgs.color import srgb_decode
 from refgs.errors import InputError, InputWarning
 from refgs.formats.ply import read_ply, write_ply
 
-DC = 0.5 / math.sqrt(math.pi)  # Y00: a constant harmonic f_dc shows the colour 0.5 + DC · f_dc
+DC = 0.5 / math.sqrt(math.pi)  # Y00: a constant harmonic f_dc has the colour 0.5 + DC · f_dc
 
 
 @dataclass
 class Splats:
-    """N surfels with appearance and materials; float32 numpy arrays.
+    """Table of N splats with appearance and materials; float32 numpy arrays.
 
-    positions (N, 3), normals (N, 3) unit and pointing outward where that is known, sh (N, K, 3) spherical harmonics
-    with K = (degree + 1)² and colour = 0.5 + SH (the 3DGS convention), opacities (N,) in 0..1, scales (N, 2) standard
-    deviations in world units, or (N, 3) of 3D Gaussians with the normal's last, rotations (N, 4) unit quaternions wxyz,
-    albedo (N, 3) linear Rec.709, metallic (N,) and perceptual roughness (N,) in 0..1, received (N, 3) the part of the recovered
-    light's irradiance that reaches a surfel, with what comes from the object itself, indirect (N, K', 3) spherical harmonics
-    of the linear radiance that comes from the object itself; K' is 0 where a scene does without, all of `received` is 1 then.
-    `constants` are those of CONSTANTS that all splats have alike: a file then has no column of them.
-    `beside` is what else a file held: its elements, `vertex` with the properties that are none of these.
+    - positions (N, 3), world units
+    - normals (N, 3), unit, outward where that is known
+    - sh (N, K, 3): spherical harmonics, K = (degree + 1)², colour = 0.5 + SH as in 3DGS
+    - opacities (N,) in 0..1
+    - scales: standard deviations in world units, (N, 2) of surfels, (N, 3) of 3D Gaussians with the normal's last
+    - rotations (N, 4): unit quaternions wxyz
+    - albedo (N, 3), linear Rec.709; metallic (N,) and perceptual roughness (N,) in 0..1
+    - received (N, 3): irradiance, with light from the object itself, divided by that of an unoccluded surface
+    - indirect (N, K', 3): spherical harmonics of the linear radiance from the object itself. Scenes without inter-reflection have
+      K' = 0 and `received` 1.
+    - constants: values, by the names of CONSTANTS, that all splats share. Files have no columns for them.
+    - others: elements of a file that are not in this table. Its `vertex` has the unknown properties.
     """
 
     positions: np.ndarray
@@ -44,7 +48,7 @@ class Splats:
     received: np.ndarray
     indirect: np.ndarray
     constants: dict[str, float] = field(default_factory=dict)
-    beside: tuple[PlyElement, ...] = ()
+    others: tuple[PlyElement, ...] = ()
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -52,29 +56,27 @@ class Splats:
 
 _HEAD = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 _TAIL = ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
-THIN = 0.05  # of a surfel's smaller scale: the third, for viewers of 3D Gaussians
-CHUNK = 4096  # rows, which the processor's cache holds
+THIN = 0.05  # third scale of a surfel in 3DGS viewers, as a part of its smaller scale
+CHUNK = 4096  # rows copied at a time; they fit the processor's cache
 _RECEIVED = ["received_r", "received_g", "received_b"]
 _MATERIAL = ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
-CONSTANTS = (
-    "metallic",
-    "roughness",
-    "specular",
-)  # the last, the Principled BSDF's Specular IOR Level, is 0.5 where nothing is said
-_CONSTANT = re.compile(rf"constant ({'|'.join(CONSTANTS)}) ([0-9.e+-]+)")  # in a comment of the head
-_REFERENCE = ["ori_color_0", "ori_color_1", "ori_color_2", "refl_strength", "roughness"]  # Ref-Gaussian's, as logits
-MATTE = 0.0, 1.0  # metallic and roughness of splats that come without materials
-# Turns that bring axis 0, 1 or 2 to the third place, as quaternions wxyz.
+# `specular` is the Principled BSDF's Specular IOR Level. Its default is 0.5.
+CONSTANTS = ("metallic", "roughness", "specular")
+_CONSTANT = re.compile(rf"constant ({'|'.join(CONSTANTS)}) ([0-9.e+-]+)")  # in a comment of the header
+# Properties of Ref-Gaussian's files, as logits.
+_REF_GAUSSIAN = ["ori_color_0", "ori_color_1", "ori_color_2", "refl_strength", "roughness"]
+MATTE = 0.0, 1.0  # metallic and roughness of splats without materials
+# Rotations, as quaternions wxyz, that move axis 0, 1 or 2 to the third place.
 _TO_THIRD = np.array([(0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1, 0, 0, 0)], np.float32)
 
 
 def write_splats(path: str | os.PathLike, splats: Splats) -> None:
-    """Write a binary little-endian PLY with one `vertex` element, and what `splats.beside` holds; see docs for the properties.
+    """Write a binary little-endian PLY: the table as `vertex`, then the elements of `splats.others` (docs/formats.md).
 
-    Opacity is stored as a logit and scales as logarithms, as 3DGS viewers expect; spherical harmonics of the first
-    degree and above are channel-major; materials are stored as they are. Opacities are clipped to 1e-6 .. 1 - 1e-6.
+    As 3DGS viewers expect, opacities are logits, scales are logarithms, and spherical harmonics of degree 1 and above are
+    channel-major. Materials are stored unchanged. Opacities are clipped to 1e-6 .. 1 - 1e-6.
     """
-    names, columns = _common(splats, splats.scales)
+    names, columns = _common_columns(splats, splats.scales)
     names += _MATERIAL[:3]
     columns.append(splats.albedo)
     for name in ("metallic", "roughness"):
@@ -85,21 +87,23 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
         names += [*_RECEIVED, *(f"ind_{i}" for i in range(3 * splats.indirect.shape[1]))]
         columns += [splats.received, splats.indirect.transpose(0, 2, 1)]
     _write(
-        path, names, columns, splats.beside, [f"constant {name} {value:g}" for name, value in splats.constants.items()]
+        path, names, columns, splats.others, [f"constant {name} {value:g}" for name, value in splats.constants.items()]
     )
 
 
 def write_display_splats(path: str | os.PathLike, splats: Splats) -> None:
-    """Write a binary little-endian PLY as 3D Gaussian splatting's viewers expect it: harmonics, opacity, three scales, of which a
-    surfel's third is THIN of its smaller one (zero would hide it), rotation; no materials."""
+    """Write a binary little-endian PLY for 3DGS viewers: harmonics, opacity, three scales, rotation; no materials.
+
+    A surfel's third scale is THIN times its smaller one, because viewers hide a splat with scale 0.
+    """
     scales = splats.scales
     if scales.shape[1] == 2:
         scales = np.column_stack([scales, THIN * scales.min(axis=1)])
-    _write(path, *_common(splats, scales))
+    _write(path, *_common_columns(splats, scales))
 
 
-def _common(splats: Splats, scales: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
-    """The properties that all splats' files have, and their columns."""
+def _common_columns(splats: Splats, scales: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
+    """Return the names and columns of the properties in all files of splats."""
     opacity = np.clip(splats.opacities.astype(np.float64), 1e-6, 1 - 1e-6)
     rest = splats.sh[:, 1:].transpose(0, 2, 1)
     columns = [
@@ -121,7 +125,7 @@ def _write(
     path: str | os.PathLike,
     names: list[str],
     columns: list[np.ndarray],
-    beside: tuple[PlyElement, ...] = (),
+    others: tuple[PlyElement, ...] = (),
     comments: list[str] = (),
 ) -> None:
     count = len(columns[0])
@@ -135,7 +139,7 @@ def _write(
         start += width
     rows = table.view([(name, "<f4") for name in names]).reshape(count)
     properties = [PlyProperty(name, "float") for name in names]
-    unknown = next((element for element in beside if element.name == "vertex"), None)
+    unknown = next((element for element in others if element.name == "vertex"), None)
     if unknown is not None:
         more = [p for p in unknown.properties if p.name not in names]
         both = np.empty(count, [*rows.dtype.descr, *((p.name, p.dtype("<")) for p in more)])
@@ -145,15 +149,15 @@ def _write(
         rows, properties = both, [*properties, *more]
     vertex = PlyElement("vertex", properties, count)
     vertex.data = rows
-    write_ply(path, [vertex, *(element for element in beside if element.name != "vertex")], comments)
+    write_ply(path, [vertex, *(element for element in others if element.name != "vertex")], comments)
 
 
 def read_splats(path: str | os.PathLike) -> Splats:
-    """Read splats: what `write_splats` wrote, and the PLY files of 3DGS (three scales), 2DGS (two) and Ref-Gaussian.
+    """Read the PLY files of `write_splats`, 3DGS (three scales), 2DGS (two scales) and Ref-Gaussian.
 
-    Where there are no materials, base colour is the colour that the constant harmonic shows, and the rest is matte: MATTE. Where there
-    are no normals, they are the rotation's third axis, to either side; of three scales the least becomes the last. Rows with a value
-    that is not finite are left out, with an InputWarning. Raises InputError for a file that is missing, broken, or not of splats.
+    Missing materials become MATTE, with the colour of the constant harmonic as base colour. Missing normals become the rotation's third
+    axis, of unknown sign. Three scales are reordered so that the smallest is the last. Rows with values that are not finite are left
+    out, with an InputWarning. Raises InputError for a file that is missing, broken, or not of splats.
     """
     data = read_ply(path)
     if "vertex" not in data:
@@ -177,11 +181,11 @@ def read_splats(path: str | os.PathLike) -> Splats:
         known.update(wanted)
         if not wanted:
             return np.empty((vertex.count, 0), np.float32)
-        part = rows[[*wanted]]  # a view, which lists beside it would be in the way of
+        part = rows[[*wanted]]  # a view; numpy cannot convert it directly where the row also has lists
         return structured_to_unstructured(repack_fields(part) if rows.dtype.hasobject else part, np.float32, copy=True)
 
     def harmonics(prefix: str, *degrees: int) -> np.ndarray:
-        """(N, K, 3) from the channel-major values of a name, which must be as many as some degree has."""
+        """Return the channel-major values of a prefix as (N, K, 3). Raises InputError where no degree has so many."""
         found = sum(re.fullmatch(rf"{prefix}\d+", name) is not None for name in names)
         wanted = [f"{prefix}{i}" for i in range(found)]
         if found not in degrees or not {*wanted} <= {*names}:
@@ -196,7 +200,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
         scales = np.exp(columns(*(name for name in ("scale_0", "scale_1", "scale_2") if name in names)))
         rotations = columns("rot_0", "rot_1", "rot_2", "rot_3")
         length = np.linalg.norm(rotations, axis=1, keepdims=True)
-        rotations = np.where(np.abs(length - 1) < 1e-4, rotations, rotations / length)  # to the last bit, if they are
+        rotations = np.where(np.abs(length - 1) < 1e-4, rotations, rotations / length)  # keep the bits of unit ones
         if scales.shape[1] == 3:
             rotations, scales = _shortest_last(rotations, scales)
         if ours:
@@ -205,8 +209,8 @@ def read_splats(path: str | os.PathLike) -> Splats:
                 np.full(vertex.count, constants[name], np.float32) if name in constants else columns(name)[:, 0]
                 for name in _MATERIAL[3:]
             )
-        elif {*_REFERENCE} <= {*names}:
-            *albedo, metallic, roughness = _logistic(columns(*_REFERENCE)).T
+        elif {*_REF_GAUSSIAN} <= {*names}:
+            *albedo, metallic, roughness = _logistic(columns(*_REF_GAUSSIAN)).T
             albedo = srgb_decode(np.stack(albedo, axis=1))
         else:
             albedo = srgb_decode((0.5 + DC * sh[:, 0]).clip(0, 1))
@@ -227,8 +231,8 @@ def read_splats(path: str | os.PathLike) -> Splats:
         )
     none = ~splats.normals.any(axis=1)  # 3DGS writes zeros
     splats.normals[none] = _third_axis(rotations[none])
-    splats.beside = _beside(data.elements, known)
-    return _finite(splats, Path(path))
+    splats.others = _other_elements(data.elements, known)
+    return _without_nonfinite(splats, Path(path))
 
 
 def _logistic(values: np.ndarray) -> np.ndarray:
@@ -241,7 +245,7 @@ def _third_axis(rotations: np.ndarray) -> np.ndarray:
 
 
 def _shortest_last(rotations: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same Gaussians with their shortest axis, which is their normal, in the third place."""
+    """Rotate Gaussians' axes so that the shortest, which is the normal, is the third."""
     shortest = np.where(scales[:, 2] <= scales.min(axis=1), 2, scales.argmin(axis=1))
     w, x, y, z = rotations.T
     a, b, c, d = _TO_THIRD[shortest].T
@@ -254,8 +258,8 @@ def _shortest_last(rotations: np.ndarray, scales: np.ndarray) -> tuple[np.ndarra
     return np.stack(turned, axis=1), np.take_along_axis(scales, (shortest[:, None] + [1, 2, 3]) % 3, axis=1)
 
 
-def _beside(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[PlyElement, ...]:
-    """A file's elements without the known properties of `vertex`, in memory of their own."""
+def _other_elements(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[PlyElement, ...]:
+    """Copy a file's elements, without the known properties of `vertex`."""
     left = []
     for element in elements:
         more = [p for p in element.properties if element.name != "vertex" or p.name not in known]
@@ -266,9 +270,11 @@ def _beside(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[PlyEleme
     return tuple(left)
 
 
-def _finite(splats: Splats, path: Path) -> Splats:
-    """Those of the splats all of whose values are finite. A warning says how many others there were; further elements, which may
-    number the rows, go with them."""
+def _without_nonfinite(splats: Splats, path: Path) -> Splats:
+    """Remove the splats with a value that is not finite, with an InputWarning.
+
+    Elements other than `vertex` are removed with them, because they may refer to rows by index.
+    """
     values = {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
     wrong = [name for name, value in values.items() if not np.isfinite(value).all()]
     if not wrong:
@@ -276,10 +282,10 @@ def _finite(splats: Splats, path: Path) -> Splats:
     fine = np.logical_and.reduce([np.isfinite(v).reshape(len(splats), -1).all(axis=1) for v in values.values()])
     what = f"{path}: {(~fine).sum():,} of {len(splats):,} splats have {', '.join(wrong)} that are not finite: left out"
     warnings.warn(what, InputWarning, stacklevel=3)
-    beside = []
-    for element in splats.beside:
+    others = []
+    for element in splats.others:
         if element.name == "vertex":
             copy = PlyElement(element.name, element.properties, int(fine.sum()))
             copy.data = element.data[fine]
-            beside.append(copy)
-    return replace(splats, **{name: value[fine] for name, value in values.items()}, beside=tuple(beside))
+            others.append(copy)
+    return replace(splats, **{name: value[fine] for name, value in values.items()}, others=tuple(others))

@@ -1,4 +1,4 @@
-"""Tangents as MikkTSpace makes them, which is what glTF asks for and Blender computes."""
+"""MikkTSpace tangents, as glTF demands and Blender computes."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ from refgs.formats.mesh import Mesh
 
 
 def vertex_tangents(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Unit tangents (V, 3), along increasing u, and the bitangent's sign (V,): bitangent = sign · normal × tangent.
+    """Compute unit tangents (V, 3) along increasing u, and signs (V,): bitangent = sign · normal × tangent.
 
-    Mikkelsen 2008, "Simulation of Wrinkled Surfaces Revisited": the faces' tangents in the plane of the vertex's
-    normal, weighted by the angle of the face there. Vertices must be cut where charts meet, as `unwrap` leaves them.
+    Project the faces' tangents to the plane of the vertex's normal; weight them by the face's angle at the vertex (Mikkelsen 2008,
+    "Simulation of Wrinkled Surfaces Revisited"). Vertices on a seam must be doubled, as `unwrap` does.
     """
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -30,7 +30,7 @@ def vertex_tangents(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
         for axis in range(3):
             total[:, axis] += np.bincount(vertex, tangent[:, axis], len(total))
         flips += np.bincount(vertex, angle * sign, len(total))
-    # Where all faces are degenerate in uv any direction will do, but it must be one.
+    # Where all faces are degenerate in uv, take an arbitrary tangent.
     smallest = np.eye(3)[np.abs(mesh.normals).argmin(1)]
     lost = np.linalg.norm(total, axis=1) < 1e-12
     total[lost] = _flatten(smallest, mesh.normals)[lost]

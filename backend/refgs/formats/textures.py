@@ -1,4 +1,4 @@
-"""Texture maps of a mesh, as PNG and EXR."""
+"""Write the texture maps of a mesh as PNG and EXR."""
 
 import io
 from dataclasses import dataclass
@@ -18,10 +18,12 @@ FOLDER = "textures"  # beside the mesh
 class Textures:
     """Square maps of S×S texels, float32, the first row at v = 1.
 
-    base_color (S, S, 3) linear Rec.709; metallic, roughness and occlusion (S, S); normal (S, S, 3), unit vectors in MikkTSpace
-    tangent space, y along v (OpenGL, glTF and Blender); mask (S, S), true where a texel's centre lies on the mesh or one
-    beside it does, so that look-ups on the mesh read nothing else: the rest is padding that repeats the nearest such texel.
-    specular is 1, or 0 where nothing is mirrored anywhere.
+    - base_color (S, S, 3), linear Rec.709
+    - metallic, roughness and occlusion (S, S)
+    - normal (S, S, 3): unit vectors in MikkTSpace tangent space, y along v (OpenGL, glTF and Blender)
+    - mask (S, S): true where the centre of a texel or of one of its neighbours lies on the mesh. Bilinear look-ups on the mesh read only
+      these; the others are padding, copied from the nearest one.
+    - specular: 1, or 0 for a material without specular reflection
     """
 
     base_color: np.ndarray
@@ -34,8 +36,10 @@ class Textures:
 
 
 def write_textures(folder: Path, textures: Textures) -> dict[str, np.ndarray]:
-    """Write the maps as 8-bit PNG and as linear float EXR (the normal mapped to 0..1 in both), for 8 bits are coarse on a mirror; each
-    file whole or not at all. Returns the 8-bit ones by their names, base colour sRGB-encoded."""
+    """Write each map as 8-bit PNG and as linear float EXR, each file whole or not at all. 8 bits alone are coarse for a mirror.
+
+    Normals are mapped to 0..1 in both. Returns the 8-bit pictures by name, base colour sRGB-encoded.
+    """
     maps = {
         "base_color": textures.base_color,
         "metallic": textures.metallic,
@@ -47,7 +51,7 @@ def write_textures(folder: Path, textures: Textures) -> dict[str, np.ndarray]:
     pictures = {}
     for name, linear in maps.items():
         pictures[name] = np.empty(linear.shape, np.uint8)
-        for row, values in zip(pictures[name], linear, strict=True):  # one at a time: of large maps copies are large
+        for row, values in zip(pictures[name], linear, strict=True):  # row by row: a copy of a large map is large
             row[:] = np.rint(255 * (srgb_encode(values.clip(0, 1)) if name == "base_color" else values.clip(0, 1)))
         png = io.BytesIO()
         Image.fromarray(pictures[name]).save(png, "PNG")

@@ -1,1 +1,1 @@
-"""Shape: visual hulls, TSDF fusion of depth, and the clean-up of meshes."""
+"""Geometry: visual hulls, TSDF fusion of depth maps, clean-up of meshes, visibility by ray tracing."""

@@ -1,4 +1,4 @@
-"""Rays against a mesh on a CUDA card."""
+"""Trace rays against a mesh on a CUDA card."""
 
 import numpy as np
 import torch
@@ -9,29 +9,31 @@ from refgs.formats.mesh import Mesh
 from refgs.kernels.layout import struct
 from refgs.kernels.load import run
 
-LEAF = 4  # triangles, as in trace.cu
-BITS = 10  # of a Morton code's coordinate
+LEAF = 4  # triangles a leaf, as in trace.cu
+BITS = 10  # bits a coordinate in a Morton code
 
 
 _Work = struct("Trace", "trace.cu")
 
 
-def _spread(v: Tensor) -> Tensor:
-    """The bits of integers below 2^10, two zeros between any two."""
+def _spread_bits(v: Tensor) -> Tensor:
+    """Insert two zero bits between any two bits of integers below 2^10."""
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         v = (v | v << shift) & mask
     return v
 
 
 class Tree:
-    """A complete binary tree of boxes over a mesh's triangles, in the order of their middles' Morton codes (Lauterbach et al.
-    2009); every box is that of its two children. The mesh is taken to its `centre` and `size`, in which `lift` is too."""
+    """Bounding volume hierarchy of a mesh: a complete binary tree over its triangles in Morton order (Lauterbach et al. 2009).
+
+    Vertices are stored as (vertex − `centre`) / `size`. `lift` is in units of `size`.
+    """
 
     def __init__(self, mesh: Mesh, centre: np.ndarray, size: float, lift: float, device: torch.device):
         self.centre, self.size, self.lift = centre, size, lift
         corners = torch.from_numpy(((mesh.vertices[mesh.faces] - centre) / size).astype(np.float32)).to(device)
         cell = ((corners.mean(dim=1) + 1) / 2 * 2**BITS).long().clamp(0, 2**BITS - 1)
-        x, y, z = (_spread(v) for v in cell.unbind(-1))
+        x, y, z = (_spread_bits(v) for v in cell.unbind(-1))
         corners = corners[torch.argsort(x | y << 1 | z << 2)]
         self.leaves = 1 << max(0, (-(-len(corners) // LEAF) - 1).bit_length())
         empty = corners.new_full((self.leaves * LEAF - len(corners), 3, 3), torch.nan)
@@ -43,13 +45,15 @@ class Tree:
             low, high = levels[0].split(3, dim=1)
             pairs = low.reshape(-1, 2, 3).amin(dim=1), high.reshape(-1, 2, 3).amax(dim=1)
             levels.insert(0, torch.cat(pairs, dim=1))
-        self._boxes = torch.cat([levels[0], *levels]).contiguous()  # what comes before the root is not used
+        self._boxes = torch.cat([levels[0], *levels]).contiguous()  # the root has index 1: entry 0 is unused
         edges = corners[:, 1:] - corners[:, :1]
         self._triangles = torch.cat([corners[:, :1], edges], dim=1).contiguous()
 
     def visible(self, mirrored: Tensor, alpha: Tensor, depth: Tensor, camera: Camera) -> Tensor:
-        """1 where the way `mirrored` (H, W, 3), a unit vector, is free at what a pixel shows (H, W), else 0; 1 where
-        `alpha` (H, W) says that it shows nothing. `depth` (H, W) is blended with it."""
+        """Trace each pixel's mirrored ray: 1 where it is free, 0 where the mesh occludes it, 1 in empty pixels; (H, W).
+
+        `mirrored` (H, W, 3) are unit directions. `depth` (H, W) is the sum of depths weighted as `alpha` (H, W), not divided by it.
+        """
         mirrored, alpha, depth = (v.detach().contiguous() for v in (mirrored, alpha, depth))
         visible, work = torch.empty_like(alpha), _Work(width=camera.width, height=camera.height, leaves=self.leaves)
         work.view[:], work.camera[:] = camera.world_to_camera[:3].reshape(-1).tolist(), camera.position.tolist()

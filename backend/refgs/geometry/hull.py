@@ -1,4 +1,4 @@
-"""The visual hull: the largest shape that fits inside every mask, and points spread on it and in it."""
+"""Carve the visual hull, the largest shape inside all masks, and spread points on it and in it."""
 
 import ctypes
 import logging
@@ -14,8 +14,8 @@ from refgs.errors import InputError
 from refgs.kernels.layout import struct
 from refgs.kernels.load import kernels, parallel
 
-# A view that alone removes more of the object than this, against the word of all the others, has a bad mask. Measured
-# with true masks of a sphere and a torus: at most 0.04 among 8 views, 0.015 among 12, 0.005 among 40.
+# Part of the object that a single view may remove against all the others: above it, the view's mask is bad. True masks of a sphere
+# and a torus remove at most 0.04 among 8 views, 0.015 among 12, 0.005 among 40.
 _LONE_CARVER = 0.15
 _FEWEST_VIEWS_TO_JUDGE = 8
 
@@ -30,18 +30,19 @@ def visual_hull_points(
     seed: int = 0,
     on_hull: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points spread evenly on the visual hull of an object: positions (count, 3), outward unit normals (count, 3),
-    and spacing (count,), the mean distance to the three nearest neighbours; float32, world units. Where not all are `on_hull`,
-    those that follow lie inside it, at random; their normals are those of the hull next to them.
+    """Spread points on the visual hull of an object.
 
-    `alphas` are masks (H, W), float in 0..1 or unsigned integers, one for each camera. The hull is sought in the cube
-    of half-side `radius` around `centre`, first coarsely, then on a grid of `resolution`³ around what was found. A
-    view whose mask contradicts all the others is left out, with a warning, as is one whose mask is empty.
-    Raises InputError where no hull is left.
+    Returns positions (count, 3), outward unit normals (count, 3), and the spacing (count,), which is the mean distance to the three
+    nearest neighbours; float32, world units. The first `on_hull` points, by default all, lie evenly on the hull. The others are random
+    points inside it, with the normals of the nearest point on it.
+
+    `alphas` are masks (H, W), one a camera, as floats in 0..1 or unsigned integers. The hull is carved twice on a grid of `resolution`³:
+    first in the cube of half-side `radius` about `centre`, then in the bounds of what remains. A view is left out, with a warning, if
+    its mask is empty or contradicts all the others. Raises InputError where no hull is left.
     """
     masks, views = [], []
     for alpha, camera in zip(alphas, cameras, strict=True):
-        mask = _unit(alpha)
+        mask = _as_float(alpha)
         if mask.max() >= 0.5:
             masks.append(mask)
             views.append(camera)
@@ -66,7 +67,7 @@ def visual_hull_points(
             views = [view for i, view in enumerate(views) if i not in bad]
             smallest, _, _ = _carve(masks, views, low, high, resolution)
 
-    # A thin part may be grazed by a single coarse voxel: any trace of it counts for the bounds.
+    # Bounds have a low threshold: a coarse voxel may only graze a thin part.
     found = np.argwhere(smallest > 0.05)
     if len(found) == 0:
         raise InputError(
@@ -76,7 +77,7 @@ def visual_hull_points(
     low, high = low + (found.min(0) - 1) * voxel, low + (found.max(0) + 2) * voxel
     smallest, _, _ = _carve(masks, views, low, high, resolution)
 
-    # Empty voxels all round close the hull where the cube cuts it.
+    # Pad with empty voxels, which close the hull where the cube cuts it.
     field = gaussian_filter(np.pad(smallest, 3), 0.8)
     if field.max() <= 0.5:
         raise InputError(
@@ -86,8 +87,8 @@ def visual_hull_points(
     vertices, faces, _, _ = marching_cubes(field, 0.5)
     rng = np.random.default_rng(seed)
     on_hull = count if on_hull is None else on_hull
-    points = _spread(_sample_triangles(vertices * voxel, faces, 10 * on_hull, rng), on_hull)
-    # The masks' edges are about a voxel wide, so a voxel's own gradient is noise: normals come from a wider filter.
+    points = _choose_evenly(_sample_triangles(vertices * voxel, faces, 10 * on_hull, rng), on_hull)
+    # Compute normals from a wider filter: masks' edges are about a voxel wide, so the gradient of one voxel is noise.
     wide = gaussian_filter(field, 1.5)
     normals = np.stack(
         [-map_coordinates(np.gradient(wide, voxel[a], axis=a), (points / voxel).T, order=1) for a in range(3)], axis=1
@@ -103,8 +104,8 @@ def visual_hull_points(
     return positions.astype(np.float32), normals.astype(np.float32), spacing.astype(np.float32)
 
 
-def _unit(alpha: np.ndarray) -> np.ndarray:
-    """A mask as float32 in 0..1."""
+def _as_float(alpha: np.ndarray) -> np.ndarray:
+    """Convert a mask to float32 in 0..1."""
     alpha = np.asarray(alpha)
     if np.issubdtype(alpha.dtype, np.integer):
         return alpha.astype(np.float32) / np.iinfo(alpha.dtype).max
@@ -118,8 +119,7 @@ _Work = struct("Carve", "carve.cpp")
 def _silhouette(mask: np.ndarray, camera: Camera, low: np.ndarray, voxel: np.ndarray) -> _Silhouette:
     height, width = mask.shape
     matrix = camera.resized(width, height).projection
-    # Where the mask keeps clear of the picture's border the whole object is in the picture, and what lies outside it is empty;
-    # elsewhere nothing is known about it.
+    # A mask clear of the picture's border shows the whole object: space outside the picture is empty. Otherwise it is unknown.
     whole = max(mask[0].max(), mask[-1].max(), mask[:, 0].max(), mask[:, -1].max()) < 0.5
     first, step = matrix[:, :3] @ (low + 0.5 * voxel) + matrix[:, 3], matrix[:, :3] * voxel
     size = {"width": width, "height": height, "whole": int(whole)}
@@ -127,8 +127,11 @@ def _silhouette(mask: np.ndarray, camera: Camera, low: np.ndarray, voxel: np.nda
 
 
 def _carve(masks, cameras, low, high, resolution):
-    """Smallest and second smallest alpha over the views that see a voxel, and the view with the smallest; each
-    (resolution,)³. Voxels that fewer than an eighth of the views see are empty: nothing speaks for them."""
+    """Compute each voxel's smallest and second smallest alpha over the views that see it, and the view with the smallest.
+
+    Each has the shape (resolution,)³. Voxels that fewer than an eighth of the views see count as empty, because hardly any mask
+    confirms them.
+    """
     masks, voxel = [np.ascontiguousarray(mask, np.float32) for mask in masks], (high - low) / resolution
     views = [_silhouette(mask, camera, low, voxel) for mask, camera in zip(masks, cameras, strict=True)]
     least, second = (np.empty(3 * (resolution,), np.float32) for _ in range(2))
@@ -144,10 +147,10 @@ def _carve(masks, cameras, low, high, resolution):
 
 
 def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Random points (count, 3), uniform by area."""
+    """Draw random points (count, 3) on triangles, uniform by area."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    # One stratum a point: the same number of random points leaves smaller gaps than independent draws.
+    # Stratified, one stratum a point: the gaps are smaller than with independent draws.
     where = (np.arange(count) + rng.random(count)) / count
     chosen = np.searchsorted(np.cumsum(area) / area.sum(), where).clip(max=len(faces) - 1)
     u, v = rng.random((2, count, 1))
@@ -155,8 +158,8 @@ def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int, rng: 
     return a[chosen] * (1 - root) + b[chosen] * (root * (1 - v)) + c[chosen] * (root * v)
 
 
-def _spread(dense: np.ndarray, count: int) -> np.ndarray:
-    """`count` of the points, far from each other: a few Lloyd iterations, each ending on one of the points."""
+def _choose_evenly(dense: np.ndarray, count: int) -> np.ndarray:
+    """Choose `count` evenly spaced points by a few Lloyd iterations. Each moves a cell's centre to the point nearest to its mean."""
     chosen = dense[:: len(dense) // count][:count]
     for _ in range(5):
         cell = cKDTree(chosen).query(dense)[1]

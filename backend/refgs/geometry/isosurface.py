@@ -1,4 +1,4 @@
-"""The zero surface of distances that are known in blocks about it."""
+"""Mesh the zero level of signed distances on sparse blocks of voxels."""
 
 import numpy as np
 from skimage.measure import marching_cubes
@@ -6,37 +6,38 @@ from skimage.measure import marching_cubes
 from refgs.formats.mesh import Mesh
 
 BLOCK = 4  # voxels along a block's side
-_CHUNK = 16  # blocks along the side of what marching cubes takes at a time: 1 MB
+_CHUNK = 16  # blocks along the side of a chunk, which marching cubes meshes at a time: 1 MB
 
 
 def isosurface(block: np.ndarray, signed: np.ndarray) -> Mesh:
-    """Marching cubes (Lewiner et al. 2003) over blocks (M, 3), each once, of BLOCK³ voxels with distances (M, BLOCK³), not finite where
-    they are not known.
+    """Run marching cubes (Lewiner et al. 2003) over unique blocks (M, 3) of BLOCK³ voxels with signed distances (M, BLOCK³).
 
-    Vertices are in voxels, zero at the centre of the first voxel of the block (0, 0, 0). Only cells whose eight corners are known have
-    faces. Memory follows the blocks and not the space that they span: chunks are meshed one by one, each with one layer of its
-    neighbours' voxels, and what two of them have in common is joined.
+    Unknown distances are NaN or infinite; only cells with eight known corners have faces. Vertices are in voxels; the origin is the
+    centre of the first voxel of block (0, 0, 0). Chunks are meshed one by one, each with one layer of its neighbours' voxels, and their
+    common vertices are merged. So memory grows with the blocks, not with the volume that they span.
     """
-    rows, chunks = _in_chunks(block)
+    rows, chunks = _assign_to_chunks(block)
     order = np.lexsort(chunks.T)
     rows, chunks = rows[order], chunks[order]
     first = np.flatnonzero(np.r_[True, (chunks[1:] != chunks[:-1]).any(axis=1)]) if len(rows) else np.zeros(0, int)
     vertices, faces, count = [], [], 0
     for part in np.split(np.arange(len(rows)), first[1:]) if len(rows) else ():
         chunk = chunks[part[0]]
-        found = _mesh(block[rows[part]] - _CHUNK * chunk, signed[rows[part]])
+        found = _mesh_chunk(block[rows[part]] - _CHUNK * chunk, signed[rows[part]])
         if found is not None:
             vertices.append(found[0] + float(BLOCK * _CHUNK) * chunk)
             faces.append(found[1] + count)
             count += len(found[0])
     if not vertices:
         return Mesh.empty()
-    return _joined(np.concatenate(vertices), np.concatenate(faces))
+    return _merge_vertices(np.concatenate(vertices), np.concatenate(faces))
 
 
-def _in_chunks(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (K,) of blocks, and the chunks (K, 3) that they are looked at in: their own, and those before, whose last cells reach into
-    them."""
+def _assign_to_chunks(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Assign blocks to chunks: rows (K,) of blocks, and the chunk (K, 3) of each.
+
+    A block on the lower side of a chunk is also in the chunk before, whose last cells need its voxels.
+    """
     rows, chunks = [], []
     for back in np.ndindex(2, 2, 2):
         row = np.flatnonzero((block % _CHUNK == 0)[:, np.array(back, bool)].all(axis=1))
@@ -45,8 +46,8 @@ def _in_chunks(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(rows), np.concatenate(chunks)
 
 
-def _mesh(block: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices, exact in the chunk's frame, and faces of one chunk; `block` counts from its corner."""
+def _mesh_chunk(block: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Mesh one chunk: vertices, exact in the chunk's frame, and faces. `block` counts from the chunk's corner."""
     side = _CHUNK + 1
     grid = np.full((side * BLOCK,) * 3, np.nan, np.float32)
     grid.reshape((side, BLOCK) * 3).transpose(0, 2, 4, 1, 3, 5)[tuple(block.T)] = signed.reshape(
@@ -56,7 +57,7 @@ def _mesh(block: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.ndarray
     grid = grid[:end, :end, :end]
     known = np.isfinite(grid)
     grid[~known] = 1
-    # Marching cubes visits a cell where its last corner is in the mask.
+    # Mark the cells with eight known corners: marching cubes visits a cell if its last corner is in the mask.
     for axis in range(3):
         known[(slice(None),) * axis + (slice(1, None),)] &= known[(slice(None),) * axis + (slice(-1),)].copy()
         known[(slice(None),) * axis + (0,)] = False
@@ -64,14 +65,16 @@ def _mesh(block: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.ndarray
         return None
     try:
         vertices, faces, _, _ = marching_cubes(grid, 0.0, mask=known)
-    except RuntimeError:  # no surface in the mask
+    except RuntimeError:  # the mask has no surface
         return None
     return vertices.astype(np.float64), faces.astype(np.int64)
 
 
-def _joined(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """With one vertex where chunks have the same one. They have it at the very same place: on the plane between them it is
-    interpolated from the same two voxels."""
+def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """Merge the vertices that chunks share.
+
+    Shared vertices have equal coordinates, bit for bit: on the plane between chunks both are interpolated from the same two voxels.
+    """
     shared = np.flatnonzero((vertices % (BLOCK * _CHUNK) == 0).any(axis=1))
     _, kept, which = np.unique(vertices[shared], axis=0, return_index=True, return_inverse=True)
     target = np.arange(len(vertices))

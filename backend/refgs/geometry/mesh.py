@@ -1,4 +1,4 @@
-"""Clean-up and smooth normals of triangle meshes."""
+"""Clean up triangle meshes and compute their smooth normals."""
 
 import fast_simplification
 import numpy as np
@@ -9,11 +9,11 @@ from refgs.formats.mesh import Mesh
 
 
 def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
-    """The mesh without what is not the object, with at most about `triangles` faces, and smooth normals.
+    """Remove floaters, simplify to about `triangles` faces at most, and compute smooth normals.
 
-    Keeps the connected parts with at least `keep` of the largest part's area: floaters go, the rings of a chain
-    stay. Faces keep their winding, and no edge has more than two. Simplification is by quadric error (Garland and Heckbert 1997). Raises
-    InputError where nothing is left.
+    Connected parts with less than `keep` of the largest part's area are floaters; so the rings of a chain stay. Faces keep their
+    winding. An edge has two faces at most. Simplification is by quadric error (Garland and Heckbert 1997). Raises InputError where
+    nothing is left.
     """
     work = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     work.update_faces(np.isfinite(work.triangles).all((1, 2)))
@@ -28,8 +28,8 @@ def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
     part, areas = _parts(work)
     work.update_faces((areas >= keep * areas.max())[part])
     if len(work.faces) > triangles:
-        # The gentlest setting that reaches the budget: on a sphere, 3 leaves normals 0.1° off and 7 (the library's own
-        # choice) 0.5°, with some vertices at 30°; on a very noisy mesh 3 stops early.
+        # Take the gentlest setting that reaches the budget. On a sphere, normals are off by 0.1° with 3, and by 0.5° with 7, the
+        # library's default, at some vertices by 30°. On a very noisy mesh 3 stops early.
         for aggressiveness in (3, 5, 7):
             vertices, faces = fast_simplification.simplify(
                 work.vertices, work.faces, target_count=triangles, agg=aggressiveness
@@ -46,7 +46,7 @@ def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
 
 
 def _manifold(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Which faces (F,) to keep so that no edge has three: of each edge the two largest. Simplifying folds a few thin parts."""
+    """Select the faces (F,) to keep so that no edge has three: the two largest at each edge. Simplification folds a few thin parts."""
     _, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
     edge, face = edge.reshape(-1), mesh.edges_face
     order = np.lexsort((-mesh.area_faces[face], edge))
@@ -58,19 +58,19 @@ def _manifold(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def is_crumbs(mesh: Mesh, many: int = 5) -> bool:
-    """Whether a mesh is hardly a surface: more than so many connected parts, none of which has half of the area."""
+    """Return true for a mesh that is hardly a surface: more than `many` connected parts, none with half of the area."""
     _, areas = _parts(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
     return len(areas) > many and areas.max() < areas.sum() / 2
 
 
 def _parts(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """The connected part of each face (F,), and the parts' areas."""
+    """Label each face's connected part (F,), and measure the parts' areas."""
     part = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
     return part, np.bincount(part, mesh.area_faces)
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3): the faces' normals weighted by their angle at the vertex (Thürmer and Wüthrich 1998)."""
+    """Compute unit normals (V, 3): faces' normals, weighted by their angle at the vertex (Thürmer and Wüthrich 1998)."""
     corners = vertices[faces]
     edges = np.roll(corners, -1, axis=1) - corners
     length = np.maximum(np.linalg.norm(edges, axis=-1, keepdims=True), 1e-30)

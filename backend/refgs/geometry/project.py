@@ -1,17 +1,17 @@
-"""Looking world points up in a camera's image."""
+"""Project world points into a camera's image, and look up its values there."""
 
 import cv2
 import numpy as np
 
 from refgs.camera import Camera
 
-_ROW = 4096  # cv2.remap takes pictures, not lists: points go through it in rows of this length
+_ROW = 4096  # points a row: cv2.remap takes pictures, not lists
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel positions (N, 2) and depths (N,) along the camera's axis, float32, of world points (N, 3).
+    """Project world points (N, 3): pixel positions (N, 2) and depths (N,) along the camera's axis, float32.
 
-    Pixel positions of points with depth ≤ 0 mean nothing.
+    Pixel positions of points with depth ≤ 0 are meaningless.
     """
     matrix = camera.projection.astype(np.float32)
     x, y, z = matrix[:, :3] @ np.asarray(points, np.float32).T + matrix[:, 3:]
@@ -20,9 +20,10 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def sample(image: np.ndarray, pixels: np.ndarray, clamp: bool = False) -> np.ndarray:
-    """Values (N,) or (N, C) of a float32 image (H, W) or (H, W, C) at pixel positions (N, 2), bilinear.
+    """Look up a float32 image (H, W) or (H, W, C) at pixel positions (N, 2), bilinear: values (N,) or (N, C).
 
-    Outside is 0, or with `clamp` the nearest pixel. Pixel centres are at half-integers. OpenCV rounds positions to 1/32 of a pixel.
+    Outside the image the value is 0, or with `clamp` that of the nearest pixel. Pixel centres are at half-integers. OpenCV rounds
+    positions to 1/32 of a pixel.
     """
     count = len(pixels)
     rows = max(1, -(-count // _ROW))
@@ -35,6 +36,6 @@ def sample(image: np.ndarray, pixels: np.ndarray, clamp: bool = False) -> np.nda
 
 
 def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Which points (N,) fall in front of the camera and on its image."""
+    """Mark the points (N,) that are in front of the camera and inside its image."""
     x, y = pixels[:, 0], pixels[:, 1]
     return (depth > 0) & (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)

@@ -1,4 +1,4 @@
-"""Which ways are free of the object itself: rays traced against a mesh of it (paper §3.2)."""
+"""Find the directions that the object itself occludes, by rays against its mesh (paper §3.2)."""
 
 import numpy as np
 import torch
@@ -8,13 +8,16 @@ from embreex.rtcore_scene import EmbreeScene
 from refgs.formats.mesh import Mesh
 from refgs.geometry.bvh import Tree
 
-_LIFT = 1.0  # of the mesh's mean edge: how far a ray starts above its surface, which the mesh only comes near to
-_PASSES = 3  # faces that a ray looks at: behind two back faces, the third
+_LIFT = 1.0  # height of a ray's start above the mesh, in mean edges: the mesh only approximates the surface
+_PASSES = 3  # faces tested by a ray: it passes through two back faces at most
 
 
 class Occluder:
-    """A mesh that stands in the way of light. Its vertices may be in any unit and anywhere: rays are traced in single
-    precision about its centre, at its size. `lift` is how far above the surface they start."""
+    """Mesh that occludes light.
+
+    Its scale and position are arbitrary: rays are traced in single precision relative to its centre and size. `lift` is the height of
+    their start above the mesh, in its units.
+    """
 
     def __init__(self, mesh: Mesh):
         self.mesh = mesh
@@ -29,39 +32,38 @@ class Occluder:
         TriangleMesh(self._scene, ((corners - self._centre) / self._size).astype(np.float32))
 
     def tree(self, device: torch.device) -> Tree:
-        """What a card traces rays against in place of Embree."""
+        """Return the tree that a CUDA card traces in place of Embree. The first call builds it."""
         if self._tree is None:
             self._tree = Tree(self.mesh, self._centre, self._size, self.lift / self._size, device)
         return self._tree
 
     def visible(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Whether nothing is in the way (P,) of rays as `meet` takes them."""
+        """Trace rays as `meet` does: true (P,) where nothing occludes."""
         return self.meet(points, normals, directions)[0] < 0
 
     def meet(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What rays from `points` (P, 3) of the surface, in the mesh's own frame, meet first in unit `directions` (P, 3):
-        the face (P,), -1 where there is none, and the weights of its corners (P, 3). `normals` (P, 3) are the surface's:
-        rays start a little above it.
+        """Trace rays from surface `points` (P, 3), in the mesh's frame, along unit `directions` (P, 3).
 
-        Only the front of a face blocks. A ray that meets a back face first began below the mesh, or comes to its open
-        side: it goes on.
+        Returns the first face hit (P,), −1 for none, and the weights of its corners (P, 3). Rays start `lift` above the surface, along
+        its `normals` (P, 3). Only fronts of faces occlude. A ray passes through a back face, because it started below the mesh or meets
+        the mesh's open side.
         """
         lift = self.lift / self._size
         directions = np.ascontiguousarray(directions, np.float32)
         origins = ((points - self._centre) / self._size + lift * normals).astype(np.float32)
         face, weights = np.full(len(origins), -1, np.int32), np.zeros((len(origins), 3), np.float32)
-        going = np.arange(len(origins))
+        rays = np.arange(len(origins))
         for _ in range(_PASSES):
             hit = self._scene.run(origins, directions, query="INTERSECT", output=True)
             facing = np.einsum("pa,pa->p", hit["Ng"], directions)
             met = hit["primID"] >= 0
             front = met & (facing < 0)
-            face[going[front]] = hit["primID"][front]
+            face[rays[front]] = hit["primID"][front]
             u, v = hit["u"][front], hit["v"][front]
-            weights[going[front]] = np.stack([1 - u - v, u, v], axis=1)
-            on = met & ~front
-            if not on.any():
+            weights[rays[front]] = np.stack([1 - u - v, u, v], axis=1)
+            back = met & ~front
+            if not back.any():
                 break
-            going, directions = going[on], directions[on]
-            origins = origins[on] + (hit["tfar"][on, None] + 0.1 * lift) * directions
+            rays, directions = rays[back], directions[back]
+            origins = origins[back] + (hit["tfar"][back, None] + 0.1 * lift) * directions
         return face, weights

@@ -15,7 +15,7 @@ namespace refgs {
 constexpr float ALPHA_CUT = 1.0f / 255.0f;  // a splat ends where its alpha falls below this
 constexpr float ALPHA_CAP = 0.99f;          // a single splat never hides what is behind it completely
 constexpr float MIN_TRANSMITTANCE = 1e-4f;  // a pixel is finished below this
-constexpr float LOW_PASS = 8.0f;            // 1 / variance of the screen-space filter, in pixels^-2; 2DGS' 2 blurs (docs/approximations.md)
+constexpr float LOW_PASS = 8.0f;            // 1 / variance of the screen-space filter, in pixels^-2; 2DGS' 2 blurs (docs/notebook/approximations.md)
 constexpr double UNIT = 1.4142135623730951;  // u and v count in it, standard deviations: so a splat's alpha is opacity e^-(u^2 + v^2)
 constexpr double LOG2_E = 1.4426950408889634;
 constexpr double FAR = 1e12;                // depths beyond this are not drawn: keeps every product finite in float

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from refgs.capture import write_cameras
 from refgs.errors import InputError
+from refgs.formats.exr import write_exr
 from refgs.formats.mesh import write_mesh
-from refgs.formats.panorama import write_environment
 from refgs.formats.splats import write_splats
 from refgs.model import harmonics
 from refgs.model.environment import Environment
@@ -37,7 +37,7 @@ def write_asset(state: State) -> None:
         write_mesh(folder / OCCLUDER, state.occluder.mesh)
     if environment is not None:
         panorama = environment.panorama(4 * environment.resolution)
-        write_environment(folder / "environment.exr", state.method.light.to_linear(panorama))
+        write_exr(folder / "environment.exr", state.method.light.to_linear(panorama))
         surfels = _with_relightable_albedo(surfels, environment, state)
     side, wanted = _seen_side(surfels, state), state.wanted()
     kept = wanted & (side != 0)

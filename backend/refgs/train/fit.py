@@ -4,10 +4,10 @@ import math
 from pathlib import Path
 
 from refgs.capture import Capture
+from refgs.events import Report
 from refgs.settings import RATES, Settings, load_settings, validate
 from refgs.train.effective import Effective
 from refgs.train.plan import END, END_A_VIEW, OTHERS, Plan, growth, iterations_time
-from refgs.train.state import Report
 from refgs.train.trainer import Trainer
 
 WARM, REHEARSED = 5, 25  # iterations: the pace is that from the first to the second

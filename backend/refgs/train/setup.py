@@ -5,6 +5,7 @@ from pathlib import Path
 import torch
 
 from refgs.capture import Capture
+from refgs.events import Report
 from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters, activate
 from refgs.train import light, needs
@@ -14,7 +15,7 @@ from refgs.train.light_frame import light_frame
 from refgs.train.losses import Photo
 from refgs.train.plan import Plan
 from refgs.train.start import start_appearance, start_parameters
-from refgs.train.state import Report, State
+from refgs.train.state import State
 from refgs.train.trace import why_not_traced
 
 

@@ -1,6 +1,6 @@
 """State of a training: what it works on, what it learns, and what was decided about it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +10,7 @@ from torch import Tensor
 from refgs.camera import Camera
 from refgs.capture import Capture, load_view
 from refgs.clock import Clock
+from refgs.events import Report
 from refgs.geometry.visibility import Occluder
 from refgs.model.adam import Adam
 from refgs.model.environment import Environment
@@ -21,9 +22,6 @@ from refgs.train.effective import Effective
 from refgs.train.losses import Photo
 from refgs.train.motion import ScreenGradient
 from refgs.train.plan import Plan
-
-Report = Callable[[str, dict[str, Any]], None]
-"""Called with an event's name and its facts: "stage", "decided", "progress", "measured", "warning"."""
 
 
 def spread(items: Sequence, most: int) -> Sequence:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from refgs.capture import Capture
 from refgs.compare.metrics import decibels
+from refgs.events import Report
 from refgs.settings import Settings
 from refgs.train import densify, exposures, history, light, needs, snapshot
 from refgs.train.effective import Effective
@@ -18,7 +19,6 @@ from refgs.train.measures import Measures
 from refgs.train.plan import Plan, growth
 from refgs.train.rates import set_rates
 from refgs.train.setup import set_up, start_deferred
-from refgs.train.state import Report
 from refgs.train.trace import trace_due
 
 REPORT_EVERY = 10  # iterations

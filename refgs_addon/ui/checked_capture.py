@@ -1,36 +1,35 @@
-"""What the Train panel shows of a capture that was checked."""
+"""Draw a checked capture in the Train panel: thumbnails, and a button for its cameras."""
 
 from pathlib import Path
+from typing import ClassVar
 
 import bpy
-from bpy.props import IntProperty
 
 from .. import jobs
-from ..scene.capture import cameras_of, remove_cameras, show_cameras
-from .operators import Door, choose
-from .pictures import thumbnail
+from ..scene.capture_cameras import cameras_of, remove_cameras, show_cameras
+from .icons import thumbnail
+from .operators import OnJob, select_only
 
 
-class ShowCameras(Door, bpy.types.Operator):
+class ShowCameras(OnJob, bpy.types.Operator):
     bl_idname = "refgs.show_cameras"
     bl_label = "Show Cameras"
-    bl_description = "Add the capture's cameras to the scene, to see whether they are right; or remove them again"
-
-    number: IntProperty(name="Number", description="Of the check in the list")
+    bl_description = "Add the capture's cameras to the scene to check them, or remove them again"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
 
     def work(self, context: bpy.types.Context) -> None:
-        checked = jobs.JOBS[self.number].results["check"]
+        checked = self.job.results["check"]
         capture = Path(checked["capture"])
         if cameras_of(context.scene, capture):
             remove_cameras(context.scene, capture)
         else:
             cameras = show_cameras(context.scene, capture, Path(checked["cameras"])).objects
             if cameras:
-                choose(context, cameras[0])
+                select_only(context, cameras[0])
 
 
 def draw_capture(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job) -> None:
-    """Some of the photos that a job has checked, and a button for their cameras."""
+    """Draw some of the photos that a job has checked, and a button for their cameras."""
     checked = job.results.get("check", {})
     if "cameras" not in checked:
         return

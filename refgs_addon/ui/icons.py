@@ -1,4 +1,4 @@
-"""Pictures for the panels: a training's newest preview, its curve, and thumbnails of files."""
+"""Icons for the panels: a training's newest preview and its curve, and thumbnails of files."""
 
 import math
 from pathlib import Path
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
     import numpy as np
 
 CURVE = 200, 130  # pixels
-EDGE, DOT = 4, 3  # pixels: beside what is drawn; half a dot's side
+EDGE, DOT = 4, 3  # pixels: margin, and half a dot's side
 GROUND, GRID, LINE, DOTS = (0.0, 0.0, 0.0, 0.25), (1.0, 1.0, 1.0, 0.12), (0.35, 0.65, 1.0, 1.0), (1.0, 0.65, 0.25, 1.0)
 
 _pictures: bpy.utils.previews.ImagePreviewCollection | None = None
-_newest: dict[int, str] = {}  # by a job's id, the key of its newest picture
-_drawn: dict[int, tuple[int, int]] = {}  # by a job's id, how many points its curve was drawn with
+_newest: dict[int, str] = {}  # key of the newest preview by the job's serial number
+_drawn: dict[int, tuple[int, int]] = {}  # number of points in the drawn curve by the job's serial number
 
 
-def picture(job: jobs.Job) -> int:
-    """The icon of a job's newest preview; 0 where there is none yet."""
+def preview_icon(job: jobs.Job) -> int:
+    """Icon of a job's newest preview; 0 where there is none yet."""
     if not job.preview or _pictures is None:
         return 0
     key = f"{job.serial} {job.preview['iteration']}"
@@ -36,22 +36,24 @@ def picture(job: jobs.Job) -> int:
 
 
 def thumbnail(file: Path, version: int = 0) -> int:
-    """The icon of a small picture of a file, which Blender makes beside; 0 where there is none. What is written anew under the same name
-    is of another version."""
+    """Icon of a file's thumbnail, which Blender makes in the background; 0 without a window.
+
+    A new `version` reloads a file that was overwritten.
+    """
     if _pictures is None:
         return 0
     key = f"{file} {version}"
     return (_pictures[key] if key in _pictures else _pictures.load(key, str(file), "IMAGE")).icon_id
 
 
-def curve(job: jobs.Job) -> int:
-    """The icon of a picture of `plot`; 0 where there are too few points, or no numpy, without which Debian's Blender may come."""
+def curve_icon(job: jobs.Job) -> int:
+    """Icon of a job's `plot`; 0 for fewer than two points, or without numpy, which Debian's Blender may lack."""
     if len(job.curve) < 2 or _pictures is None:
         return 0
     key = f"{job.serial} curve"
     shown = _pictures[key] if key in _pictures else _pictures.new(key)
     count = len(job.curve), len(job.held_out)
-    if _drawn.get(job.serial) != count:  # the panel is drawn far more often than there is news
+    if _drawn.get(job.serial) != count:  # the panel is drawn far more often than points arrive
         try:
             pixels = plot(job.curve, job.held_out)
         except ModuleNotFoundError:
@@ -63,8 +65,10 @@ def curve(job: jobs.Job) -> int:
 
 
 def plot(trained: list[tuple[float, float]], held_out: list[tuple[float, float]]) -> "np.ndarray":
-    """RGBA (height, width, 4), bottom row first, of points (seconds, PSNR): a line through the training views', a dot for each of the views
-    that were held out. Time is logarithmic, as decibels are of the error; the grid is at 1, 10, 100 … seconds, and 5 dB apart."""
+    """Plot PSNR over log time as RGBA (height, width, 4), bottom row first: a line for training views, dots for held-out views.
+
+    Points are (seconds, PSNR). The grid is at 1, 10, 100 … seconds and every 5 dB.
+    """
     import numpy as np
 
     width, height = CURVE

@@ -1,4 +1,4 @@
-"""A training's surfels in the 3D view, as they are by now. They go when the training ends: importing the run brings what was learned."""
+"""Show a training's current surfels in the 3D view. They are removed when it ends: import the run then."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -8,34 +8,36 @@ import bpy
 
 from .. import compat, jobs
 from ..errors import InputError
-from ..nodes.splats import NAME
+from ..nodes.splats_tree import NAME
 
 
 @dataclass
-class _Live:
+class _LiveObject:
     job: jobs.Job
     scene: str
-    item: str  # the object's name, for undo makes another object of it
+    item: str  # the object's name: undo replaces the object itself
     iteration: int = -1
-    coming: Future | None = None
+    reading: Future | None = None
 
 
-_shown: list[_Live] = []
+_shown: list[_LiveObject] = []
 _reader = ThreadPoolExecutor(1)
 
 
 def watch(job: jobs.Job, scene: bpy.types.Scene, on: bool = True) -> None:
-    """Show a job's surfels in a scene whenever there is a new preview of them, or no longer. The object is there at once, without points,
-    for making its nodes takes longer than a timer should."""
+    """Show a job's surfels in a scene with each new preview, or stop showing them.
+
+    The object is added at once, without points: making its nodes takes too long for a timer.
+    """
     for live in [live for live in _shown if live.job is job]:
-        _take_away(live)
+        _remove(live)
     if on and not job.ended:
-        from .splats import add_splats
+        from .splat_cloud import add_splats
 
         name = f"{job.name} in training"
         item = add_splats(name, bpy.data.pointclouds.new(name), scene.collection)
         compat.set_modifier_input(item.modifiers[NAME], "Display", "Base Color")  # there is no light yet
-        _shown.append(_Live(job, scene.name, item.name))
+        _shown.append(_LiveObject(job, scene.name, item.name))
 
 
 def is_watched(job: jobs.Job) -> bool:
@@ -43,36 +45,36 @@ def is_watched(job: jobs.Job) -> bool:
 
 
 def update() -> None:
-    """Put what has been read into the scene, and have what is new read, in a thread."""
+    """Put the previews that have been read into the scene, and start reading new ones in a thread."""
     for live in list(_shown):
         deleted = live.item not in bpy.data.objects
         if live.job.ended or deleted or live.scene not in bpy.data.scenes:
-            _take_away(live)
-        elif live.coming is not None and live.coming.done():
-            values, live.coming = live.coming.result(), None
+            _remove(live)
+        elif live.reading is not None and live.reading.done():
+            values, live.reading = live.reading.result(), None
             if values is not None:
-                _put(live, values)
-        elif live.coming is None and live.job.preview and live.job.preview["iteration"] != live.iteration:
+                _replace_points(live, values)
+        elif live.reading is None and live.job.preview and live.job.preview["iteration"] != live.iteration:
             live.iteration = live.job.preview["iteration"]
-            live.coming = _reader.submit(_read, Path(live.job.preview["splats"]))
+            live.reading = _reader.submit(_read, Path(live.job.preview["splats"]))
 
 
 def _read(path: Path) -> dict | None:
-    """Flat splats: how they bend takes longer than all the rest."""
+    """Read splats without bent normals, which take longer than everything else."""
     import numpy as np
 
-    from .splats import read_splats, with_slopes
+    from .splat_cloud import cloud_attributes, read_splats
 
     try:
         splats, _ = read_splats(path)
-    except InputError:  # the next preview will do
+    except InputError:  # wait for the next preview
         return None
     flat = np.zeros_like(splats["position"])
-    return with_slopes(splats, flat, flat)
+    return cloud_attributes(splats, flat, flat)
 
 
-def _put(live: _Live, values: dict) -> None:
-    from .splats import point_cloud
+def _replace_points(live: _LiveObject, values: dict) -> None:
+    from .splat_cloud import point_cloud
 
     item = bpy.data.objects[live.item]
     before, item.data = item.data, point_cloud(item.name, values)
@@ -81,7 +83,7 @@ def _put(live: _Live, values: dict) -> None:
     bpy.data.pointclouds.remove(before)
 
 
-def _take_away(live: _Live) -> None:
+def _remove(live: _LiveObject) -> None:
     _shown.remove(live)
     item = bpy.data.objects.get(live.item)
     if item is not None:

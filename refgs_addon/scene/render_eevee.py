@@ -1,4 +1,4 @@
-"""Previews: a picture in Eevee, whatever the scene's own render settings are."""
+"""Render a view in Eevee, whatever the scene's own render settings are."""
 
 import contextlib
 from collections.abc import Iterator
@@ -8,8 +8,8 @@ import bpy
 
 from .. import compat
 from ..errors import InputError
-from .cameras import frame_camera
-from .files import whole
+from .atomic_file import atomic_write
+from .camera_objects import frame_camera
 
 
 def render_preview(
@@ -22,9 +22,9 @@ def render_preview(
 ) -> None:
     """Render a camera's view (the scene's camera by default) in Eevee, over a transparent background.
 
-    `size` is the longer side in pixels; by default the photo's. `png` gets sRGB, 8 bits, straight alpha, through the
-    Standard view transform; `exr`, if given, linear Rec.709 radiance, 32 bits, premultiplied. The scene's own settings
-    are put back. Raises InputError where there is no camera or a file cannot be written.
+    `size` is the longer side in pixels; by default the photo's. `png` is 8-bit sRGB with straight alpha, through the Standard
+    view transform. `exr` is linear Rec.709 radiance in 32 bits, premultiplied. The scene's own settings are restored. Raises
+    InputError where there is no camera or a file cannot be written.
     """
     camera = camera or scene.camera
     if camera is None:
@@ -47,13 +47,13 @@ def render_preview(
 
 def _save(picture: bpy.types.Image, scene: bpy.types.Scene, path: Path, kind: str, depth: str) -> None:
     compat.set_format(scene.render.image_settings, kind, depth)
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         picture.save_render(str(temporary), scene=scene)
 
 
 @contextlib.contextmanager
 def _restored(scene: bpy.types.Scene) -> Iterator[None]:
-    """Put back every render setting that a preview touches."""
+    """Restore every render setting that a preview changes."""
     render = scene.render
     touched = [
         (scene, ["camera"]),

@@ -1,4 +1,4 @@
-"""A whole run: from a run folder to a collection with its splats, mesh, light and cameras."""
+"""Import a run folder: a collection of its splats, mesh and cameras, and its light."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,36 +6,36 @@ from pathlib import Path
 import bpy
 
 from ..errors import InputError
-from . import parts
-from .cameras import add_camera, frame_camera, light_of, read_cameras
-from .capture import hand_over
-from .notes import capture_of
-from .relight import light_with_recovered, load_panorama
-from .splats import add_splats, normal_slopes, point_cloud, read_constants, read_splats, with_slopes
+from . import run_parts
+from .camera_objects import add_camera, frame_camera, light_of, read_cameras
+from .capture_cameras import replace_cameras
+from .run_toml import capture_of
+from .splat_cloud import add_splats, cloud_attributes, normal_slopes, point_cloud, read_constants, read_splats
+from .world_light import light_with_recovered, load_panorama
 
 
 @dataclass
 class Run:
-    """What was imported; parts that the run folder does not have are None or empty."""
+    """Imported data of a run. Parts that the run folder lacks are None or empty."""
 
     collection: bpy.types.Collection
     splats: bpy.types.Object
     left_out: int
-    """How many splats are not there, for values that are not finite."""
+    """Number of splats left out for values that are not finite."""
     mesh: list[bpy.types.Object] = field(default_factory=list)
     world: bpy.types.World | None = None
     cameras: dict[str, bpy.types.Object] = field(default_factory=dict)
-    """By view: the name of the photo without its ending."""
+    """Cameras by view, the photo's name without its extension."""
     light_of: str = ""
-    """The view that the world is right for, where the light turned with the camera; the world says so as `refgs_light_of`."""
+    """View that the world belongs to, if the light turned with the camera. Also in the world's property `refgs_light_of`."""
 
 
 def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     """Import a run folder into a scene, in a new collection `RefGS NAME`.
 
-    splats.ply must be there; mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be
-    missing. The mesh is hidden at first, for it is where the splats are: see `parts.show`. Cameras that `capture.show_cameras`
-    added of the same capture make way for the run's. Raises InputError, and then leaves the file as it was.
+    splats.ply must exist; mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be missing. The mesh is
+    hidden at first, as it is where the splats are: see `run_parts.show`. The run's cameras replace those that
+    `capture_cameras.show_cameras` added for the same capture. Raises InputError, and then leaves Blender's file unchanged.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -47,12 +47,12 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     before, world, camera = data_blocks(), scene.world, scene.camera
     try:
         collection = bpy.data.collections.new(f"RefGS {name}")
-        collection[parts.FOLDER] = str(folder.resolve())
+        collection[run_parts.FOLDER] = str(folder.resolve())
         scene.collection.children.link(collection)
-        cloud = point_cloud(f"{name} splats", with_slopes(splats, *normal_slopes(splats)))
+        cloud = point_cloud(f"{name} splats", cloud_attributes(splats, *normal_slopes(splats)))
         drawn = add_splats(cloud.name, cloud, collection, read_constants(folder / "splats.ply"))
         run = Run(collection, drawn, left_out)
-        run.splats[parts.KEY] = "splats"
+        run.splats[run_parts.KEY] = "splats"
         if (folder / "mesh.glb").exists():
             run.mesh = add_mesh(folder / "mesh.glb", f"{name} mesh", collection)
         if (folder / "environment.exr").exists():
@@ -66,18 +66,18 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
             run.cameras = {frame["name"]: add_camera(frame, cameras) for frame in frames}
             if scene.camera is None:
                 frame_camera(scene, next(iter(run.cameras.values())))
-        parts.show(collection, "splats")
+        run_parts.show(collection, "splats")
     except BaseException:
         scene.world, scene.camera = world, camera
         bpy.data.batch_remove(data_blocks() - before)
         raise
     if capture is not None and frames:
-        hand_over(scene, capture, run.cameras)
+        replace_cameras(scene, capture, run.cameras)
     return run
 
 
 def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """A GLB through Blender's own importer, moved into the collection."""
+    """Import a GLB with Blender's importer, and move its meshes into the collection."""
     before = set(bpy.data.objects)
     try:
         bpy.ops.import_scene.gltf(filepath=str(path))
@@ -88,31 +88,23 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
     bpy.context.view_layer.update()
     meshes = [item for item in added if item.type == "MESH"]
     for item in meshes:
-        matrix = item.matrix_world.copy()  # the file's own nodes come as empty parents: keep what they did, drop them
+        matrix = (
+            item.matrix_world.copy()
+        )  # keep the transforms of the file's nodes, which become empty parents, and drop these
         item.parent, item.matrix_world = None, matrix
         for other in item.users_collection:
             other.objects.unlink(item)
         collection.objects.link(item)
         item.name = item.data.name = name
-        item[parts.KEY] = "mesh"
+        item[run_parts.KEY] = "mesh"
     bpy.data.batch_remove(set(added) - set(meshes))
     if not meshes:
-        raise InputError(f"{path} has no mesh in it: export the run again")
+        raise InputError(f"{path} contains no mesh: export the run again")
     return meshes
 
 
 def data_blocks() -> set[bpy.types.ID]:
-    """All of the file's data-blocks that an import can add to."""
-    kinds = (
-        "objects",
-        "pointclouds",
-        "meshes",
-        "cameras",
-        "materials",
-        "images",
-        "worlds",
-        "collections",
-        "node_groups",
-        "scenes",
-    )
+    """List the file's data-blocks of all kinds that an import can add."""
+    kinds = ("objects", "pointclouds", "meshes", "cameras", "materials", "images", "worlds", "collections")
+    kinds += ("node_groups", "scenes")
     return {item for kind in kinds for item in getattr(bpy.data, kind)}

@@ -1,4 +1,4 @@
-"""A run's mesh for other programs, as USD or FBX through Blender's own exporters, with its pictures beside it."""
+"""Export a run's mesh as USD or FBX through Blender's own exporters, with its textures beside it."""
 
 import shutil
 from pathlib import Path
@@ -8,55 +8,53 @@ import bpy
 from ..compat import node_tree, usd_keeps_textures
 from ..errors import InputError
 from ..nodes import add, out
-from ..nodes.materials import SPECULAR, principled
-from .files import whole
-from .run import add_mesh, data_blocks
+from ..nodes.splat_material import SPECULAR, principled
+from .atomic_file import atomic_write
+from .import_run import add_mesh, data_blocks
 
-TEXTURES = "textures"  # beside a run's mesh.glb
+TEXTURES = "textures"  # folder beside a run's mesh.glb
 _PICTURES = {"base_color": "Base Color", "metallic": "Metallic", "roughness": "Roughness", "normal": "Normal"}
 
 
 def write_mesh(mesh: Path, path: Path) -> None:
-    """Write a run's mesh.glb as `path`, a .usdc or .fbx, and the pictures of its textures into the folder `NAME textures` beside.
+    """Write a run's mesh.glb as a .usdc or .fbx, and its textures into the folder `NAME textures` beside.
 
-    Blender's file is left as it was. Raises InputError where pictures are missing, and where something cannot be read or written.
+    Blender's file does not change. Raises InputError where a texture is missing or a file cannot be read or written.
     """
     sources = {name: mesh.parent / TEXTURES / f"{name}.png" for name in (*_PICTURES, "occlusion")}
     for source in sources.values():
         if not source.is_file():
-            raise InputError(f"{source} is not there: make the run's mesh again")
+            raise InputError(f"{source} does not exist: make the run's mesh again")
     folder = path.with_name(f"{path.stem} {TEXTURES}")
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot write {folder}: {error.strerror}") from None
     for name, source in sources.items():
-        with whole(folder / f"{name}.png") as temporary:
+        with atomic_write(folder / f"{name}.png") as temporary:
             shutil.copyfile(source, temporary)
     before = data_blocks()
     try:
-        scene = bpy.data.scenes.new(
-            path.stem
-        )  # of its own: what is selected, hidden or in work elsewhere does not matter
+        scene = bpy.data.scenes.new(path.stem)  # of its own: the export ignores what is selected or hidden elsewhere
         with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
             items = add_mesh(mesh, path.stem, scene.collection)
             material = _material(path.stem, folder, _specular(items[0]))
             for item in items:
                 item.data.materials.clear()
                 item.data.materials.append(material)
-            with whole(path) as temporary:
+            with atomic_write(path) as temporary:
                 _EXPORTERS[path.suffix.lower()](str(temporary))
     finally:
         bpy.data.batch_remove(data_blocks() - before)
 
 
 def _specular(item: bpy.types.Object) -> float:
-    """The Specular IOR Level that a mesh.glb came with: 0 where nothing is mirrored."""
+    """Specular IOR Level of an imported mesh: 0 for no specular reflection."""
     return principled(item.data.materials[0]).inputs[SPECULAR].default_value
 
 
 def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:
-    """A Principled BSDF with a picture an input: FBX knows no channels of pictures, and the exporters no other nodes."""
+    """Make a Principled BSDF with one texture for each input: FBX has no texture channels, and the exporters read no other nodes."""
     material = bpy.data.materials.new(name)
     tree, inputs = node_tree(material), {SPECULAR: specular}
     for picture, socket in _PICTURES.items():
@@ -72,15 +70,15 @@ def _usd(file: str) -> None:
     try:
         textures = usd_keeps_textures()
     except KeyError:
-        raise InputError("this Blender was built without USD: use the one from blender.org, or write FBX") from None
+        raise InputError("this Blender was built without USD: use the one from blender.org, or export FBX") from None
     bpy.ops.wm.usd_export(filepath=file, export_custom_properties=False, convert_world_material=False, **textures)
 
 
 def _fbx(file: str) -> None:
     try:
         bpy.ops.export_scene.fbx(filepath=file, path_mode="RELATIVE", use_tspace=True, bake_anim=False)
-    except AttributeError:  # the operator is not there
-        raise InputError("Blender's FBX add-on is off: switch it on in the preferences") from None
+    except AttributeError:  # the operator does not exist
+        raise InputError("Blender's FBX add-on is off: enable it in the preferences") from None
 
 
 _EXPORTERS = {".usdc": _usd, ".fbx": _fbx}

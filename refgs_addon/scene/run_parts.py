@@ -1,13 +1,13 @@
-"""The parts of an imported run, and which of them are seen."""
+"""Parts of an imported run: find them, and show one of them."""
 
 import bpy
 
-KEY = "refgs_part"  # the custom property of an imported object: "splats" or "mesh"
-FOLDER = "refgs_folder"  # the custom property of a run's collection: where it was imported from
+KEY = "refgs_part"  # custom property of an imported object: "splats" or "mesh"
+FOLDER = "refgs_folder"  # custom property of a run's collection: its run folder
 
 
 def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]:
-    """The objects of a run's collection by part; empty for a collection that is not a run's."""
+    """Group the objects of a run's collection by part. Empty for a collection that is not a run's."""
     found: dict[str, list[bpy.types.Object]] = {}
     for item in collection.objects:
         if KEY in item:
@@ -23,7 +23,7 @@ def show(collection: bpy.types.Collection, part: str) -> None:
 
 
 def active_run(context: bpy.types.Context) -> bpy.types.Collection | None:
-    """The run that the active object belongs to, else the newest of the scene."""
+    """Find the run of the active object, else the scene's newest run."""
     runs = [collection for collection in context.scene.collection.children if parts(collection)]
     chosen = context.view_layer.objects.active
     of_chosen = [run for run in runs if chosen is not None and chosen.name in run.all_objects]

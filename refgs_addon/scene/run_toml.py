@@ -1,4 +1,4 @@
-"""What a run folder's run.toml says of the run: nothing, where there is none or it cannot be read."""
+"""Read facts about a run from its run.toml. A missing or unreadable file yields none."""
 
 import math
 import tomllib
@@ -8,13 +8,13 @@ MANIFEST = Path(__file__).resolve().parents[2] / "blender_manifest.toml"
 
 
 def capture_of(run: Path) -> Path | None:
-    """The folder of the capture that a run is of."""
+    """Folder of the capture that a run was trained on."""
     capture = _table(run, "run").get("capture")
     return Path(capture) if isinstance(capture, str) else None
 
 
-def tilted(run: Path) -> bool:
-    """Whether a run stands otherwise than its capture's cameras, another direction than theirs having been chosen as up."""
+def up_was_chosen(run: Path) -> bool:
+    """Check whether another up than that of the capture's cameras was chosen, so that the run is rotated."""
     try:
         x, y, z = _table(run, "settings")["region"]["up"]
         return math.hypot(x, y) > 1e-3 * z and any((x, y, z))
@@ -22,8 +22,8 @@ def tilted(run: Path) -> bool:
         return False
 
 
-def newer(run: Path) -> str:
-    """The release that made a run, where this add-on is of an older one, which may not know all that is in it; else ""."""
+def newer_release(run: Path) -> str:
+    """Return the release that made a run if it is newer than this add-on, else ""."""
     made_by = _table(run, "run").get("refgs")
     own = tomllib.loads(MANIFEST.read_text(encoding="utf-8"))["version"]
     try:
@@ -33,7 +33,7 @@ def newer(run: Path) -> str:
 
 
 def _release(version: str) -> tuple[int, ...]:
-    return tuple(int(number) for number in version.split(".")[:2])  # the third only mends
+    return tuple(int(number) for number in version.split(".")[:2])  # the third number only fixes bugs
 
 
 def _table(run: Path, name: str) -> dict:

@@ -1,4 +1,4 @@
-"""What leaves Blender: a run with its edits as a new run folder, its splats, its light."""
+"""Export a run with its edits: as a new run folder, or its splats, mesh or light alone."""
 
 import os
 import shutil
@@ -10,22 +10,22 @@ import numpy as np
 from numpy.lib.recfunctions import append_fields
 
 from ..errors import InputError
-from ..nodes.splats import NAME as SPLATS
+from ..nodes.splats_tree import NAME as SPLATS
+from .atomic_file import atomic_write
 from .edit import edits, splats_of
-from .exchange import TEXTURES, write_mesh
-from .files import whole
-from .parts import FOLDER
-from .splats import MATERIALS, PLY_TYPES, SH_DC, finite, read_constants, read_rows
+from .mesh_exchange import TEXTURES, write_mesh
+from .run_parts import FOLDER
+from .splat_cloud import MATERIALS, PLY_TYPES, SH_DC, finite_rows, read_constants, read_rows, srgb_to_linear
 
 KEPT = ("environment.exr", "cameras.json", "needs.json", "occluder.ply", "run.toml")
-DARK = 0.02  # base colour below which it does not tell how much light there is
+DARK = 0.02  # a darker base colour does not reveal how much light falls on it
 
 
 def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
-    """What the edits make of splats: base_color (N, 3) linear Rec.709, metallic (N,), roughness (N,)."""
+    """Evaluate the edits of splats: base_color (N, 3) linear Rec.709, metallic (N,), roughness (N,)."""
     drawing = splats.modifiers[SPLATS]
     before = drawing.show_viewport, splats.hide_viewport, splats.hide_get()
-    drawing.show_viewport = splats.hide_viewport = False  # what is hidden is not evaluated
+    drawing.show_viewport = splats.hide_viewport = False  # Blender does not evaluate hidden objects
     splats.hide_set(False)
     try:
         bpy.context.view_layer.update()
@@ -42,21 +42,21 @@ def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
 
 
 def export_splats(collection: bpy.types.Collection, path: Path) -> None:
-    """Write a run's splats with their edits as a splats.ply: that of the run, with other materials, and with them the colours that
-    viewers without lights show.
+    """Write a run's splats with their edits as a splats.ply.
 
-    Raises InputError where the run's own file is not there or not the one that was imported, and where the new one cannot be written.
+    It is the run's own file with other materials, and with the colours that viewers without lights show adapted to them. Raises InputError
+    where the run's file is missing or has changed, or the new one cannot be written.
     """
     splats = splats_of(collection)
     source = run_folder(collection) / "splats.ply"
-    rows, constants = finite(read_rows(source)), read_constants(source)
+    rows, constants = finite_rows(read_rows(source)), read_constants(source)
     if len(rows) != len(splats.data.points):
         raise InputError(f"{run_folder(collection)} has changed since it was imported: import it again")
     if not {*MATERIALS} <= {*rows.dtype.names, *constants}:
-        mend = "make one that has with `refgs export FILE.ply --splats splats.ply`, and import that"
-        raise InputError(f"{source} has no materials that edits could be written to: {mend}")
+        fix = "add them with `refgs export FILE.ply --splats splats.ply`, and import that file"
+        raise InputError(f"{source} has no materials to edit: {fix}")
     new = edited_materials(splats)
-    if edits(splats):  # not all splats have the same any more
+    if edits(splats):  # the splats may differ now: write columns
         columns = {name: np.full(len(rows), constants[name], "<f4") for name in MATERIALS[3:] if name in constants}
         rows = append_fields(rows, [*columns], [*columns.values()], usemask=False) if columns else rows
         constants = {}
@@ -68,26 +68,26 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
         old, color, look = rows[f"albedo_{channel}"], new["base_color"][:, i], rows[f"f_dc_{i}"]
         changed = np.abs(color - old) > 1e-6
         edited |= changed
-        light = _decoded(0.5 + SH_DC * look) / np.maximum(old, DARK)
-        rows[f"f_dc_{i}"] = np.where(changed, (_encoded(color * light) - 0.5) / SH_DC, look)
+        light = srgb_to_linear(np.clip(0.5 + SH_DC * look, 0, 1)) / np.maximum(old, DARK)
+        rows[f"f_dc_{i}"] = np.where(changed, (linear_to_srgb(color * light) - 0.5) / SH_DC, look)
         rows[f"albedo_{channel}"] = color
     for name in rows.dtype.names:
         if name.startswith("f_rest_"):
-            rows[name][edited] = 0  # how the colour depended on the direction was the old material's
+            rows[name][edited] = 0  # view dependence belongs to the old material
     types = {np.dtype(kind): name for name, kind in PLY_TYPES.items()}
     names = "".join(f"property {types[rows.dtype[name]]} {name}\n" for name in rows.dtype.names)
     said = "".join(f"comment constant {name} {value:g}\n" for name, value in constants.items())
     head = f"ply\nformat binary_little_endian 1.0\n{said}element vertex {len(rows)}\n{names}end_header\n"
-    with whole(path) as temporary, open(temporary, "wb") as file:
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
         file.write(head.encode("ascii"))
         file.write(rows)
 
 
 def export_run(collection: bpy.types.Collection, folder: Path) -> None:
-    """Write a run with its edits as a new run folder, which must not be there; the run itself stays as it is.
+    """Write a run with its edits as a new run folder, which must not exist. The run itself does not change.
 
-    It has no mesh, whose textures would be those of before; where there are no edits the run's is copied. `refgs export`, or the
-    trainer, makes one. Raises InputError.
+    The mesh is copied only if there are no edits: its textures would lack them. `refgs export` or the trainer makes a new one. Raises
+    InputError.
     """
     original = run_folder(collection)
     if folder.exists():
@@ -102,7 +102,7 @@ def export_run(collection: bpy.types.Collection, folder: Path) -> None:
                 shutil.copy2(original / name, temporary / name)
         if "mesh.glb" in kept and (original / TEXTURES).is_dir():
             shutil.copytree(original / TEXTURES, temporary / TEXTURES)
-        temporary.chmod(0o755)  # as folders are, where mkdtemp keeps others out
+        temporary.chmod(0o755)  # mkdtemp makes folders that only the owner can read
         os.replace(temporary, folder)
     except OSError as error:
         raise InputError(f"cannot write {folder}: {error.strerror}") from None
@@ -115,18 +115,20 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
     """Copy a run's recovered light, an equirectangular EXR. Raises InputError."""
     light = run_folder(collection) / "environment.exr"
     if not light.is_file():
-        raise InputError(f"{light} is not there: the run has no light")
+        raise InputError(f"{light} does not exist: the run has no light")
     _copy(light, path)
 
 
 def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
-    """Write a run's mesh with its textures: a .glb is the run's own, .usdc and .fbx are `exchange`'s. Raises InputError where it has
-    none, and where edits would be lost."""
+    """Write a run's mesh with its textures: a .glb is a copy of the run's, `mesh_exchange` writes .usdc and .fbx.
+
+    Raises InputError where the run has no mesh, or has edits that its textures lack.
+    """
     mesh = run_folder(collection) / "mesh.glb"
     if edits(splats_of(collection)):
-        raise InputError("the mesh would be without the edits: apply them to a new run, and export that one's mesh")
+        raise InputError("the mesh lacks the edits: apply them to a new run, and export the mesh of that one")
     if not mesh.is_file():
-        raise InputError(f"{mesh} is not there: make the run's mesh first")
+        raise InputError(f"{mesh} does not exist: make the run's mesh first")
     if path.suffix.lower() == ".glb":
         _copy(mesh, path)
     else:
@@ -134,25 +136,19 @@ def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
 
 
 def _copy(file: Path, path: Path) -> None:
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         shutil.copyfile(file, temporary)
 
 
 def run_folder(collection: bpy.types.Collection) -> Path:
-    """The run folder that a collection was imported from. Raises InputError where it is not there."""
+    """Find the run folder that a collection was imported from. Raises InputError where it is gone."""
     folder = Path(bpy.path.abspath(collection.get(FOLDER, "")))
     if not collection.get(FOLDER) or not (folder / "splats.ply").is_file():
-        raise InputError(f"the run of {collection.name} is not at {folder}: import it again from where it is now")
+        raise InputError(f"the run of {collection.name} is no longer at {folder}: import it again from its new place")
     return folder
 
 
-def _decoded(encoded: np.ndarray) -> np.ndarray:
-    """sRGB to linear."""
-    x = np.clip(encoded, 0, 1)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-
-
-def _encoded(linear: np.ndarray) -> np.ndarray:
-    """Linear to sRGB."""
+def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
+    """Encode linear values as sRGB, clipped to 0..1."""
     x = np.clip(linear, 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)

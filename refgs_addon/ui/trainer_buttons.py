@@ -1,35 +1,35 @@
-"""The preferences' buttons."""
+"""Operators of the preferences: query, install and remove the trainer."""
 
 from typing import ClassVar
 
 import bpy
 
 from .. import preferences
-from .operators import Door
+from .operators import ReportsErrors
 
 
-class AskTrainer(Door, bpy.types.Operator):
+class QueryTrainer(ReportsErrors, bpy.types.Operator):
     bl_idname = "refgs.ask_trainer"
-    bl_label = "Ask the Trainer"
-    bl_description = "Ask the Python that is used for RefGS's trainer which one it is and what it trains on"
+    bl_label = "Query the Trainer"
+    bl_description = "Ask the chosen Python for the trainer's release and its device"
     bl_options: ClassVar = {"REGISTER"}
 
     def work(self, context: bpy.types.Context) -> None:
-        preferences.ask()
+        preferences.query_trainer()
 
 
-class InstallTrainer(Door, bpy.types.Operator):
+class InstallTrainer(ReportsErrors, bpy.types.Operator):
     bl_idname = "refgs.install_trainer"
     bl_label = "Install the Trainer"
     bl_description = (
-        "Fetch what the trainer needs from the network and install it in the add-on's own folder, in the background. "
-        "Nothing else on this machine is changed"
+        "Download the trainer's packages and install them in the add-on's own folder, in the background. "
+        "Nothing else on this machine changes"
     )
     bl_options: ClassVar = {"REGISTER"}
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        reason = preferences.why_no_installation()
+        reason = preferences.installation_problem()
         cls.poll_message_set(reason)
         return not reason
 
@@ -37,20 +37,20 @@ class InstallTrainer(Door, bpy.types.Operator):
         preferences.install()
 
 
-class StopInstalling(Door, bpy.types.Operator):
+class StopInstalling(ReportsErrors, bpy.types.Operator):
     bl_idname = "refgs.stop_installing"
     bl_label = "Stop Installing"
-    bl_description = "Stop here; what has been fetched is kept, and the installation can be gone on with"
+    bl_description = "Stop the installation. Finished downloads are kept, and it can be resumed"
     bl_options: ClassVar = {"REGISTER"}
 
     def work(self, context: bpy.types.Context) -> None:
         preferences.stop()
 
 
-class RemoveTrainer(Door, bpy.types.Operator):
+class RemoveTrainer(ReportsErrors, bpy.types.Operator):
     bl_idname = "refgs.remove_trainer"
     bl_label = "Remove the Trainer"
-    bl_description = "Delete the trainer that was installed from here, with all that it came with"
+    bl_description = "Delete the installed trainer and its packages"
     bl_options: ClassVar = {"REGISTER"}
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
@@ -62,4 +62,4 @@ class RemoveTrainer(Door, bpy.types.Operator):
         preferences.remove()
 
 
-CLASSES = (AskTrainer, InstallTrainer, StopInstalling, RemoveTrainer)
+CLASSES = (QueryTrainer, InstallTrainer, StopInstalling, RemoveTrainer)

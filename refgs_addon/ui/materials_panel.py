@@ -1,4 +1,4 @@
-"""The Materials panel: the edits of a run's materials."""
+"""Materials panel: edit the materials of a run."""
 
 from typing import ClassVar
 
@@ -7,53 +7,49 @@ from bl_ui.utils import PresetPanel
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from .. import compat
-from ..nodes.edit import REGIONS
+from ..nodes.edit_tree import REGIONS
 from ..scene.edit import add_edit, edits, remove_edit
-from ..scene.materials import PRESETS, ROOT, materials, remove_material, save_material, set_material
-from ..scene.parts import active_run, parts
-from .export import ApplyEdits
-from .operators import Door, choose, has_run
+from ..scene.material_presets import PRESETS, ROOT, materials, remove_material, save_material, set_material
+from ..scene.run_parts import active_run, parts
+from .export_menu import ApplyEdits
+from .operators import OnRun, ReportsErrors, select_only
 from .panels import Tab
 
 _WHERE = {
-    "Everywhere": ("Change all of the object", "WORLD"),
-    "Box": ("Change what is in a box, which you move, turn and scale", "MESH_CUBE"),
-    "Sphere": ("Change what is in a ball, which you move, turn and scale", "MESH_UVSPHERE"),
-    "Painted": ("Change what you paint on the mesh", "BRUSH_DATA"),
-    "Similar": ("Change what has a material like the one at a point that you move", "EYEDROPPER"),
+    "Everywhere": ("Edit the whole object", "WORLD"),
+    "Box": ("Edit a box that you move, rotate and scale", "MESH_CUBE"),
+    "Sphere": ("Edit a ball that you move, rotate and scale", "MESH_UVSPHERE"),
+    "Painted": ("Edit the area that you paint on the mesh", "BRUSH_DATA"),
+    "Similar": ("Edit all places with a material like the one at a point that you move", "EYEDROPPER"),
 }
 
 
-class AddEdit(Door, bpy.types.Operator):
+class AddEdit(OnRun, bpy.types.Operator):
     bl_idname = "refgs.add_edit"
     bl_label = "Edit Material"
-    bl_description = "Change the material of all of the object or a part of it; what was learned stays beneath"
+    bl_description = "Edit the material of the object or a part of it. The learned material is kept"
 
     where: EnumProperty(
         name="Where", items=[(name, name, _WHERE[name][0], _WHERE[name][1], i) for i, name in enumerate(REGIONS)]
     )
     material: StringProperty(
         name="Material",
-        description="The preset to start from",
+        description="Preset to start from",
         default="Gold",
         search=lambda operator, context, text: [*materials()],
     )
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return has_run(cls, context)
 
     def work(self, context: bpy.types.Context) -> None:
         edit = add_edit(active_run(context), self.where, self.material)
         region = compat.get_modifier_input(edit, "Region")
         if region is not None:
-            choose(context, region)
+            select_only(context, region)
         if self.where == "Painted" and context.area is not None:
             bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
 
 
-class _OfEdit(Door):
-    """An operator on one edit."""
+class _OfEdit(ReportsErrors):
+    """Base of operators on one edit."""
 
     splats: StringProperty(name="Splats", options={"HIDDEN"})
     edit: StringProperty(name="Edit", options={"HIDDEN"})
@@ -65,41 +61,43 @@ class _OfEdit(Door):
 class RemoveEdit(_OfEdit, bpy.types.Operator):
     bl_idname = "refgs.remove_edit"
     bl_label = "Remove Edit"
-    bl_description = "Remove this edit; what was learned shows again"
+    bl_description = "Remove this edit, and show the learned material again"
 
     def work(self, context: bpy.types.Context) -> None:
         remove_edit(bpy.data.objects[self.splats], self.edit)
 
 
 class SetMaterial(_OfEdit, bpy.types.Operator):
-    """In place of Blender's own operator for presets, which cannot be undone."""
+    """Replace Blender's own preset operator, which cannot be undone."""
 
     bl_idname = "refgs.set_material"
     bl_label = "Set Material"
-    bl_description = "Give this edit the values of a material"
+    bl_description = "Set this edit to the values of a material"
 
-    material: StringProperty(name="Material", description="A preset's name, or its file", options={"HIDDEN"})
+    material: StringProperty(name="Material", description="Name or file of the preset", options={"HIDDEN"})
 
     def work(self, context: bpy.types.Context) -> None:
         set_material(self.modifier(), bpy.path.display_name(self.material, title_case=False))
 
 
 class KeepMaterial(_OfEdit, bpy.types.Operator):
-    """What Blender's list of presets has its + and − call. Its own operator for them writes over a preset of the same name (4.3), and
-    knows no modifier's inputs, which each Blender has elsewhere."""
+    """Save or remove a preset, for + and − in Blender's list of presets.
+
+    Blender's own operator overwrites a preset of the same name (4.3), and cannot read a modifier's inputs.
+    """
 
     bl_idname = "refgs.keep_material"
     bl_label = "Save or Remove Material"
     bl_options: ClassVar = {"INTERNAL"}
 
-    name: StringProperty(name="Name", description="The preset's")
+    name: StringProperty(name="Name", description="Name of the preset")
     remove_name: BoolProperty(name="Remove", description="Remove the preset of this name")
 
     @classmethod
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         if properties.remove_name:
-            return "Remove this preset; only those that you saved can be removed"
-        return "Save this edit's material as a preset of your own, under the name beside"
+            return "Remove this preset. Only presets that you saved can be removed"
+        return "Save this edit's material as a preset with the name on the left"
 
     def work(self, context: bpy.types.Context) -> None:
         if self.remove_name:

@@ -1,4 +1,4 @@
-"""Cameras: from cameras.json to Blender's."""
+"""Camera objects: make them from cameras.json, look through them, lay photos over them."""
 
 import json
 import math
@@ -9,13 +9,15 @@ from mathutils import Matrix
 
 from ..errors import InputError
 
-SENSOR_WIDTH = 36.0  # mm, Blender's own
-PHOTO = "refgs_photo"  # the custom property of a camera's data: its photo's file
+SENSOR_WIDTH = 36.0  # mm, Blender's default
+PHOTO = "refgs_photo"  # custom property of a camera's data: the file of its photo
 
 
 def read_cameras(path: Path, capture: Path | None) -> list[dict]:
-    """The frames of a cameras.json, of a run or a check: camera-to-world matrices with OpenGL's axes, pinhole intrinsics, and under
-    `photo` the file of the photo where it is known which capture's folder it is in."""
+    """Read the frames of a cameras.json: camera-to-world matrices with OpenGL's axes, and pinhole intrinsics.
+
+    `photo` is the photo's file if the capture's folder is known, else "".
+    """
     try:
         frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
         for frame in frames:
@@ -33,23 +35,23 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
 
 
 def light_of(path: Path) -> str:
-    """The view that a run's recovered light is right for, where it turned with the camera, as on a turntable; else ""."""
+    """Name of the view that the recovered light belongs to, if the light turned with the camera; else ""."""
     return Path(json.loads(path.read_text(encoding="utf-8")).get("light_of", "")).stem
 
 
 def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Object:
-    """One frame's camera in a collection: pose, focal length and principal point.
+    """Add a frame's camera to a collection, with its pose, focal length and principal point.
 
-    Blender keeps the size of the picture and the pixels' aspect in the scene, so they ride on the camera's data as the
-    properties `refgs_size` (pixels) and `refgs_pixel_aspect`, for `frame_camera` to read.
+    Blender stores resolution and pixel aspect in the scene. The camera's data stores them too, as the properties `refgs_size`
+    (pixels) and `refgs_pixel_aspect`, for `frame_camera`.
     """
     data = bpy.data.cameras.new(frame["name"])
     width, height = frame["w"], frame["h"]
     aspect = frame["fl_x"] / frame["fl_y"]  # a pixel's height over its width
-    data.display_size = 0.15  # in the way of the object otherwise, there being a hundred of them
+    data.display_size = 0.15  # a hundred cameras of the default size hide the object
     data.sensor_fit, data.sensor_width = "HORIZONTAL", SENSOR_WIDTH
     data.lens = SENSOR_WIDTH * frame["fl_x"] / width
-    # Shifts are in widths of the picture, positive to the right and up; cx, cy run right and down.
+    # A shift is in picture widths, to the right and up; cx and cy run right and down.
     data.shift_x = 0.5 - frame["cx"] / width
     data.shift_y = (frame["cy"] - 0.5 * height) * aspect / width
     data["refgs_size"] = [int(width), int(height)]
@@ -62,7 +64,7 @@ def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Objec
 
 
 def frame_camera(scene: bpy.types.Scene, camera: bpy.types.Object, size: int | None = None) -> None:
-    """Make a camera the scene's, with its photo's resolution; `size` is another length of the longer side in pixels."""
+    """Make a camera the scene's, at its photo's resolution. `size` is a different longer side in pixels."""
     scene.camera = camera
     render = scene.render
     if "refgs_size" in camera.data:
@@ -76,9 +78,9 @@ def frame_camera(scene: bpy.types.Scene, camera: bpy.types.Object, size: int | N
 
 
 def show_photo(camera: bpy.types.Object, amount: float = 1.0) -> None:
-    """Lay a camera's photo over what it sees, so much of it: 0 hides it. The photo is loaded the first time.
+    """Lay a camera's photo over its view with this opacity; 0 hides it. The photo is loaded the first time.
 
-    Raises InputError where the camera has no photo, or the photo is not where it was when it was trained on or checked.
+    Raises InputError where the camera has no photo, or the photo's file is gone.
     """
     data = camera.data
     if amount > 0 and not data.background_images:
@@ -88,7 +90,7 @@ def show_photo(camera: bpy.types.Object, amount: float = 1.0) -> None:
         try:
             image = bpy.data.images.load(str(path), check_existing=True)
         except RuntimeError:
-            raise InputError(f"the photo {path} is not there: put the capture back where it was") from None
+            raise InputError(f"the photo {path} does not exist: move the capture back to where it was") from None
         layer = data.background_images.new()
         layer.image, layer.display_depth, layer.frame_method = image, "FRONT", "STRETCH"
     data.show_background_images = amount > 0
@@ -97,20 +99,19 @@ def show_photo(camera: bpy.types.Object, amount: float = 1.0) -> None:
 
 
 def photo_shown(camera: bpy.types.Object | None) -> float:
-    """How much of a camera's photo lies over what it sees."""
+    """Opacity of the photo over a camera's view; 0 where none is shown."""
     layers = camera.data.background_images if camera is not None and camera.type == "CAMERA" else ()
     return layers[0].alpha if layers and camera.data.show_background_images else 0.0
 
 
 def next_camera(scene: bpy.types.Scene, collection: bpy.types.Collection, steps: int = 1) -> bpy.types.Object:
-    """Look through another camera of a run or a capture, so many further in the photos' order; where a photo is shown, its photo is
-    shown next.
+    """Make another camera of a run or a capture the scene's, `steps` further in the photos' order.
 
-    Raises InputError where there are no cameras.
+    If the old camera shows its photo, the new one shows its own. Raises InputError where there are no cameras.
     """
     cameras = [item for item in collection.all_objects if item.type == "CAMERA"]
     if not cameras:
-        raise InputError(f"{collection.name} has no cameras: its run folder had no cameras.json")
+        raise InputError(f"{collection.name} has no cameras: its run folder has no cameras.json")
     known = scene.camera in cameras
     camera = cameras[(cameras.index(scene.camera) + steps) % len(cameras)] if known else cameras[0]
     if amount := photo_shown(scene.camera):

@@ -1,4 +1,4 @@
-"""Contact sheets: one view under many lights, on one picture."""
+"""Contact sheets: one view under many lights, in one picture."""
 
 import tempfile
 from collections.abc import Callable, Sequence
@@ -7,10 +7,10 @@ from pathlib import Path
 import bpy
 
 from ..errors import InputError
-from ..nodes.world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama
-from .files import whole
-from .preview import render_preview
-from .relight import relight
+from ..nodes.panorama_world import RECOVERED, get_light, is_panorama, set_light
+from .atomic_file import atomic_write
+from .render_eevee import render_preview
+from .world_light import relight
 
 GAP = 4  # pixels between pictures
 
@@ -23,11 +23,11 @@ def contact_sheet(
     samples: int = 32,
     progress: Callable[[int, str], None] = lambda done, what: None,
 ) -> None:
-    """Render the scene camera's view in Eevee under the recovered light, if there is one, and under each HDRI, and lay the pictures on one
-    PNG with a transparent ground, row by row, about as wide as high.
+    """Render the scene camera's view in Eevee under the recovered light, if there is one, and each HDRI, into one PNG.
 
-    `size` is the longer side of each in pixels. The scene's light is put back. `progress` hears how many are done, and which is next.
-    Raises InputError where there is no camera, a light cannot be read, or the file cannot be written.
+    The pictures are laid out in rows on a transparent, roughly square sheet. `size` is the longer side of each in pixels. `progress` gets
+    the number of finished pictures and the next light. The scene's light is restored. Raises InputError where there is no camera, a light
+    cannot be read, or the file cannot be written.
     """
     import numpy as np
 
@@ -35,10 +35,10 @@ def contact_sheet(
     known = is_panorama(world) and world.get(RECOVERED) is not None
     lights: list[Path | None] = ([None] if known else []) + list(hdris)
     if not lights:
-        raise InputError("there is no light to show the object under: choose a folder of HDRIs in the preferences")
-    if not png.parent.is_dir():  # Blender would make it
-        raise InputError(f"cannot write {png}: its folder is not there")
-    before = _light(world) if is_panorama(world) else None
+        raise InputError("there is no light to render under: choose a folder of HDRIs in the preferences")
+    if not png.parent.is_dir():  # Blender would create it
+        raise InputError(f"cannot write {png}: its folder does not exist")
+    before = get_light(world) if is_panorama(world) else None
     pictures = []
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -51,13 +51,10 @@ def contact_sheet(
     finally:
         lit, scene.world = scene.world, world
         if before is not None:
-            nodes = world.node_tree.nodes
-            nodes[IMAGE].image = before[0]
-            nodes[ROTATION].inputs["Rotation"].default_value = before[1]
-            nodes[STRENGTH].inputs["Strength"].default_value = before[2]
+            set_light(world, *before)
         elif lit is not None:
             bpy.data.worlds.remove(lit)
-    progress(len(lights), "laying them out")
+    progress(len(lights), "layout")
     height, width = pictures[0].shape[:2]
     columns = max(1, round((len(pictures) * height / width) ** 0.5))
     rows = -(-len(pictures) // columns)
@@ -69,15 +66,8 @@ def contact_sheet(
     _write(sheet, png)
 
 
-def _light(world: bpy.types.World) -> tuple:
-    """What is to be put back: the image, the rotation, the strength."""
-    nodes = world.node_tree.nodes
-    rotation = nodes[ROTATION].inputs["Rotation"].default_value
-    return nodes[IMAGE].image, tuple(rotation), nodes[STRENGTH].inputs["Strength"].default_value
-
-
 def _pixels(file: Path):
-    """A PNG's numbers (h, w, 4) as they are in the file, the top row first."""
+    """Read a PNG's values (h, w, 4) as they are in the file, top row first."""
     import numpy as np
 
     image = bpy.data.images.load(str(file))
@@ -100,7 +90,7 @@ def _write(pixels, png: Path) -> None:
     image.file_format = "PNG"
     try:
         image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1]).ravel())
-        with whole(png) as temporary:
+        with atomic_write(png) as temporary:
             image.save(filepath=str(temporary))
     finally:
         bpy.data.images.remove(image)

@@ -1,4 +1,4 @@
-"""The Light panel: which panorama lights the scene."""
+"""Light panel: choose the panorama that lights the scene."""
 
 import math
 from pathlib import Path
@@ -9,15 +9,15 @@ from bpy.props import EnumProperty, FloatProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
 from ..errors import InputError
-from ..nodes.world import IMAGE, RECOVERED, ROTATION, STRENGTH, is_panorama
+from ..nodes.panorama_world import IMAGE, RECOVERED, ROTATION, STRENGTH, get_light, is_panorama
 from ..preferences import hdri_folder
-from ..scene.relight import hdris, match_light, relight
-from . import pictures
-from .operators import Door
+from ..scene.world_light import hdris, match_light, relight
+from . import icons
+from .operators import ReportsErrors
 from .panels import Tab
 
-OTHER = 1  # the number of a light that is none of those listed
-_listed: list[tuple[str, str, str, int, int]] = []  # Blender keeps no strings of a list that is made anew
+OTHER = 1  # number of a light that is not in the list
+_listed: list[tuple[str, str, str, int, int]] = []  # Blender keeps no references to a dynamic list's strings
 
 
 def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, int]]:
@@ -26,19 +26,19 @@ def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, 
     _listed.clear()
     if is_panorama(world) and world.get(RECOVERED) is not None:
         recovered = world[RECOVERED]
-        icon = pictures.thumbnail(Path(bpy.path.abspath(recovered.filepath)))
-        _listed.append(("RECOVERED", "Recovered", "The light that was recovered from the photos", icon, 0))
+        icon = icons.thumbnail(Path(bpy.path.abspath(recovered.filepath)))
+        _listed.append(("RECOVERED", "Recovered", "Light recovered from the photos", icon, 0))
     files = hdris(hdri_folder())
     for file in files:
-        _listed.append((str(file), file.stem.capitalize(), str(file), pictures.thumbnail(file), _number(file)))
+        _listed.append((str(file), file.stem.capitalize(), str(file), icons.thumbnail(file), _number(file)))
     if _shown(world, files) == OTHER:
         name = shown.name if shown else "None"
-        _listed.append(("OTHER", name, "What lights the scene now", 0, OTHER))
+        _listed.append(("OTHER", name, "Light of the scene", 0, OTHER))
     return _listed
 
 
 def _number(file: Path) -> int:
-    """A number for a file that stays, whatever else is in its folder; above OTHER."""
+    """Number a file independently of the other files in its folder, above OTHER."""
     return 2 + crc32(str(file).encode()) % (1 << 30)
 
 
@@ -61,24 +61,22 @@ def _set(self, number: int) -> None:
     if chosen is None and number != 0:
         return
     world = bpy.context.scene.world
-    nodes = world.node_tree.nodes if is_panorama(world) else None
-    turn = nodes[ROTATION].inputs["Rotation"].default_value[2] if nodes and number else 0.0
-    strength = nodes[STRENGTH].inputs["Strength"].default_value if nodes and number else 1.0
+    _, rotation, strength = get_light(world) if is_panorama(world) and number else (None, (0.0, 0.0, 0.0), 1.0)
     try:
-        relight(bpy.context.scene, chosen, turn, strength)
+        relight(bpy.context.scene, chosen, rotation[2], strength)
     except InputError as error:
-        said = str(error)
-        bpy.context.window_manager.popup_menu(lambda menu, _: menu.layout.label(text=said), title="RefGS", icon="ERROR")
+        text = str(error)
+        bpy.context.window_manager.popup_menu(lambda menu, _: menu.layout.label(text=text), title="RefGS", icon="ERROR")
 
 
-class Relight(Door, ImportHelper, bpy.types.Operator):
+class Relight(ReportsErrors, ImportHelper, bpy.types.Operator):
     bl_idname = "refgs.relight"
     bl_label = "Open HDRI"
-    bl_description = "Light the scene with a panorama; the recovered light is kept"
+    bl_description = "Light the scene with a panorama. The recovered light is kept"
 
     filter_glob: StringProperty(default="*.exr;*.hdr", options={"HIDDEN"})
     rotation: FloatProperty(
-        name="Rotation", description="Turn the light counter-clockwise, seen from above", subtype="ANGLE",
+        name="Rotation", description="Rotation of the light, counter-clockwise seen from above", subtype="ANGLE",
         soft_min=-math.pi, soft_max=math.pi,
     )  # fmt: skip
     strength: FloatProperty(name="Strength", default=1.0, min=0.0, soft_max=10.0)
@@ -87,24 +85,24 @@ class Relight(Door, ImportHelper, bpy.types.Operator):
         relight(context.scene, Path(bpy.path.abspath(self.filepath)), self.rotation, self.strength)
 
 
-class RecoveredLight(Door, bpy.types.Operator):
+class RecoveredLight(ReportsErrors, bpy.types.Operator):
     bl_idname = "refgs.recovered_light"
     bl_label = "Recovered Light"
-    bl_description = "Light the scene with the panorama that was recovered from the photos"
+    bl_description = "Light the scene with the panorama recovered from the photos"
 
     def work(self, context: bpy.types.Context) -> None:
         relight(context.scene, None)
 
 
-class MatchLight(Door, bpy.types.Operator):
+class MatchLight(ReportsErrors, bpy.types.Operator):
     bl_idname = "refgs.match_light"
     bl_label = "Match Recovered Light"
-    bl_description = "Turn and scale the HDRI so that it lights as the recovered light does, as far as it can"
+    bl_description = "Rotate and scale the HDRI to match the recovered light as closely as possible"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         world = context.scene.world
-        cls.poll_message_set("Import a run with a light, and choose an HDRI in its place")
+        cls.poll_message_set("Import a run with a light, then choose an HDRI")
         return is_panorama(world) and world.get(RECOVERED) not in (None, world.node_tree.nodes[IMAGE].image)
 
     def work(self, context: bpy.types.Context) -> None:
@@ -140,7 +138,7 @@ CLASSES = (Relight, RecoveredLight, MatchLight, LightPanel)
 
 def register() -> None:
     bpy.types.WindowManager.refgs_light = EnumProperty(
-        name="Light", description="What lights the scene", items=_lights, get=_get, set=_set
+        name="Light", description="Panorama that lights the scene", items=_lights, get=_get, set=_set
     )
 
 

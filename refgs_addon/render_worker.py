@@ -1,6 +1,8 @@
-"""A second Blender, without a window, that renders a copy of the file; `scene.beside` starts it. It speaks as the trainer's process does
-(docs/job-protocol.md), and takes one command, {"command": "render", "png": …, "hdris": […], "size": …, "samples": …}: a contact sheet
-under these lights, or the scene camera's view where there are none. It ends when its input does, so when the Blender that started it does.
+"""Render a copy of the file in a second Blender without a window; `scene.render_process` starts it.
+
+It speaks the job protocol (docs/job-protocol.md) and takes one command: {"command": "render", "png": …, "hdris": […], "size": …,
+"samples": …}. With HDRIs it renders a contact sheet, without them the scene camera's view. It exits when its standard input closes,
+so it never outlives the Blender that started it.
 """
 
 import json
@@ -9,22 +11,22 @@ import sys
 import threading
 from pathlib import Path
 
-from .environment import end_with_input
 from .errors import InputError
+from .installation import exit_with_stdin
 from .jobs import PROTOCOL
 
 
 def main() -> None:
-    """Do what the one command says, and end the process."""
+    """Run the one command, then end the process."""
     events = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
-    os.dup2(2, 1)  # Blender prints what it likes
+    os.dup2(2, 1)  # Blender prints to stdout: only events may go there
 
     def say(event: str, **facts) -> None:
         events.write(json.dumps({"event": event, "job": "render"} | facts) + "\n")
 
     say("ready", protocol=PROTOCOL, refgs="")
     command = json.loads(sys.stdin.readline())
-    threading.Thread(target=end_with_input, daemon=True).start()
+    threading.Thread(target=exit_with_stdin, daemon=True).start()
     say("started")
     try:
         _render(command, say)
@@ -32,18 +34,18 @@ def main() -> None:
     except InputError as error:
         say("failed", what=str(error), fault=False)
     except Exception as error:
-        say("failed", what=f"a fault of ours: {type(error).__name__}: {error}", fault=True)
+        say("failed", what=f"internal error: {type(error).__name__}: {error}", fault=True)
         raise
     finally:
         events.flush()
-    os._exit(0)  # Blender's own clean-up at the end of a process has been seen to hang
+    os._exit(0)  # Blender's own clean-up at exit can hang
 
 
 def _render(command: dict, say) -> None:
     import bpy
 
-    from .scene.preview import render_preview
-    from .scene.sheet import contact_sheet
+    from .scene.contact_sheet import contact_sheet
+    from .scene.render_eevee import render_preview
 
     png, hdris = Path(command["png"]), [Path(hdri) for hdri in command["hdris"]]
     look = {"size": command["size"], "samples": command["samples"]}

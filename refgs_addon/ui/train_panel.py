@@ -1,163 +1,141 @@
-"""The Train panel and its buttons."""
+"""Train panel and its operators."""
 
 from pathlib import Path
 from typing import ClassVar
 
 import bpy
-from bpy.props import IntProperty, StringProperty
+from bpy.props import StringProperty
 
 from .. import jobs, preferences
-from ..follow import follow_elsewhere
-from ..preferences import lines
-from ..scene import live, training
+from ..job_timers import follow_other_processes
+from ..preferences import wrapped_text
+from ..scene import live_splats, training
 from ..scene.regions import add_training_region, training_region
-from .capture import draw_capture
-from .closing import Keep, StopRun
-from .operators import Door, choose, has_trainer, import_run_folder
+from .checked_capture import draw_capture
+from .closing import KeepTraining, StopRun
+from .icons import curve_icon, preview_icon
+from .operators import OnJob, OnRunFolder, ReportsErrors, has_trainer, import_run_folder, select_only
 from .panels import Tab
-from .pictures import curve, picture
 
 
-def has_capture(operator: type[bpy.types.Operator], context: bpy.types.Context) -> bool:
-    """Whether there is something to train, and a trainer; the button's tooltip says what is missing."""
-    if not has_trainer(operator):
-        return False
-    operator.poll_message_set("Choose the capture's folder first")
-    return bool(context.scene.refgs.capture)
-
-
-class CheckCapture(Door, bpy.types.Operator):
-    bl_idname = "refgs.check_capture"
-    bl_label = "Check"
-    bl_description = "Read all of the capture's photos and cameras, and say what is wrong with them"
-    bl_options: ClassVar = {"REGISTER"}
+class _OnCapture(ReportsErrors):
+    """Base of operators on the chosen capture. Without one, or without a trainer, the button's tooltip says what to do."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return has_capture(cls, context)
+        if not has_trainer(cls):
+            return False
+        cls.poll_message_set("Choose the capture's folder first")
+        return bool(context.scene.refgs.capture)
+
+
+class CheckCapture(_OnCapture, bpy.types.Operator):
+    bl_idname = "refgs.check_capture"
+    bl_label = "Check"
+    bl_description = "Read all photos and cameras of the capture, and report problems"
+    bl_options: ClassVar = {"REGISTER"}
 
     def work(self, context: bpy.types.Context) -> None:
         training.check(context.scene)
 
 
-class FindCameras(Door, bpy.types.Operator):
+class FindCameras(ReportsErrors, bpy.types.Operator):
     bl_idname = "refgs.find_cameras"
     bl_label = "Find Cameras"
-    bl_description = "Find where the photos were taken from, from the photos alone"
+    bl_description = "Find the cameras from the photos alone"
     bl_options: ClassVar = {"REGISTER"}
 
     def work(self, context: bpy.types.Context) -> None:
         training.find_cameras(context.scene)
 
 
-class AddTrainingRegion(Door, bpy.types.Operator):
+class AddTrainingRegion(ReportsErrors, bpy.types.Operator):
     bl_idname = "refgs.add_training_region"
     bl_label = "Add Region"
     bl_description = (
-        "Add a box, or select the one there is: move, turn and scale it until it stands with the object and holds it. "
-        "Only what lies in it comes out, and the box's own up, its Z axis, is the result's up"
+        "Add a box, or select the existing one: move, rotate and scale it until it contains the object. "
+        "Only what is inside is trained. The box's Z axis is the result's up"
     )
 
     def work(self, context: bpy.types.Context) -> None:
-        choose(context, add_training_region(context.scene))
+        select_only(context, add_training_region(context.scene))
 
 
-class Train(Door, bpy.types.Operator):
+class Train(_OnCapture, bpy.types.Operator):
     bl_idname = "refgs.train"
     bl_label = "Train"
-    bl_description = "Learn surfels, materials and light from the photos, in a process of its own: Blender stays yours"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return has_capture(cls, context)
+    bl_description = "Learn surfels, materials and light from the photos, in a separate process: Blender stays free"
 
     def work(self, context: bpy.types.Context) -> None:
         training.train(context.scene)
 
 
-class Resume(Door, bpy.types.Operator):
+class Resume(OnRunFolder, bpy.types.Operator):
     bl_idname = "refgs.resume"
-    bl_label = "Go On"
-    bl_description = "Go on with this training from where it was stopped"
+    bl_label = "Resume"
+    bl_description = "Resume this training from its last checkpoint"
     bl_options: ClassVar = {"REGISTER"}
-
-    folder: StringProperty(name="Run Folder")
 
     def work(self, context: bpy.types.Context) -> None:
         training.resume(context.scene, Path(self.folder))
 
 
-class Forget(Door, bpy.types.Operator):
+class RemoveFromList(OnRunFolder, bpy.types.Operator):
     bl_idname = "refgs.forget"
-    bl_label = "Take off the List"
-    bl_description = "Do not list this run any longer; its folder stays as it is"
-
-    folder: StringProperty(name="Run Folder")
+    bl_label = "Remove from List"
+    bl_description = "Remove this run from the list. Its folder stays"
 
     def work(self, context: bpy.types.Context) -> None:
         training.forget(context.scene, Path(self.folder))
 
 
-class Tell(Door, bpy.types.Operator):
+class SendCommand(OnJob, bpy.types.Operator):
     bl_idname = "refgs.tell"
-    bl_label = "Tell the Training"
-    bl_options: ClassVar = {"REGISTER"}
+    bl_label = "Send Command to Training"
 
-    number: IntProperty(name="Number", description="Of the job in the list")
     command: StringProperty(name="Command", description="pause, resume, stop or cancel")
 
     @classmethod
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         return {
-            "pause": "Let the training rest, and the machine with it",
-            "resume": "Let the training go on",
-            "stop": "Good enough: take what has been learned so far as the result",
-            "cancel": "Stop here; a training can be gone on with later",
+            "pause": "Pause the training, and free the machine",
+            "resume": "Resume the training",
+            "stop": "Finish now, and take the current state as the result",
+            "cancel": "Stop. A training can be resumed later",
         }.get(properties.command, "")
 
     def work(self, context: bpy.types.Context) -> None:
-        job = jobs.JOBS[self.number]
         if self.command == "cancel":
-            job.stop()
+            self.job.stop()
         else:
-            job.tell(self.command)
+            self.job.tell(self.command)
 
 
-class Watch(Door, bpy.types.Operator):
+class ShowLiveSplats(OnJob, bpy.types.Operator):
     bl_idname = "refgs.watch"
     bl_label = "Show Splats"
-    bl_description = "Show the surfels in the 3D view as they are by now, in their base colour; or no longer"
-    bl_options: ClassVar = {"REGISTER"}
-
-    number: IntProperty(name="Number", description="Of the job in the list")
+    bl_description = "Show or hide the current surfels in the 3D view, in their base colour"
 
     def work(self, context: bpy.types.Context) -> None:
-        job = jobs.JOBS[self.number]
-        live.watch(job, context.scene, not live.is_watched(job))
+        live_splats.watch(self.job, context.scene, not live_splats.is_watched(self.job))
 
 
-class PutAway(Door, bpy.types.Operator):
+class Dismiss(OnJob, bpy.types.Operator):
     bl_idname = "refgs.put_away"
-    bl_label = "Put Away"
-    bl_description = "Do not show this any longer; what is still being done is stopped first"
-    bl_options: ClassVar = {"REGISTER"}
-
-    number: IntProperty(name="Number", description="Of the job in the list")
+    bl_label = "Dismiss"
+    bl_description = "Stop this job if it still runs; remove it from the list if it has ended"
 
     def work(self, context: bpy.types.Context) -> None:
-        job = jobs.JOBS[self.number]
-        if job.ended:
-            jobs.JOBS.remove(job)
+        if self.job.ended:
+            jobs.JOBS.remove(self.job)
         else:
-            job.stop()
+            self.job.stop()
 
 
-class ImportTrained(Door, bpy.types.Operator):
+class ImportTrained(OnRunFolder, bpy.types.Operator):
     bl_idname = "refgs.import_trained"
     bl_label = "Import"
     bl_description = "Import this run: splats, mesh, recovered light and cameras"
-
-    folder: StringProperty(name="Run Folder")
 
     def work(self, context: bpy.types.Context) -> None:
         import_run_folder(self, context, Path(self.folder))
@@ -172,7 +150,7 @@ class TrainPanel(Tab, bpy.types.Panel):
         layout, settings = self.layout, context.scene.refgs
         width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
         if not preferences.set_up():
-            lines(layout.box(), preferences.state()[1], width, "INFO")
+            wrapped_text(layout.box(), preferences.status()[1], width, "INFO")
             layout.operator(
                 "preferences.addon_show", text="Preferences", icon="PREFERENCES"
             ).module = preferences.PACKAGE
@@ -180,7 +158,7 @@ class TrainPanel(Tab, bpy.types.Panel):
         column.use_property_split, column.use_property_decorate = True, False
         column.prop(settings, "capture")
         sub = column.row()
-        sub.active = not settings.limited  # a time says it all
+        sub.active = not settings.limited  # the minutes choose everything
         sub.prop(settings, "preset")
         row = column.row(heading="Limit Time", align=True)
         row.prop(settings, "limited", text="")
@@ -204,83 +182,83 @@ class TrainPanel(Tab, bpy.types.Panel):
         row.operator(CheckCapture.bl_idname, icon="VIEWZOOM")
         row.operator(Train.bl_idname, icon="PLAY")
         for number, job in enumerate(jobs.JOBS):
-            if job.program == jobs.TRAINER and job not in preferences.asked():
-                _job(layout.box(), context.scene, number, job, width)
+            if job.program == jobs.TRAINER and job not in preferences.own_jobs():
+                _draw_job(layout.box(), context.scene, number, job, width)
         for known in settings.runs:
             if not any(job.run == Path(known.folder) for job in jobs.JOBS):
-                _run(layout.box(), Path(known.folder))
+                _draw_run(layout.box(), Path(known.folder))
 
 
-def _job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job, width: int) -> None:
+def _draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job, width: int) -> None:
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE", "paused": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
     if job.ended:
-        head.operator(PutAway.bl_idname, text="", icon="X", emboss=False).number = number
+        head.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).number = number
     if job.active and (job.run or ("stage" in job.progress and not job.results)):
-        box.progress(factor=_part(job), text=_how_far(job).capitalize())
+        box.progress(factor=_fraction(job), text=_status(job).capitalize())
     if job.line:
-        lines(box, job.line[0].upper() + job.line[1:], width)
+        wrapped_text(box, job.line[0].upper() + job.line[1:], width)
     for warning in job.warnings:
-        lines(box, warning[0].upper() + warning[1:], width, "ERROR")
+        wrapped_text(box, warning[0].upper() + warning[1:], width, "ERROR")
     for line in job.results.get("check", {}).get("lines", ()):
-        lines(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
+        wrapped_text(box, line.removeprefix("Warning: "), width, "ERROR" if line.startswith("Warning: ") else "NONE")
     draw_capture(box, scene, number, job)
     if file := job.results.get("export", {}).get("display_splats"):
-        lines(box, f"Wrote {file}", width)
+        wrapped_text(box, f"Wrote {file}", width)
     if job.curve:
         facts = job.progress
         box.label(text=f"{facts['psnr']:.1f} dB{f', held out {job.held_out[-1][1]:.1f} dB' if job.held_out else ''}")
         box.label(text=f"{facts['splats'] / 1000:.1f} k splats after {_duration(facts['seconds'])}")
-        if shown := curve(job):
+        if shown := curve_icon(job):
             box.template_icon(icon_value=shown, scale=6)
             ends = box.row()
             ends.label(text=_duration(min(seconds for seconds, _ in job.curve + job.held_out)))
             ends.label(text="log time")
             ends.label(text=_duration(job.curve[-1][0]))
-    if shown := picture(job):
+    if shown := preview_icon(job):
         box.template_icon(icon_value=shown, scale=10)
     if job.run and job.state in ("running", "paused") and "train" not in job.results:
         row = box.row(align=True)
         command = "resume" if job.state == "paused" else "pause"
-        _tell(row, number, command, command.title(), "PLAY" if command == "resume" else "PAUSE")
-        _tell(row, number, "stop", "Finish", "CHECKMARK")
-        _tell(row, number, "cancel", "Stop", "CANCEL")
-        watched = live.is_watched(job)
+        _command_button(row, number, command, command.title(), "PLAY" if command == "resume" else "PAUSE")
+        _command_button(row, number, "stop", "Finish", "CHECKMARK")
+        _command_button(row, number, "cancel", "Stop", "CANCEL")
+        watched = live_splats.is_watched(job)
         icon = "HIDE_OFF" if watched else "HIDE_ON"
-        box.operator(Watch.bl_idname, icon=icon, depress=watched).number = number
+        box.operator(ShowLiveSplats.bl_idname, icon=icon, depress=watched).number = number
     elif not job.ended:
-        _tell(box, number, "cancel", "Stop", "CANCEL")
+        _command_button(box, number, "cancel", "Stop", "CANCEL")
     if job.run and not job.ended:
         icon = "CHECKBOX_HLT" if job.kept else "CHECKBOX_DEHLT"
-        box.operator(Keep.bl_idname, icon=icon, emboss=False).number = number
+        box.operator(KeepTraining.bl_idname, icon=icon, emboss=False).number = number
     if job.no_cameras:
         box.operator(FindCameras.bl_idname, icon="OUTLINER_OB_CAMERA")
     elif job.state == "failed":
         box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
     for decision in job.decided.values():
-        lines(box, decision[0].upper() + decision[1:], width, "DOT")
+        wrapped_text(box, decision[0].upper() + decision[1:], width, "DOT")
     if job.run and job.ended:
-        _run(box, job.run)
+        _draw_run(box, job.run)
 
 
 def draw_status(self, context: bpy.types.Context) -> None:
-    """A training's bar in the status bar."""
+    """Draw a training's progress in the status bar."""
     job = next((job for job in jobs.JOBS if job.run and job.active), None)
     if job is not None:
         row = self.layout.row()
         row.ui_units_x = 14
-        row.progress(factor=_part(job), text=f"{job.name}: {_how_far(job)}")
+        row.progress(factor=_fraction(job), text=f"{job.name}: {_status(job)}")
 
 
-def _part(job: jobs.Job) -> float:
-    """How much of the training, or of a stage of another job, is done, 0..1."""
+def _fraction(job: jobs.Job) -> float:
+    """Fraction of the training, or of another job's stage, that is done."""
     facts = job.progress
     return facts["done" if "stage" in facts else "iteration"] / max(facts["total"], 1) if facts else 0.0
 
 
-def _how_far(job: jobs.Job) -> str:
-    """A few words on where a job is."""
+def _status(job: jobs.Job) -> str:
+    """Describe a job's progress in a few words."""
     if job.state == "paused":
         return "paused"
     if "train" in job.results:
@@ -299,40 +277,40 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
-def _tell(layout: bpy.types.UILayout, number: int, command: str, text: str, icon: str) -> None:
-    button = layout.operator(Tell.bl_idname, text=text, icon=icon)
+def _command_button(layout: bpy.types.UILayout, number: int, command: str, text: str, icon: str) -> None:
+    button = layout.operator(SendCommand.bl_idname, text=text, icon=icon)
     button.number, button.command = number, command
 
 
-def _run(box: bpy.types.UILayout, folder: Path) -> None:
-    """What can be done with a run folder."""
+def _draw_run(box: bpy.types.UILayout, folder: Path) -> None:
+    """Draw the buttons for a run folder."""
     state = jobs.run_state(folder)
     row = box.row(align=True)
     if state == "finished":
         row.operator(ImportTrained.bl_idname, text=f"Import {folder.name}", icon="IMPORT").folder = str(folder)
     elif state == "stopped":
-        row.operator(Resume.bl_idname, text=f"Go On with {folder.name}", icon="PLAY").folder = str(folder)
+        row.operator(Resume.bl_idname, text=f"Resume {folder.name}", icon="PLAY").folder = str(folder)
     elif state == "training":
         row.label(text=f"{folder.name} is being trained", icon="SORTTIME")
     else:
-        row.label(text=f"{folder.name} is not there", icon="GHOST_DISABLED")
-    row.operator(Forget.bl_idname, text="", icon="X").folder = str(folder)
+        row.label(text=f"{folder.name} does not exist", icon="GHOST_DISABLED")
+    row.operator(RemoveFromList.bl_idname, text="", icon="X").folder = str(folder)
     if state == "training":
-        follow_elsewhere()
-        part, text = how_far_elsewhere(folder)
+        follow_other_processes()
+        part, text = other_process_status(folder)
         row = box.row(align=True)
         row.progress(factor=part, text=text)
-        if jobs.run_progress(folder) and not jobs.stops(folder):
+        if jobs.run_progress(folder) and not jobs.stop_requested(folder):
             row.operator(StopRun.bl_idname, icon="CANCEL").folder = str(folder)
 
 
-def how_far_elsewhere(folder: Path) -> tuple[float, str]:
-    """How much of a run that a process which is not of this Blender trains is done, 0..1, and a few words on it."""
+def other_process_status(folder: Path) -> tuple[float, str]:
+    """Fraction and description of the progress of a run that another process trains."""
     facts = jobs.run_progress(folder)
     if not facts:
         return (1.0, "Making the mesh") if (folder / "splats.ply").exists() else (0.0, "Starting")
     part = facts["iteration"] / max(facts["total"], 1)
-    return part, "Stopping" if jobs.stops(folder) else f"{part:.0%}, {_duration(facts['seconds_left'])} left"
+    return part, "Stopping" if jobs.stop_requested(folder) else f"{part:.0%}, {_duration(facts['seconds_left'])} left"
 
 
 CLASSES = (
@@ -341,10 +319,10 @@ CLASSES = (
     AddTrainingRegion,
     Train,
     Resume,
-    Forget,
-    Tell,
-    Watch,
-    PutAway,
+    RemoveFromList,
+    SendCommand,
+    ShowLiveSplats,
+    Dismiss,
     ImportTrained,
     TrainPanel,
 )

@@ -1,18 +1,20 @@
-"""A capture's cameras in the scene before anything is trained, as the trainer's check wrote them down."""
+"""Cameras of a checked capture in the scene, before anything is trained."""
 
 from pathlib import Path
 
 import bpy
 
-from .cameras import PHOTO, add_camera, frame_camera, read_cameras
-from .parts import active_run
+from .camera_objects import PHOTO, add_camera, frame_camera, read_cameras
+from .run_parts import active_run
 
-CAPTURE = "refgs_capture"  # the custom property of a collection of a capture's cameras: the capture's folder
+CAPTURE = "refgs_capture"  # custom property of a collection of cameras: the capture's folder
 
 
 def show_cameras(scene: bpy.types.Scene, capture: Path, cameras: Path) -> bpy.types.Collection:
-    """Add a capture's cameras to a scene in a collection `NAME cameras`, in place of those that it has of them; `cameras` is the
-    cameras.json that a check wrote. Raises InputError."""
+    """Add a capture's cameras to a scene in a collection `NAME cameras`, or replace them.
+
+    `cameras` is the cameras.json that a check wrote. Raises InputError where it cannot be read.
+    """
     frames = read_cameras(cameras, capture)
     remove_cameras(scene, capture)
     collection = bpy.data.collections.new(f"{capture.name} cameras")
@@ -25,7 +27,7 @@ def show_cameras(scene: bpy.types.Scene, capture: Path, cameras: Path) -> bpy.ty
 
 
 def cameras_of(scene: bpy.types.Scene, capture: Path) -> bpy.types.Collection | None:
-    """The collection of a capture's cameras that `show_cameras` added to a scene."""
+    """Find the collection that `show_cameras` added for a capture."""
     return next((item for item in _captures(scene) if item[CAPTURE] == str(capture)), None)
 
 
@@ -34,16 +36,20 @@ def remove_cameras(scene: bpy.types.Scene, capture: Path) -> None:
     collection = cameras_of(scene, capture)
     if collection is not None:
         cameras = [item for item in collection.all_objects if item.type == "CAMERA" and PHOTO in item.data]
-        for item in set(collection.objects) - set(cameras) - set(scene.collection.objects):  # what the artist put there
+        for item in (
+            set(collection.objects) - set(cameras) - set(scene.collection.objects)
+        ):  # objects that the artist put there
             scene.collection.objects.link(item)
         for child in set(collection.children) - set(scene.collection.children):
             scene.collection.children.link(child)
         bpy.data.batch_remove([*cameras, *(camera.data for camera in cameras), collection])
 
 
-def hand_over(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bpy.types.Object]) -> None:
-    """Remove a capture's cameras for those of a run of it, by their names, which they get; who looked through one goes on through
-    that of the same photo."""
+def replace_cameras(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bpy.types.Object]) -> None:
+    """Replace a capture's cameras by those of its run, which take their names.
+
+    If the scene's camera was one of them, it becomes the run's camera of the same photo.
+    """
     known = cameras_of(scene, capture)
     if known is None:
         return
@@ -57,8 +63,10 @@ def hand_over(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bpy.type
 
 
 def active_cameras(context: bpy.types.Context) -> bpy.types.Collection | None:
-    """Whose cameras are stepped through: the run's or capture's that the active object is of, else that the scene's camera is of, else
-    the newest run's, else the newest capture's."""
+    """Find the collection of cameras to step through.
+
+    It is the run or capture of the active object, else that of the scene's camera, else the newest run, else the newest capture.
+    """
     captures = _captures(context.scene)
     for item in (context.view_layer.objects.active, context.scene.camera):
         for collection in context.scene.collection.children:

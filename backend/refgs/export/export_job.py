@@ -1,0 +1,173 @@
+"""Export of a run: checks, then splats or the textured mesh.
+
+Importing torch takes seconds. It is imported only once everything that can be wrong without it has been checked.
+"""
+
+import warnings
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from refgs.errors import InputError, InputWarning
+from refgs.events import Report
+from refgs.lock import RunLock
+from refgs.paths import disk_errors_named
+from refgs.run_folder import check_finished
+
+if TYPE_CHECKING:
+    from refgs.formats.splats import Splats
+    from refgs.run import Run
+
+
+def export(
+    folder: Path,
+    mesh_file: Path | None,
+    texture: int | None,
+    splats_file: Path | None,
+    display_file: Path | None,
+    overwrite: bool,
+    report: Report,
+) -> list[Path]:
+    """Export the textured mesh of a run, or its splats; return the files written.
+
+    Where a splats file is named, the mesh is written only if its file is named too. `folder` may be a PLY file of splats
+    instead of a run: it has no mesh.
+    """
+    splats = [file for file in (splats_file, display_file) if file is not None]
+    is_run = folder.is_dir() or folder.suffix.lower() != ".ply"
+    if not is_run and (mesh_file or not splats):
+        raise InputError(
+            f"{folder} is no run folder, so there is no mesh: add --splats FILE.ply or --display-splats FILE.ply"
+        )
+    if is_run:
+        check_finished(folder)
+    target = mesh_file if mesh_file or splats else folder / "mesh.glb"
+    _check_names(target, splats)
+    _check_absent([*splats, *_mesh_files(target)], overwrite)
+    run, source = _read_source(folder, is_run, report)
+    folders = [file.parent for file in [*splats, target] if file]
+    _make_folders(folders)
+    with disk_errors_named(folders, "export again"):
+        _write_splats(run, source, splats_file, display_file, report)
+        if target is None:
+            return splats
+        with RunLock(folder) if target.parent == folder else nullcontext():
+            _write_mesh(run, target, texture, report)
+    return [*splats, target]
+
+
+def _check_names(target: Path | None, splats: list[Path]) -> None:
+    if target is not None and target.suffix.lower() not in (".glb", ".obj"):
+        raise InputError(f"{target}: a mesh is written as .glb or .obj; give it a name that ends so")
+    for file in splats:
+        if file.suffix.lower() != ".ply" or splats.count(file) > 1:
+            raise InputError(f"{file}: splats are written as .ply, each to a file of its own")
+
+
+def _mesh_files(target: Path | None) -> list[Path]:
+    """Return the mesh's file and what is written beside it."""
+    from refgs.formats.textures import FOLDER
+
+    if target is None:
+        return []
+    materials = [target.with_suffix(".mtl")] if target.suffix.lower() == ".obj" else []
+    return [target, target.parent / FOLDER, *materials]
+
+
+def _check_absent(files: list[Path], overwrite: bool) -> None:
+    for file in files:
+        if file.exists() and not overwrite:
+            raise InputError(f"{file} exists: add --overwrite to replace it, or name another file")
+
+
+def _read_source(folder: Path, is_run: bool, report: Report) -> "tuple[Run | None, Splats]":
+    """Open the run, or read the PLY file of splats; report what was left out of it."""
+    from refgs.formats.splats import read_splats
+    from refgs.run import open_run
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        run = open_run(folder) if is_run else None
+        splats = run.splats if run else read_splats(folder)
+    for warning in caught:
+        report("warning", {"what": str(warning.message)})
+    return run, splats
+
+
+def _make_folders(folders: list[Path]) -> None:
+    try:
+        for folder in folders:
+            folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: the folder cannot be made ({error.strerror}): choose another") from None
+
+
+def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, display: Path | None, report: Report) -> None:
+    from refgs.export.display import displayed
+    from refgs.formats.splats import write_display_splats, write_splats
+
+    def learned(done: int, total: int) -> None:
+        if done % 10 == 0:
+            report("progress", {"stage": "colours", "done": done, "total": total})
+
+    if ours is not None:
+        write_splats(ours, source)
+    if display is not None and run is None:
+        write_display_splats(display, source)  # a foreign PLY has its colours by direction
+    elif display is not None:
+        report("stage", {"what": "learning colours by direction"})
+        write_display_splats(display, displayed(run, learned))
+
+
+def _write_mesh(run: "Run", target: Path, texture: int | None, report: Report) -> None:
+    """Fuse, simplify, unwrap and bake the mesh, and write it with its textures."""
+    from refgs.export.bake import bake
+    from refgs.formats.gltf import write_glb
+    from refgs.formats.obj import write_obj
+
+    mesh = _make_mesh(run, report)
+
+    def baked(done: int, total: int) -> None:
+        report("progress", {"stage": "baking", "done": done, "total": total})
+
+    textures = bake(mesh, _baked_splats(run, mesh), texture or run.settings.mesh.texture, baked)
+    report("stage", {"what": "writing"})
+    write = write_obj if target.suffix.lower() == ".obj" else write_glb
+    write(target, mesh, textures)
+
+
+def _make_mesh(run: "Run", report: Report) -> Any:
+    """Return the simplified mesh with texture coordinates."""
+    from refgs.export.outline import fit_to_outlines
+    from refgs.export.unwrap import layout, unwrap
+    from refgs.geometry.mesh import clean, is_crumbs
+    from refgs.render.extract import extract
+
+    settings, cameras = run.settings.mesh, run.training_cameras()
+    mesh, voxel = extract(run.surfels(), cameras, run.near, run.centre, run.radius, settings.resolution)
+    report("stage", {"what": f"fused {len(mesh.faces):,} triangles"})
+    mesh = clean(mesh, settings.triangles)
+    report("stage", {"what": f"simplified to {len(mesh.faces):,} triangles; fitting it to the outlines"})
+    mesh = fit_to_outlines(mesh, run.render, cameras, voxel)
+    report("stage", {"what": "unwrapping"})
+    if is_crumbs(mesh):
+        what = "the mesh is in pieces, none of them half of it: the photos do not agree on a surface"
+        report("warning", {"what": f"{what}; give them masks of the object, or take more of them"})
+    mesh = unwrap(mesh)
+    charts = layout(mesh)
+    density = " to ".join(f"{value:.2f}" for value in charts.density)
+    what = f"{charts.used:.0%} of the texture used, density {density}, angles bent by {charts.bend:.1f}°; baking"
+    report("stage", {"what": what})
+    return mesh
+
+
+def _baked_splats(run: "Run", mesh: Any) -> "Splats":
+    """Return the splats to bake: shadows are taken out where the recovered light cannot have accounted for them."""
+    from refgs.export.unshadowed import unshadowed
+    from refgs.render.baselines import method_of
+
+    light = run.environment
+    stands = light is not None and light.reference is None
+    if stands and run.occluder is None and not method_of(run.settings.render).light.display:
+        return unshadowed(run.splats, run.surfels(), mesh, light)
+    return run.splats

@@ -1,0 +1,307 @@
+"""Install and remove the trainer in its own Python environment. Needs no bpy.
+
+Run as a program, this file speaks the job protocol (docs/job-protocol.md) and takes one command: `install` or `remove`. It exits with
+its child process when its standard input closes, so whenever Blender ends. That does no harm: a marker file is written last, and only
+an environment with it counts. Finished downloads stay in uv's cache; the next installation uses them.
+"""
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import threading
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+WHEELS = (
+    Path(__file__).resolve().parents[1] / "wheels"
+)  # in a release's zip: the wheels of the trainer and of uv for this platform
+PYTHONS = ">=3.11,<3.14"  # as in pyproject.toml
+GB = 1e9
+NEEDED, NEEDED_WITH_CARD = 2 * GB, 7 * GB  # torch's CUDA builds include CUDA's libraries
+
+# ---- Called by Blender
+
+
+def wheel(name: str) -> Path | None:
+    """Find a wheel bundled with the add-on; None in a clone, which has none."""
+    return next(WHEELS.glob(f"{name}-*.whl"), None)
+
+
+def bundled_version() -> str:
+    """Version of the bundled trainer, or ""."""
+    file = wheel("refgs") if wheel("uv") else None
+    return file.name.split("-")[1] if file else ""
+
+
+def installed(home: Path) -> str:
+    """Version of the installed trainer, or ""."""
+    try:
+        return _marker(home).read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
+def interrupted(home: Path) -> bool:
+    """Check whether an installation was stopped halfway."""
+    return not installed(home) and (home / "cache").is_dir()
+
+
+def python(home: Path) -> Path:
+    """Path of the environment's Python."""
+    return home / "env" / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
+
+
+def needed_bytes() -> float:
+    """Estimate the bytes of an installation. nvidia-smi is also uv's last means to find a card."""
+    return NEEDED_WITH_CARD if shutil.which("nvidia-smi") else NEEDED
+
+
+def free_bytes(home: Path) -> float:
+    """Free bytes on the disk of a folder, which need not exist yet."""
+    return shutil.disk_usage(next(folder for folder in (home, *home.parents) if folder.is_dir())).free
+
+
+def space_line(home: Path) -> str:
+    """Describe the space that an installation needs and the space that is free."""
+    return f"it needs about {needed_bytes() / GB:.0f} GB; {free_bytes(home) / GB:.0f} GB are free"
+
+
+def disk_full_line(home: Path) -> str:
+    """Line for the artist if the disk has too little space for the rest of the installation, else ""."""
+    if installed(home) or free_bytes(home) + folder_bytes(home) >= needed_bytes():
+        return ""
+    return f"too little space on the disk of {home} ({space_line(home)}): free some, or choose a Python that has the trainer"
+
+
+def folder_bytes(folder: Path) -> int:
+    """Total bytes of the files in a folder."""
+    total = 0
+    for path, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(OSError):  # uv may have renamed the file
+                total += os.lstat(os.path.join(path, name)).st_size
+    return total
+
+
+def _marker(home: Path) -> Path:
+    return home / "installed"
+
+
+# ---- The process
+
+_emitting = threading.Lock()
+_starting = threading.Lock()
+_child: subprocess.Popen | None = None
+
+
+class _Failed(Exception):
+    """Report one line to the artist."""
+
+
+def main() -> None:
+    """Run one command from stdin, and emit events."""
+    command = json.loads(sys.stdin.readline() or "null")
+    if command is None:
+        return
+    threading.Thread(target=exit_with_stdin, daemon=True).start()
+    job = command.pop("command")
+    _emit("started", job=job)
+    try:
+        with _locked(Path(command["home"])):
+            {"install": _install, "remove": _remove}[job](**{key: Path(path) for key, path in command.items()})
+    except _Failed as error:
+        _emit("failed", job=job, what=str(error))
+    except OSError as error:
+        where = command["home"]
+        _emit(
+            "failed",
+            job=job,
+            what=explain_uv_error(f"os error {error.errno}", where) or f"{where}: {error}: see the log",
+        )
+    else:
+        _emit("done", job=job)
+
+
+def _emit(event: str, **facts) -> None:
+    with _emitting:
+        print(json.dumps({"event": event} | facts), flush=True)
+
+
+def exit_with_stdin() -> None:
+    """Wait for the end of stdin, then kill the child process and exit. Runs in a thread of its own."""
+    sys.stdin.read()
+    with _starting:  # no child is started after this
+        if _child is not None:
+            _child.kill()
+        os._exit(1)
+
+
+@contextlib.contextmanager
+def _locked(home: Path) -> Iterator[None]:
+    """Hold the installation's lock. The system frees it when this process ends."""
+    home.parent.mkdir(parents=True, exist_ok=True)
+    with open(home.with_name(f"{home.name}.lock"), "ab") as file:
+        try:
+            if sys.platform == "win32":
+                msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+            else:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):
+            raise _Failed("another Blender installs or removes the trainer: wait until it has finished") from None
+        except OSError:  # a file system without locks
+            pass
+        yield
+
+
+def _install(home: Path, uv: Path, trainer: Path) -> None:
+    was = installed(home)
+    _marker(home).unlink(missing_ok=True)
+    home.mkdir(parents=True, exist_ok=True)
+    program = _unpack(uv, home)
+    variables = _uv_environment(home)
+    if not was:  # update an environment in place; start an interrupted one anew, as it may be broken
+        _emit("stage", what="Making a Python environment")
+        _delete(home / "env")
+        _uv(program, variables, home, "venv", "--python", PYTHONS, str(home / "env"))
+    _emit("stage", what="Resolving the trainer's dependencies")
+    # --no-build: the artist's machine may have no compiler.
+    _uv(program, variables, home, "pip", "install", "--no-build", "--python", str(python(home)), str(trainer))
+    _emit("stage", what="Starting the trainer for the first time", part=0.99)
+    _start_trainer(python(home))
+    _marker(home).write_text(trainer.name.split("-")[1], encoding="utf-8")
+    program.unlink()
+    _delete(home / "cache")
+
+
+def _remove(home: Path) -> None:
+    _marker(home).unlink(missing_ok=True)
+    _delete(home)
+
+
+def _unpack(uv: Path, home: Path) -> Path:
+    """Unpack uv's program from its wheel. Blender installs a wheel's modules, but leaves its programs not executable."""
+    name = "uv.exe" if sys.platform == "win32" else "uv"
+    program = home / name
+    with zipfile.ZipFile(uv) as archive:
+        inside = next(inside for inside in archive.namelist() if inside.endswith(f".data/scripts/{name}"))
+        with archive.open(inside) as source, open(program, "wb") as target:
+            shutil.copyfileobj(source, target)
+    program.chmod(0o755)
+    return program
+
+
+def _uv_environment(home: Path) -> dict[str, str]:
+    """Environment variables for uv. Those that are already set, such as a studio's mirror, take precedence.
+
+    uv fetches a Python of its own: Blender's goes with the next Blender, and the system's changes with its updates. The build of torch
+    is chosen for this machine's card. An empty UV_TORCH_BACKEND takes the index's build, for mirrors.
+    """
+    set_here = {"UV_TORCH_BACKEND": "auto", "UV_PYTHON_INSTALL_DIR": str(home / "python")}
+    if not os.environ.keys() & {
+        "UV_PYTHON_PREFERENCE",
+        "UV_MANAGED_PYTHON",
+        "UV_NO_MANAGED_PYTHON",
+    }:  # mutually exclusive
+        set_here["UV_PYTHON_PREFERENCE"] = "only-managed"
+    variables = {key: value for key, value in (set_here | os.environ).items() if not key.startswith("PYTHON")}
+    if not variables["UV_TORCH_BACKEND"]:
+        del variables["UV_TORCH_BACKEND"]
+    return variables
+
+
+def _start(words: list[str], **how) -> subprocess.Popen:
+    global _child
+    with _starting:
+        _child = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, **how)
+    return _child
+
+
+def _uv(program: Path, variables: dict[str, str], home: Path, *words: str) -> None:
+    """Run uv and report its progress. Raises _Failed with what is wrong and what to do."""
+    options = ["--color", "never", "--cache-dir", str(home / "cache")]
+    process = _start([str(program), *options, *words], stderr=subprocess.STDOUT, env=variables, cwd=home)
+    fetching: dict[str, str] = {}  # size by package
+    ended = threading.Event()
+    threading.Thread(target=_report_download, args=(home, fetching, ended), daemon=True).start()
+    said = []
+    for line in process.stdout:
+        said.append(line.decode(errors="replace").rstrip())
+        print(said[-1], file=sys.stderr, flush=True)  # the log
+        match said[-1].split():
+            case ["Downloading", name, amount]:
+                fetching[name] = amount.strip("()")
+            case ["Downloaded", name]:
+                fetching.pop(name, None)
+            case ["Prepared", *_]:
+                fetching.clear()
+                _emit("stage", what="Installing the packages", part=0.98)
+    status = process.wait()
+    ended.set()
+    if status != 0:
+        text = "\n".join(said)
+        first = next((line for line in said if line.startswith("error: ")), f"error: uv ended with status {status}")
+        raise _Failed(explain_uv_error(text, str(home)) or f"{first.removeprefix('error: ')}: see the log")
+
+
+def _report_download(home: Path, fetching: dict[str, str], ended: threading.Event) -> None:
+    """Report downloads every other second: uv itself is silent during torch's, which takes minutes."""
+    while not ended.wait(2):
+        now = list(fetching.items())
+        if now:
+            name, amount = now[0]
+            others = f" and {len(now) - 1} more" if len(now) > 1 else ""
+            have, expected = folder_bytes(home / "cache"), needed_bytes()
+            of = (
+                f" of about {expected / GB:.0f}" if have < expected else ""
+            )  # a mirror may have only torch's largest build
+            what = f"Fetching {name} ({amount}){others}: {have / GB:.1f}{of} GB"
+            if fetching:  # may have ended meanwhile
+                _emit("stage", what=what, part=min(have / expected, 0.97))
+
+
+def _start_trainer(python: Path) -> None:
+    """Start the trainer once. The installation counts only if it reports that it is ready."""
+    process = _start([str(python), "-E", "-m", "refgs.cli", "worker"])
+    heard = process.communicate()[0].splitlines()
+    event = json.loads(heard[0]) if process.returncode == 0 and heard else {}
+    if event.get("event") != "ready":
+        raise _Failed("the trainer is installed but does not start on this machine: see the log")
+    _emit(**event)
+
+
+def explain_uv_error(text: str, home: str) -> str:
+    """Turn uv's error into one line for the artist; "" for errors that the artist cannot fix."""
+    lower = text.lower()
+    if re.search(r"no space left|os error (28|112|122)\b", lower):
+        return f"the disk of {home} is full: free some space and resume"
+    if re.search(r"permission denied|access is denied|os error (5|13|30|32)\b", lower):
+        return f"cannot write to {home}: close programs that use it or fix its permissions, and resume"
+    if "no solution found" in lower:
+        return "a package of the trainer does not exist for this machine: see the log"
+    if re.search(r"failed to (fetch|download)|request failed|error sending request|timed? ?out", lower):
+        host = re.search(r"https?://([^/:\s`]+)", text)
+        what = f"{host[1]} cannot be reached" if host else "the network cannot be reached"
+        return f"{what}: check the connection and the firewall, and resume"
+    return ""
+
+
+def _delete(folder: Path) -> None:
+    if sys.platform == "win32":
+        folder = Path(f"\\\\?\\{folder.resolve()}")  # lifts Windows' limit on path length, which torch exceeds
+    with contextlib.suppress(FileNotFoundError):
+        shutil.rmtree(folder)
+
+
+if __name__ == "__main__":
+    sys.stdin.reconfigure(encoding="utf-8")
+    main()

@@ -1,0 +1,66 @@
+"""Timers: one polls the jobs and redraws the window after a change, one follows trainings of other processes."""
+
+from pathlib import Path
+
+import bpy
+
+from . import jobs
+from .scene import live_splats
+
+POLL_SECONDS = 0.2  # a poll without news costs microseconds
+PREVIEW_SECONDS = 4.0  # between the previews of a training
+OTHER_SECONDS = 2.0  # between looks at runs that other processes train
+
+_since_preview = 0.0
+
+
+def follow_jobs() -> None:
+    """Poll the jobs until all have ended."""
+    if not bpy.app.timers.is_registered(_poll_jobs):
+        bpy.app.timers.register(_poll_jobs, first_interval=POLL_SECONDS, persistent=True)
+
+
+def _poll_jobs() -> float | None:
+    global _since_preview
+    _since_preview += POLL_SECONDS
+    changed = jobs.poll()
+    if _since_preview >= PREVIEW_SECONDS:
+        _since_preview = 0.0
+        for job in jobs.JOBS:
+            if job.run and job.state == "running" and job.progress and "train" not in job.results:
+                job.tell("preview")
+    live_splats.update()
+    if changed:
+        redraw()
+    return POLL_SECONDS if any(not job.ended for job in jobs.JOBS) else None
+
+
+def follow_other_processes() -> None:
+    """Redraw the panel every other second while another process trains a listed run."""
+    if not bpy.app.timers.is_registered(_poll_other_processes):
+        bpy.app.timers.register(_poll_other_processes, first_interval=OTHER_SECONDS, persistent=True)
+
+
+def _poll_other_processes() -> float | None:
+    listed = {Path(known.folder) for scene in bpy.data.scenes for known in scene.refgs.runs}
+    others = listed - {job.run for job in jobs.JOBS if not job.ended}
+    redraw()
+    return OTHER_SECONDS if any(jobs.run_state(folder) == "training" for folder in others) else None
+
+
+def redraw() -> None:
+    """Redraw the panel, the preferences and the status bar."""
+    manager = bpy.context.window_manager
+    for window in manager.windows if manager else ():
+        for area in window.screen.areas:
+            if area.type in ("VIEW_3D", "PREFERENCES"):
+                area.tag_redraw()
+        window.workspace.status_text_set_internal(None)  # the status bar is no area that could be tagged
+
+
+def unregister() -> None:
+    """Stop the timers, and end all jobs cleanly except those that are kept."""
+    for timer in (_poll_jobs, _poll_other_processes):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
+    jobs.stop_all()

@@ -1,0 +1,94 @@
+"""Geometry-nodes tree that turns a point cloud of splats into quads with a material."""
+
+import bpy
+
+from . import (
+    add,
+    add_input,
+    max_component,
+    modifier_tree,
+    object_frame,
+    out,
+    read_attribute,
+    scaled,
+    store_attribute,
+    vector_math,
+)
+
+NAME = "RefGS Splats"  # the tree and its modifier
+# The quad reaches three standard deviations: the Gaussian is exp(-4.5) = 1.1 % of its peak there.
+EXTENT = 3.0
+DISPLAYS = ("Shaded", "Base Color", "Roughness", "Metallic", "Normal")
+
+
+def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
+    """Make the tree `RefGS Splats`, or return the one that all runs in the file share.
+
+    It reads from the points: scale (standard deviations along two axes), rotation (quaternion), opacity 0..1, and for the
+    displays base_color, roughness, metallic and normal. The quads keep all attributes of the points and add `gaussian`, the
+    position on the splat in standard deviations. Quads are realised: Eevee draws them several times faster than instances.
+    `values_material` shows the attribute `display` in all displays but "Shaded".
+    """
+    if NAME in bpy.data.node_groups:
+        return bpy.data.node_groups[NAME]
+    tree = modifier_tree(NAME)
+    text = "Scale of all splats: small values show how they cover the surface"
+    add_input(tree, "Size", "Float", text, default_value=1.0, min_value=0.0, max_value=4.0)
+    limits = {"min_value": 0.0, "max_value": 1.0, "subtype": "FACTOR"}
+    add_input(tree, "Opacity Cut", "Float", "Hide splats with a lower opacity", default_value=0.0, **limits)
+    add_input(tree, "Crop", "Bool", "Draw only the splats in a box")
+    add_input(tree, "Crop Box", "Object", "Box that crops the splats: move, rotate and scale it")
+    display = add_input(tree, "Display", "Menu", "Show the lit material, or one of its values unlit")
+    add_input(tree, "Material", "Material")
+
+    group = add(tree, "NodeGroupInput").outputs
+
+    def attribute(name: str, kind: str) -> bpy.types.NodeSocket:
+        return read_attribute(tree, name, kind)
+
+    menu = add(tree, "GeometryNodeMenuSwitch", data_type="INT")
+    menu.enum_items.clear()
+    for number, name in enumerate(DISPLAYS):
+        menu.enum_items.new(name)
+        menu.inputs[name].default_value = number
+    tree.links.new(group["Display"], menu.inputs["Menu"])
+    shown = out(menu)
+
+    opacity = {"A": attribute("opacity", "FLOAT"), "B": group["Opacity Cut"]}
+    faint = out(add(tree, "FunctionNodeCompare", opacity, operation="LESS_THAN"))
+    distance = {"A": max_component(tree, object_frame(tree, group["Crop Box"])[1]), "B": 1.0}
+    outside = out(add(tree, "FunctionNodeCompare", distance, operation="GREATER_THAN"))
+    away = add(tree, "FunctionNodeBooleanMath", {0: group["Crop"], 1: outside}, operation="AND")
+    unseen = out(add(tree, "FunctionNodeBooleanMath", {0: faint, 1: out(away)}, operation="OR"))
+    points = add(tree, "GeometryNodeDeleteGeometry", {"Geometry": group["Geometry"], "Selection": unseen})
+    half = (0.5, 0.5, 0.5)
+    values = [
+        attribute("base_color", "FLOAT_COLOR"),
+        attribute("roughness", "FLOAT"),
+        attribute("metallic", "FLOAT"),
+        vector_math(tree, "MULTIPLY_ADD", attribute("normal", "FLOAT_VECTOR"), half, half),
+    ]
+    value = add(tree, "GeometryNodeIndexSwitch", {"Index": shown}, data_type="RGBA")
+    while len(value.index_switch_items) < len(DISPLAYS):
+        value.index_switch_items.new()
+    for number, source in enumerate(values, start=1):  # 0 is shaded
+        tree.links.new(source, value.inputs[str(number)])
+    points = store_attribute(tree, out(points), "display", "FLOAT_COLOR", out(value))
+
+    size = {"Size X": 2 * EXTENT, "Size Y": 2 * EXTENT, "Vertices X": 2, "Vertices Y": 2}
+    grid, position = out(add(tree, "GeometryNodeMeshGrid", size)), out(add(tree, "GeometryNodeInputPosition"))
+    placed = {
+        "Points": points,
+        "Instance": store_attribute(tree, grid, "gaussian", "FLOAT_VECTOR", position),
+        "Rotation": attribute("rotation", "QUATERNION"),
+        "Scale": scaled(tree, attribute("scale", "FLOAT_VECTOR"), group["Size"]),
+    }
+    instances = add(tree, "GeometryNodeInstanceOnPoints", placed)
+    realised = add(tree, "GeometryNodeRealizeInstances", {"Geometry": out(instances)})
+    is_shaded = out(add(tree, "FunctionNodeCompare", {"A": shown, "B": 0}, data_type="INT", operation="EQUAL"))
+    choice = {"Switch": is_shaded, "True": group["Material"], "False": values_material}
+    material = add(tree, "GeometryNodeSwitch", choice, input_type="MATERIAL")
+    result = add(tree, "GeometryNodeSetMaterial", {"Geometry": out(realised), "Material": out(material)})
+    add(tree, "NodeGroupOutput", {"Geometry": out(result)})
+    display.default_value = DISPLAYS[0]
+    return tree

@@ -1,0 +1,24 @@
+"""Atomic writes: a file is written completely or not at all."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from ..errors import InputError
+
+
+@contextlib.contextmanager
+def atomic_write(path: Path) -> Iterator[Path]:
+    """Yield a temporary file beside `path`, then rename it to `path`. Raises InputError where a write fails."""
+    # Keep the extension last: Blender appends a missing one.
+    temporary = path.with_name(f".{path.stem}.part{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except (RuntimeError, OSError) as error:  # Blender's own writers raise RuntimeError
+        reason = getattr(error, "strerror", None) or "does its folder exist, and has the disk free space?"
+        raise InputError(f"cannot write {path}: {reason}") from None
+    finally:
+        with contextlib.suppress(OSError):  # its parent may be a file
+            temporary.unlink(missing_ok=True)

@@ -1,0 +1,95 @@
+"""Materials to start an edit from, as Blender preset files: the add-on's, and those that the artist saves."""
+
+import runpy
+from pathlib import Path
+
+import bpy
+from bl_operators.presets import AddPresetBase
+
+from .. import compat
+from ..errors import InputError
+from .atomic_file import atomic_write
+
+ROOT = Path(__file__).resolve().parents[1]  # its folder `presets` has the add-on's own
+PRESETS = "refgs_material"  # subfolder for materials, in the add-on's and in the artist's presets
+# Inputs of an edit that a file may set, as Python names (`base_color`). An edit keeps its value for the others.
+INPUTS = ("Base Color", "Color Amount", "Metallic", "Metallic Amount", "Roughness", "Roughness Amount")
+
+
+def materials() -> dict[str, Path]:
+    """Map the names of all materials to their files. Of two with the same name, the artist's counts."""
+    folders = [ROOT / "presets" / PRESETS, *map(Path, bpy.utils.preset_paths(PRESETS)), _user_folder()]
+    files = (file for folder in folders for file in folder.glob("[!.]*.py"))
+    found = {bpy.path.display_name(file.name, title_case=False): file for file in files}
+    return dict(sorted(found.items()))
+
+
+def read_material(name: str) -> dict[str, float | tuple[float, ...]]:
+    """Read the inputs that a material sets: base colour RGBA in linear Rec.709, all others 0..1. Raises InputError."""
+    file = materials().get(name)
+    if file is None:
+        raise InputError(f"there is no material {name}: choose one of {', '.join(materials())}")
+    try:
+        found = runpy.run_path(str(file))  # bpy.utils.execfile would leave its bytecode beside the file, and use it
+        return {key: _rounded(key, found[_identifier(key)]) for key in INPUTS if _identifier(key) in found}
+    except Exception as error:  # a preset is a script: it may raise anything
+        raise InputError(f"the material {file} cannot be read ({error}): remove it, and save it again") from None
+
+
+def set_material(edit: bpy.types.NodesModifier, name: str) -> None:
+    """Set an edit to the values of a material. Raises InputError."""
+    set_inputs(edit, read_material(name))
+
+
+def set_inputs(edit: bpy.types.NodesModifier, values: dict[str, float | tuple[float, ...]]) -> None:
+    """Set inputs of an edit by name."""
+    for name, value in values.items():
+        compat.set_modifier_input(edit, name, value)
+
+
+def save_material(edit: bpy.types.NodesModifier, name: str) -> Path:
+    """Save an edit's values as a preset of the artist's. Raises InputError where the name exists or is empty."""
+    stem = AddPresetBase.as_filename(name)
+    if not stem:
+        raise InputError("the material has no name: type one first")
+    file = _user_folder() / f"{stem}.py"
+    shown = bpy.path.display_name(file.name, title_case=False)
+    if shown.casefold() in (known.casefold() for known in materials()):  # some file systems ignore case
+        raise InputError(f"the material {shown} exists already: choose another name")
+    values = {key: _rounded(key, compat.get_modifier_input(edit, key)) for key in INPUTS}
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot write {file}: {error.strerror}") from None
+    with atomic_write(file) as temporary:
+        lines = (f"{_identifier(key)} = {value!r}\n" for key, value in values.items())
+        temporary.write_text("".join(lines), encoding="utf-8")
+    return file
+
+
+def remove_material(name: str) -> None:
+    """Remove a preset of the artist's. Raises InputError for any other preset."""
+    file = materials().get(name)
+    if file is None or file.parent != _user_folder():
+        raise InputError(f"{name} is not a material that you saved: only those can be removed")
+    try:
+        file.unlink()
+    except OSError as error:
+        raise InputError(f"cannot remove {file}: {error.strerror}") from None
+
+
+def _user_folder() -> Path:
+    """Folder of the artist's presets, which may not exist."""
+    return Path(bpy.utils.user_resource("SCRIPTS", path=f"presets/{PRESETS}"))
+
+
+def _identifier(name: str) -> str:
+    return name.lower().replace(" ", "_")
+
+
+def _rounded(name: str, value) -> float | tuple[float, ...]:
+    """Convert a value for an edit, rounded: in single precision a typed 0.2 is 0.20000000298."""
+    if name == "Base Color":
+        r, g, b, alpha = value
+        return tuple(round(float(part), 6) for part in (r, g, b, alpha))
+    return round(float(value), 6)
