@@ -149,6 +149,4 @@ def test_exposures_cost_nothing_where_photos_agree(ball_capture, tmp_path):
     without.run()
     asked.run()
     assert asked.state.exposures is None and "no exposures of their own" in asked.state.decided["exposures"]
-    assert (
-        abs(held_out_psnr(asked.state) - held_out_psnr(without.state)) < 0.3
-    )  # seeds and instruction sets differ by 0.4 dB
+    assert abs(held_out_psnr(asked.state) - held_out_psnr(without.state)) < 0.3
