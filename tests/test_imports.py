@@ -1,5 +1,6 @@
 """Floors, circles and forbidden imports: scripts/check_imports.py finds each, and none in this clone."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -75,3 +76,12 @@ def test_each_rule_finds_what_breaks_it(tmp_path, name, text, expected):
     assert status == 1
     for words in expected:
         assert words in said
+
+
+def test_no_test_imports_another():
+    """What several tests share lies in tests/makers."""
+    for file in (ROOT / "tests").rglob("*.py"):
+        imported = re.findall(
+            r"^ *(?:from|import) ((?:tests\.|test_|makers|conftest)\S*)", file.read_text("utf-8"), re.MULTILINE
+        )
+        assert all(name.startswith("tests.makers") for name in imported), f"{file}: {imported}"
