@@ -1,4 +1,4 @@
-"""RefGS in Blender. The add-on's code is in refgs_addon; this is the door that Blender knocks on."""
+"""RefGS in Blender: the entry point that Blender loads. The add-on's code is in refgs_addon."""
 
 
 def register() -> None:
