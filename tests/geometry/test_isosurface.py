@@ -19,7 +19,7 @@ def ball(centre, radius):
 
 
 def test_it_is_the_surface_of_the_whole_grid_across_chunks():
-    """A surface through eight chunks of 64 voxels has the vertices and faces of marching cubes on the whole grid."""
+    """Eight chunks of 64 voxels give the same vertices and faces as marching cubes on the whole grid."""
     sdf = ball([63.7, 64.2, 60.1], 40.3)
     mesh = isosurface(*blocks_about(sdf, 32))
     grid = np.stack(np.meshgrid(*[np.arange(128)] * 3, indexing="ij"), axis=-1)
@@ -32,7 +32,7 @@ def test_it_is_the_surface_of_the_whole_grid_across_chunks():
 
 
 def test_a_surface_on_the_planes_between_chunks_has_no_cracks():
-    """The surface passes through voxel centres, where a vertex lies on many edges at once."""
+    """Surfaces pass through voxel centres, where a vertex lies on many edges at once."""
     for middle, radius in ((64.0, 32.0), (64.0, 20.5), (63.5, 30.0)):
         mesh = isosurface(*blocks_about(lambda p, m=middle, r=radius: np.abs(p - m).max(axis=-1) - r, 32))
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -42,7 +42,7 @@ def test_a_surface_on_the_planes_between_chunks_has_no_cracks():
 
 
 def test_space_between_costs_nothing():
-    """A grid around both balls would take 17 TB."""
+    """Mesh two distant balls: a grid around both would take 17 TB."""
     block, signed = blocks_about(ball([30.0, 30.0, 30.0], 12.0), 16)
     far = 4096
     mesh = isosurface(np.concatenate([block, block + far]), np.concatenate([signed, signed]))

@@ -66,7 +66,7 @@ def test_the_inside_of_a_bowl(scale, moved):
 
 
 def test_a_point_below_the_mesh_is_not_in_its_shadow():
-    """The surfels' surface may lie inside the mesh that was fused from them."""
+    """Surfels may lie inside the mesh that was fused from them."""
     normals = directions(2000)
     occluder = placed(trimesh.creation.icosphere(5), 1.0, 0.0)
     assert occluder.visible(0.8 * normals, normals, normals).all()

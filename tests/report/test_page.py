@@ -1,4 +1,4 @@
-"""The report page holds all of a run folder, says what is missing, and fetches nothing."""
+"""Report pages show all of a run folder, name what is missing, and fetch nothing."""
 
 import base64
 import csv

@@ -23,7 +23,7 @@ def composite(view: LoadedView, background: Tensor) -> Tensor:
 
 
 def maps(rendering: Rendering) -> dict[str, np.ndarray]:
-    """A rendering's passes as float arrays: colour (H, W, 4), linear and premultiplied; the others (H, W, 3) or (H, W)."""
+    """Collect a rendering's passes as float arrays: colour (H, W, 4), linear and premultiplied; the others (H, W, 3) or (H, W)."""
     alpha = rendering.alpha.numpy(force=True)
     normal = torch.nn.functional.normalize(rendering.normal, dim=-1).numpy(force=True)
     images = {"normal": normal, "depth": rendering.depth.numpy(force=True), "alpha": alpha}
@@ -36,14 +36,14 @@ def maps(rendering: Rendering) -> dict[str, np.ndarray]:
 
 
 def color_picture(rendering: Rendering, background: np.ndarray) -> np.ndarray:
-    """A rendering's colour as 8-bit RGBA, sRGB-encoded, with straight alpha."""
+    """Convert a rendering's colour to 8-bit RGBA, sRGB-encoded, with straight alpha."""
     alpha = rendering.alpha.numpy(force=True)[..., None]
     over = rendering.color.numpy(force=True) - background * (1 - alpha)
     return as_bytes(np.dstack([over / np.maximum(alpha, 1e-6), alpha]))
 
 
 def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """A pass of `maps` as 8-bit RGB or grey.
+    """Convert a pass of `maps` to 8-bit RGB or grey.
 
     Colour is over white, base colour is sRGB-encoded, normals are n/2 + 1/2, depth is divided by its maximum.
     """

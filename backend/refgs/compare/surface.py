@@ -10,53 +10,55 @@ from refgs.camera import Camera
 from refgs.formats.mesh import Mesh
 
 POINTS = 100_000  # on each mesh, evenly by area
-_NEAREST = 4  # sample points, and as many centres, whose triangles are searched for a mesh's nearest point
-_SAME = 1e-3  # of the radius; a ray starts this far from its point, so that it does not hit its own surface
+_NEAREST = (
+    4  # nearest samples, and as many nearest centres, whose triangles are searched for the nearest point of a mesh
+)
+_OFFSET = 1e-3  # distance of a ray's start from its point, in radii, so that it does not hit its own surface
 
 
 def radius(mesh: Mesh) -> float:
-    """The largest distance of a vertex from the centre of the mesh's bounding box."""
+    """Largest distance of a vertex from the centre of the mesh's bounding box."""
     middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
     return float(np.linalg.norm(mesh.vertices - middle, axis=1).max())
 
 
 def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
-    """Chamfer distance, in radii of the true mesh, and normal consistency of two meshes in one frame.
+    """Measure the Chamfer distance, in radii of the true mesh, and the normal consistency of two meshes in one frame.
 
-    POINTS even samples on each mesh are matched to the nearest point of the other. The figures are the mean distance and the mean absolute
-    cosine between the faces' normals, averaged over both directions. Samples that no camera sees, by rays against their own mesh, are not
-    matched, since photos do not show what is there; others may match them. Returns {} if no sample of a mesh is seen.
+    POINTS even samples on each mesh are matched to the nearest points of the other. The figures are the mean distance and the mean absolute
+    cosine between the faces' normals, averaged over both directions. A sample counts only if a camera sees it, by rays against its own
+    mesh: photos do not show the rest. The nearest point may be unseen. Returns {} if no sample of a mesh is seen.
     """
     unit = radius(truth)
     samples = []
     for one in (mesh, truth):
         solid = trimesh.Trimesh(one.vertices, one.faces, process=False)
         points, face = trimesh.sample.sample_surface(solid, POINTS, seed=0)
-        samples.append((solid, np.asarray(points), face, seen(one, points, cameras, _SAME * unit)))
+        samples.append((solid, np.asarray(points), face, seen(one, points, cameras, _OFFSET * unit)))
     if not all(visible.any() for *_, visible in samples):
         return {}
-    ways = [_to_nearest(a, b) for a, b in (samples, reversed(samples))]
-    distance, consistency = np.mean(ways, axis=0)
+    both = [_to_nearest(a, b) for a, b in (samples, reversed(samples))]
+    distance, consistency = np.mean(both, axis=0)
     return {"chamfer": float(distance / unit), "normal_consistency": float(consistency)}
 
 
-def seen(mesh: Mesh, points: np.ndarray, cameras: list[Camera], tolerance: float) -> np.ndarray:
-    """Mark the points (P, 3) of a mesh that any camera sees, unoccluded by the mesh: (P,)."""
+def seen(mesh: Mesh, points: np.ndarray, cameras: list[Camera], offset: float) -> np.ndarray:
+    """Mark the points (P, 3) of a mesh that any camera sees, unoccluded by the mesh: (P,). Rays start `offset` from their point."""
     middle = mesh.vertices.mean(axis=0)  # Embree traces in float32: centre the mesh
     scene = EmbreeScene()
     TriangleMesh(scene, (mesh.vertices[mesh.faces] - middle).astype(np.float32))
     found = np.zeros(len(points), bool)
     for camera in cameras:
-        left = np.flatnonzero(~found)
-        x, y, z = (points[left] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
+        unseen = np.flatnonzero(~found)
+        x, y, z = (points[unseen] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).T
         depth = np.where(z > 0, z, np.inf)
         u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-        left = left[(z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)]
+        unseen = unseen[(z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)]
         # Trace towards the camera, from a little nearer to it, so that a ray does not hit the surface it starts on.
-        way = camera.position - points[left]
-        way /= np.linalg.norm(way, axis=1, keepdims=True)
-        origins = (points[left] - middle + tolerance * way).astype(np.float32)
-        found[left] = scene.run(origins, way.astype(np.float32)) < 0
+        direction = camera.position - points[unseen]
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        origins = (points[unseen] - middle + offset * direction).astype(np.float32)
+        found[unseen] = scene.run(origins, direction.astype(np.float32)) < 0
     return found
 
 

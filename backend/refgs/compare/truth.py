@@ -18,10 +18,10 @@ PASSES = ("normal", "albedo", "roughness", "metallic", "visibility")
 
 
 class GroundTruth:
-    """A folder of ground truth, read in the run's frame. Every part is optional.
+    """Folder of ground truth, read in the run's frame. Every part is optional.
 
-    light.exr; mesh.ply; normal, albedo, roughness, metallic, visibility/NAME.exr of the views with alpha/NAME.exr;
-    relight/HDRI.exr with relight/HDRI/NAME.exr (see `scripts.demo.capture`).
+    light.exr; mesh.ply; normal, albedo, roughness, metallic, visibility/VIEW.exr, with alpha/VIEW.exr;
+    relight/HDRI.exr with relight/HDRI/VIEW.exr (see `scripts.demo.capture`).
     """
 
     def __init__(self, folder: Path, to_capture: np.ndarray):
@@ -36,7 +36,7 @@ class GroundTruth:
             raise InputError(f"{folder}: there is no ground truth in it; known are {known}")
 
     def maps(self, camera: Camera) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """All passes of a view in the folder, and its alpha."""
+        """Read all passes of a view, and its alpha (h, w); without passes, {} and an alpha of 0."""
         if not self.passes:
             return {}, np.zeros((camera.height, camera.width), np.float32)
         return {name: self.view(name, camera) for name in self.passes}, self.view("alpha", camera)
@@ -82,9 +82,9 @@ def read_relit(file: Path, size: tuple[int, int] | None = None) -> np.ndarray:
 def known_maps(
     truth: GroundTruth | None, view: View, camera: Camera, to_capture: np.ndarray
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The true maps of a view, as `GroundTruth.maps` returns them; without any, the data set's own normals.
+    """Read the true maps of a view and its alpha, as `GroundTruth.maps` does; without any, take the data set's own normals.
 
-    `camera` is the view's, at the size that is rendered.
+    `camera` is the view's camera, resized to the rendering.
     """
     known, alpha = truth.maps(camera) if truth else ({}, np.zeros((camera.height, camera.width), np.float32))
     if not known and (published := published_normals(view, max(camera.width, camera.height))):
@@ -96,7 +96,7 @@ def known_maps(
 def errors(images: dict[str, np.ndarray], known: dict[str, np.ndarray], true_alpha: np.ndarray) -> dict:
     """Errors of a view's maps (`pictures.maps`) against the true ones; {} if the object covers no pixel.
 
-    For base colour these are the `channel_products` that `metrics.aligned_psnr` takes of all views together.
+    For base colour they are the view's `metrics.channel_products`, because `metrics.aligned_psnr` compares all views at once.
     """
     figures, covered, alpha = {}, true_alpha >= metrics.COVERED, images["alpha"]
     for name, true in known.items() if covered.any() else ():

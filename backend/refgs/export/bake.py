@@ -13,7 +13,7 @@ from refgs.formats.splats import Splats
 from refgs.formats.tangents import vertex_tangents
 from refgs.formats.textures import Textures
 
-# Least texels along a splat's standard deviation where splats are composited. Larger textures are interpolated from these texels.
+# Resolution of compositing, in texels a standard deviation of a splat. Textures with more texels are interpolated.
 FINE = 3
 _ROWS = 64  # rows of texels at a time
 _NEIGHBOURS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)]

@@ -19,11 +19,11 @@ DEGREE = 3
 
 
 def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Splats:
-    """Replace the splats' harmonics by harmonics of degree 3 that reproduce, sRGB-encoded, the run's renderings. Geometry is unchanged.
+    """Learn harmonics of degree 3 that reproduce the run's renderings, sRGB-encoded, and put them into its splats.
 
-    Adam minimises the squared error to renderings of the training cameras under the run's light. Mirror images are as sharp as degree 3
-    allows. `progress` is called with the iterations done and their total. A run that learned colour by direction has such harmonics
-    already: its splats are returned.
+    Geometry is unchanged. Adam minimises the squared error to renderings of the training cameras under the run's light. Mirror images are
+    as sharp as degree 3 allows. `progress` is called with the iterations done and their total. A run that learned colour by direction
+    has such harmonics already: its splats are returned.
     """
     splats = run.splats
     if run.environment is None:

@@ -151,23 +151,23 @@ def _make_mesh(run: "Run", report: Report) -> Any:
     mesh = fit_to_outlines(mesh, run.render, cameras, voxel)
     report("stage", {"what": "unwrapping"})
     if is_crumbs(mesh):
-        what = "the mesh is in pieces, none of them half of it: the photos do not agree on a surface"
-        report("warning", {"what": f"{what}; give them masks of the object, or take more of them"})
+        message = "the mesh is in pieces, none of them half of it: the photos do not agree on a surface"
+        report("warning", {"what": f"{message}; give them masks of the object, or take more of them"})
     mesh = unwrap(mesh)
     charts = layout(mesh)
     density = " to ".join(f"{value:.2f}" for value in charts.density)
-    what = f"{charts.used:.0%} of the texture used, density {density}, angles bent by {charts.bend:.1f}°; baking"
-    report("stage", {"what": what})
+    message = f"{charts.used:.0%} of the texture used, density {density}, angles bent by {charts.bend:.1f}°; baking"
+    report("stage", {"what": message})
     return mesh
 
 
 def _baked_splats(run: "Run", mesh: Any) -> "Splats":
-    """Return the splats to bake: shadows are taken out where the recovered light cannot have accounted for them."""
+    """Return the splats to bake. Shadows are removed from base colours if the training did not model them, under a fixed light."""
     from refgs.export.unshadowed import unshadowed
     from refgs.render.baselines import method_of
 
     light = run.environment
-    stands = light is not None and light.reference is None
-    if stands and run.occluder is None and not method_of(run.settings.render).light.display:
+    fixed = light is not None and light.reference is None
+    if fixed and run.occluder is None and not method_of(run.settings.render).light.display:
         return unshadowed(run.splats, run.surfels(), mesh, light)
     return run.splats

@@ -23,7 +23,7 @@ def openness(mesh: Mesh) -> np.ndarray:
     # Points of a spiral over the disc, lifted to the hemisphere, have the density of the cosine.
     place = np.arange(RAYS) + 0.5
     radius, turn = np.sqrt(place / RAYS), place * np.pi * (3 - 5**0.5)
-    ways = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - radius**2)], axis=1)
+    hemisphere = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - radius**2)], axis=1)
     normals = mesh.normals
     across = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
@@ -32,7 +32,7 @@ def openness(mesh: Mesh) -> np.ndarray:
     free = np.empty(len(vertices), np.float32)
     for start in range(0, len(vertices), _CHUNK):
         at = slice(start, start + _CHUNK)
-        rays = (ways @ frames[at]).astype(np.float32)
+        rays = (hemisphere @ frames[at]).astype(np.float32)
         origins = np.repeat(vertices[at] + (lift * normals[at]).astype(np.float32), RAYS, axis=0)
         free[at] = (scene.run(origins, rays.reshape(-1, 3)) < 0).reshape(-1, RAYS).mean(axis=1)
     return free

@@ -260,14 +260,14 @@ def _shortest_last(rotations: np.ndarray, scales: np.ndarray) -> tuple[np.ndarra
 
 def _other_elements(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[PlyElement, ...]:
     """Copy a file's elements, without the known properties of `vertex`."""
-    left = []
+    kept = []
     for element in elements:
         more = [p for p in element.properties if element.name != "vertex" or p.name not in known]
         if more:
             copy = PlyElement(element.name, more, element.count)
             copy.data = np.array(element.data[[p.name for p in more]])
-            left.append(copy)
-    return tuple(left)
+            kept.append(copy)
+    return tuple(kept)
 
 
 def _without_nonfinite(splats: Splats, path: Path) -> Splats:
@@ -280,8 +280,10 @@ def _without_nonfinite(splats: Splats, path: Path) -> Splats:
     if not wrong:
         return splats
     fine = np.logical_and.reduce([np.isfinite(v).reshape(len(splats), -1).all(axis=1) for v in values.values()])
-    what = f"{path}: {(~fine).sum():,} of {len(splats):,} splats have {', '.join(wrong)} that are not finite: left out"
-    warnings.warn(what, InputWarning, stacklevel=3)
+    message = (
+        f"{path}: {(~fine).sum():,} of {len(splats):,} splats have {', '.join(wrong)} that are not finite: left out"
+    )
+    warnings.warn(message, InputWarning, stacklevel=3)
     others = []
     for element in splats.others:
         if element.name == "vertex":

@@ -1,4 +1,4 @@
-"""The report's charts, as SVG in the page's text colour."""
+"""Draw the report's charts as SVG, in the page's text colour."""
 
 import io
 from collections.abc import Iterator
@@ -14,8 +14,8 @@ from refgs.report.curves import Curve, front, knee
 
 INK = "#010203"  # replaced by the page's text colour, light or dark
 ACROSS = 3  # charts in a row
-LETTERS = 50  # of the legend, per chart's width
-PARTS = {  # parts of a training's time and their titles, in the order of the bar
+LETTERS = 50  # letters of the legend that fit the width of one chart
+PARTS = {  # parts of a run's time and their titles, in the order of the bar
     "raster": "raster",
     "shading": "shading",
     "prefilter": "prefilter of the light",
@@ -63,7 +63,7 @@ def error_chart(groups: list[list[Curve]], runs: list[str]) -> str:
     with _drawing(3.9 * columns, 2.9 * rows + 0.2 * (1 + (len(runs) + 2) // beside)) as (figure, made):
         grid = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes, curves in zip(grid, groups, strict=False):
-            _errors(axes, curves, runs)
+            _draw_errors(axes, curves, runs)
         for axes in grid[len(groups) :]:
             axes.axis("off")
         handles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
@@ -72,7 +72,7 @@ def error_chart(groups: list[list[Curve]], runs: list[str]) -> str:
     return made[0]
 
 
-def _errors(axes: Axes, curves: list[Curve], runs: list[str]) -> None:
+def _draw_errors(axes: Axes, curves: list[Curve], runs: list[str]) -> None:
     for found in curves:
         number = runs.index(found.run)
         style = {"color": _color(number), "ls": "-" if number < 10 else "--", "lw": 1.8}

@@ -12,14 +12,14 @@ from matplotlib.ticker import MaxNLocator
 
 from refgs.report.figures import flatten, is_number
 
-LEVELS = 6  # about so many errors have their times listed in a table
+LEVELS = 6  # errors in a table of times, approximately
 LEAST_KNEE = 0.1  # of the chord's height; a curve that bends less has no knee
 
 
 class Quantity(NamedTuple):
-    """A key of history.jsonl, the title of its error, and how to compute the error; less is better.
+    """Error measure in history.jsonl: its key, its title, and its unit. Smaller errors are better.
 
-    With a peak of 1, a PSNR in dB is −20 log₁₀ of the RMS error.
+    With `decibels` the value is a PSNR in dB, which is −20 log₁₀ of the RMS error for a peak of 1.
     """
 
     key: str
@@ -72,7 +72,7 @@ def curve(run: str, history: list[dict], quantity: Quantity) -> Curve:
 def front(curves: list[Curve]) -> list[np.ndarray]:
     """Mark the points of each curve (n,) that lie on the Pareto front of all curves.
 
-    No other point has a smaller error in the same time, or the same error in less time.
+    No other point has a smaller error in at most the same time, or at most the same error in less time.
     """
     seconds, errors = (np.concatenate([getattr(c, name) for c in curves]) for name in ("seconds", "errors"))
     order = np.lexsort((errors, seconds))
@@ -117,16 +117,16 @@ def levels(curves: list[Curve]) -> list[float]:
     if best >= worst:
         return []
     ends = sorted(-20 * np.log10(e) if quantity.decibels else e for e in (worst, best))
-    round_ones = MaxNLocator(nbins=LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(*ends)
-    inside = [quantity.error(float(x)) for x in round_ones if ends[0] < x <= ends[1] or x == ends[0]]
+    rounded = MaxNLocator(nbins=LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(*ends)
+    inside = [quantity.error(float(x)) for x in rounded if ends[0] < x <= ends[1] or x == ends[0]]
     return sorted((e for e in inside if best <= e < worst), reverse=True)
 
 
 def as_csv(histories: dict[str, list[dict]], groups: list[list[Curve]]) -> str:
-    """Write all that the charts and tables show as CSV: run, iteration, seconds, quantity, value, mark.
+    """Write the figures of the charts and tables as CSV: run, iteration, seconds, quantity, value, mark.
 
-    Each point of a curve has a row, with the marks "front" and "knee". So has the seconds of each part, and each time to a given error,
-    marked "reaches".
+    Each point of a curve has a row. It is marked "front" on the Pareto front, and "knee" at the knee. Rows marked "reaches" are the times
+    to given errors. Rows with the quantity "part: NAME" have the seconds of that part as value.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -136,7 +136,7 @@ def as_csv(histories: dict[str, list[dict]], groups: list[list[Curve]]) -> str:
             bend, name = knee(found), found.quantity.key
             name = f"{name.removesuffix('_psnr').removeprefix('psnr_')}_rmse" if found.quantity.decibels else name
             for i, point in enumerate(zip(found.iterations, found.seconds, found.errors, strict=True)):
-                marks = " ".join(mark for mark, is_so in (("front", on[i]), ("knee", i == bend)) if is_so)
+                marks = " ".join(mark for mark, marked in (("front", on[i]), ("knee", i == bend)) if marked)
                 writer.writerow((found.run, int(point[0]), f"{point[1]:g}", name, f"{point[2]:.6g}", marks))
             for error in levels(curves):
                 seconds = time_to(found, error)

@@ -46,7 +46,7 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
     without_lpips = metrics.lpips_missing()
     for view in views:
         loaded = load_view(view, run.settings.image.max_side)
-        figures = _view(run, view, loaded, truth, pictures / split, without_lpips is None)
+        figures = _measure_view(run, view, loaded, truth, pictures / split, without_lpips is None)
         for name, value in figures.items():
             rows.setdefault(name, []).append(value)
         cameras.append(loaded.camera)
@@ -57,20 +57,20 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
     found = {name: float(np.mean(values)) for name, values in rows.items()} | found
     found = {"lpips": None} | found | {"lpips_reason": without_lpips}
     if lit:
-        found |= _light(run, truth, pictures)
+        found |= _measure_light(run, truth, pictures)
     for hdri in hdris:
-        figures = _relit(run, hdri, cameras, truth, pictures / "relight", next_step)
+        figures = _measure_relit(run, hdri, cameras, truth, pictures / "relight", next_step)
         found.setdefault("relight", {})[hdri] = {"refgs": figures}
     if truth and truth.has_mesh and (run.folder / "mesh.glb").exists():
         mesh = read_glb(run.folder / "mesh.glb")
         found["mesh"] = surface.compare(mesh, truth.mesh(), run.training_cameras())
-    return found | {"views": len(views), "split": split, "splats": len(run.splats)} | _speed(run, cameras)
+    return found | {"views": len(views), "split": split, "splats": len(run.splats)} | _measure_speed(run, cameras)
 
 
-def _view(
+def _measure_view(
     run: Run, view: View, loaded: LoadedView, truth: GroundTruth | None, pictures: Path, with_lpips: bool
 ) -> dict[str, Any]:
-    """Measure one view and write its pictures. Without a pass in the ground truth, the data set's own normals are the truth."""
+    """Measure one view and write its pictures."""
     camera, background = loaded.camera, np.array(run.settings.image.background, dtype=np.float32)
     rendering = run.render(camera)
     color = np.clip(rendering.color.numpy(), 0, 1)
@@ -106,7 +106,7 @@ def _view(
     return figures
 
 
-def _light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dict[str, float]]:
+def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dict[str, float]]:
     """Measure the recovered light, and write pictures of it and of the true light."""
 
     def write(name: str, panorama: np.ndarray) -> None:
@@ -115,9 +115,8 @@ def _light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dic
 
     light = read_environment(run.folder / "environment.exr")
     write("environment", light)
-    if (
-        truth is None or not truth.has_light or run.settings.light.frame == "camera"
-    ):  # the true light stands in the world
+    # A light that turns with the camera has no counterpart: the true one is fixed in the world.
+    if truth is None or not truth.has_light or run.settings.light.frame == "camera":
         return {}
     true = truth.panorama("light")
     write("environment_truth", true)
@@ -129,7 +128,7 @@ def _light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dic
     return {"environment": figures}
 
 
-def _relit(
+def _measure_relit(
     run: Run,
     hdri: str,
     cameras: list[Camera],
@@ -137,12 +136,11 @@ def _relit(
     pictures: Path,
     next_step: Callable[[str], None],
 ) -> dict[str, float]:
-    """Measure views under another light, and write pictures of both."""
+    """Measure views under another light, and write pictures of the renderings and of the truth."""
     light = run.light(truth.panorama(f"relight/{hdri}"))
 
-    def pairs() -> Iterator[
-        tuple[np.ndarray, np.ndarray]
-    ]:  # renders anew at each pass: keeping all pictures takes too much memory
+    # Each call renders again, because keeping all pictures takes too much memory.
+    def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for camera in cameras:
             image, true = maps(run.render(camera, light))["color"], truth.relit(hdri, camera)
             for kind, pixels in (("refgs", image), ("truth", true)):
@@ -153,8 +151,8 @@ def _relit(
     return metrics.relit(pairs)
 
 
-def _speed(run: Run, cameras: list[Camera]) -> dict[str, float | str]:
-    """Measure the renderer's frames a second, on the card if there is one. Each frame is waited for."""
+def _measure_speed(run: Run, cameras: list[Camera]) -> dict[str, float | str]:
+    """Measure the renderer's frames a second, by the median frame; on the CUDA card if there is one."""
     device = torch.device("cuda" if cuda.unusable() is None else "cpu")
     surfels = Surfels(*(value.to(device) for value in run.surfels()))
     light = run.environment and Environment(run.environment.radiance.to(device), run.environment.reference)

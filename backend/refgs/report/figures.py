@@ -13,7 +13,10 @@ RELIT = {
 
 
 class Quantity(NamedTuple):
-    """A key of metrics.json (nested keys joined by dots), its heading, its format, and which direction is better."""
+    """Figure in metrics.json: its key (nested keys joined by dots), its heading, and its format.
+
+    `better` is max or min, or None where no direction is better.
+    """
 
     key: str
     heading: str
@@ -22,7 +25,7 @@ class Quantity(NamedTuple):
 
 
 def duration(seconds: float) -> str:
-    """Format a time."""
+    """Format seconds, from a minute on as minutes and seconds."""
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
 
@@ -33,9 +36,9 @@ HEADLINE = [
     Quantity("flip", "FLIP", "{:.4f}".format, min),
     Quantity("normal_mae_degrees", "normal error", "{:.2f}°".format, min),
     Quantity("training_seconds", "training", duration, min),
-    Quantity("total_seconds", "with start and end", duration, min),
-    Quantity("seconds", "all of it", duration, min),
-    Quantity("frames_per_second", "renders", "{:.3g} a second".format, max),
+    Quantity("total_seconds", "training with start and end", duration, min),
+    Quantity("seconds", "whole demo", duration, min),
+    Quantity("frames_per_second", "rendering", "{:.3g} frames a second".format, max),
     Quantity("splats", "surfels", "{:,.0f}".format, None),
     Quantity("peak_memory_bytes", "peak memory", lambda x: f"{x / 2**30:.2f} GiB", min),
 ]
@@ -51,7 +54,7 @@ DETAILS = [
     Quantity("visibility_agreement", "mirror visibility: pixels that agree", "{:.1%}".format, max),
     Quantity("visibility_free", "mirror visibility: pixels that are free in truth", "{:.1%}".format, None),
     Quantity("environment.log_rmse", "light: RMS error of log radiance after one scale", "{:.3f}".format, min),
-    Quantity("environment.lights_degrees", "light: how far the brightest lights are off", "{:.2f}°".format, min),
+    Quantity("environment.lights_degrees", "light: angular error of the brightest lights", "{:.2f}°".format, min),
     Quantity("mesh.chamfer", "mesh: Chamfer distance, of the object's radius", "{:.3%}".format, min),
     Quantity("mesh.normal_consistency", "mesh: normal consistency", "{:.4f}".format, max),
     Quantity("peak_card_memory_bytes", "peak memory on the card", lambda x: f"{x / 2**30:.2f} GiB", min),
@@ -78,7 +81,7 @@ def in_words(metrics: dict, figures: list[Quantity]) -> list[str]:
 
 
 def relit_pair(figures: dict[str, float], prefix: str) -> str:
-    """Format the figures of relit pictures, e.g. of "relight.studio.mesh": raw / after one scale."""
+    """Format PSNR and FLIP of relit pictures: raw / after one scale. An example of `prefix` is "relight.studio.mesh"."""
     parts = []
     for name, text in (("psnr", "{:.2f}"), ("flip", "{:.3f}")):
         found = [figures.get(f"{prefix}.{name}_{which}") for which in ("raw", "aligned")]
@@ -88,7 +91,7 @@ def relit_pair(figures: dict[str, float], prefix: str) -> str:
 
 
 def relit_in_words(metrics: dict) -> list[str]:
-    """Format a line for each light and each kind of asset that was lit."""
+    """Format a line for each light and each kind of asset lit by it."""
     known = dict(flatten(metrics))
     lit = [(hdri, kind) for hdri, kinds in metrics.get("relight", {}).items() for kind in kinds]
     return [

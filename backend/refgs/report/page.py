@@ -1,6 +1,6 @@
-"""The report: one self-contained HTML file for one run folder, or several side by side.
+"""Write the report: one self-contained HTML file for one run folder, or several side by side.
 
-Files that are read from a run folder; a section without its file is left out:
+It reads these files of a run folder. A section without its file is left out:
 
     metrics.json     numbers, nested to any depth: the figures of `refgs.report.figures`, ambiguities.NAME.what (text),
                      relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}
@@ -50,14 +50,14 @@ LARGEST_SIDE = 512  # pixels, so that the page stays small enough to open
 
 @dataclass
 class RunPage:
-    """The data of one run on the page. `label` names it beside other runs."""
+    """Data of one run on the page. `label` names it beside other runs."""
 
     name: str
     label: str
     figures: dict[str, float]
     history: list[dict]
     left_out: list[dict]
-    untold: list[str]
+    ambiguities: list[str]
     settings: str
     facts: dict
     trained_on: str
@@ -87,9 +87,9 @@ def write_report(runs: list[Path], out: Path) -> None:
         headline=_columns(pages, HEADLINE),
         details=_columns(pages, DETAILS),
         relit_table=_relit_table(pages),
-        rest=_rest(pages),
-        views=_names(page.views for page in pages),
-        relit=_names(page.relit for page in pages),
+        rest=_other_figures(pages),
+        views=_unique_names(page.views for page in pages),
+        relit=_unique_names(page.relit for page in pages),
         passes=PASSES,
         relit_kinds=RELIT,
         errors=error_chart(groups, [page.label for page in pages]),
@@ -137,7 +137,7 @@ def _read_run(folder: Path) -> RunPage:
         figures=dict(flatten(metrics)),
         history=lines,
         left_out=[item for item in left_out if isinstance(item, dict)] if isinstance(left_out, list) else [],
-        untold=_untold(metrics),
+        ambiguities=_ambiguities(metrics),
         settings=settings,
         facts=facts,
         trained_on=trained_on,
@@ -155,22 +155,22 @@ def _read_run(folder: Path) -> RunPage:
     return page
 
 
-def _untold(metrics: dict) -> list[str]:
-    """The explanations of what the photos cannot tell apart."""
-    trades = metrics.get("ambiguities")
-    known = trades.values() if isinstance(trades, dict) else ()
+def _ambiguities(metrics: dict) -> list[str]:
+    """Collect the sentences on ambiguities: changes to the scene that the photos cannot tell apart."""
+    found = metrics.get("ambiguities")
+    known = found.values() if isinstance(found, dict) else ()
     return [facts["what"] for facts in known if isinstance(facts, dict) and "what" in facts]
 
 
 def _lines(text: str) -> list[dict]:
-    """The lines of history.jsonl that have seconds."""
+    """Parse the lines of history.jsonl that have seconds."""
     return [line for line in history.read(text) if is_number(line.get("seconds"))]
 
 
 def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[str, str]]:
     """Embed the pictures folder/KIND/NAME.png: {name: {kind: data URL}}.
 
-    Only names with the most kinds are taken, and at most `most` of them, evenly chosen.
+    Names that have fewer kinds than others are skipped. Of the rest at most `most` are taken, evenly spaced.
     """
     count = Counter(path.stem for kind in kinds for path in folder.glob(f"{kind}/*.png"))
     names = sorted(name for name in count if count[name] == max(count.values()))
@@ -181,7 +181,7 @@ def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[
 
 
 def _embed(path: Path) -> str:
-    """Embed a picture as a data URL, reduced if it is large; "" if it cannot be read."""
+    """Embed a picture as a data URL, scaled down to LARGEST_SIDE; "" if it is missing or broken."""
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.exists() else None
     if image is None:
         return ""
@@ -193,13 +193,13 @@ def _embed(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(data).decode()
 
 
-def _names(groups) -> list[str]:
+def _unique_names(groups) -> list[str]:
     """List every name once, in the order of the runs."""
     return list(dict.fromkeys(name for group in groups for name in group))
 
 
 def _columns(pages: list[RunPage], figures: list[Quantity]) -> list[dict]:
-    """Columns of the figures that any run has: the heading, and for each run the text and whether it is the best."""
+    """Make a column for each figure that any run has: its heading, and for each run its text and a flag for the best."""
     columns = []
     for key, heading, text, better in figures:
         values = [page.figures.get(key) for page in pages]
@@ -213,8 +213,8 @@ def _columns(pages: list[RunPage], figures: list[Quantity]) -> list[dict]:
 
 
 def _relit_table(pages: list[RunPage]) -> list[dict]:
-    """Rows of the relit pictures' figures: a light and a kind of asset, with a cell for each run."""
-    found = _names({key.rsplit(".", 1)[0] for key in sorted(page.figures) if _is_relit(key)} for page in pages)
+    """Make the table of relit figures: a row for each light and kind of asset, with a cell for each run."""
+    found = _unique_names({key.rsplit(".", 1)[0] for key in sorted(page.figures) if _is_relit(key)} for page in pages)
     rows = []
     for prefix in sorted(found):
         _, hdri, kind = prefix.split(".")
@@ -228,10 +228,10 @@ def _is_relit(key: str) -> bool:
     return parts[0] == "relight" and len(parts) == 4 and parts[3].startswith(("psnr_", "flip_"))
 
 
-def _rest(pages: list[RunPage]) -> list[dict]:
-    """Rows of the figures that no other table shows."""
+def _other_figures(pages: list[RunPage]) -> list[dict]:
+    """Make a row for each figure that no other table shows."""
     shown = {figure.key for figure in HEADLINE + DETAILS}
-    keys = [key for key in _names(page.figures for page in pages) if key not in shown and not _is_relit(key)]
+    keys = [key for key in _unique_names(page.figures for page in pages) if key not in shown and not _is_relit(key)]
     texts = {key: [page.figures.get(key) for page in pages] for key in keys}
     return [{"key": key, "cells": ["–" if x is None else f"{x:.5g}" for x in row]} for key, row in texts.items()]
 
@@ -247,33 +247,33 @@ def _curves(pages: list[RunPage]) -> list[list[Curve]]:
 
 
 def _times(groups: list[list[Curve]]) -> list[dict]:
-    """A table for each quantity: times to given errors, and the knee, with a row for each run."""
+    """Make a table for each quantity, with a row for each run: times to given errors, and the knee."""
     tables = []
     for curves in groups:
         quantity, errors = curves[0].quantity, levels(curves)
-        cells = {found.run: [_said(time_to(found, error)) for error in errors] for found in curves}
+        cells = {found.run: [_duration_or_dash(time_to(found, error)) for error in errors] for found in curves}
         heads, knees = [quantity.text(error) for error in errors], [knee(found) for found in curves]
         if any(at is not None for at in knees):
             heads.append("knee")
             for found, at in zip(curves, knees, strict=True):
-                point = "–" if at is None else f"{_said(found.seconds[at])}: {quantity.text(found.errors[at])}"
+                point = "–" if at is None else f"{duration(found.seconds[at])}: {quantity.text(found.errors[at])}"
                 cells[found.run].append(point)
         if heads:
             tables.append({"what": quantity.title, "levels": heads, "cells": cells})
     return tables
 
 
-def _said(seconds: float | None) -> str:
+def _duration_or_dash(seconds: float | None) -> str:
     return "–" if seconds is None else duration(seconds)
 
 
 def _parts(page: RunPage) -> dict[str, float]:
-    """Seconds by part, from the last line of the history that has them."""
+    """Read the seconds by part from the last line of the history that has them."""
     return next((dict(flatten(line["parts"])) for line in reversed(page.history) if line.get("parts")), {})
 
 
 def _parts_table(parts: dict[str, dict[str, float]]) -> list[dict]:
-    """Rows of parts: seconds and percentage for each run."""
+    """Make a row for each part: seconds and percentage for each run."""
     rows = []
     for name, title in PARTS.items():
         seconds = [spent.get(name, 0.0) for spent in parts.values()]
