@@ -9,6 +9,14 @@ from refgs.kernels.build import HERE
 from refgs.kernels.layout import struct
 
 ROOT = Path(__file__).parents[2]
+# NVRTC has neither offsetof nor a header for it, but its front end's own operator.
+OFFSET = """
+#ifdef __CUDACC__
+#define OFFSET(structure, field) __INTADDR__(&((structure*)0)->field)
+#else
+#define OFFSET(structure, field) __builtin_offsetof(structure, field)
+#endif
+"""
 
 
 def used() -> list[tuple[str, str]]:
@@ -28,7 +36,7 @@ def assertions(made: type[ctypes.Structure]) -> str:
     lines = [f'static_assert(sizeof({name}) == {ctypes.sizeof(made)}, "size of {name}");']
     for field, kind in fields(made):
         at, what = getattr(made, field), f"{name}::{field}"
-        lines.append(f'static_assert(__builtin_offsetof({name}, {field}) == {at.offset}, "offset of {what}");')
+        lines.append(f'static_assert(OFFSET({name}, {field}) == {at.offset}, "offset of {what}");')
         lines.append(f'static_assert(sizeof({what}) == {at.size}, "size of {what}");')
         part = kind._type_ if issubclass(kind, ctypes.Array) else kind
         if issubclass(part, ctypes.Structure):
@@ -44,5 +52,5 @@ def asserted(folder: Path) -> Path:
         if (name, source) == ("Raster", "raster.h"):  # the CPU's; raster.cu has its own
             text = f"#ifndef __CUDACC__\n{text}\n#endif"
         with (folder / source).open("a", encoding="utf-8") as file:
-            file.write(f"\n{text}\n")
+            file.write(f"{OFFSET}{text}\n")
     return folder
