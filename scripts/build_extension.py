@@ -1,10 +1,9 @@
-"""Builds the extension as it is released: a zip a platform, with the trainer's wheel in it and uv's, which installs it.
+"""Build the extension for a release: one zip for each platform, with the wheels of the trainer and of uv, which installs it.
 
     python scripts/build_extension.py [FOLDER]      # into dist/
 
-Blender's own tool builds and validates; it is the one in Blender's Python module (`pip install -e ".[blender]"`). There is none for
-macOS on Intel, which torch is no longer built for: what `blender --command extension build` makes of the clone serves there, and
-anywhere else that the trainer is not to be installed from.
+Blender's own tool, which comes with its Python module (`pip install -e ".[blender]"`), builds and validates the zips. There is no zip for
+macOS on Intel, for which torch is no longer built. For a zip without the trainer, run `blender --command extension build` in the clone.
 """
 
 import importlib.util
@@ -18,18 +17,18 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 UV = "uv==0.13.9"
 PLATFORMS = {"linux-x64": "manylinux2014_x86_64", "windows-x64": "win_amd64", "macos-arm64": "macosx_11_0_arm64"}
-LARGEST = 60e6  # bytes that a zip may have
+LARGEST = 60e6  # largest size of a zip in bytes
 
 
 def run(*words: str | Path) -> None:
-    """Run Python with these words, its output shown only where it fails."""
+    """Run Python with these arguments; show its output only if it fails."""
     done = subprocess.run([sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     if done.returncode != 0:
         sys.exit(f"{' '.join(map(str, words))}\n{done.stdout}")
 
 
 def blender_tool() -> Path:
-    """Blender's tool for extensions."""
+    """Find Blender's tool that builds extensions."""
     bpy = importlib.util.find_spec("bpy")
     if bpy is None:
         sys.exit('Blender\'s Python module is missing: pip install -e ".[blender]"')
@@ -37,7 +36,7 @@ def blender_tool() -> Path:
 
 
 def build_trainer(source: Path, wheels: Path) -> None:
-    """The trainer's wheel, from a copy, where no leftovers of another build are; it has the presets inside."""
+    """Build the trainer's wheel, with the presets in it, from a clean copy without leftovers of other builds."""
     shutil.copytree(ROOT / "backend", source / "backend", ignore=shutil.ignore_patterns("*.egg-info", "__pycache__"))
     shutil.copytree(ROOT / "presets", source / "backend" / "refgs" / "presets")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
@@ -46,12 +45,12 @@ def build_trainer(source: Path, wheels: Path) -> None:
 
 
 def stage(folder: Path, wheels: Path) -> None:
-    """The extension as a folder: the clone's, with the wheels, which its manifest then tells of."""
+    """Write the extension's folder: the clone's files, the wheels, and a manifest that lists platforms and wheels."""
     shutil.copytree(ROOT / "refgs_addon", folder / "refgs_addon", ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("__init__.py", "LICENSE"):
         shutil.copy(ROOT / name, folder)
     shutil.copytree(wheels, folder / "wheels")
-    # Blender unpacks the wheels that are listed into its own Python: uv's, not the trainer's, which needs torch.
+    # Blender installs listed wheels into its own Python. So list only uv's: the trainer's wheel needs torch.
     listed = sorted(f"./wheels/{file.name}" for file in wheels.glob("uv-*.whl"))
     manifest = (ROOT / "blender_manifest.toml").read_text(encoding="utf-8")
     first_table = manifest.index("\n[") + 1

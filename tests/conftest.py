@@ -1,8 +1,7 @@
 import os
 
-if (
-    "PYTEST_XDIST_WORKER" in os.environ
-):  # several test processes share the cores: more threads would only wait for each other
+# Several test processes share the cores: more threads would only wait for each other.
+if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads

@@ -75,9 +75,8 @@ def test_other_programs_splats(tmp_path, layout):
     np.testing.assert_allclose(covariances(ours), covariances(rows), rtol=1e-4, atol=1e-5)
     write_display_splats(tmp_path / "display.ply", splats)
     shown = PlyData.read(str(tmp_path / "display.ply"))["vertex"].data
-    thin = 3e-3 * np.exp(
-        2 * np.minimum(rows["scale_0"], rows["scale_1"])
-    )  # the squared thickness that flat splats are given
+    # The squared thickness that flat splats are given.
+    thin = 3e-3 * np.exp(2 * np.minimum(rows["scale_0"], rows["scale_1"]))
     slack = 1e-5 if splats.scales.shape[1] == 3 else thin[:, None, None] + 1e-5
     assert (np.abs(covariances(shown) - covariances(rows)) <= slack + 1e-4 * np.abs(covariances(rows))).all()
     for name in ("f_dc_1", "f_rest_17"):

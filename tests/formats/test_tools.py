@@ -133,9 +133,8 @@ def test_gltf_of_splats(tmp_path):
     order = cKDTree(values("KHR_gaussian_splatting:SCALE", 3)).query(scales)[1]
     np.testing.assert_allclose(values("KHR_gaussian_splatting:SCALE", 3)[order], scales, rtol=1e-5)
     x, y, z = splats.positions.T
-    np.testing.assert_allclose(
-        values("POSITION", 3)[order], np.stack([-x, z, y], axis=1), atol=1e-6
-    )  # glTF's up axis is +Y
+    # glTF's up axis is +Y.
+    np.testing.assert_allclose(values("POSITION", 3)[order], np.stack([-x, z, y], axis=1), atol=1e-6)
     np.testing.assert_allclose(values("KHR_gaussian_splatting:OPACITY", 1)[order, 0], splats.opacities, atol=1e-5)
     np.testing.assert_allclose(
         values("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0", 3)[order], splats.sh[:, 0], atol=1e-6

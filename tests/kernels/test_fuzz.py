@@ -85,9 +85,8 @@ MATERIALS = {
     "roughness": st.one_of(st.none(), st.floats(0.01, 0.07), st.floats(0.66, 0.99)),
     "albedo": st.one_of(st.none(), st.floats(0, 1)),
     "grazing": st.one_of(st.none(), powers(-7, -0.5)),
-    "light": st.one_of(
-        st.tuples(st.just(0.0), powers(-12, 3)), st.tuples(powers(0, 6), st.just(1.0))
-    ),  # the sun's radiance, and a factor for all radiance
+    # The sun's radiance, and a factor for all radiance.
+    "light": st.one_of(st.tuples(st.just(0.0), powers(-12, 3)), st.tuples(powers(0, 6), st.just(1.0))),
 }
 
 
@@ -141,9 +140,8 @@ def test_dssim(one, other, spread, seed):
     (exact_by,) = torch.autograd.grad(expected, exact)
     found, by = dssim(image, target)
     assert abs(float(found) - float(expected.detach())) < 1e-4  # variances cancel: they are differences of squares
-    rounding = (
-        4 * torch.finfo(torch.float32).eps / (SSIM_C2 * image.numel())
-    )  # rounding of the same cancelling terms, in the derivative of a mean
+    # Rounding of the same cancelling terms, in the derivative of a mean.
+    rounding = 4 * torch.finfo(torch.float32).eps / (SSIM_C2 * image.numel())
     assert float((by - exact_by).abs().max()) < 2e-2 * float(exact_by.abs().max()) + rounding
 
 

@@ -139,7 +139,6 @@ def test_a_picture_turns_with_its_object():
     left = picture(TURN.numpy(), sh, indirect)
     covered = before.alpha > 0.1
     assert covered.any() and before.visibility[covered].eq(0).all() and after.visibility[covered].eq(0).all()
-    assert (
-        (after.color - before.color).abs().amax(dim=-1) < 1e-3
-    ).float().mean() > 0.99  # two surfels at the same depth may change their order
+    # A few pixels may differ, where two surfels at the same depth change their order.
+    assert ((after.color - before.color).abs().amax(dim=-1) < 1e-3).float().mean() > 0.99
     assert (left.color - before.color)[covered].abs().mean() > 0.02

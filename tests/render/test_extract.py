@@ -15,9 +15,8 @@ NEAR = 0.01
 
 def sheet(positions, normals, size, opacity):
     """Make round surfels of the same size at positions (N, 3), facing along normals (N, 3)."""
-    turn = np.stack(
-        [1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1
-    )  # quaternion from +Z to the normal
+    # Quaternions that rotate +Z to the normals, not normalised.
+    turn = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1)
     count = len(positions)
     rows = [positions, turn, np.full((count, 2), size), np.broadcast_to(opacity, count)]
     tensors = [torch.tensor(row, dtype=torch.float32) for row in rows]
@@ -99,9 +98,8 @@ def test_a_foreground_without_masks(monkeypatch):
         return clean(mesh, 10**6), voxel, distance.max(), np.abs(distance[high] - 1), around
 
     mesh, voxel, farthest, ball, ground = found()
-    assert (
-        1.2 * 2.2 / 64 < voxel < 2 * 2.2 / 64
-    )  # the grid is enlarged for the ground that most cameras see, not for the walls
+    # The grid is enlarged for the ground that most cameras see, but not for the walls.
+    assert 1.2 * 2.2 / 64 < voxel < 2 * 2.2 / 64
     assert 1.5 < farthest < module.REACH * 1.1 + voxel
     assert np.quantile(ball, 0.9) < voxel and np.quantile(ground, 0.9) < 0.1 * voxel
     assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).body_count == 1  # the fog gives no surface

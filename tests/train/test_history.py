@@ -127,13 +127,14 @@ def test_a_resumed_run_records_the_same(ball_capture, tmp_path, monkeypatch):
     second.resume()
     assert rows(tmp_path / "cut")[-1]["iteration"] == 20 == second.state.iteration
     second.run()
+    # Loss and psnr_train are left out: their running means start anew.
     whole, cut = (
         [
             {name: value for name, value in row.items() if name not in ("seconds", "parts", "loss", "psnr_train")}
             for row in found
         ]
         for found in map(rows, (tmp_path / "whole", tmp_path / "cut"))
-    )  # leave out loss and psnr_train: their running means start anew
+    )
     assert whole == cut and whole[-1]["iteration"] == 40 and "flip_test" in whole[3]
     before, after = (row["parts"] for row in rows(tmp_path / "cut")[3:5])
     assert all(after[name] >= before[name] - 1e-4 for name in before), "time is counted on"

@@ -180,9 +180,8 @@ def test_reflections_by_what_they_could_be_worth(mirror, tmp_path):
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-3, 3, 61)] * 2))
     at = np.arange(60 * 61).reshape(60, 61)[:, :-1].ravel()
     faces = np.concatenate([np.stack([at, at + 61, at + 1], axis=1), np.stack([at + 1, at + 61, at + 62], axis=1)])
-    made.state.occluder = Occluder(
-        Mesh(np.stack([x, y, np.full_like(x, 1.5)], axis=1), faces)
-    )  # a plane above the ball that faces down
+    # A plane above the ball that faces down.
+    made.state.occluder = Occluder(Mesh(np.stack([x, y, np.full_like(x, 1.5)], axis=1), faces))
     needs.evaluate_mesh(made.state, 0.2)
     assert (
         made.state.needs["reflections"]["needed"]
@@ -267,9 +266,8 @@ def test_what_the_part_about_the_mask_saves_is_timed(mirror, tmp_path, monkeypat
     asked = []
     monkeypatch.setattr(probe, "seconds_saved", lambda trainer, whole: asked.append(whole) or 8.0)
     made.run(stop=lambda: made.state.iteration == 6)
-    assert (
-        asked == [True] and made.state.needs["outside"]["seconds"] == 7.0
-    )  # 7/8 of 8 s: one iteration in eight uses the full photo
+    # 7/8 of 8 s are saved: one iteration in eight uses the full photo.
+    assert asked == [True] and made.state.needs["outside"]["seconds"] == 7.0
     assert next(row for row in needs.rows(made.state) if row["need"] == "outside")["saved"] == "7.0 s, 0.0 MB"
 
 

@@ -67,9 +67,8 @@ def test_the_stage_ends_where_the_preset_says(ball_capture, tmp_path):
 def test_learns_and_renders_as_it_trained(ball_capture, tmp_path, changes):
     made = trainer(ball_capture, tmp_path / "run", "quick", "train.iterations=300", "surfels.metallic=0.9", *changes)
     made.run()
-    assert held_out_psnr(made.state) > (
-        22 if "reflection=mirror" in changes else 25
-    )  # lower for mirrors, which have no colour of their own
+    # The bound is lower for mirrors, which have no colour of their own.
+    assert held_out_psnr(made.state) > (22 if "reflection=mirror" in changes else 25)
     write_asset(made.state)
     asset, view = open_run(made.state.folder), made.state.test[0]
     assert float((made.state.render(view.camera).color - asset.render(view.camera).color).abs().mean()) < 3e-3

@@ -84,9 +84,8 @@ def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
     inward = (run.surfels().normals() * torch.from_numpy(run.splats.normals)).sum(dim=-1) < 0
     assert 0.3 < inward.float().mean() < 0.7
     object.__setattr__(run, "splats", to_splats(run.surfels().turned(inward)))
-    assert (
-        float((learned - run.render(camera).normal).abs().max()) > 0.01
-    )  # turning the surfels would change the picture
+    # Turning the surfels would change the picture.
+    assert float((learned - run.render(camera).normal).abs().max()) > 0.01
 
 
 def test_what_a_ball_does_without(ball):
