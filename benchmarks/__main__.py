@@ -8,7 +8,7 @@ from refgs.errors import InputError
 
 
 def main(what: str = "", *options: str) -> None:
-    """Run a benchmark with its own options. Raises InputError, with the list of them, where there is none of that name."""
+    """Run a benchmark with its own options. Raise InputError with a list of the benchmarks if the name is unknown."""
     if what not in BENCHMARKS:
         raise InputError(f"no benchmark {what!r}: take one of {', '.join(BENCHMARKS)}")
     importlib.import_module(f"benchmarks.{what}").main(options)

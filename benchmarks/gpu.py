@@ -68,13 +68,13 @@ TABLES = (
 
 
 def synchronise(device: torch.device) -> None:
-    """Wait until the device has done what it was given."""
+    """Wait until the device has finished all work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def milliseconds(step: Callable[[], object], device: torch.device, rounds: int = ROUNDS) -> list[float]:
-    """Time each round of a step, after some to warm up."""
+    """Time each round of a step in milliseconds, after some rounds to warm up."""
     times = []
     for i in range(WARM + rounds):
         synchronise(device)
@@ -87,7 +87,7 @@ def milliseconds(step: Callable[[], object], device: torch.device, rounds: int =
 
 
 def make_ball(splats: int, width: int, height: int, device: torch.device) -> tuple[list[torch.Tensor], Camera]:
-    """Make the ball of `benchmarks.kernels` in a picture of any shape."""
+    """Make the ball of `benchmarks.kernels`, and a camera with an image of this size."""
     surfels, camera = ball(splats, min(width, height), CHANNELS)
     camera = Camera(camera.name, width, height, camera.fx, camera.fy, width / 2, height / 2, camera.world_to_camera)
     return [v.to(device) for v in surfels], camera
@@ -96,7 +96,7 @@ def make_ball(splats: int, width: int, height: int, device: torch.device) -> tup
 def gsplat_step(
     surfels: list[torch.Tensor], camera: Camera, upstream: list[torch.Tensor]
 ) -> Callable[[], object] | None:
-    """Render the same picture forward and backward by gsplat's `rasterization_2dgs`; None where gsplat is not installed."""
+    """Return a function that renders forward and backward by gsplat's `rasterization_2dgs`; None if gsplat is missing."""
     try:
         from gsplat import rasterization_2dgs
     except ImportError:
@@ -119,7 +119,7 @@ def gsplat_step(
 def measure_raster(
     bench: Bench, device: torch.device, sizes: Sequence[tuple[int, int, int]] = SIZES, rounds: int = ROUNDS
 ) -> None:
-    """Record the rasteriser at each size, its floors, and gsplat."""
+    """Record the rasteriser's times at each size, beside its floors and gsplat's times."""
     machine = Machine.measured(device)
     for splats, width, height in sizes:
         surfels, camera = make_ball(splats, width, height, device)
@@ -151,7 +151,7 @@ def measure_raster(
 def measure_frames(
     bench: Bench, device: torch.device, splats: int = FRAMES[0], side: int = FRAMES[1], rounds: int = 100
 ) -> None:
-    """Record a frame of the whole renderer, deferred shading and all."""
+    """Record the time of a whole frame, with deferred shading."""
     (positions, rotations, scales, opacities, _), camera = make_ball(splats, side, side, device)
     one = torch.ones(splats, device=device)
     none = [torch.zeros(splats, count, 3, device=device) for count in (1, 0)]
@@ -166,7 +166,7 @@ def measure_frames(
 
 
 def measure_iteration(bench: Bench, device: torch.device, rounds: int = ROUNDS) -> None:
-    """Record an iteration of the deferred stage, and the card's time in it by kernel."""
+    """Record the time of an iteration of the deferred stage, and of each kernel in it."""
     with TemporaryDirectory() as folder:
         trainer = make_trainer(Path(folder), device.type)
         times = milliseconds(trainer.step, device, rounds)
@@ -185,7 +185,7 @@ def measure_iteration(bench: Bench, device: torch.device, rounds: int = ROUNDS) 
 
 
 def measure_trainings(bench: Bench, device: torch.device, folder: Path) -> None:
-    """Train the scene by both presets; make its capture where there is none."""
+    """Train the scene by both presets; render its capture if it is missing."""
     name, side, views = SCENE
     capture = folder / f"{name}-{side}"
     if not capture.exists():
@@ -204,7 +204,7 @@ def measure_trainings(bench: Bench, device: torch.device, folder: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure all of it; exit status 2 where there is no card."""
+    """Run all measurements; exit with status 2 if there is no card."""
     bench = Bench("gpu", argparse.ArgumentParser(description=__doc__.splitlines()[0]), arguments)
     if why := cuda.unusable():
         console.print(f"no figures of a card from here: {why}")

@@ -31,7 +31,7 @@ console = Console(soft_wrap=True, width=None if sys.stdout.isatty() else 200)  #
 
 
 class Row(NamedTuple):
-    """One figure. A number is a float; a word, such as the name of a preset, a string."""
+    """Measured figure. Its value is a float, or a string for a word such as the name of a preset."""
 
     benchmark: str
     scene: str
@@ -45,7 +45,7 @@ class Row(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A column of a table: its heading, figure and format. Without a variant the table has a line for each variant."""
+    """Column of a table: its heading, figure and format. If it names no variant, it shows that of the table's line."""
 
     heading: str
     figure: str
@@ -54,17 +54,17 @@ class Column(NamedTuple):
 
 
 class Table(NamedTuple):
-    """How rows of a benchmark become a table: a line for each scene, or scene and variant; then the mean over the scenes `mean`."""
+    """Layout of a table: a line for each scene, or for each scene and variant, then the mean over the scenes `mean`."""
 
     title: str
     benchmark: str
     columns: tuple[Column, ...]
     line: str = "scene"
-    variant: str = ""  # heading of the variants, where lines are told apart by them
+    variant: str = ""  # heading of the column of variants; empty if there is one line for each scene
     mean: tuple[str, ...] = ()
 
     def lines(self, rows: Sequence[Row], kept: Sequence[Row] = ()) -> list[list[str]]:
-        """Headings, then a line a scene; kept figures stand in brackets. Lines and columns without a figure are left out."""
+        """List the table's lines, headings first; kept figures are in brackets. Lines and columns without figures are left out."""
         found, before = ({r[1:4]: r.value for r in some if r.benchmark == self.benchmark} for some in (rows, kept))
         lines = dict.fromkeys(
             (r.scene, r.variant if self.variant else "") for r in rows if r.benchmark == self.benchmark
@@ -94,19 +94,19 @@ def _cell(value: float | str | None, kept: float | str | None, form: str) -> str
 
 
 def mean(values: Sequence[float | str | None]) -> float | None:
-    """Average the values; None where one is unknown or a word, for scenes beside it would differ."""
+    """Average the values; None if one is missing or a word, because columns would then average different scenes."""
     return sum(values) / len(values) if values and all(isinstance(v, float | int) for v in values) else None
 
 
 class Way(NamedTuple):
-    """A way to train: words of `refgs train`, and minutes, if any: a number, or those that another way took."""
+    """Way to train: options of `refgs train`, and optionally minutes: a number, or the name of a way that takes as long."""
 
     words: tuple[object, ...]
     minutes: float | str | None = None
 
 
 class Bench:
-    """One benchmark while it runs: its options, the rows that it measured, and the runs that failed."""
+    """Benchmark that runs: its options, the rows measured so far, and the runs that failed."""
 
     def __init__(self, name: str, parser: argparse.ArgumentParser, arguments: Sequence[str] | None):
         parser.prog = f"refgs bench {name}"
@@ -117,7 +117,7 @@ class Bench:
         self.where = this_machine(), date.today().isoformat(), commit()
 
     def record(self, scene: str, variant: str, unit: str, **figures: float | str | None) -> None:
-        """Keep figures of a scene in a variant; one that is None was not measured."""
+        """Add figures of a scene and variant to the rows; skip those that are None, which were not measured."""
         for figure, value in figures.items():
             if value is not None:
                 self.rows.append(Row(self.name, scene, variant, figure, value, unit, *self.where))
@@ -127,7 +127,7 @@ class Bench:
         options = self.options
         preset = getattr(options, "preset", "")
         if preset:
-            load_settings(preset)  # a wrong one is said before anything is trained
+            load_settings(preset)  # report a wrong preset before anything is trained
         out = (options.out or clone_root() / "demo" / self.name) / Path(preset).stem
         for capture in find_scenes(options.scenes, options.only):
             done: dict[str, Path] = {}
@@ -144,7 +144,7 @@ class Bench:
             yield capture.name, done
 
     def finish(self, *tables: Table) -> None:
-        """Print the tables, write the CSV; end with status 1 where a run failed."""
+        """Print the tables and write the CSV; exit with status 1 if a run failed."""
         kept = read(KEPT) if KEPT.exists() else []
         for table in tables:
             headings, *lines = table.lines(self.rows, kept)
@@ -175,7 +175,7 @@ def scene_options(parser: argparse.ArgumentParser, preset: str | None = None) ->
 
 
 def find_scenes(folder: Path, only: list[str] | None = None) -> list[Path]:
-    """Find the captures in a folder, or those that are named. Raises InputError where there are none."""
+    """Find the captures in a folder, or those of the given names. Raise InputError if there are none."""
     found = [folder / name for name in NAMES if (folder / name / "ground_truth").is_dir()]
     if not found:
         raise InputError(f"{folder}: no scene is here: render them with python -m benchmarks.scenes all --out {folder}")
@@ -186,13 +186,13 @@ def find_scenes(folder: Path, only: list[str] | None = None) -> list[Path]:
 
 
 def call(*arguments: object) -> int:
-    """Run a command of refgs in a process of its own, which gives all memory back; return its exit status."""
+    """Run a command of refgs in a new process, so that all its memory is freed; return the exit status."""
     process = subprocess.Popen([sys.executable, "-m", "refgs.cli", *map(str, arguments)])
     try:
         status = process.wait()
     except KeyboardInterrupt:
         process.send_signal(signal.SIGINT)
-        process.wait()  # a training writes a checkpoint first
+        process.wait()  # let an interrupted training write its checkpoint
         raise
     if status == 130:
         raise KeyboardInterrupt
@@ -202,7 +202,7 @@ def call(*arguments: object) -> int:
 def train(
     capture: Path, run: Path, words: Iterable[object], minutes: float | None = None, truth: Path | None = None
 ) -> bool:
-    """Train and evaluate a run, resuming what was interrupted and leaving what is finished; return whether that succeeded."""
+    """Train and evaluate a run; return True on success. Resume an interrupted run; skip a finished one."""
     if figures(run) is not None:
         return True
     if not (run / "splats.ply").exists():
@@ -224,17 +224,17 @@ def figures(run: Path) -> dict | None:
 
 
 def relit(found: dict, figure: str) -> float | None:
-    """Average a figure over the lights that a run was relit by."""
+    """Average a figure over all lights with which a run was relit."""
     return mean([light.get("refgs", {}).get(figure) for light in found.get("relight", {}).values()])
 
 
 def this_machine() -> str:
-    """Name this machine by what CPU figures depend on."""
+    """Describe this machine by the properties on which CPU times depend."""
     return f"{platform.machine()}, {CORES} cores, {supported()[0]}"
 
 
 def commit() -> str:
-    """Name the commit that is measured."""
+    """Return the commit that is measured."""
     command = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
     done = subprocess.run(command, cwd=clone_root(), capture_output=True, text=True)
     return done.stdout.strip()
@@ -255,7 +255,7 @@ def _number(text: str) -> float | str:
 
 
 def write(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows into a CSV, in place of those of the same benchmark, scene, variant and figure."""
+    """Write rows into a CSV; replace old rows of the same benchmark, scene, variant and figure."""
     merged = {row[:4]: row for row in ([*read(path), *rows] if path.exists() else rows)}
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:

@@ -34,7 +34,7 @@ def make_trainer(folder: Path, device: str = "cpu") -> Trainer:
 
 
 def measure() -> dict[str, list[float]]:
-    """Seconds of each part of an iteration, and of a whole one, in each repeat."""
+    """Measure the seconds of each part of an iteration, and of a whole iteration, in each repeat."""
     parts: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as folder:
         trainer = make_trainer(Path(folder))
@@ -44,7 +44,7 @@ def measure() -> dict[str, list[float]]:
 
 
 def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
-    """Time an iteration in pieces, then a whole one."""
+    """Time the parts of one iteration, then one whole iteration."""
     photo, settings, clock = trainer.state.photos[0], trainer.state.settings, time.perf_counter
 
     def record(name: str, since: float) -> float:

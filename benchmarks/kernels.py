@@ -1,4 +1,4 @@
-"""Milliseconds of the CPU kernels and of a training iteration: `refgs bench kernels`.
+"""Time the CPU kernels and a training iteration: `refgs bench kernels`.
 
 The kernels' scene is a ball that fills most of the picture, as training starts on a visual hull: 20,000 discs, uniformly random and
 tangent to the surface, both scales the mean distance to the three nearest neighbours, opacity 0.73. Half of the discs face away and
@@ -68,19 +68,19 @@ def ball(splats: int = SPLATS, side: int = SIDE, channels: int = CHANNELS) -> tu
     normal = rng.normal(size=(splats, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     spacing = cKDTree(normal).query(normal, k=4)[0][:, 1:].mean(axis=1)
-    # the shortest rotation from z to the normal, then any about it
+    # Rotate z to the normal by the shortest way, then by a random angle about the normal.
     to_normal = np.concatenate([1 + normal[:, 2:], -normal[:, 1:2], normal[:, :1], np.zeros((splats, 1))], axis=1)
     surfels = [normal, to_normal, np.stack([spacing, spacing], axis=1), np.full(splats, 0.73)]
     surfels.append(rng.uniform(size=(splats, channels)))
     matrix = np.eye(4)
     matrix[2, 3] = 4
-    focal = 0.48 * side * np.sqrt(4**2 - 1)  # the outline's radius is 0.48 of the picture's side
+    focal = 0.48 * side * np.sqrt(4**2 - 1)  # the outline's radius becomes 0.48 of the image's side
     camera = Camera("ball", side, side, focal, focal, side / 2, side / 2, matrix)
     return [torch.tensor(v, dtype=torch.float32) for v in surfels], camera
 
 
 def _time(*steps: Callable[[], None]) -> list[list[float]]:
-    """Time steps, one after the other: milliseconds of each in each round."""
+    """Run the steps in turn, several rounds; return the milliseconds of each step in each round."""
     rounds = []
     for _ in range(ROUNDS + 3):
         stamps = [time.perf_counter()]
@@ -92,7 +92,7 @@ def _time(*steps: Callable[[], None]) -> list[list[float]]:
 
 
 def measure() -> dict[str, list[float]]:
-    """Time each step with the instruction set in REFGS_ISA: milliseconds in each round."""
+    """Time each step with the instruction set in REFGS_ISA; return the milliseconds in each round."""
     surfels, camera = ball()
     detached = [v.clone() for v in surfels]
     inputs = [v.requires_grad_() for v in surfels]
@@ -123,7 +123,7 @@ def measure() -> dict[str, list[float]]:
 
 
 def _shading() -> Callable[[], None]:
-    """Shade the ball as a rough metal under a light of noise, both ways."""
+    """Shade the ball as a rough metal under a random light, forward and backward."""
     (positions, *geometry, _), camera = ball()
     material = torch.tensor([0.9, 0.7, 0.5, 1.0, 0.3]).expand(SPLATS, 5)
     raster = rasterize(positions, *geometry, torch.cat([positions, material, positions], dim=1), camera, near=0.1)
@@ -139,14 +139,14 @@ def _shading() -> Callable[[], None]:
 
 
 def _prefilter(side: int) -> Callable[[], None]:
-    """Prefilter a cubemap of 6·side² texels, both ways."""
+    """Prefilter a cubemap of 6·side² texels, forward and backward."""
     radiance = torch.rand(6 * side**2, 3, requires_grad=True)
     upstream = torch.rand_like(prefilter(radiance, side))
     return lambda: torch.autograd.grad(prefilter(radiance, side), radiance, upstream)
 
 
 def _needs() -> dict[str, floors.Need]:
-    """Needs of the steps whose floor is known."""
+    """Count the needs of the steps that have a floor."""
     surfels, camera = ball()
     forward, backward = floors.raster(surfels, camera)
     covered = int((rasterize(*surfels, camera, near=0.1).alpha > 1 / 255).sum())
@@ -157,7 +157,7 @@ def _needs() -> dict[str, floors.Need]:
 
 
 def measure_all(bench: Bench, threads: int = THREADS) -> None:
-    """Record each part on each instruction set, and its floor."""
+    """Record the times of each part on each instruction set, and its floor."""
     before, chosen = torch.get_num_threads(), os.environ.get("REFGS_ISA")
     torch.set_num_threads(threads)
     try:
@@ -176,7 +176,7 @@ def measure_all(bench: Bench, threads: int = THREADS) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Time the kernels, then an iteration with the threads that a training has."""
+    """Time the kernels, then an iteration with as many threads as a training uses."""
     bench = Bench("kernels", argparse.ArgumentParser(description=__doc__.splitlines()[0]), arguments)
     measure_all(bench)
     for part, seconds in iteration.measure().items():

@@ -8,16 +8,19 @@ from refgs.kernels.layout import struct
 from refgs.kernels.load import kernels, run
 
 CPU = torch.device("cpu")
-CHAINS = 12  # of peak.cpp
+CHAINS = 12  # independent chains of operations in peak.cpp
 
 
 _Peak = struct("Peak", "peak.cpp")
 
 
 def arithmetic(seconds: float = 0.5, device: torch.device = CPU) -> float:
-    """Floating-point operations a second on torch's threads or a card, the best of many runs; a multiply-add counts as two."""
+    """Measure floating-point operations a second, on torch's threads or a card.
+
+    Return the best of many runs; a multiply-add counts as two operations.
+    """
     on_card = device.type == "cuda"
-    launches = 20 if on_card else 1  # several, so that waiting for the card counts little
+    launches = 20 if on_card else 1  # several launches, so that waiting for the card adds little
     rounds, one = (1 << 20, 2 * 1000 * CHAINS) if on_card else (1000, kernels().refgs_peak_round())
     work, out = _Peak(rounds=rounds), torch.zeros(1, device=device)
     work.attach(out=out)
@@ -33,7 +36,7 @@ def arithmetic(seconds: float = 0.5, device: torch.device = CPU) -> float:
 
 
 def bandwidth(seconds: float = 0.5, device: torch.device = CPU) -> float:
-    """Bytes of memory read and written a second, by copying more than the caches hold, on torch's threads or a card."""
+    """Measure bytes read and written a second, on torch's threads or a card, by copying more than the caches hold."""
     source = torch.ones(64 << 20, device=device)
     target, best, started = source.clone(), 0.0, time.perf_counter()
     copies = 20 if device.type == "cuda" else 1

@@ -1,7 +1,7 @@
-"""What a training makes of a given time: `refgs bench minutes --scenes DIR`.
+"""Measure the PSNR that a training reaches in a given time: `refgs bench minutes --scenes DIR`.
 
-Each scene is trained by the presets `quick` and `standard`, and with nothing but a time. Beside a time's held-out PSNR stands the best
-that a preset had reached by then, on its way or at its end. Seconds count from the command to the written asset.
+Each scene is trained by the presets `quick` and `standard`, and with nothing but a time. The held-out PSNR for a given time is compared
+with the best PSNR that a preset's run had reached by then. Seconds count from the command to the written asset.
 """
 
 import argparse
@@ -31,14 +31,17 @@ TABLES = (
 
 
 def course(run: Path) -> list[tuple[float, float]]:
-    """Seconds since the command was given, what follows the iterations counted, and PSNR on held-out views by then."""
+    """List the seconds and held-out PSNR of each measurement of a run.
+
+    Seconds include all that the command does before and after the iterations.
+    """
     found = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     around = found["total_seconds"] - found["training_seconds"]
     return [(line["seconds"] + around, line["psnr_test"]) for line in _lines(run) if "psnr_test" in line]
 
 
 def best(presets: dict[str, Path], seconds: float) -> tuple[float, str] | None:
-    """Best PSNR that a preset's run had by then, and which; None where none had begun."""
+    """Return the best PSNR that a preset's run had reached after these seconds, and the preset; None if none had begun."""
     reached = [(psnr, name) for name, run in presets.items() for at, psnr in course(run) if at <= seconds]
     return max(reached, default=None)
 
@@ -48,7 +51,7 @@ def _lines(run: Path) -> list[dict]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train what is not trained yet; print what each time brought."""
+    """Train the missing runs; print the PSNR of each time."""
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]))
     parser.add_argument("--minutes", nargs="+", type=float, default=[2, 5, 10, 20])
     bench = Bench("minutes", parser, arguments)

@@ -1,7 +1,7 @@
-"""What scenes do without: `refgs bench needs --scenes DIR`.
+"""Measure what scenes leave out and what that saves: `refgs bench needs --scenes DIR`.
 
-Each scene is trained as the photos say (every need "auto"), with everything on, and without inter-reflection. Seconds are the
-processor's, so that other work beside hardly counts.
+Each scene is trained with every need "auto" (decided by the photos), with every need on, and without inter-reflection. Seconds are
+processor time, so that other programs hardly disturb them.
 """
 
 import argparse
@@ -46,19 +46,19 @@ TABLES = (
 
 
 def left_out(run: Path) -> str:
-    """Name what a run did without."""
+    """List the needs that a run left out."""
     needs = json.loads((run / "needs.json").read_text(encoding="utf-8"))
     return ", ".join(need["need"] for need in needs if not need.get("needed", True))
 
 
 def deciding(run: Path) -> float:
-    """Percent of a run's seconds that the decisions took."""
+    """Compute the percentage of a run's seconds that the decisions took."""
     last = json.loads((run / "history.jsonl").read_text(encoding="utf-8").splitlines()[-1])
     return 100 * last["parts"].get("deciding", 0.0) / last["seconds"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train what is not trained yet; print what leaving out brings and costs."""
+    """Train the missing runs; print what leaving out saves and what it costs in quality."""
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]), preset="quick")
     parser.add_argument("--ways", nargs="+", choices=CHANGES, default=[*CHANGES], help="train in these ways")
     bench = Bench("needs", parser, arguments)

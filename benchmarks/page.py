@@ -46,7 +46,7 @@ An iteration is of the deferred stage.""",
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Make the page of these rows."""
+    """Make the Markdown page from these rows."""
     machines, dates = ", ".join(sorted({row.machine for row in rows})), sorted({row.date for row in rows})
     parts = [HEAD.format(machine=machines, date=" to ".join(dict.fromkeys((dates[0], dates[-1]))))]
     for title, text, tables in SECTIONS:
@@ -59,7 +59,7 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write the page."""
+    """Write docs/measurements.md."""
     argparse.ArgumentParser(prog="refgs bench page", description=__doc__.splitlines()[0]).parse_args(arguments)
     with whole(PAGE) as temporary:
         temporary.write_text(markdown(read(KEPT)), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The paper's tables with today's program: `refgs bench paper --data DIR`.
+"""Measure the scenes of the paper's tables with today's program: `refgs bench paper --data DIR`.
 
 DIR holds the published data sets as they are downloaded, any part of them: `shiny_blender/SCENE`, `ref_real/SCENE`,
 `nerf_synthetic/SCENE`, and `glossy_synthetic/SCENE` (NeRO's with `synthetic_split_128.pkl` beside the scenes, or converted to
@@ -24,7 +24,7 @@ FORMS = {"psnr": ("PSNR", ".2f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".
 
 
 class Scene(NamedTuple):
-    """A scene of the paper that is on this disk: the data set's key, its name, and the folder to train on."""
+    """Scene of the paper that was found on this disk: the data set's key, its name, and the folder to train on."""
 
     data_set: str
     name: str
@@ -32,7 +32,7 @@ class Scene(NamedTuple):
 
 
 def find_scenes(data: Path) -> list[Scene]:
-    """Find the paper's scenes in a folder. Raises InputError, saying what to put where, if there are none."""
+    """Find the paper's scenes in a folder. If there are none, raise InputError that says which folders are expected."""
     scenes = []
     for key, data_set in PAPER.items():
         for number, name in enumerate(data_set["scenes"]):
@@ -53,7 +53,7 @@ def find_scenes(data: Path) -> list[Scene]:
 
 
 def tables() -> list[Table]:
-    """Tables 1, 8 and 2, the paper's figures beside ours."""
+    """Lay out Tables 1, 8 and 2, with the paper's figures beside ours."""
     result = []
     for key, data_set in PAPER.items():
         columns = [
@@ -69,7 +69,7 @@ def tables() -> list[Table]:
 
 
 def record(bench: Bench, scene: Scene, found: dict) -> None:
-    """Keep a scene's figures."""
+    """Add a scene's figures to the rows."""
     seconds = found.get("training_seconds")
     bench.record(scene.name, scene.data_set, "dB", psnr=found["psnr"])
     bench.record(scene.name, scene.data_set, "", ssim=found.get("ssim"), lpips=found.get("lpips"))
@@ -81,14 +81,14 @@ def record(bench: Bench, scene: Scene, found: dict) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure what is there and print the tables; exit status 1 where a scene failed."""
+    """Measure the scenes that were found and print the tables; exit with status 1 if a scene failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="folder with shiny_blender/SCENE and so on")
     parser.add_argument("--out", type=Path, help="folder for the runs (default: demo/paper)")
     parser.add_argument("--preset", default="paper", help="a preset's name or a TOML file")
     bench = Bench("paper", parser, arguments)
     preset = bench.options.preset
-    load_settings(preset)  # a wrong one is said before anything else
+    load_settings(preset)  # report a wrong preset before anything else
     out = (bench.options.out or clone_root() / "demo" / "paper") / Path(preset).stem
     for scene in find_scenes(bench.options.data):
         run = out / scene.data_set / scene.name

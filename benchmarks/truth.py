@@ -1,7 +1,7 @@
-"""The method where the truth is known: `refgs bench truth --scenes DIR`.
+"""Measure the method on scenes with ground truth: `refgs bench truth --scenes DIR`.
 
-Each scene is trained by a preset and compared with all that is known of it. Plain colour by direction (`shading=sh`) is trained for as
-long, as the peer for novel views.
+Each scene is trained by a preset and compared with all its ground truth. For comparison of novel views, plain colour by direction
+(`shading=sh`) is trained for as long.
 """
 
 import argparse
@@ -33,7 +33,7 @@ TABLES = (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train what is not trained yet; print how near the truth each scene came."""
+    """Train the missing runs; print the errors of each scene against the ground truth."""
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]), preset="standard")
     bench = Bench("truth", parser, arguments)
     preset = ("--preset", bench.options.preset)
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def record(bench: Bench, scene: str, way: str, found: dict) -> None:
-    """Keep a run's figures; colour by direction has no materials and no light."""
+    """Add a run's figures to the rows; colour by direction has no materials and no light."""
     bench.record(scene, way, "dB", psnr=found["psnr"], albedo=found.get("albedo", {}).get("psnr_aligned"))
     bench.record(scene, way, "dB", relit=relit(found, "psnr_raw"), relit_aligned=relit(found, "psnr_aligned"))
     bench.record(scene, way, "°", normals=found.get("normal_mae_degrees"))

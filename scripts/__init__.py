@@ -1,1 +1,1 @@
-"""Programs of the repository that are not part of what is installed."""
+"""Programs of the repository that are not installed with the trainer or the extension."""

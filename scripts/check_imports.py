@@ -2,8 +2,8 @@
 
     python scripts/check_imports.py [FOLDER]      # the clone, or another that is laid out like it
 
-Every import counts: at the top, inside a function, and under TYPE_CHECKING. Prints a line for each that is wrong, and exits with 1
-where there is one.
+Imports at the top, inside functions and under TYPE_CHECKING all count. Print a line for each import that breaks a rule; exit with
+status 1 if there is one.
 """
 
 import ast
@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-# The trainer's floors, the lowest first: a module imports its own floor and those below. CONTRIBUTING's map says what each has.
+# The trainer's floors, the lowest first. A module may import its own floor and those below. CONTRIBUTING.md describes each floor.
 FLOORS = (
     ("", "camera", "clock", "color", "errors", "events", "paths", "settings"),
     ("formats",),
@@ -42,13 +42,13 @@ class Import(NamedTuple):
 
 
 def modules(root: Path, package: str) -> dict[str, Path]:
-    """Find the files of a package that lies in `root`, by the names of their modules."""
+    """Map module names to files, for a package that lies in `root`."""
     files = sorted((root / package).rglob("*.py"))
     return {".".join(f.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): f for f in files}
 
 
 def imports(files: dict[str, Path], root: Path) -> Iterator[Import]:
-    """Find all imports in files. A name imported from a module of theirs counts as an import of that module."""
+    """Find all imports in files. `from module import name` counts as an import of that module."""
     for source, file in files.items():
         package = source if file.name == "__init__.py" else source.rpartition(".")[0]
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), str(file))):
@@ -65,7 +65,7 @@ def imports(files: dict[str, Path], root: Path) -> Iterator[Import]:
 
 
 def circles(found: list[Import]) -> Iterator[list[Import]]:
-    """Find circles, each as a list of imports. One import of each is taken out, until no circle is left."""
+    """Find circles, each as a list of imports. After finding one, remove one of its imports and search again."""
     places = {(i.source, i.target): i for i in found if i.source != i.target}
     while True:
         graph: dict[str, list[str]] = {}
@@ -75,14 +75,14 @@ def circles(found: list[Import]) -> Iterator[list[Import]]:
             TopologicalSorter(graph).prepare()
             return
         except CycleError as error:
-            way = error.args[1][::-1]  # graphlib lists what is imported first
+            way = error.args[1][::-1]  # graphlib lists a circle from imported to importing module
             circle = [places[pair] for pair in pairwise(way)]
             yield circle
             del places[circle[-1].source, circle[-1].target]
 
 
 def floor(module: str) -> int | None:
-    """Number the floor of a module of `refgs` from below; None where FLOORS does not have it."""
+    """Return the floor of a module of `refgs`, counted from below; None if FLOORS does not list it."""
     part = [*module.split("."), ""][1]
     return next((height for height, names in enumerate(FLOORS) if part in names), None)
 

@@ -1,8 +1,7 @@
 import os
 
-if (
-    "PYTEST_XDIST_WORKER" in os.environ
-):  # two processes share the cores: of more threads some would wait for others' ends
+# Several test processes share the cores: more threads would only wait for each other.
+if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
@@ -13,7 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch._dynamo  # its Triton brings an LLVM that crashes when it is loaded after Mesa's, which Eevee draws with
+import torch._dynamo  # load Triton's LLVM before Mesa's, which Eevee uses: the other order crashes
 
 from benchmarks.scenes.analytic import write_ball_capture
 from refgs.kernels import load
@@ -27,15 +26,21 @@ CARDS = ["emulated", pytest.param("cuda", marks=NO_CARD)]
 
 @pytest.fixture(scope="session", autouse=True)
 def no_package_of_the_clone() -> None:
-    """pytest takes the root for a package, for it has an __init__.py, Blender's, and has put its parent on the path by now: in a clone
-    named refgs, processes that tests spawn would find that where they look for the trainer."""
+    """Remove the clone's parent folder from the path, where pytest has put it.
+
+    The clone's root has an __init__.py for Blender, so pytest treats it as a package. If the clone is named refgs, processes that tests
+    start would import it in place of the trainer.
+    """
     parent = str(Path(__file__).parents[2])
     sys.path[:] = [folder for folder in sys.path if folder != parent]
 
 
 @pytest.fixture(params=CARDS)
 def card(request, monkeypatch) -> torch.device:
-    """A CUDA card, emulated and real: for what the CPU does otherwise."""
+    """Return the device of CUDA's tensors; run the test with emulated kernels and, if there is one, on a card.
+
+    For code that differs between CPU and CUDA.
+    """
     if request.param == "emulated":
         emulate(monkeypatch)
     return torch.device("cuda" if request.param == "cuda" else "cpu")
@@ -43,8 +48,10 @@ def card(request, monkeypatch) -> torch.device:
 
 @pytest.fixture(params=[*load.supported(), *CARDS])
 def device(request, monkeypatch) -> torch.device:
-    """Everything that runs kernels, one after another: where a test has to put its tensors. "emulated" are CUDA's kernels
-    on this processor."""
+    """Return the device for a test's tensors; run the test on every device that has kernels.
+
+    Devices are each instruction set of this CPU, emulated CUDA kernels on the CPU, and a card if there is one.
+    """
     if request.param == "emulated":
         emulate(monkeypatch)
     elif request.param != "cuda":
@@ -54,7 +61,7 @@ def device(request, monkeypatch) -> torch.device:
 
 @pytest.fixture(scope="session")
 def ball_capture(tmp_path_factory):
-    """A small capture with a known answer: a metal ball at 64 pixels."""
+    """Write a small capture whose ground truth is known by formula: a metal ball at 64 pixels."""
     folder = tmp_path_factory.mktemp("ball")
     write_ball_capture(folder, 64)
     return folder
@@ -62,7 +69,7 @@ def ball_capture(tmp_path_factory):
 
 @pytest.fixture
 def python(tmp_path):
-    """A Python that has a trainer in it which only speaks as one, and nothing else."""
+    """Return a fake Python executable whose trainer speaks the job protocol but does not train."""
     from refgs_addon import jobs
 
     if sys.platform == "win32":
@@ -76,7 +83,7 @@ def python(tmp_path):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A real file system of four megabytes; needs root to mount."""
+    """Mount a file system of four megabytes and return its folder; mounting needs root."""
     folder = tmp_path / "disk"
     folder.mkdir()
     if os.name != "posix" or not shutil.which("mount") or os.geteuid() != 0:
@@ -97,7 +104,7 @@ def pytest_sessionfinish(exitstatus):
 
 @pytest.hookimpl(trylast=True)
 def pytest_unconfigure():
-    """Leave at once where Blender was loaded: its own clean-up at the end of a process has been seen to hang."""
+    """End the process at once if Blender was loaded, because Blender's clean-up sometimes hangs."""
     if "bpy" in sys.modules:
         sys.stdout.flush()
         sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""Help and wrong arguments are answered without torch, which takes seconds to import."""
+"""Test that help and wrong arguments are answered without importing torch, which takes seconds."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Clock of a training's parts, against a fake time that only the parts advance."""
+"""Test the clock that times the parts of a training, with a fake time that only the test advances."""
 
 import pytest
 import torch
@@ -35,7 +35,7 @@ def test_a_function_is_timed_while_an_iteration_is_watched(time, watch):
     assert draw(5) == 5
     with watch.iteration(0):
         assert draw(2) == 2
-        time.now += 7  # outside any part
+        time.now += 7  # outside any part: not counted
         draw(1)
     draw(9)
     assert watch.seconds == {"raster": 3}

@@ -6,7 +6,7 @@ from refgs.color import srgb_decode, srgb_encode
 
 
 def test_known_values():
-    # IEC 61966-2-1: mid grey, both sides of the joint, both ends.
+    # IEC 61966-2-1: both ends of the range, mid grey, and points in and at the end of the linear segment.
     linear = np.array([0.0, 0.002, 0.0031308, 0.214041140482, 1.0])
     np.testing.assert_allclose(srgb_encode(linear), [0.0, 0.02584, 0.0404499, 0.5, 1.0], atol=1e-6)
 

@@ -1,4 +1,4 @@
-"""Every stage of the demo, on fewer and smaller photos and with a shorter training."""
+"""Test all stages of the demo with fewer and smaller photos and a shorter training."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""The docs name what exists: pages, headings, commands, options, buttons."""
+"""Test that all pages, headings, commands, options and buttons that the docs name exist."""
 
 import re
 from pathlib import Path
@@ -21,7 +21,7 @@ BUTTON = re.compile(r"\*\*(\w[^*]+)\*\*")
 
 
 def anchors(page):
-    """The anchors that GitHub gives a page's headings."""
+    """Return the anchors that GitHub gives a page's headings."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
@@ -41,7 +41,7 @@ def test_commands_and_options_exist(page):
     for name, words in COMMAND.findall("\n".join(block or inline for block, inline in code)):
         assert name in commands, f"refgs {name}"
         options = {option for param in commands[name].params for option in param.opts}
-        if name != "bench":  # each benchmark has options of its own
+        if name != "bench":  # skip bench, whose options differ between benchmarks
             assert set(re.findall(r"--[a-z-]+", words)) <= options, f"refgs {name}{words}"
 
 

@@ -1,4 +1,4 @@
-"""Floors, circles and forbidden imports: scripts/check_imports.py finds each, and none in this clone."""
+"""Test scripts/check_imports.py: it finds upward imports, circles and forbidden imports, and none in this clone."""
 
 import re
 import subprocess
@@ -11,14 +11,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def check(root):
-    """Run the script. Returns its exit status and what it prints."""
+    """Run the script; return its exit status and output."""
     command = [sys.executable, ROOT / "scripts" / "check_imports.py", root]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     return done.returncode, done.stdout
 
 
 def write(root, files):
-    """Write a small clone that keeps the rules, then these files."""
+    """Write a small clone that keeps the rules; then add or replace `files`."""
     right = {
         "backend/refgs/__init__.py": "",
         "backend/refgs/camera.py": "import numpy",
@@ -79,7 +79,7 @@ def test_each_rule_finds_what_breaks_it(tmp_path, name, text, expected):
 
 
 def test_no_test_imports_another():
-    """What several tests share lies in tests/makers."""
+    """Tests import shared code only from tests/makers."""
     for file in (ROOT / "tests").rglob("*.py"):
         imported = re.findall(
             r"^ *(?:from|import) ((?:tests\.|test_|makers|conftest)\S*)", file.read_text("utf-8"), re.MULTILINE

@@ -1,4 +1,4 @@
-"""Release zips, which contain the trainer and its installer, and the installation, which downloads gigabytes."""
+"""Test the release zips, with the trainer's wheel and uv in them, and an installation, which downloads gigabytes."""
 
 import platform
 import subprocess
@@ -19,7 +19,7 @@ NAMES = {("Linux", "x86_64"): "linux_x64", ("Windows", "AMD64"): "windows_x64", 
 
 @pytest.fixture(scope="module")
 def archives(tmp_path_factory):
-    """Build and validate the zips, by platform."""
+    """Build and validate the zips of all platforms; return them by platform."""
     out = tmp_path_factory.mktemp("dist")
     subprocess.run([sys.executable, ROOT / "scripts" / "build_extension.py", out], check=True)
     return {archive.stem.split("-")[-1]: archive for archive in out.glob("*.zip")}
@@ -27,7 +27,7 @@ def archives(tmp_path_factory):
 
 @pytest.fixture
 def archive(archives):
-    """Return this platform's zip."""
+    """Return the zip for this platform."""
     name = NAMES.get((platform.system(), platform.machine()))
     if name is None:
         pytest.skip("there is no zip for this platform")
@@ -48,7 +48,10 @@ def test_the_zips(archives):
 
 @pytest.mark.timeout(3000)
 def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
-    """Install with the real uv, with this machine's Python, and torch from the package index: a mirror may have no other."""
+    """A released zip installs a working trainer by the real uv, and removes it again.
+
+    It uses this machine's Python, and torch from the package index because a mirror may have no other.
+    """
     monkeypatch.setenv("UV_PYTHON_PREFERENCE", "only-system")
     monkeypatch.setenv("UV_TORCH_BACKEND", "")
     zipfile.ZipFile(archive).extractall(tmp_path / "extension")

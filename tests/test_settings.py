@@ -89,7 +89,7 @@ def test_a_run_of_before_a_setting_still_opens():
     opened = recorded_settings(recorded, "run.toml")
     assert opened.train == settings.train
     assert opened.mesh == load_settings("standard").mesh
-    assert (opened.light.frame, opened.light.exposure) == ("world", "off")  # as in runs before these keys
+    assert (opened.light.frame, opened.light.exposure) == ("world", "off")  # runs that lack these keys were trained so
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_a_run_of_before_a_setting_still_opens():
     ],
 )
 def test_a_run_of_a_newer_release_is_not_read(tmp_path, made_by, says):
-    """A patch release counts as this one: the file is read, and what it lacks is reported."""
+    """A run of a newer minor or major release is refused. One of a newer patch release is read."""
     (tmp_path / "run.toml").write_text(f"[run]\nrefgs = {json.dumps(made_by)}\n")
     with pytest.raises(InputError, match=says):
         read_run_facts(tmp_path)

@@ -1,4 +1,4 @@
-"""Job protocol, spoken with the real process."""
+"""Test the job protocol with a real worker process."""
 
 import json
 import queue
@@ -27,7 +27,7 @@ PATIENCE = 120  # seconds
 
 
 class Talk:
-    """Worker process, and the events it has sent."""
+    """Worker process and the events that it has sent."""
 
     def __init__(self):
         command = [sys.executable, "-m", "refgs.cli", "worker"]
@@ -48,7 +48,7 @@ class Talk:
         self.process.stdin.flush()
 
     def until(self, event: str) -> dict:
-        """Wait for the next event of this kind."""
+        """Wait for the next event with this name and return it."""
         while line := self.lines.get(timeout=PATIENCE):
             self.heard.append(json.loads(line))
             if self.heard[-1]["event"] == event:
@@ -69,7 +69,7 @@ def talk():
 
 
 def test_jobs_one_after_another(talk, ball_capture, tmp_path):
-    """Jobs run in order. A wrong command is answered in one line and does not disturb the next job."""
+    """Jobs run in order. A wrong command is answered by one line and does not affect the next job."""
     run = tmp_path / "größe 'a'"
     talk.tell("check", capture=str(ball_capture))
     talk.tell("check", capture=str(ball_capture), out=str(tmp_path / "found"))
@@ -129,14 +129,14 @@ def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture
     assert cancelled["iteration"] > paused and not (run / "splats.ply").exists()
     talk.tell("train", capture=str(ball_capture), out=str(run), resume=True)
     assert talk.until("progress")["iteration"] > cancelled["iteration"]
-    # Nobody listens any more: the training ends by itself and can be resumed.
+    # After its input is closed, the training is cancelled with a checkpoint, so it can be resumed.
     assert talk.end() == 0
     ended = talk.until("cancelled")
     assert (run / "checkpoints" / f"{ended['iteration']:08d}.toml").exists(), list((run / "checkpoints").iterdir())
 
 
 def test_photos_without_cameras(talk, tmp_path):
-    """The check tells them from a folder without photos. Finding their cameras can be interrupted and started again."""
+    """The check reports photos that lack cameras. Searching their cameras can be interrupted and repeated."""
     for number in range(4):
         cv2.imwrite(
             str(tmp_path / f"{number}.png"), np.random.default_rng(number).integers(0, 255, (96, 128, 3), np.uint8)
@@ -179,7 +179,7 @@ def until(condition) -> None:
 
 
 def free(run) -> bool:
-    """Tell whether no process holds a run."""
+    """Return True if no process holds the lock of a run."""
     try:
         with RunLock(run):
             return True
@@ -188,7 +188,7 @@ def free(run) -> bool:
 
 
 def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
-    """Paused and then left with both pipes closed, it trains to the end and exports the mesh."""
+    """A kept training that is paused when both pipes are closed trains to its end, then exports the mesh."""
     run = tmp_path / "run"
     commands = [
         {"command": "train"}
@@ -211,7 +211,7 @@ def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
 
 
 def test_what_waits_goes_with_the_input(talk, ball_capture, tmp_path):
-    """Stopped and left at once, it writes the surfels but does not start the waiting export."""
+    """If the input is closed right after `stop`, the surfels are written and the waiting export is dropped."""
     run = tmp_path / "run"
     talk.tell("train", **train(ball_capture, run))
     talk.tell("export", run=str(run), texture=64)
@@ -246,7 +246,10 @@ def test_a_training_that_was_left_ends_when_it_is_terminated(talk, ball_capture,
 
 
 def test_a_folder_that_is_trained_in(talk, ball_capture, tmp_path):
-    """No other process can train there, but it can see the progress and stop it. A killed process leaves the folder free."""
+    """While a run is trained, another process cannot train it, but can read its progress and stop it.
+
+    A killed process leaves the run free.
+    """
     run = tmp_path / "run"
     talk.tell("train", **train(ball_capture, run))
     until((run / PROGRESS).exists)

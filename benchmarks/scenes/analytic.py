@@ -1,4 +1,4 @@
-"""Photograph balls under a smooth sky by formulas: captures whose every answer is known, made without Blender."""
+"""Compute photos of balls under a smooth sky by formula: captures with known ground truth, made without Blender."""
 
 import json
 from pathlib import Path
@@ -18,13 +18,16 @@ TWO = np.array([[-0.6, 0.0, 0.0, 0.5], [0.6, 0.0, 0.0, 0.5]])
 
 
 def sky(direction: np.ndarray) -> np.ndarray:
-    """Linear radiance (…, 3): bright above, dark below, warmer to +x. It is smooth: a low roughness hardly blurs it."""
+    """Compute the sky's linear radiance (…, 3): bright above, dark below, warmer towards +x.
+
+    It is so smooth that a low roughness hardly blurs it.
+    """
     x, y, z = np.moveaxis(direction, -1, 0)
     return np.stack([0.5 + 0.3 * z + 0.2 * x, 0.5 + 0.35 * z + 0.1 * y, 0.5 + 0.4 * z - 0.2 * x], axis=-1)
 
 
 def meet(origin: np.ndarray, ray: np.ndarray, balls: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Intersect unit rays (P, 3) with balls: hit or not (P,), first point (P, 3) and its normal (P, 3)."""
+    """Intersect unit rays (P, 3) with balls; return hits (P,), the first points (P, 3) and their normals (P, 3)."""
     apart = origin[:, None] - balls[:, :3]
     b = (apart * ray[:, None]).sum(-1)
     inside = b * b - ((apart**2).sum(-1) - balls[:, 3] ** 2)
@@ -36,25 +39,25 @@ def meet(origin: np.ndarray, ray: np.ndarray, balls: np.ndarray) -> tuple[np.nda
     return hit, point, (point - balls[first, :3]) / balls[first, 3:]
 
 
-# From the top down, each where the normal's z is above this. The mirror tells the light; the others are seen under it.
+# Bands from the top down: the lowest z of the normal, and the material. The first is nearly a mirror, which shows the light.
 BANDS = (
     (0.25, Material((0.9, 0.6, 0.3), 1.0, 0.1)),
     (-0.3, Material((0.7, 0.7, 0.8), 1.0, 0.5)),
     (-1.0, Material((0.2, 0.4, 0.5), 0.0, 0.6)),
 )
 SUNS = np.array([[0.6, 0.0, 0.8], [-0.64, 0.6, 0.48], [0.0, -0.96, 0.28]])
-STEPS = 14  # of the lobe's quadrature in either direction
+STEPS = 14  # nodes of the lobe's quadrature along each axis
 
 
 def sunny(direction: np.ndarray) -> np.ndarray:
-    """Add soft suns, 10 degrees wide, to the sky: enough for a roughness to show."""
+    """Compute the radiance of the sky with soft suns, 10 degrees wide, in which roughness is visible."""
     return 0.4 * sky(direction) + 0.55 * np.exp(30 * (direction @ SUNS.T - 1)).sum(axis=-1, keepdims=True)
 
 
 def reflect(material: Material, ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Radiance (P, 3) against unit rays (P, 3) off a convex object under `sunny`, by quadrature of the rendering equation.
+    """Compute the radiance (P, 3) of a convex object under `sunny`, seen along unit rays (P, 3).
 
-    The specular lobe is integrated over its visible normals (Heitz 2018), the diffuse base over the cosine."""
+    Quadrature integrates the specular lobe over its visible normals (Heitz 2018) and the diffuse base over the cosine."""
     view, alpha = -ray, material.roughness**2
     n_v = (view * normal).sum(-1).clip(1e-3, 1 - 1e-9)
     side = view - (view * normal).sum(-1, keepdims=True) * normal
@@ -96,12 +99,12 @@ def reflect(material: Material, ray: np.ndarray, normal: np.ndarray) -> np.ndarr
 
 
 def banded(ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Radiance (P, 3) off a ball of BANDS."""
+    """Compute the radiance (P, 3) of a ball with the materials BANDS."""
     color, left = np.zeros_like(ray), np.ones(len(ray), bool)
     for lowest, material in BANDS:
         here = left & (normal[:, 2] >= lowest)
         left &= ~here
-        for some in np.array_split(np.flatnonzero(here), 1 + here.sum() // 256):  # as many as the caches hold
+        for some in np.array_split(np.flatnonzero(here), 1 + here.sum() // 256):  # chunks that fit into the caches
             color[some] = reflect(material, ray[some], normal[some])
     return color
 
@@ -117,9 +120,11 @@ def photo(
     angle: float = ANGLE,
     matte: bool = False,
 ) -> np.ndarray:
-    """Photograph balls (B, 4), centre and radius: mirrors with Schlick's Fresnel, BANDS, or matte with a pattern. RGBA in 0..1.
+    """Compute a photo, RGBA in 0..1, of balls (B, 4), given by centre and radius.
 
-    Alpha is by `samples`² rays a pixel. The mirrors' sky stands still or turns with the level camera about z; `stops` is their exposure.
+    Balls are mirrors with Schlick's Fresnel, have BANDS, or are matte with a pattern.
+
+    Alpha is the mean over `samples`² rays a pixel. The mirrors' sky is fixed or turns with the camera about z. `stops` is the exposure.
     """
     focal = 0.5 * size / np.tan(angle / 2)
     grid = (np.arange(size * samples) + 0.5) / samples
@@ -148,7 +153,7 @@ def photo(
         return total / np.maximum(seen.reshape(blocks).sum(axis=(1, 3)), 1)[..., None]
 
     color = mean(color)
-    if bands:  # smooth, so once a pixel is enough
+    if bands:  # the radiance is smooth: one ray a pixel is enough
         there = alpha > 0
         ray, normal = (mean(v)[there] for v in (first_ray, first_normal))
         color[there] = banded(*(v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (ray, normal)))
@@ -156,7 +161,7 @@ def photo(
 
 
 def camera_matrix(direction: np.ndarray, distance: float = DISTANCE) -> np.ndarray:
-    """Place a camera at a distance along a direction, looking at the origin, +z up: camera-to-world with OpenGL's axes."""
+    """Return the camera-to-world matrix, with OpenGL's axes, of a camera along a direction that looks at the origin, +z up."""
     back = direction / np.linalg.norm(direction)
     right = np.cross([0, 0, 1], back)
     right /= np.linalg.norm(right)
@@ -176,9 +181,9 @@ def write_ball_capture(
     distance: float = DISTANCE,
     matte: bool = False,
 ) -> None:
-    """Write a NeRF-Blender capture of balls: 24 training and 4 test views, of the same size at any distance.
+    """Write a NeRF-Blender capture of balls with 24 training and 4 test views.
 
-    `stops` are the training views' exposures in turn."""
+    `stops` are the exposures of the training views, repeated in turn."""
     angle = ANGLE if distance == DISTANCE else 2 * np.arctan(np.tan(ANGLE / 2) * DISTANCE / distance)
     steps = np.arange(VIEWS + 4) + 0.5
     z = 0.9 - 1.5 * steps / len(steps)

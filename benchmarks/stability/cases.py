@@ -7,7 +7,10 @@ NEVER = -1
 
 
 class Found(NamedTuple):
-    """Outcome of a case: all values finite or not, the error, and the iterations until a disturbed training was back, or NEVER."""
+    """Outcome of a case: whether all values are finite, the error, and when a disturbed training recovered.
+
+    `recovered` counts iterations; it is NEVER if the training did not recover.
+    """
 
     finite: bool
     error: float
@@ -15,7 +18,10 @@ class Found(NamedTuple):
 
 
 class Case(NamedTuple):
-    """Stiff or extreme case. The error of `run` beside `against` may be `most`, and `because` says why; `guard` is the remedy."""
+    """Stiff or extreme case. The error of `run` compared with `against` may be at most `most`.
+
+    `because` says why so much is allowed; `guard` says what the program does about the case.
+    """
 
     name: str
     run: Callable[[], Found]

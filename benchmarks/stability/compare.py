@@ -1,4 +1,7 @@
-"""Compare float32 kernels with the float64 reference: largest error of values and gradients, each by its tensor's largest value."""
+"""Compare float32 kernels with the float64 reference.
+
+Errors of values and gradients are the largest ones, relative to the largest value of their tensor.
+"""
 
 from collections.abc import Sequence
 
@@ -12,20 +15,20 @@ from refgs.render import reference
 from refgs.render.rasterize import rasterize
 from refgs.render.shade import shade
 
-MARGIN = 1e-4  # pixels nearer to a comparison that rounding could flip are left out
-SMOOTH = 2e-5  # the same for kinks, which only derivatives have
-SAFE = 0.5  # least share of the picture, or of its drawn part, that must remain
+MARGIN = 1e-4  # pixels whose compared value is this near to a threshold are left out: rounding could flip them
+SMOOTH = 2e-5  # pixels this near to a kink are left out of the derivatives
+SAFE = 0.5  # least share of the picture, or of its drawn part, that must remain to be compared
 FLOAT32 = "float32, sums of hundreds of terms"
 
 
 class Undecided(Exception):
-    """Too much of a picture depends on comparisons that rounding can flip."""
+    """Raised if too much of a picture depends on comparisons that rounding can flip."""
 
 
 def worst(found: Sequence[Tensor], expected: Sequence[Tensor], terms: Sequence[Tensor] | None = None) -> float:
-    """Largest error of pairs of tensors, each relative to its largest value, or to its cancelling `terms` where they are larger.
+    """Find the largest error of pairs of tensors, each relative to its largest value, or to its cancelling `terms` if larger.
 
-    An error beside an expected zero is absolute."""
+    If the expected value is zero, the error is absolute."""
     errors = [0.0]
     for value, exact, summed in zip(found, expected, terms or expected, strict=True):
         if exact.numel():
@@ -41,13 +44,16 @@ def outcome(
     exact_by: Sequence[Tensor],
     terms: Sequence[Tensor] | None = None,
 ) -> Found:
-    """Combine the errors of values and gradients; a gradient's counts a tenth."""
+    """Combine the errors of values and gradients; an error of a gradient counts a tenth."""
     finite = all(bool(v.isfinite().all()) for v in (*found, *by))
     return Found(finite, max(worst(found, expected), 0.1 * worst(by, exact_by, terms)))
 
 
 def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest: int | None = None) -> Found:
-    """Compare the rasteriser forward and backward. The reference may take only the `nearest` surfels where they occlude the rest."""
+    """Compare the rasteriser forward and backward.
+
+    With `nearest`, the reference draws only so many surfels, which occlude the rest.
+    """
     order = None if nearest is None else _order(inputs, camera)
     few = inputs if order is None else [v[order[:nearest]] for v in inputs]
     exact = [v.double().requires_grad_() for v in few]
@@ -73,7 +79,7 @@ def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest:
 
 
 def _learned(by: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
-    """Turn derivatives into those by position, rotation angle and log scale; leave the rest."""
+    """Convert derivatives to those by position, rotation angle and log scale; keep the others."""
     position, rotation, scale, *rest = by
     return [position, rotation * inputs[1].double().norm(dim=-1, keepdim=True), scale * inputs[2].double(), *rest]
 

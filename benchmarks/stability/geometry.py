@@ -1,4 +1,4 @@
-"""Unusual surfels and cameras, through the rasteriser and the other kernels that read positions."""
+"""Cases of unusual surfels and cameras, for the rasteriser and other kernels that read positions."""
 
 import dataclasses
 from functools import partial
@@ -24,7 +24,7 @@ WIDTH, HEIGHT, COUNT = 40, 28, 90
 def camera(
     focal: float = 1.1, centre: tuple[float, float] | None = None, size: tuple[int, int] = (WIDTH, HEIGHT)
 ) -> Camera:
-    """Make a turned camera; focal length in widths, principal point in pixels."""
+    """Make a rotated camera; `focal` is in image widths, `centre` in pixels."""
     return dataclasses.replace(scenes.camera(*size, centre), fx=focal * size[0], fy=focal * size[0])
 
 
@@ -59,7 +59,7 @@ def surfels(
 
 
 def moved(scale: float = 1.0, offset: float = 0.0) -> Found:
-    """Scale and move a whole scene."""
+    """Compare the rasteriser on a scene that is scaled and moved with its camera."""
     view = camera()
     position, rotation, size, *rest = surfels(view)
     pose = view.world_to_camera.copy()
@@ -114,7 +114,7 @@ def across_near() -> Found:
 
 
 def coincident(count: int = 3000) -> Found:
-    """Put all surfels in one place, in different colours."""
+    """Compare the rasteriser with all surfels in the same place, in different colours."""
     view = camera(size=(16, 12))
     one = surfels(view, 1, pixels=(3.0, 3.0), depth=(2.0, 2.0))
     generator = torch.Generator().manual_seed(0)
@@ -139,7 +139,7 @@ def one_pixel(count: int = 1_000_000) -> Found:
     view = camera(size=(3, 3))
     _, rotation, scale, opacity, features = surfels(view, count, pixels=(0.01, 0.38), depth=(1.0, 1.0))
     depth = np.concatenate([np.linspace(1, 2, 20_000), np.linspace(2, 3, count - 20_000)])[:, None]
-    at = np.random.default_rng(1).uniform(1.4, 1.6, (count, 2))  # the nearest are further apart than rounding
+    at = np.random.default_rng(1).uniform(1.4, 1.6, (count, 2))  # even the closest pair is further apart than rounding
     way = np.concatenate([(at - [view.cx, view.cy]) / [view.fx, view.fy], np.ones((count, 1))], axis=1)
     position = torch.from_numpy(view.position + depth * way @ view.world_to_camera[:3, :3]).float()
     scale = (scale * torch.from_numpy(depth)).float()
@@ -147,7 +147,7 @@ def one_pixel(count: int = 1_000_000) -> Found:
 
 
 def nothing() -> Found:
-    """Draw no surfel: the picture is empty and gradients have no rows."""
+    """Check that without surfels the picture is empty and gradients have no rows."""
     view = camera()
     leaves = [v[:0].requires_grad_() for v in surfels(view)]
     maps = rasterize(*leaves, view, near=0.1)

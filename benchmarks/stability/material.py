@@ -1,4 +1,4 @@
-"""Unusual materials and lights, through shading, prefilter, D-SSIM, activations, optimiser and rays."""
+"""Cases of unusual materials and lights, for shading, prefilter, D-SSIM, activations, optimiser and rays."""
 
 from functools import partial
 
@@ -24,7 +24,7 @@ SIDE, RESOLUTION = 32, 16
 
 
 def ball(grazing: float | None = None) -> tuple[Tensor, Tensor, Camera]:
-    """Normals and positions (H, W, 3), float64, of a ball that fills a far camera's picture.
+    """Make normals and positions (H, W, 3), float64, of a ball that fills the image of a far camera.
 
     With `grazing`, all normals have this cosine with the view instead."""
     view = Camera("far", SIDE, SIDE, 1e3, 1e3, SIDE / 2 + 0.13, SIDE / 2 - 0.17, np.eye(4))
@@ -35,11 +35,12 @@ def ball(grazing: float | None = None) -> tuple[Tensor, Tensor, Camera]:
         ray_unit = reference.unit(ray)
         across = reference.unit(normal - (normal * ray_unit).sum(dim=-1, keepdim=True) * ray_unit)
         normal = across - grazing * ray_unit
+    # Positions are displaced, so that normals are read a third of a pixel away.
     return (
         normal,
         ray + torch.tensor([0.31e-3, -0.27e-3, 0]).double(),
         view,
-    )  # the look-up of normals is displaced by a third of a pixel
+    )
 
 
 def light(sun: float = 0.0, scale: float = 1.0) -> Tensor:
@@ -59,7 +60,7 @@ def lit(
     scale: float = 1.0,
     kink: bool = False,
 ) -> Found:
-    """Shade a ball whose material is partly given and otherwise random."""
+    """Compare shading of a ball whose material is partly given and otherwise random."""
     normal, position, view = ball(grazing)
     generator = torch.Generator().manual_seed(0)
     material = 0.05 + 0.9 * torch.rand(SIDE, SIDE, 5, generator=generator, dtype=torch.float64)
@@ -83,13 +84,13 @@ def one_sun(radiance: float) -> Found:
     error = max(
         compare.worst([found.detach()], [exact]), 0.1 * compare.worst([by], [by_each[0] + radiance * by_each[1]])
     )
-    dim = exact < 1e-3 * radiance  # texels that the sun does not reach, whose error it must not hide
+    dim = exact < 1e-3 * radiance  # texels out of the sun's reach: its size must not hide their error
     error = max(error, float(((found.detach() - exact).abs() / exact)[dim].max()) / 10)
     return Found(bool(found.isfinite().all() and by.isfinite().all()), error)
 
 
 def likeness(kind: str) -> Found:
-    """Compare D-SSIM of two pictures with float64."""
+    """Compare D-SSIM of two images with float64."""
     generator = torch.Generator().manual_seed(0)
     image, target = torch.rand(2, 30, 40, 3, generator=generator)
     if kind == "constant":
@@ -162,7 +163,7 @@ def rays(scale: float, offset: float) -> Found:
     # A ray is free where it leaves the ball of radius 1 through its opening.
     b = (inner * way).sum(axis=1)
     leaves = inner + (-b + np.sqrt(b * b - (inner**2).sum(axis=1) + 1))[:, None] * way
-    clear = np.abs(leaves[:, 2] - 0.3) > 0.06  # not at the rim, which triangles make jagged
+    clear = np.abs(leaves[:, 2] - 0.3) > 0.06  # leave out the rim, which is jagged by its triangles
     return Found(True, float((found != (leaves[:, 2] > 0.3))[clear].mean()))
 
 

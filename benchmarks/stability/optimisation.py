@@ -1,4 +1,4 @@
-"""Disturb trainings and see them recover; check that a training repeats bit for bit."""
+"""Cases of disturbed trainings, which must recover, and of repeated ones, which must agree bit for bit."""
 
 import functools
 import math
@@ -22,7 +22,7 @@ from refgs.train.densify import faint_now
 from refgs.train.start import GEOMETRY
 from refgs.train.trainer import Trainer
 
-AT, UNTIL, LONG = 50, 90, 300  # iterations: from which on it is disturbed, until when, and all of it
+AT, UNTIL, LONG = 50, 90, 300  # iterations: start and end of a disturbance, length of a long training
 
 
 def disturbed(

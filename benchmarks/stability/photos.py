@@ -1,4 +1,4 @@
-"""Unusual captures, through a whole training."""
+"""Cases of unusual captures, each with a whole training."""
 
 import functools
 from collections.abc import Callable
@@ -11,16 +11,16 @@ from refgs.errors import InputError
 from refgs.model.surfels import activate
 
 ONE = ["surfels.start=1", "surfels.budget=1"]
-NOISE = 0.7  # dB: what another seed changes is less, docs/stability.md
+NOISE = 0.7  # dB: another seed changes less than this (docs/stability.md)
 
 
 def against(course: Course, least: float) -> Found:
-    """Decibels that the held-out views are below their target."""
+    """Compute by how many decibels the held-out views miss their target."""
     return Found(course.finite, max(0.0, least - course.end))
 
 
 def elsewhere(scale: float, offset: float) -> Found:
-    """Train the scene scaled and moved; the splats must lie there, too."""
+    """Train the scene scaled and moved; check that the splats lie at the new place."""
 
     def pose(matrix: np.ndarray) -> np.ndarray:
         matrix[:3, 3] = scale * matrix[:3, 3] + offset
@@ -46,7 +46,7 @@ def of_these(**how) -> Found:
 
 
 def refused(make: Callable[[], object]) -> Found:
-    """Check that it is refused with one line."""
+    """Check that the capture is refused with a one-line error."""
     try:
         make()
     except InputError as error:
@@ -55,7 +55,7 @@ def refused(make: Callable[[], object]) -> Found:
 
 
 def mixed(pixels: np.ndarray, index: int) -> np.ndarray:
-    """Make every third photo three quarters as large, and every third not square."""
+    """Resize every third photo to 24×24 pixels, so that photos differ in size."""
     if index % 3 == 0:
         return pixels
     from PIL import Image
@@ -91,7 +91,7 @@ LEAST = "as a picture without detail"
 
 
 def _poor(name: str, photo, least: float, guard: str, total: int = TOTAL) -> Case:
-    """Train on uninformative photos: the result has at least so many dB."""
+    """Train on uninformative photos; check that the result has at least so many dB."""
     run = functools.partial(photographed, photo, lambda: least, total)
     return _case(name, run, guard, 0.0, LEAST, f"{least:g} dB")
 

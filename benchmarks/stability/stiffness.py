@@ -1,6 +1,7 @@
 """Measure in float64 how well photos tell light from material.
 
-For pairs of changes that may compensate each other: singular values of the pictures' Jacobian, and the effect of each loss weight.
+It takes pairs of changes that may compensate each other. For each pair it computes the singular values of the pictures' Jacobian, and the
+effect of each loss weight on them.
 """
 
 from collections.abc import Callable
@@ -22,9 +23,11 @@ from refgs.train.ambiguity import ambiguities
 from refgs.train.losses import departure
 
 STEP = 1e-4
-ROUNDING = 1e-12  # of the largest eigenvalue: smaller ones are zero
-RESIDUAL = 0.02  # of a trained picture: an L1 loss about residuals of this deviation has curvature 0.8 / RESIDUAL
-TURNS = ((0, 0, 0), (0, 2.1, 0), (0, 4.2, 0.5))  # of the views about the ball
+ROUNDING = 1e-12  # share of the largest eigenvalue below which others count as zero
+RESIDUAL = (
+    0.02  # standard deviation of a trained picture's residuals; the curvature of an L1 loss is then 0.8 / RESIDUAL
+)
+TURNS = ((0, 0, 0), (0, 2.1, 0), (0, 4.2, 0.5))  # rotations of the views about the ball
 WARM, MATTE = torch.tensor([0.9, 0.6, 0.3]).double(), torch.tensor([0.2, 0.4, 0.5]).double()
 LIGHT, ALBEDO, LIGHT_TINT, TINT, ROUGHNESS, BLUR, METALLIC, EXPOSURE = range(8)
 TRADES = {
@@ -43,7 +46,7 @@ class Scene(NamedTuple):
     materials: tuple[tuple[Tensor, float, float], ...]
 
     def radiance(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Radiance of the light, of its tint and of its blur by a sixteenth of a face, (6·R², 3) each."""
+        """Compute the radiance of the light, and its changes by a tint and by a blur of a sixteenth of a face, (6·R², 3) each."""
         base = torch.from_numpy(self.light(cubemap.texel_directions(RESOLUTION).numpy())).float()
         faces = torch.nn.functional.pad(
             base.view(6, RESOLUTION, RESOLUTION, 3).permute(0, 3, 1, 2), (1,) * 4, mode="replicate"
@@ -52,7 +55,7 @@ class Scene(NamedTuple):
         return base, base * torch.tensor([1.0, 0.0, -1.0]), mean - base
 
     def pictures(self, change: Tensor) -> Tensor:
-        """Render the encoded pictures after a change (8,), flattened."""
+        """Render the sRGB pictures after the changes (8,), flattened."""
         normal, position, view = ball()
         base, tint, blur = (prefilter.prefilter(radiance, RESOLUTION).double() for radiance in self.radiance())
         levels = (1 + change[LIGHT]) * base + change[LIGHT_TINT] * tint + change[BLUR] * blur
@@ -79,12 +82,12 @@ class Scene(NamedTuple):
         return torch.cat(found)
 
     def jacobian(self) -> Tensor:
-        """Jacobian of the pictures by the eight changes (P, 8), by central differences, over the root of P."""
+        """Compute the Jacobian (P, 8) of the pictures by the eight changes, by central differences, divided by √P."""
         columns = [self.pictures(STEP * e) - self.pictures(-STEP * e) for e in torch.eye(8).double()]
         return torch.stack(columns, dim=1) / (2 * STEP) / len(columns[0]) ** 0.5
 
     def weights(self, change: Tensor) -> dict[str, Tensor]:
-        """Value of each loss term after a change, with the standard preset's weights at the end of a training."""
+        """Compute each loss term after a change, with the weights of the preset `standard` at the end of a training."""
         loss = load_settings("standard").loss
         base, tint, blur = (radiance.double().mean(dim=0) for radiance in self.radiance())
         mean = (1 + change[LIGHT]) * base + change[LIGHT_TINT] * tint + change[BLUR] * blur
@@ -98,7 +101,7 @@ class Scene(NamedTuple):
         }
 
     def derivatives(self, weight: str) -> tuple[Tensor, Tensor]:
-        """First (8,) and second (8, 8) derivative of a loss term."""
+        """Compute the first (8,) and second (8, 8) derivatives of a loss term."""
         at = torch.zeros(8).double()
         return tuple(
             derivative(lambda change: self.weights(change)[weight], at)
@@ -106,10 +109,11 @@ class Scene(NamedTuple):
         )
 
 
+# Roughnesses between the prefilter's levels; at a level, derivatives have kinks.
 METAL, DIELECTRIC = (
     (WARM, 0.95, 0.2),
     (MATTE, 0.05, 0.45),
-)  # roughnesses between the prefilter's levels, where derivatives have kinks
+)
 SCENES = {
     "metal, smooth sky": Scene(sky, (METAL,)),
     "metal, suns": Scene(sunny, (METAL,)),
@@ -120,7 +124,7 @@ SCENES = {
 
 
 def condition(hessian: Tensor) -> str:
-    """Largest eigenvalue over the smallest; "no minimum" or "∞" where the smallest is negative or zero."""
+    """Divide the largest eigenvalue by the smallest; "no minimum" if the smallest is negative, "∞" if it is zero."""
     low, high = torch.linalg.eigvalsh(hessian).tolist()
     if abs(low) < ROUNDING * high:
         return "∞"
@@ -128,7 +132,7 @@ def condition(hessian: Tensor) -> str:
 
 
 def tables() -> list[tuple[str, list[str], list[list[str]]]]:
-    """Tables after the cases: title, headings, rows."""
+    """Make the tables that are printed after the cases: title, headings, rows."""
     weights, rows = ("loss.light", "loss.metallic", "loss.matte", "loss.exposure"), []
     for name, scene in SCENES.items():
         jacobian = scene.jacobian()
@@ -149,7 +153,7 @@ def tables() -> list[tuple[str, list[str], list[list[str]]]]:
 
 
 def by_autograd() -> Found:
-    """Compare the Jacobian by differences with the reference's autograd."""
+    """Compare the Jacobian by central differences with autograd through the reference."""
     scene = SCENES["half metal, half dielectric, suns"]
     upstream = torch.randn(
         len(scene.pictures(torch.zeros(8).double())), generator=torch.Generator().manual_seed(0)
@@ -161,7 +165,7 @@ def by_autograd() -> Found:
 
 
 def said() -> Found:
-    """Train an all-metal ball: the report says that photos do not tell the light's scale, and does not say so of metal."""
+    """Train an all-metal ball; check that the report calls the light's scale ambiguous, but not metallic."""
     trades = ambiguities(train(capture(), total=300).trainer.state)
     right = "what" in trades["light_scale"] and "what" in trades["white_balance"] and "what" not in trades["metal"]
     return Found(all(v["left"] <= v["alone"] for v in trades.values()), 0.0 if right else 1.0)

@@ -1,4 +1,4 @@
-"""Small trainings of a metal ball, which cases disturb and compare with."""
+"""Train a small metal ball, undisturbed or disturbed, for the cases to compare."""
 
 import atexit
 import functools
@@ -19,7 +19,7 @@ from refgs.settings import load_settings
 from refgs.train.measures import held_out_psnr
 from refgs.train.trainer import Trainer
 
-SIZE, TOTAL, LOOK = 32, 150, 10  # pixels; iterations; iterations between looks at the held-out views
+SIZE, TOTAL, LOOK = 32, 150, 10  # pixels; iterations; iterations between measurements of held-out views
 SMALL = [
     "surfels.start=500",
     "surfels.budget=600",
@@ -28,7 +28,7 @@ SMALL = [
     "train.light_first=10",
 ]
 SMALL += ["surfels.metallic=0.9", "densify.every=25", "train.checkpoint_every=20", "indirect.start=1"]
-BACK = 1.0  # dB to the undisturbed training within which a disturbed one has recovered
+BACK = 1.0  # a disturbed training has recovered when it is within so many dB of the undisturbed one
 
 
 @functools.cache
@@ -50,7 +50,7 @@ def changed(
     photo: Callable[[np.ndarray, int], np.ndarray] = lambda pixels, index: pixels,
     views: int | None = None,
 ) -> Path:
-    """Change the ball's capture: its camera-to-world matrices, or the pixels (H, W, 4) in 0..1 of each photo."""
+    """Copy the ball's capture with changed camera-to-world matrices, or changed photos (H, W, 4) in 0..1."""
     folder = Path(tempfile.mkdtemp(dir=workspace()))
     for split in ("train", "test"):
         frames = json.loads((ball() / f"transforms_{split}.json").read_text())
@@ -66,7 +66,7 @@ def changed(
 
 
 class Course(NamedTuple):
-    """Training that has ended: held-out PSNR in dB by iteration, its warnings, the trainer."""
+    """Finished training: its held-out PSNR in dB by iteration, its warnings, and the trainer."""
 
     psnr: dict[int, float]
     said: list[str]
@@ -89,7 +89,7 @@ class Course(NamedTuple):
         return self.trainer.state.render(view.camera)
 
     def back_after(self, start: int, undisturbed: "Course") -> int:
-        """Iterations from `start` until all later looks are within BACK of the undisturbed training."""
+        """Count the iterations from `start` until all later measurements are within BACK of the undisturbed training."""
         late = [i for i in self.psnr if i > start and self.psnr[i] < undisturbed.psnr.get(i, undisturbed.end) - BACK]
         return NEVER if late and max(late) == max(self.psnr) else max(late, default=start - LOOK) + LOOK - start
 
@@ -110,12 +110,12 @@ def trainer(
 def train(
     capture: Path, *changes: str, total: int = TOTAL, disturb: dict[int, Callable[[Trainer], None]] | None = None
 ) -> Course:
-    """Train to the end; `disturb` has what is done before some iterations."""
+    """Train to the end; `disturb` maps iterations to functions that are called before them."""
     said: list[str] = []
     made, psnr = trainer(capture, *changes, total=total, said=said), {}
     for end in range(LOOK, total + 1, LOOK):
         (disturb or {}).get(end - LOOK, lambda _: None)(made)
-        while made.state.iteration < end and not made.state.ended:  # it may go back to a checkpoint, or end early
+        while made.state.iteration < end and not made.state.ended:  # it may return to a checkpoint or end early
             made.run(stop=lambda end=end: made.state.iteration >= end)
         psnr[end] = held_out_psnr(made.state)
     return Course(psnr, said, made)

@@ -63,7 +63,7 @@ def write_capture(
         renderer = Renderer(scene.mesh, scene.materials, size, samples)
         renderer.set_light(truth / "light.exr")
         splits = {"train": sphere_cameras(train, distance, scene.lowest, 0.0)}
-        # Turned, so that no test view coincides with a training view.
+        # Turn the test cameras, so that no test view coincides with a training view.
         splits["test"] = sphere_cameras(test, distance, scene.lowest, np.pi / 3)
         for split, cameras in splits.items():
             (folder / split).mkdir()
@@ -72,7 +72,8 @@ def write_capture(
                 name = _name(split, index)
                 passes = renderer.render(camera, seed=done)
                 if split == "test":
-                    passes["visibility"] = renderer.visibility(camera, seed=done)  # the same seed: the same alpha
+                    # The same seed as the picture's, so alpha is the same.
+                    passes["visibility"] = renderer.visibility(camera, seed=done)
                 _write_photo(folder / split / f"{name}.png", passes["color"])
                 if split == "test":
                     for kind, pixels in passes.items():

@@ -11,7 +11,7 @@ from mathutils import Matrix
 from scripts.demo.shapes import Material, Mesh
 
 FIELD_OF_VIEW = np.radians(40.0)
-# Passes written beside the picture by the same camera rays; each is the mean over the covered part of a pixel.
+# Passes that are rendered with the picture, by the same camera rays. Each is the mean over the covered part of a pixel.
 VECTORS, SCALARS = ("normal", "albedo"), ("roughness", "metallic", "depth")
 
 
@@ -83,9 +83,9 @@ class Renderer:
         return _passes(self._channels(camera_to_world, seed))
 
     def visibility(self, camera_to_world: np.ndarray, seed: int) -> np.ndarray:
-        """Share of a pixel's covered part whose mirrored rays miss the object (h, w); zero where alpha is zero.
+        """Render visibility (h, w): the share of a pixel's covered part whose mirrored rays miss the object.
 
-        The object becomes a perfect mirror in a white world: it reflects itself black.
+        The object becomes a perfect mirror in a white world, in which it reflects itself as black. Visibility is zero where alpha is zero.
         """
         scene, layer, world = self.scene, self.scene.view_layers[0], self.scene.world
         layer.material_override, scene.world = self._mirror, self._white
@@ -102,13 +102,14 @@ class Renderer:
 
     def _channels(self, camera_to_world: np.ndarray, seed: int) -> dict[str, np.ndarray]:
         """Render and read the channels of Cycles' multilayer EXR, (h, w) float32 each."""
-        self._camera.matrix_world = Matrix(camera_to_world.tolist())  # a list of rows alone would be read as columns
+        self._camera.matrix_world = Matrix(camera_to_world.tolist())  # without Matrix, rows would be read as columns
         self.scene.cycles.seed = seed
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, "view.exr")
             self.scene.render.filepath = str(path)
             bpy.ops.render.render(write_still=True)
-            parts = OpenEXR.File(str(path), separate_channels=True).parts  # one; a part a pass from Blender 5.0
+            # A single part; from Blender 5.0, one part for each pass.
+            parts = OpenEXR.File(str(path), separate_channels=True).parts
             return {name: channel.pixels for part in parts for name, channel in part.channels.items()}
 
     def _object(self, mesh: Mesh, materials: tuple[Material, ...]) -> None:
@@ -127,9 +128,9 @@ class Renderer:
 
 
 def _material(values: Material, attribute: str) -> bpy.types.Material:
-    """Make a Principled BSDF whose inputs, shading normal and depth also go to the passes.
+    """Make a Principled BSDF whose inputs, shading normal and depth are also written to the passes.
 
-    A base colour that is a texture is the mesh's attribute of that name.
+    A textured base colour is read from a colour attribute of the mesh.
     """
     material = bpy.data.materials.new("Material")
     material.use_nodes = True

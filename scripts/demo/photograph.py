@@ -35,7 +35,7 @@ def _run(program: str, scenes: dict[str, Callable[[], Scene]]) -> int:
     parser.add_argument("--relight", nargs="*", default=[], metavar="HDRI", help="Blender's HDRIs by name")
     options = parser.parse_args()
 
-    # Blender prints to the file descriptor: events keep a copy of it, Blender gets standard error.
+    # Blender prints to file descriptor 1. Events use a copy of it; descriptor 1 itself becomes standard error.
     events = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     # A signal is obeyed after the current view, so that the half-written folder is removed: Blender hangs when an exception leaves
@@ -55,7 +55,7 @@ def _run(program: str, scenes: dict[str, Callable[[], Scene]]) -> int:
         what = f"{name}: {what}" if options.name == "all" else what
         print(json.dumps({"event": "progress", "done": done, "total": total, "what": what}), file=events)
 
-    from scripts.demo.capture import write_capture  # after the descriptors are moved: importing bpy may print
+    from scripts.demo.capture import write_capture  # import only now, with redirected output: importing bpy may print
 
     numbers = (options.size, options.train, options.test, options.samples)
     try:

@@ -1,4 +1,4 @@
-"""The harness: what is trained, what becomes a table, what is kept; and that the page is what the kept figures make."""
+"""Test the benchmarks' harness: training, tables, the kept figures, and the page that is generated from them."""
 
 import json
 from argparse import ArgumentParser
@@ -29,7 +29,7 @@ def scenes(tmp_path):
 
 @pytest.fixture
 def called(monkeypatch):
-    """Commands of refgs that were called, which leave finished runs."""
+    """Replace calls of refgs by a fake that writes finished runs; return the list of commands that are called."""
     found = []
 
     def call(command: str, folder: Path, *words: object) -> int:

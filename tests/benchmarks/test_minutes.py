@@ -1,4 +1,4 @@
-"""What a preset had by a time, its start and its end counted."""
+"""Test finding the best PSNR that a preset had reached after so many seconds, with start and end of the run counted."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The paper's tables: which scenes are found, what of them is done again, and the figures side by side."""
+"""Test the benchmark of the paper's tables: the scenes it finds, the runs it repeats, and the figures side by side."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from tests.makers.captures import colmap, nero, shiny_blender
 
 
 def finish(run: Path, **figures: float) -> None:
-    """A run folder as it is after `refgs evaluate`."""
+    """Write a run folder as `refgs evaluate` leaves it."""
     run.mkdir(parents=True)
     (run / "run.toml").touch()
     (run / "splats.ply").touch()
@@ -20,7 +20,10 @@ def finish(run: Path, **figures: float) -> None:
 
 
 def test_the_papers_figures_are_its_means():
-    """Tables 5 and 6 of the paper give the means of Table 1 (its mean PSNR of Glossy Synthetic, 30.33, is not that of its scenes)."""
+    """Means of the figures kept from the paper's Table 1 agree with its Tables 5 and 6.
+
+    Only the mean PSNR of Glossy Synthetic, 30.33, differs from the mean of its scenes.
+    """
 
     def mean(data_set: str, measure: str) -> float:
         values = paper.PAPER[data_set][measure]
@@ -73,7 +76,7 @@ def test_nothing_there_is_said_in_one_line(tmp_path):
 
 
 def test_tables_of_finished_runs(tmp_path, capsys):
-    """Nothing is trained; a scene without LPIPS has none, and then there is no mean of it."""
+    """Tables are printed from finished runs without training. If a scene lacks LPIPS, its cell and the mean are empty."""
     data, out = tmp_path / "data", tmp_path / "runs"
     measured = {
         "shiny_blender/coffee": {
@@ -132,7 +135,7 @@ def test_a_scene_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, caps
 
 
 def test_from_photos_to_the_tables(tmp_path, monkeypatch, capsys):
-    """The ball of Shiny Blender as small as can be, in this process."""
+    """A tiny version of Shiny Blender's ball is trained, evaluated and printed, all in this process."""
     shiny_blender(tmp_path / "shiny_blender" / "ball")
     preset = tmp_path / "tiny.toml"
     preset.write_text(

@@ -1,4 +1,4 @@
-"""Files of a capture with ground truth agree with each other, with the true mesh and with the light."""
+"""Test captures with ground truth: their files agree with each other, the true mesh and the light."""
 
 import json
 import subprocess
@@ -46,7 +46,7 @@ def read(path):
 
 @pytest.fixture(scope="module")
 def rings(tmp_path_factory):
-    """Make scenes by `all` where the other scenes' folders exist already."""
+    """Run `all` where every scene's folder but that of `rings` exists; return the rings' folder and the process."""
     pytest.importorskip("bpy")
     out = tmp_path_factory.mktemp("all")
     for name in set(NAMES) - {"rings"}:
@@ -61,7 +61,7 @@ def passes(capture):
 
 
 def camera_rays(capture, per_side=1):
-    """Read the origin (3,), unit rays (SIZE·n, SIZE·n, 3) and the camera's axis from the file alone."""
+    """Compute a test view's origin (3,), unit rays (SIZE·n, SIZE·n, 3) and camera axis from transforms_test.json alone."""
     transforms = json.loads((capture[0] / "transforms_test.json").read_text())
     matrix = np.array(transforms["frames"][0]["transform_matrix"])
     focal = SIZE * per_side / 2 / np.tan(transforms["camera_angle_x"] / 2)
@@ -108,7 +108,7 @@ def test_depth_and_normals_are_the_true_mesh_seen_by_the_camera(capture):
 
     normals = mesh.face_normals[triangle]
     depth = (points - origin) @ axis
-    # Away from the silhouette a pixel's mean is close to what its centre sees.
+    # Away from the silhouette, a pixel's mean is close to the value at its centre.
     inner = (np.einsum("ij,ij->i", normals, -rays[ray]) > 0.4) & (alpha[ray] > 0.999)
     assert inner.sum() > 500
     assert np.abs(images["depth"].ravel()[ray] - depth)[inner].max() < 5e-3
@@ -134,7 +134,7 @@ def test_materials_are_where_they_belong(capture):
 
 
 def lookup(panorama, directions):
-    """Look up a panorama in Blender's orientation: u = 0.5 − atan2(y, x)/2π, v = 0.5 + asin(z)/π from below."""
+    """Read a panorama in directions, in Blender's orientation: u = 0.5 − atan2(y, x)/2π, v = 0.5 + asin(z)/π from the bottom."""
     height, width = panorama.shape[:2]
     u = 0.5 - np.arctan2(directions[..., 1], directions[..., 0]) / (2 * np.pi)
     v = 0.5 - np.arcsin(directions[..., 2].clip(-1, 1)) / np.pi
@@ -149,7 +149,7 @@ def test_the_mirror_shows_the_light_where_it_is(capture, light, picture):
     panorama, color = read(truth / light)[1], read(truth / picture)[1]
     per_side = 8
     origin, directions, _ = camera_rays(capture, per_side)
-    # The unit sphere, so hits and normals are known without the renderer.
+    # The object is the unit sphere: compute hits and normals by formula, without the renderer.
     along = directions @ -origin
     discriminant = along**2 - (origin @ origin - 1)
     distance = along - np.sqrt(discriminant.clip(0))
@@ -190,7 +190,7 @@ def pixel_means(values, per_side):
 
 
 def march(solid, origins, directions):
-    """March rays (n, 3) to a distance's surface: whether they meet it, and where they end."""
+    """March rays (n, 3) to the surface of a signed distance; return which rays hit it, and their end points."""
     along = np.zeros(len(directions))
     for _ in range(200):
         distance = solid(origins + directions * along[:, None])
@@ -202,7 +202,7 @@ def test_a_convex_object_is_never_in_its_own_way(capture):
     images = passes(capture)
     inner = images["alpha"] > 0.999
     assert (images["visibility"][inner] > 0.999).all()
-    # At the very edge a mirrored ray may start below the sphere's facets.
+    # At the silhouette a mirrored ray may start below the facets that approximate the sphere.
     assert images["visibility"][images["alpha"] > 0].mean() > 0.99
     assert not images["visibility"][images["alpha"] == 0].any()
 

@@ -1,4 +1,4 @@
-"""Run the cases of `refgs stability`, trainings among the slow tests, and the command."""
+"""Run every case of `refgs stability`, and the command itself. Cases that train are slow tests."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Benchmarks of kernels and cards run; what they print depends on the machine."""
+"""Test that the benchmarks of kernels and cards run; their figures depend on the machine."""
 
 from argparse import ArgumentParser
 from functools import partial
@@ -18,7 +18,7 @@ def bench():
 
 
 def test_the_cards_benchmark_runs(bench, capsys):
-    """All but the trainings, with the CPU for a card."""
+    """The card's benchmark runs on the CPU, all but its trainings."""
     gpu.measure_raster(bench, CPU, [(500, 60, 40)], rounds=2)
     gpu.measure_frames(bench, CPU, 500, 40, rounds=2)
     gpu.measure_iteration(bench, CPU, rounds=1)
@@ -35,7 +35,7 @@ def test_no_card_is_said(monkeypatch, capsys):
 
 
 def test_the_kernels_benchmark_runs(monkeypatch, bench):
-    """Small, on one instruction set."""
+    """A small version of the kernels' benchmark records every step, on one instruction set."""
     for name, value in {"SPLATS": 300, "SIDE": 24, "ROUNDS": 1}.items():
         monkeypatch.setattr(kernels, name, value)
     monkeypatch.setattr(kernels.load, "supported", lambda: ["sse4"])
@@ -50,12 +50,15 @@ def test_the_kernels_benchmark_runs(monkeypatch, bench):
 
 
 def test_covered_pairs_are_about_those_that_are_blended():
-    """A ball of faint surfels hides nothing: its pixels' alphas add up to what the areas say."""
+    """The estimated pairs of surfel and pixel are within 15 % of the blended ones.
+
+    Surfels are so transparent that none is occluded, so the sum of alpha gives the number of pairs.
+    """
     (positions, rotations, scales, _, _), camera = gpu.make_ball(2000, 200, 150, CPU)
     opacities = torch.full((2000,), 0.02)
     pairs = floors.covered_pairs([positions, rotations, scales, opacities, torch.zeros(2000, 1)], camera)
     raster = gpu.rasterize(positions, rotations, scales, opacities, torch.ones(2000, 1), camera, near=0.1)
-    # The mean alpha over a covered ellipse, where alpha falls from o to c: (o - c) / ln(o / c). Both halves of the ball count.
+    # Alpha falls from o to c across a covered ellipse; its mean is (o - c) / ln(o / c). Near and far side of the ball are both blended.
     mean = (0.02 - 1 / 255) / torch.log(torch.tensor(0.02 * 255))
     assert float(raster.features.sum() / mean) == pytest.approx(2 * pairs, rel=0.15)
 

@@ -55,7 +55,7 @@ def test_missing_normals_count_as_ninety_degrees_and_the_background_not_at_all()
     normals[5:] *= -1
     normals[0] = 0  # no normal
     rendered = alpha.copy()
-    rendered[1] = 0.05  # next to nothing rendered
+    rendered[1] = 0.05  # rendered almost transparent: counts as missing
     normals[2] = np.nan
     assert metrics.normal_mae_degrees(normals, reference, rendered, covered) == pytest.approx(90 * 3 / 5, abs=1e-5)
 
@@ -63,8 +63,9 @@ def test_missing_normals_count_as_ninety_degrees_and_the_background_not_at_all()
 def test_flip_of_flat_greys_is_the_papers_colour_distance():
     picture = RANDOM.uniform(0, 1, (32, 40, 3))
     assert metrics.flip(picture, picture) == 0
-    # Without features only colours count (Andersson et al. 2020, §4.1): the difference in lightness to the power 0.7, relative to the
-    # largest, between green and blue, 41.28; above 0.4 of it errors are compressed into 0.95 to 1.
+    # Andersson et al. 2020, §4.1: flat pictures have no features, so FLIP compares colours only. The colour error is the lightness
+    # difference to the power 0.7. It is divided by the largest error, 41.28, which is between green and blue. Shares above 0.4 are mapped
+    # to 0.95 … 1.
     black, white = np.zeros((32, 32, 3)), np.ones((32, 32, 3))
     largest = 41.28
     expected = 0.95 + 0.05 * (100**0.7 - 0.4 * largest) / (0.6 * largest)
@@ -111,13 +112,13 @@ def test_base_colours_are_aligned_by_one_scale_a_channel_for_all_views():
     tint = np.array([0.5, 0.8, 1.1])
     mask = RANDOM.uniform(size=(12, 10)) > 0.4
     wrong = truth * tint
-    wrong[:, ~mask] = 7  # not the object's
+    wrong[:, ~mask] = 7  # background pixels, which must not count
     result = metrics.aligned_psnr([metrics.channel_products(a, b, mask) for a, b in zip(wrong, truth, strict=True)])
     assert result["psnr_aligned"] == pytest.approx(100, abs=1e-6)
     assert result["scale"] == pytest.approx(1 / tint)
     by_hand = [-10 * np.log10(((a - b)[mask] ** 2).mean()) for a, b in zip(wrong, truth, strict=True)]
     assert result["psnr_raw"] == pytest.approx(np.mean(by_hand))
-    wrong[1] = truth[1] * 2 * tint  # no one scale suits both views
+    wrong[1] = truth[1] * 2 * tint  # the two views now need different scales
     result = metrics.aligned_psnr([metrics.channel_products(a, b, mask) for a, b in zip(wrong, truth, strict=True)])
     assert result["psnr_aligned"] < 30
 
@@ -157,7 +158,7 @@ def test_environment_error_ignores_scale_and_size_and_measures_the_log():
     error, scale = metrics.environment_log_rmse(np.repeat(np.repeat(light, 4, 0), 4, 1) * 0.25, light)
     assert error < 1e-5 and scale == pytest.approx(4, rel=1e-4)
     half = light.copy()
-    half[:, :16] *= np.exp(0.2)  # half the sphere by 0.2 in the log: ±0.1 once the scale is out
+    half[:, :16] *= np.exp(0.2)  # half the sphere is off by 0.2 in the log: the best scale leaves ±0.1
     error, _ = metrics.environment_log_rmse(half, light)
     assert error == pytest.approx(0.1, rel=0.05)
 
@@ -171,7 +172,10 @@ def test_environment_pixels_count_by_solid_angle():
 
 
 def lamps(turn=0.0, lift=0.0, height=64):
-    """Make a dim room with two lamps, the second half as bright, turned about the axis and raised by degrees."""
+    """Make a panorama of a dim room with two lamps, the second half as bright as the first.
+
+    The lamps are turned about the vertical by `turn` degrees and raised by `lift` degrees.
+    """
     rays = directions(height, 2 * height).astype(np.float64)
     light = np.full((height, 2 * height), 0.1)
     for azimuth, elevation, bright in ((40, 10, 20.0), (160, 35, 10.0)):
@@ -194,16 +198,16 @@ def test_lights_error_is_the_angle_they_are_off_whatever_the_scale():
     assert metrics.lights_error(3 * truth, truth) == (pytest.approx(0, abs=1e-3), 2)
     up, count = metrics.lights_error(lamps(lift=7), truth)
     assert up == pytest.approx(7, abs=0.1) and count == 2
-    # A turn about the axis moves a higher light by less; the first light counts twice.
+    # Turning about the vertical moves the higher lamp by a smaller angle. The first lamp counts twice: it is twice as bright.
     moved = [2 * np.degrees(np.arcsin(np.sin(np.radians(5)) * np.cos(np.radians(e)))) for e in (10, 35)]
     assert metrics.lights_error(lamps(turn=10), truth)[0] == pytest.approx((2 * moved[0] + moved[1]) / 3, abs=0.1)
-    # Compare panoramas of two sizes, half a turn about the vertical apart.
+    # Compare two panoramas of different sizes, both turned by 180 degrees about the vertical.
     turned = sample(lamps(height=100), directions(100, 200) * np.float32([-1, -1, 1]))
     assert metrics.lights_error(turned, lamps(turn=180))[0] < 0.2
 
 
 def test_a_light_that_was_not_found_counts_as_thirty_degrees_and_an_even_sky_has_none():
     truth = lamps()
-    without = np.minimum(truth, lamps(turn=60))  # neither lamp
+    without = np.minimum(truth, lamps(turn=60))  # both lamps are removed
     assert metrics.lights_error(without, truth)[0] == pytest.approx(30)
     assert metrics.lights_error(truth, np.ones((32, 64, 3))) is None

@@ -1,4 +1,4 @@
-"""Compare meshes with the true one."""
+"""Test the comparison of a mesh with the true mesh."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def ball(radius=1.0, subdivisions=5, centre=(0, 0, 0)):
 
 
 def camera(axis, distance=6.0):
-    """Place a camera that looks at the origin from ±axis · distance."""
+    """Place a camera at `distance` along an axis, looking at the origin; with a negative distance it looks away."""
     forward = -np.asarray(axis, float)
     right = np.cross(forward, [0.3, 0.5, 0.8])
     right /= np.linalg.norm(right)
@@ -37,7 +37,7 @@ def test_balls_of_nearly_one_radius_are_apart_by_the_difference():
     figures = surface.compare(ball(1.01), ball(), ALL_ROUND)
     assert figures["chamfer"] == pytest.approx(0.01, rel=0.02)
     assert figures["normal_consistency"] > 0.999
-    # The unit is the true mesh's radius: at four times the size the figure is the same.
+    # Errors are relative to the true mesh's radius, so a scene four times as large has the same figures.
     larger = [camera(c.position / 6, 24.0) for c in ALL_ROUND]
     assert surface.compare(ball(4.04), ball(4.0), larger) == pytest.approx(figures, rel=1e-3)
 
@@ -58,7 +58,7 @@ def test_what_no_camera_sees_is_left_out():
         np.concatenate([truth.faces, inner.faces + len(truth.vertices)]),
     )
     assert surface.compare(hollow, truth, ALL_ROUND)["chamfer"] < 1e-3
-    # From above alone half a ball is as good as a whole one.
+    # A camera above sees only the upper half, so half a ball has no error there.
     upper = truth.faces[truth.vertices[truth.faces][..., 2].min(axis=1) > -0.05]
     half = Mesh(truth.vertices, upper)
     assert surface.compare(half, truth, [camera(np.eye(3)[2])])["chamfer"] < 1e-3
@@ -72,6 +72,6 @@ def test_seen_points_are_those_on_the_cameras_side():
     seen = surface.seen(mesh, points, [camera(np.eye(3)[0])], 1e-3)
     assert seen[points[:, 0] > 1 / 6 + 0.05].all() and not seen[points[:, 0] < 1 / 6 - 0.05].any()
     near = surface.seen(mesh, points, [camera(np.eye(3)[0], 2.0)], 1e-3)
-    # The picture ends at a tangent of 0.32 at the sides, 0.45 in the corners; beyond it nothing is seen.
+    # The field of view ends at a tangent of 0.32 at the sides and 0.45 in the corners. Points outside it are not seen.
     aside = np.linalg.norm(points[:, 1:], axis=1) / (2.0 - points[:, 0])
     assert near[(points[:, 0] > 0.6) & (aside < 0.31)].all() and not near[aside > 0.46].any()

@@ -30,7 +30,7 @@ def test_materials_come_back_where_they_were(unwrapped):
 
 
 def test_the_normal_map_mends_a_coarse_mesh():
-    # Bend the normals of the faces' corners: in a shader the map has to undo the bend.
+    # Disturb the vertex normals: the normal map has to correct them when it is shaded.
     mesh = ball(2)
     rng = np.random.default_rng(0)
     mesh.normals = mesh.normals + 0.15 * rng.normal(size=mesh.normals.shape)
@@ -57,7 +57,10 @@ def test_the_normal_map_mends_a_coarse_mesh():
 
 @pytest.mark.parametrize("size", [128, 320])
 def test_how_many_rows_are_baked_at_a_time_does_not_matter(unwrapped, monkeypatch, size):
-    """Composite all texels of a small texture, and fewer ones, enlarged afterwards, of a large one."""
+    """Baking in chunks of 37 rows gives the same textures as baking all rows at once.
+
+    A small texture is composited at every texel; a large one at a lower resolution, then enlarged.
+    """
     splats, found = sphere_of_splats(300), []
     for rows in (37, size):
         monkeypatch.setattr("refgs.export.bake._ROWS", rows)
@@ -113,7 +116,7 @@ def test_far_or_transparent_splats_still_give_colour(unwrapped):
 
 
 def test_normals_are_those_of_the_point_not_of_the_splats_middle(unwrapped):
-    # Where splats are few and uneven, the mean of those that a ray meets lies beside the ray.
+    # With few, uneven splats, the mean of the splats that a ray meets lies beside the ray.
     splats = sphere_of_splats(3000)
     rng = np.random.default_rng(3)
     some = rng.permutation(3000)[:1500]
@@ -131,7 +134,7 @@ def test_normals_are_those_of_the_point_not_of_the_splats_middle(unwrapped):
 
 
 def test_the_nearer_layer_hides_the_farther(unwrapped):
-    """Both layers face outward: the outer one covers the inner one and is not blended with it."""
+    """Only the outer of two outward-facing layers shows in the texture; the inner one is not blended in."""
     outer, inner = sphere_of_splats(), sphere_of_splats(radius=0.96)
     outer.opacities[:], inner.opacities[:] = 0.95, 0.95
     inner.albedo[:] = 0

@@ -1,4 +1,4 @@
-"""Splats for viewers without lights look as the run does, in the properties that such viewers read."""
+"""Test the splats for viewers without lights: they look like the run and have the properties that such viewers read."""
 
 import shutil
 
@@ -22,12 +22,12 @@ from tests.makers.splats import make
 
 @pytest.fixture(scope="module")
 def run(ball_capture, tmp_path_factory):
-    """Open the run of a metal ball, rough above and smooth below, under a sky."""
+    """Open the run of a metal ball under a sky; its upper half is rough, its lower half smooth."""
     return open_run(write_run(tmp_path_factory.mktemp("display") / "run", read_capture(ball_capture)))
 
 
 def quality(run, splats, cameras):
-    """Compute the PSNR of splats, rendered by their colours alone, against the run's own rendering."""
+    """Render splats by their colours alone; return the mean PSNR against the run's own rendering."""
     settings = run.settings.render.model_copy(update={"shading": "sh"})
     background = torch.tensor(run.settings.image.background)
     values = []
@@ -86,7 +86,7 @@ def test_splats_alone_are_exported_unless_the_mesh_is_named(run, tmp_path, monke
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_run_of_few_splats_leaves_in_every_format(run, tmp_path, monkeypatch, count):
-    """No splats, or one, make no mesh: an error says so. The other formats are written."""
+    """A run of no splats, or of one, is written in every format but the mesh, which is refused with an error."""
     monkeypatch.setattr("refgs.export.display.ITERATIONS", 3)
     folder = tmp_path / "des éclats, été"
     shutil.copytree(run.folder, folder, ignore=shutil.ignore_patterns("mesh.glb"))

@@ -1,4 +1,4 @@
-"""Move a mesh that is too small, or sticks out, to the outlines of the pictures."""
+"""Test fitting a mesh to the outlines in the rendered pictures."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def cameras(count=12):
 
 
 def unit_sphere(camera):
-    """Render the unit sphere's coverage."""
+    """Render the unit sphere: its alpha and nothing else."""
     y, x = np.mgrid[:SIDE, :SIDE] + 0.5 - SIDE / 2
     edge = FOCAL / np.sqrt(DISTANCE**2 - 1)
     alpha = torch.from_numpy((edge - np.hypot(x, y) + 0.5).clip(0, 1).astype(np.float32))
@@ -57,7 +57,8 @@ def test_what_sticks_out_is_pulled_in():
     grown = fit_to_outlines(mesh, unit_sphere, cameras(24), VOXEL)
     reached = np.linalg.norm(grown.vertices, axis=1)
     assert abs(reached[~bump].mean() - 1) < 0.15 * VOXEL
-    assert reached[bump].mean() < 1 + VOXEL  # it would be 2.5 voxels out if it moved as far as the rest
+    # If the bump moved outwards as far as the rest, it would end 2.5 voxels outside the sphere.
+    assert reached[bump].mean() < 1 + VOXEL
 
 
 def test_without_a_background_nothing_moves():

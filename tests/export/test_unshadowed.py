@@ -1,4 +1,4 @@
-"""Take a known shadow out of base colours."""
+"""Test removing a known shadow from base colours."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,10 @@ from tests.makers.occluders import bowl, even, mirrors, surfels
 
 @pytest.mark.parametrize("albedo", [0.1, 0.5, 0.8])
 def test_the_shadow_of_a_bowl_goes(albedo, monkeypatch):
-    """Any point of half a sphere receives x = 1/2 + albedo x / 2, so its learned base colour is albedo · x. Metals keep theirs."""
+    """The base colour learned in a bowl, albedo · x, is corrected to the albedo. Metals keep their base colour.
+
+    Every point of half a sphere receives the light x = 1/2 + albedo · x / 2.
+    """
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
     seen = surfels(points, normals, albedo * 0.5 / (1 - albedo / 2))
@@ -32,7 +35,7 @@ def test_what_is_convex_stays_as_it_is():
 
 
 def test_the_dark_is_not_made_white():
-    """Hardly any light gets between two plates that nearly touch: the correction is bounded there."""
+    """Between two plates that nearly touch, base colours are brightened by at most 1 / LEAST."""
     low, high = (trimesh.creation.box((2, 2, 0.1)) for _ in range(2))
     low.apply_translation([0, 0, -0.05])
     high.apply_translation([0, 0, 0.11])

@@ -1,4 +1,4 @@
-"""Charts cover the surface, do not overlap, and are evenly dense."""
+"""Test unwrapping: charts cover the whole surface, do not overlap, and have an even texel density."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_it_is_the_same_surface(bumpy, unwrapped):
 
 
 def test_nothing_overlaps(unwrapped):
-    """No point of the square lies in two triangles, and no triangle is flipped."""
+    """No point of the texture lies in two triangles, and no triangle is flipped."""
     size, count = 1024, np.zeros((1024, 1024), int)
     for corners in unwrapped.uv[unwrapped.faces] * size:
         low, high = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)

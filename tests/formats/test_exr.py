@@ -30,7 +30,7 @@ def test_the_file_says_what_it_is(tmp_path):
 
 
 def test_of_several_parts_the_first_in_colour_is_read(tmp_path):
-    """Renderers write depth, and both eyes of a stereo camera, as parts of one file."""
+    """In a file of several parts (depth, left eye, right eye) the first part with colours is read."""
 
     def part(name, channels):
         header = {"name": name, "type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}

@@ -1,4 +1,4 @@
-"""On a full or read-only disk the old file stays, and nothing is left beside it."""
+"""Test writing to a full or read-only disk: the old file stays, and no partial file is left."""
 
 import dataclasses
 import errno
@@ -28,7 +28,7 @@ def noisy_box(path, side):
     write_glb(path, mesh, Textures(**noise))
 
 
-WRITERS = {  # `size` is in thousands of bytes, at least
+WRITERS = {  # each writes at least `size` thousand bytes
     "splats.ply": lambda path, size: write_splats(path, make(10 * size)),
     "display.ply": lambda path, size: write_display_splats(path, make(10 * size)),
     "environment.exr": lambda path, size: write_exr(path, RNG.random((2 * size, 4 * size, 3))),

@@ -100,7 +100,7 @@ def test_blender_imports_it_upright_with_the_right_material(written):
     assert bend.type == "NORMAL_MAP" and bend.space == "TANGENT"
     assert source(bend.inputs["Color"])[1].colorspace_settings.name == "Non-Color"
 
-    # Blender's tangents are those that the normal map was baked for.
+    # The normal map was baked for `vertex_tangents`: Blender must compute the same tangents.
     data = found.data
     data.calc_tangents()
     turn = np.array(found.matrix_world.to_3x3())

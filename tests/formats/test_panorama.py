@@ -20,7 +20,7 @@ def test_half_float_panoramas_are_read(tmp_path):
 
 
 def test_six_known_directions():
-    # +x is in the middle, +y a quarter turn to its left, +z at the top: what Blender's background shader looks up.
+    # Blender's orientation of a world's background: +x in the middle, +y a quarter turn to its left, +z at the top.
     grid = directions(180, 360)
     np.testing.assert_allclose(np.linalg.norm(grid, axis=-1), 1, atol=1e-6)
     for row, column, expected in [
@@ -56,14 +56,14 @@ def test_sampling_is_smooth_across_the_seam_and_finite_at_the_poles():
 
 @pytest.fixture
 def seen(tmp_path):
-    """Render the world's panorama in a direction (x, y, z) by Cycles."""
+    """Return a function that renders a panorama by Cycles, seen in a direction (x, y, z)."""
     bpy = pytest.importorskip("bpy")
     mathutils = pytest.importorskip("mathutils")
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     world = scene.world = bpy.data.worlds.new("light")
     world.use_nodes = True
-    world.cycles.sampling_method = "NONE"  # nothing stands in its light
+    world.cycles.sampling_method = "NONE"  # no object is lit, so importance sampling is not needed
     tree = world.node_tree
     texture = tree.nodes.new("ShaderNodeTexEnvironment")
     tree.links.new(texture.outputs["Color"], tree.nodes["Background"].inputs["Color"])

@@ -1,4 +1,4 @@
-"""Read PLY files of other programs, and broken ones."""
+"""Test reading PLY files of other programs, and damaged files."""
 
 import subprocess
 import sys
@@ -32,7 +32,7 @@ LAYOUTS = {
 
 
 def table(names, count=COUNT, kind="<f4"):
-    """Make rows as trainings write them: quaternions of any length, zero normals."""
+    """Make PLY rows as 3D Gaussian trainings write them: quaternions of any length, zero normals."""
     rng = np.random.default_rng(3)
     rows = np.empty(count, [(name, kind) for name in names])
     for name in names:
@@ -75,7 +75,8 @@ def test_other_programs_splats(tmp_path, layout):
     np.testing.assert_allclose(covariances(ours), covariances(rows), rtol=1e-4, atol=1e-5)
     write_display_splats(tmp_path / "display.ply", splats)
     shown = PlyData.read(str(tmp_path / "display.ply"))["vertex"].data
-    thin = 3e-3 * np.exp(2 * np.minimum(rows["scale_0"], rows["scale_1"]))  # the squared third scale that discs get
+    # The squared thickness that flat splats are given.
+    thin = 3e-3 * np.exp(2 * np.minimum(rows["scale_0"], rows["scale_1"]))
     slack = 1e-5 if splats.scales.shape[1] == 3 else thin[:, None, None] + 1e-5
     assert (np.abs(covariances(shown) - covariances(rows)) <= slack + 1e-4 * np.abs(covariances(rows))).all()
     for name in ("f_dc_1", "f_rest_17"):
@@ -130,7 +131,7 @@ def test_what_is_unknown_is_kept(tmp_path):
     vertex = PlyElement.describe(both, "vertex", **listed)
     PlyData([PlyElement.describe(faces, "face"), vertex], byte_order="<").write(str(tmp_path / "a.ply"))
     write_splats(tmp_path / "b.ply", read_splats(tmp_path / "a.ply"))
-    write_splats(tmp_path / "b.ply", read_splats(tmp_path / "b.ply"))  # over what it was read from
+    write_splats(tmp_path / "b.ply", read_splats(tmp_path / "b.ply"))  # overwrite the file that was read
     again = PlyData.read(str(tmp_path / "b.ply"))
     assert again.byte_order == "<" and [e.name for e in again.elements] == ["vertex", "face"]
     for name in ("semantic", "confidence"):
@@ -219,7 +220,7 @@ def test_our_own_lacks_nothing(tmp_path):
 
 @pytest.mark.parametrize("format", ["text", "<", ">"])
 def test_no_damage_is_a_fault_of_ours(tmp_path, format):
-    """Change, remove and insert random bytes, mostly in the header: the result is a one-line error, or finite splats."""
+    """A damaged file gives a one-line error or finite splats. Random bytes, mostly of the header, are changed, removed or inserted."""
     rng = np.random.default_rng(7)
     rows = table(LAYOUTS["2DGS"], 6)
     face = PlyElement.describe(np.array([([0, 1, 2],)], [("vertex_indices", "O")]), "face")

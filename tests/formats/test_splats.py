@@ -38,7 +38,7 @@ def test_layout_is_what_other_programs_expect(tmp_path):
         + ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
         + ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
     )
-    # f_rest: red's fifteen higher coefficients, then green's, then blue's.
+    # f_rest holds the fifteen higher coefficients of red, then those of green, then of blue.
     np.testing.assert_array_equal(vertex["f_rest_2"], splats.sh[:, 3, 0])
     np.testing.assert_array_equal(vertex["f_rest_15"], splats.sh[:, 1, 1])
     np.testing.assert_allclose(vertex["scale_1"], np.log(splats.scales[:, 1]), rtol=1e-6)

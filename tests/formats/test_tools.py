@@ -1,4 +1,4 @@
-"""Open our files in the programs that tests/tools/package.json names."""
+"""Open exported files in other programs, which tests/tools/package.json lists."""
 
 import json
 import shutil
@@ -35,13 +35,13 @@ def said(*words, folder=TOOLS):
 
 
 def transform(source, target, *words):
-    """Convert by PlayCanvas's splat-transform on the CPU."""
+    """Convert a splat file by PlayCanvas's splat-transform, on the CPU."""
     program = TOOLS / "node_modules" / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
     return said(program, "-q", "-w", "-g", "cpu", "--max-workers", "0", source, *words, target)
 
 
 def discs(count=COUNT, degree=3):
-    """Make surfels of all sizes and orientations, with colours by direction."""
+    """Make random surfels of many sizes and orientations, with spherical harmonics."""
     rng = np.random.default_rng(5)
     turn = Rotation.random(count, random_state=5)
     values = {
@@ -61,16 +61,16 @@ def discs(count=COUNT, degree=3):
     return Splats(**{name: value.astype(np.float32) for name, value in values.items()})
 
 
-# Tolerances by a format's ending: positions, log scales, degrees, opacities, the constant colour, and the RMS of what harmonics add to it.
-# They follow from how the format stores numbers:
+# Tolerances by file extension: position, log scale, rotation in degrees, opacity, constant colour, RMS of the higher harmonics.
+# They follow from how each format stores these numbers:
 QUANTISED = {
     # 32-bit floats
     ".ply": (0, 1e-5, 0.02, 1e-5, 0, 0),
-    # 11 bits of a chunk's 2 units; 10 and 11 of its log scales; quaternions of 10; 8 of opacity, colour and harmonics
+    # bits: position 11 (of a chunk 2 units wide), log scale 10 and 11, quaternion 10, opacity, colour and harmonics 8
     ".compressed.ply": (1e-3, 1e-3, 0.2, 2e-3, 2e-3, 0.01),
-    # 16 bits of log positions; 256 log scales and colours, and 256 kinds of harmonics for all; quaternions and opacity of 8 bits
+    # 16 bits for log positions; tables of 256 log scales, 256 colours and 256 sets of harmonics; quaternion and opacity 8 bits
     ".sog": (5e-5, 0.02, 2.2, 4e-3, 5e-3, 0.05),
-    # 12 bits of a unit; sixteenths of log scales; quaternions of 10 bits; 8 of opacity and colour; 4 and 5 of harmonics
+    # position 1/4096; log scale 1/16; bits: quaternion 10, opacity and colour 8, harmonics 4 and 5
     ".spz": (1.25e-4, 0.032, 0.2, 2e-3, 4e-3, 0.05),
 }  # fmt: skip
 
@@ -84,7 +84,7 @@ def test_display_splats_in_other_formats_and_back(tmp_path, ending):
         assert there.stat().st_size < 0.6 * (tmp_path / "des éclats.ply").stat().st_size
     transform(there, tmp_path / "back.ply")
     before, after = (read_splats(tmp_path / name) for name in ("des éclats.ply", "back.ply"))
-    # Formats reorder the splats.
+    # Converting may reorder the splats: match them by position.
     nearest = cKDTree(after.positions).query(before.positions)[1]
     assert len(after) == COUNT and len(np.unique(nearest)) == COUNT
     position, scale, angle, opacity, colour, direction = QUANTISED[ending]
@@ -107,7 +107,10 @@ def test_few_splats_open_too(tmp_path, count):
 
 
 def test_gltf_of_splats(tmp_path):
-    """KHR_gaussian_splatting as splat-transform writes it: activated values, and upright where docs/formats.md's turn is asked for."""
+    """The glTF file that splat-transform writes (KHR_gaussian_splatting) holds activated values.
+
+    It is upright with the rotation that docs/formats.md recommends.
+    """
     splats = discs()
     write_display_splats(tmp_path / "a.ply", splats)
     transform(tmp_path / "a.ply", tmp_path / "a.glb", "-r", "-90,0,0")
@@ -130,9 +133,8 @@ def test_gltf_of_splats(tmp_path):
     order = cKDTree(values("KHR_gaussian_splatting:SCALE", 3)).query(scales)[1]
     np.testing.assert_allclose(values("KHR_gaussian_splatting:SCALE", 3)[order], scales, rtol=1e-5)
     x, y, z = splats.positions.T
-    np.testing.assert_allclose(
-        values("POSITION", 3)[order], np.stack([-x, z, y], axis=1), atol=1e-6
-    )  # +Y is up in glTF
+    # glTF's up axis is +Y.
+    np.testing.assert_allclose(values("POSITION", 3)[order], np.stack([-x, z, y], axis=1), atol=1e-6)
     np.testing.assert_allclose(values("KHR_gaussian_splatting:OPACITY", 1)[order, 0], splats.opacities, atol=1e-5)
     np.testing.assert_allclose(
         values("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0", 3)[order], splats.sh[:, 0], atol=1e-6

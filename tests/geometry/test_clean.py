@@ -66,14 +66,17 @@ def test_an_empty_mesh_is_explained():
 
 
 def test_smooth_normals_do_not_depend_on_the_triangulation():
-    # Angle weights: a cube's corner normal is its diagonal, however its square faces are cut.
+    # Faces are weighted by their angle, so a cube's corner normal is the diagonal for any triangulation of its sides.
     cube = trimesh.creation.box()
     normals = smooth_normals(cube.vertices, cube.faces)
     np.testing.assert_allclose(normals, cube.vertices / np.linalg.norm(cube.vertices, axis=1, keepdims=True), atol=1e-9)
 
 
 def test_no_edge_has_three_faces():
-    """Simplify a sheet of nearly no thickness, and two that cross: simplifying folds them so that edges touch."""
+    """No edge has more than two faces after simplifying a very thin sheet, and two thin sheets that cross.
+
+    Simplification folds such sheets until edges touch.
+    """
     rng = np.random.default_rng(0)
     sheet = ball(level=6)
     sheet.vertices[:, 2] *= 0.002

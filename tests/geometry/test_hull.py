@@ -18,8 +18,11 @@ def degrees(a, b):
 
 
 def expected(masks, cameras, low, high, resolution):
-    """Carve in float64 with every view: the smallest mask of each voxel, the second smallest, all, and the voxel's distance to the
-    nearest picture border in pixels."""
+    """Carve in float64 with every view.
+
+    Return for each voxel: the smallest mask value, the second smallest, the values of all views, and the distance in pixels to the
+    nearest picture border.
+    """
     grid = np.stack(np.meshgrid(*((np.arange(resolution) + 0.5) / resolution,) * 3, indexing="ij"), axis=-1)
     points, values, border = low + grid * (high - low), [], np.full(3 * (resolution,), np.inf)
     seen = np.zeros(border.shape, int)
@@ -49,7 +52,11 @@ def expected(masks, cameras, low, high, resolution):
 
 @pytest.mark.parametrize("isa", supported())
 def test_carving_matches_float64(isa, monkeypatch):
-    """Masks are noise of several sizes, seen from all sides, from within and in part. The voxel count is no multiple of a vector."""
+    """Carved values match float64 to 1e-4.
+
+    Masks are noise of several sizes. Some cameras are inside the volume and some see only a part of it. The number of voxels is no
+    multiple of the vector width.
+    """
     monkeypatch.setenv("REFGS_ISA", isa)
     rng = np.random.default_rng(0)
     cameras = [look_at(view.position * (0.2 if i % 5 == 0 else 0.7), 64, view.name) for i, view in enumerate(VIEWS)]
@@ -78,18 +85,18 @@ def test_points_lie_evenly_on_the_hull_of_a_sphere():
     assert abs(distance.mean()) < 0.2 * VOXEL
     angle = degrees(normals, gradient(sphere, positions))
     assert angle.mean() < 2.5 and angle.max() < 12
-    # On an even hexagonal pattern 2000 points are this far apart; distances of random points vary by a third.
+    # `even` is the spacing of 2000 points in a hexagonal pattern. The spacing of random points would vary by a third.
     even = np.sqrt(4 * np.pi / 2000 * 2 / np.sqrt(3))
     assert 0.8 * even < spacing.mean() < 1.05 * even
     assert spacing.std() < 0.2 * spacing.mean()
 
 
 def test_some_points_lie_inside():
-    """Inner points are even in volume and take the normals of the nearest surface."""
+    """Inner points fill the volume evenly and take the normal of the nearest surface point."""
     positions, normals, _ = visual_hull_points(DISCS, VIEWS, (0.1, 0, -0.1), 1.5, 4000, resolution=48, on_hull=1000)
     assert positions.shape == normals.shape == (4000, 3)
     assert np.abs(sphere(positions[:1000])).max() < VOXEL
-    radius = np.linalg.norm(positions[1000:], axis=1)  # of a ball of radius 1 about the origin
+    radius = np.linalg.norm(positions[1000:], axis=1)  # the hull is a ball of radius 1 about the origin
     assert radius.max() < 1 + 2 * VOXEL and abs((radius**3).mean() - 0.5) < 0.05
     deep = radius > 0.3
     assert degrees(normals[1000:][deep], positions[1000:][deep] / radius[deep, None]).mean() < 10

@@ -8,7 +8,7 @@ CORNERS = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), axis=-1)
 
 
 def blocks_about(sdf, blocks, band=6.0):
-    """Choose, of a cube of blocks, those within `band` voxels of the surface; return them and their signed distances."""
+    """Return the blocks of a cube whose centres are within `band` voxels of the surface, and their signed distances."""
     block = np.stack(np.meshgrid(*[np.arange(blocks)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     block = block[np.abs(sdf(BLOCK * block + BLOCK / 2)) < band]
     return block, sdf(BLOCK * block[:, None] + CORNERS).astype(np.float32)
@@ -19,7 +19,7 @@ def ball(centre, radius):
 
 
 def test_it_is_the_surface_of_the_whole_grid_across_chunks():
-    """Eight chunks of 64 voxels give the same vertices and faces as marching cubes on the whole grid."""
+    """A surface across eight chunks of 64³ voxels has the vertices of marching cubes on the whole grid, and as many faces."""
     sdf = ball([63.7, 64.2, 60.1], 40.3)
     mesh = isosurface(*blocks_about(sdf, 32))
     grid = np.stack(np.meshgrid(*[np.arange(128)] * 3, indexing="ij"), axis=-1)
@@ -32,7 +32,7 @@ def test_it_is_the_surface_of_the_whole_grid_across_chunks():
 
 
 def test_a_surface_on_the_planes_between_chunks_has_no_cracks():
-    """Surfaces pass through voxel centres, where a vertex lies on many edges at once."""
+    """A surface that passes exactly through voxel centres is watertight. There a vertex lies on many edges at once."""
     for middle, radius in ((64.0, 32.0), (64.0, 20.5), (63.5, 30.0)):
         mesh = isosurface(*blocks_about(lambda p, m=middle, r=radius: np.abs(p - m).max(axis=-1) - r, 32))
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -42,7 +42,7 @@ def test_a_surface_on_the_planes_between_chunks_has_no_cracks():
 
 
 def test_space_between_costs_nothing():
-    """Mesh two distant balls: a grid around both would take 17 TB."""
+    """Two balls far apart are meshed from their own blocks; a grid around both would take 17 TB."""
     block, signed = blocks_about(ball([30.0, 30.0, 30.0], 12.0), 16)
     far = 4096
     mesh = isosurface(np.concatenate([block, block + far]), np.concatenate([signed, signed]))

@@ -1,4 +1,4 @@
-"""Trace rays against shapes whose answer is known, at scales far from one and places far from the origin."""
+"""Trace rays against shapes whose visibility is known, at extreme scales and far from the origin."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,10 @@ def directions(count: int, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_nothing_is_hidden_on_a_sphere(scale, moved):
-    """Directions go down to one degree above the horizon, on meshes inside and outside the sphere."""
+    """No ray from a sphere is occluded, down to one degree above the horizon.
+
+    The mesh is slightly smaller, as large, or slightly larger than the sphere.
+    """
     normals, towards = directions(20_000), directions(20_000, seed=1)
     tangent = np.cross(normals, towards)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -35,7 +38,7 @@ def test_nothing_is_hidden_on_a_sphere(scale, moved):
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_two_plates_that_face_each_other(scale, moved):
-    """From the lower plate exactly the directions through the upper square are occluded."""
+    """From the lower plate, exactly the directions that meet the upper plate are occluded."""
     occluder = placed(trimesh.util.concatenate(plate(0.0, 1), plate(1.0, -1)), scale, moved)
     rng = np.random.default_rng(3)
     points = np.concatenate([rng.uniform(-0.9, 0.9, (20_000, 2)), np.zeros((20_000, 1))], axis=1)
@@ -53,7 +56,7 @@ def test_two_plates_that_face_each_other(scale, moved):
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_the_inside_of_a_bowl(scale, moved):
-    """From the pole of half a sphere, directions within 45° of the axis are free."""
+    """From the bottom of a half sphere, exactly the directions within 45° of its axis are free."""
     ball = trimesh.creation.icosphere(5)
     bowl = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0][:, ::-1], process=False)
     occluder = placed(bowl, scale, moved)
@@ -61,12 +64,13 @@ def test_the_inside_of_a_bowl(scale, moved):
     ways = ways[ways[:, 2] > 0.05]
     pole = np.tile([0.0, 0.0, -1.0], (len(ways), 1))
     found = occluder.visible(pole * scale + moved, -pole, ways)
-    sharp = np.abs(ways[:, 2] - np.sqrt(0.5)) > 0.03  # the rim is a polygon's, and rays start above the pole
+    # Leave out directions near the rim: it is a polygon, and rays start slightly above the bottom.
+    sharp = np.abs(ways[:, 2] - np.sqrt(0.5)) > 0.03
     np.testing.assert_array_equal(found[sharp], ways[sharp, 2] > np.sqrt(0.5))
 
 
 def test_a_point_below_the_mesh_is_not_in_its_shadow():
-    """Surfels may lie inside the mesh that was fused from them."""
+    """Points inside the mesh are not occluded by it: surfels may lie below the mesh that was fused from them."""
     normals = directions(2000)
     occluder = placed(trimesh.creation.icosphere(5), 1.0, 0.0)
     assert occluder.visible(0.8 * normals, normals, normals).all()

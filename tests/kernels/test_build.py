@@ -1,4 +1,4 @@
-"""Compile, cache and choose the kernels."""
+"""Test compiling, caching and choosing the CPU kernels."""
 
 import subprocess
 import sys
@@ -10,7 +10,7 @@ from refgs.kernels import load
 from refgs.kernels.build import TARGETS, build, target
 from tests.makers.layouts import asserted
 
-# Every run compiles the widest instruction set of each platform; each takes 20 seconds of a core.
+# A usual test run compiles only the widest instruction set of each platform; each takes 20 seconds on one core.
 EVERY = [
     pytest.param(system, machine, isa, marks=[] if isa == [*isas][-1] else pytest.mark.slow)
     for (system, machine), (_, _, isas) in TARGETS.items()
@@ -28,7 +28,7 @@ def test_compiles_for_every_platform_with_the_layouts_of_python(system, machine,
     assert content.startswith(MAGIC[wanted.extension])
     for name in (b"refgs_forward", b"refgs_backward", b"refgs_ssim_backward"):
         assert name in content
-    assert [p.name for p in cache.iterdir()] == [library.name]  # nothing left over
+    assert [p.name for p in cache.iterdir()] == [library.name]  # no temporary files are left
     made = library.stat().st_mtime_ns
     assert build(wanted, cache) == library and library.stat().st_mtime_ns == made
 

@@ -1,4 +1,7 @@
-"""Compile and cache the kernels for CUDA cards. The `device` fixture tests what they compute, emulated and on a card."""
+"""Test compiling and caching the kernels for CUDA cards.
+
+Tests that use the `device` fixture check what these kernels compute, emulated and on a card.
+"""
 
 import pytest
 
@@ -7,7 +10,7 @@ from tests.makers.layouts import asserted
 
 pytest.importorskip("cuda.bindings.nvrtc", reason="NVIDIA has nothing for this system")
 
-# Every run compiles for the oldest and the newest; each takes 25 seconds of a core.
+# A usual test run compiles only for the oldest and the newest architecture; each takes 25 seconds on one core.
 BETWEEN = [pytest.param(name, marks=pytest.mark.slow) for name in ("sm_80", "sm_86", "sm_89", "sm_90")]
 ARCHITECTURES = ["sm_75", *BETWEEN, "sm_120"]
 ELF = b"\x7fELF"

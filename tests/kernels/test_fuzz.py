@@ -1,4 +1,4 @@
-"""Fuzz the kernels by hypothesis over the ranges of docs/stability.md, against float64."""
+"""Fuzz the kernels with hypothesis over the ranges in docs/stability.md, compared with float64."""
 
 import math
 
@@ -70,7 +70,7 @@ ANYTHING = st.floats(allow_nan=False, width=32)
 @FUZZ
 @given(st.lists(st.tuples(*[ANYTHING] * 9), min_size=1, max_size=6), st.floats(0, 1, width=32))
 def test_rasteriser_takes_any_number(rows, opacity):
-    """The picture stays finite, with infinite and denormal numbers too."""
+    """The picture is finite for any float32 but NaN, also infinite and denormal numbers."""
     rows = torch.tensor(rows)
     position, rotation, scale = (v.contiguous().requires_grad_() for v in rows.split((3, 4, 2), dim=1))
     opacities = torch.full((len(rows),), opacity).requires_grad_()
@@ -85,16 +85,15 @@ MATERIALS = {
     "roughness": st.one_of(st.none(), st.floats(0.01, 0.07), st.floats(0.66, 0.99)),
     "albedo": st.one_of(st.none(), st.floats(0, 1)),
     "grazing": st.one_of(st.none(), powers(-7, -0.5)),
-    "light": st.one_of(
-        st.tuples(st.just(0.0), powers(-12, 3)), st.tuples(powers(0, 6), st.just(1.0))
-    ),  # the radiance of a sun; a factor of all radiance
+    # The sun's radiance, and a factor for all radiance.
+    "light": st.one_of(st.tuples(st.just(0.0), powers(-12, 3)), st.tuples(powers(0, 6), st.just(1.0))),
 }
 
 
 def shaded(light, **how) -> None:
     how |= {"sun": light[0], "scale": light[1]}
-    # Look-ups round by 1e-6 of a texel: beside a sun of 1e6 that is as bright as the sky, 3e-3 in sRGB, and more of the little
-    # that a black metal mirrors.
+    # Cubemap look-ups round by 1e-6 of a texel. Beside a sun of radiance 1e6 this error is as large as the sky's radiance: 3e-3 in sRGB.
+    # It is larger still, relative to the result, for a black metal, which reflects little.
     most = 3e-5 if light[0] == 0 else 3e-2
     try:
         check(lit(**how), most)
@@ -131,7 +130,7 @@ SSIM_C2 = 9e-4
 
 
 @FUZZ
-@example(1.0, 1.0, 1e-5, 0)  # nearly constant
+@example(1.0, 1.0, 1e-5, 0)  # nearly constant images
 @given(st.floats(0, 1), st.floats(0, 1), powers(-6, 0), st.integers(0, 9))
 def test_dssim(one, other, spread, seed):
     generator = torch.Generator().manual_seed(seed)
@@ -140,14 +139,13 @@ def test_dssim(one, other, spread, seed):
     expected = reference.dssim(exact, target.double())
     (exact_by,) = torch.autograd.grad(expected, exact)
     found, by = dssim(image, target)
-    assert abs(float(found) - float(expected.detach())) < 1e-4  # variances are differences of squares
-    rounding = (
-        4 * torch.finfo(torch.float32).eps / (SSIM_C2 * image.numel())
-    )  # of the same terms, in the derivative of a mean
+    assert abs(float(found) - float(expected.detach())) < 1e-4  # variances cancel: they are differences of squares
+    # Rounding of the same cancelling terms, in the derivative of a mean.
+    rounding = 4 * torch.finfo(torch.float32).eps / (SSIM_C2 * image.numel())
     assert float((by - exact_by).abs().max()) < 2e-2 * float(exact_by.abs().max()) + rounding
 
 
-# A card's NaN; the processor's has no low bits.
+# NaN as a CUDA card writes it; a CPU's NaN has zeros in its low bits.
 CARDS_NAN = float(np.uint32(0x7FFFFFFF).view(np.float32))
 
 
@@ -155,7 +153,7 @@ CARDS_NAN = float(np.uint32(0x7FFFFFFF).view(np.float32))
 @example([CARDS_NAN] * 20)
 @given(st.lists(st.floats(width=32), min_size=1, max_size=20))
 def test_activations(numbers):
-    """NaN stays NaN. All else is finite, within its range, and monotonic in the raw value."""
+    """NaN stays NaN. Other raw values give activated values that are finite and monotonic."""
     raw = torch.tensor(sorted(numbers, key=lambda x: (math.isnan(x), x)))
     count = len(raw)
     rest = ("position", "rotation", "sh_dc", "sh_rest", "received", "indirect_dc", "indirect_rest")

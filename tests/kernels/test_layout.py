@@ -1,4 +1,7 @@
-"""Structures that Python reads from the C++ sources. test_build.py and test_cuda.py have the compilers check their layouts."""
+"""Test reading structures from the C++ sources into ctypes.
+
+In test_build.py and test_cuda.py the compilers check that the layouts agree.
+"""
 
 import ctypes
 import functools
@@ -38,7 +41,7 @@ struct alignas(16) Base {
 
 @pytest.fixture
 def sources(monkeypatch, tmp_path):
-    """A folder of sources of the test's own."""
+    """Return an empty folder that is read in place of the kernels' sources."""
     monkeypatch.setattr(layout, "HERE", tmp_path)
     for name in ("_text", "_made"):
         monkeypatch.setattr(layout, name, functools.cache(getattr(layout, name).__wrapped__))
@@ -101,6 +104,6 @@ def test_wrong_layout_is_found(declared, other, said, tmp_path, monkeypatch):
     monkeypatch.setattr(build, "SOURCES", ["normals.cpp"])
     with pytest.raises(RuntimeError, match=f"{said}\\b"):
         build.build(build.target("linux", "x86_64", "sse4"), tmp_path)
-    if importlib.util.find_spec("cuda"):  # NVIDIA has nothing for some systems
+    if importlib.util.find_spec("cuda"):  # not available for every system
         with pytest.raises(RuntimeError, match=f"{said}\\b"):
             cuda.compile_source("normals.cpp", "sm_86")

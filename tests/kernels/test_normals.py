@@ -1,4 +1,4 @@
-"""Compare facing normals with torch in float64."""
+"""Compare the kernel for facing normals (turned towards the camera) with torch in float64."""
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ def surfels(count: int = 1000) -> tuple[Tensor, Tensor]:
 
 
 def expected(rotations: Tensor, positions: Tensor, camera) -> tuple[Tensor, Tensor]:
-    """Compute facing normals and cosines."""
+    """Compute in float64 the normals turned towards the camera, and their cosines with the view."""
     normals = reference.rotation_matrices(rotations)[..., 2]
     towards = reference.unit(torch.from_numpy(camera.position) - positions.double())
     cosine = (normals.detach() * towards).sum(dim=-1, keepdim=True)

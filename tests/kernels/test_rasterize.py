@@ -1,4 +1,4 @@
-"""Compare the rasteriser with the float64 reference; check determinism, ties, empty and absurd input."""
+"""Compare the rasteriser with the float64 reference. Check determinism, surfels of equal depth, empty and extreme input."""
 
 import functools
 import gc
@@ -18,15 +18,18 @@ from tests.makers import scenes
 from tests.makers.emulate import emulate
 
 NAMES = ("positions", "rotations", "scales", "opacities", "features")
-# Leave out pixels that depend on a comparison (of alpha with its cut-off, of transmittance with its end …) closer than this: float32 may
-# decide it differently. Their share of the picture is checked.
+# Thresholds (of alpha, of transmittance …) may be decided differently in float32. Pixels where a compared value is within MARGIN of
+# its threshold are left out. Tests check that these pixels are few.
 MARGIN = 1e-4
 FORWARD, GRADIENT = 1e-5, 1e-4
 
 
 @functools.cache
 def case(kind: str, channels: int, size: tuple[int, int] = (45, 30), centre: tuple[float, float] | None = None):
-    """Make inputs, camera, and the reference's maps, safe pixels, upstream gradients and gradients."""
+    """Make inputs, a camera and upstream gradients; return them with the reference's maps, safe pixels and gradients.
+
+    Safe pixels do not depend on a close comparison.
+    """
     camera, inputs = scenes.camera(*size, centre), scenes.surfels(kind, channels)
     exact = [v.double().requires_grad_() for v in inputs]
     *maps, margin = reference.rasterize(*exact, camera, scenes.NEAR)
@@ -38,7 +41,7 @@ def case(kind: str, channels: int, size: tuple[int, int] = (45, 30), centre: tup
 
 
 def run(device, inputs: tuple[Tensor, ...], camera, upstream: list[Tensor]) -> tuple[Raster, tuple[Tensor, ...]]:
-    """Rasterise on a device; return maps and gradients on the CPU."""
+    """Rasterise on a device; return the maps and gradients, moved to the CPU."""
     inputs = [v.to(device, copy=True).requires_grad_() for v in inputs]
     raster = rasterize(*inputs, camera, near=scenes.NEAR)
     gradients = torch.autograd.grad(raster, inputs, [u.to(device) for u in upstream])
@@ -46,7 +49,7 @@ def run(device, inputs: tuple[Tensor, ...], camera, upstream: list[Tensor]) -> t
 
 
 def check(device, inputs, camera, maps, safe, upstream, gradients) -> None:
-    """Check maps and gradients; errors are relative to the largest value of the same tensor."""
+    """Check maps and gradients against the reference's; errors are relative to a tensor's largest value."""
     assert safe.float().mean() > 0.9
     raster, found = run(device, inputs, camera, upstream)
     for name, value, expected in zip(raster._fields, raster, maps, strict=True):
@@ -74,7 +77,7 @@ def test_any_number_of_channels(channels, device):
         ("mixed", (17, 40), None),
         ("mixed", (33, 20), (-25.0, 60.0)),
         ("mixed", (1, 1), None),
-        ("huge", (140, 130), None),  # each in up to 81 tiles, and CUDA's warps add up more than 64 together
+        ("huge", (140, 130), None),  # each surfel covers up to 81 tiles; a CUDA warp sums more than 64
     ],
 )
 def test_any_image(kind, size, centre, device):
@@ -89,7 +92,7 @@ def test_trimmed_depth_matches_reference(kind, trim, device):
     _, depth, alpha, margin = reference.rasterize(*exact, exact[-1][:, None], camera, scenes.NEAR, *trim)
     found = [m.cpu() for m in trimmed_depth(*(v.to(device) for v in inputs), camera, scenes.NEAR, *trim)]
     part = trim[0] - (1 - alpha).clamp(*trim[::-1])
-    safe = (margin > MARGIN) & ((part > 0.01) | (part == 0))  # a small part has few digits in float32
+    safe = (margin > MARGIN) & ((part > 0.01) | (part == 0))  # a small part keeps few digits in float32
     assert safe.float().mean() > 0.85 and part[safe].max() > 0.05
     expected = torch.where(part > 0, depth / part, 0)[safe]
     assert (found[0][safe] - expected).abs().max() <= 1e-4 * expected.max()
@@ -97,7 +100,10 @@ def test_trimmed_depth_matches_reference(kind, trim, device):
 
 
 def test_trimmed_depth_is_that_of_the_surface(device):
-    """Fog before the surface, and a disc a thousand times as far behind it, move the mean depth but not the trimmed one."""
+    """Trimmed depth is the surface's depth, in spite of fog in front and a disc 1000 times as far behind.
+
+    Both move the mean depth.
+    """
     camera = replace(scenes.camera(9, 9, (4.5, 4.5)), world_to_camera=np.eye(4))
     depths, opacities = torch.tensor([0.5, 0.7, 2.0, 2000.0]), torch.tensor([0.1, 0.1, 0.9, 0.9])
     positions = torch.stack([0 * depths, 0 * depths, depths], dim=1)
@@ -109,14 +115,14 @@ def test_trimmed_depth_is_that_of_the_surface(device):
 
 
 def test_more_tiles_than_16_bits_number(monkeypatch):
-    """Images of more than eight million pixels have as many."""
+    """More tiles than 16 bits can number are sorted correctly. Images of over eight million pixels have so many."""
     emulate(monkeypatch)
     monkeypatch.setattr(raster_cuda, "SHORT", 0)
     check(torch.device("cpu"), *case("mixed", 3, (33, 20), (-25.0, 60.0)))
 
 
 def test_instruction_sets_differ(monkeypatch):
-    """REFGS_ISA, on which the tests above rely, picks another library."""
+    """Each value of REFGS_ISA loads another library; the tests above rely on this."""
     paths = set()
     for isa in load.supported():
         monkeypatch.setenv("REFGS_ISA", isa)
@@ -125,7 +131,7 @@ def test_instruction_sets_differ(monkeypatch):
 
 
 def test_reference_gradients():
-    """Check the reference's own derivatives by finite differences."""
+    """The reference's derivatives agree with finite differences."""
     inputs, camera, *_ = case("mixed", 2, (11, 8))
     picked = slice(None, None, 12)
     exact = [v[picked].double().requires_grad_() for v in inputs]
@@ -194,7 +200,7 @@ def test_absurd_input_stays_finite(device):
     far = torch.arange(n) % 3 == 0
     position[far] = (sign * sizes[torch.randint(len(sizes), (n, 3))])[far]
     rotation = torch.randn(n, 4) * sizes[torch.randint(len(sizes), (n, 1))].clamp_max(1e37)
-    rotation[::5] = torch.tensor([1.0, 0, 0, 0])  # many exactly edge-on for a camera that is not turned
+    rotation[::5] = torch.tensor([1.0, 0, 0, 0])  # many are exactly edge-on for an unrotated camera
     opacity = torch.rand(n)
     opacity[::7], opacity[1::7], opacity[2::7] = 0, 1, 1e-45
     for camera in (scenes.camera(), scenes.camera(1, 40)):
@@ -209,7 +215,7 @@ def test_absurd_input_stays_finite(device):
 
 
 def test_exactly_edge_on_is_a_dot(device):
-    """The low-pass filter alone draws a disc that is seen exactly edge-on, at its centre's depth."""
+    """A disc seen exactly edge-on is drawn by the low-pass filter alone, at the depth of its centre."""
     camera = scenes.camera(9, 9, (4.5, 4.5))
     centre = torch.tensor(camera.camera_to_world @ [0, 0, 2, 1], dtype=torch.float64)[:3]
     right, down, forward = camera.camera_to_world[:3, :3].T
@@ -218,7 +224,7 @@ def test_exactly_edge_on_is_a_dot(device):
     inputs = centre.float()[None], rotation[None], torch.full((1, 2), 0.3), torch.ones(1), torch.ones(1, 1)
     raster = Raster(*(m.cpu() for m in rasterize(*(v.to(device) for v in inputs), camera, near=0.1)))
     y, x = torch.meshgrid(torch.arange(9) - 4.0, torch.arange(9) - 4.0, indexing="ij")
-    expected = torch.exp(-4 * (x**2 + y**2)).clamp_max(0.99)  # a variance of 1/8
+    expected = torch.exp(-4 * (x**2 + y**2)).clamp_max(0.99)  # the low-pass filter: a Gaussian of variance 1/8
     off_the_line = y != 0
     expected = torch.where(expected >= 1 / 255, expected, 0)
     assert torch.allclose(raster.alpha[off_the_line], expected[off_the_line], atol=1e-5)

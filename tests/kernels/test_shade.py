@@ -1,4 +1,4 @@
-"""Compare deferred shading with the float64 reference, and with the white furnace."""
+"""Compare deferred shading with the float64 reference; test that a white surface conserves energy (white furnace)."""
 
 import functools
 
@@ -14,7 +14,7 @@ from refgs.render.shade import mirror_directions, shade, shade_splats
 from tests.makers import scenes
 
 NAMES = ("features", "alpha", "levels", "exposure")
-# Leave pixels nearer to a kink than this out of the gradients; their share is checked.
+# Shading has kinks, where derivatives jump. Pixels within MARGIN of one are left out of the gradients; tests check that they are few.
 MARGIN = 1e-4
 FORWARD, GRADIENT = 1e-5, 1e-4
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
@@ -23,7 +23,7 @@ TURN = reference.rotation_matrices(torch.tensor([[0.8, 0.3, -0.4, 0.5]], dtype=t
 
 
 class Light:
-    """Hold what `shade` reads of an Environment, as leaves."""
+    """Stand-in for an Environment, whose levels and exposure are leaves with gradients."""
 
     def __init__(self, dtype: torch.dtype, device: torch.device | str = "cpu", resolution: int = 16):
         generator = torch.Generator().manual_seed(2)
@@ -37,8 +37,10 @@ class Light:
 
 
 def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
-    """Make random maps that change over five pixels, displaced by up to ten; a third is empty. `colours` stand between material
-    and position."""
+    """Make random maps of features and alpha that vary over five pixels; a third of the pixels is empty.
+
+    The features are normal, material, `colours` colours by direction, and position. Positions are displaced by up to ten pixels.
+    """
     generator = torch.Generator().manual_seed(1)
 
     def smooth(values: Tensor) -> Tensor:
@@ -63,7 +65,7 @@ def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
 
 
 def visible(alpha: Tensor) -> Tensor:
-    """Make random visibility: free, occluded and partial."""
+    """Make a random visibility map with free, occluded and partly occluded pixels."""
     return (2 * torch.rand(alpha.shape, generator=torch.Generator().manual_seed(4)) - 0.5).clamp(0, 1)
 
 
@@ -100,7 +102,7 @@ def run(
     device: torch.device,
     by_direction: bool = False,
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Shade on a device; return maps and gradients on the CPU."""
+    """Shade on a device; return the maps and gradients, moved to the CPU."""
     light = Light(torch.float32, device)
     leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels, light.exposure]
     visibility = None if visibility is None else visibility.to(device)
@@ -126,7 +128,10 @@ def test_matches_reference(indirect, appearance, size, device):
 
 @pytest.mark.parametrize("how", ["display", "mirror", "matte"])
 def test_other_ways_match_reference(how, device):
-    """Compare display colours (not encoded), mirrors (metallic is their share) and matte surfaces."""
+    """Display colours, mirrors and matte surfaces match the reference.
+
+    Display colours are not encoded as sRGB. For mirrors, metallic is the share of mirrored light.
+    """
     by_direction = how != "matte"
     camera, (features, alpha), *_ = case(by_direction, False, (45, 30))
     features = features if by_direction else features[..., :6].contiguous()
@@ -178,7 +183,7 @@ def test_surfels_match_reference(count, more, device):
 
 
 def test_mirror_directions(device):
-    """Compare with directions of the reference's blended normals."""
+    """The mirror directions are those about the reference's blended normals, and zero where nothing is covered."""
     camera, (features, alpha), _, maps, _, _, _ = case(False, True, (37, 70))
     covered = alpha > reference.COVERED
     normal, ray = reference.unit(maps[1][covered]), reference.unit(scenes.camera_rays(camera)[covered].double())
@@ -206,7 +211,7 @@ def test_same_bits_from_call_to_call(device):
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-10, 1e10, 1e30])
 def test_gradients_of_any_size(scale, device):
-    """Integer sums hold gradients of any size, and small ones beside large ones."""
+    """Gradients are summed as integers: tiny, huge, and tiny beside huge ones keep their precision."""
     camera, inputs, visibility, _, _, upstream, gradients = case(False, False, (37, 70))
     _, by = run(camera, inputs, visibility, [u * scale for u in upstream], device)
     for value, expected in zip(by, gradients, strict=True):
@@ -215,12 +220,12 @@ def test_gradients_of_any_size(scale, device):
     for u in mixed:
         u[:35] *= 1e-6
     small, large = (b for b in (run(camera, inputs, visibility, u, device)[1][0] for u in (mixed, upstream)))
-    reach = slice(0, 35 - 10)  # rows that nothing below reaches
+    reach = slice(0, 35 - 10)  # rows out of reach of the large gradients below
     assert (1e6 * small[reach] - large[reach]).abs().max() <= GRADIENT * large[reach].abs().max()
 
 
 def test_upstream_that_is_no_number(device):
-    """The gradients are no number then, the maps are."""
+    """NaN or infinite upstream gradients make the gradients not finite; the maps stay finite."""
     camera, inputs, visibility, _, _, upstream, _ = case(False, False, (45, 30))
     for wrong in (float("nan"), float("inf")):
         for u in (given := [u.clone() for u in upstream]):
@@ -239,7 +244,7 @@ def test_nothing_there(device):
 
 
 def test_one_pixel(device):
-    """One pixel, a row and a column have no neighbours to interpolate."""
+    """A single pixel, a row and a column are shaded although they lack neighbours to interpolate."""
     light, mean = Light(torch.float32, device), torch.tensor([0, 0, -1, 0.5, 0.5, 0.5, 0, 0.5, 0, 0, 3.0])
     for size in ((1, 1), (1, 5), (5, 1)):
         camera = Camera("small", *size, 50, 50, size[0] / 2, size[1] / 2, torch.eye(4, dtype=torch.float64).numpy())
@@ -252,7 +257,7 @@ def test_one_pixel(device):
 
 
 def white_ball(metallic: float, roughness: float, side: int = 64) -> Tensor:
-    """Shade a white ball under a light of one, seen by an orthographic camera."""
+    """Shade a white ball under a light of radiance 1, seen by a nearly orthographic camera."""
     camera = Camera("far", side, side, 1e4, 1e4, side / 2, side / 2, torch.eye(4, dtype=torch.float64).numpy())
     y, x = torch.meshgrid(*[(torch.arange(side) + 0.5) / side * 2 - 1] * 2, indexing="ij")
     inside = x**2 + y**2 < 1
@@ -268,6 +273,9 @@ def white_ball(metallic: float, roughness: float, side: int = 64) -> Tensor:
 @pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("roughness", [0.0, 0.1, 0.3, 0.6, 1.0])
 def test_white_furnace(metallic, roughness):
-    """Under a light of one a white surface sends out one at every angle; multiple bounces count."""
+    """Under a light of radiance 1, a white surface has radiance 1 at every angle, to 0.001.
+
+    This includes light that bounces several times between microfacets.
+    """
     radiance = white_ball(metallic, roughness)
     assert float(radiance.max()) <= 1 + 1e-3 and float(radiance.min()) >= 1 - 1e-3

@@ -1,4 +1,4 @@
-"""Compare D-SSIM with plain torch in float64."""
+"""Compare the D-SSIM kernel with plain torch in float64."""
 
 import pytest
 import torch
@@ -24,7 +24,10 @@ def test_matches_float64(shape, likeness, device):
 
 
 def test_flat_images(device):
-    """Variances far below C2 are small differences of squares: float32 keeps fewer digits."""
+    """D-SSIM of flat images is within 1e-4 of float64, the gradient within 0.5 %.
+
+    Variances far below C2 are small differences of squares, of which float32 keeps fewer digits.
+    """
     image, target = torch.full((30, 30, 3), 0.9), torch.full((30, 30, 3), 0.8)
     exact = image.double().requires_grad_()
     expected = reference.dssim(exact, target.double())

@@ -1,4 +1,4 @@
-"""Compare activations, stacking and screen motion of surfels with torch in float64."""
+"""Compare the kernels that activate, stack and track surfels on screen with torch in float64."""
 
 import numpy as np
 import pytest

@@ -19,7 +19,7 @@ BOX = trimesh.creation.box((1.0, 1.4, 0.8)).subdivide().subdivide()
 
 
 def write_run(folder, capture):
-    """Write the run of a metal ball, rough above and smooth below, with a box for its mesh."""
+    """Write the run folder of a metal ball; its upper half is rough, its lower half smooth, its mesh a box."""
     create_run(folder, capture, load_settings("quick", ["environment.resolution=16"]), "quick", "cpu")
     steps = np.arange(3000) + 0.5
     z, azimuth = 1 - 2 * steps / len(steps), steps * np.pi * (3 - np.sqrt(5))
@@ -31,7 +31,7 @@ def write_run(folder, capture):
     write_splats(folder / "splats.ply", splats)
     write_exr(folder / "environment.exr", sky(directions(64, 128)))
     box = BOX.copy()
-    box.vertices = box.vertices[:, [0, 2, 1]] * [1, 1, -1]  # glTF's axes: Y up
+    box.vertices = box.vertices[:, [0, 2, 1]] * [1, 1, -1]  # glTF's up axis is +Y
     box.export(folder / "mesh.glb")
     cameras = json.loads((folder / "cameras.json").read_text())
     cameras["to_capture"] = [*np.hstack([SCALE * TURN, MOVE[:, None]]).tolist(), [0, 0, 0, 1]]

@@ -10,7 +10,7 @@ SIZE = 64
 
 
 def textured_box():
-    """Make a box of 2 × 4 × 6 that stands on the ground, with one value a texture."""
+    """Make a box of 2 × 4 × 6 units that stands on the ground, and its textures: a colour ramp, the others constant."""
     box = trimesh.creation.box((2, 4, 6)).subdivide()
     vertices = np.array(box.vertices) + np.array([0, 0, 3])
     mesh = unwrap(Mesh(vertices, np.array(box.faces), smooth_normals(vertices, box.faces)))

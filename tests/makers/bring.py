@@ -1,4 +1,4 @@
-"""Make wheels as the extension brings them, with a fake uv."""
+"""Make the wheels that the extension contains, with a fake uv."""
 
 import sys
 import zipfile
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def bring(folder: Path, version: str = "9.9") -> Path:
-    """Write the wheels of a trainer and of the fake uv; return their folder."""
+    """Write an empty wheel for the trainer and a wheel of the fake uv; return their folder."""
     folder = folder / f"wheels {version}"
     folder.mkdir()
     (folder / f"refgs-{version}-py3-none-any.whl").touch()

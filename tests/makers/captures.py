@@ -14,7 +14,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return camera-to-world with OpenGL axes; +Z is up."""
+    """Return the camera-to-world matrix, with OpenGL axes, of a camera that looks at the origin; +Z is up."""
     back = (position - target) / np.linalg.norm(position - target)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -24,7 +24,7 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def ring(count: int = 16, distance: float = 3.0, centre: np.ndarray = CENTRE) -> list[np.ndarray]:
-    """Return poses around the ball at alternating heights."""
+    """Return camera poses on a ring around the ball, at alternating heights."""
     poses = []
     for i in range(count):
         azimuth, elevation = 2 * np.pi * i / count, (0.2, 0.9)[i % 2]
@@ -56,7 +56,7 @@ def ball_normals(pose: np.ndarray, width: int, height: int, focal: float, centre
 
 
 def write(path: Path, image: np.ndarray) -> None:
-    """Write an image, RGB(A) or grey, 8 or 16 bits, in the format of the path's suffix. Non-ASCII paths work, too."""
+    """Write an image in the format of the path's suffix: RGB, RGBA or grey, 8 or 16 bits. Paths may have non-ASCII characters."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if image.ndim == 3:
         image = image[..., [2, 1, 0, 3][: image.shape[2]]]
@@ -64,7 +64,7 @@ def write(path: Path, image: np.ndarray) -> None:
 
 
 def edit(file: Path, change) -> None:
-    """Rewrite a JSON file after `change(data)`."""
+    """Read a JSON file, change its data by `change(data)`, and write it again."""
     data = json.loads(file.read_text())
     change(data)
     file.write_text(json.dumps(data))
@@ -83,7 +83,7 @@ def nerf_blender(folder: Path, splits: dict[str, int] | None = None) -> Path:
 
 
 def nerfstudio(folder: Path, count: int = 16, poses: list[np.ndarray] | None = None) -> Path:
-    """Make a capture with shared intrinsics and PNGs without alpha or masks."""
+    """Write a Nerfstudio capture with shared intrinsics, whose PNGs have neither alpha nor masks."""
     frames = []
     for i, pose in enumerate(poses or ring(count)):
         write(folder / "images" / f"{i:04d}.png", ball(pose, 64, 48, 60.0)[..., :3])
@@ -99,7 +99,7 @@ def colmap(
     model: tuple[int, str, list[float]] = (1, "PINHOLE", [60.0, 60.0, 32.0, 24.0]),
     count: int = 16,
 ) -> Path:
-    """Make a sparse model with one camera, `count` images and 50 points on the ball."""
+    """Write a COLMAP capture: a sparse model with one camera, `count` images and 50 points on the ball."""
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
     rng = np.random.default_rng(0)
@@ -136,7 +136,7 @@ def colmap(
 
 
 def shiny_blender(folder: Path) -> Path:
-    """Make a capture like Ref-NeRF's scene `ball`: opaque photos, with NAME_alpha.png, world-space normals and disparities."""
+    """Write a capture like Ref-NeRF's scene `ball`: opaque photos, NAME_alpha.png, world-space normals and disparities."""
     nerf_blender(folder)
     for split in ("train", "test"):
         frames = json.loads((folder / f"transforms_{split}.json").read_text())["frames"]
@@ -154,7 +154,10 @@ def shiny_blender(folder: Path) -> Path:
 
 
 def nero(folder: Path, count: int = 16, split: tuple[list, list] | None = None, protocol: int = 4) -> Path:
-    """Make a scene of Glossy Synthetic: opaque photos, 16-bit depth, cameras as pickles; the split lies beside it."""
+    """Write a capture like a scene of NeRO's Glossy Synthetic: opaque photos, 16-bit depth, pickled cameras.
+
+    The file with the split lies beside the scene's folder.
+    """
     folder.mkdir(parents=True)
     for i, pose in enumerate(ring(count)):
         image = ball(pose, 64, 48, 60.0)

@@ -1,4 +1,4 @@
-"""Shapes with a signed distance, and the maps that cameras around them see."""
+"""Signed distances of simple shapes; depth and masks of them as seen by cameras."""
 
 import numpy as np
 
@@ -19,14 +19,14 @@ def torus(p: np.ndarray) -> np.ndarray:
 
 
 def gradient(sdf, p: np.ndarray) -> np.ndarray:
-    """Compute the outward normal at points of the surface."""
+    """Compute outward unit normals at points of the surface, by central differences."""
     step = 1e-4 * np.eye(3)
     g = np.stack([sdf(p + step[a]) - sdf(p - step[a]) for a in range(3)], axis=-1)
     return g / np.linalg.norm(g, axis=-1, keepdims=True)
 
 
 def look_at(eye, size: int, name: str = "view") -> Camera:
-    """Place a camera at `eye`, looking at the origin, 40 degrees wide."""
+    """Place a camera at `eye` that looks at the origin, with a field of view of 40 degrees."""
     eye = np.asarray(eye, float)
     forward = -eye / np.linalg.norm(eye)
     up = np.array([0, 0, 1.0]) if abs(forward[2]) < 0.99 else np.array([0, 1.0, 0])
@@ -40,7 +40,7 @@ def look_at(eye, size: int, name: str = "view") -> Camera:
 
 
 def around(count: int, size: int, distance: float = 4.5) -> list[Camera]:
-    """Spread cameras over a whole sphere."""
+    """Place cameras evenly on a whole sphere, all looking at the origin."""
     i = np.arange(count) + 0.5
     z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
     ring = np.sqrt(1 - z * z)
@@ -49,7 +49,10 @@ def around(count: int, size: int, distance: float = 4.5) -> list[Camera]:
 
 
 def depth(camera: Camera, sdf) -> tuple[np.ndarray, np.ndarray]:
-    """Trace spheres through pixel centres: depth along the camera's axis and coverage, (H, W) float32 each."""
+    """Sphere-trace a signed distance through pixel centres.
+
+    Return depth along the camera's axis and coverage, (H, W) float32 each.
+    """
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
     rays = rays @ camera.world_to_camera[:3, :3]
@@ -62,6 +65,6 @@ def depth(camera: Camera, sdf) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mask(camera: Camera, sdf) -> np.ndarray:
-    """Compute coverage (H, W) with edges a pixel wide."""
+    """Compute the mask (H, W) of a shape; its edges are antialiased with 2 × 2 samples a pixel."""
     fine = depth(camera.resized(2 * camera.width, 2 * camera.height), sdf)[1]
     return fine.reshape(camera.height, 2, camera.width, 2).mean((1, 3))

@@ -1,4 +1,4 @@
-"""Run CUDA kernels on the CPU: compile the card's sources with CUDA's language emulated (emulator.h)."""
+"""Run the CUDA kernels on the CPU: compile their sources as C++ with emulator.h, which emulates CUDA's language."""
 
 import ctypes
 import functools
@@ -24,7 +24,7 @@ def _library(source: str) -> ctypes.CDLL:
     digest = hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
     file = Path(tempfile.gettempdir()) / "refgs-emulated" / f"{Path(source).stem}-{digest}.so"
     file.parent.mkdir(exist_ok=True)
-    with FileLock(file.with_suffix(".lock")):  # the other test process compiles the same source
+    with FileLock(file.with_suffix(".lock")):  # another test process may compile the same source
         if not file.exists():
             made = file.with_suffix(".part")
             words = ["-include", str(EMULATOR), "-x", "c++", str(HERE / source), "-o", str(made)]
@@ -40,6 +40,6 @@ def _launch(name: str, work: ctypes.Structure, device, blocks: int, threads: int
 
 
 def emulate(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Treat tensors on the CPU as a card's: CUDA's kernels and their callers run on them."""
+    """Make CPU tensors count as CUDA tensors, so that the emulated CUDA kernels and their callers run on them."""
     monkeypatch.setattr(load, "on_gpu", lambda tensor: True)
     monkeypatch.setattr(cuda, "launch", _launch)

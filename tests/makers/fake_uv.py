@@ -1,4 +1,7 @@
-"""Stand in for uv and print its lines. FAKE_UV names a failure: "hang" while fetching, "network", "full", "mute" (silent)."""
+"""Stand in for uv and print its lines.
+
+The variable FAKE_UV names a failure: "hang" (while fetching), "network", "full" (disk), "mute" (the trainer never answers).
+"""
 
 import json
 import os

@@ -1,4 +1,8 @@
-"""Speak the job protocol without training. The capture's name says how: "good", "newer", "crash", "noise", "bare", "slow"."""
+"""Speak the job protocol without training.
+
+The capture's name chooses the behaviour: "good", "crash", "noise" (lines that are no events), "bare" (photos without cameras), "slow".
+The variable FAKE chooses "newer": a newer protocol.
+"""
 
 import json
 import os
@@ -65,7 +69,7 @@ def learn(command, asked, out):
             say("progress", **facts, loss=0.1, psnr=20 + iteration / 100, splats=10)
             if iteration in (100, 1000):
                 say("measured", iteration=iteration, seconds=iteration / 100, psnr_test=19 + iteration / 100)
-            elif iteration == 500:  # no time to look at held-out views
+            elif iteration == 500:  # a measurement without held-out views
                 say("measured", iteration=iteration, seconds=iteration / 100)
     (out / "progress.json").unlink()
     (out / "splats.ply").touch()
@@ -73,7 +77,7 @@ def learn(command, asked, out):
 
 
 def png(grey):
-    """Make a picture of one pixel."""
+    """Make a PNG of one grey pixel."""
     chunks = (b"IHDR", b"\0\0\0\1\0\0\0\1\x08\0\0\0\0"), (b"IDAT", zlib.compress(bytes([0, grey]))), (b"IEND", b"")
     parts = (
         len(data).to_bytes(4, "big") + name + data + zlib.crc32(name + data).to_bytes(4, "big") for name, data in chunks
@@ -82,7 +86,7 @@ def png(grey):
 
 
 def check(command):
-    """Write two cameras, four units from the origin on either side, and their photos."""
+    """Answer a check: write two cameras on opposite sides of the origin, four units away, and their photos."""
     out, frames = Path(command["out"]), []
     out.mkdir(parents=True, exist_ok=True)
     for number, side in enumerate((1, -1)):
@@ -121,7 +125,7 @@ def main():
     def asked():
         with lock:
             taken = heard[:]
-            heard[:] = [None] if None in heard else []  # an ended job stays ended
+            heard[:] = [None] if None in heard else []  # None, the end of the input, stays in the list
         return taken
 
     threading.Thread(target=listen, daemon=True).start()

@@ -1,4 +1,4 @@
-"""Write Python's layouts of the kernels' structures as assertions for the C++ compilers."""
+"""Write the layouts that Python has of the kernels' structures as static assertions for the C++ compilers."""
 
 import ctypes
 import re
@@ -20,18 +20,18 @@ OFFSET = """
 
 
 def used() -> list[tuple[str, str]]:
-    """List the structures that Python asks for: the name and the source of each."""
+    """List the structures that Python code reads, as pairs of name and C++ source."""
     files = [file for folder in ("backend", "benchmarks") for file in (ROOT / folder).rglob("*.py")]
     return sorted({pair for file in files for pair in re.findall(r'\bstruct\("(\w+)", "([\w.]+)"\)', file.read_text())})
 
 
 def fields(made: type[ctypes.Structure]) -> list[tuple[str, type]]:
-    """List the fields of a structure, its bases' among them."""
+    """List the names and types of a structure's fields, including those of its bases."""
     return [field for part in made.__mro__ if "_fields_" in vars(part) for field in part._fields_]
 
 
 def assertions(made: type[ctypes.Structure]) -> str:
-    """Assert the size of a structure, and the offset and the size of each field; of structures among the fields, too."""
+    """Return static assertions of a structure's size and of each field's offset and size, nested structures included."""
     name = made.__name__
     lines = [f'static_assert(sizeof({name}) == {ctypes.sizeof(made)}, "size of {name}");']
     for field, kind in fields(made):
@@ -45,11 +45,11 @@ def assertions(made: type[ctypes.Structure]) -> str:
 
 
 def asserted(folder: Path) -> Path:
-    """Copy the kernels' sources to a new folder, where they assert the layouts of all structures that Python asks for."""
+    """Copy the kernels' sources to a new folder, with assertions of the layout of every structure that Python reads."""
     shutil.copytree(HERE, folder, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
     for name, source in used():
         text = assertions(struct(name, source))
-        if (name, source) == ("Raster", "raster.h"):  # the CPU's; raster.cu has its own
+        if (name, source) == ("Raster", "raster.h"):  # for the CPU only; raster.cu has its own
             text = f"#ifndef __CUDACC__\n{text}\n#endif"
         with (folder / source).open("a", encoding="utf-8") as file:
             file.write(f"{OFFSET}{text}\n")

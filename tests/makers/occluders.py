@@ -1,4 +1,4 @@
-"""Make shapes that occlude each other, where the answer is known."""
+"""Make shapes that occlude themselves or each other, with a known visibility."""
 
 import functools
 
@@ -15,7 +15,7 @@ from refgs.render import relight
 
 
 def plate(z: float, up: int) -> trimesh.Trimesh:
-    """Make the square of half-side 1 at a height, in 2 × 20² triangles, facing up (1) or down (-1)."""
+    """Make a square of side 2 at height `z`, in 2 × 20² triangles, that faces up (1) or down (-1)."""
     at = np.linspace(-1, 1, 21)
     x, y = np.meshgrid(at, at, indexing="ij")
     corner = (np.arange(20)[:, None] * 21 + np.arange(20)).ravel()
@@ -26,7 +26,7 @@ def plate(z: float, up: int) -> trimesh.Trimesh:
 
 @functools.cache
 def bowl() -> tuple[Occluder, np.ndarray, np.ndarray]:
-    """Make the inside of half a sphere, of radius 1 below z = 0; points from which rays start on it; and their normals."""
+    """Make a bowl: the inside of the lower half of the unit sphere. Return it with points on it and their normals."""
     ball = trimesh.creation.icosphere(5)
     inside = ball.faces[ball.triangles_center[:, 2] < 0][:, ::-1]
     occluder = Occluder(Mesh(ball.vertices, inside))
@@ -58,7 +58,7 @@ def even(radiance: float = 1.0) -> Environment:
 
 
 def mirrors(monkeypatch: pytest.MonkeyPatch, part: float) -> None:
-    """Have surfaces mirror this share of the light at any angle, and scatter the rest."""
+    """Make all surfaces mirror the share `part` of the light at any angle, and reflect the rest diffusely."""
 
     def shares(albedo, metallic, roughness, cosine):
         return torch.full_like(albedo, part), (1 - part) * albedo

@@ -1,4 +1,4 @@
-"""Make a ball of splats whose paint is a formula, and read textures as a renderer does."""
+"""Make a ball of splats whose base colour is a formula; read textures as a renderer does."""
 
 import numpy as np
 import trimesh
@@ -10,12 +10,12 @@ from refgs.geometry.mesh import smooth_normals
 
 
 def paint(p: np.ndarray) -> np.ndarray:
-    """Paint points of the unit sphere smoothly (P, 3)."""
+    """Compute the smooth base colour (P, 3) of points on the unit sphere."""
     return 0.5 + 0.4 * np.sin(2 * p + [0, 1, 2])
 
 
 def sphere_of_splats(count: int = 4000, radius: float = 1.0, outward: float = 1.0) -> Splats:
-    """Cover a sphere with painted splats, each as large as their spacing."""
+    """Cover a sphere evenly with painted splats, each as large as the spacing between them."""
     i = np.arange(count) + 0.5
     z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
     ring = np.sqrt(1 - z * z)
@@ -40,13 +40,13 @@ def sphere_of_splats(count: int = 4000, radius: float = 1.0, outward: float = 1.
 
 
 def ball(level: int = 3) -> Mesh:
-    """Make a unit sphere of triangles with smooth normals."""
+    """Make a triangle mesh of the unit sphere, with smooth normals."""
     sphere = trimesh.creation.icosphere(level)
     return Mesh(np.array(sphere.vertices), np.array(sphere.faces), smooth_normals(sphere.vertices, sphere.faces))
 
 
 def on_surface(mesh: Mesh, count: int = 3000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw random faces with barycentric weights, and their uv."""
+    """Draw random points of a mesh: return their faces, barycentric weights and uv."""
     rng = np.random.default_rng(2)
     faces = mesh.faces[rng.integers(len(mesh.faces), size=count)]
     weights = rng.dirichlet([1, 1, 1], size=count)

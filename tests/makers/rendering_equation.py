@@ -1,7 +1,7 @@
-"""Outgoing radiance three ways: Monte Carlo of the rendering equation, the exact split sum, and the kernels.
+"""Compute outgoing radiance in three ways: by Monte Carlo of the rendering equation, by the exact split sum, by the kernels.
 
-The split sum sees each lobe from its own axis (N = V = R): it neither stretches at grazing angles nor ends at the horizon. That is its
-error against Monte Carlo. Texels and roughness levels add the difference between the kernels and the exact split sum.
+The split sum assumes N = V = R. So its lobes neither stretch at grazing angles nor end at the horizon, and it differs from Monte Carlo.
+The kernels differ from the exact split sum by their texels and roughness levels.
 """
 
 import functools
@@ -21,7 +21,7 @@ from refgs.render.shade import shade
 
 ROUGHNESS, ANGLES = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0), (0, 30, 60, 80)  # degrees between view and normal
 RESOLUTION = 64
-SHARPNESS = 200.0  # of the sun, a standard deviation of 4 degrees
+SHARPNESS = 200.0  # sharpness of the sun's lobe: a standard deviation of 4 degrees
 
 Radiance = Callable[[np.ndarray], np.ndarray]
 
@@ -35,7 +35,7 @@ METAL, DIELECTRIC = Material(1.0, 0.7), Material(0.0, 0.5)
 
 
 class View(NamedTuple):
-    """Direction to the camera from a surface whose normal is +z, and the mirrored direction."""
+    """Direction to the camera, seen from a surface with the normal +z, and the mirror direction."""
 
     way: np.ndarray
     mirrored: np.ndarray
@@ -47,7 +47,7 @@ class View(NamedTuple):
 
 
 def lights(sun: np.ndarray) -> dict[str, Radiance]:
-    """Lights by name: functions from directions (P, 3) to radiance (P,). `sun` is where the sun stands."""
+    """Return the lights by name, as functions from directions (P, 3) to radiance (P,); `sun` is the sun's direction."""
     slope = np.array([-0.48, 0.48, 0.424])
     return {
         "constant": lambda d: np.ones(len(d)),
@@ -57,7 +57,7 @@ def lights(sun: np.ndarray) -> dict[str, Radiance]:
 
 
 class Reflected(NamedTuple):
-    """Exact reflection of a constant light: factor of multiple bounces, specular part, and diffuse part of the base."""
+    """Exact reflection of a constant light: factor for multiple bounces, specular part, diffuse part of the base."""
 
     bounces: float
     specular: float
@@ -80,7 +80,7 @@ class Reflected(NamedTuple):
 def half_vectors(sine, cosine, alpha: float, u: np.ndarray, phi: np.ndarray) -> np.ndarray:
     """Sample half vectors (..., 3) about +z by the distribution of visible normals (Heitz 2018).
 
-    `u` in 0..1 and `phi` are the random numbers; the view is (sine, 0, cosine)."""
+    `u` in 0..1 and `phi` in 0..2π are random numbers; the view direction is (sine, 0, cosine)."""
     length = np.hypot(alpha * sine, cosine)
     x, z = alpha * sine / length, cosine / length
     t1, t2 = np.sqrt(u) * np.cos(phi), np.sqrt(u) * np.sin(phi)
@@ -96,7 +96,7 @@ def monte_carlo(
 ) -> tuple[float, float]:
     """Integrate the rendering equation; return outgoing radiance and its standard error.
 
-    A third of the samples each follows the visible normals (Heitz 2018), the cosine and the sun's shape; the balance heuristic weights
+    A third of the samples follows the visible normals (Heitz 2018), a third the cosine, a third the sun. The balance heuristic weights
     them."""
     rng, alpha, v = np.random.default_rng(seed), roughness**2, view.way
     n = samples // 3
@@ -127,15 +127,15 @@ def monte_carlo(
     value = light(d) * (lobe * reflected.bounces + reflected.base * n_l / np.pi)
     density = ggx * 2 / (1 + tails[0]) / (4 * n_v) + n_l / np.pi
     density += SHARPNESS / (2 * np.pi * -np.expm1(-2 * SHARPNESS)) * np.exp(SHARPNESS * (d @ sun - 1))
-    share = np.where(above, value / density, 0).reshape(3, n)  # the mean over a third of each adds up
+    share = np.where(above, value / density, 0).reshape(3, n)  # the result is the sum of the three thirds' means
     return float(share.mean(axis=1).sum()), float(np.sqrt(share.var(axis=1).sum() / n))
 
 
 def lobe_mean(light: Radiance, axes: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Integrate radiance over GGX lobes (Eq. 8): (P,) for unit axes (P, 3) and roughnesses (P,), by quadrature."""
+    """Compute the mean radiance over GGX lobes (Eq. 8) by quadrature: (P,) from unit axes (P, 3) and roughnesses (P,)."""
     x, weight = np.polynomial.legendre.leggauss(200)
     psi, alpha = np.pi / 4 * (x + 1), roughness[:, None] ** 2
-    tangent = alpha * np.tan(psi)  # of half the angle from the axis
+    tangent = alpha * np.tan(psi)  # tangent of half the angle from the axis
     cosine, sine = (1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2)
     weight = weight * ggx_lobe(cosine, roughness[:, None]) * sine * (1 + np.tan(psi) ** 2) / (1 + tangent**2)
     azimuth = 2 * np.pi * np.arange(64) / 64
@@ -152,7 +152,7 @@ def lobe_mean(light: Radiance, axes: np.ndarray, roughness: np.ndarray) -> np.nd
 
 
 def split_sum(light: Radiance, view: View, roughness: float, material: Material) -> float:
-    """Compute outgoing radiance by the split sum with both factors exact (Eq. 7 and 8), plus Lambert's diffuse part."""
+    """Compute outgoing radiance by the split sum (Eq. 7 and 8), both factors exact, plus Lambert's diffuse part."""
     filtered = lobe_mean(light, view.mirrored[None], np.array([roughness]))[0]
     d, area = (v.numpy() for v in (cubemap.texel_directions(128), cubemap.texel_solid_angles(128)))
     received = (light(d) * np.maximum(d[:, 2], 0)) @ area / np.pi
@@ -161,12 +161,12 @@ def split_sum(light: Radiance, view: View, roughness: float, material: Material)
 
 
 def pixels(view: View, materials: list[tuple[float, Material]]) -> tuple[Tensor, Camera]:
-    """Make the input of `shade`: one pixel for each roughness and material, and the camera."""
+    """Make features for `shade`, one pixel for each roughness and material, and the camera."""
     count = len(materials)
     right, up = np.array([0.0, 1.0, 0.0]), np.cross(view.way, [0.0, 1.0, 0.0])
     pose = np.eye(4)
     pose[:3, :3] = np.stack([right, -up, -view.way])
-    pose[:3, 3] = [0, 0, 1]  # one unit from the origin; the view is so narrow that all rays are parallel
+    pose[:3, 3] = [0, 0, 1]  # one unit from the origin, with a view so narrow that all rays are parallel
     camera = Camera("view", count, 1, 1e6, 1e6, count / 2, 0.5, pose)
     across = (torch.arange(count, dtype=torch.float64) + 0.5 - count / 2) / 1e6
     features = torch.zeros(1, count, 11)
@@ -178,12 +178,12 @@ def pixels(view: View, materials: list[tuple[float, Material]]) -> tuple[Tensor,
 
 
 def environment(light: Radiance, resolution: int = RESOLUTION) -> Environment:
-    """Make a grey cubemap from a light's radiance at the texels' centres."""
+    """Make a grey environment from a light's radiance at the centres of the texels."""
     radiance = torch.from_numpy(light(cubemap.texel_directions(resolution).numpy())).float()
     return Environment(radiance[:, None].expand(-1, 3).contiguous())
 
 
 def shaded(light: Radiance, view: View, materials: list[tuple[float, Material]]) -> Tensor:
-    """Compute outgoing radiance (P,) by the kernels, one pixel each."""
+    """Compute outgoing radiance (P,) of materials by the kernels, one pixel for each."""
     features, camera = pixels(view, materials)
     return shade(features, torch.ones(1, len(materials)), environment(light), camera, torch.zeros(3)).radiance[0, :, 0]

@@ -1,4 +1,4 @@
-"""Write a run folder of a few splats with public libraries alone."""
+"""Write a run folder with a few splats, by public libraries alone (none of the trainer's code)."""
 
 import json
 
@@ -15,14 +15,14 @@ COLUMNS = [
 
 
 def quaternion_matrix(q):
-    """Compute rotation matrices (N, 3, 3) of unit quaternions wxyz: v + 2 q × (q × v + w v) of each axis v."""
+    """Compute the rotation matrices (N, 3, 3) of unit quaternions wxyz, by v + 2 q × (q × v + w v) for each axis v."""
     w, xyz = q[:, :1, None], q[:, None, 1:]
     axes = np.eye(3)[None]
     return np.swapaxes(axes + 2 * np.cross(xyz, np.cross(xyz, axes) + w * axes), 1, 2)
 
 
 def look_at(eye, target=(0, 0, 0)):
-    """Return camera-to-world with OpenGL axes; +Z is up."""
+    """Return the camera-to-world matrix, with OpenGL axes, of a camera that looks at the origin; +Z is up."""
     back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
     right = np.cross([0, 0, 1], back)
     right /= np.linalg.norm(right)
@@ -45,13 +45,13 @@ def write_panorama(path, pixels):
 
 
 def read_exr(path):
-    """Read an EXR file (h, w, 4), float32."""
+    """Read an EXR file as (h, w, 4) float32."""
     channels = OpenEXR.File(str(path)).channels()
     return channels["RGBA"].pixels if "RGBA" in channels else np.dstack([channels[c].pixels for c in "RGBA"])
 
 
 def random_columns(count=COUNT, seed=0):
-    """Make the raw columns of random splats: opacity is a logit, scales are logarithms."""
+    """Make the columns of splats.ply for random splats; opacities are logits, scales are logarithms."""
     rng = np.random.default_rng(seed)
     columns = {name: rng.normal(size=count) for name in COLUMNS}
     for name in ("albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"):
@@ -75,12 +75,12 @@ FRAMES = [
 
 
 def write_run(folder):
-    """Write a whole run: random splats, a box, a grey sky, two cameras."""
+    """Write a whole run folder: random splats, a box for the mesh, a grey sky, two cameras."""
     folder.mkdir()
     write_ply(folder / "splats.ply", random_columns())
     write_panorama(folder / "environment.exr", np.full((16, 32, 3), 0.5))
     (folder / "cameras.json").write_text(json.dumps({"frames": FRAMES, "to_capture": np.eye(4).tolist()}))
     mesh = trimesh.creation.box(extents=[0.2, 0.4, 0.6])
-    mesh.apply_translation([1.0, 2.0, 3.0])  # glTF's axes: Blender's (1, -3, 2)
+    mesh.apply_translation([1.0, 2.0, 3.0])  # in glTF's axes; in Blender's this is (1, -3, 2)
     mesh.export(folder / "mesh.glb")
     return folder

@@ -1,4 +1,4 @@
-"""Make random surfels that are hard to rasterise, each kind by itself and all together."""
+"""Make random surfels that are hard to rasterise: several kinds, each alone and mixed."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,10 @@ CHANNELS = {"plain": 3, "edge_on": 1, "across_near": 16, "huge": 5, "sub_pixel":
 
 
 def camera(width: int = 45, height: int = 30, centre: tuple[float, float] | None = None) -> Camera:
-    """Place a rolled camera at (0.3, −0.2, −0.4) that looks along +z; its picture is neither square nor of whole tiles."""
+    """Place a rolled camera at (0.3, −0.2, −0.4) that looks along +z.
+
+    By default its image is neither square nor a multiple of the tile size.
+    """
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_euler("xyz", [4, -6, 25], degrees=True).as_matrix()
     matrix[:3, 3] = -matrix[:3, :3] @ [0.3, -0.2, -0.4]
@@ -24,7 +27,7 @@ def camera(width: int = 45, height: int = 30, centre: tuple[float, float] | None
 
 
 def camera_rays(camera: Camera) -> Tensor:
-    """Compute world-space rays (H, W, 3) through pixel centres, of unit depth along the camera's axis; float32."""
+    """Compute world-space rays (H, W, 3), float32, through pixel centres. Each has unit depth along the camera's axis."""
     x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
     rotation = torch.from_numpy(camera.world_to_camera[:3, :3].copy())
@@ -33,7 +36,10 @@ def camera_rays(camera: Camera) -> Tensor:
 
 
 def surfels(kind: str, channels: int, seed: int = 0) -> tuple[Tensor, ...]:
-    """Make positions, rotations, scales, opacities and features, float32; depths differ by more than rounding."""
+    """Make float32 positions, rotations, scales, opacities and features of surfels of this kind.
+
+    Depths differ by more than rounding, so the order is certain.
+    """
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     if kind == "mixed":
         parts = [surfels(k, channels, seed) for k in KINDS if k not in ("mixed", "layers")]
@@ -43,7 +49,7 @@ def surfels(kind: str, channels: int, seed: int = 0) -> tuple[Tensor, ...]:
     rotation = rng.normal(size=(n, 4)) * rng.uniform(0.1, 5, (n, 1))
     scale = np.exp(rng.uniform(np.log(0.02), np.log(0.4), (n, 2)))
     opacity = rng.uniform(0.01, 1, n)
-    if kind == "edge_on":  # the surfel's normal is at right angles to the ray through its centre, or nearly
+    if kind == "edge_on":  # normals are perpendicular, or nearly so, to the ray through the centre
         sight = position - camera().position
         normal = np.cross(sight, rng.normal(size=(n, 3)))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -4,12 +4,12 @@ from refgs.formats.splats import Splats
 
 
 def arrays(splats):
-    """Collect the columns by name."""
+    """Return the arrays of splats as a mapping by name."""
     return {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
 
 
 def make(count=7, coefficients=16, indirect=0):
-    """Make splats with a different value in every place."""
+    """Make random splats, no two values alike."""
     rng = np.random.default_rng(1)
 
     def f(*shape):

@@ -15,7 +15,7 @@ SMALL = [
 
 
 def trainer(capture_folder, folder, *changes, total=150):
-    """Start a small training; create its run folder unless it is there."""
+    """Return a small trainer that is ready to run; create its run folder if it is missing."""
     settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
     capture = read_capture(capture_folder, settings.region)
     made = Trainer(capture, settings, folder, lambda event, facts: None)

@@ -1,4 +1,4 @@
-"""Wait for the trainer's processes."""
+"""Wait for the add-on's jobs, which run in processes of their own."""
 
 import time
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from refgs_addon import jobs
 
 
 def until(condition: Callable[[], object], seconds: float = 30) -> None:
-    """Poll the jobs until the condition holds."""
+    """Poll the jobs until the condition holds; fail after `seconds`."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, [(job.name, job.state, job.line) for job in jobs.JOBS]

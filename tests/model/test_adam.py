@@ -1,4 +1,4 @@
-"""Compare the optimiser with torch's in float64, which is held where a gradient is zero."""
+"""Compare the optimiser with torch's Adam in float64, changed to leave numbers with a zero gradient untouched."""
 
 import torch
 from torch import Tensor
@@ -11,7 +11,10 @@ RATES = [1e-3, 0.0, 3e-2, 1e-4, 1.0]
 
 
 def tensors(steps: int) -> tuple[list[Tensor], list[list[Tensor]]]:
-    """Make values, and gradients of each step from 1e-12 to 1e3. Some are zero; one tensor has none in one step."""
+    """Make values, and gradients from 1e-12 to 1e3 for each step.
+
+    Some gradients are zero, and one tensor has no gradient in one step.
+    """
     generator = torch.Generator().manual_seed(0)
     sizes = [10.0 ** (15 * torch.rand(s, generator=generator) - 12) for s in SHAPES]
     values = [torch.randn(s, generator=generator) for s in SHAPES]
@@ -29,7 +32,7 @@ def train(optimizer: torch.optim.Optimizer | Adam, values: list[Tensor], gradien
 
 
 class Held(torch.optim.Adam):
-    """Adam that keeps a number, and its moments, where the gradient is zero."""
+    """Torch's Adam, except that a number whose gradient is zero keeps its value and moments."""
 
     @torch.no_grad()
     def step(self) -> None:

@@ -9,7 +9,10 @@ from refgs.model.environment import Environment
 
 
 def errors(radiance: torch.Tensor, fine: torch.Tensor, rows: int) -> list[float]:
-    """Compare `rows` random texels of each level with the lobe's sum over a finer cubemap: RMS error by the mean, for each level."""
+    """Compare `rows` random texels of each level with the lobe summed over a finer cubemap.
+
+    Return the relative RMS error of each level.
+    """
     side, fine_side = (math.isqrt(len(v) // 6) for v in (radiance, fine))
     levels = prefilter.prefilter(radiance, side).cpu()
     levels = cubemap.in_texel_order(levels, tuple(prefilter.level_sides(side))).numpy()
@@ -27,7 +30,7 @@ def errors(radiance: torch.Tensor, fine: torch.Tensor, rows: int) -> list[float]
 
 
 def light(side: int) -> torch.Tensor:
-    """Make a sky with a soft sun and stripes."""
+    """Make a cubemap of a striped sky with a soft sun."""
     d = cubemap.texel_directions(side)
     sun = torch.exp(
         20 * (d @ torch.nn.functional.normalize(torch.tensor([0.3, 0.5, 0.8], dtype=torch.float64), dim=0) - 1)
@@ -37,7 +40,7 @@ def light(side: int) -> torch.Tensor:
 
 
 def test_levels_match_direct_integration(device):
-    """Compare each level with the lobe's sum over a cubemap four times as fine."""
+    """Each level matches the lobe summed over a cubemap four times as fine, to 0.5 %."""
     assert max(errors(light(32).to(device), light(128), rows=40)) < 0.005
 
 
@@ -47,15 +50,17 @@ def test_levels_of_large_cubemaps_match_direct_integration(side):
 
 
 def test_smaller_cells_bring_the_error_down(monkeypatch):
-    """The error falls nearly in proportion to the cells' size, second order in a texel's side. The light is constant over texels. The
-    sharpest lobe is no wider than a texel: its error is small from the start."""
+    """Four times as many cells at least halve the error of every level.
+
+    The light is constant within a texel. The sharpest lobe is left out: it is no wider than a texel, so its error is small from the start.
+    """
     side, found = 32, []
     radiance = light(side)
     fine = radiance.reshape(6, side, 1, side, 1, 3).expand(6, side, 4, side, 4, 3).reshape(-1, 3)
-    monkeypatch.setattr(prefilter, "matrices", prefilter.matrices.__wrapped__)  # made anew each time
+    monkeypatch.setattr(prefilter, "matrices", prefilter.matrices.__wrapped__)  # without its cache
     for cells in (64, 256, 1024):
         monkeypatch.setattr(prefilter, "CELLS", cells)
-        found.append(np.array(errors(radiance, fine, rows=40))[1:-1])  # irradiance has its own
+        found.append(np.array(errors(radiance, fine, rows=40))[1:-1])  # without irradiance, which has cells of its own
     assert (found[1] < found[0] / 2).all() and (found[2] < found[1] / 2).all()
 
 
@@ -80,13 +85,13 @@ def test_irradiance_of_a_constant_and_of_a_cosine_sky():
     ones = Environment(torch.ones(6 * 16 * 16, 3))
     normals = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     torch.testing.assert_close(ones.diffuse(normals), torch.ones(50, 3), atol=1e-5, rtol=0)
-    # L = 1 + z: irradiance / π = 1 + (2/3) z.
+    # Radiance 1 + z gives irradiance / π = 1 + (2/3) z.
     sky = Environment((1 + cubemap.texel_directions(32)[:, 2:]).float().repeat(1, 3))
     torch.testing.assert_close(sky.diffuse(normals)[:, 0], 1 + 2 / 3 * normals[:, 2], atol=3e-3, rtol=0)
 
 
 def test_a_sun_leaves_what_faces_away_from_it_dark():
-    """Irradiance from one texel is its cosine, and zero beyond a right angle."""
+    """Irradiance from one bright texel follows the cosine, and is zero on surfaces that face away from it."""
     side, texel = 64, 1234
     directions = cubemap.texel_directions(side)
     radiance = torch.zeros(6 * side**2, 3)
@@ -94,12 +99,12 @@ def test_a_sun_leaves_what_faces_away_from_it_dark():
     cosine = directions @ directions[texel]
     found = Environment(radiance).diffuse(directions.float())[:, 0].double()
     error = (found - cosine.clamp_min(0)).abs()
-    assert error.max() < 0.08 and error.square().mean().sqrt() < 0.02  # a texel is as wide
+    assert error.max() < 0.08 and error.square().mean().sqrt() < 0.02  # the tolerance is the width of a texel
     assert found[cosine < -0.15].max() < 1e-3
 
 
 def test_panorama_round_trip():
-    """A light that the texels resolve survives cubemap → environment.exr → cubemap."""
+    """A smooth light is the same after cubemap → panorama → cubemap, to 0.5 %."""
     original = light(64)
     panorama = Environment(original).panorama(256)
     back = Environment.from_panorama(panorama, 64).radiance

@@ -1,4 +1,4 @@
-"""Compare the table of reflectances with the rendering equation."""
+"""Compare the table of reflectances with integrals of the BRDF and with Cycles."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ import torch
 from refgs.render import reference
 from refgs.render.brdf import bounces
 
-# Radiance of a plane under a white world by Cycles 4.5, a Principled BSDF with its defaults, 65 000 samples; errors are 0.0003 to 0.0005.
-# Roughness, degrees from the normal, a metal of base colour (0.9, 0.6, 0.3), a black dielectric.
+# Radiance of a plane under a white world, by Cycles 4.5 with a default Principled BSDF and 65 000 samples; standard errors are 0.0003 to
+# 0.0005. Columns: roughness, degrees from the normal, a metal of base colour (0.9, 0.6, 0.3), a black dielectric.
 CYCLES = [
     (0.1, 60, (0.9031, 0.6125, 0.3219), 0.0892),
     (0.2, 0, (0.8999, 0.5996, 0.2997), 0.0400),
@@ -27,16 +27,17 @@ def schlick(cosine: np.ndarray) -> np.ndarray:
 
 
 def dielectric(cosine: np.ndarray) -> np.ndarray:
-    """Solve Fresnel's equations at an index of 1.5, by the angle of refraction."""
+    """Compute the Fresnel reflectance of a dielectric with refractive index 1.5."""
     inside = np.sqrt(1 - (1 - cosine**2) / 1.5**2)
     across, along = (cosine - 1.5 * inside) / (cosine + 1.5 * inside), (inside - 1.5 * cosine) / (inside + 1.5 * cosine)
     return (across**2 + along**2) / 2
 
 
 def integrate(n_v: np.ndarray, roughness: np.ndarray, nodes: int) -> np.ndarray:
-    """Integrate D G2 F / (4 N·L N·V) N·L over L (3, P), F being 1 − (1 − V·H)⁵, (1 − V·H)⁵ (Schlick), and a dielectric's.
+    """Integrate D G2 F / (4 N·L N·V) N·L over all L above the horizon, for three F; return (3, P).
 
-    It takes light directions above the horizon, in polar coordinates about the mirrored view; the table is made over half vectors.
+    F is 1 − (1 − V·H)⁵, (1 − V·H)⁵ (Schlick), and the Fresnel reflectance of a dielectric. Light directions are in polar coordinates
+    about the mirrored view; the program's own table is integrated over half vectors instead.
     """
     x, weight = np.polynomial.legendre.leggauss(nodes)
     at, weight = np.sin(np.pi / 4 * (x + 1)) ** 2, weight * np.pi / 4 * np.cos(np.pi / 2 * x)
@@ -45,20 +46,21 @@ def integrate(n_v: np.ndarray, roughness: np.ndarray, nodes: int) -> np.ndarray:
         c = n_v[chunk][:, None, None]
         a2, s = roughness[chunk][:, None, None] ** 4, np.sqrt(1 - c**2)
         total = np.zeros((3, len(chunk)))
-        rise = np.arcsin(c)  # of the mirrored view above the horizon
+        rise = np.arcsin(c)  # elevation of the mirrored view
         for low, high in ((0 * c, rise), (rise, np.pi - rise)):
             low, high = (np.arctan(np.tan(np.minimum(b, np.pi - 1e-9) / 2) / np.sqrt(a2)) for b in (low, high))
-            psi = low + (high - low) * at[:, None]  # tan β/2 = α tan ψ
+            psi = low + (high - low) * at[:, None]  # substitution for the polar angle β: tan β/2 = α tan ψ
             tangent = np.sqrt(a2) * np.tan(psi)
             c_b, s_b = (1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2)
             by_psi = 2 * np.sqrt(a2) * (1 + np.tan(psi) ** 2) / (1 + tangent**2) * (high - low) * weight[:, None]
-            end = np.arccos(np.clip(-c * c_b / np.maximum(s * s_b, 1e-300), -1, 1))  # of the azimuths above the horizon
+            # Azimuths from -end to end are above the horizon.
+            end = np.arccos(np.clip(-c * c_b / np.maximum(s * s_b, 1e-300), -1, 1))
             azimuth = end * at
             n_l = np.maximum(c_b * c + s_b * s * np.cos(azimuth), 1e-12)
             v_l = c_b * (2 * c**2 - 1) + s_b * np.cos(azimuth) * 2 * s * c
             v_h = np.sqrt(np.maximum(1 + v_l, 1e-30) / 2)
             n_h2 = ((n_l + c) / (2 * v_h)) ** 2
-            # 1 - (1 - α²) N·H² would lose all digits of a small α: take 1 - N·H² from the part of H at right angles to N.
+            # For small α, 1 - (1 - α²) N·H² cancels completely. So compute 1 - N·H² from H's component at right angles to N.
             across = (s_b * np.sin(azimuth)) ** 2
             within = (s + c_b * -s + s_b * np.cos(azimuth) * c) ** 2
             slope = (across + within) / (n_l + c) ** 2
@@ -77,7 +79,7 @@ def grid(n_v: np.ndarray, roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def test_the_integral_converges():
-    """The error falls faster than any power of the nodes: with 32 it is a 40th of the table's tolerance."""
+    """With 32 nodes the integral's error is below 2.5e-5, a 40th of the table's tolerance; with 64, below 1e-7."""
     points = grid(np.array([0.02, 0.05, 0.3, 0.7, 1 - 1e-9]), np.array([0.03, 0.05, 0.1, 0.3, 1.0]))
     finest = integrate(*points, 96)
     found = [abs(integrate(*points, nodes) - finest).max() for nodes in (16, 32, 64)]
@@ -86,7 +88,10 @@ def test_the_integral_converges():
 
 
 def test_table_everywhere():
-    """Look up, between entries too: FG0, FG1, a dielectric's bounce, and reflectance at F0 of 0.04 and 1."""
+    """All values of the table are exact to 0.001, also between its entries.
+
+    They are FG0, FG1, their mean over the row, the dielectric's reflectance with bounces, and the reflectance for F0 of 0.04 and of 1.
+    """
     n_v, roughness = grid(np.linspace(0.02, 1 - 1e-9, 59), np.linspace(0.03, 1, 61))
     exact = integrate(n_v, roughness, 32)
     fg0, fg1, average, coat = reference.table(torch.from_numpy(n_v), torch.from_numpy(roughness)).numpy().T
@@ -115,7 +120,7 @@ def test_table_everywhere():
 
 @pytest.mark.parametrize(("roughness", "angle", "metal", "black"), CYCLES)
 def test_reflects_as_cycles_does(roughness, angle, metal, black):
-    """Compare a metal, and the coat over a dielectric's base."""
+    """Reflectance of a metal and of a dielectric's coat agrees with Cycles to 0.0015."""
     n_v, albedo = torch.tensor([np.cos(np.radians(angle))]), torch.tensor([[0.9, 0.6, 0.3]]).double()
     found = reference.reflectance(n_v, torch.tensor([roughness]).double(), albedo)
     assert found[0][0].tolist() == pytest.approx(metal, abs=1.5e-3)

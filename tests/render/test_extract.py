@@ -14,10 +14,9 @@ NEAR = 0.01
 
 
 def sheet(positions, normals, size, opacity):
-    """Make round surfels of one size at positions (N, 3)."""
-    turn = np.stack(
-        [1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1
-    )  # from +Z to the normal
+    """Make round surfels of the same size at positions (N, 3), facing along normals (N, 3)."""
+    # Quaternions that rotate +Z to the normals, not normalised.
+    turn = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1)
     count = len(positions)
     rows = [positions, turn, np.full((count, 2), size), np.broadcast_to(opacity, count)]
     tensors = [torch.tensor(row, dtype=torch.float32) for row in rows]
@@ -32,7 +31,7 @@ def joined(*parts):
 
 
 def spread(count):
-    """Spread unit vectors evenly over the sphere."""
+    """Return `count` unit vectors spread evenly over the sphere."""
     i = np.arange(count) + 0.5
     z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
     ring = np.sqrt(1 - z * z)
@@ -40,7 +39,7 @@ def spread(count):
 
 
 def ball(opacity, thickness, count=12000):
-    """Make surfels of a ball of radius 1, up to `thickness` below its surface."""
+    """Make surfels of a ball of radius 1, at random depths up to `thickness` below its surface."""
     normals = spread(count)
     depth = thickness * np.random.default_rng(0).uniform(size=(count, 1))
     return sheet((1 - depth) * normals, normals, 0.03, opacity)
@@ -58,12 +57,15 @@ def test_a_ball_of_one_layer():
 
 
 def test_what_is_hardly_there_has_no_surface():
-    """Coverage is that of the picture, not of the surfels that give the depth."""
+    """Nearly transparent surfels give no surface. The picture's alpha decides, not that of the surfels that give the depth."""
     assert len(radii(ball(0.004, 0.1))) == 0
 
 
 def test_voxels_are_no_finer_than_pixels():
-    """96 pixels show 3.3 units at the ball's middle, 2.5 where it is nearest: 2.6 units are 78 to 104 pixels wide."""
+    """Above 104 voxels a side the mesh gets no finer: the grid's 2.6 units are at most 104 pixels wide.
+
+    96 pixels show 3.3 units at the depth of the ball's centre and 2.5 at its nearest point.
+    """
     layer = ball(0.95, 0.0)
     fine, finer, coarse = (len(radii(layer, resolution)) for resolution in (120, 240, 75))
     assert coarse < fine == finer == len(radii(layer, 104))
@@ -76,7 +78,7 @@ ARC = [
 
 
 def place():
-    """Make a ball on the ground with far walls around it, seen from one side through fog, without masks."""
+    """Make a ball on the ground with far walls and some fog, for cameras on one side and no masks."""
     rng = np.random.default_rng(1)
     grid = np.stack(np.meshgrid(*[np.linspace(-5, 5, 100)] * 2, [-1.0]), axis=-1).reshape(-1, 3)
     ground = sheet(grid, np.tile([0.0, 0, 1], (len(grid), 1)), 0.08, 0.95)
@@ -96,11 +98,12 @@ def test_a_foreground_without_masks(monkeypatch):
         return clean(mesh, 10**6), voxel, distance.max(), np.abs(distance[high] - 1), around
 
     mesh, voxel, farthest, ball, ground = found()
-    assert 1.2 * 2.2 / 64 < voxel < 2 * 2.2 / 64  # it has the ground that most cameras show, but not the walls
+    # The grid is enlarged for the ground that most cameras see, but not for the walls.
+    assert 1.2 * 2.2 / 64 < voxel < 2 * 2.2 / 64
     assert 1.5 < farthest < module.REACH * 1.1 + voxel
     assert np.quantile(ball, 0.9) < voxel and np.quantile(ground, 0.9) < 0.1 * voxel
-    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).body_count == 1  # the fog has no surface
-    # Fog before the surface, and walls that show through it, move the mean.
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).body_count == 1  # the fog gives no surface
+    # Without trimming, depth is the mean, which fog in front and walls behind displace: the surface is worse.
     monkeypatch.setattr(module, "UPPER", 1.0)
     monkeypatch.setattr(module, "LOWER", 0.0)
     *_, mean, _ = found()

@@ -1,4 +1,4 @@
-"""Compare occluded light and light between surfaces with closed forms."""
+"""Compare occluded light and light reflected between surfaces with closed forms."""
 
 import math
 
@@ -33,7 +33,7 @@ def received(points: Surfels, occluder: Occluder, light: Environment, directions
 
 
 def test_an_open_plane_has_the_whole_light():
-    """Diffuse light is as without an object; the coat is the split sum's, to 2 % of white."""
+    """An unoccluded plane receives the diffuse light of the environment exactly, and is relit by the split sum to 0.02."""
     light, up = colourful(), np.tile([0.0, 0.0, 1.0], (5, 1))
     plane = surfels(np.zeros((5, 3)), up)
     transport = relight.Transport(plane, plates(plate(0.0, 1)))
@@ -54,8 +54,10 @@ def looking_down(position: np.ndarray) -> Camera:
 
 
 def test_between_two_plates():
-    """The middle of a black square below another misses the upper square's form factor (Howell, B-4). The error falls at least as
-    fast as the number of directions grows."""
+    """The middle of a black plate below another receives 1 minus the upper plate's form factor (Howell, B-4).
+
+    Four times as many directions at least halve the error.
+    """
     occluder = plates(plate(0.0, 1), plate(1.0, -1))
     middle = surfels(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), albedo=0.0)
     a = 1 / (1 - occluder.lift)
@@ -71,7 +73,7 @@ def test_between_two_plates():
 
 @pytest.mark.parametrize("albedo", [0.0, 0.5, 0.9])
 def test_inside_a_matte_bowl(albedo, monkeypatch):
-    """Any point of half a sphere sees half sky and half bowl: x = 1/2 + albedo x / 2."""
+    """Every point of a matte bowl receives x = 1/2 + albedo · x / 2: it sees half sky, half bowl."""
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
     found = received(surfels(points, normals, albedo), occluder, even(), bounces=20)
@@ -81,7 +83,10 @@ def test_inside_a_matte_bowl(albedo, monkeypatch):
 
 
 def test_what_training_takes_of_it(monkeypatch):
-    """Training takes the share of what a free surface receives, whichever way normals point, and from some of the surfels."""
+    """The received share of light that training reads is 2/3 in a bowl and 1 on a convex ball.
+
+    It is relative to an unoccluded surface. It holds whichever way normals point, and when only some surfels are probed.
+    """
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
     inside = surfels(points, normals).turned(torch.arange(len(points)) % 2 == 0)
@@ -98,20 +103,20 @@ def test_what_training_takes_of_it(monkeypatch):
 
 @pytest.mark.parametrize("part", [0.0, 0.3, 1.0])
 def test_a_white_bowl_under_an_even_sky_cannot_be_seen(part, monkeypatch):
-    """Light from the bowl is as even as the sky, whatever share its surface mirrors."""
+    """In a white bowl under an even sky, all received and indirect light is 1, whatever share its surface mirrors."""
     occluder, points, normals = bowl()
     mirrors(monkeypatch, part)
     transport = relight.Transport(surfels(points, normals, 1.0), occluder)
     found, indirect = relight._gather(transport, even(), 20)
     torch.testing.assert_close(found, torch.ones_like(found), rtol=0, atol=0.01)
     across = torch.tensor([0.0, 0.0, -1.0]) - transport.normals * -transport.normals[:, 2:]
-    ways = torch.nn.functional.normalize(transport.normals + 0.5 * across, dim=1)  # towards the bowl's bottom
+    ways = torch.nn.functional.normalize(transport.normals + 0.5 * across, dim=1)  # tilted towards the bowl's bottom
     seen = torch.einsum("nk,nkc->nc", harmonics.basis(ways, 3), indirect)
     torch.testing.assert_close(seen, torch.ones_like(seen), rtol=0, atol=0.03)
 
 
 def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
-    """A mirror above sends down the light from below, direction by direction."""
+    """A mirror that faces down reflects the light from below, exact to 0.05 in every direction."""
     light = colourful()
     mirrors(monkeypatch, 1.0)
     occluder = plates(plate(1.0, -1))
@@ -128,7 +133,7 @@ def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
 
 
 def test_a_light_that_the_object_hides_reaches_nothing():
-    """The upper of two plates occludes a small sun; above that plate all of the sun arrives."""
+    """A point between two plates receives less than 0.1 % of the sun that a point above them receives in full."""
     radiance = torch.full((6 * 32**2, 3), 1e-3)
     directions = cubemap.texel_directions(32)
     radiance[(directions[:, 2] > 0.99)] = 100.0

@@ -1,4 +1,4 @@
-"""Fronts, knees and times to an error agree with plain definitions and known curves; runs get names."""
+"""Test the report's curves: Pareto fronts, knees and times to an error. Test the names of runs."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_a_decibel_is_the_same_step_of_the_error_everywhere():
 
 
 def test_the_front_is_what_nothing_beats():
-    """Compare every point with every other."""
+    """The front holds exactly the points that no other point beats in both seconds and error."""
     random = np.random.default_rng(0)
     times = [np.sort(random.integers(1, 30, 25)) for _ in range(3)]
     curves = [of(t, (100 / t + random.exponential(20, 25)).round()) for t in times]

@@ -1,4 +1,4 @@
-"""Evaluate a run whose ground truth is known, in a capture that is rotated, moved and scaled from the run's frame."""
+"""Evaluate a run against known ground truth. The capture's frame is rotated, moved and scaled from the run's."""
 
 import json
 
@@ -24,17 +24,17 @@ from tests.makers.ball import BOX, MOVE, SCALE, TURN, write_run
 
 
 def dusk(direction):
-    """Compute radiance of a light other than the run's sky."""
+    """Compute the radiance of the light `dusk`, with which the run is relit."""
     return sky(direction[..., [1, 2, 0]]) * [1.0, 0.6, 0.3]
 
 
 def turned(light, turn, height=64):
-    """Sample `light` as a panorama in the frame to which `turn` leads."""
+    """Sample `light` as a panorama, rotated by `turn`."""
     return light(directions(height, 2 * height) @ turn)
 
 
 def write_truth(folder, run, views):
-    """Write all kinds of ground truth from the run itself, so that all errors are those that a test adds."""
+    """Write every kind of ground truth, made from the run itself: without further changes all errors are zero."""
     lights = {"light": sky, "relight/dusk": dusk}
     for name, light in lights.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -118,7 +118,7 @@ def test_known_errors_are_found(made, tmp_path):
         hidden[: view.camera.height // 2] = 0
         write_exr(truth / "visibility" / name, hidden)
         normal = images["normal"] @ TURN.T
-        axis = np.cross(normal, view.camera.position @ TURN.T)  # tilt about an axis in the surface
+        axis = np.cross(normal, view.camera.position @ TURN.T)  # tilt the normal about a tangent
         axis /= np.linalg.norm(axis, axis=-1, keepdims=True) + 1e-12
         write_exr(truth / "normal" / name, np.cos(0.2) * normal + np.sin(0.2) * np.cross(axis, normal))
         image = maps(there.render(view.camera, Environment.from_panorama(dusk(directions(64, 128)), 16)))["color"]

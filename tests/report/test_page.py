@@ -1,4 +1,4 @@
-"""Report pages show all of a run folder, name what is missing, and fetch nothing."""
+"""Test the report page: it shows everything in a run folder, says what is missing, and loads nothing from the network."""
 
 import base64
 import csv
@@ -17,7 +17,7 @@ VIEWS = [f"test_{i:03d}" for i in range(8)]
 
 
 class Page(HTMLParser):
-    """Parse a page: pictures by their captions, text, and every address that a browser would follow."""
+    """Parsed page: pictures with their captions, text, tags, and every address that a browser would load."""
 
     def __init__(self, text: str):
         super().__init__()
@@ -124,13 +124,13 @@ def charts(html):
 
 
 def places(svg, gid):
-    """Read the points (n, 2) of the lines with this name; y points down."""
+    """Read the points (n, 2) of the lines named `gid` in an SVG; y points down."""
     paths = re.findall(rf'<g id="{gid}">\s*<path d="([^"]+)"', svg)
     return [np.array(re.findall(r"[ML] (\S+) (\S+)", path), float) for path in paths]
 
 
 def test_the_charts_draw_the_history(run):
-    """Errors that are powers of time are straight lines. Bars are as long as their seconds."""
+    """Errors that are a power of time are drawn as straight lines. Bars are proportional to seconds."""
     write_report([run], run / "report.html")
     errors, parts = charts((run / "report.html").read_text(encoding="utf-8"))
     for words in ("held-out views: RMS error", "training views: RMS error", "training loss", "seconds of training"):

@@ -1,4 +1,4 @@
-"""Train on a CUDA card without one: emulate its kernels, and follow an iteration's tensors from device to device."""
+"""Test training on CUDA without a card: with emulated kernels, and with fake tensors that only have a shape and a device."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def make_trainer(capture, folder, *changes: str, device: str = "cpu") -> Trainer
         "surfels.hull=48",
         "train.light_first=0",
         "environment.resolution=16",
-        "surfels.metallic=0.8",  # half a metal is so nearly as bright as half a dielectric that its derivatives are mere rounding
+        "surfels.metallic=0.8",  # at 0.5, a metal and a dielectric are so equally bright that derivatives are only rounding
     ]
     settings = load_settings("quick", [*start, *changes])
     (folder / "checkpoints").mkdir(parents=True)
@@ -54,13 +54,13 @@ def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
         learned.append({name: value.detach().clone() for name, value in trainer.state.parameters.items()})
     np.testing.assert_allclose(figures[0], figures[1], rtol=1e-3)
     for name, value in learned[0].items():
-        # Adam's first steps are the gradients' signs; rounding may flip those of tiny gradients.
+        # Adam's first steps follow the sign of the gradient, which rounding may flip where gradients are tiny.
         off = (value - learned[1][name]).abs() > 1e-3 * value.abs().max()
         assert float(off.float().mean()) < 0.05, name
 
 
 def follow_to_the_card(monkeypatch) -> list[str]:
-    """Replace tensors by shapes on devices, which need no card. Return the names of launched kernels."""
+    """Prepare for fake tensors on a card: return the list to which the names of launched kernels are added."""
 
     def empty(value):
         if isinstance(value, Tensor):
@@ -70,7 +70,7 @@ def follow_to_the_card(monkeypatch) -> list[str]:
             return type(value)(*moved) if hasattr(value, "_fields") else type(value)(moved)
         return value
 
-    def computed_on_the_cpu(make):  # numpy computes these
+    def computed_on_the_cpu(make):  # tables that numpy computes
         def made(*arguments):
             with unset_fake_temporarily():
                 value = make(*arguments[:-1], torch.device("cpu"))
@@ -90,7 +90,10 @@ def follow_to_the_card(monkeypatch) -> list[str]:
 
 
 def backward(loss: Tensor) -> None:
-    """Differentiate without autograd's engine, which asks for a card. Arguments other than tensors follow those with a derivative."""
+    """Differentiate by visiting autograd's nodes, because autograd's own engine needs a card.
+
+    Assumes that a function's arguments other than tensors come after those with a derivative.
+    """
     order: list = []
 
     def visit(node) -> None:
@@ -118,21 +121,23 @@ def backward(loss: Tensor) -> None:
 
 @pytest.mark.parametrize("indirect", [False, True])
 def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, indirect):
-    """No operation mixes devices or waits for the card. Reading a value, or making a tensor whose size depends on one, is an error
-    here; the one exception is named."""
+    """An iteration neither mixes devices nor waits for the card, but for one read (`how_many`).
+
+    With fake tensors, reading a value is an error, and so is a tensor whose size depends on a value.
+    """
     ball = trimesh.creation.icosphere(2)
     occluder = Occluder(Mesh(ball.vertices, np.asarray(ball.faces)))
     tree = occluder.tree(torch.device("cpu"))
     launched = follow_to_the_card(monkeypatch)
     with FakeTensorMode(allow_non_fake_inputs=True):
-        changes = f"indirect.start={0 if indirect else 1}", "light.frame=world"  # photos say on the CPU what it is
+        changes = f"indirect.start={0 if indirect else 1}", "light.frame=world"  # "auto" would be decided on the CPU
         trainer = make_trainer(ball_capture, tmp_path / "run", *changes, device="cuda")
         with unset_fake_temporarily():
-            trainer._next_view()  # the views' order is shuffled on the CPU
+            trainer._next_view()  # shuffles the order of views on the CPU
         if indirect:
             tree._boxes, tree._triangles = (torch.empty(v.shape, device=CARD) for v in (tree._boxes, tree._triangles))
             trainer.state.occluder = occluder
-        # The part of the light that the object shows is found when the training begins.
+        # The training computes at its start which texels of the light the object shows.
         trainer.state.light_shown = torch.empty(len(trainer.state.light), device=CARD)
         figures = trainer.step()
         assert all(figure.device == CARD for figure in figures.values())

@@ -46,7 +46,7 @@ def test_the_budget_holds_and_the_largest_gradients_go_first():
 def test_a_division_keeps_the_variance():
     parameters, optimizer = make()
     with torch.no_grad():
-        parameters["scale"][:, 1] += 1.0  # the second axis is the longer
+        parameters["scale"][:, 1] += 1.0  # make the second axis the longer one
     before = activate(parameters)
     centre, sigma = before.positions[-1].detach().clone(), before.scales[-1].detach().clone()
     densify(parameters, optimizer, torch.eye(20)[-1], SETTINGS, budget=100, divide=True)
@@ -73,7 +73,7 @@ def test_faint_surfels_go_and_one_stays():
 
 
 def test_screen_gradient_is_by_pixels_of_motion():
-    """Compare dL/d(half image widths) of a point with the derivative of its projection."""
+    """The screen gradient is dL/d(pixel) times half the image's width in pixels."""
     camera = Camera("a", 200, 100, 150.0, 150.0, 100.0, 50.0, np.eye(4))
     position = torch.tensor([[0.3, -0.2, 2.5]])
     wanted = torch.tensor([2.0, -1.0])  # dL/d(pixel)

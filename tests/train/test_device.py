@@ -1,4 +1,4 @@
-"""Choose the device, warn where it is not the one asked for, and handle a card whose memory is full."""
+"""Test the choice of the device, the warning if it is not the one asked for, and a card whose memory is full."""
 
 import warnings
 
@@ -14,13 +14,13 @@ from refgs.train.trainer import Trainer
 
 
 def chosen(device: str) -> tuple[str, list[str]]:
-    """Choose a device; return it and the warnings."""
+    """Choose a device; return it with the warnings."""
     said = []
     return train_job.choose_device(device, lambda event, facts: said.append(facts["what"])), said
 
 
 def card(monkeypatch, capability: tuple[int, int], driver: str | None = None) -> None:
-    """Make torch report a card."""
+    """Make torch report a card of this compute capability; with `driver`, loading kernels fails with that message."""
 
     def module(source: str, device: int) -> int:
         if driver:

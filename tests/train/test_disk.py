@@ -1,4 +1,4 @@
-"""Disks that fill up or are taken out during a training or an export."""
+"""Test disks that fill up or are removed during a training or an export."""
 
 import pytest
 
@@ -37,7 +37,10 @@ def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
 
 
 def test_a_disk_that_is_full(ball_capture, small_disk):
-    """A write other than a checkpoint fails; failed checkpoints are reported elsewhere."""
+    """On a full disk a training ends with one line, and can be resumed once there is space.
+
+    Here a write other than a checkpoint fails; test_checkpoint.py has failing checkpoints.
+    """
     filler = small_disk / "filler"
 
     def later(trainer):
@@ -54,7 +57,7 @@ def test_a_disk_that_is_full(ball_capture, small_disk):
 
 
 def test_a_mesh_that_cannot_be_written(ball_capture, small_disk):
-    """The old mesh and textures stay as they were."""
+    """An export that fails on a full disk leaves the old mesh and textures unchanged."""
     run = small_disk / "run"
     words = ["train.iterations=60", "mesh.resolution=32", "mesh.triangles=500"]
     train(ball_capture, run, lambda trainer: False, *SMALL, *words)

@@ -1,4 +1,4 @@
-"""Settings in effect: those asked for stay, and run.toml says of each change what made it."""
+"""Test the settings in effect: the settings asked for are kept, and run.toml records what changed each of them."""
 
 import tomllib
 
@@ -14,7 +14,7 @@ from tests.makers.training import SMALL
 
 
 def changed(folder):
-    """Read [changed] of run.toml."""
+    """Read the table [changed] of run.toml."""
     return tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))["changed"]
 
 
@@ -44,7 +44,7 @@ def test_a_plan_changes_each_number_that_differs():
 
 
 def test_a_run_says_what_changed_its_settings(ball_capture, tmp_path):
-    """The photos at the start, the needs when they are decided; a resumed run keeps what the first process recorded."""
+    """Changes by the photos and by the needs are recorded in run.toml; a resumed run keeps these records."""
     out, words = tmp_path / "run", [*SMALL, "train.iterations=40", "needs.specular=off"]
     train_job.train(
         ball_capture, out, "quick", "cpu", None, words, False, lambda *_: None, lambda state: state.iteration == 30
@@ -62,7 +62,7 @@ def test_a_run_says_what_changed_its_settings(ball_capture, tmp_path):
 
 
 def test_a_run_without_the_table_opens(ball_capture, tmp_path):
-    """As runs of earlier releases are."""
+    """A run.toml without [changed], as earlier releases wrote it, is read and stays unchanged."""
     settings = load_settings("quick")
     create_run(tmp_path / "run", read_capture(ball_capture), settings, "quick", "cpu")
     before = (tmp_path / "run" / "run.toml").read_bytes()

@@ -1,4 +1,4 @@
-"""Choose settings for a training that is given nothing but a time."""
+"""Test the choice of settings for a training that is given only a time."""
 
 import json
 import tomllib
@@ -26,7 +26,10 @@ def test_it_lies_between_the_presets():
 
 
 def test_more_time_brings_more_of_all(ball_capture, tmp_path):
-    """Times go from less than `quick` takes to more than `standard` takes; only the pace is measured, nothing is trained so long."""
+    """With more time, a training has more surfels and iterations, and lower rates.
+
+    Times range from below that of `quick` to above that of `standard`. Only the pace is measured; nothing is trained.
+    """
     capture = read_capture(ball_capture)
     said, found = [], []
     for minutes in (0.2, 2, 6, 600):
@@ -34,7 +37,7 @@ def test_more_time_brings_more_of_all(ball_capture, tmp_path):
         made = fitting(capture, ["surfels.hull=32"], tmp_path, Plan(minutes), "cpu", report)
         found.append(made.state.settings)
         assert made.state.total == made.state.settings.train.iterations and made.state.report is report
-        if made.state.settings.surfels.budget == QUICK.surfels.budget:  # the rehearsal was a part of it
+        if made.state.settings.surfels.budget == QUICK.surfels.budget:  # the rehearsal's iterations count as done
             assert made.state.iteration == REHEARSED and made.state.seconds > 0
         else:
             assert made.state.iteration == 0 and made.state.seconds == 0

@@ -1,4 +1,4 @@
-"""Guard a training against steps that are not finite."""
+"""Test the guard that rejects steps which are not finite."""
 
 import json
 import math
@@ -31,7 +31,10 @@ def learner(device):
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e30])
 def test_a_step_that_is_not_finite_leaves_all_as_it_was(device, wrong):
-    """Values and moments stay bit for bit. 1e30 is finite, but its square, which Adam keeps, overflows float32."""
+    """A step that is not finite leaves values and moments unchanged, bit for bit.
+
+    1e30 is finite, but its square, which Adam stores, overflows float32.
+    """
     values, optimizer = learner(device)
     guard, motion = Guard(torch.device(device)), ScreenGradient(50, torch.device(device))
     for step in range(3):
@@ -62,7 +65,7 @@ def test_a_loss_that_is_no_number_is_not_stepped_on():
 
 
 def test_no_kernel_hides_what_is_no_number(device):
-    """NaN in, NaN out: colour by direction, shading, and the rasteriser's derivatives."""
+    """NaN in the input gives NaN in colour by direction, shading, and the rasteriser's derivatives."""
     camera, nan = scenes.camera(20, 16), math.nan
     constant, rest, position = torch.ones(3, 1, 3), torch.ones(3, 3, 3), torch.rand(3, 3)
     constant[1, 0, 2] = rest[2, 1, 0] = nan
@@ -71,7 +74,7 @@ def test_no_kernel_hides_what_is_no_number(device):
 
     features, alpha = torch.full((16, 20, 11), 0.5), torch.ones(16, 20)
     features[..., -3:] = torch.from_numpy(camera.position).float() + scenes.camera_rays(camera)
-    for channel in range(8):  # normal, base colour, metallic, roughness
+    for channel in range(8):  # the channels of normal, base colour, metallic and roughness
         features[channel, 10, channel] = nan
     light = Environment(torch.ones(6 * 16**2, 3, device=device))
     color = shade(features.to(device), alpha.to(device), light, camera, torch.zeros(3)).color.cpu()
@@ -91,7 +94,7 @@ def test_values_stay_within_limits(device):
         value.grad = torch.linspace(-1, 1, 40, device=device)
         optimizer.step()
     assert value[[0, -1]].tolist() == [3, -12] == [float(value.max()), float(value.min())]
-    for _ in range(20):  # gradients at a limit count: values leave it
+    for _ in range(20):  # a value at a limit leaves it when its gradient points away
         value.grad = -torch.linspace(-1, 1, 40, device=device)
         optimizer.step()
     assert value[[0, -1]].tolist() == [-12, 3]
@@ -114,7 +117,7 @@ def test_a_mean_passes_over_what_is_no_number():
 def test_surfels_are_faint_until_what_the_picture_needs_can_be_back(decay, opacity):
     changes = ["densify.reset_every=100", "densify.stop=0.5", "rates.opacity=0.2", f"rates.decay={decay}"]
     settings = load_settings("paper", changes)
-    moved = np.cumsum(0.2 * decay ** (np.arange(1000) / 1000))  # by Adam, at the most
+    moved = np.cumsum(0.2 * decay ** (np.arange(1000) / 1000))  # the most that Adam can have moved a logit
     way = 4 * math.log(opacity / (1 - opacity) * 0.99 / 0.01)
 
     def found(opacity: float, settings=settings) -> list[int]:
@@ -132,7 +135,7 @@ def test_broken_surfels_are_removed_and_that_is_said(ball_capture, tmp_path):
     made = trainer(ball_capture, "densify.every=1000", total=60, said=said, folder=tmp_path)
     made.run(stop=lambda: made.state.iteration >= 15)
     nan_value("roughness")(made)
-    nan_value("position")(made)  # not drawn, so no gradient
+    nan_value("position")(made)  # not drawn, so it has no gradient
     count = len(made.state.parameters["position"])
     made.run(stop=lambda: made.state.iteration >= 30)
     broken = count - len(made.state.parameters["position"])
@@ -176,7 +179,7 @@ def test_resumed_in_every_stage_it_is_the_same_run():
 
 
 def moved(folder, target, scale, offset):
-    """Copy the capture in another unit and place."""
+    """Copy the capture with its cameras scaled and moved."""
     target.mkdir()
     for split in ("train", "test"):
         (target / split).symlink_to(folder / split)
@@ -191,9 +194,9 @@ def moved(folder, target, scale, offset):
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e-6, 1.0), (1e6, 0.0), (1.0, 1e5), (1e3, -1e7)])
 def test_a_capture_anywhere_is_learned_about_the_origin(ball_capture, tmp_path, scale, offset):
-    """Cameras are the same in the run's frame, to float64's rounding, and `to_capture` leads back."""
+    """A capture at any scale and offset has the same cameras in the run's frame, up to rounding; `to_capture` maps them back."""
     usual, found = (read_capture(c) for c in (ball_capture, moved(ball_capture, tmp_path / "moved", scale, offset)))
-    assert np.array_equal(usual.to_capture, np.eye(4))  # NeRF-Blender's own frame is kept where it will do
+    assert np.array_equal(usual.to_capture, np.eye(4))  # a NeRF-Blender frame is kept if it suits float32
     assert np.abs(found.centre).max() < 1e-9 and found.radius == pytest.approx(1)
     lost = 1e-15 * (abs(offset) / scale + 1) + 1e-9
     for before, after in zip(usual.views, found.views, strict=True):

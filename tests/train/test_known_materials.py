@@ -1,6 +1,6 @@
-"""Materials and light of a small ball in three bands: a sharp metal, a rough metal and a matte dielectric.
+"""Test recovering materials and light of a ball with three bands: a sharp metal, a rough metal and a matte dielectric.
 
-The photos are quadrature of the rendering equation. The shape is given; gradients of the shading have to lead to the rest.
+The photos are computed by quadrature of the rendering equation. The shape is given; the rest is learned by the gradients of the shading.
 """
 
 import itertools
@@ -25,7 +25,7 @@ METALLIC = torch.tensor([[material.metallic] for _, material in BANDS])
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory) -> list[tuple]:
-    """Cameras and photos, with alpha, band, normal and position of each pixel."""
+    """Return the training views: camera, photo, and maps of alpha, band, normal and position."""
     folder, found = tmp_path_factory.mktemp("bands"), []
     write_ball_capture(folder, 48, samples=2, bands=True)
     for view in read_capture(folder).train_views:
@@ -43,7 +43,7 @@ def views(tmp_path_factory) -> list[tuple]:
 
 
 def learn(views: list[tuple], steps: int, rate: float, leaves: list[Tensor], materials, light) -> None:
-    """Fit `leaves` to the photos by Adam; `materials()` (3, 5) and `light()` are made of them at each step."""
+    """Fit `leaves` to the photos by Adam; `materials()` (3, 5) and `light()` compute the model from them."""
     optimiser = torch.optim.Adam([leaf.requires_grad_() for leaf in leaves])
     for step, (camera, photo, alpha, band, normal, point) in enumerate(itertools.islice(itertools.cycle(views), steps)):
         optimiser.param_groups[0]["lr"] = rate * 0.1 ** (step / steps)
@@ -56,9 +56,9 @@ def learn(views: list[tuple], steps: int, rate: float, leaves: list[Tensor], mat
 
 @pytest.fixture(scope="module")
 def learned(views) -> tuple[Tensor, Environment]:
-    """Albedo, metallic and roughness of each band (3, 5), and the light.
+    """Learn albedo, metallic and roughness of each band (3, 5), and the light.
 
-    The first band's roughness is given: a sharper light on rougher materials gives nearly the same photos.
+    The first band's roughness is given, because a sharper light on rougher materials gives nearly the same photos.
     """
     raw, light = torch.zeros(3, 5), torch.full((6 * 16**2, 3), -1.0)
     raw[:, 4] = -0.8
@@ -74,7 +74,10 @@ def learned(views) -> tuple[Tensor, Environment]:
 
 @pytest.mark.parametrize("start", [0.12, 0.88])
 def test_roughness_under_a_known_light(views, start):
-    """Light and metallic are given. By the split sum 0.5 looks like 0.59, and 0.6 like 0.70, from either start."""
+    """Roughness is recovered to 0.12 from either start, with light and metallic given.
+
+    The error is the split sum's: a true roughness of 0.5 is learned as 0.59, and 0.6 as 0.70.
+    """
     albedo, roughness = torch.zeros(3, 3), torch.full((3, 1), math.log(start / (1 - start)))
     light = Environment.from_panorama(sunny(directions(128, 256)).astype(np.float32), 32)
 
@@ -88,7 +91,10 @@ def test_roughness_under_a_known_light(views, start):
 
 
 def test_roughness_and_metallic(learned):
-    """A dielectric shows 4 % of its highlight: its roughness is not known while its metallic is learned too."""
+    """The rough metal's roughness is recovered to 0.1, and metallic separates metals from the dielectric.
+
+    The dielectric's roughness is not compared: it reflects only 4 %, too little to learn roughness and metallic together.
+    """
     materials, _ = learned
     for (_, material), found in zip(BANDS, materials.tolist(), strict=True):
         print(material, np.round(found, 3))
@@ -98,7 +104,10 @@ def test_roughness_and_metallic(learned):
 
 
 def test_light_and_albedo(learned):
-    """Compare the light's shape, and its brightness times each albedo, for the two share a scale."""
+    """The light's shape correlates by 0.97, and brightness times albedo is right to 6 % (20 % for the dielectric).
+
+    Light and albedo share a scale, so only their product is known.
+    """
     materials, environment = learned
     panorama, truth = environment.panorama(32), sunny(directions(32, 64))
     print("correlation", np.corrcoef(panorama.ravel(), truth.ravel())[0, 1])

@@ -1,4 +1,4 @@
-"""Compare the objective with plain torch in float64, values and gradients."""
+"""Compare the objective and its gradients with plain torch in float64."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ MAPS = ("color", "normal", "blended_depth", "alpha", "material")
 
 
 def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress: float) -> dict[str, Tensor]:
-    """Compute the weighted terms."""
+    """Compute all terms of the objective in float64, each times its weight."""
     photo = view.image.double() / 255
     mask = None if view.mask is None else view.mask.double() / 255
     if mask is not None:
@@ -71,7 +71,10 @@ def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress
 
 
 def pictures(width: int, height: int, masked: bool, material: bool) -> tuple[Rendering, Photo]:
-    """Make a bumpy surface, half opaque, some pixels beyond 1, and a random photo, partly saturated."""
+    """Make a rendering of a bumpy, partly transparent surface, and a random photo of the same size.
+
+    Some colours of the rendering are above 1, and some of the photo are saturated.
+    """
     rng, camera = np.random.default_rng([width, height]), scenes.camera(width, height)
 
     def random(*shape: int) -> Tensor:
@@ -106,7 +109,7 @@ def gradients(loss: Tensor, rendering: Rendering) -> dict[str, Tensor]:
 
 
 def check(rendering: Rendering, view: Photo, weights: LossSettings, progress: float, scale: float, device) -> Tensor:
-    """Compare the loss and its gradients, `scale` times, with the reference's; return the mean squared error."""
+    """Compare the loss and the gradients of `scale` times the loss with the reference; return the mean squared error."""
     exact, found = leaves(rendering, torch.float64), leaves(rendering, torch.float32, device)
     expected = sum(reference(exact, view, weights, progress).values())
     loss, square = objective(found, None, moved(view, device), BACKGROUND.to(device), weights, progress)
@@ -133,7 +136,7 @@ def test_matches_float64(size, material, masked, device):
 
 
 def test_the_light_is_held_to_be_neutral_on_the_whole(device):
-    """Compare the penalty of a mean other than grey, and its derivative, with float64."""
+    """The penalty on a light whose mean is not grey, and its derivative, match float64."""
     rendering, view = pictures(8, 8, masked=True, material=True)
     only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, matte=0, light=0.5, exposure=0)
     mean = torch.rand(3, generator=torch.Generator().manual_seed(0))
@@ -160,14 +163,14 @@ def test_a_term_without_weight_is_not_there(term, device):
 
 
 def test_far_away_where_hardly_anything_is(device):
-    """Depths of 1e11 at nearly empty pixels leave the others alone."""
+    """Depths of 1e11 at nearly transparent pixels do not disturb the loss and gradients of the others."""
     rendering, view = pictures(30, 20, masked=True, material=True)
     rendering.alpha[::5, ::4], rendering.blended_depth[::5, ::4] = 0.01, 1e9
     check(rendering, view, ALL, 0.7, 1, device)
 
 
 def test_nothing_waits_for_a_card(monkeypatch):
-    """No tensor's value is read, forward or backward."""
+    """The objective reads no tensor's value, forward or backward, so it never waits for a card."""
     emulate(monkeypatch)
     rendering, view = pictures(30, 20, masked=True, material=True)
     found = leaves(rendering, torch.float32)

@@ -1,4 +1,4 @@
-"""Decide what a scene does without: each statistic on either side of its threshold, and the consequences."""
+"""Test the decisions which features a scene needs: statistics on both sides of their thresholds, and the effects."""
 
 import json
 import math
@@ -27,7 +27,10 @@ from refgs.train.plan import Plan
 from refgs.train.trace import why_not_traced
 from tests.makers.training import trainer as small
 
-DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # at the start, as the trainings are short
+DULL = [
+    "surfels.metallic=0.01",
+    "surfels.roughness=0.8",
+]  # start with a matte material, because the trainings are short
 SMALL = ["environment.resolution=32", "indirect.every=100", "indirect.resolution=32"]
 
 
@@ -42,7 +45,7 @@ def mirror(ball_capture):
 
 @pytest.fixture(scope="module")
 def matte(tmp_path_factory):
-    """Capture a matte ball: its colour is its irradiance, the same from every direction."""
+    """Read a capture of a matte ball, whose colour is the same from every direction."""
     folder = tmp_path_factory.mktemp("matte")
     write_ball_capture(folder, 64, matte=True)
     return read_capture(folder)
@@ -67,7 +70,7 @@ def test_what_is_matte_goes_without_specular(chalk):
 
 
 def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
-    """A fifth of what was left is saved, unless the setting is on or a time was given."""
+    """A matte scene leaves out a fifth of the remaining iterations, unless needs.iterations is on or a time was given."""
     found = chalk.state.needs["iterations"]
     assert (
         not found["needed"]
@@ -94,7 +97,7 @@ def test_a_mirror_keeps_it(mirror, tmp_path):
 
 @pytest.mark.parametrize("word", ["on", "off"])
 def test_forced_either_way(word, matte, mirror, tmp_path):
-    """Settings overrule the photos."""
+    """needs.specular on or off overrules what the photos say."""
     made = trainer(matte if word == "on" else mirror, tmp_path / "run", f"needs.specular={word}", total=120)
     made.run()
     assert ("metallic" in made.state.parameters) == (word == "on")
@@ -106,7 +109,7 @@ def test_forced_either_way(word, matte, mirror, tmp_path):
 
 
 def test_the_asset_says_so_once(chalk):
-    """Constant columns go into the header, and the pictures stay."""
+    """Columns with one value are written once, in the PLY header; the run renders as before."""
     splats, run = read_splats(chalk.state.folder / "splats.ply"), open_run(chalk.state.folder)
     assert splats.constants == {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
     assert (splats.metallic == 0).all() and (splats.roughness == 1).all()
@@ -124,11 +127,11 @@ def test_needs_are_written_down(chalk):
         assert math.isfinite(rows[name]["decibels"]) and rows[name]["seconds"] >= 0
         assert rows[name]["saved"] and rows[name]["cost"] and name in chalk.state.decided
     assert rows["light"]["side"] == 16
-    assert "cost" not in rows["iterations"]  # its cost could not be measured
+    assert "cost" not in rows["iterations"]  # has no cost: that could not be measured
 
 
 def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
-    """Parameters and light agree bit for bit."""
+    """A run resumed after the decisions keeps them; its parameters and light match an unbroken run bit for bit."""
     more = [*DULL, "train.checkpoint_every=20", "densify.every=25", "train.light_first=0"]
     whole = trainer(matte, tmp_path / "whole", *more, total=150)
     whole.run()
@@ -145,7 +148,7 @@ def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
 
 
 def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
-    """The guard goes back to a checkpoint from before the decisions."""
+    """Decisions stay when a training returns to a checkpoint from before them, as the guard does."""
     made = trainer(matte, tmp_path / "run", *DULL, "train.light_first=0", total=200)
     made.run(stop=lambda: made.state.iteration == 96)
     assert "specular" not in made.state.needs
@@ -168,13 +171,17 @@ def test_a_convex_mirror_does_without_reflections(mirror, tmp_path):
 
 
 def test_reflections_by_what_they_could_be_worth(mirror, tmp_path):
-    """A mirror with a fifth occluded keeps reflections; a rough dielectric, which would hardly be darker, does not."""
+    """A mirror with a fifth of its reflections occluded keeps inter-reflection; a rough black dielectric does not.
+
+    Occlusion would hardly darken the dielectric.
+    """
     made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
     made.run(stop=lambda: made.state.iteration == 99)
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-3, 3, 61)] * 2))
     at = np.arange(60 * 61).reshape(60, 61)[:, :-1].ravel()
     faces = np.concatenate([np.stack([at, at + 61, at + 1], axis=1), np.stack([at + 1, at + 61, at + 62], axis=1)])
-    made.state.occluder = Occluder(Mesh(np.stack([x, y, np.full_like(x, 1.5)], axis=1), faces))  # a lid that faces down
+    # A plane above the ball that faces down.
+    made.state.occluder = Occluder(Mesh(np.stack([x, y, np.full_like(x, 1.5)], axis=1), faces))
     needs.evaluate_mesh(made.state, 0.2)
     assert (
         made.state.needs["reflections"]["needed"]
@@ -205,7 +212,7 @@ def test_views_that_show_the_same_from_the_same_place(mirror, tmp_path):
 
 
 def test_the_part_about_the_mask_is_all_that_counts(mirror, tmp_path):
-    """The loss and gradients of a crop are the full photo's where nothing lies outside the crop."""
+    """A crop about the mask gives the same loss and gradients as the full photo, if nothing lies outside the crop."""
     made, generator = trainer(mirror, tmp_path / "run", total=10), torch.Generator().manual_seed(0)
     camera = made.state.photos[0].camera
     camera = replace(camera, fx=0.6 * camera.fx, fy=0.6 * camera.fy)
@@ -244,7 +251,7 @@ def test_surfels_that_are_faint_decide_nothing_and_are_no_mesh(mirror, tmp_path)
     changes = ["densify.reset_every=5", "densify.stop=0.1", "rates.opacity=1.0", "rates.decay=1.0"]
     changes += ["needs.specular=on", "needs.reflections=on", "indirect.start=0", "indirect.every=8"]
     made = trainer(mirror, tmp_path / "run", *changes, total=60)
-    way = 4 * math.log(SEEN / (1 - SEEN) * (1 - RESET) / RESET)  # in iterations, by a rate of one
+    way = 4 * math.log(SEEN / (1 - SEEN) * (1 - RESET) / RESET)  # iterations that surfels stay faint, at a rate of one
     made.run(stop=lambda: made.state.iteration >= 5 + math.floor(way))
     assert faint_now(made.state) and made.state.iteration > 60 * lighting.Light.SETTLED
     assert "light" not in made.state.needs and made.state.occluder is None
@@ -259,14 +266,16 @@ def test_what_the_part_about_the_mask_saves_is_timed(mirror, tmp_path, monkeypat
     asked = []
     monkeypatch.setattr(probe, "seconds_saved", lambda trainer, whole: asked.append(whole) or 8.0)
     made.run(stop=lambda: made.state.iteration == 6)
-    assert (
-        asked == [True] and made.state.needs["outside"]["seconds"] == 7.0
-    )  # one iteration in eight sees the full photo
+    # 7/8 of 8 s are saved: one iteration in eight uses the full photo.
+    assert asked == [True] and made.state.needs["outside"]["seconds"] == 7.0
     assert next(row for row in needs.rows(made.state) if row["need"] == "outside")["saved"] == "7.0 s, 0.0 MB"
 
 
 def test_texels_by_the_lobe():
-    """A texel, a quarter turn over their number, takes no more than half of the lobe's width, roughness²."""
+    """The chosen cubemap is the smallest whose texels are no wider than LOBE times the lobe's width, roughness².
+
+    A texel is a quarter turn divided by the side. The side is limited to 16 … 256.
+    """
     lobe = lighting.Light.LOBE
     for roughness, side in ((1.0, 16), (0.5, 16), (0.4, 32), (0.2, 128), (0.05, 256)):
         assert lighting.resolvable(roughness, lobe, 256, 16) == side
@@ -283,7 +292,7 @@ def test_weighted_quantiles():
 
 
 def test_degrees_by_what_they_are_worth(mirror, tmp_path):
-    """Keep the degrees up to the last that the photos show: all three, two, one, none."""
+    """Harmonics are kept up to the highest degree that the photos show: three, two, one, none."""
     changes = ["needs.specular=on", "needs.reflections=off", "needs.light=on", "residual.start=0.5"]
     made = trainer(mirror, tmp_path / "run", *changes, total=10)
     made.run(stop=lambda: made.state.iteration == 6)
@@ -314,14 +323,17 @@ def test_what_all_have_alike_is_said_once(mirror, tmp_path):
 
 
 def photographed(state, photo, noise=0.0):
-    """Replace a photo by what the model shows there, and noise."""
+    """Replace a photo by the model's own rendering with noise."""
     color = state.render(photo.camera).color
     color = color + noise * torch.randn(color.shape, generator=torch.Generator().manual_seed(0))
     return photo._replace(image=(color.clamp(0, 1) * 255).round().byte(), mask=torch.full_like(photo.mask, 255))
 
 
 def test_specular_on_synthetic_surfels(mirror, tmp_path):
-    """Photos are the model's own pictures: a mirror needs specular shading, chalk does not."""
+    """Specular shading explains at least 3 in photos of a mirror, at most 0.3 in photos of a matte ball.
+
+    Photos are renderings of the model itself.
+    """
     made = trainer(mirror, tmp_path / "run", total=10)
     light = torch.randn(made.state.light.shape, generator=torch.Generator().manual_seed(1))
     for metallic, roughness, least, most in ((5.0, -3.0, 3.0, math.inf), (-20.0, 20.0, -math.inf, 0.3)):
@@ -334,7 +346,7 @@ def test_specular_on_synthetic_surfels(mirror, tmp_path):
 
 
 def test_shares_are_weights(mirror, tmp_path):
-    """All shares add up to the picture's alpha; weighted means of a constant are that constant."""
+    """Blended shares add up to the picture's alpha. As weights, they average a constant to that constant."""
     made = trainer(mirror, tmp_path / "run", total=10)
     photo, surfels = made.state.photo(0), made.state.surfels()
     alpha = made.state.render(photo.camera).alpha
@@ -348,7 +360,7 @@ def test_shares_are_weights(mirror, tmp_path):
 
 
 def test_training_does_not_load_torchs_compiler(mirror, tmp_path):
-    """It takes two seconds of a start, and sympy half a second; torch loads sympy where `backward` is given a gradient."""
+    """Training imports neither torch._dynamo (2 s) nor sympy (0.5 s); torch imports sympy if `backward` gets a gradient."""
     program = """
 import sys
 from pathlib import Path

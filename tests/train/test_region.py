@@ -1,4 +1,4 @@
-"""Train a region of a capture: only the ball in the box is left, and the result stands upright as asked."""
+"""Test training a region of a capture: only the ball in the box remains, and the result is upright as asked."""
 
 import json
 
@@ -33,7 +33,7 @@ RIGHT = ["region.centre=[0.62, 0.0, 0.0]", "region.size=[1.2, 1.2, 1.2]"]
 
 @pytest.fixture(scope="module", params=["masks", "no masks"])
 def balls(request, tmp_path_factory):
-    """Capture two mirror balls that occlude each other in some photos, with masks or before grey."""
+    """Write a capture of two mirror balls that occlude each other in some photos, with masks or on a grey background."""
     folder = tmp_path_factory.mktemp("balls")
     write_ball_capture(folder, 48, TWO, samples=2)
     if request.param == "no masks":
@@ -66,7 +66,7 @@ def test_only_what_is_in_the_box_comes_out(right, balls):
     said = {entry["why"]: entry["what"] for entry in json.loads((folder / "needs.json").read_text())}
     assert said["they show what is outside the region"] == f"{beside} surfels"
     assert quality > (20 if trainer.from_hull else 15)
-    # The silhouette is the whole ball's, also where the other ball occludes it.
+    # The silhouette must be that of the whole ball, even where the other ball occludes it.
     shares = []
     for view in trainer.test:
         direction = view.camera.position @ trainer.capture.to_capture[:3, :3].T
@@ -109,7 +109,7 @@ def test_a_box_with_nothing_in_it_is_said_in_a_line(balls, tmp_path):
 
 
 def test_up_turns_the_result_and_nothing_else(ball_capture, tmp_path):
-    """Both runs look the same through their own cameras, and so does the light in Blender's axes."""
+    """`region.up` turns the result, but a run renders as before through its own cameras, under the same light."""
     up = np.array([0.6, 0.0, 0.8])
     folders = [tmp_path / "plain", tmp_path / "turned"]
     for folder, words in zip(folders, ([], [f"region.up={up.tolist()}"]), strict=True):

@@ -1,4 +1,4 @@
-"""Residual colour by direction adds to the picture what material and light leave over."""
+"""Test the residual: colour by direction that is added to the shaded picture."""
 
 import json
 
@@ -24,7 +24,7 @@ SMALL = [
     "train.light_first=0",
     "residual.start=0.5",
     "rates.residual=0.02",
-    "needs.specular=on",  # a few iterations do not tell
+    "needs.specular=on",  # too few iterations to decide
     "needs.degrees=on",
 ]
 
@@ -59,7 +59,7 @@ def test_it_learns_when_material_and_light_have(ball_capture, tmp_path):
 
 
 def test_it_adds_its_blend_to_the_picture(learned):
-    """The residual is Σ_k c_k Y_k(d) of each surfel, d the direction from the camera, in float64."""
+    """The picture gains the blend of the surfels' residuals Σ_k c_k Y_k(d), d being the direction from the camera."""
     run, camera = open_run(learned.state.folder), learned.state.test[0].camera
     surfels = run.surfels()
     ways = surfels.positions.double() - torch.from_numpy(camera.position)

@@ -1,4 +1,4 @@
-"""Place the first surfels of captures without masks."""
+"""Test placing the first surfels of captures without masks."""
 
 import dataclasses
 
@@ -35,4 +35,4 @@ def test_enough_structure_from_motion_points_are_all_there_is(tmp_path):
 def test_without_points_they_are_random(tmp_path):
     capture, position, _, said = start(tmp_path, 20)
     assert "random points" in said and len(position) == 1000
-    assert np.linalg.norm(position - capture.centre, axis=1).max() <= capture.radius  # taken for an object
+    assert np.linalg.norm(position - capture.centre, axis=1).max() <= capture.radius

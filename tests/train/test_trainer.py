@@ -37,7 +37,7 @@ def ball(ball_capture, tmp_path_factory):
 
 
 def test_the_ball_is_recovered(ball):
-    """Compare held-out views, normals, depth, light and metal with what the capture was made from."""
+    """Held-out views, normals, depth, metallic and light are close to the ground truth of the ball."""
     assert held_out_psnr(ball.state) > 30
     for view in ball.state.test:
         seen, ray = ball.state.render(view.camera), scenes.camera_rays(view.camera).double().numpy().reshape(-1, 3)
@@ -51,7 +51,7 @@ def test_the_ball_is_recovered(ball):
         assert np.abs(seen.depth[shown].numpy() - depth).mean() < 0.1
         assert float(seen.metallic[shown].mean()) > 0.8
         albedo = seen.albedo[shown].mean(dim=0).numpy()
-    # Albedo and light share a scale: compare their product, and the light's shape.
+    # Albedo and light share a scale, so compare their product and the shape of the light.
     panorama = ball.state.environment().panorama(32)
     truth = sky(directions(32, 64))
     product = panorama.mean(axis=(0, 1)) * albedo / (truth.mean(axis=(0, 1)) * F0)
@@ -67,7 +67,10 @@ def test_the_asset_renders_as_the_training_did(ball):
 
 
 def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
-    """Near the horizon a surfel's side matters: only the column of normals is turned outward, not the surfel."""
+    """In the asset, only the column of normals is turned outward; surfels keep their rotation.
+
+    Near the horizon, shading depends on which side of a surfel is its front.
+    """
     made = trainer(ball_capture, tmp_path / "run", total=10)
     made.run()
     with torch.no_grad():
@@ -81,9 +84,8 @@ def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
     inward = (run.surfels().normals() * torch.from_numpy(run.splats.normals)).sum(dim=-1) < 0
     assert 0.3 < inward.float().mean() < 0.7
     object.__setattr__(run, "splats", to_splats(run.surfels().turned(inward)))
-    assert (
-        float((learned - run.render(camera).normal).abs().max()) > 0.01
-    )  # turning the surfels too would change the picture
+    # Turning the surfels would change the picture.
+    assert float((learned - run.render(camera).normal).abs().max()) > 0.01
 
 
 def test_what_a_ball_does_without(ball):
@@ -126,7 +128,7 @@ REGION = ["region.centre=[0.0, 0.0, 0.4]", "region.size=[2.5, 2.5, 1.2]", "regio
 
 @pytest.mark.parametrize("changes", [[], ["shading=sh"], ["diffuse=sh"], INDIRECT, TURNING, STAGES, REGION])
 def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
-    """Parameters agree bit for bit, through densification."""
+    """A run that is resumed from a checkpoint gives the same parameters, bit for bit, with densification too."""
     changes = [*changes, "train.checkpoint_every=40", "densify.every=25"]
     whole = trainer(ball_capture, tmp_path / "whole", *changes, total=80)
     whole.run()
@@ -142,7 +144,7 @@ def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
     for name, value in whole.state.parameters.items():
         assert torch.equal(value, second.state.parameters[name]), name
     assert torch.equal(whole.state.light, second.state.light)
-    # With STAGES all surfels are faint when exposures would be judged.
+    # With STAGES, all surfels are faint when exposures would be decided, so exposures stay.
     assert (second.state.exposures is not None) == (changes[0] in (TURNING[0], STAGES[0]))
     if second.state.exposures is not None:
         assert torch.equal(whole.state.exposures, second.state.exposures) and whole.state.exposures.any()
@@ -168,7 +170,7 @@ def test_shading_sh_learns_colour_alone(ball_capture, tmp_path):
 
 
 def test_sh_diffuse_leaves_an_albedo_that_relights(ball_capture, tmp_path):
-    """A dielectric's albedo is its colour divided by the light that it receives; a metal's is its reflectance."""
+    """With diffuse=sh, a dielectric's albedo is its colour over the received light; a metal's is its reflectance."""
     made = trainer(ball_capture, tmp_path / "run", "diffuse=sh", "surfels.metallic=0.1", total=100)
     made.run()
     reflectance = torch.tensor([0.9, 0.6, 0.3])
@@ -176,7 +178,7 @@ def test_sh_diffuse_leaves_an_albedo_that_relights(ball_capture, tmp_path):
     with torch.no_grad():
         parameters["metallic"][::2], parameters["metallic"][1::2] = -20, 20
         parameters["albedo"][:] = reflectance.logit()
-        sent = 0.3 * (0.5 + harmonics.DC * parameters["sh_dc"])  # darker, or most of it would be beyond white
+        sent = 0.3 * (0.5 + harmonics.DC * parameters["sh_dc"])  # darken the colours, or most albedos would exceed 1
         parameters["sh_dc"][:] = (sent - 0.5) / harmonics.DC
     write_asset(made.state)
     run = open_run(tmp_path / "run")
