@@ -76,7 +76,7 @@ def disc(centre, axis, radius: float, half: float, round: float) -> Solid:
 def sweep(path, radii) -> Solid:
     """Round limb along a cubic spline through `path` (n, 3), with radii (n,) or one; its ends are half balls.
 
-    Distances end at FAR.
+    Distances are capped at FAR.
     """
     path = np.asarray(path, float)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])

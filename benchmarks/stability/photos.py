@@ -31,7 +31,8 @@ def elsewhere(scale: float, offset: float) -> Found:
     surfels = activate({**made.constant, **made.parameters})
     to_capture = made.capture.to_capture
     place = surfels.positions.detach().numpy().astype(float) @ to_capture[:3, :3].T + to_capture[:3, 3]
-    radius = np.percentile(np.linalg.norm((place - offset) / scale, axis=1), 75)  # half of the surfels start inside
+    # The 75th percentile, because half of the surfels start inside the object.
+    radius = np.percentile(np.linalg.norm((place - offset) / scale, axis=1), 75)
     return Found(course.finite and 0.9 < radius < 1.05, abs(course.end - usual().end))
 
 

@@ -330,7 +330,7 @@ def photographed(state, photo, noise=0.0):
 
 
 def test_specular_on_synthetic_surfels(mirror, tmp_path):
-    """Specular shading explains at least 3 in photos of a mirror, at most 0.3 in photos of a matte ball.
+    """Specular shading gains over 3 dB in photos of a mirror, and under 0.3 dB in photos of a matte ball.
 
     Photos are renderings of the model itself.
     """
