@@ -1,3 +1,3 @@
-"""Measurements of RefGS, from a clone: `refgs bench` and `refgs stability`; scenes with ground truth."""
+"""Measure RefGS in a copy of its repository: `refgs bench`, `refgs stability`, and scenes with ground truth."""
 
 BENCHMARKS = ("kernels", "truth", "paper", "needs", "minutes", "gpu", "page")

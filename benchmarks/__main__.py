@@ -1,4 +1,4 @@
-"""`refgs bench WHAT [OPTIONS]`: run one of the benchmarks."""
+"""Run one of the benchmarks: `refgs bench WHAT [OPTIONS]`."""
 
 import importlib
 import sys

@@ -25,7 +25,7 @@ SHADING_OPERATIONS = 410 + 1000
 
 
 class Need(NamedTuple):
-    """Number of operations and of bytes that a part needs."""
+    """Numbers of operations and of bytes that a part of the program needs."""
 
     operations: float
     bytes: float

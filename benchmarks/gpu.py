@@ -1,8 +1,9 @@
 """Measure a CUDA card in one go: `refgs bench gpu`.
 
-The ball of `benchmarks.kernels` at three sizes: the rasteriser forward and backward beside its floors, and beside gsplat's 2DGS where
-gsplat is installed. Then frames of the whole renderer, an iteration by kernel, and trainings of 100 views with ground truth by the
-presets `standard` and `paper`. Every time ends when the card has done its work.
+Four things are timed. The rasteriser draws the ball of `benchmarks.kernels` at three sizes, forward and backward; its times are shown
+beside its floors (the least possible times), and beside gsplat's 2DGS if gsplat is installed. The renderer draws whole frames. One
+iteration is timed kernel by kernel. A scene of 100 views with ground truth is trained by the presets `standard` and `paper`. Every
+measurement waits until the card has finished.
 """
 
 import argparse

@@ -1,6 +1,6 @@
-"""The harness of all benchmarks: scenes, runs, rows of figures, tables of rows.
+"""Run benchmarks: find scenes, train runs, record rows of figures, print tables of rows.
 
-A benchmark trains what is not trained yet, records rows, and names tables. Its tables are printed with the kept figure in brackets, and
+A benchmark trains the runs that are missing, records rows, and names its tables. A table is printed with the kept figures in brackets.
 `--csv FILE` writes the rows. docs/measurements.csv keeps them; `refgs bench page` makes docs/measurements.md from it.
 """
 

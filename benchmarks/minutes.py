@@ -1,7 +1,7 @@
 """Measure the PSNR that a training reaches in a given time: `refgs bench minutes --scenes DIR`.
 
-Each scene is trained by the presets `quick` and `standard`, and with nothing but a time. The held-out PSNR for a given time is compared
-with the best PSNR that a preset's run had reached by then. Seconds count from the command to the written asset.
+Each scene is trained by the presets `quick` and `standard`, and with a time limit and no preset. The held-out PSNR of a time-limited run
+is compared with the best PSNR that a preset's run had reached by that time. Seconds count from the command to the written asset.
 """
 
 import argparse

@@ -1,4 +1,6 @@
-"""Measure what scenes leave out and what that saves: `refgs bench needs --scenes DIR`.
+"""Measure which parts of the method scenes leave out, and how much that saves: `refgs bench needs --scenes DIR`.
+
+A need is a part of the method that a scene may do without.
 
 Each scene is trained with every need "auto" (decided by the photos), with every need on, and without inter-reflection. Seconds are
 processor time, so that other programs hardly disturb them.

@@ -1,7 +1,7 @@
 """Measure the method on scenes with ground truth: `refgs bench truth --scenes DIR`.
 
-Each scene is trained by a preset and compared with all its ground truth. For comparison of novel views, plain colour by direction
-(`shading=sh`) is trained for as long.
+Each scene is trained by a preset and compared with all its ground truth. Plain colour by direction (`shading=sh`) is trained for the same
+time, to compare the novel views.
 """
 
 import argparse

@@ -1,1 +1,1 @@
-"""Programs of the repository that are not installed with the trainer or the extension."""
+"""Hold programs of the repository that are installed neither with the trainer nor with the extension."""

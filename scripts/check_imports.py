@@ -1,6 +1,9 @@
-"""Check the imports of the trainer and of the extension: floors, circles, and who may import bpy and torch.
+"""Check the imports of the trainer and of the extension.
 
-    python scripts/check_imports.py [FOLDER]      # the clone, or another that is laid out like it
+The trainer's packages stand on floors: a module imports its own floor and those below. No modules import each other in a circle. The
+trainer never imports bpy, the extension never torch.
+
+    python scripts/check_imports.py [FOLDER]      # this repository, or a folder that is laid out like it
 
 Imports at the top, inside functions and under TYPE_CHECKING all count. Print a line for each import that breaks a rule; exit with
 status 1 if there is one.

@@ -1,7 +1,7 @@
-"""Captures with ground truth, rendered by Cycles: `python -m benchmarks.scenes NAME --out DIR`.
+"""Render captures with ground truth by Cycles: `python -m benchmarks.scenes NAME --out DIR`.
 
-One module a scene, each with `build()`; `solids` sculpts their meshes. `scripts.demo` has the jar and what photographs them all;
-`analytic` makes captures without Blender.
+Each scene is a module with a function `build()`. `solids` sculpts the meshes. `scripts.demo` photographs the scenes, and has one more: the
+jar. `analytic` makes captures without Blender.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.scenes NAME --out DIR`: render a capture with ground truth; `all` renders each into DIR/NAME."""
+"""Render a capture with ground truth: `python -m benchmarks.scenes NAME --out DIR`. `all` renders each scene into DIR/NAME."""
 
 from functools import partial
 

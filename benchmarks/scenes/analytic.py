@@ -50,7 +50,7 @@ STEPS = 14  # nodes of the lobe's quadrature along each axis
 
 
 def sunny(direction: np.ndarray) -> np.ndarray:
-    """Compute the radiance of the sky with soft suns, 10 degrees wide, in which roughness is visible."""
+    """Compute the radiance of the sky with soft suns, 10 degrees wide. Their reflections show how rough a surface is."""
     return 0.4 * sky(direction) + 0.55 * np.exp(30 * (direction @ SUNS.T - 1)).sum(axis=-1, keepdims=True)
 
 
@@ -99,7 +99,7 @@ def reflect(material: Material, ray: np.ndarray, normal: np.ndarray) -> np.ndarr
 
 
 def banded(ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Compute the radiance (P, 3) of a ball with the materials BANDS."""
+    """Compute the radiance (P, 3) of a ball with three horizontal bands of materials (BANDS)."""
     color, left = np.zeros_like(ray), np.ones(len(ray), bool)
     for lowest, material in BANDS:
         here = left & (normal[:, 2] >= lowest)
@@ -122,7 +122,7 @@ def photo(
 ) -> np.ndarray:
     """Compute a photo, RGBA in 0..1, of balls (B, 4), given by centre and radius.
 
-    Balls are mirrors with Schlick's Fresnel, have BANDS, or are matte with a pattern.
+    A ball is a mirror with Schlick's Fresnel, has three horizontal bands of materials (BANDS), or is matte with a pattern.
 
     Alpha is the mean over `samples`² rays a pixel. The mirrors' sky is fixed or turns with the camera about z. `stops` is the exposure.
     """

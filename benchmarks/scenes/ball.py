@@ -1,4 +1,4 @@
-"""Mirror ball with a rough band about its equator: convex, so it reflects only the light."""
+"""Build a mirror ball with a rough band about its equator. It is convex, so it reflects the environment and never itself."""
 
 import numpy as np
 

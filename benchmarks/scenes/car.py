@@ -1,4 +1,4 @@
-"""Small round car: glossy paint over a pattern, dark glass, chrome and rubber."""
+"""Build a small round car of glossy patterned paint, dark glass, chrome and rubber."""
 
 import numpy as np
 

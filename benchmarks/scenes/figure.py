@@ -1,4 +1,4 @@
-"""Dancer of polished bronze in a silver skirt on a plinth: limbs and folds that reflect each other."""
+"""Build a dancer of polished bronze in a silver skirt on a plinth. Her limbs and folds reflect each other."""
 
 from benchmarks.scenes.solids import blend, disc, ellipsoid, mirrored, ring, sculpt, sweep
 from scripts.demo.shapes import Material, Scene, join

@@ -1,4 +1,4 @@
-"""Pilot's helmet: a shell of rough plastic with stripes, a gold visor, a steel frame, copper at the ears, rubber below."""
+"""Build a pilot's helmet: rough striped plastic, a gold visor, a steel frame, copper at the ears, rubber below."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Cactus in flower in a clay pot, all matte: the scene without reflections."""
+"""Build a flowering cactus in a clay pot. All of it is matte: the scene has no reflections."""
 
 import numpy as np
 

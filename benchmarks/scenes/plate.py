@@ -1,4 +1,4 @@
-"""Several objects of different materials on a glazed plate, which reflects them and is reflected by them."""
+"""Build a glazed plate with objects of several materials on it. Plate and objects reflect each other."""
 
 import numpy as np
 

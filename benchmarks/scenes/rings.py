@@ -1,4 +1,4 @@
-"""Three linked metal rings that reflect and occlude each other: the hard case."""
+"""Build three linked metal rings. They reflect and occlude each other, which makes this scene hard."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Teapot of glossy ceramic: one smooth body with its spout and handle, two glazes that run into each other, a lid."""
+"""Build a teapot of glossy ceramic: a smooth body with spout, handle and lid, and two glazes that run into each other."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Toaster on a tray, all of polished steel: flat and concave mirrors that see each other, and two slices of bread."""
+"""Build a toaster on a tray, all of polished steel, with two slices of bread. Its flat and concave mirrors reflect each other."""
 
 import numpy as np
 

@@ -59,7 +59,7 @@ def surfels(
 
 
 def moved(scale: float = 1.0, offset: float = 0.0) -> Found:
-    """Compare the rasteriser on a scene that is scaled and moved with its camera."""
+    """Scale and move a scene together with its camera; compare the rasteriser with float64."""
     view = camera()
     position, rotation, size, *rest = surfels(view)
     pose = view.world_to_camera.copy()

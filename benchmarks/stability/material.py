@@ -1,4 +1,4 @@
-"""Cases of unusual materials and lights, for shading, prefilter, D-SSIM, activations, optimiser and rays."""
+"""Test shading, prefilter, D-SSIM, activations, optimiser and rays with unusual materials and lights."""
 
 from functools import partial
 

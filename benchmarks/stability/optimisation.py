@@ -1,4 +1,4 @@
-"""Cases of disturbed trainings, which must recover, and of repeated ones, which must agree bit for bit."""
+"""Disturb trainings, which must recover, and repeat trainings, which must agree bit for bit."""
 
 import functools
 import math
@@ -101,7 +101,10 @@ def with_settings(*changes: str, total: int = TOTAL) -> Found:
 
 
 def trajectories() -> Found:
-    """Take thirty steps of Adam with the kernels and in float64; return how far the final pictures differ, relative to what was learned."""
+    """Take thirty steps of Adam twice: with the kernels, and in float64.
+
+    Returns the difference of the two final pictures, divided by how much the picture changed during the steps.
+    """
     view = camera(size=(24, 18))
     target = reference.rasterize(*(v.double() for v in surfels(view, 60)), view, 0.1)[0].float()
     start = surfels(view, 60)

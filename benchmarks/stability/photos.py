@@ -1,4 +1,4 @@
-"""Cases of unusual captures, each with a whole training."""
+"""Train on unusual captures."""
 
 import functools
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""`python -m scripts.demo jar --out DIR`: photograph the jar of `refgs demo`."""
+"""Photograph the jar of `refgs demo`: `python -m scripts.demo jar --out DIR`."""
 
 from scripts.demo import jar
 from scripts.demo.photograph import main

@@ -1,4 +1,4 @@
-"""Lidded urn of gold, copper and glazed ceramic with a dark band, in a room: shiny, partly concave, several materials."""
+"""Build a lidded urn of gold, copper and glazed ceramic with a dark band, which stands in a room. It is shiny and partly concave."""
 
 import numpy as np
 

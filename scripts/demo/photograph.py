@@ -1,7 +1,7 @@
 """Photograph objects from a command line: `NAME --out DIR` writes a capture with ground truth, `all` each into DIR/NAME.
 
 Standard output carries JSON lines: {"event": "progress", "done": 3, "total": 104, "what": "train views"}. Blender's own messages go to
-standard error. Exit status 2 and one line: the input is wrong.
+standard error. If the input is wrong, one line says so and the exit status is 2.
 """
 
 import argparse

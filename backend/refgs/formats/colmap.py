@@ -1,7 +1,7 @@
 """Read COLMAP's sparse models, binary or text (COLMAP's documentation, "Output Format").
 
-COLMAP's own reader is not used: on a truncated file it gives an unrelated message or asks for terabytes of memory. This one names
-the file.
+COLMAP's own reader is not used: for a truncated file it prints an unrelated message, or asks for terabytes of memory. This reader's
+errors name the file.
 """
 
 import re

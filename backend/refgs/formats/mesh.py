@@ -1,4 +1,4 @@
-"""Triangle meshes, read from and written to PLY files."""
+"""Hold triangle meshes; read and write them as PLY files."""
 
 import os
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Equirectangular panoramas of radiance, in Blender's orientation (see `directions`). `write_exr` writes them."""
+"""Read and sample equirectangular panoramas of radiance, in Blender's orientation (see `directions`)."""
 
 import os
 import warnings

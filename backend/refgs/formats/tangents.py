@@ -1,4 +1,4 @@
-"""MikkTSpace tangents, as glTF demands and Blender computes."""
+"""Compute MikkTSpace tangents, which glTF demands and Blender computes, too."""
 
 import numpy as np
 

@@ -1,1 +1,1 @@
-"""Geometry: visual hulls, TSDF fusion of depth maps, clean-up of meshes, visibility by ray tracing."""
+"""Carve visual hulls, fuse depth maps, clean meshes, trace visibility."""

@@ -1,10 +1,10 @@
-"""Methods of other papers, to compare with: the settings that only they use, and how their pictures are made.
+"""Render by the methods of other papers, for comparison.
 
-`method_of` is the one place that reads these settings. Its other results are RefGS's own: deferred shading in linear radiance.
+Only `method_of` reads the settings that select these methods. By default it returns RefGS's own: deferred shading in linear radiance.
 
 - `shading = "splat"`: each surfel is shaded before blending, as in the paper's initial stage (§3.3).
 - `shading = "sh"`: colour by direction of each surfel, as in 2DGS; there is neither material nor light.
-- `reflection = "mirror"`: a sharp mirror image, of which metallic is the share (Ye et al., 3DGS-DR, 2024).
+- `reflection = "mirror"`: a sharp mirror image, weighted by metallic (Ye et al., 3DGS-DR, 2024).
 - `color_space = "display"`: light and materials are a screen's numbers in 0..1, as in the paper.
 - `primitive = "3dgs"`: 3D Gaussians in place of surfels (`refgs.render.volume`).
 """
@@ -41,23 +41,23 @@ class LinearLight:
     brightest = 1e8  # raw texel; beyond it, sums lose what is small
 
     def radiance(self, raw: Tensor) -> Tensor:
-        """Radiance of raw texels, as they are learned."""
+        """Convert raw texels, which are learned, to radiance."""
         return torch.nn.functional.softplus(raw)
 
     def raw(self, radiance: float) -> float:
-        """The raw texel of a radiance: the inverse of `radiance`."""
+        """Convert a radiance to a raw texel; the inverse of `radiance`."""
         return math.log(math.expm1(radiance))
 
     def encode(self, radiance: Tensor) -> Tensor:
-        """The colour in a picture of a radiance."""
+        """Convert radiance to a colour in the picture."""
         return srgb_encode(radiance)
 
     def to_linear(self, panorama):
-        """Linear radiance of a panorama of this light, a float array."""
+        """Convert a panorama of this light, a float array, to linear radiance."""
         return panorama
 
     def from_linear(self, panorama):
-        """The inverse of `to_linear`."""
+        """Convert a panorama of linear radiance to one of this light; the inverse of `to_linear`."""
         return panorama
 
 
@@ -88,10 +88,10 @@ LINEAR, SCREEN = LinearLight(), ScreenLight()
 
 @dataclass(frozen=True)
 class Method:
-    """How surfels and light become pictures. The defaults are RefGS's own.
+    """Way of turning surfels and light into pictures. The defaults are RefGS's own.
 
-    `draw` replaces the deferred path of `render`; it takes the same arguments. `unread` are parameters that no picture reads, `constants`
-    raw values of those that are the same for all surfels; neither learns. `left_out` are rows of needs.json.
+    `draw` replaces the deferred path of `render` and takes the same arguments. `unread` names parameters that no picture reads. `constants`
+    are raw values of parameters that are equal for all surfels. Neither learn. `left_out` are rows of needs.json.
     """
 
     lit: bool = True
@@ -106,7 +106,7 @@ class Method:
 
 @lru_cache
 def method_of(settings: RenderSettings) -> Method:
-    """The method that these settings ask for."""
+    """Return the method that the settings select."""
     method = Method()
     if settings.shading == "sh":
         row = {"what": "materials and light", "why": "shading = sh", "saved": "shading and the light's prefilter"}
@@ -129,12 +129,12 @@ def method_of(settings: RenderSettings) -> Method:
 
 
 def initial_stage(settings: RenderSettings) -> RenderSettings:
-    """These settings with each surfel shaded before blending: the paper's initial stage (§3.3)."""
+    """Change settings to those of the paper's initial stage, in which each surfel is shaded before blending (§3.3)."""
     return settings.model_copy(update={"shading": "splat"})
 
 
 def axes_of(settings: SurfelSettings) -> int:
-    """How many axes of a surfel have a scale."""
+    """Return the number of a surfel's axes that have a scale."""
     return 3 if settings.primitive == "3dgs" else 2
 
 
@@ -148,7 +148,7 @@ def draw_colors(
     occluder: None = None,
     exposure: None = None,
 ) -> Rendering:
-    """Blend each surfel's colour by direction, sRGB-encoded. The arguments are those of `render`; light and exposure are not read."""
+    """Blend the surfels' colours by direction, sRGB-encoded. Takes the arguments of `render`, but reads neither light nor exposure."""
     normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
     colors = directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera)
     features, depth, alpha = rasterize(*discs(surfels, camera), stack([normals, colors]), camera, near=near)
@@ -168,7 +168,7 @@ def draw_shaded_surfels(
     occluder: None = None,
     exposure: Tensor | None = None,
 ) -> Rendering:
-    """Shade each surfel, then blend (paper §3.3). The arguments are those of `render`; no rays are traced."""
+    """Shade each surfel, then blend (paper §3.3). Takes the arguments of `render`, but traces no rays."""
     method, matte = method_of(settings), settings.reflection == "none"
     lit = channels(surfels, camera, settings, indirect=False)
     blended = [lit[0], shade_splats(stack(lit), environment, camera, method.mirror), *lit[1 : 2 if matte else 4]]

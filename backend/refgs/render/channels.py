@@ -1,4 +1,4 @@
-"""The features of surfels that are blended before they are shaded."""
+"""Collect the surfels' features that deferred shading blends."""
 
 from torch import Tensor
 
@@ -11,10 +11,10 @@ from refgs.settings import RenderSettings
 
 
 def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirect: bool) -> list[Tensor]:
-    """Features (N, C) of surfels as a camera sees them, in the order that `shade` reads them.
+    """Collect the features (N, C) of surfels, as a camera sees them, in the order that `shade` reads.
 
-    Normals and albedo; then, unless nothing is reflected: metallic, roughness; colour by direction with `diffuse = "sh"`, or else the
-    received part of the irradiance with `indirect`; radiance from the object itself with `indirect`; positions.
+    First come normals and albedo. Unless the settings reflect nothing, these follow: metallic and roughness; colour by direction (`diffuse
+    = "sh"`) or the received part of the irradiance (with `indirect`); radiance from the object itself (with `indirect`); positions.
     """
     normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
     if settings.reflection == "none":

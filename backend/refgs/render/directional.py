@@ -1,4 +1,4 @@
-"""Colour of surfels by viewing direction."""
+"""Evaluate the colour of surfels by viewing direction."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Normals of surfels, turned towards a camera."""
+"""Turn the normals of surfels towards a camera."""
 
 import torch
 from torch import Tensor

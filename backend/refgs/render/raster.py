@@ -1,4 +1,4 @@
-"""The part that the CPU's and CUDA's rasterisers share."""
+"""Share code between the rasterisers of the CPU and of CUDA cards."""
 
 from torch import Tensor
 
@@ -6,8 +6,10 @@ from refgs.camera import Camera
 
 
 class Scene:
-    """Arguments of either rasteriser's kernels: a mixin of its `struct Raster`. A rasteriser has `project` to find the splats
-    of each tile, `blend` to draw them, and `differentiate` to fill in the derivatives."""
+    """Arguments of a rasteriser's kernels; a mixin for the rasteriser's `struct Raster`.
+
+    A rasteriser adds three methods: `project` finds the splats of each tile, `blend` draws them, `differentiate` fills in the derivatives.
+    """
 
     def look(self, camera: Camera, near: float, upper: float = 1.0, lower: float = 0.0) -> None:
         self.width, self.height = camera.width, camera.height

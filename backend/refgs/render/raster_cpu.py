@@ -1,4 +1,4 @@
-"""The rasteriser on the CPU."""
+"""Rasterise on the CPU."""
 
 import ctypes
 

@@ -1,4 +1,4 @@
-"""The rasteriser on CUDA cards."""
+"""Rasterise on a CUDA card."""
 
 import ctypes
 

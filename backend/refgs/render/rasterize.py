@@ -1,4 +1,4 @@
-"""The differentiable rasteriser: surfels to maps."""
+"""Rasterise surfels into maps, differentiably."""
 
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ class Raster(NamedTuple):
 
 
 def _draw(splats: dict[str, Tensor], camera: Camera, near: float, *trim: float) -> tuple[Scene, Raster]:
-    """Draw splats, the arguments of `rasterize` or `trimmed_depth`; return the maps and the work, which points at all tensors."""
+    """Draw `splats`, the tensors that `rasterize` or `trimmed_depth` was given. Returns the kernels' arguments and the maps."""
     features = splats["features"]
     rasteriser = raster_cuda if load.on_gpu(features) else raster_cpu
     work = rasteriser.Raster(splats=features.shape[0], channels=features.shape[1])
@@ -135,9 +135,9 @@ def trimmed_depth(
     """Compute the depth (H, W) of the surface along the camera's axis, and alpha (H, W); not differentiable.
 
     The depth is a trimmed mean over the surfels that a ray meets while its transmittance falls from `upper` to `lower`, 1 ≥ upper >
-    lower ≥ 0. So neither faint surfels in front of the surface nor anything that shows through it counts. It tends to the median, 2DGS's
-    depth for unbounded scenes, as both near 0.5. It is 0 where the transmittance stays above `upper`. The other arguments are those of
-    `rasterize`.
+    lower ≥ 0. Faint surfels in front of the surface and surfels behind it do not count. As both limits approach 0.5, the depth approaches
+    the median, which is 2DGS's depth for unbounded scenes. It is 0 where the transmittance stays above `upper`.
+    The other arguments are those of `rasterize`.
     """
     splats = {"positions": positions, "rotations": rotations, "scales": scales, "opacities": opacities}
     splats = {name: value.contiguous() for name, value in splats.items()} | {

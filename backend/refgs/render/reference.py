@@ -1,4 +1,7 @@
-"""What the kernels compute, in a few lines of torch: float64, autograd; the rasteriser dense over pixels × splats. The tests' oracle."""
+"""Compute what the kernels compute, in float64 with torch's autograd. Tests compare the kernels with these functions.
+
+The rasteriser evaluates every splat at every pixel.
+"""
 
 import math
 
@@ -15,7 +18,7 @@ COVERED, SHIFT_LIMIT, SHIFT_ALPHA = 1 / 255, 8.0, 0.3  # as in pixels.h
 
 
 def rotation_matrices(q: Tensor) -> Tensor:
-    """(N, 3, 3) from quaternions wxyz (N, 4) of any length; the identity for those without one."""
+    """Convert quaternions wxyz (N, 4) of any length to matrices (N, 3, 3). A quaternion of length 0 gives the identity."""
     norm = q.norm(dim=-1, keepdim=True)
     unit = torch.tensor([1.0, 0, 0, 0], dtype=q.dtype)
     w, x, y, z = torch.where(norm < 1e-12, unit, q / norm.clamp_min(1e-12)).unbind(-1)
@@ -36,9 +39,10 @@ def rasterize(
     upper: float = 1.0,
     lower: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """As refgs.render.rasterize.rasterize, for float64 tensors, the depth being summed as `trimmed_depth` sums it; and how far each
-    pixel (H, W) is from a decision that rounding could turn: the smallest relative margin of all the comparisons that its value
-    rests on."""
+    """Rasterise float64 tensors as `refgs.render.rasterize.rasterize` does, with the depth of `trimmed_depth`.
+
+    Also returns a margin (H, W): the smallest relative distance of a comparison that the pixel's value depends on from its threshold. Where
+    it is tiny, rounding can change the value."""
     view = torch.from_numpy(camera.world_to_camera).to(positions.dtype)
     centre = positions @ view[:3, :3].T + view[:3, 3]
     drawn = (centre[:, 2] >= near) & (centre[:, 2] <= FAR) & (opacities >= ALPHA_CUT)
@@ -109,8 +113,10 @@ def shade(
     by_direction: bool = False,
     matte: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """As refgs.render.shade.shade, for float64 tensors and a light that stands turned (3, 3) to the world; and how far each pixel
-    (H, W) is from a kink of the derivatives, in the units of what has the kink. Bilinear look-ups have one at every texel."""
+    """Shade float64 tensors as `refgs.render.shade.shade` does, under a light that is rotated by `turn` (3, 3) against the world.
+
+    Also returns a margin (H, W): the distance of each pixel from the nearest kink of the derivatives, in the units of the variable with the
+    kink. A bilinear look-up has a kink at every texel."""
     view, pixels = torch.from_numpy(camera.world_to_camera), torch.nonzero(alpha > COVERED, as_tuple=True)
     here, margins = alpha[pixels], []
     own = features[pixels] / here[:, None]
@@ -143,7 +149,7 @@ def shade_splats(
     camera: Camera,
     turn: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """As refgs.render.shade.shade_splats, for float64 tensors; and how far each surfel is from a kink."""
+    """Shade float64 surfels as `refgs.render.shade.shade_splats` does; also return each one's distance from a kink of the derivatives."""
     towards, margins, matte = unit(torch.from_numpy(camera.position) - features[:, -3:]), [], features.shape[-1] == 6
     features = _with_matte_material(features) if matte else features
     appearance = features[:, 8:11] if features.shape[-1] > 11 else None
@@ -163,7 +169,10 @@ def radiance_towards(
     mirror: bool = False,
     matte: bool = False,
 ) -> Tensor:
-    """The split sum (paper Eq. 5–10) of normals, albedo, metallic and roughness (P, 8 or more), towards unit vectors (P, 3)."""
+    """Compute radiance by the split sum (paper Eq. 5–10), from normals, albedo, metallic and roughness (P, 8 or more).
+
+    It leaves in the directions `towards` (P, 3), unit vectors.
+    """
     normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
     if turn is not None:
         normal, towards = normal @ turn.T, towards @ turn.T
@@ -191,7 +200,7 @@ def radiance_towards(
 
 
 def _with_matte_material(maps: Tensor) -> Tensor:
-    """Metallic 0 and roughness 1 after normal and albedo (P, 6)."""
+    """Append metallic 0 and roughness 1 to normal and albedo (P, 6)."""
     return torch.cat([maps, maps.new_tensor([0.0, 1.0]).expand(len(maps), 2)], dim=1)
 
 
@@ -236,7 +245,7 @@ def _cube_margins(directions: Tensor, sides: list[Tensor], margins: list) -> Non
 
 
 def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor, margins: list) -> Tensor:
-    """Radiance (P, 3) filtered by the GGX lobe of a roughness (P,) about a direction (P, 3)."""
+    """Look up radiance (P, 3), filtered by the GGX lobe of a roughness (P,) about a direction (P, 3)."""
     known, alpha = torch.tensor(prefilter.ROUGHNESS, dtype=roughness.dtype), roughness**2
     interval = (torch.bucketize(roughness.detach().contiguous(), known) - 1).clamp(0, len(known) - 2)
     low, high = known[interval] ** 2, known[interval + 1] ** 2
@@ -247,7 +256,7 @@ def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughne
 
 
 def table(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> Tensor:
-    """brdf.reflectance_table at N·V and roughness (P,), (P, 4)."""
+    """Look up `brdf.reflectance_table` at N·V and roughness (P,): (P, 4)."""
     values, at = reflectance_table().to(n_v.dtype), torch.stack([n_v, roughness], dim=-1)
     places = at.clamp(LEAST_N_V, 1).sqrt() * (len(values) - 1)
     if margins is not None:
@@ -259,13 +268,13 @@ def table(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> Tensor
 
 
 def reflectance(n_v: Tensor, roughness: Tensor, albedo: Tensor, margins: list | None = None) -> tuple[Tensor, Tensor]:
-    """What a metal (P, 3) and what a dielectric (P, 1) reflect of an even light, at N·V and roughness (P,)."""
+    """Compute the reflectance under uniform light of a metal (P, 3) and of a dielectric (P, 1), at N·V and roughness (P,)."""
     fg0, fg1, average, dielectric = table(n_v, roughness, margins).split(1, dim=-1)
     return (albedo * fg0 + fg1) * bounces((20 * albedo + 1) / 21, fg0 + fg1, average), dielectric
 
 
 def dssim(image: Tensor, target: Tensor) -> Tensor:
-    """As refgs.render.ssim.dssim."""
+    """Compute the structural dissimilarity as `refgs.render.ssim.dssim` does."""
     k = torch.arange(-5, 6, dtype=image.dtype)
     window = torch.exp(-(k**2) / (2 * 1.5**2))
     window = torch.outer(window, window) / window.sum() ** 2

@@ -1,4 +1,4 @@
-"""Light transport on the object under another light: shadows, and light that the object reflects onto itself.
+"""Relight surfels: compute shadows on the object, and the light that it reflects onto itself, under another environment.
 
 All surfels trace rays in the same directions. Each direction stands for its cell of the sphere, so that a small sun falls into one
 of them, whole. Rays are traced once; each light then takes a few matrix products. The point that a ray hits reflects, by the split
@@ -55,9 +55,9 @@ def _mirror(directions, normals):
 
 
 def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
-    """Reflectances (P, 3) of materials (P, 3), (P,), (P,): of the light from the mirror direction, and of irradiance / π.
+    """Compute two reflectances (P, 3) of materials: for light from the mirror direction, and for irradiance / π.
 
-    `cosine` (P,) is that of the viewing direction to the normal.
+    `cosine` (P,) is the cosine between viewing direction and normal.
     """
     metal, dielectric = reference.reflectance(cosine, roughness, albedo)
     metallic = metallic[:, None]
@@ -70,9 +70,9 @@ def _prefiltered(levels: Tensor, sides: tuple[int, ...], directions: Tensor, rou
 
 
 class Transport:
-    """The hits of rays from surfels whose normals point outward; independent of the light. On the CPU.
+    """Rays from the surfels, traced to their hits on the mesh. They do not depend on the light. On the CPU.
 
-    `progress` is called with how many of the surfels are done.
+    The surfels' normals must point outward. `progress` is called with the number of surfels done and of all.
     """
 
     def __init__(
@@ -146,7 +146,10 @@ def _blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: n
 
 
 def relit(t: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
-    """Compute the surfels' `sh` and `indirect` under `light`. Render them with the occluder that was traced and diffuse = "sh"."""
+    """Compute the surfels' `sh` and `indirect` under `light`.
+
+    Render the result with diffuse = "sh" and the occluder that `t` was traced with.
+    """
     received, indirect = _gather(t, light, bounces)
     sh = _colour(t.surfels, t.normals, received)
     return t.surfels._replace(
@@ -155,7 +158,7 @@ def relit(t: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
 
 
 def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor:
-    """Compute the ratio (N, 3) of the irradiance that surfels receive, shadowed and lit by the object, to that of unoccluded surfaces.
+    """Compute the ratio (N, 3) of the surfels' irradiance to that of unoccluded surfaces; the object shadows and lights itself.
 
     Normals may point either way. Rays are traced from a subset of the surfels; the others interpolate.
     """
@@ -205,8 +208,11 @@ def _gather(t: Transport, light: Environment, bounces: int) -> tuple[Tensor, Ten
 
 
 def _first(t: Transport, rays: slice, levels: Tensor, sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Shade the hits of rays (P, 3): the environment's light that they mirror to the surfel; their reflectances of other light that they
-    mirror, and of irradiance / π."""
+    """Shade the hits of rays.
+
+    Returns three (P, 3): the environment's light that a hit mirrors to the surfel; the hit's reflectance for other mirrored light; and its
+    reflectance for irradiance / π.
+    """
     vertex, ray, free = t.vertex[rays], t.directions[t.direction[rays]], t.free[rays]
     albedo, metallic, roughness = t.material[vertex].split((3, 1, 1), dim=1)
     normals = torch.from_numpy(t.vertex_normals[vertex.numpy()]).float()
@@ -220,7 +226,7 @@ def _first(t: Transport, rays: slice, levels: Tensor, sides: tuple[int, ...]) ->
 
 
 def _past_the_object(t: Transport, light: Environment) -> Tensor:
-    """Irradiance / π (N, 3) from the environment: unoccluded, times the part of it that the object does not block."""
+    """Compute the irradiance / π (N, 3) that reaches the surfels from the environment past the object."""
     texels, area = cubemap.texel_directions(light.resolution), cubemap.texel_solid_angles(light.resolution)
     cell = torch.from_numpy(cKDTree(t.directions.numpy()).query(texels.numpy())[1])
     power = torch.zeros(len(t.directions), 3).index_add_(0, cell, light.radiance * area[:, None].float())

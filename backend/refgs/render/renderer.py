@@ -1,4 +1,4 @@
-"""The one renderer: surfels and light in, picture and maps out. Training, evaluation and export all call it."""
+"""Render surfels under a light into a picture and maps. Training, evaluation and export all call this renderer."""
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ SIGNED = 1.0  # added to the residual while it is blended: it may be negative, a
 
 
 def near_plane(radius: float) -> float:
-    """The nearest depth that is drawn in a scene of this radius, in world units."""
+    """Return the nearest depth that is drawn in a scene of this radius, in world units."""
     return NEAR * radius
 
 
@@ -68,8 +68,8 @@ def render(
     `near` is in world units. Where the `occluder` blocks a pixel's mirror direction, the surfels' own radiance replaces the
     environment's (paper Eq. 9). Radiance is multiplied by `exposure`, a scalar, before it is encoded.
 
-    Surfels with harmonics beyond the constant add a residual, with integrated diffuse light: colour by direction, sRGB-encoded, that
-    makes up for what material and light cannot explain.
+    With integrated diffuse light (diffuse = "irradiance"), surfels can have harmonics beyond the constant. These add a residual to the
+    picture: a colour by direction, sRGB-encoded, for the part of the photos that material and light do not explain.
     """
     method = method_of(settings)
     if method.draw is not None:

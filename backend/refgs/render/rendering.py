@@ -1,4 +1,4 @@
-"""The result of rendering a camera."""
+"""Hold the result of rendering a camera."""
 
 from dataclasses import dataclass
 
@@ -11,11 +11,11 @@ COVERED = 1 / 255  # pixels with less alpha than this are background
 
 @dataclass(frozen=True)
 class Rendering:
-    """The picture that a camera sees, and the maps it was made of.
+    """Picture of a camera, and the maps that were shaded.
 
     `color` (H, W, 3) is sRGB-encoded, over the background. The maps are alpha-weighted means over the surfels of a pixel:
     linear, zero where nothing is. `normal` (H, W, 3) is in world space, faces the camera, and is not normalised. `depth` (H, W)
-    is along the camera's axis; `blended_depth` is that sum before it is divided by alpha. With a light, `material` (H, W, 5) is
+    is along the camera's axis; `blended_depth` is the sum of depths before the division by alpha. With a light, `material` (H, W, 5) is
     albedo, metallic, roughness. With inter-reflection, `visibility` (H, W) is 0 where the object occludes the mirror
     direction, else 1. `background` (3,) and `exposure`, a scalar, are the arguments of `render`.
     """

@@ -1,4 +1,4 @@
-"""Differentiable shading: of blended maps, or of each surfel."""
+"""Shade blended maps, or each surfel, differentiably."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -21,10 +21,10 @@ MATTE = 6  # without specular shading: normal and albedo
 
 
 class Shaded(NamedTuple):
-    """A picture (H, W, 3), sRGB-encoded, over the background, and its maps, zero where nothing is.
+    """Picture (H, W, 3), sRGB-encoded, over the background, and its maps.
 
-    The maps are blended normals (H, W, 3), not normalised; albedo, metallic and roughness (H, W, 5); linear radiance (H, W, 3) before the
-    background, which is not differentiable.
+    The maps are zero where nothing is: blended normals (H, W, 3), not normalised; albedo, metallic and roughness (H, W, 5); linear
+    radiance (H, W, 3) before the background, which is not differentiable.
     """
 
     color: Tensor
@@ -38,7 +38,7 @@ class _Work(struct("Shade", "pixels.h")):
 
     @classmethod
     def of(cls, features: Tensor, alpha: Tensor, camera: Camera) -> "_Work":
-        """Make the work of one picture, with the fields that all of its kernels read."""
+        """Make the kernels' arguments for one picture, with the fields that all of them read."""
         height, width, channels = features.shape
         work = cls(width=width, height=height, channels=channels, chunk_rows=max(32, -(-height // 16)))
         work.view[:] = camera.world_to_camera[:3].reshape(-1).tolist()

@@ -1,4 +1,4 @@
-"""Structural dissimilarity of two images."""
+"""Compute the structural dissimilarity of two images."""
 
 import torch
 from torch import Tensor

@@ -1,4 +1,4 @@
-"""Concatenation of the surfels' features."""
+"""Concatenate the surfels' features."""
 
 from collections.abc import Sequence
 

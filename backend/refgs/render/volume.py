@@ -1,4 +1,4 @@
-"""3D Gaussians, drawn by the rasteriser of surfels, to compare with (paper Tables 3 and 7).
+"""Draw 3D Gaussians by the rasteriser of surfels, for comparison (paper Tables 3 and 7).
 
 EWA splatting (Zwicker et al. 2001, as in Kerbl et al. 2023) projects a Gaussian's covariance by the projection's derivative at its
 centre. A disc perpendicular to the camera's axis, at the centre's depth, has the same picture. Its projection is affine, so the
@@ -43,7 +43,7 @@ def shortest_last(rotations: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def with_normals_last(surfels: Surfels) -> Surfels:
-    """Reorder the axes of 3D Gaussians so that the normal is the third, as it is for surfels, which are returned unchanged."""
+    """Reorder the axes of 3D Gaussians so that the normal is the third axis. Surfels are returned unchanged: theirs already is."""
     if surfels.scales.shape[1] == 2:
         return surfels
     rotations, scales = shortest_last(surfels.rotations, surfels.scales)
@@ -52,7 +52,7 @@ def with_normals_last(surfels: Surfels) -> Surfels:
 
 @timed("surfels")
 class _Angle(torch.autograd.Function):
-    """Half the angle of (x, y). Round Gaussians have no such angle: their derivative is damped to zero."""
+    """Half the angle of (x, y). A round Gaussian has no such angle, so its derivative is damped to zero."""
 
     @staticmethod
     def forward(ctx, y, x, size):
@@ -68,7 +68,7 @@ class _Angle(torch.autograd.Function):
 
 
 def discs(surfels: Surfels, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The first four arguments of `rasterize`: the geometry of surfels, or for 3D Gaussians that of discs with the same picture."""
+    """Return the first four arguments of `rasterize`: the surfels' geometry, or for 3D Gaussians that of discs that look the same."""
     positions, rotations, scales, opacities, *_ = surfels
     if scales.shape[1] == 3:
         rotations, scales = across_the_axis(positions, rotations, scales, camera)
@@ -105,6 +105,6 @@ def across_the_axis(positions: Tensor, rotations: Tensor, scales: Tensor, camera
 
 
 def _from_camera(camera: Camera) -> Tensor:
-    """The quaternion wxyz (4,) of the rotation from the camera's axes to the world's."""
+    """Return the quaternion wxyz (4,) of the rotation from the camera's axes to the world's."""
     x, y, z, w = Rotation.from_matrix(camera.world_to_camera[:3, :3].T).as_quat()
     return torch.tensor([w, x, y, z])
