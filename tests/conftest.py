@@ -26,10 +26,10 @@ CARDS = ["emulated", pytest.param("cuda", marks=NO_CARD)]
 
 @pytest.fixture(scope="session", autouse=True)
 def no_package_of_the_clone() -> None:
-    """Remove the clone's parent folder from the path, where pytest has put it.
+    """Remove the parent of the repository's folder from sys.path; pytest puts it there.
 
-    The clone's root has an __init__.py for Blender, so pytest treats it as a package. If the clone is named refgs, processes that tests
-    start would import it in place of the trainer.
+    The repository has an __init__.py for Blender, so pytest takes it for a package. If its folder is named refgs, processes that tests start
+    would import that folder in place of the trainer.
     """
     parent = str(Path(__file__).parents[2])
     sys.path[:] = [folder for folder in sys.path if folder != parent]
@@ -37,9 +37,9 @@ def no_package_of_the_clone() -> None:
 
 @pytest.fixture(params=CARDS)
 def card(request, monkeypatch) -> torch.device:
-    """Return the device of CUDA's tensors; run the test with emulated kernels and, if there is one, on a card.
+    """Run the test with emulated CUDA kernels and, if there is one, on a card. Returns the device for tensors.
 
-    For code that differs between CPU and CUDA.
+    Tests of code that differs between CPU and CUDA use it.
     """
     if request.param == "emulated":
         emulate(monkeypatch)
@@ -48,9 +48,9 @@ def card(request, monkeypatch) -> torch.device:
 
 @pytest.fixture(params=[*load.supported(), *CARDS])
 def device(request, monkeypatch) -> torch.device:
-    """Return the device for a test's tensors; run the test on every device that has kernels.
+    """Run the test on everything that has kernels. Returns the device for tensors.
 
-    Devices are each instruction set of this CPU, emulated CUDA kernels on the CPU, and a card if there is one.
+    That is: each instruction set of this CPU, CUDA kernels emulated on the CPU, and a card if there is one.
     """
     if request.param == "emulated":
         emulate(monkeypatch)

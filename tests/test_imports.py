@@ -1,4 +1,4 @@
-"""Test scripts/check_imports.py: it finds upward imports, circles and forbidden imports, and none in this clone."""
+"""Test scripts/check_imports.py: it finds upward imports, circles and forbidden imports in made trees, and none in the repository."""
 
 import re
 import subprocess
@@ -18,7 +18,7 @@ def check(root):
 
 
 def write(root, files):
-    """Write a small clone that keeps the rules; then add or replace `files`."""
+    """Write a small source tree that obeys the import rules. Then add or replace `files`."""
     right = {
         "backend/refgs/__init__.py": "",
         "backend/refgs/camera.py": "import numpy",

@@ -136,7 +136,7 @@ def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture
 
 
 def test_photos_without_cameras(talk, tmp_path):
-    """The check reports photos that lack cameras. Searching their cameras can be interrupted and repeated."""
+    """The check reports photos without cameras. The search for their cameras can be interrupted and repeated."""
     for number in range(4):
         cv2.imwrite(
             str(tmp_path / f"{number}.png"), np.random.default_rng(number).integers(0, 255, (96, 128, 3), np.uint8)
@@ -188,7 +188,7 @@ def free(run) -> bool:
 
 
 def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
-    """A kept training that is paused when both pipes are closed trains to its end, then exports the mesh."""
+    """A training with `keep` goes on after both pipes are closed, even if it was paused: it ends, and its mesh is exported."""
     run = tmp_path / "run"
     commands = [
         {"command": "train"}
@@ -211,7 +211,7 @@ def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
 
 
 def test_what_waits_goes_with_the_input(talk, ball_capture, tmp_path):
-    """If the input is closed right after `stop`, the surfels are written and the waiting export is dropped."""
+    """If the input is closed right after `stop`, the worker writes the surfels and drops the export that was waiting."""
     run = tmp_path / "run"
     talk.tell("train", **train(ball_capture, run))
     talk.tell("export", run=str(run), texture=64)
@@ -246,9 +246,9 @@ def test_a_training_that_was_left_ends_when_it_is_terminated(talk, ball_capture,
 
 
 def test_a_folder_that_is_trained_in(talk, ball_capture, tmp_path):
-    """While a run is trained, another process cannot train it, but can read its progress and stop it.
+    """While a process trains a run, another process cannot train it, but can read its progress and stop it.
 
-    A killed process leaves the run free.
+    After the process is killed, the run can be trained again.
     """
     run = tmp_path / "run"
     talk.tell("train", **train(ball_capture, run))

@@ -1,4 +1,4 @@
-"""Wrong captures are refused with one line that names the place."""
+"""Test that broken captures are refused with one line that names the file or frame at fault."""
 
 import json
 import pickle

@@ -1,4 +1,4 @@
-"""Wanted region and up direction: both are in the capture's own frame, in every layout."""
+"""Test the region and the up direction of settings: in every layout they are read in the capture's own frame."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Camera files: written to a run folder and read back, and read from the capture's own JSON."""
+"""Test camera files: those of a run folder, written and read back, and the capture's own JSON."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Lines and files of `refgs check`."""
+"""Test the lines that `refgs check` prints and the files that it writes."""
 
 import json
 from pathlib import Path
@@ -74,7 +74,7 @@ def test_blurred_photos_are_named(tmp_path):
 
 
 def test_what_is_shown_of_it(tmp_path):
-    """The cameras read back as the capture's; thumbnails are small, masked photos."""
+    """The written cameras equal the capture's cameras. Thumbnails are small, masked photos."""
     capture = read_capture(nerf_blender(tmp_path / "capture", {"train": 24, "test": 6}))
     found = check(capture, tmp_path / "new" / "out")
     assert found["capture"] == str(tmp_path / "capture") and any(

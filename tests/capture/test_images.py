@@ -1,4 +1,4 @@
-"""Photos are refused or decoded completely, and masked, undistorted and reduced without inventing colours."""
+"""Test loading of photos: they are decoded completely or refused; masks, undistortion and reduction invent no colours."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Cameras of every layout see the scene where their photos show it."""
+"""Test all layouts of captures: projected points of the scene lie where the photos show them."""
 
 import json
 
@@ -32,7 +32,7 @@ def project(camera, point):
 
 
 def assert_sees_the_ball(capture):
-    """Points of the ball project onto the colours they have, and points just beside it onto nothing."""
+    """Assert that points of the ball project to pixels of their colour, and points just beside the ball to the background."""
     to_run = np.linalg.inv(capture.to_capture)
     for view in capture.views:
         loaded = load_view(view, None)
@@ -352,7 +352,7 @@ def test_glossy_synthetic_without_depth_takes_the_photos_alpha(tmp_path):
 
 
 def test_glossy_synthetic_converted_to_nerf_blender(tmp_path):
-    """Its users convert it so: photos of both splits in `rgb`, sizes and focal lengths in the files."""
+    """A converted Glossy Synthetic scene is read: photos of both splits lie in `rgb`; the files give sizes and focal lengths."""
     folder = nerf_blender(tmp_path)
     (folder / "rgb").mkdir()
     for split, first in (("train", 0), ("test", 20)):
@@ -371,7 +371,7 @@ def test_glossy_synthetic_converted_to_nerf_blender(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".png", ".PNG", ".webp"])
 def test_reduced_photos_of_a_colmap_capture(tmp_path, suffix):
-    """Naming `images_4` of Ref-NeRF's real scenes uses its photos; every eighth is held out."""
+    """A path to `images_4` of a Ref-NeRF scene selects these reduced photos. Every eighth photo is held out."""
     folder = colmap(tmp_path / "sedan")
     for i, pose in enumerate(ring(16)):
         write(folder / "images_4" / f"{i:04d}.png", ball(pose, 16, 12, 15.0)[..., :3])

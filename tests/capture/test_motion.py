@@ -1,4 +1,4 @@
-"""Poses from photos alone, against known poses."""
+"""Test structure from motion: compare the poses found from photos alone with known poses."""
 
 import multiprocessing
 
@@ -93,7 +93,7 @@ def test_photos_become_a_capture(photos):
 
 
 def test_one_that_is_interrupted_goes_on(photos):
-    """An interrupted search leaves no capture. The next one reuses its features, unless a photo was changed."""
+    """An interrupted search for camera poses writes no capture. The next search reuses the saved features of unchanged photos."""
 
     def interrupt(event: str, facts: dict) -> None:
         if facts.get("stage") == "matching":
@@ -125,9 +125,9 @@ def test_no_photos(tmp_path):
 
 
 def test_what_stands_still_contradicts_what_turns():
-    """An object turns in front of a room, and the camera moves a little.
+    """Poses that fit a turning object contradict the matches in the room behind it, and the other way round.
 
-    Cameras around the object contradict the room's matches; cameras in the room contradict the object's.
+    The object turns, the room stands still, and the camera moves a little.
     """
     rng, focal, count = np.random.default_rng(0), 1000, 36
     block, room = rng.uniform(-0.8, 0.8, (100, 3)), np.add(rng.uniform(-2, 2, (50, 3)), [0, 6, 0])

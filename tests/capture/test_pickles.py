@@ -1,4 +1,4 @@
-"""Pickles of all NumPy releases and protocols are read, and no code that they name runs."""
+"""Test the pickle reader: it reads arrays of all NumPy releases and protocols, and never runs code that a pickle names."""
 
 import os
 import pickle

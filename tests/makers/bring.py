@@ -1,4 +1,4 @@
-"""Make the wheels that the extension contains, with a fake uv."""
+"""Make the wheels that the extension carries; its uv is a fake."""
 
 import sys
 import zipfile

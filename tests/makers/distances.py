@@ -1,4 +1,4 @@
-"""Signed distances of simple shapes; depth and masks of them as seen by cameras."""
+"""Define simple shapes by signed distances, and compute their depth maps and masks for cameras."""
 
 import numpy as np
 

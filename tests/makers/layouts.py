@@ -1,4 +1,4 @@
-"""Write the layouts that Python has of the kernels' structures as static assertions for the C++ compilers."""
+"""Assert in C++ that Python's layouts of the kernels' structures are right; the compilers check the static assertions."""
 
 import ctypes
 import re

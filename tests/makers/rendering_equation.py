@@ -1,6 +1,6 @@
 """Compute outgoing radiance in three ways: by Monte Carlo of the rendering equation, by the exact split sum, by the kernels.
 
-The split sum assumes N = V = R. So its lobes neither stretch at grazing angles nor end at the horizon, and it differs from Monte Carlo.
+The split sum differs from Monte Carlo because it assumes N = V = R: its lobes neither stretch at grazing angles nor end at the horizon.
 The kernels differ from the exact split sum by their texels and roughness levels.
 """
 
@@ -57,7 +57,7 @@ def lights(sun: np.ndarray) -> dict[str, Radiance]:
 
 
 class Reflected(NamedTuple):
-    """Exact reflection of a constant light: factor for multiple bounces, specular part, diffuse part of the base."""
+    """Exact reflection of a constant light: the factor for multiple bounces, the specular part, and the base's diffuse part."""
 
     bounces: float
     specular: float
