@@ -1,5 +1,5 @@
-// CUDA's language on a processor, to run kernels where there is no card: blocks one after another, a block's threads as fibres
-// that take turns where they wait for each other, in an order that changes from block to block, so that a missing barrier shows.
+// Emulator of CUDA on the CPU, to test kernels without a card. Blocks run one after another. The threads of a block are fibres that take
+// turns where they wait for each other. Their order changes from block to block, so that a missing barrier shows.
 #pragma once
 
 #include <math.h>
@@ -32,7 +32,7 @@ struct Thread {
   ucontext_t start;
   Dimensions index;
   bool done;
-  uint64_t sent;  // to the others of its warp
+  uint64_t sent;  // its value for the others of its warp
 };
 
 constexpr int MOST = 1024;
@@ -51,7 +51,7 @@ inline void resume(int thread) {
   _longjmp(threads[thread].here, 1);
 }
 
-// To the next thread that is not done, or out of the block.
+// Resume the next thread that is not done; if all are, leave the block.
 inline void next() {
   for (int step = 1; step <= count; step++) {
     int thread = order[(place[current] + step) % count];
@@ -122,7 +122,7 @@ inline void launch(int blocks, int size, void (*kernel)(const void*), const void
   }
 }
 
-// What lane `lane` of the warp sent; all of the warp must come by.
+// Return the value that lane `lane` of the warp sent. All threads of the warp must call this.
 template <class T>
 T exchange(T value, int lane) {
   Group& warp = warps[current / 32];

@@ -1,9 +1,9 @@
-// Raw parameters to values, and derivatives back: several tensors at once, a number at a time.
+// Activations: raw parameters to values, and derivatives back, element by element for several tensors in one call.
 #include "vector.h"
 
 namespace {
 
-enum Kind : int64_t { EXP, SIGMOID, SMOOTHSTEP };  // the last: 3 s² − 2 s³ of the second
+enum Kind : int64_t { EXP, SIGMOID, SMOOTHSTEP };  // SMOOTHSTEP is 3 s² − 2 s³, s = sigmoid(raw)
 
 struct Activation {
   int64_t count, kind;
@@ -21,9 +21,9 @@ struct Activate {
   mutable Shared shared;
 };
 
-constexpr float LOG2_E = 1.4426950f, LN_2_HIGH = 0.693359375f, LN_2_LOW = -2.1219444e-4f;  // their sum is ln 2; k LN_2_HIGH is exact
+constexpr float LOG2_E = 1.4426950f, LN_2_HIGH = 0.693359375f, LN_2_LOW = -2.1219444e-4f;  // ln 2 in two parts; k LN_2_HIGH is exact
 
-// e^x = 2^k e^r, for |x| <= 87; beyond, the values there. What is no number stays none: exp2 would make numbers of some of these.
+// e^x = 2^k e^r, with x clamped to [-87, 87]. A NaN is passed through: exp2 would turn some NaNs into numbers.
 INLINE Vector exponential(Vector x) {
   Vector within = clamp(x, -87, 87), k = round_down(within * LOG2_E + 0.5f), r = within - k * LN_2_HIGH - k * LN_2_LOW;
   return select(x == x, exp2(k) * exp2(r * LOG2_E), x);

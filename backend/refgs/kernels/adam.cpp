@@ -1,5 +1,5 @@
-// A step of Adam (Kingma and Ba 2015) for several tensors at once. What has no gradient stays as it is, moments and all: surfels
-// that this view does not see. (Adam itself would move them on, by what earlier views said.)
+// Adam's step (Kingma and Ba 2015) for several tensors in one call. Elements with a zero gradient keep their value and moments: they
+// belong to surfels that this view does not see. Plain Adam would move them by the moments of earlier views.
 #include "vector.h"
 
 namespace {
@@ -8,8 +8,8 @@ struct Learned {
   int64_t count;
   float *value, *mean, *square;  // running means of the gradient and of its square
   const float* gradient;
-  double rate, square_scale;     // with the corrections of the means' start: α / (1 − β1^t), and 1 / √(1 − β2^t)
-  double low, high;              // what values are kept within
+  double rate, square_scale;     // with bias correction: α / (1 − β1^t), and 1 / √(1 − β2^t)
+  double low, high;              // values are clamped to this range
 };
 
 constexpr int MOST = 16;  // tensors
@@ -18,13 +18,13 @@ struct Adam {
   int64_t tensors;
   Learned learned[MOST];
   double beta1, beta2, epsilon;
-  const float* accepted;  // zero where the step is not to be taken; or null
+  const float* accepted;  // (1): zero skips the step; or null
   mutable Shared shared;
 };
 
 INLINE void step(const Adam& a, const Learned& t, int64_t i, int64_t n) {
   Vector g = read(t.gradient + i, n);
-  Mask felt = ~(g == 0.0f);  // what is no number is felt, too
+  Mask felt = ~(g == 0.0f);  // true for a NaN: it must not go unnoticed
   if (!any(felt)) return;
   Vector m = read(t.mean + i, n), v = read(t.square + i, n), x = read(t.value + i, n);
   Vector mean = m + (float)(1 - a.beta1) * (g - m);

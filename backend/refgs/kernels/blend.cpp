@@ -1,20 +1,20 @@
-// Tiles to pixels: blend front to back; and the derivatives of each pair of splat and tile.
+// The CPU's blending: each tile blends its splats front to back, and sums the derivatives of its (splat, tile) pairs.
 #include "raster.h"
 
 using refgs::Splat;
 
 namespace {
 
-constexpr int CHUNK = 64;  // splats of a tile that are treated together
+constexpr int CHUNK = 64;  // splats of a tile that are processed together
 
-// A tile's pixels are numbered block by block, and within a block lane by lane.
+// Pixels of a tile are numbered block by block, and lane by lane within a block.
 constexpr int pixel_x(int i) { return i / LANES % BLOCKS_X * BLOCK_X + i % LANES % BLOCK_X; }
 constexpr int pixel_y(int i) { return i / LANES / BLOCKS_X * BLOCK_Y + i % LANES / BLOCK_X; }
 
 bool contains(const Tile& t, int i) { return pixel_x(i) < t.width && pixel_y(i) < t.height; }
 int64_t pixel(const Raster& r, const Tile& t, int i) { return (t.y + pixel_y(i)) * r.width + t.x + pixel_x(i); }
 
-// Pixel centres of a tile from its middle, block by block.
+// Pixel centres relative to the middle of the tile, block by block.
 struct Centres {
   alignas(64) float x[PIXELS], y[PIXELS];
   constexpr Centres() : x(), y() {
@@ -26,10 +26,10 @@ struct Centres {
 };
 constexpr Centres CENTRES;
 
-// A pixel's transmittance, zero from where it is finished.
+// Set the transmittance to zero once the pixel is finished.
 INLINE Vector unfinished(Vector T) { return select(T >= refgs::MIN_TRANSMITTANCE, T, Vector()); }
 
-// Start fetching what a tile's member holds: they lie anywhere.
+// Prefetch a tile's k-th splat: a tile's splats are scattered in memory.
 INLINE void fetch(const Raster& r, const int32_t* members, int64_t k, int64_t count) {
   if (k >= count) return;
   __builtin_prefetch(&r.projected[members[k]]);
@@ -37,7 +37,7 @@ INLINE void fetch(const Raster& r, const int32_t* members, int64_t k, int64_t co
   __builtin_prefetch(r.features + members[k] * r.channels);
 }
 
-// sums[c] += sum_k weights[k] features[which[k]][c], for N channels of a block.
+// sums[c] += sum over k of weights[k] rows[k][c], for N channels of a block of pixels.
 template <int N>
 void blend(float* sums, const Vector* weights, const float* const* rows, int count, int64_t channel) {
   Vector s[N];
@@ -56,7 +56,7 @@ void blend_all(float* sums, const Vector* weights, const float* const* rows, int
   REST[channels - c](sums + c * LANES, weights, rows, count, c);
 }
 
-// Two splats' alphas and depths at the pixels of a block. Two at once, step by step: the one's arithmetic goes on while the other's waits.
+// Compute the alphas and depths of two splats at the pixels of a block. The two are interleaved to hide the latency of the arithmetic.
 template <bool PLAIN>
 INLINE void see(const Splat& s, const Splat& t, Vector x, Vector y, Vector (&alpha)[2], Vector (&z)[2]) {
   refgs::Hit<Vector> hits[] = {refgs::intersect<PLAIN>(s, x, y), refgs::intersect<PLAIN>(t, x, y)};
@@ -78,7 +78,7 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
   for (int b = 0; b < BLOCKS; b++) live |= (uint64_t)any(load(transmittance + b * LANES) > 0.0f) << b;
   const int32_t* members = r.members + r.tile_start[index];
   int64_t count = r.tile_start[index + 1] - r.tile_start[index], reach = 0;
-  Splat splats[CHUNK + 1];  // the one after the last covers nothing, and completes an odd list
+  Splat splats[CHUNK + 1];  // the last one covers nothing and pads a list of odd length
   const float* features[CHUNK];
   uint8_t lists[BLOCKS][CHUNK + 1];
   Vector weights[CHUNK];
@@ -148,8 +148,8 @@ void forward_tile(Raster& r, int64_t index, float* sums) {
     }
 }
 
-// row[c] = sum over the pixels of some blocks of weights * by_features[pixel][c], for N channels and zeros up to LANES; a block's plane is
-// (channel, lane).
+// row[c] = sum over blocks k and their pixels of weights[k] * by_features[pixel][c], for N channels; zero from there up to LANES.
+// planes[k] holds by_features of block k as (channel, lane).
 template <int N>
 void gather(float* row, const Vector* weights, const float* const* planes, int count, int64_t channel) {
   Vector s[LANES] = {};
@@ -170,11 +170,12 @@ void gather_all(float* row, const Vector* weights, const float* const* planes, i
   if (c < channels) REST[(channels - c - 1) / QUARTER](row, weights, planes, count, c);
 }
 
-// Front to back again. What lies behind a splat is what is left of the pixel's total, so one scalar a pixel suffices.
+// Differentiate front to back. The derivative by alpha needs what the splats behind contribute to the loss. That is the pixel's total minus
+// what has been passed, so one scalar a pixel (`rest`) suffices.
 void backward_tile(Raster& r, int64_t index, float* scratch) {
   Tile t(r, (int32_t)index);
   int64_t channels = r.channels, C = padded(channels);
-  float* planes = scratch;  // derivatives by features, (block, channel, lane)
+  float* planes = scratch;  // derivatives by the blended features, (block, channel, lane)
   alignas(64) float transmittance[PIXELS], by_depth[PIXELS] = {}, by_alpha[PIXELS] = {}, rest[PIXELS];
   for (int y = 0; y < t.height; y++) {
     int64_t first = ((t.y + y) * r.width + t.x) * channels;

@@ -1,4 +1,5 @@
-// What a pixel is shaded by: what was blended there, or the point that its blend is of; or a surfel's own.
+// Channels that a pixel is shaded with: the blended ones (Mean), those with the normal read at the blended surface point (Displaced),
+// or a surfel's own (Own).
 #pragma once
 
 #include "pixels.h"
@@ -7,7 +8,7 @@ namespace {
 
 INLINE Vector inverse_norm(Vectors n) { return inverse_root(dot(n, n) + 1e-24f); }
 
-// What is blended, over alpha: C channels.
+// Blended means: the sums over a pixel's splats divided by alpha, C channels.
 template <int C>
 struct Mean {
   const Pixels& pixels;
@@ -18,7 +19,7 @@ struct Mean {
     for (int c = 0; c < C; c++) value[c] *= inverse;
   }
 
-  // From the derivatives by `value` and by the pixel's own alpha.
+  // Pass on the derivatives by `value` and by the pixel's alpha.
   template <class Sums>
   MEMBER void backward(const Vector (&by_value)[C], Vector by_alpha, Sums& sums) const {
     Vector by_own[C];
@@ -27,21 +28,23 @@ struct Mean {
   }
 };
 
-// Discs sorted and blended by their centres favour those in front: on a curved surface the blend at a pixel is that of a point
-// nearer to the camera, whose normal leans towards it. The blended position tells which point; the pixel whose blend is *this*
-// pixel's point lies the same way back, and the normal is read there. The other channels are this pixel's own: what a surface looks
-// like is learned where it shows, and reading it elsewhere would blur it. C channels.
+// Blended means whose normal is read at a displaced pixel; C channels, the last three of which are the blended position.
+//
+// Splats are sorted by the depths of their centres, so blending favours those in front. On a curved surface the blend at a pixel p then
+// belongs to a surface point q nearer to the camera, whose normal is turned towards the camera. The blended position tells q, which
+// projects to p + shift. The pixel p - shift has a blend that belongs to p's own surface point, so the normal is read there, bilinearly.
+// All other channels are read at p: a material is learned where it is seen, and reading it elsewhere would blur it.
 template <int C, bool DERIVATIVES>
 struct Displaced {
   static constexpr int S = C - 3;
   const Pixels& pixels;
   Mean<C> mean;
   Vector alpha, value[S];
-  Vector x, y, inverse_z, px, py;  // the blended point in camera space; where it projects
-  Mask moves_x, moves_y;           // the derivative passes the limits
+  Vector x, y, inverse_z, px, py;  // the blended position in camera space, and its projection relative to (cx, cy)
+  Mask moves_x, moves_y;           // where no clamp stops the derivative
   Corners corners;
   Vector there, trust, scale, inverse_there;
-  Vector sampled[4], by_x[4], by_y[4], there_by_x, there_by_y;  // normals blended over the four corners, and how that changes along x and y
+  Vector sampled[4], by_x[4], by_y[4], there_by_x, there_by_y;  // bilinear normal; its and alpha's derivatives along x, y
 
   MEMBER Displaced(const Shade& s, const Pixels& p) : pixels(p), mean(s, p), alpha(mean.alpha) {
     const auto& own = mean.value;
@@ -62,7 +65,7 @@ struct Displaced {
     float right = (float)(s.width - 1), bottom = (float)(s.height - 1);
     moves_x &= (u > 0.0f) & (u < right), moves_y &= (v > 0.0f) & (v < bottom);
     u = clamp(u, 0, right), v = clamp(v, 0, bottom);
-    // At the right and at the bottom the last two, unless there is but one.
+    // Use the last two columns or rows at the right or bottom border; there may be only one.
     corners.next = s.width > 1, corners.below = s.height > 1 ? s.width : 0;
     Vector u0 = smaller(round_down(u), Vector() + (right - (float)corners.next));
     Vector v0 = smaller(round_down(v), Vector() + (s.height > 1 ? bottom - 1 : 0));
@@ -72,7 +75,7 @@ struct Displaced {
 
     alignas(64) float along_x[LANES], along_y[LANES];
     store(along_x, corners.x), store(along_y, corners.y);
-    typedef typename Blocks<4>::Numbers Numbers;  // the normal's, and one more, as four are quick to load
+    typedef typename Blocks<4>::Numbers Numbers;  // the normal's three channels and an unused one: four load faster
     Rows<4> rows_by_x, rows_by_y;
     to_lanes<4>(
         [&](int k, int b) {
@@ -94,14 +97,14 @@ struct Displaced {
     Vector above = load(a[0]) + corners.x * across;
     there_by_x = across + corners.y * (across_below - across), there_by_y = load(a[2]) + corners.x * across_below - above;
     there = above + corners.y * there_by_y;
-    // At a silhouette the way back leads off the object: there the pixel keeps its own blend.
+    // At a silhouette the displaced pixel may lie off the object. Where its alpha is low, fall back to the pixel's own normal.
     trust = clamp((there - SHIFT_ALPHA) * (1 / SHIFT_ALPHA), 0, 1);
     inverse_there = reciprocal(larger(there, Vector() + SHIFT_ALPHA));
     scale = trust * inverse_there;
     for (int c = 0; c < S; c++) value[c] = c < ALBEDO ? scale * sampled[c] + (1.0f - trust) * own[c] : own[c];
   }
 
-  // From the derivatives by `value` and by the pixel's own alpha.
+  // Pass on the derivatives by `value` and by the pixel's alpha.
   template <class Sums>
   MEMBER void backward(const Shade& s, const Vector (&by_value)[S], Vector by_alpha, Sums& sums) const {
     Vector by_sampled[4], by_own[C], by_there = {}, by_u = {}, by_v = {};
@@ -122,7 +125,7 @@ struct Displaced {
   }
 };
 
-// Surfels: their own channels.
+// Channels of a surfel itself, for shading before blending.
 template <int C>
 struct Own {
   static constexpr int S = C - 3;

@@ -1,15 +1,15 @@
-// What masks leave of a grid of voxels: its visual hull (Laurentini 1994).
+// Visual hull (Laurentini 1994): carve a grid of voxels by the views' masks.
 #include "vector.h"
 
 namespace {
 
-constexpr int BLOCK = 8;  // voxels along two sides of a block, LANES along the third: what a mask shows of it stays in the cache
+constexpr int BLOCK = 8;  // voxels along two sides of a block, LANES along the third: its part of a mask fits the cache
 constexpr float EMPTY = 0.01f;
 
 struct Silhouette {
-  double first[3], step[9];  // of voxel 0, 0, 0: its pixel's column and row times its depth, and that; by a voxel on along x, y, z (3, 3)
+  double first[3], step[9];  // (column × depth, row × depth, depth) of voxel 0, 0, 0; its change by a voxel along x, y, z (3, 3)
   const float* mask;         // (height, width)
-  int64_t width, height, whole;
+  int64_t width, height, whole;  // whole: the mask keeps clear of the border
 };
 
 struct Carve {
@@ -20,7 +20,7 @@ struct Carve {
   mutable Shared shared;
 };
 
-// The mask at pixel positions that lie on it, bilinear, to the middle of the pixels at its border.
+// Sample the mask bilinearly at pixel positions inside it. Positions are clamped to the centres of the border's pixels.
 INLINE Vector sample(const Silhouette& s, Vector x, Vector y, Mask lanes) {
   x = clamp(x - 0.5f, 0, (float)(s.width - 1)), y = clamp(y - 0.5f, 0, (float)(s.height - 1));
   Vector left = round_down(x), top = round_down(y);
@@ -39,9 +39,9 @@ INLINE Vector sample(const Silhouette& s, Vector x, Vector y, Mask lanes) {
 
 }  // namespace
 
-// The smallest and the second smallest mask over the views that see a voxel, which view has the smallest, and how many see it. A view
-// whose mask keeps clear of the border shows the whole object: it sees what lies outside it, empty. A voxel that two views say is empty
-// is not looked at by those that follow.
+// Find for each voxel the smallest and second smallest mask value over the views that see it, the view with the smallest, and how many
+// views see it. A `whole` view shows the whole object, so it also sees all voxels outside its image, as empty. Once two views show a
+// voxel as empty, the views that follow skip it.
 EXPORT void refgs_carve(const Carve* c) {
   int64_t n = c->resolution, side = (n + BLOCK - 1) / BLOCK, along = (n + LANES - 1) / LANES;
   Vector lane;

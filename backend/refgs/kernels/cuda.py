@@ -23,7 +23,7 @@ OPTIONS = (
     "--fmad=true",
     "--diag-suppress=177",
 )
-# The source of each kernel by its name. A source without any has functions for the CPU alone.
+# The source of each kernel, by the kernel's name. Sources without KERNEL are for the CPU only.
 KERNELS = {
     name: file.name
     for file in sorted(HERE.glob("*.c*"))
@@ -48,7 +48,7 @@ def unusable() -> str | None:
         found, least = (".".join(map(str, version)) for version in (capability, OLDEST))
         return f"{torch.cuda.get_device_name()} is too old: its compute capability is {found}, {least} is the least"
     try:
-        for source in SOURCES:  # load all now: later the memory may be full
+        for source in SOURCES:  # load all sources now: the card's memory may be full later
             _module(source, torch.cuda.current_device())
     except RuntimeError as error:
         return f"the kernels cannot be loaded ({str(error).splitlines()[0]}): a newer driver may do"
@@ -56,7 +56,7 @@ def unusable() -> str | None:
 
 
 def _check(result: tuple, what: str):
-    """Return the values of a call of NVIDIA's, without its status. Raise an error if the status is one."""
+    """Return the values of a call to NVIDIA's API, without its status. Raise an error if the call failed."""
     status, *values = result
     if status.name == "CUDA_ERROR_OUT_OF_MEMORY":
         raise torch.OutOfMemoryError(what)
@@ -86,7 +86,7 @@ def compile_source(source: str, architecture: str) -> bytes:
 
 
 def cubin(source: str, architecture: str, cache: Path) -> bytes:
-    """Return the same from `cache`, compiling it if it is not there. Its name has a hash of all that it depends on."""
+    """Return the machine code of `compile_source` from `cache`; compile it if it is missing. The file's name has a hash of its inputs."""
     from cuda.bindings import nvrtc
 
     parts = [(HERE / name).read_bytes() for name in (source, *HEADERS)]

@@ -1,5 +1,5 @@
-// What the sources that serve the CPU and CUDA alike need of CUDA: kernels, and threads that share work by its number.
-// Compiled by NVRTC, with every function for the device (--device-as-default-execution-space).
+// The CUDA side of library.h, for sources that serve both the CPU and CUDA: kernels, and threads that share numbered work items.
+// NVRTC compiles every function for the device (--device-as-default-execution-space).
 #pragma once
 
 #ifdef __CUDACC_RTC__
@@ -14,7 +14,7 @@ typedef unsigned long long uint64_t;
 
 #define EXPORT extern "C"
 
-// A kernel takes its work by value; `w` points at it. Launch bounds may follow.
+// Define a kernel. It takes its work by value, and `w` points at it. Launch bounds may follow.
 #ifndef KERNEL
 #define KERNEL(name, Work, w, ...)                                                 \
   static void name##_threads(const Work* w);                                       \
@@ -26,15 +26,15 @@ typedef unsigned long long uint64_t;
 
 struct Shared;  // library.h
 
-// body(i) for each i below n, each by a thread of its own, or by turns where there are fewer.
+// Call body(i) for each i below n, one thread an i. If there are fewer threads than n, each takes several.
 template <class Body>
 inline void share(const Shared&, int64_t n, int64_t, Body body) {
   int64_t threads = (int64_t)gridDim.x * blockDim.x;
   for (int64_t i = (int64_t)blockIdx.x * blockDim.x + threadIdx.x; i < n; i += threads) body(i);
 }
 
-// The sums of N numbers over the threads of a block, whole warps, always added in the same order: in float within a warp, then in
-// double. Once in a kernel.
+// Sum N numbers over the threads of a block of whole warps: in float within a warp, then in double over warps. The order is fixed, so
+// the result is deterministic. A kernel may call it only once: its shared memory is not guarded.
 template <int N>
 inline void sum_over_block(float (&numbers)[N], double* sums) {
   __shared__ float of_warps[N][32];

@@ -1,9 +1,9 @@
-// Colour by direction: real spherical harmonics of each surfel towards a camera, or of the mirrored way (paper Eq. 10), and back.
+// Directional colour of each surfel: real spherical harmonics in the viewing direction, or mirrored (paper Eq. 10); and derivatives.
 #include "vector.h"
 
 namespace {
 
-constexpr int MOST = 16;  // coefficients a colour, at degree 3
+constexpr int MOST = 16;  // coefficients of a colour channel at degree 3
 
 struct Harmonics {
   int64_t count, coefficients;
@@ -17,7 +17,7 @@ struct Harmonics {
   mutable Shared shared;
 };
 
-// From the camera to a surfel; where there are normals, mirrored there.
+// Direction from the camera to a surfel, mirrored at its normal if there are normals.
 void direction(const Harmonics& h, int64_t i, float (&d)[3]) {
   double towards[3], square = 1e-24;
   for (int a = 0; a < 3; a++) towards[a] = h.camera[a] - h.positions[3 * i + a], square += towards[a] * towards[a];
@@ -29,7 +29,7 @@ void direction(const Harmonics& h, int64_t i, float (&d)[3]) {
   for (int a = 0; a < 3; a++) d[a] -= 2 * along * n[a];
 }
 
-// In the order and signs of refgs.model.harmonics, whose numbers these are.
+// Evaluate the harmonics, with the constants, order and signs of refgs.model.harmonics.
 void basis(const float (&d)[3], int64_t coefficients, float (&y)[MOST]) {
   float x = d[0], v = d[1], z = d[2], xx = x * x, vv = v * v, zz = z * z;
   y[0] = 0.28209479f;

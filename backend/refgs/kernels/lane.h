@@ -1,4 +1,4 @@
-// The names of vector.h where a thread has one number: what is written for vectors of the CPU serves CUDA by these.
+// The CUDA counterpart of vector.h: the same names for one number a thread, so that code written for the CPU's vectors compiles for CUDA.
 #pragma once
 
 #define LANES 1
@@ -34,8 +34,8 @@ struct Lane {
 };
 
 typedef Lane<float> Vector;
-typedef Lane<int32_t> Mask;  // -1 or 0, or an integer
-typedef Lane<float> Sum;     // a thread adds up few; many threads do in double: sum_over_block
+typedef Lane<int32_t> Mask;  // -1 (true) or 0 (false), or an integer
+typedef Lane<float> Sum;     // float: a thread adds up few numbers; sum_over_block adds up warps in double
 
 struct alignas(16) Four {
   float value[4] = {};
@@ -72,7 +72,7 @@ INLINE float root(float x) { return sqrtf(x); }
 INLINE double root(double x) { return sqrt(x); }
 INLINE Vector round_down(Vector x) { return floorf(x.value); }
 INLINE Vector inverse_root(Vector x) { return 1.0f / sqrtf(x.value); }
-#ifdef __CUDACC_RTC__  // one instruction each, where 1 / x and exp2f are right for denormal numbers, too
+#ifdef __CUDACC_RTC__  // one instruction each; they flush denormal numbers to zero, unlike 1 / x and exp2f
 INLINE Vector reciprocal(Vector x) {
   float y;
   asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x.value));

@@ -1,4 +1,4 @@
-// What every exported function needs, without a C library: the result depends on nothing but the processor.
+// Definitions for every exported function. No C library is used, so that results depend on the processor only.
 #pragma once
 
 #ifdef __CUDACC__
@@ -7,7 +7,7 @@
 #include <stdint.h>
 #endif
 
-// How the threads inside a function share its work.
+// Counters by which the threads inside a function share its work.
 struct Shared {
   int64_t next, thread;
 };
@@ -19,12 +19,12 @@ struct Shared {
 #define EXPORT extern "C" __attribute__((visibility("default")))
 #endif
 
-// A function that several threads may enter at once; they share its work.
+// Define a function that several threads may enter at once to share its work.
 #define KERNEL(name, Work, w) EXPORT void name(const Work* w)
 
 static inline int64_t take(int64_t& next, int64_t n) { return __atomic_fetch_add(&next, n, __ATOMIC_RELAXED); }
 
-// body(i) for each i below n, `batch` of them at a time for whichever thread comes next.
+// Call body(i) for each i below n. A free thread takes the next `batch` of them.
 template <class Body>
 static inline void share(Shared& shared, int64_t n, int64_t batch, Body body) {
   for (int64_t first; (first = take(shared.next, batch)) < n;)

@@ -1,38 +1,38 @@
-// What a shaded pixel looks up, LANES pixels at a time, with derivatives: the prefiltered light along a direction (paper
-// Eq. 8), irradiance about a normal, reflectance (Eq. 7), the sRGB curve.
+// Look-ups of shading with their derivatives, LANES pixels at a time: prefiltered light in a direction (paper Eq. 8), irradiance for a
+// normal, reflectance (Eq. 7), and the sRGB curve.
 #pragma once
 
 #include "rows.h"
 
-// Cubemaps of several roughnesses and one of irradiance / pi, one after another; see refgs.model.cubemap for the order of texels. Each
-// face is padded by one, so that a look-up's four neighbours lie side by side, two and two.
+// Stacked cubemaps: one for each of several roughnesses, then one of irradiance / pi. refgs.model.cubemap defines the order of texels.
+// Each face is padded by one cell all around, so that the four cells of a bilinear look-up are two adjacent pairs.
 struct Levels {
   int64_t count;
-  int32_t side[8], start[8], line[8];  // where a level starts, in cells, and in lines: rows of cells
-  float alpha[8];  // of GGX: roughness²
-  const float* cells;  // (cells, 4): red, green, blue, nothing
+  int32_t side[8], start[8], line[8];  // `start` counts cells and `line` counts lines before a level; a line is a row of cells
+  float alpha[8];  // GGX alpha of the level: roughness²
+  const float* cells;  // (cells, 4): red, green, blue, unused
 
   MEMBER int level_of(int32_t at) const {
     int k = 0;
     while (k + 1 < count && at >= line[k + 1]) k++;
     return k;
   }
-  MEMBER int64_t width(int32_t at) const { return side[level_of(at)] + 2; }  // of a line, in cells
+  MEMBER int64_t width(int32_t at) const { return side[level_of(at)] + 2; }  // length of a line, in cells
   MEMBER int64_t first_cell(int32_t at) const {
     int k = level_of(at);
     return start[k] + (at - line[k]) * width(at);
   }
 };
 
-// Look-up of a direction, bilinear, in N levels that are blended: in the two about a roughness, linear in its square, as a lobe is about
-// that wide; or in the last one, which is irradiance / pi about a normal.
+// Look-up of a direction, bilinear within a level. N = 2 blends the two levels around a roughness, linearly in roughness², which is
+// about the width of a lobe. N = 1 reads the last level: irradiance / pi for a normal.
 template <int N, bool DERIVATIVES>
 struct Lookup {
-  Vector s, t, inverse_major;  // on the face: the two coordinates; 1 / the direction's largest component
+  Vector s, t, inverse_major;  // coordinates on the face; 1 / the direction's largest component
   Mask on_x, on_y, face;
-  Vector share[N], slope;      // of the levels; the upper one's derivative by roughness
-  Vector x[N], y[N];           // in each level, how far from one cell's centre to the next
-  alignas(64) int32_t cell[N][LANES], width[N][LANES], line[N][LANES];  // the first of the four
+  Vector share[N], slope;      // weights of the levels; the derivative of the upper one's by roughness
+  Vector x[N], y[N];           // bilinear weights within each level
+  alignas(64) int32_t cell[N][LANES], width[N][LANES], line[N][LANES];  // of the first cell: index, length of its line, line
   Vector light[3] = {}, by_s[3] = {}, by_t[3] = {}, by_share[3] = {};   // the light and its derivatives
 
   MEMBER Lookup(const Levels& levels, Vectors d) {
@@ -66,7 +66,7 @@ struct Lookup {
     for (int i = 0; i < 2; i++) blend(levels, i, side[i], start[i], first_line[i]);
   }
 
-  // The derivatives by direction and by roughness.
+  // Derivatives by direction (returned) and by roughness.
   MEMBER Vectors backward(const Vector (&by_light)[3], Vector& by_roughness) const {
     by_roughness = Vector();
     for (int c = 0; c < 3; c++) by_roughness += by_light[c] * slope * by_share[c];
@@ -80,7 +80,7 @@ struct Lookup {
     return {choose(by_major, t_sum, s_sum), choose(s_sum, by_major, t_sum), choose(t_sum, s_sum, by_major)};
   }
 
-  // Of the levels' four cells each.
+  // Weights of the four cells of each level.
   MEMBER void weights(Vector (&w)[N][4]) const {
     for (int i = 0; i < N; i++) {
       Vector below = share[i] * y[i], above = share[i] - below;
@@ -99,13 +99,13 @@ struct Lookup {
     face = select(on_x, Mask(), select(on_y, Mask() + 2, Mask() + 4)) - (major < 0.0f);
   }
 
-  // Adds what is looked up in one level, of this side, which starts at that cell and line.
+  // Add the look-up in one level, given its side and its first cell and line.
   MEMBER void blend(const Levels& levels, int i, Mask side, Mask start, Mask first_line) {
     Vector sides = convert<Vector>(side), half = 0.5f * sides, column, row;
     x[i] = along(s, half, sides, column), y[i] = along(t, half, sides, row);
     Mask across = side + 2, down = face * across + convert<Mask>(row);
     store(cell[i], start + down * across + convert<Mask>(column)), store(width[i], across), store(line[i], first_line + down);
-    Vector top[8], bottom[8];  // two cells each
+    Vector top[8], bottom[8];  // two adjacent cells each
     two_cells(levels, i, 0, top), two_cells(levels, i, 1, bottom);
     for (int c = 0; c < 3; c++) {
       Vector across_top = top[4 + c] - top[c], across_bottom = bottom[4 + c] - bottom[c];
@@ -122,7 +122,7 @@ struct Lookup {
 
   MEMBER Vector choose(Vector if_x, Vector if_y, Vector if_z) const { return select(on_x, if_x, select(on_y, if_y, if_z)); }
 
-  // Of those of level i, in the first line or in the second.
+  // Load two adjacent cells of the i-th level, of the upper line (second = 0) or the lower one (second = 1).
   MEMBER void two_cells(const Levels& levels, int i, int second, Vector (&v)[8]) const {
     auto at = [&](int k) { return levels.cells + 4 * ((int64_t)cell[i][k] + second * width[i][k]); };
 #ifdef __CUDACC__
@@ -133,7 +133,7 @@ struct Lookup {
 #endif
   }
 
-  // The cell of the padded face, and how far along it.
+  // Find the first cell along one axis of the padded face (`at`), and return the bilinear weight of the next.
   static MEMBER Vector along(Vector s, Vector half, Vector side, Vector& at) {
     Vector x = (s + 1.0f) * half + 0.5f;
     at = smaller(larger(round_down(x), Vector()), side);
@@ -141,11 +141,11 @@ struct Lookup {
   }
 };
 
-// What a material reflects of an even light, by the square roots of roughness (row) and N.V (column), bilinear; table (side, side, 4)
-// of refgs.render.brdf.
+// Look-up of the reflectance under uniform light. Table (side, side, 4) of refgs.render.brdf, bilinear in the square roots of
+// roughness (row) and N.V (column).
 struct ReflectanceTable {
   static constexpr int FG0 = 0, FG1 = 1, AVERAGE = 2, DIELECTRIC = 3;
-  Vector value[4], by_n_v[4], by_roughness[4];  // derivatives: zero below LEAST and above 1
+  Vector value[4], by_n_v[4], by_roughness[4];  // derivatives are zero below LEAST and above 1
 
   MEMBER ReflectanceTable(const float* table, int64_t side, Vector n_v, Vector roughness) {
     constexpr float LEAST = 1e-4f;
@@ -182,8 +182,8 @@ struct ReflectanceTable {
   }
 };
 
-// What a metal reflects of an even light: Schlick's Fresnel at F0, and what microfacets pass on to each other; `bounces` of
-// refgs.render.brdf, of a mean Fresnel term of F0 + (1 - F0) / 21.
+// Reflectance of a metal under uniform light: single scattering F0 fg0 + fg1 with Schlick's Fresnel term, times the gain by multiple
+// scattering between microfacets. The gain is `bounces` of refgs.render.brdf, for the mean Fresnel term F0 + (1 - F0) / 21.
 struct Metal {
   Vector value, by_f0, by_fg[2], by_average;
 
@@ -202,12 +202,12 @@ struct Metal {
   }
 };
 
-// The sRGB curve (IEC 61966-2-1), unclamped as in refgs.color, and its derivative. What is no number stays none: of two, `larger` takes
-// the second then.
+// The sRGB curve (IEC 61966-2-1), unclamped as in refgs.color, and its derivative. A NaN stays one: `larger` returns its second argument
+// then.
 INLINE Vector srgb_encode(Vector linear, Vector& derivative) {
   constexpr float LINEAR_END = 0.0031308f;
   Vector x = larger(Vector() + LINEAR_END, linear), square_root = x * inverse_root(x);
-  // x^(5/12) = x x^(-1/4) x^(-1/3); y = (x^(1/2))^(-1/3) by Newton from an estimate in the exponent's bits.
+  // x^(5/12) = x x^(-1/4) x^(-1/3). y = (x^(1/2))^(-1/3) by Newton's method, from an estimate made from the float's bits.
   Vector third = convert<Vector>(bits(square_root)) * (1 / 3.0f);
   Vector y = from_bits((Mask() + 0x54a2fa8c) - convert<Mask>(third));
 #pragma unroll

@@ -30,11 +30,14 @@ def supported() -> list[str]:
 
 
 def _keep_memory() -> None:
-    """Have GNU's malloc keep freed memory. By default the buffers of an iteration go back to the system at its end, and the next
-    iteration faults them in again page by page: 4 % of its time for small pictures, half for large ones."""
+    """Have GNU's malloc keep freed memory.
+
+    By default the buffers of an iteration go back to the system at its end, and the next iteration faults them in again page by page: 4 %
+    of its time for small images, half for large ones.
+    """
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
-        libc.mallopt(-4, 0)  # M_MMAP_MAX: no allocation is mapped by itself, however large
-        libc.mallopt(-8, 1)  # M_ARENA_MAX: memory that one thread frees, another may have
+        libc.mallopt(-4, 0)  # M_MMAP_MAX: no allocation has a mapping of its own, however large
+        libc.mallopt(-8, 1)  # M_ARENA_MAX: threads reuse each other's freed memory
         libc.mallopt(-1, 512 << 20)  # M_TRIM_THRESHOLD
 
 
@@ -109,16 +112,15 @@ def borrow(name: str, count: int) -> torch.Tensor:
     """
     memory = _kept.__dict__.get(name)
     if memory is None or len(memory) < count:
-        _kept.__dict__[name] = None  # freed first, so that both are never there at once
+        _kept.__dict__[name] = None  # free the old memory first: both never exist at once
         memory = _kept.__dict__[name] = torch.empty(count + count // 8, dtype=torch.int32)
     return memory
 
 
 def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most: int = CORES) -> None:
-    """Call `function(&work)` at once on as many threads as torch has, but on no more than there are cores, or than `most`.
+    """Call `function(&work)` on several threads at once: as many as torch has, at most the number of cores, at most `most`.
 
-    The threads share the work through `work.shared`. Each gets `scratch` floats of `work.scratch`, which only a kernel that
-    needs them has.
+    The threads share the work through `work.shared`. Each gets `scratch` floats of `work.scratch`, a field that only some kernels have.
     """
     threads = max(1, min(torch.get_num_threads(), CORES, most))
     if scratch:
@@ -133,8 +135,10 @@ def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most:
 
 
 def run(name: str, work: ctypes.Structure, like: torch.Tensor, items: int, scratch: int = 0) -> None:
-    """Run a kernel on `items` where the tensor `like` is: on torch's threads on the CPU, each with `scratch` floats of its own,
-    or on a card, one thread an item."""
+    """Run a kernel on `items`, on the device of the tensor `like`.
+
+    The CPU uses torch's threads, each with `scratch` floats of its own. A card uses one thread an item.
+    """
     if on_gpu(like):
         cuda.launch(name, work, like.device, max(1, -(-items // cuda.BLOCK)))
     else:

@@ -1,41 +1,46 @@
-// The objective of a view but for D-SSIM, and its derivatives by the rendering's maps: two passes over the rows.
+// The loss of a view except D-SSIM, and its derivatives by the rendered maps, in two passes over the pixels.
 //
-// Colour: |C - C_gt|, C clipped only where the photo is. Normals: 1 - N.n between the depth's normal N and the blended n. Smoothness:
-// |grad n| exp(-|grad C_gt|). Mask: |alpha - mask|. Metallic: m (1 - m), which is zero at both ends. Roughness: by how much it is above
-// GLOSSY. A weight is that of one pixel's term.
+// Colour: |C - C_gt|, with C clipped only where the photo is saturated.
+// Normals: 1 - N.n, N being the normal of the depth map and n the blended normal.
+// Smoothness: |grad n| exp(-|grad C_gt|); with the `even` weights also of metallic and roughness.
+// Mask: |alpha - mask|.
+// Metallic: m (1 - m), which is zero at 0 and at 1; and m on surfaces that are too dark for a metal.
+// Roughness: the excess above GLOSSY.
+//
+// A weight applies to one pixel's term.
 #include "vector.h"
 
 namespace {
 
 struct Losses {
   int64_t width, height;
-  const float *color, *normal, *depth, *alpha, *material;  // (H, W, 3), (H, W, 3), (H, W) times alpha, (H, W), (H, W, 5) or null
-  const uint8_t *image, *mask;                             // (H, W, 3), (H, W) or null: as on disk, 255 is 1
+  const float *color, *normal, *depth, *alpha, *material;  // (H, W, 3), (H, W, 3), (H, W) blended sum of depths, (H, W), (H, W, 5) or null
+  const uint8_t *image, *mask;                             // (H, W, 3), (H, W) or null: 8-bit as on disk, 255 is 1
   const float* background;                                 // (3)
-  float rotation[9], across, down, left, top;              // world to camera; at depth 1 a pixel's size, and where the first one is
+  float rotation[9], across, down, left, top;              // world to camera; at depth 1: a pixel's size, the first pixel's position
   float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, even_x_weight, even_y_weight, alpha_weight, metallic_weight, dark_weight, matte_weight;
-  float *photo, *clipped;   // (H, W, 3) the photo over the background; C as above, for D-SSIM
-  const float* by_clipped;  // (H, W, 3) D-SSIM's share
+  float *photo, *clipped;   // (H, W, 3) the photo over the background; the clipped C, for D-SSIM
+  const float* by_clipped;  // (H, W, 3) derivatives of D-SSIM by `clipped`
   float *by_color, *by_normal, *by_depth, *by_alpha, *by_material;
-  float* slopes;            // (4, H, W) derivatives by the depths to the right, to the left, below and above
-  double* sums;             // (SUMS) of each row, or of each block's pixels
-  const double *first, *second;  // (SUMS) of each pass
-  const float* structure;   // D-SSIM, or null
-  const float* light;  // (3): its mean radiance; or null
+  float* slopes;            // (4, H, W) derivatives of a pixel's normal term by the depths of its right, left, lower and upper neighbour
+  double* sums;             // (SUMS) for each row, or on CUDA for each block
+  const double *first, *second;  // (SUMS) totals of each pass
+  const float* structure;   // (1): D-SSIM, or null
+  const float* light;  // (3): the light's mean radiance; or null
   float dssim_weight, light_weight;
-  float *loss, *square, *by_light;  // what comes of it: the loss; the mean squared error; (3)
+  float *loss, *square, *by_light;  // results: the loss; the mean squared error; (3) the derivative by `light`
   mutable Shared shared;
 };
 
-enum { LOSS, SURFACES, SQUARES, SUMS };  // weighted terms; pixels with a surface; squared errors
-constexpr float SATURATED = 0.998f;  // a photo's value above which the true radiance is unknown
-constexpr float SOLID = 0.5f, COVERED = 1 / 255.0f;  // alphas of an opaque pixel, and of one that is not background
-constexpr int MATERIAL = 5, METAL = 3, ROUGH = 4;    // numbers of a material; which is the metallic, which the roughness
-constexpr float FLAT = 0.01f;                        // a smaller change of metallic or roughness hardly counts
-constexpr float GLOSSY = 0.3f;                       // rougher than this a surface is only where photos say so
-constexpr float DARK = 0.1f;                         // no metal's base colour is darker in all of its channels
+enum { LOSS, SURFACES, SQUARES, SUMS };  // sum of weighted terms; number of pixels with a surface; sum of squared errors
+constexpr float SATURATED = 0.998f;  // photo values above this are saturated: the true radiance is unknown
+constexpr float SOLID = 0.5f, COVERED = 1 / 255.0f;  // least alpha of an opaque pixel, and of one that is not background
+constexpr int MATERIAL = 5, METAL = 3, ROUGH = 4;    // channels of a material; the index of metallic, and of roughness
+constexpr float FLAT = 0.01f;                        // Huber threshold: smaller differences of metallic or roughness cost quadratically
+constexpr float GLOSSY = 0.3f;                       // roughness above this costs: only the photos can justify it
+constexpr float DARK = 0.1f;                         // every metal's base colour is brighter than this in some channel
 
-// A vector's worth of pixels of a row.
+// LANES adjacent pixels of a row.
 struct Pixels {
   int64_t x, width;
   MEMBER bool whole() const { return x >= 0 && x + LANES <= width; }
@@ -46,7 +51,7 @@ struct Pixels {
     for (int lane = 0; lane < LANES; lane++) m[lane] = -has(lane);
     return m;
   }
-  // One number of each pixel, of `stride` a pixel; zero beyond the row.
+  // Load one channel of each pixel from a row with `stride` channels a pixel; zero beyond the row.
   template <class T>
   MEMBER Vector get(const T* row, int stride) const {
     Vector v = {};
@@ -71,10 +76,10 @@ struct Pixels {
 INLINE Vector magnitude(Vector v) { return select(v < 0.0f, -v, v); }
 INLINE Vector sign(Vector v) { return select(v > 0.0f, Vector() + 1.0f, select(v < 0.0f, Vector() - 1.0f, Vector())); }
 INLINE Vector inverse_length(Vectors v) { return reciprocal(root(smaller(dot(v, v) + 1e-24f, Vector() + 1e36f))); }
-// From the derivative by v / |v|, `unit`, to that by v.
+// The derivative by v, from that by `unit` = v / |v|.
 INLINE Vectors by_length(Vectors by, Vectors unit, Vector inverse) { return inverse * (by - dot(by, unit) * unit); }
 
-// A row of a pass, `at` being some pixels of it.
+// Some pixels (`at`) of row y.
 struct Row {
   const Losses& l;
   int64_t y;
@@ -99,7 +104,7 @@ struct Row {
   MEMBER void add(Sum& sum, Vector v) const { sum += convert<Sum>(select(inside, v, Vector())); }
 };
 
-// The photo over the background; colour and mask.
+// Compose the photo over the background, and compute the colour and mask terms.
 INLINE void pixel_terms(const Row& r, Sum (&sums)[SUMS]) {
   const Losses& l = r.l;
   Vector opaque = Vector() + 1.0f, photo[3], color[3], loss = {}, squares = {};
@@ -125,9 +130,9 @@ INLINE void pixel_terms(const Row& r, Sum (&sums)[SUMS]) {
   r.add(sums[SURFACES], select(alpha > COVERED, Vector() + 1.0f, Vector()));
 }
 
-// The depth's normal at a pixel, by central differences: with X, Y where its ray meets depth 1, p and t the differences of depth along
-// x and y, and q and s the widths there of two pixels, the tangents are (X p + q, Y p, p) and (X t, Y t + s, t), whose product, towards
-// the camera, is N = (p s, q t, -(q s + X p s + Y q t)).
+// The normal term. The normal of the depth map is found by central differences. The pixel's ray meets depth 1 at (X, Y); p and t are the
+// differences of depth along x and y; q and s are the widths of two pixels at those depths. The tangents are (X p + q, Y p, p) and
+// (X t, Y t + s, t). Their cross product, turned towards the camera, is N = (p s, q t, -(q s + X p s + Y q t)).
 INLINE void normal_term(const Row& r, Sum& loss) {
   const Losses& l = r.l;
   float* slopes[4];
@@ -144,7 +149,7 @@ INLINE void normal_term(const Row& r, Sum& loss) {
   float Y = (float)(int32_t)r.y * l.down + l.top;
   Vector X;
   for (int lane = 0; lane < LANES; lane++) X[lane] = (float)(int32_t)(r.at.x + lane) * l.across + l.left;
-  // Zero where they are not asked: one outlier there must not become a NaN here.
+  // Depths are zero in lanes that are not solid: an outlier there must not become a NaN that enters the sums.
   auto depth = [&](int dx, int dy) { return select(solid, r.mean_depth(dx, dy), Vector()); };
   Vector right = depth(1, 0), left = depth(-1, 0), below = depth(0, 1), above = depth(0, -1);
   Vector p = right - left, q = (right + left) * l.across, t = below - above, s = (below + above) * l.down;
@@ -162,8 +167,8 @@ INLINE void normal_term(const Row& r, Sum& loss) {
   r.put(slopes[0], by_q + by_p), r.put(slopes[1], by_q - by_p), r.put(slopes[2], by_s + by_t), r.put(slopes[3], by_s - by_t);
 }
 
-// The change of the normal, and of metallic and roughness, towards a neighbour, and its derivatives, which both of them feel; counted
-// once, by the pixel before.
+// The smoothness term between a pixel and its neighbour at (dx, dy): differences of the normal, of metallic and of roughness. Both pixels
+// compute it for their own derivatives. Only the first of the two adds it to the loss.
 INLINE void smooth_term(const Row& r, int dx, int dy, float smooth, float even, Sum& loss, Vectors& by_normal, Vector (&by_material)[2]) {
   const Losses& l = r.l;
   Mask both = r.inside & r.at.beside(dx).inside();
@@ -176,13 +181,13 @@ INLINE void smooth_term(const Row& r, int dx, int dy, float smooth, float even, 
   by_normal = by_normal + Vectors{w * sign(n.x), w * sign(n.y), w * sign(n.z)};
   for (int i = 0; i < 2 && even != 0; i++) {
     Vector m = r.at.get(r.of(l.material, MATERIAL) + METAL + i, MATERIAL) - r.at.beside(dx).get(r.of(l.material, MATERIAL, dy) + METAL + i, MATERIAL);
-    Vector slope = clamp(m * (1 / FLAT), -1, 1);  // Huber's: where all is even, rounding has no say
+    Vector slope = clamp(m * (1 / FLAT), -1, 1);  // Huber loss: in even regions the sign of rounding errors must not matter
     cost += by_even * slope * (m - 0.5f * FLAT * slope), by_material[i] += by_even * slope;
   }
   if (dx + dy > 0) r.add(loss, cost);
 }
 
-// Body(row) for all the pixels; its sums are those of a row, or on CUDA of a block, which has a tile of 32 x 8 pixels.
+// Call body(row, sums) for all pixels. Sums are kept for each row; on CUDA for each block, which has a tile of 32 x 8 pixels.
 template <class Body>
 void each(const Losses* l, Body body) {
 #ifdef __CUDACC__
@@ -208,7 +213,7 @@ void each(const Losses* l, Body body) {
 
 }  // namespace
 
-// what a pixel says by itself, or by the depths around it
+// First pass: terms of a pixel by itself, and the normal term, which reads the depths around it.
 KERNEL(refgs_losses_first, Losses, l) {
   each(l, [](const Row& r, Sum (&sums)[SUMS]) {
     pixel_terms(r, sums);
@@ -216,7 +221,7 @@ KERNEL(refgs_losses_first, Losses, l) {
   });
 }
 
-// what it says with its neighbours, and what they say of it
+// Second pass: terms between neighbours, and derivatives that come from the neighbours' normal terms.
 KERNEL(refgs_losses_second, Losses, l) {
   each(l, [](const Row& r, Sum (&sums)[SUMS]) {
     const Losses& l = r.l;
@@ -246,7 +251,7 @@ KERNEL(refgs_losses_second, Losses, l) {
     float surfaces = (float)l.first[SURFACES], share_of_each = 1 / (surfaces > 1 ? surfaces : 1);
     float weight = share_of_each * l.metallic_weight;
     Vector dark = share_of_each * l.dark_weight * clamp(1.0f - brightest * (1 / DARK), 0, 1);
-    Vector matte = of_material(ROUGH) - GLOSSY, slope = clamp(matte * (1 / FLAT), 0, 1);  // Huber's: surfels may start at the kink
+    Vector matte = of_material(ROUGH) - GLOSSY, slope = clamp(matte * (1 / FLAT), 0, 1);  // Huber loss, as surfels may start at the kink
     Vector felt = share_of_each * l.matte_weight * slope;
     r.add(sums[LOSS], weight * metallic * (1.0f - metallic) + dark * metallic + felt * (matte - 0.5f * FLAT * slope));
     by_smooth[0] += weight * (1.0f - 2.0f * metallic) + dark, by_smooth[1] += felt;
@@ -255,17 +260,17 @@ KERNEL(refgs_losses_second, Losses, l) {
   });
 }
 
-// The whole, with the light's own word: the squared departure from grey of its mean. Of
-// numbers m with mean u that is mean((m / u - 1)^2).
+// Add up the loss, including the light's term: the squared departure of its mean radiance from grey. For channels m with mean u it is
+// mean((m / u - 1)^2).
 KERNEL(refgs_losses_total, Losses, l) {
   share(l->shared, 1, 1, [&](int64_t) {
     const double *first = l->first, *second = l->second;
     double loss = first[LOSS] + second[LOSS];
     if (l->structure) loss += l->dssim_weight * (double)*l->structure;
     if (l->light) {
-      double mean = 0, square = 0, along = 0, departure[3];  // along: what all three do to the mean
+      double mean = 0, square = 0, along = 0, departure[3];  // along: the derivative through the mean
       for (int c = 0; c < 3; c++) mean += l->light[c] / 3.0;
-      double weight = mean > 1e-9 ? l->light_weight : 0;  // darkness has no colour
+      double weight = mean > 1e-9 ? l->light_weight : 0;  // a black light has no hue
       mean = mean > 1e-9 ? mean : 1;
       for (int c = 0; c < 3; c++) {
         departure[c] = l->light[c] / mean - 1;

@@ -1,14 +1,14 @@
-// How far a view's loss would have each surfel move on the screen.
+// Screen-space gradient of each surfel's position under a view's loss, accumulated over views for densification.
 #include "vector.h"
 
 namespace {
 
 struct Motion {
   int64_t count;
-  const float *positions, *gradients;  // (count, 3) in the world
+  const float *positions, *gradients;  // (count, 3) in world space
   double view[12];                     // world to camera, 3x4, row-major
-  const float* accepted;               // zero where the gradients are not to be counted; or null
-  double scale;                        // from the derivative by a unit across, at depth 1, to that by half an image's width
+  const float* accepted;               // (1): zero skips the view; or null
+  double scale;                        // converts the derivative by a unit across at depth 1 to that by half an image's width
   float *total, *views;                // (count)
   mutable Shared shared;
 };
@@ -26,7 +26,7 @@ KERNEL(refgs_motion, Motion, m) {
       across[0] += (float)m->view[a] * g[a], across[1] += (float)m->view[4 + a] * g[a];
     }
     float length = root(across[0] * across[0] + across[1] * across[1]);
-    // One pixel at depth z is z / f wide.
+    // A pixel at depth z is z / f wide.
     m->total[i] += depth > 0 ? length * depth * (float)m->scale : 0;
     m->views[i] += length > 0 ? 1 : 0;
   });

@@ -1,14 +1,14 @@
-// Normals of surfels, turned towards a camera; and back to their rotations.
+// Normals of surfels, flipped towards a camera; and derivatives back to the rotations.
 #include "vector.h"
 
 namespace {
 
-constexpr float PAST_HORIZON = -0.3f;  // cosine below which a surfel shows its back
+constexpr float PAST_HORIZON = -0.3f;  // cosine to the camera below which a surfel's normal is flipped
 constexpr float MIN_NORM = 1e-12f;
 
 struct Normals {
   int64_t count;
-  const float *rotations, *positions;  // (count, 4) wxyz of any length, (count, 3)
+  const float *rotations, *positions;  // (count, 4) quaternions wxyz of any length, (count, 3)
   double camera[3];
   float* normals;                      // (count, 3)
   const float* by_normals;
@@ -20,12 +20,12 @@ struct Turned {
   float q[4], inverse, n[3], sign;
 };
 
-// The third column of the rotation, and whether it has to be turned.
+// Normalise the quaternion; take the rotation's third column as normal, and the sign that turns it towards the camera.
 inline Turned turned(const Normals& s, int64_t i) {
   Turned t;
   const float* q = s.rotations + 4 * i;
   float norm = root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  t.inverse = norm < MIN_NORM ? 0 : 1 / norm;  // one that says nothing stands for the identity, as in project.h
+  t.inverse = norm < MIN_NORM ? 0 : 1 / norm;  // a zero quaternion stands for the identity, as in project.h
   for (int k = 0; k < 4; k++) t.q[k] = q[k] * t.inverse;
   float w = t.q[0], x = t.q[1], y = t.q[2], z = t.q[3];
   t.n[0] = 2 * (x * z + w * y), t.n[1] = 2 * (y * z - w * x), t.n[2] = 1 - 2 * (x * x + y * y);

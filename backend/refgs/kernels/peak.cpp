@@ -1,19 +1,19 @@
-// Nothing but arithmetic: what this processor can do at the most, which benchmarks set the other kernels beside.
+// Peak arithmetic rate of this processor: benchmarks compare the other kernels with it.
 #include "vector.h"
 
 namespace {
 
 struct Peak {
   int64_t rounds;
-  float* out;  // (1): never written to, but no compiler knows
+  float* out;  // (1): never written, but it keeps the compiler from removing the loop
   mutable Shared shared;
 };
 
-constexpr int CHAINS = 12;  // products and sums that do not wait for each other
+constexpr int CHAINS = 12;  // independent products and sums, to hide latency
 
 }  // namespace
 
-// A round is CHAINS LANES products and as many sums, of a thousand.
+// A round is 1000 × CHAINS × LANES products and as many sums.
 KERNEL(refgs_peak, Peak, p) {
   Vector chains[CHAINS];
   for (int i = 0; i < CHAINS; i++) chains[i] = Vector() + (float)i;

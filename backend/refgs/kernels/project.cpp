@@ -1,4 +1,5 @@
-// Splats to the CPU's tiles: project, sort by depth, bin. And back: derivatives from the tiles to the splats' parameters.
+// The CPU's projection: project the splats, sort them by depth, bin them to tiles; and carry derivatives from the tiles to the splats'
+// parameters.
 #include "project.h"
 
 namespace {
@@ -12,11 +13,13 @@ void prefetch(const Raster& r, int64_t i) {
   });
 }
 
-// A gradient row's geometry: n0, n0 x, n0 y, and so on, and the rest; x and y from the middle of the tile.
+// Geometry of a gradient row: derivatives by the value, x slope and y slope of n0, n1 and n2 relative to the middle of the tile; then by
+// the determinant, the centre's x, y and depth, and the logarithm of the opacity.
 typedef double Row __attribute__((vector_size(8 * GEOMETRY)));
 typedef float FloatRow __attribute__((vector_size(4 * GEOMETRY), aligned(4)));
 
-// Add up a splat's rows: those of its features in place, its geometry as values and as moments, x and y times as much. Whether there were any.
+// Add up a splat's rows: features in place; geometry plain (`sum`) and times the x and y of each tile's middle, to change the origin to the
+// image's corner. Return whether there were any.
 INLINE bool add_rows(const Raster& r, int64_t i, Row& sum, Row& sum_x, Row& sum_y) {
   int64_t channels = r.channels, stride = GEOMETRY + padded(channels);
   float* __restrict by_features = r.by_splat_features + i * channels;
@@ -36,7 +39,7 @@ INLINE bool add_rows(const Raster& r, int64_t i, Row& sum, Row& sum_x, Row& sum_
   return touched;
 }
 
-// The derivatives of a batch, from its rows to its parameters.
+// Carry the derivatives of a batch of splats from their rows to their parameters.
 void gather(const Raster& r, int64_t first) {
   Sums sums;
   for (int lane = 0; lane < BATCH; lane++) {
@@ -64,11 +67,11 @@ EXPORT void refgs_project(Raster* r) {
     for (int64_t j = i; j < i + 256 && j < r->splats; j += BATCH)
       project(*r, j, [&](int64_t k, const Octagon& octagon, float depth) {
         r->octagons[k] = octagon;
-        __builtin_memcpy(r->keys + 2 * r->splats + k, &depth, 4);  // a positive float's bits are in its order
+        __builtin_memcpy(r->keys + 2 * r->splats + k, &depth, 4);  // the bits of positive floats sort like the floats
       });
 }
 
-// Order the visible splats by depth (in float, ties by index) and count the pairs.
+// Sort the visible splats by depth (a radix sort of floats; ties by index), and count the (splat, tile) pairs.
 EXPORT void refgs_sort(Raster* r) {
   constexpr int BITS = 11, DIGITS = 3, SIZE = 1 << BITS;  // a positive float has 31 bits
   int64_t n = 0, pairs = 0;
@@ -100,9 +103,9 @@ EXPORT void refgs_sort(Raster* r) {
   for (int64_t i = 0; i < n; i++) r->order[i] = (int32_t)values[i];
 }
 
-// Counting scatter of the sorted splats into tiles.
+// Bin the sorted splats into tiles by a counting scatter.
 EXPORT void refgs_bin(Raster* r) {
-  int32_t* counts = r->reach;  // not in use yet
+  int32_t* counts = r->reach;  // borrowed: refgs_forward fills it later
   for (int64_t t = 0; t < tiles_x(*r) * tiles_y(*r); t++) counts[t] = 0;
   for (int64_t k = 0; k < r->visible; k++) {
     int32_t i = r->order[k], ahead = r->order[k + AHEAD < r->visible ? k + AHEAD : k];
@@ -116,7 +119,7 @@ EXPORT void refgs_bin(Raster* r) {
   }
 }
 
-// Where each tile's rows begin, one for each member up to its reach, and how many there are.
+// Find where each tile's gradient rows begin, and how many there are in all. A tile has one for each member up to its reach.
 EXPORT void refgs_rows(Raster* r) {
   int64_t tiles = tiles_x(*r) * tiles_y(*r);
   r->row_count = 0;

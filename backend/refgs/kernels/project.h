@@ -1,9 +1,10 @@
-// Splats to the picture and back, in double: projection and bounds, and the derivatives from those of Splat to a splat's parameters.
+// Projection of splats and their bounds in the image, in double; and derivatives from those by Splat's fields to the splats' parameters.
 #pragma once
 
 #include "raster.h"
 
-// BATCH splats are treated at once, one a lane. Bounds of their images may be rough: most cards are slow with doubles.
+// BATCH splats are processed at once, one a lane. On CUDA the bounds in the image are computed in float (Bound): most cards are slow with
+// doubles.
 #ifdef __CUDACC__
 constexpr int BATCH = 1;
 typedef Lane<double> Real;
@@ -38,7 +39,8 @@ INLINE Vec3 operator*(Real s, Vec3 a) { return {s * a.x, s * a.y, s * a.z}; }
 INLINE Real dot(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 INLINE Vec3 cross(Vec3 a, Vec3 b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
 
-// A batch of splats: of an array with `stride` floats a splat, the number `k` of each. Past the last splat stands the last one.
+// A batch of splats. (p, stride, k) loads number k of each splat from an array with `stride` floats a splat. Lanes past the last splat
+// repeat it.
 struct Batch {
   int64_t first, last;
   MEMBER int64_t operator[](int lane) const { return first + lane < last ? first + lane : last; }
@@ -49,9 +51,9 @@ struct Batch {
   }
 };
 
-// Splats in camera space: centre c, axes a = s_u t_u and b = s_v t_v; their homographies (see Splat) before the factors k and UNIT.
+// Splats in camera space: centre c, axes a = s_u t_u and b = s_v t_v; their homographies (see Splat) without the factors k and UNIT.
 struct Disc {
-  Real q[4], per_norm;  // unit quaternion; what it was multiplied by, 0 where it had no length and stands for the identity
+  Real q[4], per_norm;  // unit quaternion; the factor that normalised it, 0 for one of zero length, which stands for the identity
   Vec3 u, v;            // unit tangents, camera space
   Real scale_u, scale_v;
   Vec3 a, b, c;
@@ -70,7 +72,7 @@ INLINE Vec3 rotate_back(const double* view, Vec3 p) {
           view[2] * p.x + view[6] * p.y + view[10] * p.z};
 }
 
-constexpr double MIN_NORM = 1e-12;  // a quaternion shorter than this says nothing
+constexpr double MIN_NORM = 1e-12;  // a shorter quaternion stands for the identity
 
 INLINE Disc disc(const Scene& r, Batch i) {
   Disc d;
@@ -89,7 +91,7 @@ INLINE Disc disc(const Scene& r, Batch i) {
 
   d.n0 = cross(d.b, d.c), d.n1 = cross(d.c, d.a), d.n2 = cross(d.a, d.b);
   d.determinant = dot(d.c, d.n2);
-  // The factor that makes the coefficients of Eq. 4 of the order of one, and the determinant positive; 0 for a degenerate disc.
+  // The factor k scales the coefficients of Eq. 4 to the order of one and makes the determinant positive. It is 0 for a degenerate disc.
   double per_fx = 1 / r.fx, per_fy = 1 / r.fy;
   Real height = magnitude(d.determinant) * d.per_z, largest = height;
   const Vec3 rows[] = {d.n0, d.n1, d.n2};
@@ -99,14 +101,15 @@ INLINE Disc disc(const Scene& r, Batch i) {
   return d;
 }
 
-// How far the image of {c + u a + v b: u^2 + v^2 <= k2}, wholly in front of the camera, reaches along an image axis, from that of c: the
-// tangents to the outline, a conic. `a` and `b` are the axis' homogeneous coordinates of the two vectors, where c has 0; `zz` < 0.
+// Bounds along an image axis of the image of {c + u a + v b: u^2 + v^2 <= k2}, relative to the image of c. The set must be wholly in front
+// of the camera. The bounds are tangents to the outline, which is a conic. `a` and `b` are the vectors' homogeneous coordinates along the
+// axis, az and bz their depths, relative to c at 0; `zz` < 0.
 INLINE void extent(Bound a, Bound b, Bound az, Bound bz, Bound k2, Bound zz, Bound per_zz, Bound& low, Bound& high) {
   Bound uz = k2 * (a * az + b * bz), uu = k2 * (a * a + b * b), side = root(uz * uz - uu * zz);
   low = (uz + side) * per_zz, high = (uz - side) * per_zz;
 }
 
-// Fill `projected` for a batch, where a splat is to be seen; each(i, octagon, depth) for all.
+// Fill `projected` for the visible splats of a batch. Call each(i, octagon, depth) for all splats; the octagon is empty for invisible ones.
 template <class Each>
 INLINE void project(const Scene& r, int64_t first, Each each) {
   Batch i = {first, r.splats - 1};
@@ -120,7 +123,7 @@ INLINE void project(const Scene& r, int64_t first, Each each) {
   Truth whole = ahead * ahead >= k2 * slopes, cut = visible & proper & ~whole;
   bool some_cut = false;
   for (int lane = 0; lane < BATCH; lane++) some_cut |= cut[lane] != 0;
-  Real px[4], py[4];  // image of what is left of a cut disc: that of a rectangle, which the near plane cuts off, is convex
+  Real px[4], py[4];  // for a disc that the near plane cuts: projected corners of a rectangle around its front part
   if (some_cut) {
     Real slope = root(slopes), reach = root(k2), eu = d.a.z / slope, ev = d.b.z / slope;
     for (int j = 0; j < 4; j++) {
@@ -130,13 +133,13 @@ INLINE void project(const Scene& r, int64_t first, Each each) {
       px[j] = r.fx * corner.x / corner.z + r.cx, py[j] = r.fy * corner.y / corner.z + r.cy;
     }
   }
-  // Along the octagon's axes x, y, x + y, x - y: the centre, and a and b from there; how far the screen-space filter reaches.
+  // Along the octagon's axes x, y, x + y, x - y: the projected centre, a and b relative to it, and the reach of the low-pass filter.
   Real from_x = d.c.x * d.per_z, from_y = d.c.y * d.per_z, x = r.fx * from_x + r.cx, y = r.fy * from_y + r.cy;
   Bound ax = bound(r.fx * (d.a.x - from_x * d.a.z)), ay = bound(r.fy * (d.a.y - from_y * d.a.z)), az = bound(d.a.z);
   Bound bx = bound(r.fx * (d.b.x - from_x * d.b.z)), by = bound(r.fy * (d.b.y - from_y * d.b.z)), bz = bound(d.b.z);
   const Bound as[] = {ax, ay, ax + ay, ax - ay}, bs[] = {bx, by, bx + by, bx - by};
   const Bound centres[] = {bound(x), bound(y), bound(x + y), bound(x - y)};
-  const float diagonal[] = {1, 1, (float)refgs::UNIT, (float)refgs::UNIT}, first_pixel[] = {0.5f, 0.5f, 1, 0};  // its centre along the axes
+  const float diagonal[] = {1, 1, (float)refgs::UNIT, (float)refgs::UNIT}, first_pixel[] = {0.5f, 0.5f, 1, 0};  // first pixel's centre
   const float LIMIT = 32767, lowest[] = {0, 0, -LIMIT, -LIMIT}, highest[] = {r.width - 1.0f, r.height - 1.0f, LIMIT, LIMIT};
   Bound bound_k2 = bound(k2), radius = root(bound_k2 * (1 / refgs::LOW_PASS)), bound_zz = bound(zz), per_zz = 1 / bound_zz;
   Bound lows[4], highs[4];
@@ -149,7 +152,7 @@ INLINE void project(const Scene& r, int64_t first, Each each) {
     };
     extent(as[j], bs[j], az, bz, bound_k2, bound_zz, per_zz, a, b);
     include(proper & whole, a, b);
-    Bound slack = 1e-6f * (larger(centres[j], -centres[j]) + high - low) + 1 / 64.0f;  // for the rounding of what is float
+    Bound slack = 1e-6f * (larger(centres[j], -centres[j]) + high - low) + 1 / 64.0f;  // covers rounding in float
     low += centres[j], high += centres[j];
     if (some_cut)
       for (int k = 0; k < 4; k++) {
@@ -189,19 +192,19 @@ INLINE void project(const Scene& r, int64_t first, Each each) {
   }
 }
 
-// A batch's derivatives: by n0, n1, n2, each by its value and its slopes along x and y, the origin at the image's corner, and by the rest.
+// Derivatives of a batch: by value, x slope and y slope of n0, n1 and n2, with the origin at the image's corner; and by the other fields.
 struct Sums {
   Real n[3][3], determinant, x, y, depth, log_opacity;
-  Truth touched;  // whether there were any
+  Truth touched;  // whether any tile gave derivatives
 };
 
-// Carry them through the projection to the splats' parameters.
+// Carry the derivatives `sums` through the projection to the splats' parameters.
 INLINE void carry(const Scene& r, int64_t first, const Sums& sums) {
   Batch i = {first, r.splats - 1};
   bool any_touched = false;
   for (int lane = 0; lane < BATCH; lane++) any_touched |= sums.touched[lane] != 0;
   auto put = [&](float* p, int stride, int k, Real v) {
-    v = sums.touched ? smaller(Real() + 3.4028234e38, larger(Real() - 3.4028234e38, v)) : Real();  // in this order a NaN stays one
+    v = sums.touched ? smaller(Real() + 3.4028234e38, larger(Real() - 3.4028234e38, v)) : Real();  // this order of arguments keeps a NaN
     for (int lane = 0; lane < BATCH && first + lane < r.splats; lane++) p[(first + lane) * stride + k] = (float)v[lane];
   };
   Disc d = {};

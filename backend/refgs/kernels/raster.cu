@@ -1,6 +1,6 @@
-// The rasteriser on CUDA cards. Splats are projected, a thread each; sorted by depth; every pair of a splat and a tile is listed in
-// that order, and the list sorted by tile (both by torch: render/raster_cuda.py). A tile's pixels are blended, and the derivatives of
-// its pairs summed, by a thread block; then each splat adds up its pairs. No sum depends on who comes first.
+// The rasteriser on CUDA cards. Splats are projected, one thread each, and sorted by depth. All (splat, tile) pairs are listed in that
+// order, and the list is sorted by tile. Torch does both sorts (render/raster_cuda.py). A thread block blends the pixels of a tile, and
+// sums the derivatives of its pairs. Then each splat adds up its pairs. Every sum has a fixed order, so results are deterministic.
 #include "project.h"
 
 using refgs::Splat;
@@ -8,7 +8,7 @@ using refgs::Splat;
 namespace {
 
 constexpr int WARP = 32, WARPS = 4, THREADS = WARPS * WARP;
-constexpr int HALVES = PIXELS / THREADS;  // pixels of a thread: the same one of blocks that lie one above the other
+constexpr int HALVES = PIXELS / THREADS;  // pixels of a thread: at the same place in two blocks, one above the other
 static_assert(BLOCK_X * BLOCK_Y == WARP && BLOCKS_X == 2 && BLOCKS_Y == 4 && HALVES == 2, "a warp has a quarter of the tile");
 
 struct Pair {
@@ -16,23 +16,24 @@ struct Pair {
 };
 
 struct Raster : Scene {
-  int32_t *depths, *counts;     // (splats) what they are sorted by; how many tiles they meet
-  const int64_t *order, *ends;  // (splats) front to back; how many pairs there are up to each of `order` and with it
-  int32_t* starts;              // (splats) where a splat's pairs begin
+  int32_t *depths, *counts;     // (splats) sort keys, the depths' bits; number of tiles that each meets
+  const int64_t *order, *ends;  // (splats) splats front to back; number of pairs up to and including each of `order`
+  int32_t* starts;              // (splats) index of a splat's first pair
   int64_t pair_count;
-  Pair* pairs;                  // (pair_count) those of a splat together, front to back
-  const int64_t* sorted;        // (pair_count) into `pairs`: tile by tile, each front to back
+  Pair* pairs;                  // (pair_count) splat by splat, front to back
+  const int64_t* sorted;        // (pair_count) indices into `pairs`: tile by tile, each front to back
   int32_t* tile_start;          // (tiles + 1) into `members` and `places`
-  int32_t *members, *places;    // (pair_count) in the order of `sorted`: splats, and where their pairs are in `pairs`
-  int32_t *reach, *last;        // (tiles) members up to the last that any pixel sees; its place, or -1
-  int64_t size;                 // channels that the kernels are compiled for, of which `channels` are used
-  float* rows;                  // (pair_count, GEOMETRY + size) derivatives of a pair, where its tile reaches it
+  int32_t *members, *places;    // (pair_count) in the order of `sorted`: the splat of a pair, and the pair's index in `pairs`
+  int32_t *reach, *last;        // (tiles) number of members up to the last that any pixel sees; its index in `pairs`, or -1
+  int64_t size;                 // number of channels that the kernels are compiled for; `channels` of them are used
+  float* rows;                  // (pair_count, GEOMETRY + size) derivatives of a pair, written if its tile reaches it
 };
 
 INLINE int lane() { return threadIdx.x % WARP; }
 
-// Sums over WIDTH neighbouring lanes, of V numbers a lane: lane l is left with that of the number l V / WIDTH; v is spoilt. Half of the
-// numbers are passed on to a lane that keeps the other half, and so on: V - 1 exchanges, where one sum after the other takes V log WIDTH.
+// Sum V numbers a lane over groups of WIDTH neighbouring lanes. Lane l returns the sum of number l V / WIDTH; v is overwritten. In each
+// step a lane passes half of its numbers to a lane that keeps that half. This takes about V exchanges; summing the numbers one by one would
+// take V log WIDTH.
 template <int WIDTH, int V>
 INLINE float sums(float* v) {
   constexpr int APART = WIDTH / 2, REST = V / 2;
@@ -59,11 +60,11 @@ INLINE void add_up(float* to, const float* v) {
   if constexpr (M > V) add_up<M - V>(to + V, v + V);
 }
 
-// A splat in shared memory, in vectors of four: those of Affine, and in their last lanes what else there is.
+// A splat in shared memory, as vectors of four. The fourth lanes of Affine's vectors hold other fields.
 struct alignas(16) Stored {
-  float value[4], slope_x[4], slope_y[4];              // and x, y, depth
+  float value[4], slope_x[4], slope_y[4];              // fourth lanes: x, y, depth
   float rest[4];                                       // determinant, log2_opacity, rho_max, plain
-  float low_value[4], low_slope_x[4], low_slope_y[4];  // and n2_min, n2_max
+  float low_value[4], low_slope_x[4], low_slope_y[4];  // fourth lanes: n2_min, n2_max, unused
 };
 
 INLINE float total(Four f) { return (f[0] + f[1]) + (f[2] + f[3]); }
@@ -78,7 +79,7 @@ INLINE void keep(Stored& to, Splat s) {
   to.rest[0] = s.determinant, to.rest[1] = s.log2_opacity, to.rest[2] = s.rho_max, to.rest[3] = s.plain;
 }
 
-// Without what a plain one does not need.
+// Load a splat without the fields that a plain one does not need.
 INLINE Splat plain(const Stored& from) {
   Splat s;
   alignas(16) float rest[4];
@@ -95,15 +96,15 @@ INLINE refgs::Hit<Vector> intersect(const Stored& from, Splat s, Vector x, Vecto
   return refgs::intersect<false>(s, x, y);
 }
 
-// Members of a tile that its threads treat together, as the tile sees them.
+// Members of a tile that its threads process together, localised to the tile.
 template <int SIZE, int N>
 struct Chunk {
   Stored splats[SIZE];
   alignas(16) float features[SIZE][N];
-  Bits met[SIZE];  // the warps' blocks
+  Bits met[SIZE];  // the blocks that each splat meets
 };
 
-// Of `members`, n <= SIZE: some threads localise, the others fetch the features.
+// Load the first n <= SIZE of `members`. The first SIZE threads localise the splats, the others fetch the features.
 template <int SIZE, int N>
 INLINE void fetch(Chunk<SIZE, N>& chunk, const Raster& r, const Tile& t, const int32_t* members, int n) {
   int i = threadIdx.x;
@@ -121,10 +122,10 @@ INLINE void fetch(Chunk<SIZE, N>& chunk, const Raster& r, const Tile& t, const i
   }
 }
 
-// A thread's pixels.
+// Pixels of a thread.
 struct Place {
-  int first;  // of the warp's blocks; the next is that below it
-  int x, y;   // of the first pixel in the tile; the next is BLOCK_Y below it
+  int first;  // index of the warp's first block; its next is the one below
+  int x, y;   // first pixel within the tile; the next is BLOCK_Y below
   Place() {
     int warp = threadIdx.x / WARP;
     first = warp / BLOCKS_X * HALVES * BLOCKS_X + warp % BLOCKS_X;
@@ -136,7 +137,7 @@ struct Place {
   Vector centre_y(int half) const { return y + half * BLOCK_Y + 0.5f - TILE_Y / 2; }
 };
 
-// body(k, in) for the members of a chunk that meet the warp's blocks, in order; `in` says which of the blocks that are `live`.
+// Call body(k, in) in order for the members k of a chunk that meet the warp's live blocks. `in` tells which of these blocks k meets.
 template <class Body>
 INLINE void each_met(const Bits* met, int n, const Place& place, const bool (&live)[HALVES], Body body) {
   for (int base = 0; base < n; base += WARP) {
@@ -151,7 +152,7 @@ INLINE void each_met(const Bits* met, int n, const Place& place, const bool (&li
   }
 }
 
-// A pixel's transmittance, zero from where it is finished.
+// Set the transmittance to zero once the pixel is finished.
 INLINE Vector unfinished(Vector T) { return select(T >= refgs::MIN_TRANSMITTANCE, T, Vector()); }
 
 INLINE bool anywhere(Mask mask) { return __any_sync(~0u, any(mask)); }
@@ -227,13 +228,14 @@ INLINE void read_channels(const Raster& r, const float* from, Four (&v)[QUADS]) 
       for (int i = 0; i < 4; i++) v[c][i] = 4 * c + i < r.channels ? from[4 * c + i] : 0;
 }
 
-// Front to back again. What lies behind a splat is what is left of the pixel's total, so one scalar a pixel suffices.
+// Differentiate front to back. The derivative by alpha needs what the splats behind contribute to the loss. That is the pixel's total minus
+// what has been passed, so one scalar a pixel (`rest`) suffices.
 template <int N>
 INLINE void backward(const Raster& r) {
   constexpr int SIZE = 32, ROW = GEOMETRY + N;
   __shared__ Chunk<SIZE, N> chunk;
-  __shared__ float parts[WARPS][SIZE][ROW];  // of a row: what a warp's pixels give
-  __shared__ uint32_t given[WARPS];          // by which splats, one bit each
+  __shared__ float parts[WARPS][SIZE][ROW];  // each warp's part of the rows
+  __shared__ uint32_t given[WARPS];          // bit mask of the splats that a warp has a part for
   Tile t(r, (int32_t)blockIdx.x);
   Place place;
   Vector x = place.centre_x(), T[HALVES], rest[HALVES], by_z[HALVES], by_alpha[HALVES];
@@ -314,9 +316,9 @@ INLINE void backward(const Raster& r) {
   }
 }
 
-constexpr int SUMMED = 14;  // of a row's geometry
+constexpr int SUMMED = 14;  // used numbers of a row's geometry
 
-// Add up every `step`-th row of a splat from `k` on, of those that its tiles reach: whether there was any.
+// Add up every `step`-th row of a splat from `k` on, skipping rows that their tiles do not reach. Return whether there was any.
 INLINE bool add_rows(const Raster& r, int32_t k, int32_t end, int step, double (&sum)[SUMMED]) {
   bool touched = false;
   for (; k < end; k += step) {
@@ -344,7 +346,7 @@ KERNEL(refgs_raster_project, Raster, r) {
       int32_t tiles = 0;
       each_row(octagon, [&](int32_t, int32_t x0, int32_t x1) { tiles += x1 - x0 + 1; });
       r->counts[i] = tiles;
-      r->depths[i] = tiles ? __float_as_int(depth) : 0x7fffffff;  // a positive float's bits are in its order
+      r->depths[i] = tiles ? __float_as_int(depth) : 0x7fffffff;  // the bits of positive floats sort like the floats
     });
   });
 }
@@ -366,7 +368,7 @@ KERNEL(refgs_raster_bin, Raster, r) {
       int32_t place = (int32_t)r->sorted[at];
       r->members[at] = r->pairs[place].splat, r->places[at] = place, here = r->pairs[place].tile;
     }
-    for (int32_t tile = before + 1; tile <= here; tile++) r->tile_start[tile] = (int32_t)at;  // few are empty
+    for (int32_t tile = before + 1; tile <= here; tile++) r->tile_start[tile] = (int32_t)at;  // those before `here` are empty, and few
   });
 }
 
@@ -383,7 +385,7 @@ KERNEL(refgs_raster_backward_12, Raster, r, __launch_bounds__(THREADS, 4)) { bac
 KERNEL(refgs_raster_backward_16, Raster, r, __launch_bounds__(THREADS, 4)) { backward<16>(*r); }
 KERNEL(refgs_raster_backward_20, Raster, r, __launch_bounds__(THREADS, 4)) { backward<20>(*r); }
 
-// A thread a splat; but one with many rows has its warp's threads read them.
+// One thread a splat. If a splat has many rows, all threads of its warp read them.
 KERNEL(refgs_raster_gather, Raster, r) {
   constexpr int32_t MANY = 64;
   int64_t i = (int64_t)blockIdx.x * blockDim.x + threadIdx.x;
@@ -412,7 +414,7 @@ KERNEL(refgs_raster_gather, Raster, r) {
   carry(*r, i, sums);
 }
 
-// Of a splat, four features' rows by eight threads.
+// Sum the rows of each splat's features: eight threads for four features.
 KERNEL(refgs_raster_gather_features, Raster, r) {
   constexpr int PHASES = 8;
   uint32_t thread = blockIdx.x * blockDim.x + threadIdx.x, quads = (uint32_t)(r->channels + 3) / 4;

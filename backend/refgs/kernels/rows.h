@@ -1,4 +1,4 @@
-// Between vectors of LANES pixels and the pixels' numbers side by side, as they lie in memory.
+// Transposition between memory, where a pixel's numbers are adjacent, and vectors, which hold one number of LANES pixels.
 #pragma once
 
 #include "vector.h"
@@ -23,7 +23,8 @@ struct Wide {
 #endif
 #endif
 
-// How N numbers of a pixel are moved: in blocks, of which the last begins early where N is no multiple of their width.
+// Division of a pixel's N numbers into blocks of WIDTH, each moved at once. If N is no multiple of WIDTH, the last block begins early and
+// overlaps the one before.
 template <int N>
 struct Blocks {
   static constexpr int WIDTH = N >= LANES ? LANES : N > 8 ? 16 : N == 8 ? 8 : 4, COUNT = (N + WIDTH - 1) / WIDTH;
@@ -50,7 +51,7 @@ struct Blocks {
 };
 
 #ifndef __CUDACC__
-// W numbers of each of LANES pixels, pixel by pixel, to a vector each; and back.
+// Transpose W numbers of each of LANES pixels: from pixel by pixel to a vector for each number (unzip), and back (zip).
 template <int W>
 INLINE void unzip(Vector (&v)[W]) {
 #pragma unroll
@@ -77,7 +78,7 @@ INLINE void zip(Vector (&v)[W]) {
   }
 }
 
-// The blocks of as many pixels from k on as fill a vector.
+// Concatenate the blocks of pixels k, k + 1, ... that fill a vector.
 template <int W, class Row>
 INLINE auto side_by_side(Row row, int k) {
   if constexpr (W == LANES) {
@@ -93,7 +94,7 @@ INLINE auto side_by_side(Row row, int k) {
 }
 #endif
 
-// lanes[c]: number c of each pixel, where block(k, b) is block b of pixel k.
+// Fill lanes[c] with number c of each pixel. block(k, b) returns block b of pixel k.
 template <int N, class Block>
 INLINE void to_lanes(Block block, Vector (&lanes)[N]) {
   constexpr int W = Blocks<N>::WIDTH;
@@ -112,7 +113,7 @@ INLINE void to_lanes(Block block, Vector (&lanes)[N]) {
   }
 }
 
-// N numbers of each of LANES pixels. Where blocks overlap, the later holds zeros.
+// N numbers of each of LANES pixels, in blocks. Where two blocks overlap the later one holds zeros, so that `add` counts each number once.
 template <int N>
 struct Rows {
   static constexpr int W = Blocks<N>::WIDTH, COUNT = Blocks<N>::COUNT;

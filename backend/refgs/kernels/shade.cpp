@@ -1,6 +1,6 @@
-// Maps to a picture and back: deferred shading of what the rasteriser blended (paper Eq. 5-10). Or surfels to their colours, before
-// they are blended (paper 3.3, the initial stage): there a "pixel" is a surfel, seen from where it is. Pixels that nothing covers cost
-// nothing: the others are taken LANES at a time, wherever they lie.
+// Deferred shading of the blended maps (paper Eq. 5-10), and its derivatives. It also shades surfels before they are blended (paper 3.3,
+// the initial stage): a "pixel" is a surfel then, with its own direction to the camera. Covered pixels are gathered LANES at a time, so
+// that background costs nothing.
 #include "blended.h"
 #include "sums.h"
 
@@ -14,7 +14,7 @@ INLINE Vectors towards_camera(const Shade& s, const Pixels& p) {
   return inverse_norm(v) * v;
 }
 
-// By a rotation; by its inverse.
+// Rotate by m; by its inverse.
 INLINE Vectors turned(const float* m, Vectors v) {
   auto row = [&](int i) { return m[i] * v.x + m[i + 1] * v.y + m[i + 2] * v.z; };
   return {row(0), row(3), row(6)};
@@ -29,7 +29,7 @@ INLINE Vectors mirror(Vectors normal, Vectors view, Vector& n_dot_v) {
   return 2.0f * n_dot_v * normal - view;
 }
 
-// From exposed radiance to what is blended over the background, and its derivative. Of surfels it is blended as it is.
+// Encode exposed radiance for blending over the background, with the derivative. Surfels are blended unencoded.
 template <bool SPLATS>
 INLINE void encode(const Shade& s, Vector exposed, Vector& encoded, Vector& slope) {
   if (SPLATS || s.display)
@@ -49,13 +49,15 @@ INLINE void write_pixels(const Shade& s, const Map& map, const Vector (&radiance
   scatter<3>(s.radiance, map.pixels, radiance);
 }
 
-// The split sum over a metallic-roughness material, of LANES pixels. HARMONICS: colour by direction in place of the reflected
-// irradiance. INDIRECT: light from the object itself where it stands in the mirror direction (Eq. 9), and its shadow on the irradiance.
-// SPLATS: of surfels. Directions are those of the light's frame, for it may stand with the camera.
+// Split-sum shading of a metallic-roughness material, LANES pixels at a time.
+// HARMONICS: directional colour replaces the reflected irradiance.
+// INDIRECT: light from the object itself where it occludes the mirror direction (Eq. 9), and its shadow on the irradiance.
+// SPLATS: pixels are surfels.
+// Directions are in the light's frame, because the light may turn with the camera.
 template <bool HARMONICS, bool INDIRECT, bool SPLATS, bool DERIVATIVES>
 struct Shaded {
   static constexpr bool SHADOW = INDIRECT && !HARMONICS;
-  static constexpr int DIFFUSE = 8, FROM_OBJECT = INDIRECT ? 11 : 0;  // channels: the first of colour by direction, or of the shadow
+  static constexpr int DIFFUSE = 8, FROM_OBJECT = INDIRECT ? 11 : 0;  // channels: directional colour or shadow; the object's light
   static constexpr int C = 11 + 3 * (HARMONICS || INDIRECT) + 3 * INDIRECT, S = C - 3;
   Map<SPLATS, C, DERIVATIVES> map;
   Vector inverse_length, n_dot_v, visibility;
@@ -173,7 +175,7 @@ struct Shaded {
   }
 
  private:
-  // The part of the light in the mirror direction that is sent on.
+  // Fraction of the light from the mirror direction that is reflected.
   MEMBER Vector reflected(const Shade& s, const Metal& metal) const {
     Vector metallic = map.value[METALLIC], dielectric = table.value[ReflectanceTable::DIELECTRIC];
     return s.mirror ? metallic : dielectric + metallic * (metal.value - dielectric);
@@ -190,8 +192,9 @@ struct Shaded {
   MEMBER Vectors mirrored() { return mirror(normal, view, n_dot_v); }
 };
 
-// A surface that mirrors nothing: its albedo times the irradiance, of LANES pixels or SPLATS. Irradiance changes too slowly with the normal
-// for the way back that Displaced goes to show: without it normals and relit pictures were better, and the photos explained as well.
+// Shading of a matte surface: albedo times irradiance, for LANES pixels or surfels (SPLATS). It uses the blended normal, not Displaced's:
+// irradiance varies too slowly with the normal to need that. With the blended normal, normals and relit images were better, and photos were
+// fitted as well.
 template <bool SPLATS, bool DERIVATIVES>
 struct Matte {
   static constexpr int C = 6;  // normal, albedo
@@ -245,7 +248,7 @@ struct Matte {
 void mirrored_pixels(const Shade& s, int64_t first, int64_t end) {
   for (int64_t i = 3 * first; i < 3 * end; i++) s.mirrored[i] = 0;
   each_covered(s, first, end, [&](const Pixels& pixels) {
-    Displaced<17, false> map(s, pixels);  // INDIRECT's channels
+    Displaced<17, false> map(s, pixels);  // the number of channels with INDIRECT
     Vectors normal = {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]}, view = towards_camera(s, pixels);
     Vector n_dot_v;
     Vectors m = mirror(inverse_norm(normal) * normal, view, n_dot_v);
@@ -274,7 +277,7 @@ using Glossy = Kind<SPLATS, Shaded<HARMONICS, INDIRECT, SPLATS, false>, Shaded<H
 template <bool SPLATS = false>
 using Dull = Kind<SPLATS, Matte<SPLATS, false>, Matte<SPLATS, true>>;
 
-// body(kind) of what the pixels are.
+// Call body(kind) with the kind of shading that `s` asks for.
 template <class Body>
 void by_kind(const Shade& s, Body body) {
   if (s.matte)
@@ -287,7 +290,7 @@ void by_kind(const Shade& s, Body body) {
     s.harmonics ? body(Glossy<true, false>()) : body(Glossy<false, false>());
 }
 
-// body(first, end) for all pixels, some at a time.
+// Call body(first, end) for strips of pixels until all are done.
 template <class Body>
 void share_pixels(const Shade& s, Body body) {
   const int64_t STRIP = LANES == 1 ? 1 : 8 * s.width;
@@ -299,7 +302,7 @@ void share_pixels(const Shade& s, Body body) {
 }
 
 #ifdef __CUDACC__
-// A thread a pixel.
+// One thread a pixel. With LARGEST, only find the largest contributions.
 template <bool LARGEST>
 void backward_block(const Shade& s) {
   int64_t pixels = s.width * s.height, i = (int64_t)blockIdx.x * blockDim.x + threadIdx.x;
@@ -339,11 +342,11 @@ void backward_chunk(const Shade& s, int64_t index) {
 }
 #endif
 
-constexpr int BATCH = 1024;  // cells or texels
+constexpr int BATCH = 1024;  // cells or texels at a time
 
 }  // namespace
 
-// The light's cells from its texels.
+// Copy the light's texels to the cells of the padded faces.
 KERNEL(refgs_shade_pad, Shade, s) {
   share(s->shared, s->cells, BATCH, [light = s->light, texel = s->texel, padded = s->padded](int64_t i) {
     const float* from = light + 3 * texel[i];

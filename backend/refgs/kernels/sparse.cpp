@@ -1,5 +1,5 @@
-// A sparse matrix times a dense one of three columns: the light's prefilter. Both are over texels of cubemaps in the order of
-// their orbits, and the cube's 24 symmetries leave the matrix as it is (cubemap.py).
+// Product of a sparse matrix and a dense one of three columns: the light's prefilter. Rows and columns are texels of cubemaps in the order
+// of their orbits (model/cubemap.py). The cube's 24 symmetries leave the matrix unchanged, so only the first row of each orbit is stored.
 #include "vector.h"
 
 namespace {
@@ -7,12 +7,12 @@ namespace {
 const int SYMMETRIES = 24, WIDTH = 3 * SYMMETRIES;
 
 struct Product {
-  int64_t orbits;                   // of rows
-  const int32_t *starts, *columns;  // (orbits + 1), of the numbers of each one's first row; their columns, by symmetry
+  int64_t orbits;                   // orbits of the rows, 24 rows each
+  const int32_t *starts, *columns;  // (orbits + 1), where the numbers of each orbit's first row begin; their columns, grouped by symmetry
   const float* numbers;
-  const int32_t* compositions;  // (24, 24): the symmetry that is the row's, then the column's
+  const int32_t* compositions;  // (24, 24): the symmetry that applies the row's, then the column's
   const float* dense;           // (columns, 3)
-  const int32_t* rows;          // (24 orbits) where in `out` each row goes; null where it stays in place
+  const int32_t* rows;          // (24 orbits): where in `out` each row goes; null if rows stay in place
   float* out;                   // (24 orbits, 3)
   mutable Shared shared;
 
@@ -20,7 +20,7 @@ struct Product {
 };
 
 #ifdef __CUDACC__
-// A warp a row: its threads take numbers by turns, then add up what they have.
+// One warp a row: its threads take numbers by turns, then add up their sums.
 INLINE void product(const Product& p) {
   share(p.shared, 32 * SYMMETRIES * p.orbits, 32, [&](int64_t i) {
     int32_t row = i / 32, orbit = row / SYMMETRIES;
@@ -37,15 +37,15 @@ INLINE void product(const Product& p) {
   });
 }
 #else
-constexpr int VECTORS = WIDTH / LANES, REST = WIDTH % LANES;  // an orbit's floats
+constexpr int VECTORS = WIDTH / LANES, REST = WIDTH % LANES;  // an orbit's floats: whole vectors, and the rest
 typedef float UnalignedFour __attribute__((vector_size(16), aligned(4)));
 typedef float UnalignedRest __attribute__((vector_size(4 * (REST ? REST : LANES)), aligned(4)));
 
-// An orbit's rows at once: what the first reads of another orbit the others read too, each another image of it.
+// Compute all rows of an orbit at once. Where the first row reads a texel of another orbit, the other rows read that texel's images.
 INLINE void product(const Product& p) {
   const int64_t BATCH = 16;
   share(p.shared, p.orbits, BATCH, [&](int64_t i) {
-    int64_t orbit = p.orbits - 1 - i;  // the last have most numbers
+    int64_t orbit = p.orbits - 1 - i;  // begin with the last orbits, which have most numbers
     Four sums[SYMMETRIES] = {};
     for (int32_t k = p.starts[orbit], end = p.starts[orbit + 1]; k < end;) {
       int32_t symmetry = p.columns[k] % SYMMETRIES;

@@ -1,7 +1,7 @@
-// Structural similarity of two images (Wang et al. 2004): 11x11 Gaussian window, sigma 1.5, zero padding, and its derivative.
+// Structural similarity of two images (Wang et al. 2004) and its derivative: 11x11 Gaussian window, sigma 1.5, zero padding.
 //
-// Images are (height, width * CHANNELS) rows; with the channels interleaved, a neighbour along x is CHANNELS floats away. Windows
-// are separable: columns first, straight from the image, then rows of what that gave.
+// Images are (height, width * CHANNELS). Channels are interleaved, so a neighbour along x is CHANNELS floats away. The window is separable:
+// columns are filtered first, straight from the image, then the rows of the result.
 #include "vector.h"
 
 namespace {
@@ -9,9 +9,9 @@ namespace {
 struct Ssim {
   int64_t height, width;
   const float *image, *target;
-  float *by_mean, *by_square, *by_product;  // derivatives of a pixel's SSIM by the windowed image, x^2 + y^2 and x y
-  double* sums;                             // of SSIM, over a row or a block's pixels
-  float scale;                              // of the derivative
+  float *by_mean, *by_square, *by_product;  // derivatives of a pixel's SSIM by the windowed x, x^2 + t^2 and x t (x: image, t: target)
+  double* sums;                             // of SSIM over each row, or on CUDA over each block's pixels
+  float scale;                              // factor of the derivative
   float* by_image;
   float* scratch;                           // (threads, refgs_ssim_scratch_size)
   mutable Shared shared;
@@ -19,7 +19,7 @@ struct Ssim {
 
 constexpr int CHANNELS = 3, RADIUS = 5;
 constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
-// exp(-k^2 / (2 1.5^2)) over their sum
+// Weights exp(-k^2 / (2 * 1.5^2)), normalised.
 constexpr float WINDOW[RADIUS + 1] = {0.26601171f, 0.21300553f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
 
 INLINE Vector along(const float* line) {
@@ -32,7 +32,7 @@ struct Similarity {
   Vector ssim, by_mean, by_square, by_product;
 };
 
-// Of the windowed image, target, x^2 + y^2 and x y.
+// SSIM and its derivatives, given the windowed image x, target t, x^2 + t^2 and x t.
 INLINE Similarity similarity(Vector x, Vector t, Vector square, Vector product) {
   Vector xt = x * t, means = x * x + t * t;
   Vector a1 = 2.0f * xt + C1, a2 = 2.0f * (product - xt) + C2, b1 = means + C1, b2 = square - means + C2;
@@ -46,14 +46,14 @@ INLINE Vector derivative(const Ssim& s, Vector mean, Vector square, Vector produ
 }
 
 #ifdef __CUDACC__
-// A block has a tile: ROWS rows of THREADS numbers, of which the MARGIN on the left and on the right is for the windows of the others.
-// A thread has a column: it windows that, from the image into shared memory, and then the rows of what the block has there.
+// A block has a tile of ROWS rows and THREADS columns of numbers. The outer MARGIN columns at the left and right only serve the windows of
+// the inner ones. A thread has a column: it filters it from the image into shared memory, then filters the rows there.
 constexpr int THREADS = 256, MARGIN = 16, ROWS = 6;
 static_assert(MARGIN >= RADIUS * CHANNELS);
 
 struct Column {
-  int64_t x, y, width, height;  // of its first number; numbers of a row, and rows
-  bool ours;                    // whether it is no margin
+  int64_t x, y, width, height;  // position of the column's first number; size of the image, in numbers and rows
+  bool ours;                    // whether the column is an inner one
 
   explicit Column(const Ssim& s) : width(s.width * CHANNELS), height(s.height) {
     const int OURS = THREADS - 2 * MARGIN;
@@ -62,14 +62,14 @@ struct Column {
     ours = thread >= MARGIN && thread < THREADS - MARGIN && x < width;
   }
 
-  // The column of N maps windowed; get(at, values) gives their values, which are zero beyond the image.
+  // Filter the column of N maps into `lines`. get(at, values) loads their values; beyond the image they count as zero.
   template <int N, class Get>
   void down(float (&lines)[N][ROWS][THREADS], Get get) const {
     float sums[N][ROWS] = {};
     if (x >= 0 && x < width) {
 #pragma unroll
       for (int k = -RADIUS; k < ROWS + RADIUS; k++) {
-        bool inside = y + k >= 0 && y + k < height;  // no branch: the loads of all rows are on their way at once
+        bool inside = y + k >= 0 && y + k < height;  // no branch, so that the loads of all rows are in flight at once
         float values[N];
         get((inside ? y + k : y) * width + x, values);
         for (float& value : values) value = inside ? value : 0;
@@ -86,7 +86,7 @@ struct Column {
     __syncthreads();
   }
 
-  // body(at, row) for the numbers that are the thread's.
+  // Call body(at, row) for the thread's numbers.
   template <class Body>
   void each(Body body) const {
     if (!ours) return;
@@ -127,7 +127,7 @@ KERNEL(refgs_ssim_backward, Ssim, s) {
   });
 }
 #else
-// Of a thread: four rows with zeros around, as far as a window along x may reach.
+// Scratch of a thread: four rows, padded with zeros as far as a window along x reaches.
 struct Lines {
   int64_t margin, stride;
   float* memory;
@@ -142,7 +142,7 @@ struct Lines {
   float* operator[](int i) const { return memory + i * stride + margin; }
 };
 
-// body(first, count) for each vector of a row; the last may be shorter.
+// Call body(first, count) for each vector of a row of n numbers. The last may be shorter than LANES.
 template <class Body>
 INLINE void each(int64_t n, Body body) {
   for (int64_t x = 0; x < n; x += LANES) body(x, n - x < LANES ? n - x : LANES);
@@ -173,7 +173,7 @@ void forward_row(const Ssim& s, int64_t y, const Lines& lines) {
   for (int k = 0; k < LANES; k++) s.sums[y] += sum[k];
 }
 
-// The window is symmetric, so the derivative of windowing is windowing.
+// Derivatives are filtered by the same window: it is symmetric, so the filter is its own transpose.
 void backward_row(const Ssim& s, int64_t y, const Lines& lines) {
   int64_t n = s.width * CHANNELS;
   each(n, [&](int64_t i, int64_t count) {
@@ -209,7 +209,7 @@ KERNEL(refgs_ssim_backward, Ssim, s) {
 }
 
 #if defined(_WIN32)
-extern "C" int _fltused = 0;  // names that Windows' linker wants
+extern "C" int _fltused = 0;  // symbols that Windows' linker requires
 extern "C" int _DllMainCRTStartup(void*, unsigned, void*) { return 1; }
 #endif
 #endif

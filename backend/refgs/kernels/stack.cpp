@@ -1,17 +1,17 @@
-// Tensors side by side, a surfel's features from its parts; and a derivative apart again.
+// Concatenation of tensors along their last dimension: a surfel's features from its parts; and the split of their derivative.
 #include "library.h"
 
 namespace {
 
 struct Part {
   int64_t width;
-  float* numbers;  // (rows, width); null where a derivative is not wanted
+  float* numbers;  // (rows, width); null if its derivative is not wanted
 };
 
 constexpr int MOST = 8;  // parts
 
 struct Stack {
-  int64_t rows, parts, width;  // of all
+  int64_t rows, parts, width;  // width: of the stack
   Part part[MOST];
   float* stacked;              // (rows, width)
   mutable Shared shared;
@@ -23,7 +23,8 @@ constexpr int BATCH = 1;
 constexpr int BATCH = 256;
 #endif
 
-// body(number of a part, the same in the stack) for some rows of a part; its width, where it is known to be.
+// Call body(number of a part, the same number in the stack) for some rows of a part. WIDTH is the part's width if known at compile
+// time, else 0.
 template <int WIDTH, class Body>
 inline void each(const Part& part, float* stacked, int64_t stride, int64_t first, int64_t end, Body body) {
   int64_t width = WIDTH ? WIDTH : part.width;

@@ -1,6 +1,6 @@
-// What many pixels add to: the derivatives by maps that they looked up beside themselves, and by the light. The CPU works on the picture in
-// chunks of rows whose size does not depend on the threads, and sums are taken in the chunks' order, so neither does any result.
-// With CUDA, where a thread has a pixel, what many add to is summed up in integers: in whatever order, the sum is the same.
+// Sums that many pixels add to: derivatives by the maps at displaced pixels, and by the light. No result depends on the threads. The CPU
+// divides the image into chunks of rows, whose size does not depend on the number of threads, and adds up the chunks in order. On CUDA a
+// thread has a pixel, and sums are integers, which are the same in any order.
 #pragma once
 
 #include "pixels.h"
@@ -8,11 +8,11 @@
 namespace {
 
 #ifdef __CUDACC__
-// What fixed-point numbers count, such that neither they nor their sums overflow: a power of two.
+// Unit of fixed-point numbers: a power of two such that neither the numbers nor their sums overflow.
 struct Unit {
-  float per, size;  // how many make one; one of them
+  float per, size;  // units in 1; the value of a unit
 
-  // For sums of up to 2^count numbers up to `largest`, the bits of a float. Where that is not finite no sum is a number.
+  // For sums of up to 2^count numbers whose magnitudes are at most `largest` (a float's bits). If it is not finite, all sums are NaN.
   Unit(int32_t largest, int count) {
     int exponent = (largest >> 23) - 127;  // largest < 2^(exponent + 1)
     int bits = 60 - count - exponent;
@@ -22,13 +22,14 @@ struct Unit {
   }
 };
 
-constexpr int SOURCES = 9;  // 2^9 > (2 HALO + 1)^2: the pixels that can add to one, each with weights of up to 1 in all
+// log2 of the number of addends of a pixel: (2 HALO + 1)^2 < 2^9 pixels can add to one, each with a total weight of at most 1.
+constexpr int SOURCES = 9;
 
-// Of cells: all pixels may add to one, twelve numbers each.
+// log2 of the number of addends of a cell: all pixels may add to one, up to twelve numbers each.
 int adders(const Shade& s) { return 4 + 64 - __clzll(s.width * s.height); }
 
-// The derivatives by the maps and by the light of a pixel: what it adds to others. A first pass takes the LARGEST of that in
-// magnitude, a second adds it.
+// Derivatives of a pixel by the maps and by the light. A first pass finds the LARGEST magnitude of the numbers that are added to shared
+// sums. A second pass adds them.
 template <bool LARGEST>
 struct Contributions {
   const Shade& s;
@@ -80,7 +81,7 @@ struct Contributions {
 
  private:
   static void raise(int32_t& largest, float v) {
-    int32_t bits = __float_as_int(v) & 0x7fffffff;  // in the order of the magnitudes, a NaN beyond all
+    int32_t bits = __float_as_int(v) & 0x7fffffff;  // sorts like the magnitude, with NaN above all numbers
     largest = bits > largest ? bits : largest;
   }
   static void add(int64_t* to, float v) {
@@ -94,12 +95,12 @@ void zero(float* p, int64_t n) {
   for (int64_t i = 0; i < n; i++) p[i] = 0;
 }
 
-// The derivatives by the maps and by the light of a chunk of rows.
+// Derivatives of a chunk of rows by the maps and by the light.
 struct Chunk {
   const Shade& s;
   int64_t first, end;         // pixels
-  float *near, *cells;        // near: as for the picture's first pixel
-  uint8_t *rows, *lines;      // touched
+  float *near, *cells;        // `near` is offset so that the image's pixel indices apply
+  uint8_t *rows, *lines;      // `touched` flags of the image's rows, and of lines of cells
   Vector by_exposure = {};
 
   Chunk(const Shade& s, int64_t index) : s(s), first(index * s.chunk_rows * s.width) {
@@ -113,7 +114,7 @@ struct Chunk {
     for (int64_t i = before; i < before + most + s.lines; i++) rows[i] = 0;
   }
 
-  // To the pixels themselves.
+  // Add to the pixels themselves.
   template <int C>
   MEMBER void add_own(const Pixels& p, const Vector (&by_own)[C], Vector by_alpha) {
     Rows<C> own(by_own);
@@ -122,7 +123,7 @@ struct Chunk {
     for (int k = 0; k < p.count; k++) own.add(k, 1, s.by_features + (int64_t)p.at[k] * C), s.by_alpha[p.at[k]] = alpha[k];
   }
 
-  // To the corners, by their weights.
+  // Add to the four pixels around a displaced point, by their bilinear weights.
   MEMBER void add_sampled(const Corners& c, int count, const Vector (&by_sampled)[4]) {
     alignas(64) float w[4][LANES];
     Vector weight[4];
@@ -138,7 +139,7 @@ struct Chunk {
 
   MEMBER void add_exposure(Vector by) { by_exposure += by; }
 
-  // To the cells that were looked up.
+  // Add to the cells that were looked up.
   template <int N>
   MEMBER void add_light(const Lookup<N, true>& l, int count, const Vector (&by_light)[3]) {
     Vector weight[N][4];
@@ -176,7 +177,7 @@ struct Chunk {
   }
 };
 
-// What chunks added to the normals of a row: its own, that above and that below.
+// Add to row y what its own chunk, the one above and the one below wrote for its normals.
 void add_near(const Shade& s, int64_t y) {
   int64_t chunk = y / s.chunk_rows, most = s.chunk_rows + 2 * HALO;
   for (int64_t from = chunk - 1; from <= chunk + 1; from++) {
@@ -190,7 +191,7 @@ void add_near(const Shade& s, int64_t y) {
   }
 }
 
-// What the chunks added to a line of cells.
+// Add up what all chunks wrote to a line of cells.
 void add_line(const Shade& s, int32_t line) {
   int64_t first = 4 * s.levels.first_cell(line), n = 4 * s.levels.width(line);
   float* sum = s.by_cells + chunks(s) * 4 * s.cells + first;

@@ -1,23 +1,23 @@
-// Whether the object itself stands in the way a pixel mirrors: rays against a tree of boxes over its triangles.
+// Visibility of each pixel's mirror direction: rays are traced against a tree of boxes over the object's triangles.
 #include "library.h"
 
 namespace {
 
-constexpr int LEAF = 4;         // triangles
-constexpr int DEEPEST = 32;     // levels of the tree
-constexpr int PASSES = 3;       // faces that a ray looks at: behind two back faces, the third
+constexpr int LEAF = 4;         // triangles a leaf
+constexpr int DEEPEST = 32;     // most levels of the tree
+constexpr int PASSES = 3;       // faces that a ray may meet: it passes through two back faces
 constexpr float COVERED = 1.0f / 255.0f;
-constexpr float AGAIN = 0.1f;   // of the lift: how far behind a back face a ray goes on
+constexpr float AGAIN = 0.1f;   // distance behind a back face where a ray continues, as a fraction of the lift
 constexpr float FAR = 1e30f;
 
 struct Trace {
   int64_t width, height;
   double view[12];  // world to camera, 3x4, row-major
   double camera[3], fx, fy, cx, cy;
-  double centre[3], size, lift;              // of the mesh; how far above it rays start, in its size
-  const float *mirrored, *depth, *alpha;     // (height, width, 3): ways, zero where nothing is; (height, width): sums of depth; alpha
+  double centre[3], size, lift;              // centre and size of the mesh; the height above it where rays start, in units of `size`
+  const float *mirrored, *depth, *alpha;     // (height, width, 3): mirror directions, 0 on background; (height, width): depth sums; alpha
   int64_t leaves;                            // a power of two
-  const float* boxes;                        // (2 leaves, 6): least and greatest corner; a node's children are 2 i and 2 i + 1, the root is 1
+  const float* boxes;                        // (2 leaves, 6): least and greatest corner; root: node 1, children of i: 2 i, 2 i + 1
   const float* triangles;                    // (leaves LEAF, 9): a corner and the two edges from it
   float* visible;                            // (height, width)
   mutable Shared shared;
@@ -32,9 +32,9 @@ inline void cross(const float* a, const float* b, float* c) {
   c[0] = a[1] * b[2] - a[2] * b[1], c[1] = a[2] * b[0] - a[0] * b[2], c[2] = a[0] * b[1] - a[1] * b[0];
 }
 
-// How far along the ray it enters a box; FAR where it does not before `nearest`.
+// Distance at which the ray enters a box, or FAR if it does not before `nearest`.
 inline float enter(const Ray& r, const float* box, float nearest) {
-  if (!(box[0] <= box[3])) return FAR;  // an empty one
+  if (!(box[0] <= box[3])) return FAR;  // an empty box
   float first = 0, last = nearest;
   for (int a = 0; a < 3; a++) {
     float t0 = (box[a] - r.origin[a]) * r.inverse[a], t1 = (box[3 + a] - r.origin[a]) * r.inverse[a];
@@ -43,7 +43,8 @@ inline float enter(const Ray& r, const float* box, float nearest) {
   return first <= last ? first : FAR;
 }
 
-// Moeller and Trumbore (1997): whether the ray meets a triangle before `nearest`, which becomes that distance; and its front.
+// Return whether the ray meets a triangle before `nearest` (Moeller and Trumbore 1997). If so, set `nearest` to the distance, and `front`
+// to whether it meets the front.
 inline bool meet(const Ray& r, const float* triangle, float& nearest, bool& front) {
   const float *u = triangle + 3, *v = triangle + 6;
   float p[3], q[3], from[3];
@@ -61,7 +62,7 @@ inline bool meet(const Ray& r, const float* triangle, float& nearest, bool& fron
   return true;
 }
 
-// The nearest triangle, as `meet` says it.
+// Find the nearest triangle; results as those of `meet`.
 inline bool cast(const Trace& s, const Ray& r, float& nearest, bool& front) {
   int waiting[DEEPEST], count = 0;
   int64_t node = 1;
@@ -78,7 +79,7 @@ inline bool cast(const Trace& s, const Ray& r, float& nearest, bool& front) {
         continue;
       }
     }
-    // A box may lie behind what was found since it had to wait.
+    // Skip boxes that lie behind a triangle found since they were pushed.
     do {
       if (!count) return found;
       node = waiting[--count];
@@ -86,8 +87,8 @@ inline bool cast(const Trace& s, const Ray& r, float& nearest, bool& front) {
   }
 }
 
-// From the point that the pixel shows, a little above its surface, the mirrored way. Only the front of a face blocks: a ray that
-// meets a back face first began below the mesh, or comes to its open side, and goes on.
+// Return whether the mirror direction of pixel i is unoccluded. The ray starts at the pixel's surface point, lifted a little above it.
+// Only front faces occlude. A ray that meets a back face started below the mesh or passes an open side of it, so it continues behind.
 inline bool free_way(const Trace& s, int64_t i) {
   double x = ((double)(i % s.width) + 0.5 - s.cx) / s.fx, y = ((double)(i / s.width) + 0.5 - s.cy) / s.fy;
   double depth = s.depth[i] / s.alpha[i], length = 1 / sqrt(x * x + y * y + 1);
@@ -96,7 +97,7 @@ inline bool free_way(const Trace& s, int64_t i) {
   for (int a = 0; a < 3; a++) {
     double seen = x * s.view[a] + y * s.view[4 + a] + s.view[8 + a];
     r.way[a] = s.mirrored[3 * i + a];
-    normal[a] = r.way[a] - (float)(seen * length);  // half way back to the camera
+    normal[a] = r.way[a] - (float)(seen * length);  // along the normal: the sum of the mirror direction and the one to the camera
     r.origin[a] = (float)((s.camera[a] + depth * seen - s.centre[a]) / s.size);
     r.inverse[a] = 1 / r.way[a];
   }

@@ -1,4 +1,4 @@
-// The CPU's number type: LANES floats, in the compilers' vector extensions, so that one source serves every instruction set.
+// The CPU's number type: LANES floats. It uses the compiler's vector extensions, so that one source serves every instruction set.
 #pragma once
 
 #include "library.h"
@@ -23,7 +23,7 @@ typedef float UnalignedVector __attribute__((vector_size(4 * LANES), aligned(4))
 #define INLINE static MEMBER
 
 typedef float Four __attribute__((vector_size(16)));
-typedef double Sum __attribute__((vector_size(8 * LANES)));  // what many vectors are added up in
+typedef double Sum __attribute__((vector_size(8 * LANES)));  // accumulates many vectors
 
 INLINE Vector select(Mask mask, Vector a, Vector b) { return mask ? a : b; }
 INLINE Vector smaller(Vector a, Vector b) { return a < b ? a : b; }
@@ -49,9 +49,9 @@ INLINE Vector load(const float* p) { return *(const UnalignedVector*)p; }
 INLINE void store(float* p, Vector v) { *(UnalignedVector*)p = v; }
 INLINE void store(int32_t* p, Mask v) { __builtin_memcpy(p, &v, sizeof v); }
 
-// 1/x to 1 ulp or so, from 1e-37 to 1e37 in magnitude; beyond, a NaN may stand for an infinity.
+// 1/x to about 1 ulp, for magnitudes from 1e-37 to 1e37. Beyond, a NaN may replace an infinity.
 INLINE Vector reciprocal(Vector x) {
-#if LANES == 16  // a division of 16 numbers stops the arithmetic for as long as four steps of this: an estimate to 2^-14, Newton
+#if LANES == 16  // an estimate to 2^-14 and a Newton step: a division of 16 numbers would block the arithmetic for four times as long
   Vector r = (Vector)__builtin_ia32_rcp14ps512_mask(x, Vector(), 0xffff);
   Vector error = 1.0f - x * r;
   return r + r * error;
@@ -60,9 +60,9 @@ INLINE Vector reciprocal(Vector x) {
 #endif
 }
 
-// 1/sqrt(x) to 2 ulp or so, for x from 1e-37 to 1e37.
+// 1/sqrt(x) to about 2 ulp, for x from 1e-37 to 1e37.
 INLINE Vector inverse_root(Vector x) {
-#if LANES == 16  // as above
+#if LANES == 16  // estimate and Newton step, as above
   Vector r = (Vector)__builtin_ia32_rsqrt14ps512_mask(x, Vector(), 0xffff);
   return r + r * (0.5f - 0.5f * x * r * r);
 #else
@@ -70,8 +70,8 @@ INLINE Vector inverse_root(Vector x) {
 #endif
 }
 
-// 2^x for -126 <= x <= 126 to 2.3 ulp; garbage, but no trap, beyond. 2^x = 2^round(x) 2^f, |f| <= 1/2, the latter by the polynomial
-// of degree 5 that is 1 at 0 and errs least (9e-8).
+// 2^x to 2.3 ulp for -126 <= x <= 126; garbage beyond, but no trap. 2^x = 2^round(x) 2^f with |f| <= 1/2. 2^f is approximated by the
+// polynomial of degree 5 with the least error (9e-8) among those that are 1 at 0.
 INLINE Vector exp2(Vector x) {
   const float ROUND = 12582912.0f;  // 1.5 * 2^23: adding it rounds to an integer, held in the low bits
   Vector shifted = x + ROUND;
@@ -93,7 +93,7 @@ INLINE Mask first_lanes(int64_t n) {
 }
 #endif
 
-// Part of a vector: the first n lanes, the others zero.
+// Load the first n lanes; the others are zero.
 INLINE Vector read(const float* p, int64_t n) {
   if (n >= LANES) return load(p);
 #if LANES == 16
@@ -122,7 +122,7 @@ INLINE void clear(float* p, int64_t n) {  // n: a multiple of LANES
   for (int64_t i = 0; i < n; i += LANES) store(p + i, Vector());
 }
 
-// The lower and the upper halves of two vectors, lane by lane in turn.
+// Interleave the lower, or the upper, halves of two vectors lane by lane.
 #if LANES == 16
 #define INTERLEAVE(n) n, n + 16, n + 1, n + 17, n + 2, n + 18, n + 3, n + 19, n + 4, n + 20, n + 5, n + 21, n + 6, n + 22, n + 7, n + 23
 #elif LANES == 8
@@ -133,7 +133,7 @@ INLINE void clear(float* p, int64_t n) {  // n: a multiple of LANES
 INLINE Vector interleave_low(Vector a, Vector b) { return __builtin_shufflevector(a, b, INTERLEAVE(0)); }
 INLINE Vector interleave_high(Vector a, Vector b) { return __builtin_shufflevector(a, b, INTERLEAVE(LANES / 2)); }
 
-// Lane k of the result is the sum of v[k]'s lanes; v is spoilt.
+// Lane k of the result is the sum of v[k]'s lanes; v is overwritten.
 INLINE Vector sums(Vector (&v)[LANES]) {
 #pragma unroll
   for (int n = LANES / 2; n; n /= 2)
@@ -142,7 +142,7 @@ INLINE Vector sums(Vector (&v)[LANES]) {
   return v[0];
 }
 
-INLINE void transpose(Vector (&v)[LANES]) {  // perfect shuffles, as many as a lane's index has bits
+INLINE void transpose(Vector (&v)[LANES]) {  // by log2(LANES) perfect shuffles
 #pragma unroll
   for (int n = 1; n < LANES; n *= 2) {
     Vector w[LANES];
@@ -167,8 +167,8 @@ INLINE Vectors operator-(Vectors a, Vectors b) { return {a.x - b.x, a.y - b.y, a
 INLINE Vectors operator*(Vector s, Vectors a) { return {s * a.x, s * a.y, s * a.z}; }
 INLINE Vector dot(Vectors a, Vectors b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 
-// body(tensor, first, numbers) for vectors of several tensors that have a `count`; a thread takes as many numbers of one at a time
-// as are worth its while.
+// Call body(tensor, first, numbers) for each vector of several tensors, which have a `count`; the last vector of a tensor may be partial. A
+// thread takes BATCH numbers of a tensor at a time.
 template <class Tensor, class Body>
 INLINE void share_vectors(Shared& shared, const Tensor* tensors, int64_t n, Body body) {
   constexpr int64_t BATCH = LANES == 1 ? 1 : 4096;
