@@ -28,8 +28,8 @@ CARDS = ["emulated", pytest.param("cuda", marks=NO_CARD)]
 def no_package_of_the_clone() -> None:
     """Remove the parent of the repository's folder from sys.path; pytest puts it there.
 
-    The repository has an __init__.py for Blender, so pytest takes it for a package. If its folder is named refgs, processes started by tests
-    would import that folder in place of the trainer.
+    The repository has an __init__.py for Blender, so pytest takes it for a package. If its folder is named refgs, processes that
+    tests start would import that folder in place of the trainer.
     """
     parent = str(Path(__file__).parents[2])
     sys.path[:] = [folder for folder in sys.path if folder != parent]
