@@ -1,1 +1,1 @@
-"""C++ kernels: their sources, and how they are built and loaded."""
+"""Build, load and run the C++ kernels. Their sources lie in this folder."""

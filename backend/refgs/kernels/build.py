@@ -1,4 +1,7 @@
-"""Compile the C++ kernels with the compiler in the `ziglang` wheel: one shared library a platform and instruction set."""
+"""Compile the C++ kernels with the compiler in the `ziglang` wheel.
+
+Each platform and instruction set has its own shared library.
+"""
 
 import hashlib
 import importlib.metadata
@@ -23,7 +26,7 @@ FLAGS += ["-fno-builtin", "-ffp-contract=on", "-fno-math-errno", "-mprefer-vecto
 
 @dataclass(frozen=True)
 class Target:
-    """Zig's names of the platform and of the processor that a library is compiled for, and the library's extension."""
+    """Describe what a library is compiled for: platform and processor by Zig's names, and the library's file extension."""
 
     platform: str
     processor: str
@@ -41,13 +44,16 @@ TARGETS = {
 
 
 def target(system: str, machine: str, isa: str) -> Target:
-    """Choose the target by `sys.platform`, machine ("x86_64" or "aarch64") and "sse4", "avx2", "avx512" or "neon"."""
+    """Choose the target for a platform, a machine and an instruction set.
+
+    `system` is `sys.platform`, `machine` is "x86_64" or "aarch64", `isa` is "sse4", "avx2", "avx512" or "neon".
+    """
     platform, extension, processors = TARGETS[system, machine]
     return Target(platform, processors[isa], extension)
 
 
 def cache_folder() -> Path:
-    """Return the folder of compiled kernels: the environment variable REFGS_CACHE, else in the user's cache."""
+    """Return the folder of compiled kernels: the environment variable REFGS_CACHE if it is set, else a folder in the user's cache."""
     return Path(os.environ.get("REFGS_CACHE") or platformdirs.user_cache_dir("refgs", appauthor=False))
 
 
@@ -59,7 +65,7 @@ def _fingerprint(target: Target) -> str:
 
 
 def sizes() -> dict[str, int]:
-    """Find the functions that return a size, each with the number of integers that it takes."""
+    """Map each kernel function that returns a size to the number of integers that it takes."""
     text = "".join((HERE / source).read_text(encoding="utf-8") for source in SOURCES)
     found = re.findall(r"^EXPORT int64_t (\w+)\((.*?)\)", text, re.MULTILINE)
     return {name: parameters.count("int64_t") for name, parameters in found}
@@ -73,9 +79,9 @@ def unwritable(cache: Path, error: OSError) -> InputError:
 
 
 def build(target: Target, cache: Path) -> Path:
-    """Compile the library for a target into `cache`, unless it is there. Safe when several processes want it at once.
+    """Compile the library for a target into `cache`, unless it is already there. Returns its path.
 
-    Raises InputError where `cache` can't be written.
+    Several processes may call this at once. Raises InputError where `cache` can't be written.
     """
     library = cache / f"refgs-{_fingerprint(target)}.{target.extension}"
     if library.exists():

@@ -36,7 +36,7 @@ NO_CARD = "no NVIDIA card, or no driver for it, was found"
 
 
 def unusable() -> str | None:
-    """Say in a line why no card can be used here, NO_CARD if there is none. Return None if one can."""
+    """Return in one line why no CUDA card can be used here, NO_CARD if there is none. Return None if a card can be used."""
     if torch.version.cuda is None:
         return NO_CARD
     with warnings.catch_warnings(record=True) as said:  # torch warns if the driver is too old
@@ -56,7 +56,7 @@ def unusable() -> str | None:
 
 
 def _check(result: tuple, what: str):
-    """Return the values of a call to NVIDIA's API, without its status. Raise an error if the call failed."""
+    """Return the values of a CUDA call, without its status. Raise an error if the status says that the call failed."""
     status, *values = result
     if status.name == "CUDA_ERROR_OUT_OF_MEMORY":
         raise torch.OutOfMemoryError(what)
@@ -86,7 +86,10 @@ def compile_source(source: str, architecture: str) -> bytes:
 
 
 def cubin(source: str, architecture: str, cache: Path) -> bytes:
-    """Return the machine code of `compile_source` from `cache`; compile it if it is missing. The file's name has a hash of its inputs."""
+    """Return a source's machine code from `cache`. Compile the source first if its machine code is not there.
+
+    The file's name has a hash of everything that the machine code depends on.
+    """
     from cuda.bindings import nvrtc
 
     parts = [(HERE / name).read_bytes() for name in (source, *HEADERS)]
@@ -121,7 +124,10 @@ def _function(name: str, device: int):
 
 
 def launch(name: str, work: ctypes.Structure, device: torch.device, blocks: int, threads: int = BLOCK) -> None:
-    """Run a kernel on torch's current stream of a device. The tensors that `work` points at must live until it is done."""
+    """Run a kernel on torch's current stream of a device.
+
+    The tensors that `work` points at must live until the kernel is done.
+    """
     from cuda.bindings import driver
 
     # Autograd's own threads have no context until they ask for one, and `torch.cuda.device` asks only if the device changes.

@@ -1,4 +1,7 @@
-"""Read the structures that kernels take from their C++ declarations, so that no layout is written down twice."""
+"""Read the layout of the kernels' argument structures from their C++ declarations.
+
+So no layout is written down twice.
+"""
 
 import ctypes
 import functools
@@ -18,10 +21,10 @@ NUMBERS = {
 
 
 class Work(ctypes.Structure):
-    """Arguments of a kernel, pointers to tensors among them."""
+    """Hold the arguments of a kernel: numbers, and pointers to tensors."""
 
     def attach(self, **tensors: torch.Tensor) -> None:
-        """Point fields at tensors, which must be contiguous and outlive the calls that use them."""
+        """Point fields at tensors. The tensors must be contiguous and outlive the calls that use them."""
         for name, tensor in tensors.items():
             assert tensor.is_contiguous()
             setattr(self, name, tensor.data_ptr())
@@ -30,8 +33,8 @@ class Work(ctypes.Structure):
 def struct(name: str, source: str) -> type[Work]:
     """Make the ctypes class of `struct name`, which a source of the kernels declares or includes.
 
-    Its fields stand before the first empty line: numbers, other such structures, pointers, and arrays whose length is an
-    integer or an integer constant of the same file. Raises ValueError where a field is anything else.
+    Only fields before the first empty line count. A field may be a number, another such structure, a pointer, or an array. An array's
+    length is an integer or an integer constant of the same file. Raises ValueError for any other field.
     """
     if made := _made(name, source):
         return made

@@ -32,8 +32,8 @@ def supported() -> list[str]:
 def _keep_memory() -> None:
     """Have GNU's malloc keep freed memory.
 
-    By default the buffers of an iteration go back to the system at its end, and the next iteration faults them in again page by page: 4 %
-    of its time for small images, half for large ones.
+    By default the buffers of an iteration go back to the system at its end. The next iteration then faults the same memory in again, page
+    by page. This takes 4 % of an iteration's time for small pictures, half for large ones.
     """
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
         libc.mallopt(-4, 0)  # M_MMAP_MAX: no allocation has a mapping of its own, however large
@@ -53,9 +53,10 @@ def _load(isa: str) -> ctypes.CDLL:
 
 
 def kernels() -> ctypes.CDLL:
-    """Load the library for this processor, compiled on first use (seconds). The environment variable REFGS_ISA picks another.
+    """Load the library for this processor. Compile it on first use, which takes seconds.
 
-    Raises InputError if this processor can't run it, or the cache can't be written.
+    The environment variable REFGS_ISA picks another instruction set. Raises InputError if this processor can't run that instruction set,
+    or the cache can't be written.
     """
     sets = supported()
     isa = os.environ.get("REFGS_ISA") or sets[0]
@@ -66,9 +67,9 @@ def kernels() -> ctypes.CDLL:
 
 @functools.cache
 def _openmp() -> Callable | None:
-    """Find GOMP_parallel of the OpenMP library that torch itself runs on, if it is GNU's.
+    """Find GOMP_parallel of the OpenMP library that torch itself runs on. Return None if that library is not GNU's.
 
-    Its workers spin for a while after torch's own work: a second pool would compete with them for the cores.
+    The library's worker threads spin for a while after torch's own work. A second pool of threads would compete with them for the cores.
     """
     torch_folder = Path(torch.__file__).parent
     for path in (*torch_folder.glob("lib/libgomp*"), *torch_folder.parent.glob("torch.libs/libgomp*")):
@@ -93,7 +94,7 @@ def on_gpu(tensor: torch.Tensor) -> bool:
 
 
 def check(**expected: tuple[torch.Tensor, tuple[int, ...]]) -> None:
-    """Raise ValueError unless each tensor is float32, of its shape, and on the first one's device, the CPU or a CUDA card."""
+    """Raise ValueError unless each tensor is float32, has its shape, and is on the first tensor's device: the CPU or a CUDA card."""
     home = next(iter(expected.values()))[0].device
     for name, (tensor, shape) in expected.items():
         known = tensor.device == home and home.type in ("cpu", "cuda")
@@ -106,9 +107,9 @@ _kept = threading.local()
 
 
 def borrow(name: str, count: int) -> torch.Tensor:
-    """Lend memory for `count` 32-bit numbers, until the same name is asked for again.
+    """Lend memory for `count` 32-bit numbers. The next call with the same name lends the same memory again.
 
-    Temporary buffers whose size differs from view to view would leave gaps in malloc's memory each time.
+    Memory is kept because temporary buffers of another size for each view would leave gaps in malloc's memory.
     """
     memory = _kept.__dict__.get(name)
     if memory is None or len(memory) < count:
@@ -118,9 +119,10 @@ def borrow(name: str, count: int) -> torch.Tensor:
 
 
 def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most: int = CORES) -> None:
-    """Call `function(&work)` on several threads at once: as many as torch has, at most the number of cores, at most `most`.
+    """Call `function(&work)` on several threads at once.
 
-    The threads share the work through `work.shared`. Each gets `scratch` floats of `work.scratch`, a field that only some kernels have.
+    There are as many threads as torch has, but no more than cores, and no more than `most`. They divide the work among them by
+    `work.shared`. If `scratch` is given, each thread gets so many floats of temporary memory in `work.scratch`.
     """
     threads = max(1, min(torch.get_num_threads(), CORES, most))
     if scratch:
@@ -135,9 +137,9 @@ def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most:
 
 
 def run(name: str, work: ctypes.Structure, like: torch.Tensor, items: int, scratch: int = 0) -> None:
-    """Run a kernel on `items`, on the device of the tensor `like`.
+    """Run a kernel on a number of `items`, on the device of the tensor `like`.
 
-    The CPU uses torch's threads, each with `scratch` floats of its own. A card uses one thread an item.
+    On the CPU, torch's threads run it, each with `scratch` floats of temporary memory. On a card, there is one thread an item.
     """
     if on_gpu(like):
         cuda.launch(name, work, like.device, max(1, -(-items // cuda.BLOCK)))

@@ -1,1 +1,1 @@
-"""What is learned: the surfels and the light."""
+"""Represent what a training learns: the surfels and the environment's light."""

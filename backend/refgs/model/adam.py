@@ -1,4 +1,4 @@
-"""The optimiser."""
+"""Optimise parameters by Adam."""
 
 import math
 from collections import defaultdict
@@ -15,12 +15,17 @@ _Work = struct("Adam", "adam.cpp")
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015), of float32 tensors on one device, all of them in one go: torch's own takes them one by one.
+    """Optimise float32 tensors on one device by Adam (Kingma and Ba 2015).
 
-    A number whose gradient is zero, as of a surfel that the view does not see, is left as it is, with its moments: these
-    neither fade nor move it on, as they would in Adam itself. So is a parameter without a gradient. A group's values are kept
-    within its `limits`, a pair. Groups, whose `params` are lists, and state are as in `torch.optim.Adam` otherwise, the step a
-    plain number. It is none of torch's own optimisers, whose first one loads torch's compiler: two seconds.
+    All tensors are updated in one go; torch's own Adam takes them one by one.
+
+    A number whose gradient is zero keeps its value and its moments. So a surfel that the view does not see stays as it is; in the original
+    Adam its moments would fade and still move it. A parameter without a gradient stays as it is, too.
+
+    A group's values are kept within its `limits` (lowest, highest). Groups and state are otherwise as in `torch.optim.Adam`, but `params`
+    is always a list and the step a plain number.
+
+    The class does not derive from torch's optimisers: the first of them loads torch's compiler, which takes two seconds.
     """
 
     BETAS, EPSILON = (0.9, 0.999), 1e-15
@@ -32,7 +37,10 @@ class Adam:
     @timed("optimiser")
     @torch.no_grad()
     def step(self, accepted: Tensor | None = None) -> None:
-        """Move every parameter by its group's rate `lr`; none, nor its moments, where `accepted`, a float32 scalar, is zero."""
+        """Move every parameter by its group's rate `lr`.
+
+        If `accepted`, a float32 scalar, is zero, parameters and moments stay as they are.
+        """
         (beta1, beta2), learned, kept = self.BETAS, [], []
         for group in self.param_groups:
             for value in group["params"]:

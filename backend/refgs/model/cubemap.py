@@ -1,7 +1,7 @@
-"""Cubemaps as flat lists of texels: directions, solid angles, seamless bilinear look-up.
+"""Look up cubemaps, stored as flat lists of texels: directions, solid angles, seamless bilinear look-up.
 
 A cubemap of side R has 6·R² texels in the order face, row, column. Faces are +x, −x, +y, −y, +z, −z of the world. A face's (s, t)
-coordinates in [−1, 1] run along the two world axes that follow the face's own cyclically. Cubemaps never leave the program
+coordinates in [−1, 1] run along the two world axes that follow the face's own axis in the cycle x, y, z. Cubemaps never leave the program
 (environment.exr is equirectangular), so they follow no image convention.
 """
 
@@ -15,7 +15,7 @@ SYMMETRIES = 24  # of the cube: all changes of the axes' signs, times all cyclic
 
 
 def _face_direction(face: Tensor, s: Tensor, t: Tensor) -> Tensor:
-    """The unnormalised direction of (s, t) on a face (see the module's docstring)."""
+    """Return the direction, not normalised, of (s, t) on a face (see the module's docstring)."""
     face, s, t = torch.broadcast_tensors(face, s, t)
     axis, sign = face // 2, (1 - 2 * (face % 2)).to(s.dtype)
     direction = torch.stack([sign, s, t], dim=-1)  # along the face's axis and the two that follow it
@@ -25,7 +25,7 @@ def _face_direction(face: Tensor, s: Tensor, t: Tensor) -> Tensor:
 
 
 def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Face index and (s, t) in [−1, 1] of directions (..., 3), differentiable in s and t.
+    """Return the face index and (s, t) in [−1, 1] of directions (..., 3). s and t are differentiable.
 
     A zero direction gives face 0, s = t = 0.
     """
@@ -43,7 +43,7 @@ def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 @lru_cache(maxsize=32)
 def texel_directions(resolution: int) -> Tensor:
-    """Unit directions (6·R², 3) of the texels' centres, float64."""
+    """Return the unit directions (6·R², 3) of the texels' centres, float64."""
     centres = (torch.arange(resolution, dtype=torch.float64) + 0.5) * (2 / resolution) - 1
     face = torch.arange(6)[:, None, None]
     direction = _face_direction(face, centres[None, None, :], centres[None, :, None])
@@ -52,7 +52,7 @@ def texel_directions(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=32)
 def texel_solid_angles(resolution: int) -> Tensor:
-    """Exact solid angles (6·R²,) of the texels in steradians, float64; they sum to 4π."""
+    """Return the exact solid angles (6·R²,) of the texels in steradians, float64. They sum to 4π."""
     edges = torch.arange(resolution + 1, dtype=torch.float64) * (2 / resolution) - 1
     s, t = edges[None, :], edges[:, None]
     corner = torch.atan2(s * t, torch.sqrt(s * s + t * t + 1))  # area of the rectangle from the face's centre to (s, t)
@@ -62,11 +62,13 @@ def texel_solid_angles(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=32)
 def orbits(resolution: int) -> Tensor:
-    """Orbits of texels under the cube's symmetries (R²/4, 24), R even.
+    """List the orbits of texels under the cube's symmetries (R²/4, 24), R even.
 
-    A row is a texel of the quarter s, t > 0 of face +x, by row and column, and its images. Symmetry 8·turn + signs is P^turn D: D changes
-    the signs of x, y, z where `signs` has the bits 1, 2, 4; then P takes +x to +y, +y to +z, +z to +x. Only the first symmetry maps a
-    texel to itself, so each texel occurs once.
+    An orbit is the set of texels that the cube's 24 symmetries map onto each other. Each row lists one orbit: a texel of the quarter s, t
+    > 0 of face +x, then its images under the other symmetries. Rows are in the order of that first texel's row and column.
+
+    Column 8·turn + signs has the image under the symmetry P^turn D. D changes the signs of x, y, z where `signs` has the bits 1, 2, 4.
+    Then P takes +x to +y, +y to +z, +z to +x. Only the first symmetry maps a texel to itself, so each texel occurs once.
     """
     texel = torch.arange(6 * resolution**2).reshape(3, 2, resolution, resolution)  # axis, its sign, t, s
     for dim in (2, 4):  # count each half from the face's middle outwards; its sign is a dimension before it
@@ -78,19 +80,26 @@ def orbits(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def orbit_order(sides: tuple[int, ...]) -> Tensor:
-    """Indices (Σ 6·side²,) of the texels of stacked cubemaps, in the order of each one's orbits."""
+    """Return the indices (Σ 6·side²,) that put the texels of stacked cubemaps in orbit order.
+
+    An orbit is the set of texels that the cube's symmetries map onto each other. In orbit order, the texels of a cubemap follow the rows
+    of `orbits`. The cubemaps keep their place in the stack.
+    """
     starts = itertools.accumulate((6 * side * side for side in sides), initial=0)
     return torch.cat([orbits(side).flatten() + start for side, start in zip(sides, starts, strict=False)])
 
 
 def in_texel_order(levels: Tensor, sides: tuple[int, ...]) -> Tensor:
-    """Reorder stacked cubemaps (Σ 6·side², C) from the order of orbits to that of texels, as `sample` takes them."""
+    """Reorder stacked cubemaps (Σ 6·side², C) from orbit order (see `orbit_order`) to texel order, as `sample` takes them."""
     return levels[orbit_order(sides).argsort()]
 
 
 @lru_cache(maxsize=1)
 def compositions() -> Tensor:
-    """Composition table (24, 24): the symmetry that applies the row's, then the column's."""
+    """Tabulate the compositions of the cube's symmetries (24, 24).
+
+    An entry is the symmetry that applies its row's symmetry, then its column's.
+    """
     first, then = torch.arange(SYMMETRIES)[:, None], torch.arange(SYMMETRIES)
     turn, signs = first // 8, then % 8
     signs = signs >> turn | signs << 3 - turn  # D P^turn = P^turn D', where P^turn takes the axes of D' to those of D
@@ -99,7 +108,10 @@ def compositions() -> Tensor:
 
 @lru_cache(maxsize=32)
 def _padded_texels(resolution: int) -> Tensor:
-    """Texel index of every cell of the faces padded by one, (6, R+2, R+2). Padding is the neighbour across the edge: no seams."""
+    """Find the texel index of every cell of the faces padded by one cell, (6, R+2, R+2).
+
+    A cell of the padding holds the neighbour across the edge, so that bilinear look-up has no seams.
+    """
     centres = (torch.arange(-1, resolution + 1, dtype=torch.float64) + 0.5) * (2 / resolution) - 1
     face = torch.arange(6)[:, None, None]
     inside = centres.clamp(-1, 1)
@@ -120,7 +132,7 @@ def _padded_texels(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def padded(sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Of stacked cubemaps: texel indices of the padded faces' cells, the first cell of each level, the sides."""
+    """Return texel indices of the padded faces' cells, each level's first cell, and the levels' sides, for stacked cubemaps."""
     indices, starts, texels = [], [], 0
     for side in sides:
         starts.append(sum(len(i) for i in indices))

@@ -1,4 +1,4 @@
-"""The environment's light: a cubemap of linear HDR radiance, prefiltered for the split sum and for irradiance."""
+"""Represent the environment's light: a cubemap of linear HDR radiance, prefiltered for the split sum and for irradiance."""
 
 import math
 
@@ -13,18 +13,18 @@ from refgs.model import cubemap, harmonics, prefilter
 
 
 def turn_between(camera: Camera, reference: Camera) -> np.ndarray:
-    """The rotation (3, 3) about the world's z axis from a camera's heading to a reference's."""
+    """Return the rotation (3, 3) about the world's z axis from a camera's heading to a reference's."""
     angle = reference.heading - camera.heading
     sine, cosine = math.sin(angle), math.cos(angle)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
 class Environment:
-    """Distant light: linear `radiance` (6·R², 3) in the order of `refgs.model.cubemap`.
+    """Represent distant light by its linear `radiance` (6·R², 3), in the texel order of `refgs.model.cubemap`.
 
-    The light stands still in the world. With a `reference` camera it turns with the camera, as on a turntable: it is rotated about the
-    world's z axis by the difference in heading, and `radiance` is that of the reference. It does not tilt with the camera: lamps stand in
-    the room, whatever height a photo was taken from.
+    Without a `reference` camera the light stands still in the world. With one it turns with the camera, as on a turntable: it is rotated
+    about the world's z axis by the difference between the two cameras' headings. `radiance` is then the light as the reference camera has
+    it. The light does not tilt with the camera: lamps stand in the room, whatever height a photo was taken from.
     """
 
     def __init__(self, radiance: Tensor, reference: Camera | None = None):
@@ -35,20 +35,20 @@ class Environment:
 
     @property
     def harmonics(self) -> Tensor:
-        """Harmonic coefficients (16, 3) of the radiance, up to degree 3."""
+        """Compute the harmonic coefficients (16, 3) of the radiance, up to degree 3."""
         directions, area = cubemap.texel_directions(self.resolution), cubemap.texel_solid_angles(self.resolution)
         return (harmonics.basis(directions, 3) * area[:, None]).T.float().to(self.radiance.device) @ self.radiance
 
     def diffuse(self, normals: Tensor) -> Tensor:
-        """Irradiance / π (P, 3) for unit normals (P, 3): the radiance of a white matte surface."""
+        """Return irradiance / π (P, 3) for unit normals (P, 3): the radiance of a white matte surface."""
         return prefilter.irradiance(self.levels.cpu(), self.sides, normals.cpu()).to(normals)
 
     def turn(self, camera: Camera) -> np.ndarray:
-        """The rotation (3, 3) from world directions to the light's, for a camera."""
+        """Return the rotation (3, 3) from the world's directions to the light's, for a camera."""
         return np.eye(3) if self.reference is None else turn_between(camera, self.reference)
 
     def panorama(self, height: int) -> np.ndarray:
-        """Equirectangular radiance (height, 2·height, 3) in Blender's orientation."""
+        """Convert the light to an equirectangular picture of radiance (height, 2·height, 3) in Blender's orientation."""
         directions = torch.from_numpy(panorama_directions(height, 2 * height)).reshape(-1, 3).float()
         level = torch.zeros(len(directions))
         colour = cubemap.sample(self.radiance.detach().cpu(), (self.resolution,), directions, level)
@@ -56,7 +56,10 @@ class Environment:
 
     @classmethod
     def from_panorama(cls, panorama: np.ndarray, resolution: int, reference: Camera | None = None) -> "Environment":
-        """Make the light of an equirectangular picture (H, W, 3) in Blender's orientation: each texel is the mean over its area."""
+        """Make the light from an equirectangular picture (H, W, 3) in Blender's orientation.
+
+        Each texel is the picture's mean over the texel's area.
+        """
         fine = max(
             1, math.ceil(panorama.shape[0] / (2 * resolution))
         )  # samples a texel along each side, so that no pixel is skipped

@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3, in 3D Gaussian splatting's order and sign convention."""
+"""Evaluate real spherical harmonics up to degree 3, in 3D Gaussian splatting's order and sign convention."""
 
 import math
 
@@ -24,7 +24,7 @@ C3 = (
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Evaluate the K = (degree + 1)² real harmonics at unit directions (..., 3): (..., K).
+    """Evaluate the K = (degree + 1)² real harmonics at unit directions (..., 3). Returns (..., K).
 
     Odd orders have the sign that 3D Gaussian splatting's files use: (−y, z, −x) at degree 1.
     """

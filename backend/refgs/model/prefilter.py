@@ -1,10 +1,11 @@
-"""GGX prefiltering of a cubemap: the second factor of the split sum (paper Eq. 8) at a few fixed roughnesses.
+"""Prefilter a cubemap by GGX: the second factor of the split sum (paper Eq. 8) at a few fixed roughnesses.
 
 With N = V = R (Karis, "Real Shading in Unreal Engine 4", 2013) the filtered radiance is Σ L(l) K(θ) / Σ K(θ), K(θ) = D(cos θ/2) cos θ,
-where θ is the angle between l and the lobe's axis. K depends on θ and roughness alone, so each level is one fixed sparse matrix
-over the texels of the cubemap and of its pooled mips: fine texels at the lobe's core, coarse ones in its tail. A matrix has the
-cube's symmetries, so only a 24th of it is computed and kept. That takes 0.05 s for 6×64² texels and 0.25 s for 6×128²: too little to
-cache on disk.
+where θ is the angle between l and the lobe's axis. K depends on θ and roughness alone. So each level is one fixed sparse matrix over the
+texels of the pyramid, which is the cubemap with its pooled mips. Fine texels cover the lobe's core, coarse ones its tail.
+
+A matrix has the cube's symmetries, so only a 24th of it is computed and kept. This takes 0.05 s for 6×64² texels and 0.25 s for 6×128²:
+too little to cache on disk.
 """
 
 from collections.abc import Callable
@@ -34,13 +35,16 @@ SAMPLES = 3  # sub-samples of the lobe along each side of a texel
 
 
 def level_sides(resolution: int) -> list[int]:
-    """Side of each prefiltered level, in texels: one for each of `ROUGHNESS`, then irradiance."""
+    """Return the side of each prefiltered level, in texels. There is one level for each of `ROUGHNESS`, then irradiance."""
     sides = [max(resolution // d, min(resolution, LEAST_SIDE)) for d in DIVISOR]
     return [*sides, min(resolution, IRRADIANCE_SIDE)]
 
 
 def level_of(roughness):
-    """The fractional level of a roughness, a float array or a number: levels are interpolated linearly in roughness squared."""
+    """Return the fractional level of a roughness, a float array or a number.
+
+    Levels are interpolated linearly in roughness squared.
+    """
     return np.interp(np.square(roughness), np.square(ROUGHNESS), np.arange(len(ROUGHNESS)))
 
 
@@ -52,14 +56,14 @@ def _pyramid_sides(resolution: int) -> list[int]:
 
 
 def ggx_lobe(cosine: np.ndarray, roughness: float) -> np.ndarray:
-    """K(θ) by cos θ, up to a factor; zero below the horizon."""
+    """Evaluate K(θ) (see the module's docstring) by cos θ, up to a factor. It is zero below the horizon."""
     a2 = roughness**4  # α² with α = roughness²
     half = (1 + cosine) / 2  # cos²(θ/2)
     return np.maximum(cosine, 0) / (half * (a2 - 1) + 1) ** 2
 
 
 def cosine_lobe(cosine: np.ndarray) -> np.ndarray:
-    """The weight of radiance in irradiance, by cos θ, up to a factor."""
+    """Evaluate the weight of radiance in irradiance by cos θ, up to a factor."""
     return np.maximum(cosine, 0)
 
 
@@ -68,10 +72,11 @@ LOBES = (*(partial(ggx_lobe, roughness=roughness) for roughness in ROUGHNESS[1:]
 
 
 def _level(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute a level's matrix, of which symmetry gives the rest: rows for the pyramid's texels in the quarter s, t > 0 of face +x.
+    """Compute a level's matrix for the pyramid's texels in the quarter s, t > 0 of face +x. Symmetry gives the rest.
 
-    Returns those texels, the level's texels in the order of orbits, and weights. The weights of each texel of the level sum to one.
-    Pooled mips whose side is below `coarsest` are not used.
+    Returns three arrays, which describe each number of the matrix: the pyramid's texel, the level's texel in orbit order
+    (`cubemap.orbit_order`), and the weight. The weights of each texel of the level sum to one. Pooled mips whose side is below `coarsest`
+    are not used.
     """
     axes = cubemap.texel_directions(side)[cubemap.orbits(side).flatten()].numpy()
     sides = _pyramid_sides(resolution)
@@ -96,7 +101,10 @@ def _level(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.nd
 
 
 def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, side: int, lobe: Lobe) -> np.ndarray:
-    """Average the lobe about each axis over a texel, which it varies within. Rows and columns count from the middle of face +x."""
+    """Average the lobe about each axis over the area of a texel.
+
+    The lobe varies within a texel, so several points are averaged. Rows and columns count from the middle of face +x.
+    """
     value = np.zeros(len(axes))
     x, y, z = np.ascontiguousarray(axes.T)
     for i in range(SAMPLES):
@@ -107,9 +115,10 @@ def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, sid
 
 
 class Matrix(NamedTuple):
-    """A sparse matrix over texels in the order of `cubemap.orbits`, invariant under the cube's symmetries.
+    """Hold a sparse matrix over texels in orbit order (`cubemap.orbit_order`). The cube's symmetries leave the matrix as it is.
 
-    Only the first of an orbit's 24 rows is kept: the others have the same numbers, at the images of its columns.
+    Only the first of an orbit's 24 rows is kept. The other rows have the same numbers: a symmetry that maps the first row to another row
+    maps the first row's columns to the other row's columns.
     """
 
     starts: Tensor  # (orbits + 1), int32: the start of each row's numbers
@@ -132,7 +141,10 @@ class Matrix(NamedTuple):
 def _pair(
     shape: tuple[int, int], orbit: np.ndarray, column: np.ndarray, number: np.ndarray, device: torch.device
 ) -> tuple[Matrix, Matrix]:
-    """Make the matrix that has these numbers in the first rows of orbits, and its transpose; `shape` is in orbits."""
+    """Make a matrix from the numbers in the first rows of its orbits, and its transpose.
+
+    `shape` counts orbits (see `cubemap.orbits`).
+    """
     # A number at row 24 i, column 24 j + h is also at row 24 i + g, column 24 j, where g is the inverse of h.
     inverse = (cubemap.compositions() == 0).int().argmax(dim=1).numpy()
     transpose = column // SYMMETRIES, SYMMETRIES * orbit + inverse[column % SYMMETRIES], number
@@ -141,7 +153,7 @@ def _pair(
 
 @lru_cache(maxsize=4)
 def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
-    """The matrix from the pyramid's texels to the stacked levels, and its transpose."""
+    """Return the matrix from the pyramid's texels to the stacked levels, and its transpose."""
     itself = np.arange(resolution**2 // 4)  # level 0
     parts, start = [(itself, SYMMETRIES * itself, np.ones(len(itself)))], 6 * resolution**2
     for side, lobe in zip(level_sides(resolution)[1:], LOBES, strict=True):
@@ -157,7 +169,10 @@ def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
 
 @lru_cache(maxsize=4)
 def _pyramid(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
-    """The matrix from the cubemap's texels to its pooled mips, means by solid angle, and its transpose."""
+    """Return the matrix from the cubemap's texels to the pyramid's, and its transpose.
+
+    A texel of a pooled mip is the mean of the finer texels by solid angle.
+    """
     mip = sparse.identity(resolution**2 // 4, format="csr")
     mips = [mip]
     for side in _pyramid_sides(resolution)[:-1]:
@@ -181,7 +196,10 @@ _Work = struct("Product", "sparse.cpp")
 
 
 def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tensor:
-    """Multiply. Input and output are in the order of orbits, unless `rows` gives each output its row."""
+    """Multiply a matrix by `dense`.
+
+    Input and output are in orbit order (`cubemap.orbit_order`), unless `rows` gives each output its row.
+    """
     work = _Work(orbits=len(matrix.starts) - 1)
     out = dense.new_empty(SYMMETRIES * work.orbits, 3)
     work.attach(**matrix._asdict(), dense=dense, out=out, **({} if rows is None else {"rows": rows}))
@@ -207,15 +225,18 @@ class _Prefilter(torch.autograd.Function):
 
 
 def prefilter(radiance: Tensor, resolution: int) -> Tensor:
-    """Prefilter a cubemap (6·R², 3) of linear radiance: all levels stacked (Σ 6·side², 3), each in the order of `cubemap.orbits`.
+    """Prefilter a cubemap (6·R², 3) of linear radiance. Returns all levels stacked (Σ 6·side², 3).
 
-    The last level is irradiance / π.
+    Each level is in orbit order (`cubemap.orbit_order`). The last level is irradiance / π.
     """
     check(radiance=(radiance, (6 * resolution**2, 3)))
     return _Prefilter.apply(radiance, resolution)
 
 
 def irradiance(levels: Tensor, sides: tuple[int, ...], normals: Tensor) -> Tensor:
-    """Look up irradiance / π (P, 3) for unit normals (P, 3) in the levels that `prefilter` returns. On the CPU; differentiable."""
+    """Look up irradiance / π (P, 3) for unit normals (P, 3) in the levels that `prefilter` returns.
+
+    The look-up runs on the CPU and is differentiable.
+    """
     last = cubemap.in_texel_order(levels, sides)[-6 * sides[-1] ** 2 :]
     return cubemap.sample(last, sides[-1:], normals, torch.zeros(len(normals), dtype=normals.dtype))

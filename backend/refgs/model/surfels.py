@@ -25,7 +25,7 @@ logit; sh_dc (N, 1, 3); sh_rest (N, K − 1, 3); albedo (N, 3) logit; metallic (
 
 
 def axes(rotations: Tensor) -> list[Tensor]:
-    """The columns (N, 3) of the rotation matrices of quaternions wxyz (N, 4) of any length."""
+    """Compute the columns (N, 3) of the rotation matrices of quaternions wxyz (N, 4) of any length."""
     w, x, y, z = torch.nn.functional.normalize(rotations, dim=-1).unbind(-1)
     return [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1),
@@ -35,11 +35,11 @@ def axes(rotations: Tensor) -> list[Tensor]:
 
 
 class Surfels(NamedTuple):
-    """Activated values of N surfels: world units, linear Rec.709 albedo, materials in 0..1, SH with colour = 0.5 + SH.
+    """Hold the activated values of N surfels: world units, linear Rec.709 albedo, materials in 0..1, SH with colour = 0.5 + SH.
 
-    `received` (N, 3) is the irradiance of a surfel, divided by that of an unoccluded surface; light from the object itself can raise it
-    above 1. SH are split into the constant (N, 1, 3) and the rest (N, K − 1, 3), which learn at different rates. `indirect` are the SH of
-    the linear radiance that reaches a surfel from the object itself (paper Eq. 10).
+    `received` (N, 3) is the irradiance at a surfel, divided by the irradiance at an unoccluded surface. Light from the object itself can
+    raise it above 1. SH are split into the constant (N, 1, 3) and the rest (N, K − 1, 3), which learn at different rates. `indirect` are
+    the SH of the linear radiance that reaches a surfel from the object itself (paper Eq. 10).
     """
 
     positions: Tensor
@@ -56,7 +56,10 @@ class Surfels(NamedTuple):
     indirect_rest: Tensor
 
     def normals(self) -> Tensor:
-        """Unit normals t_u × t_v (N, 3): the third column of each rotation. 3D Gaussians need `with_normals_last` first."""
+        """Compute the unit normals t_u × t_v (N, 3): the third column of each rotation.
+
+        3D Gaussians need `with_normals_last` first.
+        """
         return axes(self.rotations)[2]
 
     def without_directions(self) -> "Surfels":
@@ -68,7 +71,7 @@ class Surfels(NamedTuple):
         return Surfels(*(value[which] for value in self))
 
     def turned(self, which: Tensor) -> "Surfels":
-        """Flip the normals of those selected by a mask (N,)."""
+        """Flip the normals of the surfels that a mask (N,) selects."""
         w, x, y, z = self.rotations.unbind(-1)
         turned = torch.stack([-x, w, z, -y], dim=-1)  # q · (0, 1, 0, 0): a half turn about t_u
         return self._replace(rotations=torch.where(which[:, None], turned, self.rotations))
@@ -135,7 +138,7 @@ def activate(p: Parameters) -> Surfels:
 
 
 def quaternions_towards(normals: np.ndarray) -> np.ndarray:
-    """Unit quaternions wxyz (N, 4) of the shortest rotations from +z to unit normals (N, 3)."""
+    """Compute the unit quaternions wxyz (N, 4) of the shortest rotations from +z to unit normals (N, 3)."""
     x, y, z = normals.T
     q = np.stack([1 + z, -y, x, np.zeros_like(z)], axis=1)
     q[1 + z < 1e-6] = (0, 1, 0, 0)  # straight down: a half turn about x
@@ -155,10 +158,10 @@ def initial_parameters(
     metallic: float,
     roughness: float,
 ) -> Parameters:
-    """Make round surfels at points (N, 3) that face along normals (N, 3), with the spacing (N,) as standard deviation.
+    """Make round surfels at points (N, 3) that face along normals (N, 3).
 
-    `colours` (N, 3), sRGB-encoded 0..1, initialise the SH; the default is grey. With three `axes` they are 3D Gaussians, FLAT along the
-    normals.
+    `spacing` (N,) is the surfels' standard deviation. `colours` (N, 3), sRGB-encoded 0..1, initialise the SH; the default is grey. With
+    three `axes` the surfels are 3D Gaussians, whose thickness along the normals is FLAT times their width.
     """
     n = len(positions)
 
