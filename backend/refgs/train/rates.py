@@ -8,7 +8,7 @@ REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest",
 
 
 def set_rates(state: State, progress: float) -> None:
-    """Set each group's rate for a progress of 0..1."""
+    """Set the learning rate of each of the optimiser's groups, for a progress of 0..1."""
     rates, late = state.settings.rates, state.residual_start
     frozen = _frozen(state, progress)
     for group in state.optimizer.param_groups:

@@ -102,7 +102,7 @@ def restore(state: State, recorded: dict[str, dict[str, Any]]) -> None:
 
 
 def rows(state: State) -> list[dict[str, Any]]:
-    """List the decisions for needs.json."""
+    """List the decisions as the rows of needs.json."""
     listed = []
     for name, found in state.needs.items():
         row = {"need": name, "what": BY_NAME[name].what, **found}
