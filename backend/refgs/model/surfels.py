@@ -1,4 +1,4 @@
-"""Surfels: raw parameters, which are learned, and activated values, which are rendered."""
+"""Represent surfels by raw parameters, which are learned, and by activated values, which are rendered."""
 
 import math
 from typing import NamedTuple
@@ -63,7 +63,7 @@ class Surfels(NamedTuple):
         return axes(self.rotations)[2]
 
     def without_directions(self) -> "Surfels":
-        """Drop the harmonics beyond the constant."""
+        """Drop the harmonics beyond the constant, so that colour no longer depends on direction."""
         return self._replace(sh_rest=self.sh_rest[:, :0])
 
     def chosen(self, which: Tensor) -> "Surfels":
@@ -115,10 +115,10 @@ class _Activate(torch.autograd.Function):
 
 
 def activate(p: Parameters) -> Surfels:
-    """Activate raw parameters.
+    """Compute the surfels' activated values from raw parameters.
 
-    Metallic approaches 0 and 1 faster than a logistic function does. One percent of matte white in a black metal would be as bright as
-    its mirror image, and the light would compensate for it.
+    Metallic approaches 0 and 1 faster than a logistic function does. One percent of matte white in a black metal would be as bright as its
+    mirror image, and the light would compensate for it.
     """
     scales, opacities, albedo, metallic, roughness = _Activate.apply(*(p[name] for name in _KINDS))
     return Surfels(

@@ -1,4 +1,4 @@
-"""Ambiguities: changes of light and materials that cancel in all of the pictures, so that photos cannot tell them apart."""
+"""Measure ambiguities: changes of light and materials that cancel in all pictures, so that photos cannot tell them apart."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -29,7 +29,10 @@ def _redder(of: Explanation, size: float) -> Explanation:
 
 
 def _blurred(of: Explanation, size: float) -> Explanation:
-    """Blend this much of a mean over neighbours on the face into each texel; it reaches a sixteenth of the face's side."""
+    """Blend the mean of each texel's neighbours into the texel; `size` is the mean's weight.
+
+    Neighbours lie on the same face, up to a sixteenth of the face's side away.
+    """
     side = round((len(of[1]) // 6) ** 0.5)
     faces = of[1].view(6, side, side, 3).permute(0, 3, 1, 2)
     reach = max(1, side // 16)
@@ -55,7 +58,10 @@ def _more_metal(of: Explanation, size: float) -> Explanation:
 
 
 class Trade(NamedTuple):
-    """A change of a size, in words, and another change that may cancel it."""
+    """Pair a change of a given size with another change that may cancel it in the pictures.
+
+    `words` name the change and `answer` names the other one, for the artist.
+    """
 
     words: str
     change: Change
@@ -73,11 +79,13 @@ TRADES = {
 
 
 def ambiguities(state: State) -> dict[str, dict]:
-    """Measure each trade by differences at the end of the training; empty where nothing is lit.
+    """Measure at the end of the training how far the two changes of each trade (see `Trade`) cancel.
 
-    `alone` is how far the pictures change; `left` is what remains where the other change cancels it as well as it can, with the size
-    `answer`; `error` is the pictures' own (all root mean squares of encoded colours). `what` is a line for the artist, present only where
-    less is left than UNSEEN of the error.
+    Returns figures for each of `TRADES`, and nothing where nothing is lit. All are root mean squares of encoded colours, except `answer`:
+
+    `alone` is how far the first change alters the pictures. `answer` is the size of the other change that cancels it best. `left` is how
+    far both changes together alter the pictures. `error` is the pictures' error against the photos. `what` is a line for the artist,
+    present only if `left` is less than UNSEEN of `error`. Derivatives are finite differences.
     """
     light = state.environment()
     if light is None:
@@ -102,7 +110,7 @@ def ambiguities(state: State) -> dict[str, dict]:
 
 
 def _pictures(state: State, of: Explanation, chosen: range) -> Tensor:
-    """Render what the photos would be, flattened into one vector."""
+    """Render the training views `chosen` from surfels and radiance, flattened into one vector."""
     light = Environment(of[1].contiguous(), state.environment().reference)
     inputs = RenderInputs(of[0], light, state.settings.render, state.occluder)
     pictures = (state.picture(inputs, state.views[i].camera, state.exposure(i)) for i in chosen)

@@ -1,4 +1,4 @@
-"""Asset of a training that has ended: surfels whose materials relight, and the light."""
+"""Write the asset of a training that has ended: surfels whose materials can be relit, and the environment's light."""
 
 import json
 from typing import Any
@@ -24,7 +24,10 @@ from refgs.train.trace import why_not_traced
 
 
 def write_asset(state: State) -> None:
-    """Write splats.ply, environment.exr, needs.json and, where they are known, occluder.ply and the exposures in cameras.json."""
+    """Write splats.ply, environment.exr and needs.json.
+
+    Also write occluder.ply and the exposures in cameras.json, where the training has them.
+    """
     folder, settings = state.folder, state.settings
     with torch.no_grad():
         surfels, environment = with_normals_last(state.surfels()), state.environment()
@@ -60,7 +63,10 @@ def write_asset(state: State) -> None:
 
 
 def _constant_columns(state: State, surfels: Surfels, kept: Tensor) -> dict[str, float]:
-    """Find what splats.ply says once for all surfels kept (N,): metallic, roughness, specular."""
+    """Find the columns of splats.ply that have one value for all surfels: metallic, roughness, specular.
+
+    Only the surfels in `kept` (N,) count.
+    """
     if state.settings.render.reflection == "none" and state.method.lit:
         return {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
     common = needs.CONSTANTS.common(state, surfels, kept)
@@ -71,8 +77,8 @@ def _constant_columns(state: State, surfels: Surfels, kept: Tensor) -> dict[str,
 def _with_relightable_albedo(surfels: Surfels, environment: Environment, state: State) -> Surfels:
     """Recover the albedo under the recovered light, and the SH that a viewer without lights shows.
 
-    Where the diffuse part was learned as SH, a dielectric's albedo is that colour divided by the irradiance it received; a metal's is
-    its reflectance. Where it was learned as albedo, the SH becomes the matte colour under that irradiance.
+    If the diffuse part was learned as SH, a dielectric's albedo is the SH's colour divided by the surfel's irradiance. A metal's albedo is
+    its reflectance. If the diffuse part was learned as albedo, the SH are set to the matte colour under that irradiance.
     """
     received = _received(surfels, environment, state)
     metallic = surfels.metallic[:, None]
@@ -87,7 +93,7 @@ def _with_relightable_albedo(surfels: Surfels, environment: Environment, state: 
 def _received(surfels: Surfels, environment: Environment, state: State) -> Tensor:
     """Compute irradiance / π of each surfel (N, 3).
 
-    Where the light turned with the camera, it is the mean over the photos, weighted by the cosine to the camera, on the side seen.
+    If the light turned with the camera, irradiance is the mean over the photos on the side seen, weighted by the cosine to the camera.
     """
     normals = surfels.normals()
     if environment.reference is None:
@@ -105,7 +111,8 @@ def _received(surfels: Surfels, environment: Environment, state: State) -> Tenso
 def _seen_side(surfels: Surfels, state: State) -> Tensor:
     """Find the side of each surfel (N,) that training views see.
 
-    1: that which its normal points to; −1: the other; 0: none sees the surfel. Where none sees any surfel, all count as seen.
+    1 is the side that the normal points to, −1 the other side. 0 means that no view sees the surfel. If no view sees any surfel, all
+    surfels count as seen.
     """
     surfels = Surfels(*(value.detach() for value in surfels))
     normals = surfels.normals()
@@ -120,9 +127,9 @@ def _seen_side(surfels: Surfels, state: State) -> Tensor:
 
 
 def _left_out(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) -> list[dict[str, Any]]:
-    """List for needs.json the decisions about needs, and what else the run did without, why, and what that saved.
+    """List for needs.json the decisions of `refgs.train.needs`, and what else the run did without, why, and what that saved.
 
-    `side` (N,) is that of `_seen_side`; `wanted` (N,) are the surfels in the region.
+    `side` (N,) is the result of `_seen_side`. `wanted` (N,) are the surfels in the region to train.
     """
     settings, method, left = state.settings, state.method, needs.rows(state)
 
@@ -150,7 +157,7 @@ def _left_out(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) -> l
 
 
 def _why_no_mesh(state: State) -> str:
-    """Say why there is no mesh to trace inter-reflection on, where nothing forbids it."""
+    """Say why a run that may trace inter-reflection has no mesh to trace it on."""
     indirect = state.settings.indirect
     first = max(indirect.every, max(indirect.start, state.settings.initial.until) * state.total)
     over = state.total * state.residual_start <= first

@@ -1,4 +1,7 @@
-"""Checkpoint files: safetensors for the tensors, TOML for the rest; the last two complete ones are kept."""
+"""Write and read checkpoints: a safetensors file for the tensors, a TOML file for the rest.
+
+The last two complete checkpoints are kept.
+"""
 
 import errno
 import os
@@ -16,9 +19,9 @@ KEPT = 2
 
 
 def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
-    """Write a checkpoint of an iteration. It is complete once its TOML file is there.
+    """Write a checkpoint of an iteration. The checkpoint is complete once its TOML file is there.
 
-    Raises InputError when the disk is full: earlier checkpoints stay complete.
+    Raises InputError when the disk is full. Earlier checkpoints then stay complete.
     """
     folder.mkdir(exist_ok=True)
     data, note = folder / f"{iteration:08d}.safetensors", folder / f"{iteration:08d}.toml"

@@ -1,4 +1,4 @@
-"""Densification: divide surfels where the picture asks for more, remove faint ones, reset opacities, propagate normals."""
+"""Divide surfels where the picture asks for more, remove faint ones, reset opacities, propagate normals."""
 
 import math
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ LEAST_SURFELS = 1000
 
 
 def faint_now(state: State, opacity: float = SEEN) -> bool:
-    """Tell whether an opacity reset is too recent for surfels to be back at an opacity."""
+    """Tell whether the last opacity reset is too recent for needed surfels to be back at `opacity`."""
     return faint(state.settings.densify, state.settings.rates, state.iteration, state.total, opacity)
 
 
@@ -42,7 +42,10 @@ def densify_due(state: State, progress: float) -> None:
 
 
 def since_propagation(state: State) -> int | None:
-    """Count the iterations since normals were last propagated; None before the first time and after the last."""
+    """Count the iterations since normals were last propagated.
+
+    Returns None before the first propagation and after the last.
+    """
     settings, iteration = state.settings.propagation, state.iteration
     if not settings.every or iteration < settings.every or not state.method.lit:
         return None
@@ -69,10 +72,10 @@ def densify(
     budget: int,
     divide: bool,
 ) -> int:
-    """Remove faint surfels; divide those with the largest screen gradients in two along their longer axis, up to the budget.
+    """Remove faint surfels, and divide those with the largest screen gradients, up to the budget.
 
-    Parameters are replaced in the dictionary and in the optimiser. Survivors keep their moments, new surfels start without.
-    Returns how many were divided. At least one surfel is kept.
+    A surfel is divided in two along its longer axis. At least one surfel is kept. Parameters are replaced in the dictionary and in the
+    optimiser. Surviving surfels keep their moments, new ones start without. Returns how many surfels were divided.
     """
     opacity = parameters["opacity"].sigmoid()
     keep = ~(opacity < settings.prune_opacity)  # NaN is kept here: guard.py removes it, with a warning
@@ -97,16 +100,19 @@ def densify(
 
 @torch.no_grad()
 def reset_opacity(parameters: Parameters, optimizer: Adam) -> None:
-    """Reset all opacities: surfels that the picture needs come back, the others are removed later (Kerbl et al. 2023)."""
+    """Lower all opacities to RESET at most (Kerbl et al. 2023).
+
+    The picture then raises the opacities of surfels that it needs. The others are removed later.
+    """
     parameters["opacity"].clamp_(max=math.log(RESET / (1 - RESET)))
     optimizer.state.pop(parameters["opacity"], None)
 
 
 def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total: int, opacity: float) -> bool:
-    """Tell whether the last opacity reset is too recent for needed surfels to be back at an `opacity`.
+    """Tell whether the last opacity reset is too recent for needed surfels to be back at `opacity`.
 
-    Adam moves a logit by about its rate, which decays, in each iteration that sees the surfel. Surfels get four times as long as
-    that takes.
+    Adam moves a logit by about its rate in each iteration that sees the surfel, and the rate decays. Surfels get four times as long as
+    this takes.
     """
     every = settings.reset_every
     last = min(iteration, math.ceil(settings.stop * total)) - 1  # a reset at the end of this iteration does not count
@@ -126,8 +132,8 @@ def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total:
 def propagate_normals(parameters: Parameters, optimizer: Adam, settings: PropagationSettings) -> None:
     """Propagate normals from mirrors to their surroundings (paper §3.3).
 
-    All surfels become opaque and mirrors grow. Surfels in front then lend their normals to the pixels around; those behind give way
-    or follow.
+    All surfels become opaque, and mirrors grow. The surfels in front then lend their normals to the pixels around. The surfels behind give
+    way or follow.
     """
     parameters["opacity"].clamp_(min=math.log(settings.opacity / (1 - settings.opacity)))
     optimizer.state.pop(parameters["opacity"], None)
@@ -138,12 +144,12 @@ def propagate_normals(parameters: Parameters, optimizer: Adam, settings: Propaga
 
 @torch.no_grad()
 def thin(parameters: Parameters, optimizer: Adam, count: int) -> None:
-    """Keep this many surfels, the most opaque."""
+    """Keep the `count` most opaque surfels."""
     take(parameters, optimizer, parameters["opacity"].topk(count).indices.sort().values)
 
 
 def full_card() -> InputError:
-    """Say what helps where a card's memory is too small."""
+    """Make the error for a card whose memory is too small. Its message says what helps."""
     return InputError("the card's memory is too small: close what else uses it, or take --device cpu")
 
 
@@ -161,10 +167,10 @@ def fewer_surfels(state: State) -> None:
 
 
 def take(parameters: Parameters, optimizer: Adam, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
-    """Replace the surfels by those of an index, with their moments; rows at `fresh` start with zero moments.
+    """Replace the surfels by those at `index`, with their Adam moments. Rows at `fresh` start with zero moments.
 
-    Adam then moves fresh rows by several times its rate for a while. The picture gets worse at first, but surfels find their places:
-    captures without masks end better. Where memory does not suffice, nothing is replaced.
+    Adam then moves fresh rows by several times their rate for a while. The picture gets worse at first, but captures without masks end
+    better. If memory does not suffice, nothing is replaced.
     """
     groups = [group for group in optimizer.param_groups if group["name"] in parameters]  # without light and exposures
     made = []
@@ -184,7 +190,10 @@ def take(parameters: Parameters, optimizer: Adam, index: Tensor, fresh: Sequence
 
 
 def _divide(parameters: Parameters, first: Tensor, second: Tensor) -> None:
-    """Move two copies of a surfel apart along its longer axis, so that together they cover what it did."""
+    """Move the two copies of a divided surfel apart along its longer axis.
+
+    Together the copies cover what the surfel covered.
+    """
     scale = parameters["scale"][first]
     longer = scale.argmax(dim=1)
     rows = torch.arange(len(first), device=first.device)

@@ -1,4 +1,4 @@
-"""Effective settings of a training: those that were asked for, and each change with what made it."""
+"""Track a training's settings in effect: the settings that were asked for, and each change with its cause."""
 
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
@@ -11,7 +11,7 @@ By = Literal["plan", "photos", "needs", "memory"]
 
 @dataclass(frozen=True)
 class Change:
-    """One setting's change."""
+    """Record the change of one setting: the value asked for, the new value, the cause and the reason."""
 
     asked: Any
     became: Any
@@ -21,7 +21,10 @@ class Change:
 
 @dataclass(frozen=True)
 class Effective:
-    """Settings that a training goes by. The user's own are in `asked` and stay as they are."""
+    """Hold the settings that a training goes by.
+
+    The user's own settings are in `asked` and never change.
+    """
 
     asked: Settings
     settings: Settings
@@ -33,31 +36,34 @@ class Effective:
         return cls(asked, asked)
 
     def changed(self, key: str, value: Any, by: By, why: str) -> "Effective":
-        """Change one setting, `section.name`."""
+        """Change one setting, given by its key `section.name`."""
         section, name = key.split(".")
         table = getattr(self.settings, section).model_copy(update={name: value})
         return self.moved_to(self.settings.model_copy(update={section: table}), by, why)
 
     def noted(self, key: str, value: Any, by: By, why: str) -> "Effective":
-        """Keep a change of a number that the state holds in the settings' place: how many iterations there are."""
+        """Record the change of a number without changing `settings`.
+
+        The training's state holds this number itself, such as how many iterations there are.
+        """
         return replace(self, changes=self.changes | {key: Change(_numbers(self.asked)[key], value, by, why)})
 
     def moved_to(self, settings: Settings, by: By, why: str) -> "Effective":
-        """Take other settings, and keep each number that differs as a change."""
+        """Take other settings, and record each setting that differs as a change."""
         asked, before, after = (_numbers(s) for s in (self.asked, self.settings, settings))
         changes = {key: Change(asked[key], value, by, why) for key, value in after.items() if value != before[key]}
         return replace(self, settings=settings, changes=self.changes | changes)
 
     def chosen(self) -> dict[str, str]:
-        """Say what the photos decided, and why: run.toml's [chosen]."""
+        """Say what the photos decided, and why. This is the table [chosen] of run.toml."""
         return {key: f"{change.became}: {change.why}" for key, change in self.changes.items() if change.by == "photos"}
 
     def rows(self) -> dict[str, dict[str, Any]]:
-        """List the changes: run.toml's [changed]."""
+        """List the changes. This is the table [changed] of run.toml."""
         return {key: asdict(change) for key, change in self.changes.items()}
 
 
 def _numbers(settings: Settings) -> dict[str, Any]:
-    """List all settings by their dotted keys."""
+    """List the values of all settings by their dotted keys."""
     tables = settings.model_dump(mode="json")
     return {f"{section}.{name}": value for section, table in tables.items() for name, value in table.items()}

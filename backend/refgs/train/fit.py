@@ -1,4 +1,4 @@
-"""Fit settings to a time: as far from `quick` to `standard`, and beyond, as fits into it."""
+"""Fit settings to a given time: between the presets `quick` and `standard`, or beyond `standard`."""
 
 import math
 from pathlib import Path
@@ -18,11 +18,13 @@ STEPS, MOST = 64, 2.0  # steps in which settings richer than quick are tried, an
 
 
 def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, device: str, report: Report) -> Trainer:
-    """Make a trainer of a capture whose settings fit the time of a `plan`.
+    """Make a trainer of a capture. Its settings fit into the time of `plan`.
 
-    Between the presets, and as far again beyond `standard`, every number is interpolated geometrically. With less time than `quick` takes,
-    or more than the richest settings do, the number of iterations changes. The pace is measured by a rehearsal, some iterations by `quick`.
-    Where only their number changes, the rehearsal's iterations are the training's first.
+    All numbers are interpolated geometrically between the presets `quick` and `standard`, and extrapolated as far again beyond `standard`.
+    If the time is too short for `quick`, or longer than the richest settings take, the number of iterations changes instead.
+
+    A rehearsal measures the pace: some iterations with `quick`. If the trainer keeps the settings of `quick`, the rehearsal's iterations
+    are the training's first.
     """
     quick, standard = (load_settings(preset, changes) for preset in ("quick", "standard"))
     begun, said = plan.spent, []
@@ -37,7 +39,7 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
     pixels = _pixels(capture, quick)
 
     def iterations(settings: Settings) -> float:
-        """Count the iterations by these settings that fit."""
+        """Estimate how many iterations with these settings fit into the time."""
         larger = _pixels(capture, settings) / pixels
         # There may be fewer points to start from than the settings ask for.
         start = settings.surfels.start if first == quick.surfels.start else first
@@ -88,9 +90,9 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
 
 
 def _scheduled(settings: Settings, iterations: float, usual: float) -> Settings:
-    """Scale a schedule to a number of iterations, and the rates by the inverse root of their ratio to the `usual` number.
+    """Scale a schedule to a number of iterations, and the rates by the inverse square root of `iterations / usual`.
 
-    The steps' noise, each being of one view, then adds up to the same.
+    A step has the noise of one view. With such rates, the noise of all steps adds up to the same.
     """
     tables, part = settings.model_dump(), iterations / settings.train.iterations
     for section, name in (("train", "iterations"), *SCHEDULE):

@@ -1,4 +1,4 @@
-"""Guard against numbers that are not finite: skip and count such steps, remove such surfels."""
+"""Guard a training against numbers that are not finite: skip and count such steps, remove such surfels."""
 
 import math
 
@@ -26,7 +26,10 @@ SMALLEST, LARGEST = 1e-6, 1e2  # of a surfel, in scene radii
 
 
 def limits(name: str, radius: float, brightest: float) -> tuple[float, float]:
-    """Bound a parameter's raw values, in a scene of this radius, to where their gradients still lead back; raw light to `brightest`."""
+    """Return the lowest and the highest raw value of a parameter. `brightest` is the highest raw light.
+
+    Between them, gradients are large enough to lead back. `radius` is the scene's.
+    """
     if name == "scale":
         return math.log(SMALLEST * radius), math.log(LARGEST * radius)
     if name == "environment":
@@ -35,7 +38,10 @@ def limits(name: str, radius: float, brightest: float) -> tuple[float, float]:
 
 
 class Guard:
-    """Count the steps that were not taken, on the training's device: a card need not wait."""
+    """Count the steps that were skipped.
+
+    The counts are kept on the training's device, so that the CPU need not wait for a card.
+    """
 
     def __init__(self, device: torch.device):
         self._counts = torch.zeros(3, device=device)  # left out, in all and in a row; taken
@@ -43,9 +49,9 @@ class Guard:
 
     @torch.no_grad()
     def judge(self, loss: Tensor, optimizer: Adam) -> Tensor:
-        """Tell whether to take a step, by a float32 scalar: 1 or 0.
+        """Return 1 if a step may be taken, else 0, as a float32 scalar.
 
-        The loss must be finite, and the gradients' squares, which Adam sums.
+        A step may be taken if the loss and the sum of the gradients' squares, which Adam needs, are finite.
         """
         gradients = [
             value.grad for group in optimizer.param_groups for value in group["params"] if value.grad is not None
@@ -59,14 +65,14 @@ class Guard:
 
     @property
     def left_out(self) -> int:
-        """How many steps were not taken, by this process."""
+        """Return how many steps this process has skipped."""
         return int(self._counts[0])
 
     def look(self, state: State, whole: bool) -> str:
-        """Warn of steps left out, and remove surfels that are not finite; always where `whole`, else only where steps were left out.
+        """Warn of skipped steps, and remove surfels that are not finite.
 
-        Returns why the training must go back to its last checkpoint, or "". Raises InputError where there is none, or going back to it
-        did not help before.
+        Surfels are checked if steps were skipped since the last call, or if `whole` is true. Returns why the training must go back to its
+        last checkpoint, or "" if it need not. Raises InputError if there is no checkpoint, or if going back to it did not help before.
         """
         total, in_a_row, taken = (int(count) for count in self._counts.tolist())
         worse, self._seen = total > self._seen, total
@@ -117,6 +123,6 @@ def remove_broken(parameters: Parameters, optimizer: Adam) -> int:
 
 
 def running(mean: Tensor, figure: Tensor) -> Tensor:
-    """Update a running mean with one more figure, unless that is not finite."""
+    """Update a running mean with one more figure, unless the figure is not finite."""
     known = torch.where(mean.isfinite(), figure + 0.95 * (mean - figure), figure)
     return torch.where(figure.isfinite(), known, mean)

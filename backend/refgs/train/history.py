@@ -1,4 +1,4 @@
-"""History of a training: RUN/history.jsonl, an object a line (docs/run-folder.md)."""
+"""Record the history of a training in RUN/history.jsonl, one object a line (docs/run-folder.md)."""
 
 import json
 import math
@@ -16,15 +16,19 @@ BESIDE = ("reading", "start", "writing", "measuring", "FLIP")  # parts of the cl
 
 
 def due(iteration: int) -> bool:
-    """Tell whether to record an iteration: A_DECADE of each decade, evenly by logarithm. The last one is recorded besides."""
+    """Tell whether to record an iteration.
+
+    In each decade, A_DECADE iterations are recorded, evenly spaced by logarithm. The last iteration is recorded besides.
+    """
     place, before = (math.floor(A_DECADE * math.log10(max(i, 1))) for i in (iteration, iteration - 1))
     return iteration >= FIRST and place > before
 
 
 def allowed(iteration: int, total: int, seconds: float) -> float:
-    """Limit the seconds that measuring may have taken before this iteration.
+    """Return how many seconds measuring may have taken before this iteration.
 
-    The share of the training's expected time is spread over the lines evenly by logarithm, as the lines are.
+    Measuring may take SHARE of the training's expected time. This time is spread evenly over the history's lines, which are evenly spaced
+    by the iteration's logarithm.
     """
     lines = math.log(max(total / FIRST, 1)) or 1.0
     passed = min(math.log(max(iteration / FIRST, 1)) / lines, 1.0)
@@ -32,7 +36,10 @@ def allowed(iteration: int, total: int, seconds: float) -> float:
 
 
 def record(state: State, measures: Measures, loss: float, quality: float) -> None:
-    """Add a line of the training as it stands, with running means of its loss and of its PSNR on training views."""
+    """Add a line that describes the training as it stands.
+
+    `loss` is the running mean of its loss, `quality` that of its PSNR on training views.
+    """
     limit = math.inf if state.ended else allowed(state.iteration, state.total, state.seconds)
     parts = dict(state.clock.seconds)
     parts["other"] = state.seconds - sum(value for name, value in parts.items() if name not in BESIDE)
@@ -54,7 +61,7 @@ def record(state: State, measures: Measures, loss: float, quality: float) -> Non
 
 
 def trim(folder: Path, iteration: int) -> None:
-    """Remove lines of later iterations: they will be recorded again."""
+    """Remove the lines of iterations after `iteration`, which will be recorded again."""
     file = folder / FILE
     if file.exists():
         kept = [line for line in read(file.read_text(encoding="utf-8")) if line.get("iteration", math.inf) <= iteration]

@@ -1,4 +1,7 @@
-"""The light as it learns: its resolution, diffusion between texels, and the mean that is held grey."""
+"""Learn the environment's light: refine its resolution, diffuse between texels, measure its mean.
+
+The objective holds the mean grey.
+"""
 
 import math
 
@@ -29,19 +32,22 @@ SOLID = 0.5  # alpha
 
 
 def start_value(state: State) -> float:
-    """Raw value of a texel at the start."""
+    """Return the raw value of a texel at the start."""
     return state.method.light.raw(state.settings.environment.radiance)
 
 
 def resolution(settings: Settings, progress: float) -> int:
-    """Texels along a side: half of them at first, for each is then seen more often and learns sooner."""
+    """Return how many texels the cubemap has along a side.
+
+    At first it has half of them: each texel is then seen more often and learns sooner.
+    """
     finest = settings.environment.resolution
     return finest if progress >= REFINED else max(finest // 2, LEAST)
 
 
 @torch.no_grad()
 def refine_due(state: State, progress: float) -> None:
-    """Double the texels along a side when it is time."""
+    """Double the texels along a side at the iteration that is due for it."""
     if not state.method.lit or len(state.light) >= 6 * resolution(state.settings, progress) ** 2:
         return
     side = math.isqrt(len(state.light) // 6)
@@ -52,7 +58,7 @@ def refine_due(state: State, progress: float) -> None:
 
 @torch.no_grad()
 def coarsen(state: State, side: int) -> None:
-    """Keep means of the texels, so many along a side."""
+    """Average the texels, so that `side` of them are left along a side."""
     fine = math.isqrt(len(state.light) // 6) // side
     _replace(state, state.light.view(6, side, fine, side, fine, 3).mean(dim=(2, 4)).reshape(-1, 3))
 
@@ -66,10 +72,10 @@ def _replace(state: State, texels: Tensor) -> None:
 @timed("optimiser")
 @torch.no_grad()
 def diffuse(state: State) -> None:
-    """Let texels flow into their neighbours on the face, in proportion to the light's rate.
+    """Let texels flow into their neighbours on the face, in proportion to the light's learning rate.
 
-    As decoupled weight decay does (Loshchilov and Hutter 2019), it acts beside the optimiser's step. Texels that photos agree on move
-    by the whole rate and stay sharp; texels that only noise moves even out. The mean stays.
+    Diffusion acts beside the optimiser's step, as decoupled weight decay does (Loshchilov and Hutter 2019). Texels that photos agree on
+    move by the whole rate and stay sharp. Texels that only noise moves even out. The mean stays.
     """
     side = math.isqrt(len(state.light) // 6)
     rate = state.group("environment")["lr"]
@@ -84,7 +90,10 @@ def diffuse(state: State) -> None:
 
 
 def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
-    """Average the light (3,) over what the object mirrors of it; None where the objective does not hold it grey."""
+    """Average the light's radiance (3,) over the directions that the object mirrors.
+
+    Returns None where the objective does not hold the mean grey.
+    """
     if light is None or state.settings.loss.light == 0:
         return None
     if state.light_shown is None or len(state.light_shown) != len(light.radiance):
@@ -97,9 +106,9 @@ def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
 def mirrored(
     surfels: Surfels, cameras: list[Camera], light: Environment, settings: RenderSettings, near: float
 ) -> Tensor:
-    """Weigh the light's texels (6·R²,) by their solid angles where a camera sees them mirrored; zero elsewhere.
+    """Weigh the light's texels (6·R²,) by solid angle if a camera sees them mirrored, by zero otherwise.
 
-    The weights sum to one. All texels count where none is seen.
+    The weights sum to one. If no texel is seen, all texels count.
     """
     seen = torch.zeros(6 * PART * PART, dtype=torch.bool)
     settings = settings.model_copy(update={"reflection": "microfacet"})  # treat matte surfaces as reflective here
@@ -115,7 +124,7 @@ def mirrored(
 
 
 def _cells(directions: Tensor) -> Tensor:
-    """Find the texels of a cubemap, PART along a side, that directions (P, 3) lie in."""
+    """Find the texels in which directions (P, 3) lie, on a cubemap with PART texels along a side."""
     face, s, t = cubemap.face_coordinates(directions)
     column, row = (((x + 1) / 2 * PART).long().clamp(0, PART - 1) for x in (s, t))
     return (face * PART + row) * PART + column

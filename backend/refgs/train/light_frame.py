@@ -1,4 +1,7 @@
-"""Frame of the light: whether it stood still or turned with the camera, asked of the photos before training."""
+"""Choose the light's frame before training: the world's or the camera's.
+
+The photos tell whether the light stood still or turned with the camera.
+"""
 
 import cv2
 import numpy as np
@@ -25,13 +28,15 @@ LESS = 0.95  # of the error under a still light: the light turns only where it e
 
 
 def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple[str, str]:
-    """Choose "world" or "camera", and say why, from points (N, 3) on an object's visual hull, their normals, and the photos.
+    """Choose "world" or "camera" from the photos. Returns the choice and the reason.
 
-    A point's brightness is its own, times a factor of the light. Under a still light that factor changes from photo to photo with the
-    mirror direction alone; under a light that turns with the camera, with normal and mirror direction in the camera's frame. The
-    brightness' logarithm is fitted, in three quarters of the photos, by harmonics of those directions, a number for each point, and one for
-    each photo, its exposure. The light that better predicts the other photos, apart from their exposures, is chosen. It takes seconds and
-    is deterministic.
+    `positions` (N, 3) are points on the object's visual hull, with their `normals`. A point's brightness is a number of its own, times a
+    factor of the light. Under a still light, this factor changes from photo to photo with the mirror direction alone. Under a light that
+    turns with the camera, the factor changes with the normal and the mirror direction, both in the camera's frame.
+
+    The logarithm of the brightness is fitted in three quarters of the photos by harmonics of those directions, a number for each point,
+    and a number for each photo, its exposure. The light that better predicts the other photos is chosen; their exposures do not count.
+    "camera" has to predict them clearly better. This takes seconds and is deterministic.
     """
     points, photos, brightness, still, turning = _observations(views, positions, normals, radius)
     if len(np.unique(photos)) < 2 * FOLDS or len(points) < 100:
@@ -49,7 +54,10 @@ def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndar
 
 
 def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple:
-    """List what photos show of the points: point, photo and log radiance (M,), and the terms (M, K) under either light."""
+    """List what the photos show of the points, in M rows.
+
+    A row is the point, the photo, the log radiance, and the fit's terms (M, K) under a still and under a turning light.
+    """
     some = np.arange(0, len(positions), max(1, len(positions) // POINTS))
     coarse = int(np.clip(0.75 * np.sqrt(len(positions)), 16, SIDE))  # coarse enough that points leave no holes
     reference, rows = views[0].camera, []
@@ -79,7 +87,10 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
 
 
 def _in_front(camera: Camera, positions: np.ndarray, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tell which of some points are in the picture, and how far each is behind the foremost point there."""
+    """Tell which of the points `some` are in the picture.
+
+    Return also how far each point is behind the foremost point at its pixel.
+    """
     pixels, depth = project(camera, positions)
     ahead = inside(camera, pixels, depth)
     limits = camera.height - 1, camera.width - 1
@@ -95,7 +106,10 @@ def _harmonics(directions: np.ndarray) -> np.ndarray:
 
 
 def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray, photos: np.ndarray) -> float:
-    """Cross-validate a fit of values (M,) by terms (M, K), a number for each point and one for each photo: its mean squared error."""
+    """Return the mean squared error of a fit on photos that the fit has not seen (cross-validation).
+
+    The fit explains values (M,) by terms (M, K), a number for each point and a number for each photo.
+    """
     total = count = 0
     for fold in range(FOLDS):
         known = photos % FOLDS != fold
@@ -116,6 +130,6 @@ def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray,
 
 
 def _means(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
-    """Average rows (M, K) by their group (M,): (groups, K), zero for empty groups."""
+    """Average rows (M, K) by their group (M,). Returns (groups, K), zero for empty groups."""
     sums = np.stack([np.bincount(group, column, groups) for column in values.T], axis=1)
     return sums / np.maximum(np.bincount(group, minlength=groups), 1)[:, None]

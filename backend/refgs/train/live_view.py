@@ -1,4 +1,4 @@
-"""Preview of a training while it runs."""
+"""Write a preview of a training while it runs."""
 
 import numpy as np
 import torch
@@ -13,9 +13,9 @@ FOLDER = "preview"  # in the run folder
 
 
 def write_preview(state: State) -> dict[str, str | int]:
-    """Write RUN/preview/view.png, a view as it is rendered now, and RUN/preview/splats.ply, each whole or not at all.
+    """Write RUN/preview/view.png, a view as it is rendered now, and RUN/preview/splats.ply.
 
-    Returns their paths, and the iteration.
+    Each file is written whole or not at all. Returns the two paths and the iteration.
     """
     folder = state.folder / FOLDER
     view = (state.test or state.views)[0]

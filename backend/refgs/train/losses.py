@@ -1,4 +1,4 @@
-"""The objective (paper §3.3): colour, normal consistency, edge-aware smoothness; and the mask."""
+"""Compute the objective (paper §3.3): colour, normal consistency, edge-aware smoothness, and further terms such as the mask."""
 
 from typing import NamedTuple
 
@@ -22,9 +22,9 @@ SUMS = 3  # of a row or a block: of the loss, of the pixels with a surface, of s
 
 
 class Photo(NamedTuple):
-    """Photo of a view on the training's device: `image` (H, W, 3) uint8, sRGB-encoded, and `mask` (H, W) uint8 or None.
+    """Hold a view's photo on the training's device: `image` (H, W, 3) uint8, sRGB-encoded, and `mask` (H, W) uint8 or None.
 
-    They may be a crop of a photo of the size `whole` (H, W), which is background beyond the crop.
+    The photo may be a crop of a photo of the size `whole` (H, W). Beyond the crop, the whole photo is background.
     """
 
     image: Tensor
@@ -46,9 +46,9 @@ class Photo(NamedTuple):
 
 
 class Objective(NamedTuple):
-    """Training loss of a view, a differentiable scalar, and mean squared error of the picture, clipped to 0..1.
+    """Hold the training loss of a view, a differentiable scalar, and the mean squared error of the picture, clipped to 0..1.
 
-    Means are over the full photo; pixels outside the crop count as error-free.
+    Both are means over the full photo. Pixels outside the crop count as error-free.
     """
 
     loss: Tensor
@@ -60,7 +60,7 @@ _Work = struct("Losses", "losses.cpp")
 
 @timed("loss")
 class _Objective(torch.autograd.Function):
-    """Objective as an autograd function. Derivatives are computed with the value."""
+    """Compute the objective as an autograd function. Its derivatives are computed together with its value."""
 
     DIFFERENTIABLE = "color", "normal", "depth", "alpha", "material", "light"
 
@@ -139,10 +139,10 @@ class _Objective(torch.autograd.Function):
 
 
 def departure(exposure: Tensor) -> Tensor:
-    """Penalise an exposure other than one, given its natural logarithm: its magnitude, rounded off below 2 %.
+    """Penalise an exposure other than one, given the exposure's natural logarithm.
 
-    Photos cannot tell a brighter light from longer exposures, so one of them must be held. Magnitudes, unlike squares, let a few photos
-    differ without moving the rest.
+    The penalty is the logarithm's magnitude, rounded off below 2 %. Photos cannot tell a brighter light from longer exposures, so one of
+    the two must be held. Magnitudes, unlike squares, let a few photos differ without moving the rest.
     """
     return torch.sqrt(exposure * exposure + ROUND_OFF**2) - ROUND_OFF
 
@@ -161,15 +161,15 @@ def objective(
       clipped: elsewhere an over-bright pixel must feel its gradient.
     - Normals: 1 − ÑᵀN, Ñ from the depth by central differences, where the surface is opaque around the pixel.
     - Smoothness: ‖∇N‖ exp(−‖∇C_gt‖), forward differences, where the surface is opaque. Metallic and roughness have a weight of their
-      own: no photo tells them where all that is mirrored is even.
+      own: where everything mirrored is even, no photo tells them.
     - Mask: |α − mask|.
-    - Light: squared departure from grey of its mean radiance (3,), where `light` is given. Warm metal under neutral light looks almost like
-      neutral metal under warm light: without this term white balance drifts. Only the mean is held, so that colours may differ by
-      direction. It must be the mean over what is seen mirrored: unseen texels would take on whatever colour the mean lacks.
+    - Light: squared departure from grey of the mean radiance `light` (3,), where it is given. Warm metal under neutral light looks almost
+      like neutral metal under warm light: without this term white balance drifts. Only the mean is held, so that colours may differ by
+      direction. The mean is over texels that are seen mirrored: unseen texels would take on the colour that the mean lacks.
     - Metallic m: m (1 − m) over the object, for nothing real is half a metal. Dielectrics' highlights, 4 % of the light and colourless,
       then fix the light's scale and white balance, which metals cannot. The weight grows with the square of the progress, for at first
       it is not known which is which.
-    - Dark metals: m of what is darker than any metal, by how much it is, from the start. A metal of 4 % would mirror as dark glass does.
+    - Dark metals: m times how much darker the surfel is than any metal, from the start. A metal of 4 % would mirror as dark glass does.
     - Roughness: by how much it exceeds 0.3, over the object. Where photos are clipped, or show nothing bright, a broad lobe explains as
       much as a sharp one, and forgives wrong normals.
     """

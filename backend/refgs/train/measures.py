@@ -1,4 +1,4 @@
-"""Errors of a training against held-out photos and the ground truth that a capture brings."""
+"""Measure a training's errors against held-out photos, and against the ground truth that a capture brings."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -22,7 +22,7 @@ ROWS = 128  # of the lights that are compared
 
 
 def held_out_psnr(state: State, most: int = VIEWS) -> float | None:
-    """Average the PSNR over at most this many of the held-out views; None where there are none."""
+    """Average the PSNR over at most `most` of the held-out views. Return None if there are no held-out views."""
     chosen = spread(state.test, most)
     if not chosen:
         return None
@@ -31,7 +31,7 @@ def held_out_psnr(state: State, most: int = VIEWS) -> float | None:
 
 
 class _Look(NamedTuple):
-    """A held-out view; its true maps, with the object's coverage; its true picture under another light."""
+    """Hold a held-out view, its true maps with the object's coverage, and its true picture under another light."""
 
     view: LoadedView
     known: dict[str, np.ndarray]
@@ -40,10 +40,10 @@ class _Look(NamedTuple):
 
 
 class Measures:
-    """A few fixed held-out views, with their ground truth.
+    """Measure a few fixed held-out views against their photos and their ground truth.
 
-    Ground truth is the capture's folder `ground_truth`, as `compare.truth.GroundTruth` reads it, or the normals of its data set. Where
-    its size is not that of the photos, a warning is reported and it is left out.
+    Ground truth is the capture's folder `ground_truth`, as `compare.truth.GroundTruth` reads it, or the normals of its data set. If its
+    size is not the photos' size, a warning is reported and ground truth is left out.
     """
 
     def __init__(self, state: State) -> None:
@@ -75,7 +75,7 @@ class Measures:
         return _Look(loaded, known, alpha, relit)
 
     def _read_lights(self, truth: GroundTruth, device: torch.device) -> None:
-        """Read the true light, and the light of the held-out relit pictures: the first that there are pictures under."""
+        """Read the true light, and the first of the other lights that the capture has relit pictures for."""
         if not self._method.lit:
             return
         if truth.has_light and self.settings.light.frame != "camera":  # the true light stands still
@@ -85,11 +85,11 @@ class Measures:
             self._light = Environment(light.radiance.to(device))
 
     def errors(self, state: State) -> dict[str, float]:
-        """Measure the mean errors that are known of a training as it stands.
+        """Measure the mean errors of a training as it stands, where the truth is known.
 
-        They are `psnr_test`, and against ground truth `normal_mae_degrees`, `albedo_psnr` (linear, one scale a channel aligned),
-        `metallic_mae`, `roughness_mae`, `light_log_rmse` (natural logarithm, one scale aligned) and `relit_psnr` (one scale aligned;
-        without inter-reflection).
+        Without ground truth there is `psnr_test`. With it there are `normal_mae_degrees`, `albedo_psnr` (linear, one scale a channel
+        aligned), `metallic_mae`, `roughness_mae`, `light_log_rmse` (natural logarithm, one scale aligned) and `relit_psnr` (one scale
+        aligned; without inter-reflection).
         """
         rows: dict[str, list] = {}
         for look in self._looks:
@@ -110,7 +110,7 @@ class Measures:
         return found
 
     def flip(self, state: State) -> dict[str, float]:
-        """Average FLIP, `flip_test`, over the first views."""
+        """Average FLIP over the first held-out views. Returns it as `flip_test`."""
         looks = self._looks[:FEWER]
         values = [self._against_photo(metrics.flip, state.render(look.view.camera), look) for look in looks]
         return {"flip_test": float(np.mean(values))} if values else {}
@@ -123,7 +123,7 @@ class Measures:
 
     @torch.no_grad()
     def _relit(self, state: State) -> float:
-        """PSNR of the first views under the held-out light, one scale aligned."""
+        """Compute the PSNR of the first views under the held-out light, with one scale aligned."""
         settings = self.settings.render.model_copy(update={"reflection": "microfacet"})
         surfels = state.surfels().without_directions()
         pairs = []

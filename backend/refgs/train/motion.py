@@ -1,4 +1,4 @@
-"""Each surfel's mean gradient on the screen, by which densification divides surfels."""
+"""Average each surfel's gradient on the screen. Densification divides the surfels whose mean gradient is large."""
 
 import torch
 from torch import Tensor
@@ -12,7 +12,10 @@ _Work = struct("Motion", "motion.cpp")
 
 
 class ScreenGradient:
-    """Mean gradient of the loss by a surfel's motion on the screen, in half image widths, as in 3D Gaussian splatting."""
+    """Average the gradient of the loss by each surfel's position on the screen.
+
+    Positions are in half image widths, as in 3D Gaussian splatting.
+    """
 
     def __init__(self, count: int, device: torch.device):
         self.total = torch.zeros(count, device=device)
@@ -21,7 +24,10 @@ class ScreenGradient:
     @timed("densification")
     @torch.no_grad()
     def add(self, position: Tensor, gradient: Tensor, camera: Camera, accepted: Tensor | None = None) -> None:
-        """Add one view's gradient (N, 3) by the world position (N, 3), unless `accepted`, a float32 scalar, is zero."""
+        """Add one view's gradient (N, 3) of the loss by the world `position` (N, 3).
+
+        If `accepted`, a float32 scalar, is zero, nothing is added.
+        """
         surfels = len(self.total)
         check(total=(self.total, (surfels,)), position=(position, (surfels, 3)), gradient=(gradient, (surfels, 3)))
         position, gradient, work = position.contiguous(), gradient.contiguous(), _Work(count=len(position))
@@ -32,5 +38,5 @@ class ScreenGradient:
         run("refgs_motion", work, position, items=work.count)
 
     def mean(self) -> Tensor:
-        """Average over the views (N,); zero where a surfel was never seen."""
+        """Return the mean over the views (N,). It is zero for a surfel that was never seen."""
         return self.total / self.views.clamp_min(1)

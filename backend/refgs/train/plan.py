@@ -1,4 +1,4 @@
-"""Plan of a training that was given a time: how many iterations fit, with its start and its end."""
+"""Plan how many iterations fit into a given time, with the training's start and end."""
 
 import time
 
@@ -13,7 +13,10 @@ MIRRORED = 1.2  # factor of an iteration's time for inter-reflection: 1 without,
 
 
 def iterations_time(growth: float, progress: float) -> float:
-    """Integrate iterations' time up to a progress of 0..1, where an iteration takes 1 at first and `growth` at the end."""
+    """Integrate the time of iterations up to a progress of 0..1.
+
+    An iteration takes 1 at first and `growth` at the end.
+    """
     first, last = GROWS
     ramp = min(max(progress - first, 0.0), last - first)
     more = ramp**2 / (2 * (last - first)) + max(progress - last, 0.0)
@@ -21,34 +24,43 @@ def iterations_time(growth: float, progress: float) -> float:
 
 
 def growth(first: int, last: int) -> float:
-    """Estimate the factor by which an iteration at the end, with `last` surfels, takes longer than one at the start, with `first`."""
+    """Estimate how many times longer an iteration takes at the end than at the start.
+
+    There are `first` surfels at the start and `last` at the end.
+    """
     return MIRRORED * (OTHERS + max(last, first)) / (OTHERS + first)
 
 
 class Plan:
-    """Time by which a training, its asset included, must have ended. Pauses do not count."""
+    """Plan a training that must end within a given time, its asset included. Pauses do not count."""
 
     def __init__(self, minutes: float | None):
-        """Start now; without `minutes` there is no limit."""
+        """Start the clock. Without `minutes` there is no limit."""
         self.minutes, self._begun = minutes, time.perf_counter()
         self.before = 0.0  # seconds spent before the run was resumed
         self._growth, self._marks = 1.0, [(0, 0.0)]
 
     @property
     def spent(self) -> float:
-        """Seconds since the command was given, and before it was resumed."""
+        """Return the seconds since the command was given, plus those spent before the run was resumed."""
         return self.before + time.perf_counter() - self._begun
 
     def wait(self, seconds: float) -> None:
-        """Do not count a pause."""
+        """Leave out the seconds of a pause."""
         self._begun += seconds
 
     def begin(self, iteration: int, growth: float) -> None:
-        """Start measuring the pace of iterations, which at the end are expected to take `growth` times as long."""
+        """Start measuring the pace of iterations.
+
+        An iteration at the end is expected to take `growth` times as long as one at the start.
+        """
         self._growth, self._marks = growth, [(iteration, self.spent)]
 
     def total(self, iteration: int, views: int) -> int | None:
-        """Plan the total of iterations, with so many photos, at the pace until now; None at iterations that do not plan."""
+        """Plan the total number of iterations from the pace until now. Return None at iterations that do not plan.
+
+        `views` is the number of photos, all of which are rendered for the asset.
+        """
         done = iteration - self._marks[0][0]
         if self.minutes is None or not (done == FIRST or (done > 0 and iteration % EVERY == 0)):
             return None
@@ -59,7 +71,7 @@ class Plan:
         pace, left = (now - then) / (iteration - half), 60 * self.minutes - now
 
         def ahead(total: int) -> float:
-            """Estimate the seconds that the rest of so many iterations take, and the asset after them."""
+            """Estimate the seconds left in a training of `total` iterations, its asset included."""
             whole, by_now, by_half = (
                 iterations_time(self._growth, k / total) * total for k in (total, iteration, half)
             )

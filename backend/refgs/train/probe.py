@@ -1,6 +1,7 @@
-"""Figures of a training that needs are decided by: what pictures lose without a part of the method, and what an iteration saves.
+"""Measure what pictures lose without a part of the method, and what time an iteration saves.
 
-All are of training views, at the moment of asking. Decibels are of the mean squared error over all views looked at.
+`refgs.train.needs` decides by these figures. All are of training views, at the time of the call. Decibels are computed from the mean
+squared error over all views looked at.
 """
 
 import math
@@ -27,7 +28,7 @@ Change = Callable[[RenderInputs], RenderInputs]
 
 
 def pooled(environment: Environment, side: int) -> Environment:
-    """Average the light's texels to so many along a side."""
+    """Average the light's texels, so that `side` of them are left along a side."""
     fine = environment.resolution // side
     texels = environment.radiance.reshape(6, side, fine, side, fine, 3).mean(dim=(2, 4))
     return Environment(texels.reshape(-1, 3), environment.reference)
@@ -39,7 +40,7 @@ def without_specular(inputs: RenderInputs) -> RenderInputs:
 
 
 def picture(state: State, view: int, inputs: RenderInputs, whole: bool = False) -> Rendering:
-    """Render the part of a view that is trained on, or all of it."""
+    """Render the part of a view that is trained on, or the whole view if `whole` is true."""
     return state.picture(inputs, state.photo(view, whole).camera, state.exposure(view))
 
 
@@ -53,18 +54,18 @@ def squared_error(color: Tensor, photo: Photo, background: Tensor) -> float:
 
 
 def decibels_lost(errors: list[float], without: list[float]) -> float:
-    """Compute by how much the PSNR falls from mean squared errors to others."""
+    """Compute how many dB the PSNR falls from mean squared errors `errors` to mean squared errors `without`."""
     return 10 * math.log10(max(sum(without), 1e-12) / max(sum(errors), 1e-12))
 
 
 def spread_views(state: State, most: int = VIEWS) -> list[int]:
-    """Choose at most this many training views, evenly."""
+    """Choose at most `most` training views, evenly spaced."""
     return [*spread(range(len(state.photos)), most)]
 
 
 @torch.no_grad()
 def squared_errors(state: State, inputs: RenderInputs) -> list[float]:
-    """Compute mean squared errors of training views."""
+    """Compute the mean squared error of each of a few training views."""
     found = []
     for view in spread_views(state):
         found.append(squared_error(picture(state, view, inputs).color, state.photo(view), state.background))
@@ -73,16 +74,17 @@ def squared_errors(state: State, inputs: RenderInputs) -> list[float]:
 
 @torch.no_grad()
 def psnr_loss(state: State, change: Change) -> float:
-    """Compute the PSNR, in dB, that training views lose by a change."""
+    """Compute how many dB of PSNR the training views lose by a change."""
     inputs = state.inputs()
     return decibels_lost(squared_errors(state, inputs), squared_errors(state, change(inputs)))
 
 
 @torch.enable_grad()
 def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: bool = False) -> float:
-    """Time an iteration without and with a change, and give the seconds saved in the iterations that are left.
+    """Time an iteration without and with a change. Return the seconds saved in the iterations that are left.
 
-    With `whole`, time the whole photo and the part that is trained on. The optimiser's step is in neither.
+    If `whole` is true, the first timing is of the whole photo, the second of the part that is trained on. The optimiser's step is left out
+    of both.
     """
     fastest = [math.inf, math.inf]
     for _ in range(REPEATS):
@@ -100,10 +102,10 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
 
 @torch.no_grad()
 def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: list[Tensor] | None = None) -> Tensor:
-    """Compute each surfel's weight in each photo, in pixels (V, N).
+    """Compute each surfel's blending weight in each photo, summed over the photo's pixels (V, N).
 
-    With `maps` (H, W, C) of the photos, compute instead each surfel's mean of them by that weight (N, C). Both are gradients of a sum of
-    constant features.
+    If `maps` (H, W, C) of the photos are given, return each surfel's mean of the maps by that weight instead (N, C). Both are gradients of
+    a sum of constant features.
     """
     surfels, count, rows = Surfels(*(value.detach() for value in surfels)), len(surfels.positions), []
     width = 1 if maps is None else maps[0].shape[-1] + 1
@@ -123,9 +125,10 @@ def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: lis
 
 @torch.no_grad()
 def specular_explains(state: State) -> float:
-    """Compute how many dB of training views the specular part explains beyond one colour a surfel, the same from everywhere.
+    """Compute how many dB of training views the specular part explains.
 
-    That colour is the surfel's mean of the specular part, by its weight in the pixels: a matte surface learns as much by its albedo.
+    The pictures are compared with pictures in which each surfel's specular part is one colour, the same from everywhere. That colour is
+    the mean of the specular part, by the surfel's weight in the pixels: a matte surface learns as much by its albedo.
     """
     inputs, some = state.inputs(), spread_views(state, SEVERAL)
     photos, dull = [state.photo(view) for view in some], without_specular(inputs)
@@ -147,10 +150,10 @@ def specular_explains(state: State) -> float:
 
 @torch.no_grad()
 def reflections_explain(state: State) -> float:
-    """Bound, in dB, what inter-reflection can explain of training views.
+    """Bound how many dB of training views inter-reflection can explain.
 
-    It compares mirroring black, where the object mirrors itself, with mirroring the light there, relative to the pictures' errors: what
-    the object really mirrors lies between.
+    Where the object mirrors itself, mirroring black is compared with mirroring the environment's light. The object's real mirror image
+    lies between the two. The difference is relative to the pictures' errors.
     """
     inputs, wrong, apart = state.inputs(), 0.0, 0.0
     black = inputs.surfels._replace(
@@ -168,7 +171,7 @@ def reflections_explain(state: State) -> float:
 
 @torch.no_grad()
 def quantile(values: Tensor, weight: Tensor, part: float) -> float:
-    """Find the value (N,) below which this part of the weight (N,) is."""
+    """Find the value below which `part` of the weight lies, for values (N,) with weights (N,)."""
     order = values.argsort()
     share = weight[order].cumsum(dim=0) / weight.sum().clamp_min(1e-9)
     return float(values[order][int((share < part).sum().clamp_max(len(order) - 1))])

@@ -1,4 +1,4 @@
-"""Learning rates of an iteration: decay, and what holds still at which stage."""
+"""Set the learning rates of an iteration: decay them, and hold parameters still at some stages."""
 
 from refgs.train.densify import since_propagation
 from refgs.train.start import GEOMETRY
@@ -8,7 +8,7 @@ REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest",
 
 
 def set_rates(state: State, progress: float) -> None:
-    """Set each group's rate for a progress of 0..1."""
+    """Set the learning rate of each of the optimiser's groups, for a progress of 0..1."""
     rates, late = state.settings.rates, state.residual_start
     frozen = _frozen(state, progress)
     for group in state.optimizer.param_groups:
@@ -30,7 +30,7 @@ def _start_rate(state: State, name: str) -> float:
 
 
 def _frozen(state: State, progress: float) -> set[str]:
-    """List the parameters that hold still."""
+    """List the parameters that hold still at this iteration."""
     settings, frozen = state.settings, set()
     if state.from_hull and state.iteration < settings.train.light_first and state.method.deferred:
         frozen |= {*GEOMETRY}

@@ -1,4 +1,7 @@
-"""Setting up a training: photos, the light's frame, surfels, the optimiser; and setting up anew for the deferred stage."""
+"""Set up a training: photos, the light's frame, surfels, the optimiser.
+
+Surfels are set up anew for the deferred stage.
+"""
 
 from pathlib import Path
 
@@ -20,7 +23,7 @@ from refgs.train.trace import why_not_traced
 
 
 def set_up(capture: Capture, effective: Effective, folder: Path, report: Report, plan: Plan, device: str) -> State:
-    """Read a capture's photos and make all that learns, ready for the first iteration."""
+    """Read a capture's photos and make everything that learns, ready for the first iteration."""
     state = State(capture, effective, folder, report, plan, device)
     needs.evaluate_due(state, "photos")
     state.photos = [Photo.of(view, state.device) for view in state.views]
@@ -35,7 +38,10 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
 
 
 def _choose_light_frame(state: State, start: Parameters, shown: int) -> None:
-    """Ask the photos for the light's frame, where the settings leave it to them. The first surfels, `shown`, lie on the hull."""
+    """Choose the light's frame from the photos, if the settings leave it to them.
+
+    The first `shown` of the initial surfels lie on the visual hull.
+    """
     lit = state.method.lit
     if state.settings.light.frame != "auto":
         return
@@ -52,7 +58,10 @@ def _choose_light_frame(state: State, start: Parameters, shown: int) -> None:
 
 
 def _start_learning(state: State) -> None:
-    """Make light, exposures and the optimiser; set parameters aside that this run's shading never reads."""
+    """Make light, exposures and the optimiser.
+
+    Parameters that this run's shading never reads are set aside.
+    """
     settings, method = state.settings, state.method
     texels = torch.empty(6 * light.resolution(settings, 0) ** 2, 3, device=state.device)
     state.light = texels.fill_(light.start_value(state)).requires_grad_()
@@ -69,7 +78,7 @@ def _start_learning(state: State) -> None:
 
 
 def _set_constants_aside(state: State) -> None:
-    """Move parameters that the shading never reads to the constants, one row each."""
+    """Move parameters that the shading never reads to the constants, where each has one row for all surfels."""
     method, diffuse = state.method, state.settings.render.diffuse
     unused = [*method.unread]
     if method.lit and diffuse == "irradiance":
@@ -87,7 +96,10 @@ def _set_constants_aside(state: State) -> None:
 
 @torch.no_grad()
 def start_deferred(state: State) -> None:
-    """End the stage in which surfels are shaded one by one: colour, material and light start anew on its geometry (paper §3.3)."""
+    """End the first stage, in which surfels are shaded one by one.
+
+    Colour, material and light start anew on this stage's geometry (paper §3.3).
+    """
     state.initial = False
     for name, row in start_appearance(state.settings).items():
         if name in state.parameters:

@@ -1,4 +1,4 @@
-"""Checkpoint of a training's state: everything that the next iteration depends on."""
+"""Save and restore a training's state: everything that the next iteration depends on."""
 
 import numpy as np
 import torch

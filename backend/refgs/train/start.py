@@ -1,4 +1,4 @@
-"""Where surfels start: on the visual hull, on structure-from-motion points, or at random."""
+"""Place the first surfels on the visual hull, on structure-from-motion points, or at random."""
 
 import math
 
@@ -19,8 +19,8 @@ AROUND = 0.5  # part of the surfels, at the most, that lie outside the region
 def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings) -> tuple[Parameters, int, str]:
     """Make the initial parameters.
 
-    Returns with them how many of the surfels, the first ones, lie on the known surface, and a line that says where all came from. The
-    others start inside the visual hull, for hollows that no mask shows.
+    Returns also how many surfels lie on the known surface, and a line that says where all surfels came from. The surfels on the surface
+    are the first ones. Other surfels start inside the visual hull, for hollows that no mask shows.
     """
     count, seed = min(settings.surfels.start, settings.surfels.budget), settings.train.seed
     colours, opacity, shown = None, settings.surfels.opacity, count
@@ -63,7 +63,10 @@ def _initial(positions, normals, spacing, colours, surfels: SurfelSettings, opac
 
 
 def _hull(capture: Capture, views: list[LoadedView], count: int, settings: Settings):
-    """Place points on the masks' visual hull and inside it. Returns positions, normals, spacing, and how many are on it: the first."""
+    """Place points on the masks' visual hull and inside it.
+
+    Returns positions, normals, spacing, and how many points are on the hull. These points are the first ones.
+    """
     alphas, cameras = [view.alpha for view in views], [view.camera for view in views]
     surfels, seed = settings.surfels, settings.train.seed
 
@@ -96,9 +99,10 @@ def _hull(capture: Capture, views: list[LoadedView], count: int, settings: Setti
 def _in_and_around(
     box: Box, near: np.ndarray, around: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose at random points `near` (N, 3) that lie in the box and points `around` (M, 3) that do not.
+    """Choose at random from the points `near` (N, 3) inside the box, and from the points `around` (M, 3) outside it.
 
-    Returns their indices, at most `count` in all, of which AROUND are outside. Raises InputError where none is in the box.
+    Returns the indices of both, at most `count` in all. At most AROUND of `count` are outside. Raises InputError if no point is in the
+    box.
     """
     rng = np.random.default_rng(seed)
     inner, outer = np.flatnonzero(box.contains(near)), np.flatnonzero(~box.contains(around))
@@ -109,7 +113,7 @@ def _in_and_around(
 
 
 def _has_points(capture: Capture) -> bool:
-    """Tell whether structure from motion found enough points in the region to start from."""
+    """Tell whether structure from motion found enough points to start from in the region to train."""
     if capture.points is None:
         return False
     return len(capture.points if capture.box is None else capture.points[capture.box.contains(capture.points)]) >= 100
@@ -125,9 +129,9 @@ def _thinned(capture: Capture, count: int, seed: int):
 
 
 def _random(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """Place points at random: uniform in the ball of interest, or in the region where there is one.
+    """Place points at random, uniform in the ball of interest, or in the region to train if there is one.
 
-    In a room, or around a region, a part lies beyond, uniform in inverse distance.
+    In a room, or around a region, some points lie farther out, uniform in inverse distance.
     """
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))
@@ -146,14 +150,17 @@ def _random(capture: Capture, count: int, seed: int) -> np.ndarray:
 
 
 def _towards_cameras(positions: np.ndarray, views: list[LoadedView]) -> np.ndarray:
-    """Point unit vectors (N, 3) from each point to the nearest camera: a surface that was seen faces a camera."""
+    """Compute the unit vectors (N, 3) from each point to the nearest camera.
+
+    They stand for normals: a surface that was seen faces a camera.
+    """
     cameras = np.stack([view.camera.position for view in views])
     towards = cameras[cKDTree(cameras).query(positions)[1]] - positions
     return towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
 
 
 def _spacing(positions: np.ndarray) -> np.ndarray:
-    """Compute the mean distance (N,) to the three nearest neighbours."""
+    """Compute each point's mean distance (N,) to its three nearest neighbours."""
     k = min(4, len(positions))
     distance = cKDTree(positions).query(positions, k=k)[0][:, 1:] if k > 1 else np.ones((len(positions), 1))
     return np.maximum(distance.mean(axis=1), 1e-7)

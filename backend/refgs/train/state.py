@@ -1,4 +1,4 @@
-"""State of a training: what it works on, what it learns, and what was decided about it."""
+"""Hold the state of a training: what it works on, what it learns, and what was decided about it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,12 +25,12 @@ from refgs.train.plan import Plan
 
 
 def spread(items: Sequence, most: int) -> Sequence:
-    """Choose at most this many items, evenly."""
+    """Choose at most `most` items, evenly spaced."""
     return items[:: max(1, len(items) // most)][:most]
 
 
 class RenderInputs(NamedTuple):
-    """All that a picture is rendered from, except the camera and its exposure."""
+    """Hold everything that a picture is rendered from, except the camera and the camera's exposure."""
 
     surfels: Surfels
     environment: Environment | None
@@ -39,9 +39,10 @@ class RenderInputs(NamedTuple):
 
 
 class State:
-    """A training as it stands: read from a capture here, made ready by `train/setup.py`, moved on by `train/trainer.py`.
+    """Hold a training as it stands.
 
-    The second block of attributes is what a checkpoint holds (`train/snapshot.py`); the first is made anew when a run is resumed.
+    The constructor reads the capture's photos, `train/setup.py` makes the state ready, and `train/trainer.py` moves it on. The second
+    block of attributes is what a checkpoint holds (`train/snapshot.py`). The first block is made anew when a run is resumed.
     """
 
     def __init__(
@@ -79,12 +80,12 @@ class State:
 
     @property
     def settings(self) -> Settings:
-        """The settings in effect."""
+        """Return the settings in effect."""
         return self.effective.settings
 
     @property
     def method(self) -> Method:
-        """How surfels and light become pictures."""
+        """Return the method by which surfels and light become pictures."""
         return method_of(self.settings.render)
 
     @property
@@ -93,20 +94,23 @@ class State:
 
     @property
     def residual_start(self) -> float:
-        """The part of the training after which colour by direction learns what material and light leave over; 1: it never does."""
+        """Return the progress at which the residual starts to learn, or 1 if it never does.
+
+        The residual is the colour by direction that material and light leave over.
+        """
         settings = self.settings
         return settings.residual.start if self.method.deferred and settings.render.diffuse == "irradiance" else 1.0
 
     @property
     def losses(self) -> LossSettings:
-        """The objective's weights. Matte surfels have no metallic or roughness to weigh."""
+        """Return the objective's weights. Matte surfels have no metallic or roughness, so these terms weigh nothing for them."""
         weights = self.settings.loss
         if self.settings.render.reflection == "none":
             return weights.model_copy(update={"even": 0.0, "metallic": 0.0, "matte": 0.0})
         return weights
 
     def surfels(self) -> Surfels:
-        """Activate the surfels, with the values of what does not learn filled in."""
+        """Activate the surfels. A parameter that does not learn has one value for all surfels."""
         count, late = len(self.parameters["position"]), self.residual_start
         values = activate({**self.parameters, **self.constant})
         unlearned = late == 1 or self.iteration < late * self.total
@@ -115,64 +119,67 @@ class State:
         return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
 
     def environment(self) -> Environment | None:
-        """Make the light of its raw texels; None where nothing is lit."""
+        """Make the light from its raw texels. Return None where nothing is lit."""
         if not self.method.lit:
             return None
         reference = self.views[0].camera if self.settings.light.frame == "camera" else None
         return Environment(self.method.light.radiance(self.light), reference)
 
     def inputs(self) -> RenderInputs:
-        """Gather what pictures are rendered from at this stage."""
+        """Gather everything that pictures are rendered from at this stage."""
         settings = self.settings.render
         settings = initial_stage(settings) if self.initial else settings
         return RenderInputs(self.surfels(), self.environment(), settings, self.occluder)
 
     def picture(self, inputs: RenderInputs, camera: Camera, exposure: Tensor | None = None) -> Rendering:
-        """Render a camera, with gradients."""
+        """Render a camera's picture, with gradients."""
         surfels, environment, settings, occluder = inputs
         return render(surfels, environment, camera, self.background, settings, self.near, occluder, exposure)
 
     @torch.no_grad()
     def render(self, camera: Camera, surfels: Surfels | None = None) -> Rendering:
-        """Render a camera without gradients: all surfels, or those given."""
+        """Render a camera's picture without gradients, from `surfels` if they are given, else from all surfels."""
         inputs = self.inputs()
         return self.picture(inputs if surfels is None else inputs._replace(surfels=surfels), camera)
 
     def photo(self, view: int, whole: bool = False) -> Photo:
-        """Give the part of a view's photo that is trained on, or all of it."""
+        """Return the part of a view's photo that is trained on, or the whole photo if `whole` is true."""
         return self.photos[view] if whole or self.crops is None else self.photos[view].part(*self.crops[view])
 
     def exposure(self, view: int) -> Tensor | None:
-        """Give the factor of a photo's radiance; None where photos have no exposures of their own."""
+        """Return the factor of a photo's radiance. Return None where photos have no exposures of their own."""
         return None if self.exposures is None else self.exposures[view].exp()
 
     def spread_cameras(self, least: int) -> list[Camera]:
-        """Cameras of at least this many training views, evenly chosen; of all where there are fewer."""
+        """Return the cameras of at least `least` training views, evenly spaced. If there are fewer views, return all cameras."""
         return [view.camera for view in self.views[:: max(1, len(self.views) // least)]]
 
     def wanted(self) -> Tensor:
-        """Tell which surfels (N,) lie in the region, all where there is none. The others show what photos show beside it."""
+        """Tell which surfels (N,) lie in the region to train. Without a region, all do.
+
+        The other surfels show what photos show beside the region.
+        """
         position, box = self.parameters["position"], self.capture.box
         if box is None:
             return torch.ones(len(position), dtype=torch.bool, device=self.device)
         return torch.from_numpy(box.contains(position.numpy(force=True))).to(self.device)
 
     def announce(self, about: str, what: str) -> None:
-        """Report a decision once, and again only where it changes."""
+        """Report a decision once, and again only if it changes."""
         if self.decided.get(about) != what:
             self.decided[about] = what
             self.report("decided", {"about": about, "what": what})
 
     def change(self, key: str, value: Any, by: str, why: str) -> None:
-        """Change a setting, `section.name`, from here on."""
+        """Change a setting from here on, given by its key `section.name`."""
         self.effective = self.effective.changed(key, value, by, why)
 
     def group(self, name: str) -> dict[str, Any]:
-        """Give the optimiser's group of a parameter."""
+        """Return the optimiser's group of a parameter."""
         return next(group for group in self.optimizer.param_groups if group["name"] == name)
 
     def leave_out(self, *names: str) -> None:
-        """Stop learning these parameters; the first surfel's values stand for all."""
+        """Stop learning these parameters. The first surfel's values then stand for all surfels."""
         for name in names:
             if name in self.parameters:
                 value = self.parameters.pop(name)
@@ -181,7 +188,7 @@ class State:
         self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] not in names]
 
     def shorten(self, name: str, count: int) -> None:
-        """Keep only the first harmonics' coefficients of a parameter."""
+        """Keep only the first `count` of a parameter's harmonic coefficients."""
         old, new = self.parameters[name], self.parameters[name].detach()[:, :count].contiguous().requires_grad_()
         state = self.optimizer.state.pop(old, {})
         self.group(name)["params"][0] = self.parameters[name] = new
@@ -190,13 +197,13 @@ class State:
             self.optimizer.state[new] = state | moments
 
     def without_exposures(self) -> None:
-        """Stop learning exposures: each photo's is one."""
+        """Stop learning exposures. Each photo's exposure is then one."""
         self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] != "exposure"]
         self.optimizer.state.pop(self.exposures, None)
         self.exposures = None
 
     def reset_motion(self) -> None:
-        """Forget the gradients by which surfels are divided: they are of other surfels."""
+        """Forget the screen gradients by which surfels are divided, because the surfels have been replaced."""
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
 
     def forget_gradients(self) -> None:

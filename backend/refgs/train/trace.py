@@ -1,4 +1,4 @@
-"""Inter-reflection: the mesh that it is traced on, and whether a training has it at all."""
+"""Trace inter-reflection on a mesh of the surfels, and say whether a training has inter-reflection at all."""
 
 import torch
 
@@ -18,7 +18,7 @@ VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer
 
 
 def why_not_traced(state: State) -> str:
-    """Say why this run looks for no inter-reflection; "" where it does."""
+    """Say why this run traces no inter-reflection. Return "" if it traces it."""
     settings = state.settings
     if not state.method.deferred:
         return f"shading = {settings.render.shading}"
@@ -36,7 +36,7 @@ def why_not_traced(state: State) -> str:
 
 
 def trace_due(state: State, progress: float) -> None:
-    """Make a new mesh at the iterations that are due for one."""
+    """Make a new mesh, and trace on it, at the iterations that are due for one."""
     settings = state.settings.indirect
     # Materials would no longer adapt to a mesh that is made after the residual has started to learn.
     learns = settings.start <= progress < state.residual_start
@@ -49,7 +49,7 @@ def trace_due(state: State, progress: float) -> None:
 
 @torch.no_grad()
 def _trace(state: State) -> None:
-    """Extract the mesh, decide by it whether inter-reflection is needed, and trace the irradiance that surfels receive."""
+    """Extract the mesh, decide whether inter-reflection is needed, and trace the irradiance that surfels receive."""
     capture, cameras = state.capture, state.spread_cameras(VIEWS)
     state.occluder = None
     inputs = state.inputs()

@@ -1,4 +1,4 @@
-"""Training loop: one view, one step, and at stated iterations refine, decide, divide, record."""
+"""Train by iterations of one view and one step. At stated iterations refine, decide, divide and record."""
 
 import time
 from collections.abc import Callable
@@ -25,7 +25,7 @@ REPORT_EVERY = 10  # iterations
 
 
 class Trainer:
-    """Learn a capture. After each checkpoint the run folder holds the whole state."""
+    """Train on a capture. After each checkpoint the run folder holds the whole state."""
 
     def __init__(
         self,
@@ -44,7 +44,10 @@ class Trainer:
         self._order: tuple[int, list[int]] = (-1, [])
 
     def step(self) -> dict[str, Tensor]:
-        """Do one iteration. Returns its loss and mean squared error, which a card may still be computing."""
+        """Do one iteration. Returns its loss and its mean squared error.
+
+        A card may still be computing the two tensors.
+        """
         state, view = self.state, self._next_view()
         progress = min(state.iteration / state.total, 1.0)
         photo = state.photo(view, whole=state.iteration % needs.WHOLE_EVERY == 0)
@@ -77,7 +80,10 @@ class Trainer:
         return {"loss": loss.detach(), "square": square}
 
     def _next_view(self) -> int:
-        """Take every view once an epoch. The order depends on the seed and the epoch alone, so that a resumed run takes the same."""
+        """Choose the next view. An epoch takes every view once.
+
+        The order depends on the seed and the epoch alone, so that a resumed run takes the same order.
+        """
         epoch, place = divmod(self.state.iteration, len(self.state.views))
         if self._order[0] != epoch:
             generator = torch.Generator().manual_seed(self.state.settings.train.seed * 1_000_003 + epoch)
@@ -85,7 +91,10 @@ class Trainer:
         return self._order[1][place]
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> bool:
-        """Train to the end, or until `stop` says so. A checkpoint is written either way. Returns whether the end was reached."""
+        """Train to the end, or until `stop` returns true. Returns whether the end was reached.
+
+        A checkpoint is written in both cases.
+        """
         state, means = self.state, {}
         before, first = state.seconds, state.iteration
         state.plan.begin(state.iteration, growth(len(state.parameters["position"]), state.settings.surfels.budget))
@@ -118,14 +127,20 @@ class Trainer:
         history.record(self.state, self.measures, float(means["loss"]), decibels(float(means["square"])))
 
     def _waited(self, stop: Callable[[], bool]) -> bool:
-        """Ask `stop`, which may pause the training: a plan does not count that time."""
+        """Call `stop` and return its answer.
+
+        `stop` may pause the training. The plan does not count that time.
+        """
         begun = time.perf_counter()
         stopped = stop()
         self.state.plan.wait(time.perf_counter() - begun)
         return stopped
 
     def iterate(self) -> dict[str, Tensor]:
-        """Do a `step` and count its seconds; where the card's memory is full, with fewer surfels from here on."""
+        """Do a `step` and count its seconds.
+
+        If the card's memory is full, train with fewer surfels from here on.
+        """
         begun, used = time.perf_counter(), time.process_time()
         figures = self._attempt()
         while figures is None:  # out of the attempt, whose traceback held its tensors
@@ -136,7 +151,7 @@ class Trainer:
         return figures
 
     def _attempt(self) -> dict[str, Tensor] | None:
-        """Try a step. Returns None where the card's memory is full."""
+        """Try a step. Return None if the card's memory is full."""
         try:
             with self.state.clock.iteration(self.state.iteration):
                 return self.step()
@@ -144,13 +159,16 @@ class Trainer:
             return None
 
     def save(self) -> None:
-        """Write a checkpoint, once all of the state is finite."""
+        """Write a checkpoint, after making sure that all of the state is finite."""
         self._check(whole=True)
         with self.state.clock.part("writing"):
             snapshot.save(self.state)
 
     def _check(self, whole: bool) -> None:
-        """Have the guard look, and go back to the last checkpoint where it says so. The time spent since counts."""
+        """Let the guard check the state. Go back to the last checkpoint if the guard says so.
+
+        The time spent since that checkpoint counts.
+        """
         state = self.state
         if why := self.guard.look(state, whole):
             spent = state.seconds, dict(state.clock.seconds), state.plan.before

@@ -1,8 +1,8 @@
-"""Needs: parts of the method that a scene may do without.
+"""Decide which needs a scene has. A need is a part of the method that a scene may do without.
 
-Each decision compares a figure of the training with a threshold, and is recorded in needs.json. Settings, parameters and photos are
-changed accordingly; nothing else looks at a decision. Its cost is the PSNR of training views rendered with and without; its saving is the
-seconds of an iteration with and without, times the iterations that were left.
+Each decision compares a figure of the training with a threshold, and is recorded in needs.json. If a part is not needed, settings,
+parameters and photos are changed accordingly. The decision's cost is the PSNR that training views lose without the part. Its saving is the
+seconds that an iteration saves, times the iterations that were left.
 """
 
 from typing import Any
@@ -45,7 +45,10 @@ __all__ = [
 
 
 def evaluate_due(state: State, moment: Moment, *given: Any, progress: float = 0.0) -> list[str]:
-    """Decide the needs that are due at a moment, 0..1 into the training. Returns their names."""
+    """Decide the needs that are due at a moment of the training (see `Moment`). Returns their names.
+
+    A need is a part of the method that a scene may do without. `progress` is 0..1.
+    """
     decided: list[str] = []
     for need in NEEDS:
         asked = moment in need.moments or need.follows in decided
@@ -58,7 +61,7 @@ def evaluate_due(state: State, moment: Moment, *given: Any, progress: float = 0.
 
 
 def evaluate_iteration(state: State, progress: float) -> None:
-    """Decide the needs that are due after an iteration."""
+    """Decide the needs (parts of the method that a scene may do without) that are due after an iteration."""
     if state.initial or not state.method.deferred or state.settings.render.diffuse != "irradiance" or faint_now(state):
         return
     time_crops(state)
@@ -66,13 +69,16 @@ def evaluate_iteration(state: State, progress: float) -> None:
 
 
 def evaluate_mesh(state: State, hidden: float) -> None:
-    """Decide by a mesh, where that is not decided yet, whether inter-reflection is needed; else say how much the object mirrors itself."""
+    """Decide whether inter-reflection is needed, unless that is decided already.
+
+    Otherwise say how much the object mirrors itself. `hidden` is the part of the object's pixels that mirror the object.
+    """
     if not evaluate_due(state, "mesh", hidden):
         state.announce("reflections", f"with {Reflections.what}: {share_hidden(hidden)}")
 
 
 def _record(state: State, need: Need, decision: Decision) -> None:
-    """Keep and announce a decision, and do without what is not needed."""
+    """Record and announce a decision. If the need's part of the method is not needed, leave it out."""
     found: dict[str, Any] = {"needed": decision.needed, "why": decision.why}
     if decision.statistic is not None:
         found["statistic"] = float(decision.statistic)
@@ -85,7 +91,10 @@ def _record(state: State, need: Need, decision: Decision) -> None:
 
 
 def restore(state: State, recorded: dict[str, dict[str, Any]]) -> None:
-    """Take a checkpoint's decisions; those made since it, where the training goes back, stay."""
+    """Take over a checkpoint's decisions, and leave out again what is not needed.
+
+    When the training goes back to a checkpoint, decisions made since then stay.
+    """
     state.needs = recorded | state.needs
     for name, found in state.needs.items():
         if not found["needed"]:
@@ -93,7 +102,7 @@ def restore(state: State, recorded: dict[str, dict[str, Any]]) -> None:
 
 
 def rows(state: State) -> list[dict[str, Any]]:
-    """List the decisions for needs.json."""
+    """List the decisions as the rows of needs.json."""
     listed = []
     for name, found in state.needs.items():
         row = {"need": name, "what": BY_NAME[name].what, **found}

@@ -1,4 +1,4 @@
-"""Needs of the lighting: inter-reflection, the light's texels, harmonics' degrees."""
+"""Decide whether a scene needs inter-reflection, all texels of the environment's light, and all degrees of harmonics."""
 
 import math
 from typing import Any
@@ -13,7 +13,7 @@ from refgs.train.state import RenderInputs, State
 
 
 class Reflections(Need):
-    """Inter-reflection of the object in itself."""
+    """Decide whether the scene needs inter-reflection: the object's mirror image in itself."""
 
     name, what = "reflections", "inter-reflection"
     threshold = 0.1  # dB
@@ -25,7 +25,7 @@ class Reflections(Need):
 
     @torch.no_grad()
     def measure(self, state: State, hidden: float = 0.0) -> Decision:
-        """Decide by the part of the object's pixels in whose mirror direction the object itself stands."""
+        """Decide by `hidden`, the part of the object's pixels whose mirror direction hits the object itself."""
         if self.asked(state) == "off":
             return Decision(False, ASKED)
         why, least = share_hidden(hidden), state.settings.indirect.least
@@ -49,12 +49,15 @@ class Reflections(Need):
 
 
 def share_hidden(hidden: float) -> str:
-    """Say how much of the object mirrors the object."""
+    """Say in words on what part of its pixels the object mirrors itself."""
     return f"the object mirrors itself on {hidden:.1%} of it"
 
 
 class Light(Need):
-    """Texels of the light finer than the sharpest image of it on the object."""
+    """Decide whether the scene needs all texels of the environment's light.
+
+    If not, the light keeps the fewest texels that resolve the object's sharpest reflections.
+    """
 
     name, what = "light", "all of the light's texels"
     threshold, reason = 0.01, "dB; a coarser light that costs more is not taken, whatever the roughness"
@@ -102,9 +105,9 @@ class Light(Need):
 
 
 def resolvable(roughness: float, part: float, finest: int, coarsest: int) -> int:
-    """Choose the fewest texels along a side that show a roughness's lobe, between `coarsest` and `finest`.
+    """Choose the fewest texels along a side that resolve a roughness's lobe, between `coarsest` and `finest`.
 
-    A texel may take this part of the lobe's width, the square of the roughness in radians.
+    A texel may take at most `part` of the lobe's width. This width, in radians, is the square of the roughness.
     """
     side = coarsest
     while side < finest and math.pi / 2 / side > part * roughness**2:
@@ -113,7 +116,10 @@ def resolvable(roughness: float, part: float, finest: int, coarsest: int) -> int
 
 
 class Degrees(Need):
-    """Higher degrees of harmonics, of the residual and of the light that the object sends itself."""
+    """Decide whether the scene needs all degrees of harmonics.
+
+    There are harmonics of the colour by direction that material and light leave over, and of the light that the object sends itself.
+    """
 
     name, what = "degrees", "all degrees of harmonics"
     threshold, reason = 0.01, "dB of the training views: nobody sees it"
@@ -157,6 +163,6 @@ class Degrees(Need):
 
 
 def _shortened(inputs: RenderInputs, field: str, count: int) -> RenderInputs:
-    """Keep only the first coefficients of a field."""
+    """Keep only the first `count` coefficients of a field."""
     values = {field: getattr(inputs.surfels, field)[:, :count]}
     return inputs._replace(surfels=inputs.surfels._replace(**values))

@@ -1,4 +1,4 @@
-"""Needs of the materials: specular shading, and columns of splats.ply where all surfels have the same value."""
+"""Decide whether a scene needs specular shading, and columns for metallic and roughness in splats.ply."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ INDIRECT = "indirect_dc", "indirect_rest", "received"
 
 
 class Specular(Need):
-    """Specular shading: metallic, roughness and inter-reflection."""
+    """Decide whether the scene needs specular shading: metallic, roughness and inter-reflection."""
 
     name, what = "specular", "specular shading"
     threshold = 0.3  # dB
@@ -52,7 +52,10 @@ class Specular(Need):
 
 
 class Constants(Need):
-    """Columns of splats.ply for metallic and roughness."""
+    """Decide whether splats.ply needs columns for metallic and roughness.
+
+    A column is left out if all surfels have about the same value.
+    """
 
     name, what = "constants", "columns for metallic and roughness"
     threshold, reason = 1 / 255, "no 8-bit texture shows a smaller spread"
@@ -73,7 +76,10 @@ class Constants(Need):
 
     @torch.no_grad()
     def common(self, state: State, surfels: Surfels, kept: Tensor) -> dict[str, tuple[float, float]]:
-        """Find the value, and its spread, of metallic and roughness where all surfels kept (N,) have about the same."""
+        """Find which of metallic and roughness are about the same for all surfels in `kept` (N,).
+
+        Returns the common value and its spread, by name.
+        """
         if self.asked(state) == "on" or not state.method.lit:
             return {}
         photos = [state.photo(view) for view in probe.spread_views(state)]

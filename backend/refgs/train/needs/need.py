@@ -1,4 +1,4 @@
-"""Shape of a need: a part of the method that a scene may do without, and how that is decided."""
+"""Define a need, a part of the method that a scene may do without, and the decision about it."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -15,10 +15,10 @@ MEGA = 1e6
 
 
 class Decision(NamedTuple):
-    """What was found about a need.
+    """Hold the decision about a need.
 
-    `statistic` was compared with `threshold`, the need's own unless another is given. `figures` say what is saved, in `seconds` and
-    `megabytes`, and what it cost, in `decibels` of the training views' PSNR; and what `Need.apply` reads.
+    `statistic` was compared with `threshold`; None stands for the need's own threshold. `figures` say what was saved, in `seconds` and
+    `megabytes`, and what it cost, in `decibels` of the training views' PSNR. They also hold numbers that `Need.apply` reads.
     """
 
     needed: bool
@@ -32,7 +32,7 @@ class Decision(NamedTuple):
 
 
 class Need:
-    """One entry of the table in `refgs.train.needs`."""
+    """Describe a part of the method that a scene may do without. `refgs.train.needs` lists all of them."""
 
     name: ClassVar[str]  # also in the settings' `needs`
     what: ClassVar[str]  # words for the artist
@@ -42,21 +42,27 @@ class Need:
     follows: ClassVar[str] = ""  # a need after whose decision this one is asked, too
 
     def due(self, state: State, moment: Moment, progress: float) -> bool:
-        """Tell whether to decide now, at one of the moments. `on` in the settings, and what is decided already, is never asked."""
+        """Tell whether to decide at this moment of the training.
+
+        This is not called for a need whose setting is "on", or that is decided already.
+        """
         return True
 
     def measure(self, state: State, *given: Any) -> Decision | None:
-        """Measure and decide, from what the moment gives besides the state. None where there is nothing to record."""
+        """Measure and decide. `given` is what the moment gives besides the state.
+
+        Returns None where there is nothing to record.
+        """
         raise NotImplementedError
 
     def apply(self, state: State, found: dict[str, Any]) -> None:
-        """Do without; when it is decided, and again when a run is resumed."""
+        """Leave out this part of the method. This is called after the decision, and again when a run is resumed."""
 
     def asked(self, state: State) -> str:
-        """The setting: "auto", "on" or "off"."""
+        """Return the need's setting: "auto", "on" or "off"."""
         return getattr(state.settings.needs, self.name)
 
 
 def megabytes(state: State, names: tuple[str, ...]) -> float:
-    """Memory of these parameters while they learn."""
+    """Compute how much memory these parameters take while they learn, in MB."""
     return sum(state.parameters[name].numel() for name in names if name in state.parameters) * NUMBER / MEGA

@@ -1,4 +1,4 @@
-"""Needs of the photos: views that show the same as others, pixels beyond the masks."""
+"""Decide whether a training needs all of its photos, and the photos' pixels beyond the masks."""
 
 import math
 
@@ -17,7 +17,7 @@ ALIKE_PIXELS, ALIKE_DECIBELS = 0.5, 40.0  # duplicates move by less, and differ 
 
 
 class Views(Need):
-    """Training views that duplicate others."""
+    """Decide whether the training needs all of its views. Views that duplicate others are removed."""
 
     name, what = "views", "all photos"
     threshold, reason = 1, "each duplicate costs as much as a photo that adds something"
@@ -38,7 +38,7 @@ class Views(Need):
 
 
 class Outside(Need):
-    """Pixels that lie beyond the masks' bounds."""
+    """Decide whether the training needs the pixels beyond the masks' bounds. If not, the photos are cropped."""
 
     name, what = "outside", "the pixels beyond the masks"
     threshold, reason = 0.1, "a part of the pixels; the time that less saves could not be measured"
@@ -62,13 +62,19 @@ class Outside(Need):
 
 
 def time_crops(state: State) -> None:
-    """Add to the decision about `outside` the seconds that it saves, once there are iterations to time."""
+    """Measure the seconds that cropped photos save, once there are enough iterations to time.
+
+    The seconds are added to the decision `outside`, which has cropped the photos (see `Outside`).
+    """
     if state.crops is not None and state.iteration >= TIMED and "seconds" not in state.needs["outside"]:
         state.needs["outside"]["seconds"] = (1 - 1 / WHOLE_EVERY) * probe.seconds_saved(state, whole=True)
 
 
 def bounds(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """Rows and columns of a mask (H, W) and so many pixels about them; all of them where it is empty."""
+    """Return the rows and columns that hold a mask (H, W), and `margin` pixels about them.
+
+    If the mask is empty, they are all rows and columns.
+    """
     shown = []
     for axis, size in ((1, mask.shape[0]), (0, mask.shape[1])):
         there = np.flatnonzero(mask.any(axis=axis)) if mask.any() else np.array([0, size - 1])
@@ -77,7 +83,10 @@ def bounds(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
 
 
 def duplicate_views(views: list[LoadedView], radius: float) -> list[int]:
-    """Find views that add nothing to an earlier one: no point of the object moves between them, and they show the same."""
+    """Find views that duplicate an earlier view.
+
+    From a view to its duplicate no point of the object moves, and the two photos show the same.
+    """
     found, kept = [], []
     for number, view in enumerate(views):
         alike = any(
@@ -89,7 +98,10 @@ def duplicate_views(views: list[LoadedView], radius: float) -> list[int]:
 
 
 def motion(one: LoadedView, other: LoadedView, radius: float) -> float:
-    """Bound how far, in pixels, a point of the object moves from one photo to the other; infinite between photos of two sizes."""
+    """Bound how far, in pixels, a point of the object moves from one photo to the other.
+
+    The bound is infinite between photos of two sizes, or if only one of them has a mask.
+    """
     a, b = one.camera, other.camera
     if (a.width, a.height) != (b.width, b.height) or (one.alpha is None) != (other.alpha is None):
         return math.inf
@@ -101,5 +113,5 @@ def motion(one: LoadedView, other: LoadedView, radius: float) -> float:
 
 
 def _agreement(one: LoadedView, other: LoadedView) -> float:
-    """PSNR in dB between two photos of the same size."""
+    """Compute the PSNR in dB between two photos of the same size."""
     return psnr(one.image / np.float32(255), other.image / np.float32(255))

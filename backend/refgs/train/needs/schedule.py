@@ -1,4 +1,4 @@
-"""Needs of the schedule: the first stage, and how many iterations there are."""
+"""Decide whether a training needs its first stage, and all of its iterations."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from refgs.train.state import State
 
 
 class Initial(Need):
-    """First stage, in which each surfel is shaded by itself."""
+    """Decide whether the training needs a first stage, in which each surfel is shaded by itself."""
 
     name, what = "initial", "a first stage of surfels shaded one by one"
     moments = ("start",)
@@ -26,7 +26,10 @@ class Initial(Need):
 
 
 class Iterations(Need):
-    """Last fifth of the iterations, where there is no specular part to learn, unless a time was given to be used."""
+    """Decide whether the training needs the last fifth of its iterations.
+
+    A scene without a specular part does not need them. A training that was given a time does all of its iterations.
+    """
 
     name, what = "iterations", "all iterations"
     moments, follows = ("start",), "specular"
