@@ -1,5 +1,6 @@
-"""RefGS add-on: all code that runs inside Blender, and the only code that imports bpy.
+"""Run RefGS inside Blender: this package is the add-on, and the only code that imports bpy.
 
-`scene` holds plain functions that write Blender data, `nodes` the node trees, `ui` the operators and panels that call them. The
-package itself imports nothing: `python -m refgs_addon.preview` can then report a missing library where bpy does not load.
+`scene` holds plain functions that write Blender data. `nodes` builds node trees. `ui` holds the operators and panels that call them.
+
+The package itself imports nothing, so that `python -m refgs_addon.preview` can report a missing library before it loads bpy.
 """

@@ -1,4 +1,4 @@
-"""Differences between Blender 4.3, 4.5 LTS and 5.2 LTS, all of them here."""
+"""Hide the differences between Blender 4.3, 4.5 LTS and 5.2 LTS behind functions. No other module checks Blender's version."""
 
 import bpy
 
@@ -9,7 +9,7 @@ FORMAT = (["media_type"] if bpy.app.version >= (5, 0, 0) else []) + ["file_forma
 
 
 def set_format(settings: bpy.types.ImageFormatSettings, kind: str, depth: str) -> None:
-    """Set the format of saved RGBA pictures: `kind` is "PNG" or "OPEN_EXR", `depth` the bits."""
+    """Set the file format of saved RGBA pictures. `kind` is "PNG" or "OPEN_EXR"; `depth` is the number of bits per channel."""
     for name, value in zip(FORMAT, ["IMAGE"] * (len(FORMAT) - 3) + [kind, "RGBA", depth], strict=True):
         setattr(settings, name, value)
 
@@ -45,7 +45,7 @@ def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
 
 
 def modifier_input(modifier: bpy.types.NodesModifier, name: str) -> tuple[bpy.types.bpy_struct, str]:
-    """Find the owner and property of a geometry-nodes modifier's input, as `layout.prop` takes them."""
+    """Return the struct and the property name of a geometry-nodes modifier's input, as `layout.prop` takes them."""
     identifier = modifier.node_group.interface.items_tree[name].identifier
     if hasattr(modifier, "properties"):  # from 5.2
         return getattr(modifier.properties.inputs, identifier), "value"
@@ -68,7 +68,7 @@ def set_modifier_input(modifier: bpy.types.NodesModifier, name: str, value) -> N
 
 
 def get_modifier_input(modifier: bpy.types.NodesModifier, name: str):
-    """Return a modifier's input; for a menu, the item's name. An object may be None."""
+    """Return the value of a modifier's input. A menu returns its item's name; an empty object input returns None."""
     owner, path = modifier_input(modifier, name)
     if path == "value":
         return owner.value
@@ -81,7 +81,7 @@ def get_modifier_input(modifier: bpy.types.NodesModifier, name: str):
 
 
 def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
-    """List the curves of an object's keyframes."""
+    """List an object's animation curves."""
     animation = item.animation_data
     if hasattr(animation.action, "fcurves"):  # until 5.0
         return list(animation.action.fcurves)
@@ -90,6 +90,9 @@ def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
 
 
 def usd_keeps_textures() -> dict[str, str | bool]:
-    """Options that make the USD exporter refer to textures where they are. Raises KeyError where Blender has no USD, as Debian's."""
+    """Return the USD exporter's options that keep textures in their place instead of copying them.
+
+    Raises KeyError where Blender is built without USD, as Debian's is.
+    """
     known = bpy.ops.wm.usd_export.get_rna_type().properties
     return {"export_textures_mode": "KEEP"} if "export_textures_mode" in known else {"export_textures": False}

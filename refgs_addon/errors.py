@@ -1,5 +1,8 @@
-"""Errors that the artist can fix."""
+"""Define the error that the artist can fix."""
 
 
 class InputError(Exception):
-    """Report one line to the artist: what is wrong, where, what to do. Operators show it, the command line prints it."""
+    """Report one line to the artist: what is wrong, where, and what to do.
+
+    Operators show the line in Blender. Programs without a window print it to stderr.
+    """

@@ -1,8 +1,9 @@
-"""Install and remove the trainer in its own Python environment. Needs no bpy.
+"""Install and remove the trainer in a Python environment of its own. This module needs no bpy.
 
-Run as a program, this file speaks the job protocol (docs/job-protocol.md) and takes one command: `install` or `remove`. It exits with
-its child process when its standard input closes, so whenever Blender ends. That does no harm: a marker file is written last, and only
-an environment with it counts. Finished downloads stay in uv's cache; the next installation uses them.
+Run as a program, this file speaks the job protocol (docs/job-protocol.md) and takes one command: `install` or `remove`. When its standard
+input closes, which happens whenever Blender ends, it kills its child process and exits. An interrupted installation does no harm: a
+marker file is written last, and an environment without the marker counts as not installed. Finished downloads stay in uv's cache, and the
+next installation uses them.
 """
 
 import contextlib
@@ -33,18 +34,18 @@ NEEDED, NEEDED_WITH_CARD = 2 * GB, 7 * GB  # torch's CUDA builds include CUDA's 
 
 
 def wheel(name: str) -> Path | None:
-    """Find a wheel bundled with the add-on; None in a clone, which has none."""
+    """Find a wheel that is bundled with the add-on. Returns None in a copy of the repository, which bundles no wheels."""
     return next(WHEELS.glob(f"{name}-*.whl"), None)
 
 
 def bundled_version() -> str:
-    """Version of the bundled trainer, or ""."""
+    """Return the version of the bundled trainer, or "" without one."""
     file = wheel("refgs") if wheel("uv") else None
     return file.name.split("-")[1] if file else ""
 
 
 def installed(home: Path) -> str:
-    """Version of the installed trainer, or ""."""
+    """Return the version of the installed trainer, or "" without one."""
     try:
         return _marker(home).read_text(encoding="utf-8")
     except OSError:
@@ -57,17 +58,17 @@ def interrupted(home: Path) -> bool:
 
 
 def python(home: Path) -> Path:
-    """Path of the environment's Python."""
+    """Return the path of the environment's Python."""
     return home / "env" / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
 
 
 def needed_bytes() -> float:
-    """Estimate the bytes of an installation. nvidia-smi is also uv's last means to find a card."""
+    """Estimate the bytes of an installation. It needs more where nvidia-smi exists: uv may then choose torch's CUDA build."""
     return NEEDED_WITH_CARD if shutil.which("nvidia-smi") else NEEDED
 
 
 def free_bytes(home: Path) -> float:
-    """Free bytes on the disk of a folder, which need not exist yet."""
+    """Return the free bytes on the disk of a folder, which need not exist yet."""
     return shutil.disk_usage(next(folder for folder in (home, *home.parents) if folder.is_dir())).free
 
 
@@ -77,14 +78,14 @@ def space_line(home: Path) -> str:
 
 
 def disk_full_line(home: Path) -> str:
-    """Line for the artist if the disk has too little space for the rest of the installation, else ""."""
+    """Return a line for the artist if the disk is too full for the rest of the installation, else ""."""
     if installed(home) or free_bytes(home) + folder_bytes(home) >= needed_bytes():
         return ""
     return f"too little space on the disk of {home} ({space_line(home)}): free some, or choose a Python that has the trainer"
 
 
 def folder_bytes(folder: Path) -> int:
-    """Total bytes of the files in a folder."""
+    """Add up the bytes of the files in a folder."""
     total = 0
     for path, _, names in os.walk(folder):
         for name in names:
@@ -105,11 +106,11 @@ _child: subprocess.Popen | None = None
 
 
 class _Failed(Exception):
-    """Report one line to the artist."""
+    """Stop the command and report one line to the artist."""
 
 
 def main() -> None:
-    """Run one command from stdin, and emit events."""
+    """Read one command from stdin, run it, and print its events to stdout."""
     command = json.loads(sys.stdin.readline() or "null")
     if command is None:
         return
@@ -189,7 +190,7 @@ def _remove(home: Path) -> None:
 
 
 def _unpack(uv: Path, home: Path) -> Path:
-    """Unpack uv's program from its wheel. Blender installs a wheel's modules, but leaves its programs not executable."""
+    """Unpack uv's program from its wheel, and make it executable. Blender installs the wheel without the executable flag."""
     name = "uv.exe" if sys.platform == "win32" else "uv"
     program = home / name
     with zipfile.ZipFile(uv) as archive:
@@ -201,10 +202,10 @@ def _unpack(uv: Path, home: Path) -> Path:
 
 
 def _uv_environment(home: Path) -> dict[str, str]:
-    """Environment variables for uv. Those that are already set, such as a studio's mirror, take precedence.
+    """Return the environment variables for uv. Variables that are already set, such as a studio's mirror, take precedence.
 
-    uv fetches a Python of its own: Blender's goes with the next Blender, and the system's changes with its updates. The build of torch
-    is chosen for this machine's card. An empty UV_TORCH_BACKEND takes the index's build, for mirrors.
+    uv downloads its own Python, because Blender's changes with the next Blender and the system's with its updates. uv chooses the build
+    of torch for this machine's card. An empty UV_TORCH_BACKEND makes uv take the build of the package index, which mirrors need.
     """
     set_here = {"UV_TORCH_BACKEND": "auto", "UV_PYTHON_INSTALL_DIR": str(home / "python")}
     if not os.environ.keys() & {
@@ -254,7 +255,7 @@ def _uv(program: Path, variables: dict[str, str], home: Path, *words: str) -> No
 
 
 def _report_download(home: Path, fetching: dict[str, str], ended: threading.Event) -> None:
-    """Report downloads every other second: uv itself is silent during torch's, which takes minutes."""
+    """Report downloads every other second. uv itself is silent while it downloads torch, which takes minutes."""
     while not ended.wait(2):
         now = list(fetching.items())
         if now:
@@ -270,7 +271,7 @@ def _report_download(home: Path, fetching: dict[str, str], ended: threading.Even
 
 
 def _start_trainer(python: Path) -> None:
-    """Start the trainer once. The installation counts only if it reports that it is ready."""
+    """Start the installed trainer once. Raises _Failed unless the trainer reports that it is ready."""
     process = _start([str(python), "-E", "-m", "refgs.cli", "worker"])
     heard = process.communicate()[0].splitlines()
     event = json.loads(heard[0]) if process.returncode == 0 and heard else {}
@@ -280,7 +281,7 @@ def _start_trainer(python: Path) -> None:
 
 
 def explain_uv_error(text: str, home: str) -> str:
-    """Turn uv's error into one line for the artist; "" for errors that the artist cannot fix."""
+    """Turn uv's error into one line for the artist. Returns "" for errors that the artist cannot fix."""
     lower = text.lower()
     if re.search(r"no space left|os error (28|112|122)\b", lower):
         return f"the disk of {home} is full: free some space and resume"

@@ -1,4 +1,4 @@
-"""Timers: one polls the jobs and redraws the window after a change, one follows trainings of other processes."""
+"""Run two timers: one polls the jobs and redraws the window after a change, one follows trainings that other processes run."""
 
 from pathlib import Path
 
@@ -59,7 +59,7 @@ def redraw() -> None:
 
 
 def unregister() -> None:
-    """Stop the timers, and end all jobs cleanly except those that are kept."""
+    """Stop the timers. Stop all jobs cleanly, except those that the artist chose to keep when Blender closes."""
     for timer in (_poll_jobs, _poll_other_processes):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)

@@ -1,8 +1,10 @@
-"""Start the backend's processes and follow them without blocking the window. Needs no bpy.
+"""Start the backend's processes and follow them without blocking the window. This module needs no bpy.
 
-Each job has a `refgs worker` process of its own (docs/job-protocol.md). A thread reads its events into a queue; `poll` handles them.
-When Blender ends, the process's standard input closes and the process stops. A job that is kept was told to finish all the same.
-A lock in the run folder shows whether any process works in it.
+Each job has a `refgs worker` process of its own (docs/job-protocol.md). A thread reads the worker's events into a queue, and `poll`
+handles them.
+
+When Blender ends, the worker's standard input closes and the worker stops. A kept job, one that the artist chose to finish without
+Blender, continues. A lock in the run folder shows whether any process works in that folder.
 """
 
 import contextlib
@@ -33,9 +35,9 @@ LOCK, PROGRESS, STOP = "run.lock", "progress.json", "stop"  # files in a run fol
 
 @dataclass
 class Job:
-    """Commands for one worker process, in order, and the events it has sent so far.
+    """Hold the commands for one worker process, in order, and the events that the worker has sent so far.
 
-    `state` is "waiting" (for earlier jobs), "starting", "running", "paused", or one of ENDED. A job without commands asks only for the
+    `state` is "waiting" (for earlier jobs), "starting", "running", "paused", or one of ENDED. A job without commands only asks for the
     worker's version.
     """
 
@@ -72,11 +74,11 @@ class Job:
 
     @property
     def active(self) -> bool:
-        """True while its process works."""
+        """Return True while the job's process works."""
         return not self.ended and self.state != "waiting"
 
     def start(self) -> None:
-        """Start the process. If that fails, the job fails."""
+        """Start the process. If that fails, the job's state becomes "failed"."""
         self.state, self.line = "starting", "Starting"
         try:
             self.log.parent.mkdir(parents=True, exist_ok=True)
@@ -103,19 +105,19 @@ class Job:
             self._close()
 
     def tell(self, command: str, **facts) -> None:
-        """Send a command. Write errors are ignored: `poll` reports a process that has ended."""
+        """Send a command to the process. Write errors are ignored, because `poll` reports a process that has ended."""
         with contextlib.suppress(OSError, ValueError):
             self._process.stdin.write(json.dumps({"command": command} | facts).encode() + b"\n")
             self._process.stdin.flush()
 
     def keep(self, on: bool) -> None:
-        """Choose whether the job finishes after Blender closes or is killed. A job that still waits then never starts."""
+        """Choose whether the job finishes after Blender closes or is killed. A job that still waits at that time never starts."""
         self.kept = on
         if self.active:
             self.tell("keep", on=on)
 
     def poll(self) -> bool:
-        """Handle new events; return whether there were any."""
+        """Handle the process's new events. Returns True if there were any."""
         heard = False
         while not self._events.empty():
             heard, event = True, self._events.get()
@@ -184,7 +186,7 @@ class Job:
             self.close_input()
 
     def close_input(self) -> None:
-        """Close the process's input. It then stops, unless the job is kept."""
+        """Close the process's standard input. The process then stops, unless the job is kept."""
         with contextlib.suppress(OSError):
             self._process.stdin.close()
 
@@ -197,7 +199,7 @@ class Job:
             self._fail(f"{self.program} ended unexpectedly (status {status}): see its log")
 
     def stop(self) -> None:
-        """Stop cleanly. A training stops after its iteration, with a checkpoint."""
+        """Stop the job cleanly. A training stops after its current iteration and writes a checkpoint."""
         if self.state == "waiting":
             self.state, self.line = "cancelled", "Cancelled"
         elif not self.ended:
@@ -220,7 +222,7 @@ JOBS: list[Job] = []
 
 
 def check(python: Path, capture: Path, out: Path, log: Path) -> Job:
-    """Check a capture at once, whatever else runs. `out` gets its cameras.json and thumbnails.
+    """Check a capture at once, even while other jobs run. The worker writes cameras.json and thumbnails into `out`.
 
     `results["check"]` has `lines`, `cameras`, `thumbnails` and more: docs/job-protocol.md.
     """
@@ -228,7 +230,7 @@ def check(python: Path, capture: Path, out: Path, log: Path) -> Job:
 
 
 def find_cameras(python: Path, capture: Path, out: Path, log: Path) -> Job:
-    """Find the cameras of a folder's photos, then check it as `check` does, at once."""
+    """Find the cameras of a folder's photos at once, then check the capture as `check` does."""
     return _add(Job(capture.name, python, [{"command": "poses", "capture": str(capture)}, _check(capture, out)], log))
 
 
@@ -237,23 +239,26 @@ def _check(capture: Path, out: Path) -> dict:
 
 
 def query_trainer(python: Path, log: Path) -> Job:
-    """Ask a Python for its trainer. `ready` then has the release and the device."""
+    """Ask a Python for its trainer. The job's `ready` then has the trainer's release and device."""
     return _add(Job("trainer", python, [], log))
 
 
 def install(home: Path, log: Path) -> Job:
-    """Install the bundled trainer into its own environment, or resume that. `ready` then has the release and the device."""
+    """Install the bundled trainer into its own environment, or resume an interrupted installation.
+
+    The job's `ready` then has the trainer's release and device.
+    """
     arguments = {"uv": str(installation.wheel("uv")), "trainer": str(installation.wheel("refgs"))}
     return _run_installation("install", home, log, arguments)
 
 
 def remove(home: Path, log: Path) -> Job:
-    """Remove the trainer's environment, complete or not."""
+    """Remove the trainer's environment, even an incomplete one."""
     return _run_installation("remove", home, log, {})
 
 
 def _run_installation(command: str, home: Path, log: Path, arguments: dict[str, str]) -> Job:
-    """Run installation.py in Blender's own Python: it needs only the standard library."""
+    """Run installation.py as a job in Blender's own Python. That file needs only the standard library."""
     commands = [{"command": command, "home": str(home)} | arguments]
     return _add(Job(command, Path(sys.executable), commands, log, arguments=("-I", installation.__file__)))
 
@@ -270,10 +275,11 @@ def train(
     mesh: bool = True,
     resume: bool = False,
 ) -> Job:
-    """Train a capture into a run folder and make its mesh, after the trainings that wait already.
+    """Train a capture into a run folder and make its mesh. The job waits until earlier trainings have ended.
 
-    Without a preset the minutes choose all settings; without either the preset is "standard". `settings` override a preset's values by
-    name: `{"train.iterations": 2000}`. Raises InputError where there is no capture, or the run folder is not empty.
+    `preset` names the settings. With `minutes` and no preset, the minutes choose all settings. With neither, the preset is "standard".
+    `settings` override a preset's values by name: `{"train.iterations": 2000}`. Raises InputError where there is no capture, or the run
+    folder is not empty.
     """
     if not capture.is_dir():
         raise InputError(f"{capture} is not a folder: choose the folder of a capture")
@@ -291,18 +297,18 @@ def train(
 
 
 def export(python: Path, run: Path, log: Path) -> Job:
-    """Make a run's mesh and textures, after the trainings that wait already."""
+    """Make a run's mesh and textures. The job waits until earlier trainings have ended."""
     return _add(Job(run.name, python, [{"command": "export", "run": str(run)}], log, run))
 
 
 def display_splats(python: Path, run: Path, file: Path, log: Path) -> Job:
-    """Write a run as display splats, for viewers without lights, at once. Replaces the file."""
+    """Write a run at once as display splats: splats with fixed colours, for viewers without lights. Replaces the file."""
     command = {"command": "export", "run": str(run), "display_splats": str(file)}
     return _add(Job(file.name, python, [command], log))
 
 
 def render(blender: Path, arguments: tuple[str, ...], command: Mapping[str, object], log: Path) -> Job:
-    """Render in another Blender (`render_worker`), at once. `results["render"]["png"]` is the picture."""
+    """Render at once in another Blender, which runs `render_worker`. `results["render"]["png"]` is the picture's file."""
     return _add(Job(Path(command["png"]).name, blender, [dict(command)], log, arguments=arguments, program=BLENDER))
 
 
@@ -313,7 +319,7 @@ def _add(job: Job) -> Job:
 
 
 def poll() -> bool:
-    """Handle all new events and start the next job; return whether anything changed."""
+    """Handle all new events and start the next job. Returns True if anything changed."""
     changed = [job.poll() for job in JOBS]
     busy = any(job.run and job.active for job in JOBS)
     for job in JOBS:
@@ -324,18 +330,18 @@ def poll() -> bool:
 
 
 def trainings() -> list[Job]:
-    """List the jobs that work in a run folder or wait to. Only these can be kept."""
+    """List the jobs that work in a run folder or wait for it. Only these jobs can be kept when Blender closes."""
     return [job for job in JOBS if job.run and not job.ended]
 
 
 def keep_all(on: bool) -> None:
-    """Keep all trainings when Blender closes, or none. Those that still wait then never start."""
+    """Choose whether all trainings finish after Blender closes. A training that still waits at that time never starts."""
     for job in trainings():
         job.keep(on)
 
 
 def stop_all() -> None:
-    """Stop all jobs cleanly except those that are kept, and clear the list."""
+    """Stop all jobs cleanly, except kept ones, which finish without Blender. Clear the list."""
     for job in JOBS:
         if job.kept and job.active:
             job.close_input()
@@ -345,7 +351,10 @@ def stop_all() -> None:
 
 
 def run_state(folder: Path) -> str:
-    """State of a run folder: "training" (a process works in it), "finished", "stopped" (can be resumed), or "" for no run."""
+    """Return a run folder's state.
+
+    "training": a process works in the folder. "stopped": the training can be resumed. "finished". "": the folder holds no run.
+    """
     if _locked(folder / LOCK):
         return "training"
     if (folder / "splats.ply").is_file():
@@ -354,9 +363,9 @@ def run_state(folder: Path) -> str:
 
 
 def run_progress(folder: Path) -> dict:
-    """Progress of the training in a folder, of whichever process: `iteration`, `total`, `seconds_left`.
+    """Read the progress of the training in a folder: `iteration`, `total`, `seconds_left`. Any process may run the training.
 
-    Empty before the first iteration and while the mesh is made.
+    The result is empty before the first iteration and while the mesh is made.
     """
     try:
         return json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
@@ -365,7 +374,10 @@ def run_progress(folder: Path) -> dict:
 
 
 def stop_run(folder: Path) -> None:
-    """Stop the training in a folder, whichever process runs it; it can be resumed. Raises InputError where none runs."""
+    """Stop the training in a folder, even one that another process runs. The training can be resumed.
+
+    Raises InputError where no training runs.
+    """
     if run_state(folder) != "training":
         raise InputError(f"{folder} is not being trained")
     (folder / STOP).touch()

@@ -1,4 +1,4 @@
-"""Preferences: install the trainer or choose a Python that has it, and show its status."""
+"""Show the add-on's preferences: install the trainer or choose a Python that has it, and see the trainer's status."""
 
 import textwrap
 from pathlib import Path
@@ -67,7 +67,7 @@ def set_up() -> bool:
 
 
 def python() -> Path:
-    """Path of the Python that has the trainer. Raises InputError where there is none."""
+    """Return the path of the Python that has the trainer. Raises InputError where there is none."""
     if preferences().python:
         return Path(bpy.path.abspath(preferences().python))
     if not set_up():
@@ -76,28 +76,31 @@ def python() -> Path:
 
 
 def home() -> Path:
-    """Folder for the installed trainer."""
+    """Return the folder for the installed trainer."""
     return _folder("trainer")
 
 
 def hdri_folder() -> Path | None:
-    """Folder of the artist's panoramas, if one is chosen."""
+    """Return the folder of the artist's panoramas, or None if none is chosen."""
     addon = bpy.context.preferences.addons.get(PACKAGE)
     return Path(bpy.path.abspath(addon.preferences.hdris)) if addon and addon.preferences.hdris else None
 
 
 def log_file(name: str) -> Path:
-    """File for a job's log."""
+    """Return the path of a job's log."""
     return _folder("logs") / f"{name}.txt"
 
 
 def capture_folder(capture: Path) -> Path:
-    """Folder for the cameras and thumbnails that a check writes."""
+    """Return the folder for the cameras and thumbnails that a capture's check writes."""
     return _folder("captures") / f"{capture.name} {crc32(str(capture).encode()):08x}"
 
 
 def _folder(name: str) -> Path:
-    """Subfolder of the extension's user folder, which survives updates; temporary where the add-on is no extension."""
+    """Return a subfolder of the extension's user folder, which survives updates.
+
+    An add-on that is not installed as an extension gets a temporary folder.
+    """
     try:
         return Path(bpy.utils.extension_path_user(PACKAGE, path=name))
     except ValueError:
@@ -105,7 +108,7 @@ def _folder(name: str) -> Path:
 
 
 def query_trainer() -> None:
-    """Ask the chosen Python for its trainer; `status` shows the answer."""
+    """Ask the chosen Python for its trainer. `status` then shows the trainer's answer."""
     forget_queries()
     if set_up():
         _own_jobs.append(jobs.query_trainer(python(), log_file("trainer")))
@@ -113,7 +116,7 @@ def query_trainer() -> None:
 
 
 def install() -> None:
-    """Install the trainer, or resume that. Raises InputError where it is impossible."""
+    """Install the trainer, or resume an interrupted installation. Raises InputError where installing is impossible."""
     if reason := installation_problem() or installation.disk_full_line(home()):
         raise InputError(reason)
     forget_queries()
@@ -122,7 +125,7 @@ def install() -> None:
 
 
 def remove() -> None:
-    """Remove the installed trainer, complete or not."""
+    """Remove the installed trainer, even an incomplete one. Raises InputError while the trainer runs."""
     if reason := _busy_line():
         raise InputError(reason)
     forget_queries()
@@ -131,14 +134,14 @@ def remove() -> None:
 
 
 def stop() -> None:
-    """Stop the installation; it can be resumed."""
+    """Stop the installation, which can be resumed."""
     if job := installing():
         job.stop()
         job.line = "Stopping …"
 
 
 def forget_queries() -> None:
-    """Drop the query or installation, and its answer."""
+    """Stop the newest query or installation, and drop its result."""
     for job in _own_jobs:
         job.stop()
         if job in jobs.JOBS:
@@ -147,17 +150,17 @@ def forget_queries() -> None:
 
 
 def own_jobs() -> list[jobs.Job]:
-    """List the jobs that this page started, which the Train panel does not show."""
+    """List the jobs that the preferences started. The Train panel does not show these jobs."""
     return _own_jobs
 
 
 def installing() -> jobs.Job | None:
-    """Find the installation or removal that is running."""
+    """Return the job that installs or removes the trainer, or None while none runs."""
     return next((job for job in _own_jobs if job.name in ("install", "remove") and not job.ended), None)
 
 
 def status() -> tuple[str, str]:
-    """Icon and one line for the trainer's status."""
+    """Return an icon and one line that describe the trainer's status."""
     job = _own_jobs[0] if _own_jobs else None
     if job and job.state == "failed":
         return "ERROR", job.line[0].upper() + job.line[1:]
@@ -173,7 +176,7 @@ def status() -> tuple[str, str]:
 
 
 def installation_problem() -> str:
-    """Line for the artist if the trainer cannot be installed now, else ""."""
+    """Return a line for the artist if the trainer cannot be installed now, else ""."""
     if not installation.bundled_version():
         return "This copy of the add-on contains no trainer: choose a Python that has it"
     if preferences().python:

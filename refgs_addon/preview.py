@@ -101,9 +101,9 @@ def preview(options: argparse.Namespace) -> None:
 
 
 def check_libraries() -> None:
-    """Raise InputError with the names of the system libraries that Blender needs and this machine lacks.
+    """Raise InputError if this machine lacks a system library that Blender needs. The error names all missing libraries.
 
-    Blender's module links against X. Eevee loads EGL when it first draws, and ends the process where there is none.
+    Blender's module links against X. Eevee loads EGL at its first picture, and without EGL it ends the process.
     """
     spec = importlib.util.find_spec("bpy")
     if spec is None:

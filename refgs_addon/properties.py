@@ -1,4 +1,4 @@
-"""Properties stored in the .blend: the capture, its training settings and the runs trained from it."""
+"""Define the properties stored in the .blend: the capture, its training settings and the runs trained from the capture."""
 
 import bpy
 from bpy.props import (
@@ -13,7 +13,7 @@ from bpy.props import (
 
 
 class KnownRun(bpy.types.PropertyGroup):
-    """Run folder that was trained from this file."""
+    """Store a run folder that was trained from this file."""
 
     folder: StringProperty(subtype="DIR_PATH")
     capture: StringProperty(subtype="DIR_PATH")

@@ -4,7 +4,7 @@ import bpy
 
 
 def modifier_tree(name: str) -> bpy.types.NodeTree:
-    """Make a geometry-nodes tree for a modifier, with a geometry input and output."""
+    """Make a geometry-nodes tree for a modifier, with one input and one output for geometry."""
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
     tree.is_modifier = True
     for in_out in ("INPUT", "OUTPUT"):
@@ -38,7 +38,7 @@ def add_input(tree: bpy.types.NodeTree, name: str, kind: str, description: str =
 
 
 def out(node: bpy.types.Node, name: str | None = None) -> bpy.types.NodeSocket:
-    """Find the enabled output of this name; without a name, the first."""
+    """Find the enabled output with this name. Without a name, return the first enabled output."""
     return next(s for s in node.outputs if s.enabled and name in (None, s.name))
 
 
@@ -69,7 +69,7 @@ def store_attribute(tree: bpy.types.NodeTree, geometry, name: str, kind: str, va
 
 
 def object_frame(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[bpy.types.Node, bpy.types.NodeSocket]:
-    """Add an Object Info node, and compute the points' positions in that object's frame."""
+    """Add an Object Info node, and transform the points' positions into that object's frame. Returns the positions' output."""
     info = add(tree, "GeometryNodeObjectInfo", {"Object": item}, transform_space="RELATIVE")
     inverse = add(tree, "FunctionNodeInvertMatrix", {"Matrix": info.outputs["Transform"]}).outputs["Matrix"]
     position = out(add(tree, "GeometryNodeInputPosition"))
@@ -77,6 +77,6 @@ def object_frame(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[
 
 
 def max_component(tree: bpy.types.NodeTree, vector: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """Compute a vector's largest absolute component: at most 1 inside a cube of radius 1."""
+    """Compute a vector's largest absolute component. The result is at most 1 inside the cube from -1 to 1."""
     x, y, z = add(tree, "ShaderNodeSeparateXYZ", {0: vector_math(tree, "ABSOLUTE", vector)}).outputs
     return math(tree, "MAXIMUM", math(tree, "MAXIMUM", x, y), z)

@@ -1,4 +1,4 @@
-"""Trees that edit the splats' materials without changing the learned values, and that show the edits on the mesh."""
+"""Build the node trees of edits. One edits the splats' materials and keeps the learned values; one shows the edits on the mesh."""
 
 import bpy
 
@@ -26,12 +26,14 @@ _MIXED = "RefGS Edited"  # node that marks a mesh's material as showing the edit
 
 
 def edit_tree() -> bpy.types.NodeTree:
-    """Make the tree `RefGS Edit`, or return the one that all edits in the file share.
+    """Make the tree `RefGS Edit`, or return the existing one, which all edits in the file share.
 
-    Mask and amounts blend the splats' base_color, metallic and roughness with those of the edit. The mask is
-    - in a box or a ball: 1 inside the object Region (an Empty of size 1), falling to 0 at its border over the fraction Falloff;
-    - with "Similar": 1 for the material of the splat nearest to Region, 0 for one that differs by more than Tolerance;
-    - with "Painted": the weight of the vertex group Painted at the nearest point of Region, a mesh.
+    The tree blends the splats' base_color, metallic and roughness with the edit's values. Each has an amount, which is multiplied by a
+    mask:
+    - "Everywhere": 1;
+    - "Box" or "Sphere": 1 inside the object Region (an Empty of size 1), falling to 0 at its border over the fraction Falloff;
+    - "Similar": 1 for the material of the splat nearest to Region, 0 for a material that differs by more than Tolerance;
+    - "Painted": the weight of the vertex group Painted at the nearest point of Region, which is a mesh.
     """
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]
@@ -135,7 +137,10 @@ def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.N
 
 
 def mesh_edits_tree() -> bpy.types.NodeTree:
-    """Make the tree `RefGS Follow`, or return it. Each corner of a mesh takes the edits of the nearest splat, in the run's frame."""
+    """Make the tree `RefGS Follow`, or return the existing one. It gives each corner of a mesh the edits of the nearest splat.
+
+    Distances are measured in the run's frame.
+    """
     if MESH_EDITS in bpy.data.node_groups:
         return bpy.data.node_groups[MESH_EDITS]
     tree = modifier_tree(MESH_EDITS)
@@ -156,7 +161,7 @@ def mesh_edits_tree() -> bpy.types.NodeTree:
 
 
 def add_edits_to_material(material: bpy.types.Material) -> None:
-    """Make a mesh's material show the edits on its textures, if it does not yet."""
+    """Make a mesh's material show the edits on top of its textures. Does nothing where the material already shows them."""
     nodes = material.node_tree.nodes
     principled = next((node for node in nodes if node.type == "BSDF_PRINCIPLED"), None)
     if principled is None or _MIXED in nodes:

@@ -1,4 +1,4 @@
-"""Materials of the splats: a Principled BSDF that reads attributes, and one that shows an attribute unlit."""
+"""Build the splats' materials: a Principled BSDF that reads attributes, and an unlit one that shows a single attribute."""
 
 import bpy
 
@@ -13,10 +13,10 @@ _SURFACE = {"metallic": "Metallic", "roughness": "Roughness", "specular": SPECUL
 
 
 def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material:
-    """Make a Principled material for the quads of `nodes.splats_tree`, with each splat's base colour, metallic and roughness.
+    """Make a Principled material for the quads of `nodes.splats_tree`. It reads each splat's base colour, metallic and roughness.
 
-    `constants` (of metallic, roughness and specular) are set as values; no node reads them. The back of a splat is black, like the inside
-    of a solid: lit, it would shine through where the front splats leave a few per cent uncovered.
+    `constants` (of metallic, roughness and specular) are set as values on the BSDF, without a node. The back of a splat is black, like
+    the inside of a solid. A lit back would shine through where the front splats leave a few per cent uncovered.
     """
     material = bpy.data.materials.new(name)
     tree = node_tree(material)
@@ -47,7 +47,7 @@ def principled(material: bpy.types.Material) -> bpy.types.ShaderNode:
 def connect_edits(material: bpy.types.Material) -> None:
     """Make a material of `splat_material` read all attributes that edits change.
 
-    Where specular is 0, an edit of the roughness brings specular reflection back.
+    A material with specular 0 gets its specular reflection back where an edit changes the roughness.
     """
     tree = material.node_tree
     shader = principled(material)
@@ -62,7 +62,7 @@ def connect_edits(material: bpy.types.Material) -> None:
 
 
 def values_material() -> bpy.types.Material:
-    """Make the material `RefGS Splat Values`, or return it. It shows the attribute `display` unlit, and all runs share it."""
+    """Make the material `RefGS Splat Values`, or return the existing one, which all runs share. It shows the attribute `display` unlit."""
     if VALUES_NAME in bpy.data.materials:
         return bpy.data.materials[VALUES_NAME]
     material = bpy.data.materials.new(VALUES_NAME)
@@ -74,8 +74,8 @@ def values_material() -> bpy.types.Material:
 def _finish(material: bpy.types.Material, shader: bpy.types.NodeSocket) -> None:
     """Mix a shader with transparency by the splat's alpha, opacity · exp(-(u² + v²) / 2).
 
-    Each Eevee sample keeps a quad with a probability of its alpha, and the nearest kept quad wins. On average this is
-    front-to-back compositing in the order of each pixel's depths, for any number of overlapping quads.
+    In each sample Eevee keeps a quad with a probability equal to its alpha, and shows the nearest kept quad. The average over samples
+    equals front-to-back compositing by each pixel's depths, for any number of overlapping quads.
     """
     material.surface_render_method = "DITHERED"
     tree = material.node_tree
@@ -92,10 +92,10 @@ def _attribute(tree: bpy.types.NodeTree, name: str, output: int) -> bpy.types.No
 
 
 def _normal(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
-    """Compute the normal bent across the splat, n + u·dn/du + v·dn/dv, in world space, and whether its front is visible.
+    """Compute the bent normal n + u·dn/du + v·dn/dv in world space, and whether the splat's front is visible.
 
-    At silhouettes the bent normal can face away from the viewer, where a BSDF is black. Such a normal is turned back to a
-    right angle with the view.
+    At silhouettes the bent normal can face away from the viewer, where a BSDF is black. Such a normal is turned back until it is
+    perpendicular to the view direction.
     """
     u_v = add(tree, "ShaderNodeSeparateXYZ", {"Vector": _attribute(tree, "gaussian", VECTOR)}).outputs
     centre = _attribute(tree, "normal", VECTOR)

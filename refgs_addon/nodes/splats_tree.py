@@ -1,4 +1,4 @@
-"""Geometry-nodes tree that turns a point cloud of splats into quads with a material."""
+"""Build the geometry-nodes tree that turns a point cloud of splats into quads with a material."""
 
 import bpy
 
@@ -22,12 +22,12 @@ DISPLAYS = ("Shaded", "Base Color", "Roughness", "Metallic", "Normal")
 
 
 def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
-    """Make the tree `RefGS Splats`, or return the one that all runs in the file share.
+    """Make the tree `RefGS Splats`, or return the existing one, which all runs in the file share.
 
-    It reads from the points: scale (standard deviations along two axes), rotation (quaternion), opacity 0..1, and for the
-    displays base_color, roughness, metallic and normal. The quads keep all attributes of the points and add `gaussian`, the
-    position on the splat in standard deviations. Quads are realised: Eevee draws them several times faster than instances.
-    `values_material` shows the attribute `display` in all displays but "Shaded".
+    The tree reads the points' attributes: scale (standard deviations along two axes), rotation (quaternion), opacity 0..1, and for the
+    displays base_color, roughness, metallic and normal. The quads keep all attributes of the points. They add `gaussian`, the position on
+    the splat in standard deviations. Quads are realised, because Eevee draws them several times faster than instances. The display
+    "Shaded" uses the splats' own material. All other displays use `values_material`, which shows the attribute `display`.
     """
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]

@@ -1,1 +1,1 @@
-"""Plain functions that read and write Blender data. Operators call them, and scripts can."""
+"""Read and write Blender data with plain functions. Operators and scripts call them."""

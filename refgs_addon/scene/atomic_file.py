@@ -1,4 +1,4 @@
-"""Atomic writes: a file is written completely or not at all."""
+"""Write a file completely or not at all."""
 
 import contextlib
 import os

@@ -1,4 +1,4 @@
-"""Camera objects: make them from cameras.json, look through them, lay photos over them."""
+"""Make camera objects from cameras.json, look through them, and lay photos over their views."""
 
 import json
 import math
@@ -16,7 +16,7 @@ PHOTO = "refgs_photo"  # custom property of a camera's data: the file of its pho
 def read_cameras(path: Path, capture: Path | None) -> list[dict]:
     """Read the frames of a cameras.json: camera-to-world matrices with OpenGL's axes, and pinhole intrinsics.
 
-    `photo` is the photo's file if the capture's folder is known, else "".
+    Each frame's `photo` is the path of its photo. Without a `capture` folder it is "".
     """
     try:
         frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
@@ -35,15 +35,18 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
 
 
 def light_of(path: Path) -> str:
-    """Name of the view that the recovered light belongs to, if the light turned with the camera; else ""."""
+    """Return the name of the view that the recovered light is right for, or "" for a light that stood still.
+
+    A light that turned with the camera is different in each view.
+    """
     return Path(json.loads(path.read_text(encoding="utf-8")).get("light_of", "")).stem
 
 
 def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Object:
-    """Add a frame's camera to a collection, with its pose, focal length and principal point.
+    """Add a camera for a frame to a collection, with the frame's pose, focal length and principal point.
 
-    Blender stores resolution and pixel aspect in the scene. The camera's data stores them too, as the properties `refgs_size`
-    (pixels) and `refgs_pixel_aspect`, for `frame_camera`.
+    Blender stores resolution and pixel aspect in the scene, not in the camera. For `frame_camera` the camera's data stores them too, as
+    the properties `refgs_size` (pixels) and `refgs_pixel_aspect`.
     """
     data = bpy.data.cameras.new(frame["name"])
     width, height = frame["w"], frame["h"]
@@ -64,7 +67,10 @@ def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Objec
 
 
 def frame_camera(scene: bpy.types.Scene, camera: bpy.types.Object, size: int | None = None) -> None:
-    """Make a camera the scene's, at its photo's resolution. `size` is a different longer side in pixels."""
+    """Make a camera the active one of the scene, and set the resolution to that of its photo.
+
+    `size` sets another longer side, in pixels.
+    """
     scene.camera = camera
     render = scene.render
     if "refgs_size" in camera.data:
@@ -78,9 +84,9 @@ def frame_camera(scene: bpy.types.Scene, camera: bpy.types.Object, size: int | N
 
 
 def show_photo(camera: bpy.types.Object, amount: float = 1.0) -> None:
-    """Lay a camera's photo over its view with this opacity; 0 hides it. The photo is loaded the first time.
+    """Lay a camera's photo over its view with the opacity `amount`; 0 hides the photo. The first call loads the photo.
 
-    Raises InputError where the camera has no photo, or the photo's file is gone.
+    Raises InputError where the camera has no photo, or the photo's file is missing.
     """
     data = camera.data
     if amount > 0 and not data.background_images:
@@ -99,15 +105,15 @@ def show_photo(camera: bpy.types.Object, amount: float = 1.0) -> None:
 
 
 def photo_shown(camera: bpy.types.Object | None) -> float:
-    """Opacity of the photo over a camera's view; 0 where none is shown."""
+    """Return the opacity of the photo over a camera's view, or 0 where no photo is shown."""
     layers = camera.data.background_images if camera is not None and camera.type == "CAMERA" else ()
     return layers[0].alpha if layers and camera.data.show_background_images else 0.0
 
 
 def next_camera(scene: bpy.types.Scene, collection: bpy.types.Collection, steps: int = 1) -> bpy.types.Object:
-    """Make another camera of a run or a capture the scene's, `steps` further in the photos' order.
+    """Step to another camera of a run or a capture: make the one `steps` further in the photos' order the scene's camera.
 
-    If the old camera shows its photo, the new one shows its own. Raises InputError where there are no cameras.
+    If the old camera shows its photo, the new camera shows its own. Raises InputError where there are no cameras.
     """
     cameras = [item for item in collection.all_objects if item.type == "CAMERA"]
     if not cameras:

@@ -1,4 +1,4 @@
-"""Cameras of a checked capture in the scene, before anything is trained."""
+"""Show the cameras of a checked capture in the scene, before the training."""
 
 from pathlib import Path
 
@@ -11,9 +11,9 @@ CAPTURE = "refgs_capture"  # custom property of a collection of cameras: the cap
 
 
 def show_cameras(scene: bpy.types.Scene, capture: Path, cameras: Path) -> bpy.types.Collection:
-    """Add a capture's cameras to a scene in a collection `NAME cameras`, or replace them.
+    """Add a capture's cameras to a scene in a collection `NAME cameras`. An earlier collection of the capture is replaced.
 
-    `cameras` is the cameras.json that a check wrote. Raises InputError where it cannot be read.
+    `cameras` is the path of the cameras.json that a check wrote. Raises InputError where the file cannot be read.
     """
     frames = read_cameras(cameras, capture)
     remove_cameras(scene, capture)
@@ -32,7 +32,7 @@ def cameras_of(scene: bpy.types.Scene, capture: Path) -> bpy.types.Collection | 
 
 
 def remove_cameras(scene: bpy.types.Scene, capture: Path) -> None:
-    """Remove a capture's cameras from a scene, if it has them."""
+    """Remove a capture's cameras from a scene. Does nothing where there are none."""
     collection = cameras_of(scene, capture)
     if collection is not None:
         cameras = [item for item in collection.all_objects if item.type == "CAMERA" and PHOTO in item.data]
@@ -46,9 +46,9 @@ def remove_cameras(scene: bpy.types.Scene, capture: Path) -> None:
 
 
 def replace_cameras(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bpy.types.Object]) -> None:
-    """Replace a capture's cameras by those of its run, which take their names.
+    """Replace a capture's cameras by those of its run, and give the run's cameras the same names.
 
-    If the scene's camera was one of them, it becomes the run's camera of the same photo.
+    If the scene's camera was one of the capture's, the run's camera of the same photo becomes the scene's camera.
     """
     known = cameras_of(scene, capture)
     if known is None:
@@ -65,7 +65,8 @@ def replace_cameras(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bp
 def active_cameras(context: bpy.types.Context) -> bpy.types.Collection | None:
     """Find the collection of cameras to step through.
 
-    It is the run or capture of the active object, else that of the scene's camera, else the newest run, else the newest capture.
+    The first that exists is taken: the run or capture of the active object, that of the scene's camera, the newest run, the newest
+    capture.
     """
     captures = _captures(context.scene)
     for item in (context.view_layer.objects.active, context.scene.camera):

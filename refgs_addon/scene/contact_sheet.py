@@ -1,4 +1,4 @@
-"""Contact sheets: one view under many lights, in one picture."""
+"""Render a contact sheet: one view under many lights, in one picture."""
 
 import tempfile
 from collections.abc import Callable, Sequence
@@ -23,11 +23,11 @@ def contact_sheet(
     samples: int = 32,
     progress: Callable[[int, str], None] = lambda done, what: None,
 ) -> None:
-    """Render the scene camera's view in Eevee under the recovered light, if there is one, and each HDRI, into one PNG.
+    """Render the scene camera's view in Eevee under several lights into one PNG: the recovered light, if any, and each HDRI.
 
-    The pictures are laid out in rows on a transparent, roughly square sheet. `size` is the longer side of each in pixels. `progress` gets
-    the number of finished pictures and the next light. The scene's light is restored. Raises InputError where there is no camera, a light
-    cannot be read, or the file cannot be written.
+    The pictures are laid out in rows on a transparent, roughly square sheet. `size` is the longer side of each picture in pixels.
+    `progress` gets the number of finished pictures and the name of the next light. The scene's light is restored. Raises InputError where
+    there is no camera, a light cannot be read, or the file cannot be written.
     """
     import numpy as np
 
@@ -67,7 +67,7 @@ def contact_sheet(
 
 
 def _pixels(file: Path):
-    """Read a PNG's values (h, w, 4) as they are in the file, top row first."""
+    """Read a PNG's values (h, w, 4) without colour conversion, top row first."""
     import numpy as np
 
     image = bpy.data.images.load(str(file))

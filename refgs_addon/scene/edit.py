@@ -1,4 +1,4 @@
-"""Edit materials. Each edit is a modifier on the splats, to be changed, switched off, reordered or removed at any time."""
+"""Edit materials. Each edit is a modifier on the splats, and can be changed, switched off, reordered or removed at any time."""
 
 import bpy
 
@@ -15,11 +15,11 @@ from .run_parts import parts
 def add_edit(
     collection: bpy.types.Collection, where: str = "Everywhere", material: str = "Gold"
 ) -> bpy.types.NodesModifier:
-    """Add an edit to a run's collection, after its other edits. The mesh, if there is one, shows it too.
+    """Add an edit to a run's splats, after the earlier edits. The mesh, if there is one, shows the edit too.
 
-    `where` is one of REGIONS. "Box", "Sphere" and "Similar" get an Empty in the middle of the splats, to move, rotate and scale.
-    "Painted" gets a copy of the mesh for painting weights, all zero at first. `material` is the name of a preset. Raises InputError
-    where the collection has no splats, or no mesh to paint on.
+    `where` is one of REGIONS. "Box", "Sphere" and "Similar" get an Empty in the middle of the splats, which the artist moves, rotates and
+    scales. "Painted" gets a copy of the mesh to paint weights on, all zero at first. `material` is the name of a preset. Raises
+    InputError where the collection has no splats, or no mesh to paint on.
     """
     if where not in REGIONS:
         raise InputError(f"there is no region {where}: choose one of {', '.join(REGIONS)}")
@@ -46,12 +46,12 @@ def add_edit(
 
 
 def edits(splats: bpy.types.Object) -> list[bpy.types.NodesModifier]:
-    """List the edits of splats in the order of their application."""
+    """List the edits of splats in the order in which Blender applies them."""
     return [m for m in splats.modifiers if m.type == "NODES" and m.node_group and m.node_group.name == NAME]
 
 
 def remove_edit(splats: bpy.types.Object, name: str) -> None:
-    """Remove an edit, and its region if no other edit uses it."""
+    """Remove an edit. Remove the object that marks its region too, unless another edit uses that object."""
     edit = splats.modifiers.get(name)
     if edit is None or edit not in edits(splats):
         raise InputError(f"{splats.name} has no edit {name}")
@@ -63,7 +63,7 @@ def remove_edit(splats: bpy.types.Object, name: str) -> None:
 
 
 def splats_of(collection: bpy.types.Collection) -> bpy.types.Object:
-    """Find the splats of a run's collection. Raises InputError where it has none."""
+    """Find the splats' object in a run's collection. Raises InputError where there is none."""
     found = parts(collection).get("splats", [])
     if not found or SPLATS not in found[0].modifiers:
         raise InputError(f"{collection.name} has no splats: import a RefGS run")
@@ -71,7 +71,10 @@ def splats_of(collection: bpy.types.Collection) -> bpy.types.Object:
 
 
 def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: str) -> bpy.types.Object:
-    """Make an Empty in the middle of the splats, a third of their size; for "Similar" a sixth, to mark one splat."""
+    """Make an Empty that marks an edit's region, in the middle of the splats.
+
+    Its size is a third of the splats' extent, and a sixth for "Similar", where it marks one splat.
+    """
     shape = {"Box": "CUBE", "Sphere": "SPHERE", "Similar": "ARROWS"}[where]
     region = add_region(splats, collection, f"{where} of {splats.name}", shape)
     region.scale = [max(region.scale) * (1 / 6 if where == "Similar" else 1 / 3)] * 3
@@ -79,9 +82,9 @@ def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: s
 
 
 def _paint_target(mesh: bpy.types.Object, collection: bpy.types.Collection) -> tuple[bpy.types.Object, str]:
-    """Make or find the object to paint on, with a new vertex group.
+    """Make the object to paint on, or find the existing one, and add a vertex group to it.
 
-    It shares the mesh's data but not its modifiers, which depend on the splats and so on the paint.
+    The object shares the mesh's data but has no modifiers. The mesh's own modifiers depend on the splats, and so on the painted weights.
     """
     found = [item for item in collection.objects if item.get(REGION) and item.data == mesh.data]
     if found:

@@ -1,4 +1,4 @@
-"""Export a run with its edits: as a new run folder, or its splats, mesh or light alone."""
+"""Export a run with its edits as a new run folder, or export its splats, mesh or recovered light alone."""
 
 import os
 import shutil
@@ -22,7 +22,7 @@ DARK = 0.02  # a darker base colour does not reveal how much light falls on it
 
 
 def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
-    """Evaluate the edits of splats: base_color (N, 3) linear Rec.709, metallic (N,), roughness (N,)."""
+    """Evaluate the splats' materials after all edits: base_color (N, 3) linear Rec.709, metallic (N,), roughness (N,)."""
     drawing = splats.modifiers[SPLATS]
     before = drawing.show_viewport, splats.hide_viewport, splats.hide_get()
     drawing.show_viewport = splats.hide_viewport = False  # Blender does not evaluate hidden objects
@@ -44,8 +44,8 @@ def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
 def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     """Write a run's splats with their edits as a splats.ply.
 
-    It is the run's own file with other materials, and with the colours that viewers without lights show adapted to them. Raises InputError
-    where the run's file is missing or has changed, or the new one cannot be written.
+    The new file is the run's own file with the edited materials. Its fixed colours (f_dc), which viewers without lights show, change in
+    proportion to the base colour. Raises InputError where the run's file is missing or has changed, or the new file cannot be written.
     """
     splats = splats_of(collection)
     source = run_folder(collection) / "splats.ply"
@@ -86,8 +86,8 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
 def export_run(collection: bpy.types.Collection, folder: Path) -> None:
     """Write a run with its edits as a new run folder, which must not exist. The run itself does not change.
 
-    The mesh is copied only if there are no edits: its textures would lack them. `refgs export` or the trainer makes a new one. Raises
-    InputError.
+    The mesh is copied only without edits, because the edits are not in its textures. `refgs export` or the trainer makes a new mesh.
+    Raises InputError where the run's files are missing or have changed, or the folder exists or cannot be written.
     """
     original = run_folder(collection)
     if folder.exists():
@@ -112,7 +112,7 @@ def export_run(collection: bpy.types.Collection, folder: Path) -> None:
 
 
 def export_light(collection: bpy.types.Collection, path: Path) -> None:
-    """Copy a run's recovered light, an equirectangular EXR. Raises InputError."""
+    """Copy a run's recovered light, an equirectangular EXR. Raises InputError where it is missing or cannot be written."""
     light = run_folder(collection) / "environment.exr"
     if not light.is_file():
         raise InputError(f"{light} does not exist: the run has no light")
@@ -120,9 +120,9 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
 
 
 def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
-    """Write a run's mesh with its textures: a .glb is a copy of the run's, `mesh_exchange` writes .usdc and .fbx.
+    """Write a run's mesh with its textures. A .glb is a copy of the run's file; `mesh_exchange` writes .usdc and .fbx.
 
-    Raises InputError where the run has no mesh, or has edits that its textures lack.
+    Raises InputError where the run has no mesh, or has edits, which the mesh's textures do not contain.
     """
     mesh = run_folder(collection) / "mesh.glb"
     if edits(splats_of(collection)):
@@ -141,7 +141,7 @@ def _copy(file: Path, path: Path) -> None:
 
 
 def run_folder(collection: bpy.types.Collection) -> Path:
-    """Find the run folder that a collection was imported from. Raises InputError where it is gone."""
+    """Find the run folder that a collection was imported from. Raises InputError where the folder is missing."""
     folder = Path(bpy.path.abspath(collection.get(FOLDER, "")))
     if not collection.get(FOLDER) or not (folder / "splats.ply").is_file():
         raise InputError(f"the run of {collection.name} is no longer at {folder}: import it again from its new place")

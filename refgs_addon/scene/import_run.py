@@ -1,4 +1,4 @@
-"""Import a run folder: a collection of its splats, mesh and cameras, and its light."""
+"""Import a run folder: a collection of the run's splats, mesh and cameras, and its recovered light."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +16,7 @@ from .world_light import light_with_recovered, load_panorama
 
 @dataclass
 class Run:
-    """Imported data of a run. Parts that the run folder lacks are None or empty."""
+    """Hold the imported data of a run. Parts that the run folder lacks are None or empty."""
 
     collection: bpy.types.Collection
     splats: bpy.types.Object
@@ -33,9 +33,9 @@ class Run:
 def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     """Import a run folder into a scene, in a new collection `RefGS NAME`.
 
-    splats.ply must exist; mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be missing. The mesh is
-    hidden at first, as it is where the splats are: see `run_parts.show`. The run's cameras replace those that
-    `capture_cameras.show_cameras` added for the same capture. Raises InputError, and then leaves Blender's file unchanged.
+    splats.ply must exist. mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be missing. The mesh is hidden
+    at first, because it overlaps the splats; `run_parts.show` shows it. The run's cameras replace those that
+    `capture_cameras.show_cameras` added for the same capture. Raises InputError; Blender's file is then unchanged.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -104,7 +104,7 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
 
 
 def data_blocks() -> set[bpy.types.ID]:
-    """List the file's data-blocks of all kinds that an import can add."""
+    """List all data-blocks in the file of the kinds that an import can add."""
     kinds = ("objects", "pointclouds", "meshes", "cameras", "materials", "images", "worlds", "collections")
     kinds += ("node_groups", "scenes")
     return {item for kind in kinds for item in getattr(bpy.data, kind)}

@@ -1,4 +1,4 @@
-"""Show a training's current surfels in the 3D view. They are removed when it ends: import the run then."""
+"""Show a training's current surfels in the 3D view. When the training ends, they are removed; the finished run can be imported."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -25,9 +25,9 @@ _reader = ThreadPoolExecutor(1)
 
 
 def watch(job: jobs.Job, scene: bpy.types.Scene, on: bool = True) -> None:
-    """Show a job's surfels in a scene with each new preview, or stop showing them.
+    """Show a job's surfels in a scene, renewed with each preview of the training. With `on` False, remove them.
 
-    The object is added at once, without points: making its nodes takes too long for a timer.
+    The object is added here, without points, because making its nodes takes too long for the timer that calls `update`.
     """
     for live in [live for live in _shown if live.job is job]:
         _remove(live)
@@ -45,7 +45,7 @@ def is_watched(job: jobs.Job) -> bool:
 
 
 def update() -> None:
-    """Put the previews that have been read into the scene, and start reading new ones in a thread."""
+    """Put the previews that the thread has read into the scene, and let the thread read the next ones."""
     for live in list(_shown):
         deleted = live.item not in bpy.data.objects
         if live.job.ended or deleted or live.scene not in bpy.data.scenes:
@@ -60,7 +60,7 @@ def update() -> None:
 
 
 def _read(path: Path) -> dict | None:
-    """Read splats without bent normals, which take longer than everything else."""
+    """Read a preview's splats with flat normals. Bent normals take longer to compute than everything else."""
     import numpy as np
 
     from .splat_cloud import cloud_attributes, read_splats

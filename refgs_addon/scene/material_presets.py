@@ -1,4 +1,4 @@
-"""Materials to start an edit from, as Blender preset files: the add-on's, and those that the artist saves."""
+"""Read and save material presets, as Blender preset files. The add-on brings some, and the artist can save more."""
 
 import runpy
 from pathlib import Path
@@ -17,7 +17,7 @@ INPUTS = ("Base Color", "Color Amount", "Metallic", "Metallic Amount", "Roughnes
 
 
 def materials() -> dict[str, Path]:
-    """Map the names of all materials to their files. Of two with the same name, the artist's counts."""
+    """Map the names of all materials to their files. Where names collide, the artist's preset takes precedence."""
     folders = [ROOT / "presets" / PRESETS, *map(Path, bpy.utils.preset_paths(PRESETS)), _user_folder()]
     files = (file for folder in folders for file in folder.glob("[!.]*.py"))
     found = {bpy.path.display_name(file.name, title_case=False): file for file in files}
@@ -25,7 +25,10 @@ def materials() -> dict[str, Path]:
 
 
 def read_material(name: str) -> dict[str, float | tuple[float, ...]]:
-    """Read the inputs that a material sets: base colour RGBA in linear Rec.709, all others 0..1. Raises InputError."""
+    """Read the inputs that a material sets: base colour RGBA in linear Rec.709, all others 0..1.
+
+    Raises InputError for a preset that is missing or invalid.
+    """
     file = materials().get(name)
     if file is None:
         raise InputError(f"there is no material {name}: choose one of {', '.join(materials())}")
@@ -37,18 +40,18 @@ def read_material(name: str) -> dict[str, float | tuple[float, ...]]:
 
 
 def set_material(edit: bpy.types.NodesModifier, name: str) -> None:
-    """Set an edit to the values of a material. Raises InputError."""
+    """Set an edit to the values of a material. Raises InputError for a preset that is missing or invalid."""
     set_inputs(edit, read_material(name))
 
 
 def set_inputs(edit: bpy.types.NodesModifier, values: dict[str, float | tuple[float, ...]]) -> None:
-    """Set inputs of an edit by name."""
+    """Set the inputs of an edit from values by name."""
     for name, value in values.items():
         compat.set_modifier_input(edit, name, value)
 
 
 def save_material(edit: bpy.types.NodesModifier, name: str) -> Path:
-    """Save an edit's values as a preset of the artist's. Raises InputError where the name exists or is empty."""
+    """Save an edit's values as a preset of the artist. Raises InputError where the name is empty or exists already."""
     stem = AddPresetBase.as_filename(name)
     if not stem:
         raise InputError("the material has no name: type one first")
@@ -68,7 +71,7 @@ def save_material(edit: bpy.types.NodesModifier, name: str) -> Path:
 
 
 def remove_material(name: str) -> None:
-    """Remove a preset of the artist's. Raises InputError for any other preset."""
+    """Remove a preset that the artist saved. Raises InputError for any other preset."""
     file = materials().get(name)
     if file is None or file.parent != _user_folder():
         raise InputError(f"{name} is not a material that you saved: only those can be removed")
@@ -79,7 +82,7 @@ def remove_material(name: str) -> None:
 
 
 def _user_folder() -> Path:
-    """Folder of the artist's presets, which may not exist."""
+    """Return the folder of the artist's presets, which may not exist."""
     return Path(bpy.utils.user_resource("SCRIPTS", path=f"presets/{PRESETS}"))
 
 
@@ -88,7 +91,7 @@ def _identifier(name: str) -> str:
 
 
 def _rounded(name: str, value) -> float | tuple[float, ...]:
-    """Convert a value for an edit, rounded: in single precision a typed 0.2 is 0.20000000298."""
+    """Convert a value for an edit and round it. A typed 0.2 is stored in single precision, as 0.20000000298."""
     if name == "Base Color":
         r, g, b, alpha = value
         return tuple(round(float(part), 6) for part in (r, g, b, alpha))

@@ -17,9 +17,9 @@ _PICTURES = {"base_color": "Base Color", "metallic": "Metallic", "roughness": "R
 
 
 def write_mesh(mesh: Path, path: Path) -> None:
-    """Write a run's mesh.glb as a .usdc or .fbx, and its textures into the folder `NAME textures` beside.
+    """Write a run's mesh.glb as a .usdc or .fbx, and its textures into the folder `NAME textures` beside that file.
 
-    Blender's file does not change. Raises InputError where a texture is missing or a file cannot be read or written.
+    The open .blend does not change. Raises InputError where a texture is missing or a file cannot be read or written.
     """
     sources = {name: mesh.parent / TEXTURES / f"{name}.png" for name in (*_PICTURES, "occlusion")}
     for source in sources.values():
@@ -49,12 +49,15 @@ def write_mesh(mesh: Path, path: Path) -> None:
 
 
 def _specular(item: bpy.types.Object) -> float:
-    """Specular IOR Level of an imported mesh: 0 for no specular reflection."""
+    """Return the Specular IOR Level of an imported mesh's material, or 0 for a material without specular reflection."""
     return principled(item.data.materials[0]).inputs[SPECULAR].default_value
 
 
 def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:
-    """Make a Principled BSDF with one texture for each input: FBX has no texture channels, and the exporters read no other nodes."""
+    """Make a Principled BSDF with one texture for each input.
+
+    FBX cannot pick one channel of a texture, and the exporters read no other nodes.
+    """
     material = bpy.data.materials.new(name)
     tree, inputs = node_tree(material), {SPECULAR: specular}
     for picture, socket in _PICTURES.items():

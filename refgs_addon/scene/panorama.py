@@ -11,10 +11,10 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec.709
 
 
 def best_rotation(image: bpy.types.Image, other: bpy.types.Image) -> tuple[float, float]:
-    """Find the rotation about z that makes an equirectangular panorama most like another, and the scale to its mean radiance.
+    """Find the rotation about z that makes an equirectangular panorama most like another, and the ratio of their mean radiances.
 
-    The rotation is in radians, counter-clockwise seen from above, -π..π. It maximises the correlation of log luminance, weighted by
-    solid angle. The mean radiance is over the sphere.
+    The rotation is in radians, counter-clockwise seen from above, -π..π. It maximises the correlation of log luminance, weighted by solid
+    angle. The mean radiance is over the sphere.
     """
     area = np.cos(np.pi * ((np.arange(ROWS) + 0.5) / ROWS - 0.5))[:, None]
     small = [_luminance(picture) for picture in (image, other)]

@@ -1,4 +1,4 @@
-"""Regions: Empties that mark splats to edit or crop, or the part of a capture to train."""
+"""Add and read regions: Empties that mark the splats to edit or crop, or the part of a capture to train."""
 
 import math
 from pathlib import Path
@@ -31,7 +31,7 @@ def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name:
 
 
 def crop(splats: bpy.types.Object, collection: bpy.types.Collection, on: bool) -> bpy.types.Object | None:
-    """Draw only the splats in a box, or all of them. The box is made the first time, and kept when cropping is off."""
+    """Draw only the splats in a crop box, or all splats. The first call makes the box; switching the crop off keeps the box."""
     modifier = splats.modifiers[NAME]
     box = compat.get_modifier_input(modifier, "Crop Box")
     if on and box is None:
@@ -44,16 +44,16 @@ def crop(splats: bpy.types.Object, collection: bpy.types.Collection, on: bool) -
 
 
 def training_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
-    """Find the box to train in; None if the settings have none, or it was deleted."""
+    """Find the box that limits the training. Returns None if none was chosen or the box was deleted."""
     box = scene.refgs.region
     return box if box is not None and scene in box.users_scene else None
 
 
 def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Show the box to train in, and make it if there is none.
+    """Show the box that limits the training. Make the box if there is none.
 
-    A new box surrounds what the cameras look at, as the capture's last check found it. Without a check it is 2 m wide around the
-    origin: there the trainer puts what the cameras look at, with a radius of 1 m, except for captures in NeRF-Blender's layout.
+    A new box surrounds the ball that the cameras look at, as found by the capture's last check. Without a check the box is 2 m wide
+    around the origin. There the trainer moves that ball, with a radius of 1 m, except for captures in NeRF-Blender's layout.
     """
     box = training_region(scene)
     if box is None:
@@ -77,7 +77,7 @@ def _looked_at(scene: bpy.types.Scene) -> tuple[Vector, float]:
 
 
 def region_settings(scene: bpy.types.Scene) -> dict[str, list[float]]:
-    """Settings for the trainer from the scene's region: the box, and its Z axis as the result's up. Empty without a region.
+    """Return the trainer's settings from the scene's region: the box's extent, and its Z axis as the result's up. Empty without a region.
 
     Raises InputError for a box without volume.
     """

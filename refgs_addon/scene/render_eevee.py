@@ -1,4 +1,4 @@
-"""Render a view in Eevee, whatever the scene's own render settings are."""
+"""Render a view in Eevee, independently of the scene's own render settings."""
 
 import contextlib
 from collections.abc import Iterator
@@ -20,11 +20,11 @@ def render_preview(
     samples: int = 64,
     exr: Path | None = None,
 ) -> None:
-    """Render a camera's view (the scene's camera by default) in Eevee, over a transparent background.
+    """Render a camera's view in Eevee over a transparent background. The default is the scene's camera.
 
-    `size` is the longer side in pixels; by default the photo's. `png` is 8-bit sRGB with straight alpha, through the Standard
-    view transform. `exr` is linear Rec.709 radiance in 32 bits, premultiplied. The scene's own settings are restored. Raises
-    InputError where there is no camera or a file cannot be written.
+    `size` is the longer side in pixels; the default is the photo's. `png` gets 8-bit sRGB with straight alpha, through the Standard view
+    transform. `exr` gets linear Rec.709 radiance in 32 bits, premultiplied. The scene's own settings are restored. Raises InputError
+    where there is no camera or a file cannot be written.
     """
     camera = camera or scene.camera
     if camera is None:

@@ -1,4 +1,4 @@
-"""Parts of an imported run: find them, and show one of them."""
+"""Find the parts of an imported run, and show one of them."""
 
 import bpy
 
@@ -7,7 +7,7 @@ FOLDER = "refgs_folder"  # custom property of a run's collection: its run folder
 
 
 def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]:
-    """Group the objects of a run's collection by part. Empty for a collection that is not a run's."""
+    """Group the objects of a run's collection by part. Returns {} for any other collection."""
     found: dict[str, list[bpy.types.Object]] = {}
     for item in collection.objects:
         if KEY in item:
@@ -16,7 +16,7 @@ def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]
 
 
 def show(collection: bpy.types.Collection, part: str) -> None:
-    """Show one part of a run, "splats" or "mesh", and hide the other, in the viewport and in renders."""
+    """Show one part of a run, "splats" or "mesh", in the viewport and in renders, and hide the other part."""
     for name, items in parts(collection).items():
         for item in items:
             item.hide_viewport = item.hide_render = name != part

@@ -1,4 +1,4 @@
-"""Read facts about a run from its run.toml. A missing or unreadable file yields none."""
+"""Read facts about a run from its run.toml. A missing or unreadable file counts as empty."""
 
 import math
 import tomllib
@@ -8,13 +8,13 @@ MANIFEST = Path(__file__).resolve().parents[2] / "blender_manifest.toml"
 
 
 def capture_of(run: Path) -> Path | None:
-    """Folder of the capture that a run was trained on."""
+    """Return the folder of the capture that a run was trained on, or None if run.toml does not say."""
     capture = _table(run, "run").get("capture")
     return Path(capture) if isinstance(capture, str) else None
 
 
 def up_was_chosen(run: Path) -> bool:
-    """Check whether another up than that of the capture's cameras was chosen, so that the run is rotated."""
+    """Check whether the artist chose another up direction than the capture's. The run is then rotated against the capture."""
     try:
         x, y, z = _table(run, "settings")["region"]["up"]
         return math.hypot(x, y) > 1e-3 * z and any((x, y, z))
@@ -23,7 +23,7 @@ def up_was_chosen(run: Path) -> bool:
 
 
 def newer_release(run: Path) -> str:
-    """Return the release that made a run if it is newer than this add-on, else ""."""
+    """Return the release that trained a run if it is newer than this add-on, else ""."""
     made_by = _table(run, "run").get("refgs")
     own = tomllib.loads(MANIFEST.read_text(encoding="utf-8"))["version"]
     try:

@@ -1,4 +1,4 @@
-"""Splats: read a splats.ply, and make a point cloud with the materials as attributes."""
+"""Read a splats.ply, and make a point cloud of its splats with the materials as attributes."""
 
 import itertools
 import os
@@ -38,7 +38,7 @@ def add_splats(
 ) -> bpy.types.Object:
     """Add an object for a `point_cloud` to a collection, with the modifier and material that draw its splats.
 
-    The material uses `constants` (from `read_constants`) in place of attributes.
+    `constants` (from `read_constants`) are values that all splats share. The material uses them in place of attributes.
     """
     result = bpy.data.objects.new(name, cloud)
     collection.objects.link(result)
@@ -56,9 +56,10 @@ def add_splats(
 def cloud_attributes(
     splats: dict[str, np.ndarray], normal_u: np.ndarray, normal_v: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Attributes for the points of a cloud: those of `read_splats`, with scale and base_color extended by a 1, and normal slopes.
+    """Return the attributes for a cloud's points: the arrays of `read_splats`, and the slopes of the normal.
 
-    normal_u and normal_v (N, 3) are the changes of the normal along the splat's axes, per standard deviation.
+    scale gets a third component 1, and base_color a fourth, as Blender's types need. normal_u and normal_v (N, 3) are the changes of the
+    normal along the splat's axes, per standard deviation.
     """
     one = np.ones((len(splats["position"]), 1), np.float32)
     return splats | {
@@ -84,10 +85,10 @@ def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointClou
 def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     """Read a run's splats.ply, or a PLY of 3DGS or 2DGS (binary, little-endian, 3DGS's property names).
 
-    Returns float32 arrays, and the number of splats left out for values that are not finite: position (N, 3), normal (N, 3)
-    unit, scale (N, 2) standard deviations, rotation (N, 4) unit quaternions wxyz, opacity (N,) 0..1, base_color (N, 3) linear,
-    metallic (N,), roughness (N,). Splats without materials become matte, in the colour of their constant harmonic. Missing or zero
-    normals are set to the shortest axis. Raises InputError for any other file.
+    Returns float32 arrays and a count. The arrays are position (N, 3), normal (N, 3) unit, scale (N, 2) standard deviations, rotation (N,
+    4) unit quaternions wxyz, opacity (N,) 0..1, base_color (N, 3) linear, metallic (N,), roughness (N,). The count is the number of
+    splats left out because a value is not finite. Splats without materials become matte, in the colour of their constant spherical
+    harmonic. Missing or zero normals are set to the shortest axis. Raises InputError for any other file.
     """
     all_rows = read_rows(path)
     rows = finite_rows(all_rows)
@@ -137,7 +138,10 @@ def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
 
 
 def _flatten_gaussians(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Flatten 3D Gaussians to discs: rotate the shortest axis to the third; return quaternions wxyz (N, 4) and the other two scales."""
+    """Flatten 3D Gaussians to discs: permute the axes so that the shortest comes third, and drop its scale.
+
+    Returns quaternions wxyz (N, 4) and the other two scales (N, 2).
+    """
     shortest = np.where(scale[:, 2] <= scale.min(axis=1), 2, scale.argmin(axis=1))
     # Rotations that bring x, y or z to the third axis.
     turns = np.array([(0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1, 0, 0, 0)], np.float32)
@@ -152,7 +156,10 @@ def _flatten_gaussians(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndar
 
 
 def finite_rows(rows: np.ndarray) -> np.ndarray:
-    """Select the rows of a PLY whose values are all finite, as `refgs` does. An opacity, a logit, may be infinite: 0 or 1."""
+    """Select the rows of a PLY whose values are all finite, as the trainer does.
+
+    The opacity is a logit and may be infinite: that is an opacity of 0 or 1.
+    """
     fine = np.ones(len(rows), bool)
     floats = [name for name in rows.dtype.names if rows.dtype[name].kind == "f"]
     for start in range(0, len(rows), _ROWS):
@@ -163,7 +170,7 @@ def finite_rows(rows: np.ndarray) -> np.ndarray:
 
 
 def read_rows(path: Path) -> np.ndarray:
-    """Read the `vertex` element of a PLY file (binary, little-endian, that element first) as a structured array.
+    """Read the `vertex` element of a PLY file as a structured array. The file is binary, little-endian, and has that element first.
 
     Raises InputError for any other file.
     """
@@ -183,9 +190,9 @@ def read_rows(path: Path) -> np.ndarray:
 
 
 def read_constants(path: Path) -> dict[str, float]:
-    """Read the constants in the header comments of a run's splats.ply: values of metallic, roughness or specular for all splats.
+    """Read constants from the header comments of a run's splats.ply: one metallic, roughness or specular for all splats.
 
-    Specular is the Principled BSDF's Specular IOR Level. A column of the same name takes precedence.
+    Specular is the Principled BSDF's Specular IOR Level. A column of the same name takes precedence over the constant.
     """
     try:
         with open(path, "rb") as file:
@@ -205,7 +212,7 @@ def read_constants(path: Path) -> dict[str, float]:
 
 
 def _parse_header(head: bytes, found: bytes, path: Path) -> tuple[np.dtype, int]:
-    """Parse a PLY header into the type of a row and the number of rows. `found` is its last line."""
+    """Parse a PLY header into the numpy type of a row and the number of rows. `found` is the header's last line."""
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     if not found or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
         raise InputError(f"{path} is not a binary little-endian PLY file: export the run again")
@@ -225,9 +232,9 @@ def _parse_header(head: bytes, found: bytes, path: Path) -> tuple[np.dtype, int]
 def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the change of the normal across each splat: dn/du and dn/dv (N, 3) per standard deviation.
 
-    A flat splat mirrors only one direction, so that a curved mirror of flat splats looks faceted. The slopes are a weighted
-    least-squares plane through the normals of neighbours that face the same way, fixed at the splat's own normal. Neighbours are
-    close along space-filling curves: not always the nearest, but found in a second for a million splats.
+    A flat splat mirrors only one direction, and a curved mirror of flat splats looks faceted. The slopes are a weighted least-squares
+    plane through the normals of neighbours that face the same way, fixed at the splat's own normal. The neighbours are close along
+    space-filling curves. They are not always the nearest ones, but take only a second for a million splats.
     """
     position, normal = (splats[key].astype(np.float32) for key in ("position", "normal"))
     count = len(position)
@@ -272,9 +279,9 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
 
 
 def _morton_order(position: np.ndarray, shift: float) -> np.ndarray:
-    """Order points (N, 3) along a Morton curve through their bounding cube, shifted by a fraction of its side.
+    """Order points (N, 3) along a Morton curve through their bounding cube. `shift` moves the curve by a fraction of the cube's side.
 
-    Different shifts put the curve's jumps at different points.
+    Two curves with different shifts jump at different points, so that neighbours missed by one are found by the other.
     """
     low = position.min(axis=0)
     cells = (position - low) / max((position - low).max(), 1e-30) / 2 + np.float32(shift)

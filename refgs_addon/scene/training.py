@@ -1,4 +1,4 @@
-"""Train from a scene's settings: functions behind the buttons of the Train panel."""
+"""Train from a scene's settings. The buttons of the Train panel call these functions."""
 
 import tempfile
 from pathlib import Path
@@ -13,7 +13,7 @@ from .regions import region_settings
 
 
 def check(scene: bpy.types.Scene) -> jobs.Job:
-    """Check the scene's capture. The job's `results["check"]` has the findings."""
+    """Check the scene's capture. The job's `results["check"]` has the result."""
     capture = _capture(scene)
     job = jobs.check(python(), capture, capture_folder(capture), log_file(f"check {capture.name}"))
     follow_jobs()
@@ -21,7 +21,7 @@ def check(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
-    """Find the cameras of the scene's photos, then check the capture. Drops the jobs that failed without cameras."""
+    """Find the cameras of the scene's photos, then check the capture. Earlier jobs that failed for lack of cameras leave the list."""
     capture = _capture(scene)
     job = jobs.find_cameras(python(), capture, capture_folder(capture), log_file(f"cameras {capture.name}"))
     jobs.JOBS[:] = [known for known in jobs.JOBS if not known.no_cameras]
@@ -30,9 +30,9 @@ def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def train(scene: bpy.types.Scene) -> jobs.Job:
-    """Train the scene's capture with its settings, after the trainings that wait already. The scene lists the run folder.
+    """Train the scene's capture with its settings, once earlier trainings have ended. Adds the run folder to the scene's list.
 
-    Raises InputError where the trainer or the capture is missing, the run folder is not empty, or the region is flat.
+    Raises InputError where the trainer or the capture is missing, the run folder is not empty, or the training box is flat.
     """
     settings, capture = scene.refgs, _capture(scene)
     out = Path(bpy.path.abspath(settings.out)) if settings.out else _free_folder(capture, scene)
@@ -49,9 +49,9 @@ def train(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: Path) -> jobs.Job | None:
-    """Write a run with its edits as a new run folder, which the scene lists. Raises InputError.
+    """Write a run with its edits as a new run folder, and add the folder to the scene's list.
 
-    If a trainer is set up, it makes the mesh and textures; its job is returned.
+    If a trainer is set up, it makes the mesh and textures. Returns that job, or None. Raises InputError where the run cannot be exported.
     """
     from .export_run import export_run
 
@@ -65,9 +65,10 @@ def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: P
 
 
 def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.Job:
-    """Let the trainer write a run with its edits as display splats: in the colours under its recovered light, for viewers without lights.
+    """Let the trainer write a run with its edits as display splats, for viewers without lights.
 
-    Replaces the file. Raises InputError where the trainer, the run or the file's folder is missing.
+    Display splats have fixed colours: those that the recovered light gives them. Replaces the file. Raises InputError where the trainer,
+    the run or the file's folder is missing.
     """
     from .edit import edits, splats_of
     from .export_run import export_run, run_folder
@@ -99,7 +100,7 @@ def resume(scene: bpy.types.Scene, folder: Path) -> jobs.Job:
 
 
 def forget(scene: bpy.types.Scene, folder: Path) -> None:
-    """Remove a run from the scene's list. Its folder stays."""
+    """Remove a run from the scene's list. The run folder stays on the disk."""
     runs = scene.refgs.runs
     for number in reversed(range(len(runs))):
         if Path(runs[number].folder) == folder:
@@ -108,7 +109,7 @@ def forget(scene: bpy.types.Scene, folder: Path) -> None:
 
 
 def _choices(settings: bpy.types.PropertyGroup) -> dict[str, object]:
-    """Settings for the trainer that the scene overrides in the preset."""
+    """Return the trainer's settings that the scene overrides in the preset."""
     chosen = {
         "surfels.budget": settings.splats or "auto",
         "light.frame": settings.light,
@@ -135,7 +136,7 @@ def _capture(scene: bpy.types.Scene) -> Path:
 
 
 def _free_folder(capture: Path, scene: bpy.types.Scene) -> Path:
-    """Find a folder name beside the capture that is neither used nor reserved by a waiting training."""
+    """Find a name for a run folder beside the capture. The folder must not exist, nor be in the scene's list of runs."""
     taken = {Path(known.folder) for known in scene.refgs.runs}
     number, out = 1, capture.with_name(f"{capture.name} RefGS")
     while out in taken or out.exists():

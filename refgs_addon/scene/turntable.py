@@ -1,4 +1,4 @@
-"""Turntable: a run rotates once about itself, in front of a fixed camera and under a fixed light."""
+"""Add a turntable: a run rotates once about itself, while the camera and the environment stand still."""
 
 import math
 
@@ -12,9 +12,10 @@ KEY = "refgs_turntable"  # custom property of the Empty that rotates
 
 
 def add_turntable(scene: bpy.types.Scene, collection: bpy.types.Collection, seconds: float = 4.0) -> bpy.types.Object:
-    """Parent a run's splats, mesh and regions to an Empty that rotates once; the scene's frame range becomes `seconds` long.
+    """Parent a run's splats, mesh and regions to an Empty that rotates once in `seconds`. Sets the scene's frame range to that length.
 
-    The turn ends one frame after the last, so that a loop does not pause. Raises InputError where the run has a turntable already.
+    The rotation is complete one frame after the last frame, so that a loop does not pause. Raises InputError where the run has a
+    turntable already.
     """
     found = parts(collection)
     if not found:

@@ -40,11 +40,11 @@ def light_with_recovered(scene: bpy.types.Scene, name: str, image: bpy.types.Ima
 
 
 def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, strength: float = 1.0) -> None:
-    """Light the scene with an HDRI, or with the recovered light again where `hdri` is None.
+    """Light the scene with an HDRI. With `hdri` None, light it with the recovered light again.
 
-    `rotation` rotates the light about z, in radians, counter-clockwise seen from above; `strength` multiplies it. The
-    recovered light stays with the world. A world that RefGS did not make is replaced in the scene, but not changed.
-    Raises InputError where the HDRI cannot be read, or the scene has no recovered light.
+    `rotation` rotates the environment about z, in radians, counter-clockwise seen from above; `strength` multiplies its radiance. The
+    world keeps the recovered light. A world that RefGS did not make is replaced in the scene, but not changed. Raises InputError where
+    the HDRI cannot be read, or the scene has no recovered light.
     """
     world = scene.world if is_panorama(scene.world) else None
     if hdri is not None:
@@ -59,9 +59,10 @@ def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, st
 
 
 def match_light(scene: bpy.types.Scene) -> None:
-    """Rotate and scale the scene's HDRI to match the recovered light: by log luminance and by mean radiance over the sphere.
+    """Rotate and scale the scene's HDRI until it matches the recovered light.
 
-    Raises InputError where the scene has no recovered light, or is lit by it.
+    The rotation is matched by log luminance, the scale by the mean radiance over the sphere. Raises InputError where the scene has no
+    recovered light, or already uses it.
     """
     world = scene.world
     if not is_panorama(world) or world.get(RECOVERED) is None:

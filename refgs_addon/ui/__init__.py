@@ -1,4 +1,4 @@
-"""Register the operators and panels. They only call functions of `scene`."""
+"""Register the operators and panels. They only call functions of the package `scene`."""
 
 import bpy
 

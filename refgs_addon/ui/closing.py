@@ -1,7 +1,7 @@
-"""Close Blender during a training.
+"""Ask what becomes of running trainings before Blender closes.
 
-Blender does not ask add-ons before it closes. So only the quit key and an entry in the File menu ask; for all other ways, each
-training has a checkbox that keeps it running.
+Blender does not tell add-ons before it closes. So only the quit key and an entry in the File menu ask the question. For all other ways to
+close Blender, each training has a checkbox that keeps it running.
 """
 
 import sys
@@ -60,7 +60,7 @@ class Quit(ReportsErrors, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Leave the key to Blender while nothing trains."""
+        """Return False while nothing trains: the quit key then works as in plain Blender."""
         cls.poll_message_set("Nothing is being trained")
         return bool(jobs.trainings())
 
@@ -86,7 +86,7 @@ class Quit(ReportsErrors, bpy.types.Operator):
 
 
 def quit_question() -> str:
-    """Title of the question before quitting."""
+    """Return the title of the question before quitting."""
     number = len(jobs.trainings())
     return "A training is running" if number == 1 else f"{number} trainings are running or waiting"
 

@@ -1,4 +1,4 @@
-"""Drop files on the 3D view: a run's run.toml imports its folder, a capture's transforms.json chooses its folder."""
+"""Handle files that are dropped on the 3D view: a run.toml imports its run, a transforms.json chooses its capture."""
 
 from pathlib import Path
 
@@ -12,12 +12,12 @@ from .operators import ReportsErrors, import_run_folder
 
 
 class _Drop(ReportsErrors):
-    """Base of operators on a dropped file."""
+    """Store the path of a dropped file. Base of the operators on such a file."""
 
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
 
     def folder(self, name: str) -> Path:
-        """Return the file's folder. Raises InputError where its name does not begin with `name`."""
+        """Return the dropped file's folder. Raises InputError where the file's name does not begin with `name`."""
         file = Path(bpy.path.abspath(self.filepath))
         if not file.name.startswith(name):
             raise InputError(
@@ -47,7 +47,7 @@ class DropCapture(_Drop, bpy.types.Operator):
 
 
 class _OnView:
-    """Base of handlers for files dropped on the 3D view."""
+    """Accept files that are dropped on the 3D view. Base of the file handlers."""
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:

@@ -1,4 +1,4 @@
-"""Icons for the panels: a training's newest preview and its curve, and thumbnails of files."""
+"""Make icons for the panels: a training's newest preview and its curve, and thumbnails of files."""
 
 import math
 from pathlib import Path
@@ -22,7 +22,7 @@ _drawn: dict[int, tuple[int, int]] = {}  # number of points in the drawn curve b
 
 
 def preview_icon(job: jobs.Job) -> int:
-    """Icon of a job's newest preview; 0 where there is none yet."""
+    """Return the icon of a job's newest preview, or 0 where there is none yet."""
     if not job.preview or _pictures is None:
         return 0
     key = f"{job.serial} {job.preview['iteration']}"
@@ -36,7 +36,7 @@ def preview_icon(job: jobs.Job) -> int:
 
 
 def thumbnail(file: Path, version: int = 0) -> int:
-    """Icon of a file's thumbnail, which Blender makes in the background; 0 without a window.
+    """Return the icon of a file's thumbnail, or 0 in a Blender without a window. Blender makes the thumbnail in the background.
 
     A new `version` reloads a file that was overwritten.
     """
@@ -47,7 +47,7 @@ def thumbnail(file: Path, version: int = 0) -> int:
 
 
 def curve_icon(job: jobs.Job) -> int:
-    """Icon of a job's `plot`; 0 for fewer than two points, or without numpy, which Debian's Blender may lack."""
+    """Return the icon of a job's `plot`, or 0 for fewer than two points. Also 0 without numpy, which Debian's Blender may lack."""
     if len(job.curve) < 2 or _pictures is None:
         return 0
     key = f"{job.serial} curve"
@@ -65,7 +65,7 @@ def curve_icon(job: jobs.Job) -> int:
 
 
 def plot(trained: list[tuple[float, float]], held_out: list[tuple[float, float]]) -> "np.ndarray":
-    """Plot PSNR over log time as RGBA (height, width, 4), bottom row first: a line for training views, dots for held-out views.
+    """Plot PSNR over log time as RGBA (height, width, 4), bottom row first. Training views make a line, held-out views dots.
 
     Points are (seconds, PSNR). The grid is at 1, 10, 100 … seconds and every 5 dB.
     """

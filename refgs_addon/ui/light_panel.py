@@ -1,4 +1,4 @@
-"""Light panel: choose the panorama that lights the scene."""
+"""Draw the Light panel, which chooses the panorama that lights the scene."""
 
 import math
 from pathlib import Path
@@ -38,7 +38,7 @@ def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, 
 
 
 def _number(file: Path) -> int:
-    """Number a file independently of the other files in its folder, above OTHER."""
+    """Hash a file's path to a number above OTHER. The number does not change when the folder's other files do."""
     return 2 + crc32(str(file).encode()) % (1 << 30)
 
 

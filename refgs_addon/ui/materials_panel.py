@@ -1,4 +1,4 @@
-"""Materials panel: edit the materials of a run."""
+"""Draw the Materials panel, which edits the materials of a run."""
 
 from typing import ClassVar
 
@@ -49,7 +49,7 @@ class AddEdit(OnRun, bpy.types.Operator):
 
 
 class _OfEdit(ReportsErrors):
-    """Base of operators on one edit."""
+    """Find the modifier of one edit. Base of the operators on an edit."""
 
     splats: StringProperty(name="Splats", options={"HIDDEN"})
     edit: StringProperty(name="Edit", options={"HIDDEN"})
@@ -81,7 +81,7 @@ class SetMaterial(_OfEdit, bpy.types.Operator):
 
 
 class KeepMaterial(_OfEdit, bpy.types.Operator):
-    """Save or remove a preset, for + and − in Blender's list of presets.
+    """Save or remove a preset, for the buttons + and − in Blender's list of presets.
 
     Blender's own operator overwrites a preset of the same name (4.3), and cannot read a modifier's inputs.
     """

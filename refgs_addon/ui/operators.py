@@ -1,4 +1,4 @@
-"""Operators of the Run and Preview panels, and base classes of all operators. They only call functions of `scene`."""
+"""Define the operators of the Run and Preview panels, and the base classes of all operators."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -22,7 +22,7 @@ from ..scene.world_light import hdris
 
 
 class ReportsErrors:
-    """Base of all operators: run `work`, and report an InputError in one line."""
+    """Run `work`, and report an InputError in one line. Base of all operators."""
 
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
@@ -40,7 +40,7 @@ class ReportsErrors:
 
 
 class OnJob(ReportsErrors):
-    """Base of operators on one job of the list."""
+    """Find one job of the list. Base of the operators on a job."""
 
     bl_options: ClassVar = {"REGISTER"}
 
@@ -52,7 +52,7 @@ class OnJob(ReportsErrors):
 
 
 class OnRun(ReportsErrors):
-    """Base of operators on the active run. Without one the button's tooltip says what to do."""
+    """Disable the button without an active run, and say in its tooltip what to do. Base of the operators on the active run."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -61,19 +61,19 @@ class OnRun(ReportsErrors):
 
 
 class OnRunFolder(ReportsErrors):
-    """Base of operators on a listed run."""
+    """Store the folder of a listed run. Base of the operators on such a run."""
 
     folder: StringProperty(name="Run Folder")
 
 
 def has_trainer(operator: type[bpy.types.Operator]) -> bool:
-    """Check that a trainer is set up; otherwise the button's tooltip says what to do."""
+    """Check that a trainer is set up. If none is, the button's tooltip says what to do."""
     operator.poll_message_set("Set up the trainer in the add-on's preferences first")
     return set_up()
 
 
 def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> None:
-    """Import a run, and report the result and its limits."""
+    """Import a run, and report to the artist what was imported and what to be aware of."""
     from ..scene.import_run import import_run
 
     run = import_run(folder, context.scene)
@@ -138,7 +138,7 @@ class Crop(ReportsErrors, bpy.types.Operator):
 
 
 def select_only(context: bpy.types.Context, item: bpy.types.Object) -> None:
-    """Make an object the active one, and the only selected one."""
+    """Make an object the active one, and deselect all others."""
     for other in context.selected_objects:
         other.select_set(False)
     item.select_set(True)
@@ -196,7 +196,7 @@ class Turntable(OnRun, bpy.types.Operator):
 
 
 class _Render(ReportsErrors, ExportHelper):
-    """Render in another Blender process, or in this one where it has no window."""
+    """Render in another Blender process. A Blender without a window renders in its own process."""
 
     bl_options: ClassVar = {"REGISTER"}
     filename_ext = ".png"

@@ -1,4 +1,4 @@
-"""Run and Preview panels, and the RefGS tab in the 3D view's sidebar that all panels are in."""
+"""Draw the Run and Preview panels. Define the RefGS tab in the 3D view's sidebar, which holds all panels."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Train panel and its operators."""
+"""Draw the Train panel, and define its operators."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -19,7 +19,7 @@ from .panels import Tab
 
 
 class _OnCapture(ReportsErrors):
-    """Base of operators on the chosen capture. Without one, or without a trainer, the button's tooltip says what to do."""
+    """Disable the button without a capture or a trainer, and say in its tooltip what to do. Base of the operators on the capture."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -252,7 +252,7 @@ def draw_status(self, context: bpy.types.Context) -> None:
 
 
 def _fraction(job: jobs.Job) -> float:
-    """Fraction of the training, or of another job's stage, that is done."""
+    """Return the fraction of a training, or of another job's stage, that is done."""
     facts = job.progress
     return facts["done" if "stage" in facts else "iteration"] / max(facts["total"], 1) if facts else 0.0
 
@@ -305,7 +305,7 @@ def _draw_run(box: bpy.types.UILayout, folder: Path) -> None:
 
 
 def other_process_status(folder: Path) -> tuple[float, str]:
-    """Fraction and description of the progress of a run that another process trains."""
+    """Return the fraction done, and a few words on the progress, of a run that another process trains."""
     facts = jobs.run_progress(folder)
     if not facts:
         return (1.0, "Making the mesh") if (folder / "splats.ply").exists() else (0.0, "Starting")

@@ -1,4 +1,4 @@
-"""Operators of the preferences: query, install and remove the trainer."""
+"""Define the operators of the preferences: query, install and remove the trainer."""
 
 from typing import ClassVar
 

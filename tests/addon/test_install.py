@@ -1,4 +1,4 @@
-"""Install and remove the trainer, with a fake uv."""
+"""Test that the trainer is installed and removed, with a fake uv."""
 
 import json
 import os
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def home(tmp_path, monkeypatch):
-    """Make a folder to install into, for an add-on with a bundled trainer and the fake uv."""
+    """Return a folder to install into. The add-on gets a bundled trainer and the fake uv."""
     monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     yield tmp_path / "user" / "trainer"
     jobs.stop_all()

@@ -1,4 +1,4 @@
-"""Follow the trainer's processes, with a fake worker."""
+"""Test that the add-on starts and follows the trainer's processes, with a fake worker."""
 
 import json
 import subprocess
@@ -36,7 +36,7 @@ def test_a_training_to_its_end(start, tmp_path):
 
 
 def test_one_that_is_silent_is_not_waited_for(tmp_path):
-    """Do not block the window between a process's last output and its end."""
+    """Check that polling a job whose process has closed its output, but still runs, does not block the window."""
     ends_with_its_input = "import os, sys; print('{}', flush=True); os.close(1); sys.stdin.read(); os._exit(3)"
     arguments, commands = ("-c", ends_with_its_input), [{"command": "rest"}]
     job = jobs._add(jobs.Job("slow", Path(sys.executable), commands, tmp_path / "log.txt", arguments=arguments))
@@ -130,7 +130,7 @@ time.sleep(600)
 
 @pytest.fixture
 def killed(python, tmp_path):
-    """Kill a Blender that trains, and return the run folder."""
+    """Start a second Blender that trains, kill it, and return the run folder."""
 
     def killed(kept: str) -> Path:
         capture, run = tmp_path / "slow photos", tmp_path / "run"

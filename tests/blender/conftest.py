@@ -1,4 +1,4 @@
-"""Blender as a Python module. A process has one file, so each test starts with an empty one."""
+"""Provide Blender, as a Python module, to the tests. A process has one file, so each test starts with an empty one."""
 
 import pytest
 

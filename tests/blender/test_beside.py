@@ -1,4 +1,4 @@
-"""Render in another Blender: the file as it is now, or one line of error."""
+"""Test rendering in another Blender: it renders the file's unsaved state, or reports one line of error."""
 
 import time
 

@@ -1,4 +1,4 @@
-"""Runs with constant metallic, roughness or specular: stored once in the file, and read by no node."""
+"""Test runs whose metallic, roughness or specular is constant: the file stores the value once, and no node reads it."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ MATTE = {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
 
 
 def say_once(folder, constants):
-    """Move columns of the run's splats.ply to constants in its header."""
+    """Move columns of the run's splats.ply to constants in the file's header."""
     file = folder / "splats.ply"
     data = PlyData.read(str(file))["vertex"].data
     rows = data[[name for name in data.dtype.names if name not in constants]].copy()
@@ -48,7 +48,7 @@ def test_the_material_reads_what_varies_alone(constants, run_folder, scene):
 
 
 def test_an_edit_has_it_read_all(run_folder, scene):
-    """Editing with gold makes a matte run's material read all attributes."""
+    """Check that a matte run's material reads all attributes once an edit sets it to gold."""
     say_once(run_folder, MATTE)
     run = import_run(run_folder, scene)
     add_edit(run.collection, "Everywhere", "Gold")
@@ -62,7 +62,7 @@ def test_an_edit_has_it_read_all(run_folder, scene):
 
 
 def test_what_is_exported_says_it_as_the_run_did(run_folder, scene, tmp_path):
-    """Constants stay constants until an edit makes the splats differ."""
+    """Check that an export keeps the constants, and writes columns instead once an edit makes the splats differ."""
     say_once(run_folder, MATTE)
     run = import_run(run_folder, scene)
     export_splats(run.collection, tmp_path / "same.ply")

@@ -1,4 +1,4 @@
-"""Edit materials: what an edit changes, where, and that the learned values stay."""
+"""Test material edits: what they change, where they apply, and that the learned values stay."""
 
 import bpy
 import numpy as np
@@ -24,7 +24,7 @@ def run(run_folder, scene):
 
 
 def drawn(run, name, field="value", width=1):
-    """Read an attribute of the drawn splats, at the first corner of each quad."""
+    """Read an attribute of the splats as drawn, at the first corner of each quad."""
     bpy.context.view_layer.update()
     graph = bpy.context.evaluated_depsgraph_get()
     mesh = next(
@@ -116,7 +116,10 @@ def test_what_is_like_the_splat_at_the_region(run):
 
 
 def test_the_mesh_follows_all_edits(run):
-    """Compositing the stored attributes over the learned material gives the edited material."""
+    """Check that the splats' stored edits, composited over the learned material, give the edited material.
+
+    The mesh must get the edits of the nearest splat.
+    """
     first = add_edit(run.collection, material="Gold")
     compat.set_modifier_input(first, "Color Amount", 0.7)
     second = add_edit(run.collection, "Sphere", "Rubber")
@@ -175,7 +178,7 @@ def test_the_buttons(run):
 
 
 def test_what_is_painted_on_the_mesh(run):
-    """Weights of 1 on one side of the mesh edit the nearest splats, and the mesh there."""
+    """Check that painting one side of the mesh with weight 1 edits the splats on that side, and the mesh there."""
     run.mesh[0].data.transform(Matrix.Translation((-1, 3, -2)))  # into the middle of the splats
     add_edit(run.collection, "Painted", "Gold")
     canvas = next(item for item in run.collection.objects if item.get("refgs_region"))

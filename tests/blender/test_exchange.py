@@ -1,4 +1,4 @@
-"""Export a run's mesh as USD and FBX, move it with its textures, and import it again with Blender's importers."""
+"""Test the export of a run's mesh as USD and FBX: Blender's importers read it back, even after it was moved with its textures."""
 
 import shutil
 from dataclasses import replace
@@ -84,7 +84,7 @@ def level(item):
 
 @pytest.mark.parametrize("specular", [1.0, 0.0])
 def test_what_mirrors_nothing_is_not_given_gloss(run_folder, scene, tmp_path, specular):
-    """Specular 0 survives the export. Of the two FBX importers only the one in Python reads it."""
+    """Check that specular 0 survives the export. Of the two FBX importers only the one in Python reads the value."""
     ending, read = IMPORTERS[1]
     mesh, textures = textured_box()
     write_glb(run_folder / "mesh.glb", mesh, replace(textures, specular=specular))

@@ -1,4 +1,4 @@
-"""Export a run with its edits; the run itself does not change."""
+"""Test the export of a run with its edits. The run itself must not change."""
 
 import json
 import shutil
@@ -50,7 +50,7 @@ def test_edits_are_written_and_nothing_else_changes(run, run_folder, tmp_path, p
 
 
 def test_a_viewer_without_lights_shows_the_new_colour(run, run_folder, tmp_path):
-    """Half the base colour under the same light: half of what the matte part sends."""
+    """Check that the colours that viewers without lights show change in proportion to the base colour."""
     rows = read_rows(run_folder / "splats.ply").copy()
     edit = add_edit(run.collection)
     splats = run.splats.data.attributes["base_color"].data

@@ -1,4 +1,4 @@
-"""Register the extension, build and validate it with Blender's own tool, and press its buttons."""
+"""Test that the extension registers, that Blender's own tool builds and validates it, and that its buttons work."""
 
 import shutil
 import subprocess
@@ -35,7 +35,10 @@ def test_registers_and_unregisters_twice(scene):
 
 
 def test_registers_and_draws_without_numpy():
-    """Debian's Blender may lack numpy: buttons that need it report that, and a training's curve is not drawn."""
+    """Check that the add-on works without numpy, which Debian's Blender may lack.
+
+    Buttons that need numpy report that, and a training's curve is not drawn.
+    """
     code = """if True:
         import sys
         sys.modules["numpy"] = None
@@ -54,7 +57,7 @@ def test_registers_and_draws_without_numpy():
 
 
 def test_builds_and_validates(tmp_path):
-    """Build from a clone that contains runs and captures."""
+    """Check that the extension builds from a copy of the repository that contains runs and captures."""
     clone, archive = tmp_path / "refgs", tmp_path / "refgs.zip"
     shutil.copytree(ROOT / "refgs_addon", clone / "refgs_addon")
     for name in ("__init__.py", "blender_manifest.toml", "LICENSE", "README.md"):

@@ -1,4 +1,4 @@
-"""Import a run, and compare Blender's data with numpy."""
+"""Test the import of a run: compare Blender's data with values computed in numpy."""
 
 import json
 
@@ -36,7 +36,7 @@ def stacked(columns, *names):
 
 
 def evaluated_mesh(item):
-    """Evaluate the modifier that turns a point cloud into quads."""
+    """Evaluate the modifier that turns an object's point cloud into quads, and return the mesh."""
     graph = bpy.context.evaluated_depsgraph_get()
     graph.update()
     for instance in graph.object_instances:
@@ -149,7 +149,7 @@ def test_normals_bend_as_a_sphere_does(tmp_path):
 
 
 def others(scales, normals):
-    """Make columns as other programs write them: no materials, quaternions of any length, zero or missing normals."""
+    """Make columns of splats as other programs write them: no materials, quaternions of any length, zero or missing normals."""
     rng = np.random.default_rng(4)
     columns = {name: value for name, value in random_columns().items() if name not in MATERIALS}
     for i in range(4):
@@ -165,7 +165,7 @@ def others(scales, normals):
 @pytest.mark.parametrize("normals", [False, True])
 @pytest.mark.parametrize("scales", [2, 3])
 def test_other_programs_splats(scene, tmp_path, scales, normals):
-    """Splats of other programs become discs across their shortest axis, matte, in their displayed colours."""
+    """Check that splats of other programs become matte discs across their shortest axis, in the colours that those programs show."""
     columns = others(scales, normals)
     folder = tmp_path / "d'un autre été"
     folder.mkdir()
@@ -191,7 +191,7 @@ def test_other_programs_splats(scene, tmp_path, scales, normals):
 
 
 def test_splats_that_are_not_finite_are_left_out(run_folder, scene, tmp_path, capfd):
-    """Leave out the same splats as `refgs`, and keep unknown columns."""
+    """Check that the add-on leaves out the same splats as the trainer does, and keeps unknown columns."""
     columns = {**random_columns(), "semantic": np.arange(COUNT), "weight": np.linspace(0, 1, COUNT)}
     columns |= {f"f_rest_{i}": np.zeros(COUNT) for i in range(9)}
     columns["x"][3], columns["roughness"][[5, 6]], columns["f_rest_4"][7] = np.nan, np.inf, np.nan
@@ -247,7 +247,7 @@ def test_one_splat_alone_is_flat(tmp_path):
 
 
 def test_one_splat_and_a_mesh_without_faces(run_folder, scene, tmp_path):
-    """Both can be imported, edited and exported."""
+    """Check that a run of one splat and a mesh without faces can be imported, edited and exported."""
     write_ply(run_folder / "splats.ply", random_columns(1))
     trimesh.Scene(trimesh.PointCloud(np.eye(3))).export(run_folder / "mesh.glb")
     run = import_run(run_folder, scene)

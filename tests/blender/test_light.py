@@ -1,4 +1,4 @@
-"""Light the scene: list the panoramas, choose one, and match it with the recovered light."""
+"""Test the scene's light: list the panoramas, choose one, and match it with the recovered light."""
 
 import math
 
@@ -17,13 +17,13 @@ from tests.makers.runs import write_panorama
 
 
 def room(height=48, seed=0):
-    """Make a sky of lamps over a floor, smooth enough for rotations by fractions of a pixel."""
+    """Return a function that draws a panorama of lamps over a floor. It is smooth enough to rotate by fractions of a pixel."""
     rng = np.random.default_rng(seed)
     azimuth = math.pi * (1 - 2 * (np.arange(2 * height) + 0.5) / (2 * height))
     elevation = math.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
 
     def at(turn):
-        """Rotate the panorama, counter-clockwise seen from above."""
+        """Draw the panorama, rotated by `turn` radians, counter-clockwise seen from above."""
         values = 0.2 + 0.1 * np.sin(elevation) + 0 * azimuth
         for where, up, bright in lamps:
             cosine = np.cos(azimuth - turn - where) * np.cos(elevation) * np.cos(up) + np.sin(elevation) * np.sin(up)

@@ -1,4 +1,4 @@
-"""Show a training's surfels in the 3D view while it runs."""
+"""Test that the 3D view shows a training's surfels while the training runs."""
 
 import time
 
@@ -13,7 +13,7 @@ from tests.makers.runs import random_columns, write_ply
 
 @pytest.fixture
 def job(tmp_path):
-    """Make a training without a preview yet."""
+    """Make the job of a training that has no preview yet."""
     return jobs.Job("pot", tmp_path, [], tmp_path / "log.txt", run=tmp_path / "run", state="running")
 
 

@@ -1,4 +1,4 @@
-"""Material presets of the add-on and of the artist, in one list."""
+"""Test that one list holds the material presets of the add-on and of the artist."""
 
 import bpy
 import pytest
@@ -21,7 +21,7 @@ OURS = ["Brushed Steel", "Chrome", "Clay", "Copper", "Glazed Ceramic", "Gold", "
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """Path of the artist's presets, which does not exist yet."""
+    """Return the path of the artist's presets, which does not exist yet."""
     (tmp_path / "scripts").mkdir()
     monkeypatch.setenv("BLENDER_USER_SCRIPTS", str(tmp_path / "scripts"))
     return tmp_path / "scripts" / "presets" / "refgs_material"

@@ -1,4 +1,4 @@
-"""Install, stop, resume, use and remove the trainer with the preferences' buttons and a fake uv."""
+"""Test the preferences' buttons, which install, stop, resume, use and remove the trainer, with a fake uv."""
 
 import sys
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is 
 
 @pytest.fixture
 def online(scene, tmp_path, monkeypatch):
-    """Enable the add-on with a bundled trainer, a folder of its own, and online access."""
+    """Enable the add-on with a bundled trainer, a user folder for this test, and online access."""
     monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     monkeypatch.setattr(preferences, "_folder", lambda name: tmp_path / name)
     enabled = bpy.context.preferences.addons.new()

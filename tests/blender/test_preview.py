@@ -1,4 +1,4 @@
-"""Compare Eevee's pixels with the panorama's orientation and the camera's formula."""
+"""Test rendered previews: Eevee's pixels agree with the panorama's orientation and the camera's projection."""
 
 import math
 
@@ -26,12 +26,12 @@ def scene(scene):
 
 
 def coloured_sky(direction):
-    """Linear radiance that is different for every direction."""
+    """Return a linear radiance that differs for every direction."""
     return 0.5 + 0.4 * np.asarray(direction)
 
 
 def sky_pixels(height=64):
-    """Make the sky's panorama in Blender's orientation: u = 0.5 - atan2(y, x) / 2π, v = asin(z) / π + 0.5 from below."""
+    """Draw the sky as a panorama in Blender's orientation: u = 0.5 - atan2(y, x) / 2π, v = asin(z) / π + 0.5 from below."""
     u, v = np.meshgrid((np.arange(2 * height) + 0.5) / (2 * height), 1 - (np.arange(height) + 0.5) / height)
     azimuth, elevation = 2 * np.pi * (0.5 - u), np.pi * (v - 0.5)
     return coloured_sky(

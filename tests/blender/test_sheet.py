@@ -1,4 +1,4 @@
-"""Contact sheet: each picture equals a preview under its light, and the scene does not change."""
+"""Test contact sheets: each picture equals a preview under its light, and the scene does not change."""
 
 import bpy
 import numpy as np

@@ -1,4 +1,4 @@
-"""Train from Blender with a fake worker: the scene's settings, the buttons, and the runs that a file lists."""
+"""Test training from Blender with a fake worker: the scene's settings, the buttons, and the runs that a file lists."""
 
 import json
 import math
@@ -128,7 +128,7 @@ def test_a_capture_that_is_not_there(addon):
 
 @pytest.fixture
 def checked(addon, capture):
-    """Check a capture; return the job and its number."""
+    """Check a capture with the fake trainer. Returns the job and its number in the list."""
     job = training.check(addon)
     until(lambda: job.ended)
     for number in range(2):
@@ -137,7 +137,7 @@ def checked(addon, capture):
 
 
 def test_the_curve_in_the_panel():
-    """PSNR that is linear in log time is a straight line, and held-out views are dots on it."""
+    """Check that a PSNR linear in log time is drawn as a straight line, and that held-out views are drawn as dots on the line."""
     height, width = CURVE[1], CURVE[0]
     seconds = np.geomspace(0.5, 200, 60)
     trained = [(s, 20 + 5 * np.log10(s)) for s in seconds]
@@ -157,7 +157,7 @@ def test_the_curve_in_the_panel():
 
 
 class Drawn:
-    """Fake layout that records drawn icons and pressed buttons."""
+    """Record the icons and buttons that a panel draws, as a fake of Blender's layout."""
 
     def __init__(self):
         self.pictures, self.icons, self.pressed = [], [], []
@@ -200,7 +200,7 @@ def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
 
 
 def test_a_run_brings_its_own_cameras(addon, checked, capture, run_folder):
-    """Cameras of the run replace the capture's; the scene's camera stays on the same photo."""
+    """Check that a run's cameras replace the capture's, and that the scene's camera stays on the same photo."""
     _, number = checked
     file = run_folder / "cameras.json"
     content = json.loads(file.read_text())
@@ -267,7 +267,7 @@ def test_display_splats_are_made_by_the_trainer(addon, run_folder, tmp_path):
 
 
 def test_taken_away_while_it_trains(addon, capture):
-    """Disabling the add-on ends its jobs."""
+    """Check that disabling the add-on ends its jobs."""
     training.train(addon)
     job = jobs.JOBS[-1]
     until(lambda: job.progress)
@@ -277,7 +277,7 @@ def test_taken_away_while_it_trains(addon, capture):
 
 
 def told(out):
-    """Read the settings that the trainer got, by name."""
+    """Read the settings, by name, that the fake trainer got."""
     until(lambda: (out / "started").is_file() and (out / "started").read_text())
     words = dict(word.split("=", 1) for word in json.loads((out / "started").read_text())["settings"])
     return {key: value if value.isalpha() else json.loads(value) for key, value in words.items()}

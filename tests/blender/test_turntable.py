@@ -1,4 +1,4 @@
-"""Turntable: the run rotates once, and nothing else moves."""
+"""Test the turntable: the run rotates once, and nothing else moves."""
 
 import math
 

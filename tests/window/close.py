@@ -1,4 +1,4 @@
-"""Train in a Blender window, and close Blender with simulated key presses.
+"""Train in a Blender window, and close Blender with simulated key presses. test_window.py starts this script.
 
 blender --enable-event-simulate --python close.py -- EXTENSION.zip PYTHON CAPTURE LETTER OUT
 """
@@ -33,7 +33,7 @@ def press(letter, **held):
 
 
 def artist():
-    """Yield conditions to wait for."""
+    """Train, then press the keys that close Blender. Yields conditions; each is awaited before the next step."""
     bpy.ops.extensions.package_install_files(filepath=ARCHIVE, repo="user_default", enable_on_install=True)
     bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
     settings = bpy.context.scene.refgs

@@ -1,7 +1,7 @@
-"""Build and install the extension in a real Blender window, show its tab, and remove it.
+"""Test the extension in a real Blender window: build, install, show its tab, train, and close Blender.
 
-Blender is the command in REFGS_BLENDER (one that runs Blender with a window), else `blender` in the PATH, under
-xvfb-run where there is no DISPLAY.
+Blender is the command in REFGS_BLENDER, which must open a window. Without that variable it is `blender` in the PATH, under xvfb-run where
+there is no DISPLAY.
 """
 
 import json
@@ -41,7 +41,7 @@ def blender_command():
 
 
 def in_window(script, tmp_path, *words):
-    """Run a script in a Blender window with the extension's zip; return its report."""
+    """Run a script in a Blender window, with the extension's zip as its argument. Returns the script's report."""
     command = blender_command()
     bpy = pytest.importorskip("bpy", reason="the extension is built with the tool in Blender's Python module")
     tool = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg", "cli", "blender_ext.py")
@@ -82,10 +82,10 @@ def test_the_tab_shows_in_a_window(tmp_path):
 
 @pytest.mark.window
 def test_an_artist_trains(tmp_path, ball_capture):
-    """Act as an artist with the real trainer.
+    """Check an artist's whole session with the real trainer.
 
-    Check, train, show live surfels, pause, stop, resume, finish, import; then compare with a photo, relight, edit, apply, and render in
-    another Blender.
+    The session checks and trains a capture, shows live surfels, pauses, stops, resumes, finishes and imports the run. Then it compares
+    with a photo, relights, edits, applies the edits, and renders in another Blender.
     """
     capture = tmp_path / "ball photos"
     shutil.copytree(ball_capture, capture)
@@ -117,7 +117,7 @@ def test_an_artist_trains(tmp_path, ball_capture):
 @pytest.mark.window
 @pytest.mark.parametrize("letter", ["S", "L"])
 def test_closing_asks(tmp_path, ball_capture, letter):
-    """Press Ctrl-Q, then the letters of Cancel, Stop Cleanly or Leave Running."""
+    """Check that Ctrl-Q asks about a running training, and that Cancel, Stop Cleanly and Leave Running do as they say."""
     capture = tmp_path / "photos"
     shutil.copytree(ball_capture, capture)
     report = in_window("close.py", tmp_path, sys.executable, capture, letter)

@@ -39,7 +39,7 @@ def tell(command):
 
 
 def artist():
-    """Yield a condition to wait for and a screenshot's name, after each click."""
+    """Press the buttons of a whole session. After each click, yield a condition to await and the screenshot's name."""
     bpy.ops.extensions.package_install_files(filepath=str(ARCHIVE), repo="user_default", enable_on_install=True)
     area().spaces.active.show_region_ui = True
     bpy.data.objects.remove(bpy.data.objects["Cube"])  # it is where the object will be
@@ -86,7 +86,7 @@ def artist():
 
 
 def work_with_it(folder):
-    """Compare the run with photos, relight, edit, apply and render it."""
+    """Compare the run with its photos, relight it, edit it, apply the edits and render it."""
     report["left"] = [item.name for item in bpy.data.objects if "in training" in item.name]
     scene, manager = bpy.context.scene, bpy.context.window_manager
     area().spaces.active.shading.type = "MATERIAL"
@@ -123,7 +123,7 @@ def measured():
 
 
 def measure_ours():
-    """Measure the add-on's time without clicks: its timer and the drawing of its panels."""
+    """Measure how long the add-on blocks the window apart from clicks: in its timer and while it draws its panels."""
     timers = addon("job_timers")
     look = timers._poll_jobs
 
@@ -154,7 +154,7 @@ def addon(name):
 
 
 def view():
-    """Override the context with the 3D view, as for a button in its sidebar."""
+    """Override the context with the 3D view, as Blender does for a button in the sidebar."""
     region = next(region for region in area().regions if region.type == "WINDOW")
     return bpy.context.temp_override(area=area(), region=region)
 
@@ -175,7 +175,10 @@ steps, waiting, due, longest = artist(), None, time.perf_counter() + 3.0, 0.0
 
 
 def tick() -> float | None:
-    """Continue ten times a second once the condition holds. The delay of a tick is the time that the window was busy."""
+    """Run the session's next step once its condition holds. Blender calls this ten times a second.
+
+    The delay of a call is the time for which the window was busy.
+    """
     global waiting, due, longest, ours
     now = time.perf_counter()
     longest = max(longest, now - due)
