@@ -1,4 +1,4 @@
-"""Test the report of ambiguities: changes that other changes compensate, so that photos cannot tell them."""
+"""Test the report of ambiguities. Two changes of the model are ambiguous if together they leave the photos nearly the same."""
 
 import json
 
@@ -18,7 +18,10 @@ def ball(ball_capture, tmp_path_factory):
 
 
 def test_what_is_left_is_what_both_changes_leave(ball):
-    """The residual `left` is measured again by making both changes together, a tenth as large; it agrees to 30 %."""
+    """Check that the reported residual `left` agrees to 30 % with a second measurement.
+
+    The second measurement renders both changes together, each a tenth as large.
+    """
     found = ambiguities(ball)
     now = ball.surfels(), ball.environment().radiance
     views = range(0, len(ball.views), 4)

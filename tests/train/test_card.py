@@ -1,4 +1,4 @@
-"""Test training on CUDA without a card: with emulated kernels, and with fake tensors that only have a shape and a device."""
+"""Test training on CUDA without a card. The tests use emulated kernels, or fake tensors that have a shape and a device but no values."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def make_trainer(capture, folder, *changes: str, device: str = "cpu") -> Trainer
     "changes", [["indirect.start=0"], ["render.shading=sh"], ["initial.until=0.99", "needs.initial=on"]]
 )
 def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
-    """CPU and card kernels take the same steps, with self-occlusion too."""
+    """Check that a training takes the same steps with the kernels for the CPU and for cards, with self-occlusion too."""
     figures, learned = [], []
     for name in ("cpu", "card"):
         trainer = make_trainer(ball_capture, tmp_path / name, *changes)
@@ -60,7 +60,7 @@ def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
 
 
 def follow_to_the_card(monkeypatch) -> list[str]:
-    """Prepare for fake tensors on a card: return the list to which the names of launched kernels are added."""
+    """Patch the program so that it runs with fake tensors on a card. Return a list that records the names of launched kernels."""
 
     def empty(value):
         if isinstance(value, Tensor):
@@ -90,9 +90,9 @@ def follow_to_the_card(monkeypatch) -> list[str]:
 
 
 def backward(loss: Tensor) -> None:
-    """Differentiate by visiting autograd's nodes, because autograd's own engine needs a card.
+    """Compute gradients by visiting autograd's nodes, because autograd's own engine needs a card.
 
-    Assumes that a function's arguments other than tensors come after those with a derivative.
+    Every function must take its arguments with a derivative first.
     """
     order: list = []
 
@@ -121,9 +121,9 @@ def backward(loss: Tensor) -> None:
 
 @pytest.mark.parametrize("indirect", [False, True])
 def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, indirect):
-    """An iteration neither mixes devices nor waits for the card, but for one read (`how_many`).
+    """Check that an iteration never mixes devices and waits for the card only once, in `how_many`.
 
-    With fake tensors, reading a value is an error, and so is a tensor whose size depends on a value.
+    With fake tensors, reading a value is an error. Making a tensor whose size depends on a value is an error too.
     """
     ball = trimesh.creation.icosphere(2)
     occluder = Occluder(Mesh(ball.vertices, np.asarray(ball.faces)))

@@ -73,7 +73,7 @@ def test_faint_surfels_go_and_one_stays():
 
 
 def test_screen_gradient_is_by_pixels_of_motion():
-    """The screen gradient is the length of dL/d(pixel) times half the image's width in pixels."""
+    """Check that the screen gradient is the length of dL/d(pixel) times half the image's width in pixels."""
     camera = Camera("a", 200, 100, 150.0, 150.0, 100.0, 50.0, np.eye(4))
     position = torch.tensor([[0.3, -0.2, 2.5]])
     wanted = torch.tensor([2.0, -1.0])  # dL/d(pixel)

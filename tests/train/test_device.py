@@ -1,4 +1,4 @@
-"""Test the choice of the device, the warning if it is not the one asked for, and a card whose memory is full."""
+"""Test the choice of the device, the warning if the chosen device is not the requested one, and a card whose memory is full."""
 
 import warnings
 
@@ -14,13 +14,13 @@ from refgs.train.trainer import Trainer
 
 
 def chosen(device: str) -> tuple[str, list[str]]:
-    """Choose a device; return it with the warnings."""
+    """Choose a device. Return its name and the warnings."""
     said = []
     return train_job.choose_device(device, lambda event, facts: said.append(facts["what"])), said
 
 
 def card(monkeypatch, capability: tuple[int, int], driver: str | None = None) -> None:
-    """Make torch report a card of this compute capability; with `driver`, loading kernels fails with that message."""
+    """Make torch report a card of this compute capability. If `driver` is given, loading kernels fails with the message `driver`."""
 
     def module(source: str, device: int) -> int:
         if driver:

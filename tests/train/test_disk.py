@@ -37,9 +37,9 @@ def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
 
 
 def test_a_disk_that_is_full(ball_capture, small_disk):
-    """On a full disk a training ends with one line, and can be resumed once there is space.
+    """Check that a training on a full disk ends with a one-line error, and resumes once there is space.
 
-    Here a write other than a checkpoint fails; test_checkpoint.py has failing checkpoints.
+    In this test a file other than a checkpoint cannot be written. test_checkpoint.py tests checkpoints that cannot be written.
     """
     filler = small_disk / "filler"
 
@@ -57,7 +57,7 @@ def test_a_disk_that_is_full(ball_capture, small_disk):
 
 
 def test_a_mesh_that_cannot_be_written(ball_capture, small_disk):
-    """An export that fails on a full disk leaves the old mesh and textures unchanged."""
+    """Check that an export that fails on a full disk leaves the old mesh and textures unchanged."""
     run = small_disk / "run"
     words = ["train.iterations=60", "mesh.resolution=32", "mesh.triangles=500"]
     train(ball_capture, run, lambda trainer: False, *SMALL, *words)

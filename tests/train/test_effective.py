@@ -1,4 +1,4 @@
-"""Test the settings in effect: the settings asked for are kept, and run.toml records what changed each of them."""
+"""Test the settings in effect. The program keeps the requested settings, and run.toml records each change and its reason."""
 
 import tomllib
 
@@ -44,7 +44,10 @@ def test_a_plan_changes_each_number_that_differs():
 
 
 def test_a_run_says_what_changed_its_settings(ball_capture, tmp_path):
-    """Changes by the photos and by the needs are recorded in run.toml; a resumed run keeps these records."""
+    """Check that run.toml records the settings that the training changed, and that a resumed run keeps these records.
+
+    Settings change because of the photos, or because a scene can do without a part of the method (needs).
+    """
     out, words = tmp_path / "run", [*SMALL, "train.iterations=40", "needs.specular=off"]
     train_job.train(
         ball_capture, out, "quick", "cpu", None, words, False, lambda *_: None, lambda state: state.iteration == 30
@@ -62,7 +65,7 @@ def test_a_run_says_what_changed_its_settings(ball_capture, tmp_path):
 
 
 def test_a_run_without_the_table_opens(ball_capture, tmp_path):
-    """A run.toml without [changed], as earlier releases wrote it, is read and stays unchanged."""
+    """Check that a run.toml without the table [changed], as earlier releases wrote it, can be read and stays unchanged."""
     settings = load_settings("quick")
     create_run(tmp_path / "run", read_capture(ball_capture), settings, "quick", "cpu")
     before = (tmp_path / "run" / "run.toml").read_bytes()

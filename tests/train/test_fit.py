@@ -1,4 +1,4 @@
-"""Test the choice of settings for a training that is given only a time."""
+"""Test the choice of settings for a training of which the user gives only the duration."""
 
 import json
 import tomllib
@@ -26,9 +26,10 @@ def test_it_lies_between_the_presets():
 
 
 def test_more_time_brings_more_of_all(ball_capture, tmp_path):
-    """With more time, a training has more surfels and iterations, and lower rates.
+    """Check that a longer training has more surfels, more iterations and lower learning rates.
 
-    Times range from below that of `quick` to above that of `standard`. Only the pace is measured; nothing is trained.
+    The durations range from less than `quick` takes to more than `standard` takes. The test only measures the time of an iteration;
+    it does not train to the end.
     """
     capture = read_capture(ball_capture)
     said, found = [], []

@@ -1,4 +1,4 @@
-"""Test the guard that rejects steps which are not finite."""
+"""Test the guard, which rejects steps of the optimiser that are not finite."""
 
 import json
 import math
@@ -31,7 +31,7 @@ def learner(device):
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e30])
 def test_a_step_that_is_not_finite_leaves_all_as_it_was(device, wrong):
-    """A step that is not finite leaves values and moments unchanged, bit for bit.
+    """Check that a step that is not finite leaves values and moments unchanged, bit for bit.
 
     1e30 is finite, but its square, which Adam stores, overflows float32.
     """
@@ -65,7 +65,7 @@ def test_a_loss_that_is_no_number_is_not_stepped_on():
 
 
 def test_no_kernel_hides_what_is_no_number(device):
-    """NaN in the input gives NaN in colour by direction, shading, and the rasteriser's derivatives."""
+    """Check that NaN in the input gives NaN in colour by direction, in shading, and in the rasteriser's derivatives."""
     camera, nan = scenes.camera(20, 16), math.nan
     constant, rest, position = torch.ones(3, 1, 3), torch.ones(3, 3, 3), torch.rand(3, 3)
     constant[1, 0, 2] = rest[2, 1, 0] = nan
@@ -179,7 +179,7 @@ def test_resumed_in_every_stage_it_is_the_same_run():
 
 
 def moved(folder, target, scale, offset):
-    """Copy the capture with its cameras scaled and moved."""
+    """Copy the capture. Multiply its camera positions by `scale`, then add `offset`."""
     target.mkdir()
     for split in ("train", "test"):
         (target / split).symlink_to(folder / split)
@@ -194,7 +194,10 @@ def moved(folder, target, scale, offset):
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e-6, 1.0), (1e6, 0.0), (1.0, 1e5), (1e3, -1e7)])
 def test_a_capture_anywhere_is_learned_about_the_origin(ball_capture, tmp_path, scale, offset):
-    """A capture at any scale and offset has the same cameras in the run's frame, up to rounding; `to_capture` maps them back."""
+    """Check that the scale and offset of a capture do not change its cameras in the run's frame, up to rounding.
+
+    `to_capture` maps the cameras back to the capture's frame.
+    """
     usual, found = (read_capture(c) for c in (ball_capture, moved(ball_capture, tmp_path / "moved", scale, offset)))
     assert np.array_equal(usual.to_capture, np.eye(4))  # a NeRF-Blender frame is kept if it suits float32
     assert np.abs(found.centre).max() < 1e-9 and found.radius == pytest.approx(1)

@@ -1,4 +1,4 @@
-"""Test the history of a training: when lines are written, their content, their cost, and their errors."""
+"""Test the history of a training: when its lines are written, what they contain, and how long measuring takes."""
 
 import json
 import math
@@ -49,9 +49,9 @@ def test_lines_are_evenly_spaced_by_logarithm():
 
 @pytest.mark.parametrize(("cost", "lines"), [(0.1, 26), (2.0, 5), (100.0, 2)])
 def test_measuring_has_its_share(cost, lines):
-    """Measuring takes at most 2.5 % of the training's time; if it is expensive, it is thinned out evenly.
+    """Check that measuring takes at most 2.5 % of the training's time. Expensive measurements are made less often, evenly spread.
 
-    The training is 3,000 iterations of a tenth of a second.
+    The training has 3,000 iterations of 0.1 s.
     """
     spent, at = 0.0, []
     for i in [*filter(history.due, range(3000)), 3000]:
@@ -66,7 +66,7 @@ def test_measuring_has_its_share(cost, lines):
 
 
 def test_measuring_is_not_in_the_seconds(ball_capture, tmp_path, monkeypatch):
-    """The 1000 seconds that each measuring takes here are not part of the training's seconds."""
+    """Check that the training's seconds do not include the time for measuring, which is 1000 s each in this test."""
 
     class Time:
         now = 0.0
@@ -154,7 +154,7 @@ def test_a_training_that_is_ended_early_has_a_last_line(ball_capture, tmp_path):
 
 
 def rays(camera):
-    """Return the unit rays (P, 3) of a camera's pixels, which of them meet the ball, the points and their normals."""
+    """Return a camera's unit rays (P, 3), which of them hit the ball, the hit points, and the normals at these points."""
     ray = scenes.camera_rays(camera).double().numpy().reshape(-1, 3)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     return ray, *meet(np.broadcast_to(camera.position, ray.shape), ray, ONE)
@@ -165,7 +165,7 @@ def dusk(direction):
 
 
 def write_truth(capture):
-    """Write ground truth of the held-out views, relit ones too, computed by formula for the ball."""
+    """Write ground truth of the held-out views, also under another light. It is computed by formula for the ball."""
     truth = capture / "ground_truth"
     for name in ("alpha", "normal", "albedo", "roughness", "metallic", "relight/dusk"):
         (truth / name).mkdir(parents=True)
@@ -200,7 +200,7 @@ def known_capture(ball_capture, tmp_path_factory):
 
 
 def test_errors_against_the_truth(known_capture, tmp_path):
-    """Recorded errors agree with a second computation, and are lower after training than before."""
+    """Check that the recorded errors agree with a second computation, and that training lowers them."""
     trainer = make(
         known_capture, tmp_path / "run", "surfels.metallic=0.9", "surfels.budget=1500", "surfels.start=1500", total=250
     )
@@ -232,9 +232,9 @@ def test_errors_against_the_truth(known_capture, tmp_path):
 
 
 def test_a_light_known_exactly_leaves_the_relit_picture_alone(known_capture, tmp_path):
-    """Surfels with the true material, relit by a known light, reach a PSNR of 20 dB; with another metal they do not.
+    """Check that surfels with the true material, relit by a known light, reach a PSNR of 20 dB.
 
-    The remaining error is at the outline.
+    The remaining error is at the outline. Surfels with another metal do not reach 20 dB.
     """
     trainer = make(known_capture, tmp_path / "run", "surfels.start=3000", "surfels.budget=3000", "surfels.hull=96")
     logit = np.log(F0 / (1 - F0))

@@ -1,4 +1,4 @@
-"""Test inter-reflection: train two metal balls that mirror each other with it and without."""
+"""Test inter-reflection on two metal balls that mirror each other."""
 
 import numpy as np
 import pytest
@@ -20,9 +20,9 @@ SMALL += ["surfels.metallic=0.9", "train.iterations=600", "indirect.every=200", 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Train with inter-reflection and without; return both trainers.
+    """Train with inter-reflection and without it. Return both trainers and a list of two PSNRs.
 
-    Also return the PSNR of the first, just before and just after inter-reflection starts.
+    The PSNRs are those of the trainer with inter-reflection, just before and just after inter-reflection starts.
     """
     folder = tmp_path_factory.mktemp("two")
     write_ball_capture(folder / "capture", 64, TWO)
@@ -58,9 +58,9 @@ def test_pictures_gain_where_the_balls_mirror_each_other(trained):
 
 
 def test_joining_loses_nothing(trained):
-    """PSNR drops by less than 0.1 dB when inter-reflection starts.
+    """Check that PSNR drops by less than 0.1 dB when inter-reflection starts.
 
-    Indirect light is initialised with the light that was reflected before.
+    Indirect light is initialised with the environment's light.
     """
     before, after = trained[2]
     assert after > before - 0.1
@@ -88,7 +88,7 @@ def test_visibility_is_that_of_the_balls(trained):
 
 
 def test_the_run_folder_has_it_all(trained):
-    """The run folder renders as the training did, and nearly the same if it is relit by its own light."""
+    """Check that the run folder renders as the training did, and nearly the same when relit by its own environment."""
     made = trained[0]
     run, view = open_run(made.state.folder), made.state.test[0]
     shown, asset = made.state.render(view.camera), run.render(view.camera)

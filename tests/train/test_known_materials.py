@@ -1,6 +1,7 @@
-"""Test recovering materials and light of a ball with three bands: a sharp metal, a rough metal and a matte dielectric.
+"""Test recovering the environment's light and the materials of a ball with three horizontal bands of different material.
 
-The photos are computed by quadrature of the rendering equation. The shape is given; the rest is learned by the gradients of the shading.
+The bands are a smooth metal, a rough metal and a matte dielectric. The photos are computed by quadrature of the rendering equation.
+The shape is given. Materials and light are learned by gradient descent through the shading.
 """
 
 import itertools
@@ -25,7 +26,7 @@ METALLIC = torch.tensor([[material.metallic] for _, material in BANDS])
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory) -> list[tuple]:
-    """Return the training views: camera, photo, and maps of alpha, band, normal and position."""
+    """Return camera, photo, and maps of alpha, material band (one-hot), normal and position of every training view."""
     folder, found = tmp_path_factory.mktemp("bands"), []
     write_ball_capture(folder, 48, samples=2, bands=True)
     for view in read_capture(folder).train_views:
@@ -43,7 +44,7 @@ def views(tmp_path_factory) -> list[tuple]:
 
 
 def learn(views: list[tuple], steps: int, rate: float, leaves: list[Tensor], materials, light) -> None:
-    """Fit `leaves` to the photos by Adam; `materials()` (3, 5) and `light()` compute the model from them."""
+    """Fit the parameters `leaves` to the photos by Adam. `materials()` (3, 5) and `light()` compute the model from `leaves`."""
     optimiser = torch.optim.Adam([leaf.requires_grad_() for leaf in leaves])
     for step, (camera, photo, alpha, band, normal, point) in enumerate(itertools.islice(itertools.cycle(views), steps)):
         optimiser.param_groups[0]["lr"] = rate * 0.1 ** (step / steps)
@@ -56,7 +57,7 @@ def learn(views: list[tuple], steps: int, rate: float, leaves: list[Tensor], mat
 
 @pytest.fixture(scope="module")
 def learned(views) -> tuple[Tensor, Environment]:
-    """Learn albedo, metallic and roughness of each band (3, 5), and the light.
+    """Learn albedo, metallic and roughness of each band (3, 5), and the environment's light.
 
     The first band's roughness is given, because a sharper light on rougher materials gives nearly the same photos.
     """
@@ -74,9 +75,9 @@ def learned(views) -> tuple[Tensor, Environment]:
 
 @pytest.mark.parametrize("start", [0.12, 0.88])
 def test_roughness_under_a_known_light(views, start):
-    """Roughness is recovered to 0.12 from either start, with light and metallic given.
+    """Check that roughness is recovered to 0.12 from either start, if light and metallic are given.
 
-    The error is the split sum's: a true roughness of 0.5 is learned as 0.59, and 0.6 as 0.70.
+    The split-sum approximation causes the error: a true roughness of 0.5 is learned as 0.59, and 0.6 as 0.70.
     """
     albedo, roughness = torch.zeros(3, 3), torch.full((3, 1), math.log(start / (1 - start)))
     light = Environment.from_panorama(sunny(directions(128, 256)).astype(np.float32), 32)
@@ -91,9 +92,9 @@ def test_roughness_under_a_known_light(views, start):
 
 
 def test_roughness_and_metallic(learned):
-    """The rough metal's roughness is recovered to 0.1, and metallic separates metals from the dielectric.
+    """Check that the rough metal's roughness is recovered to 0.1, and that metallic separates metals from the dielectric.
 
-    The dielectric's roughness is not compared: it reflects only 4 %, too little to learn roughness and metallic together.
+    The dielectric's roughness is not compared. The dielectric mirrors only 4 % of the light, too little to learn its roughness.
     """
     materials, _ = learned
     for (_, material), found in zip(BANDS, materials.tolist(), strict=True):
@@ -104,9 +105,9 @@ def test_roughness_and_metallic(learned):
 
 
 def test_light_and_albedo(learned):
-    """The light's shape correlates by 0.97, and brightness times albedo is right to 6 % (20 % for the dielectric).
+    """Check that the learned light correlates with the true one by 0.97, and that light times albedo is right to 6 %.
 
-    Light and albedo share a scale, so only their product is known.
+    The tolerance is 20 % for the dielectric. A brighter light and a darker albedo give the same photos, so only their product is known.
     """
     materials, environment = learned
     panorama, truth = environment.panorama(32), sunny(directions(32, 64))

@@ -86,9 +86,9 @@ def test_without_masks_the_light_stands_still(turntable, tmp_path):
 
 
 def test_a_light_that_turns_is_recovered(turntable, tmp_path):
-    """Learning a light that turns with the camera gains 3 dB over a fixed light.
+    """Check that learning a light that turns with the camera gains 3 dB over learning a fixed light.
 
-    The saved run renders as the training did and records the choice.
+    Check also that the saved run renders as the training did, and that run.toml records which light was chosen.
     """
     still = made(turntable, tmp_path / "still", "light.frame=world", "light.exposure=off", total=300)
     still.run()

@@ -1,4 +1,4 @@
-"""Compare the objective and its gradients with plain torch in float64."""
+"""Compare the training's objective and its gradients with plain torch in float64."""
 
 from dataclasses import replace
 
@@ -109,7 +109,7 @@ def gradients(loss: Tensor, rendering: Rendering) -> dict[str, Tensor]:
 
 
 def check(rendering: Rendering, view: Photo, weights: LossSettings, progress: float, scale: float, device) -> Tensor:
-    """Compare the loss and the gradients of `scale` times the loss with the reference; return the mean squared error."""
+    """Check the loss against the reference, and the gradients of `scale` times the loss. Return the mean squared error of the picture."""
     exact, found = leaves(rendering, torch.float64), leaves(rendering, torch.float32, device)
     expected = sum(reference(exact, view, weights, progress).values())
     loss, square = objective(found, None, moved(view, device), BACKGROUND.to(device), weights, progress)
@@ -136,7 +136,7 @@ def test_matches_float64(size, material, masked, device):
 
 
 def test_the_light_is_held_to_be_neutral_on_the_whole(device):
-    """The penalty on a light whose mean is not grey, and its derivative, match float64."""
+    """Check that the penalty on a light whose mean is not grey, and the penalty's derivative, match float64."""
     rendering, view = pictures(8, 8, masked=True, material=True)
     only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, matte=0, light=0.5, exposure=0)
     mean = torch.rand(3, generator=torch.Generator().manual_seed(0))
@@ -163,14 +163,14 @@ def test_a_term_without_weight_is_not_there(term, device):
 
 
 def test_far_away_where_hardly_anything_is(device):
-    """Depths of 1e11 at nearly transparent pixels do not disturb the loss and gradients of the others."""
+    """Check that depths of 1e11 at nearly transparent pixels do not change the loss and the gradients of other pixels."""
     rendering, view = pictures(30, 20, masked=True, material=True)
     rendering.alpha[::5, ::4], rendering.blended_depth[::5, ::4] = 0.01, 1e9
     check(rendering, view, ALL, 0.7, 1, device)
 
 
 def test_nothing_waits_for_a_card(monkeypatch):
-    """The objective reads no tensor's value, forward or backward, so it never waits for a card."""
+    """Check that the objective reads no tensor's value, forward or backward, so that the CPU never waits for the card."""
     emulate(monkeypatch)
     rendering, view = pictures(30, 20, masked=True, material=True)
     found = leaves(rendering, torch.float32)

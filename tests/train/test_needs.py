@@ -1,4 +1,7 @@
-"""Test the decisions which features a scene needs: statistics on both sides of their thresholds, and the effects."""
+"""Test the decisions which parts of the method (needs) a scene can do without.
+
+A part is left out if a measured statistic is below the part's threshold.
+"""
 
 import json
 import math
@@ -45,7 +48,7 @@ def mirror(ball_capture):
 
 @pytest.fixture(scope="module")
 def matte(tmp_path_factory):
-    """Read a capture of a matte ball, whose colour is the same from every direction."""
+    """Read a capture of a matte ball. Its colour is the same from every direction."""
     folder = tmp_path_factory.mktemp("matte")
     write_ball_capture(folder, 64, matte=True)
     return read_capture(folder)
@@ -53,7 +56,7 @@ def matte(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def chalk(matte, tmp_path_factory):
-    """Train the matte ball with all needs decided, and write its asset."""
+    """Train the matte ball until every need (part of the method) is decided, and write its asset."""
     made = trainer(matte, tmp_path_factory.mktemp("runs") / "chalk", *DULL, total=300)
     made.run()
     write_asset(made.state)
@@ -70,7 +73,10 @@ def test_what_is_matte_goes_without_specular(chalk):
 
 
 def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
-    """A matte scene leaves out a fifth of the remaining iterations, unless needs.iterations is on or a time was given."""
+    """Check that a training of a matte scene leaves out a fifth of its remaining iterations.
+
+    It keeps all iterations if needs.iterations is on, or if the user gave a duration.
+    """
     found = chalk.state.needs["iterations"]
     assert (
         not found["needed"]
@@ -97,7 +103,7 @@ def test_a_mirror_keeps_it(mirror, tmp_path):
 
 @pytest.mark.parametrize("word", ["on", "off"])
 def test_forced_either_way(word, matte, mirror, tmp_path):
-    """needs.specular on or off overrules what the photos say."""
+    """Check that the setting needs.specular, on or off, overrules the decision by the photos."""
     made = trainer(matte if word == "on" else mirror, tmp_path / "run", f"needs.specular={word}", total=120)
     made.run()
     assert ("metallic" in made.state.parameters) == (word == "on")
@@ -109,7 +115,7 @@ def test_forced_either_way(word, matte, mirror, tmp_path):
 
 
 def test_the_asset_says_so_once(chalk):
-    """Columns with one value are written once, in the PLY header; the run renders as before."""
+    """Check that a column whose values are all equal is written once, in the PLY header, and that the run renders as before."""
     splats, run = read_splats(chalk.state.folder / "splats.ply"), open_run(chalk.state.folder)
     assert splats.constants == {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
     assert (splats.metallic == 0).all() and (splats.roughness == 1).all()
@@ -131,7 +137,10 @@ def test_needs_are_written_down(chalk):
 
 
 def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
-    """A run resumed after the decisions keeps them; its parameters and light match an unbroken run bit for bit."""
+    """Check that a run keeps its decisions when it is resumed.
+
+    Its parameters and light equal those of an uninterrupted run, bit for bit.
+    """
     more = [*DULL, "train.checkpoint_every=20", "densify.every=25", "train.light_first=0"]
     whole = trainer(matte, tmp_path / "whole", *more, total=150)
     whole.run()
@@ -148,7 +157,10 @@ def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
 
 
 def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
-    """Decisions stay when a training returns to a checkpoint from before them, as the guard does."""
+    """Check that a training keeps its decisions when it returns to an earlier checkpoint.
+
+    The guard against values that are not finite returns to such a checkpoint.
+    """
     made = trainer(matte, tmp_path / "run", *DULL, "train.light_first=0", total=200)
     made.run(stop=lambda: made.state.iteration == 96)
     assert "specular" not in made.state.needs
@@ -171,9 +183,9 @@ def test_a_convex_mirror_does_without_reflections(mirror, tmp_path):
 
 
 def test_reflections_by_what_they_could_be_worth(mirror, tmp_path):
-    """A mirror with a fifth of its reflections occluded keeps inter-reflection; a rough black dielectric does not.
+    """Check that a mirror keeps inter-reflection if a fifth of its reflections are occluded, and that a rough black dielectric does not.
 
-    Occlusion would hardly darken the dielectric.
+    The dielectric reflects so little light that occlusion hardly changes the photos.
     """
     made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
     made.run(stop=lambda: made.state.iteration == 99)
@@ -212,7 +224,10 @@ def test_views_that_show_the_same_from_the_same_place(mirror, tmp_path):
 
 
 def test_the_part_about_the_mask_is_all_that_counts(mirror, tmp_path):
-    """A crop about the mask gives the same loss and gradients as the full photo, if nothing lies outside the crop."""
+    """Check that a crop about the mask gives the same loss and gradients as the full photo.
+
+    The rendering is empty outside the crop.
+    """
     made, generator = trainer(mirror, tmp_path / "run", total=10), torch.Generator().manual_seed(0)
     camera = made.state.photos[0].camera
     camera = replace(camera, fx=0.6 * camera.fx, fy=0.6 * camera.fy)
@@ -272,9 +287,9 @@ def test_what_the_part_about_the_mask_saves_is_timed(mirror, tmp_path, monkeypat
 
 
 def test_texels_by_the_lobe():
-    """The chosen cubemap is the smallest whose texels are no wider than LOBE times the lobe's width, roughness².
+    """Check that the smallest cubemap is chosen whose texels are no wider than LOBE · roughness², in radians.
 
-    A texel is a quarter turn divided by the side. The side is limited to 16 … 256.
+    roughness² is the width of the specular lobe. A texel is π / 2 divided by the side wide. The side is limited to 16 … 256.
     """
     lobe = lighting.Light.LOBE
     for roughness, side in ((1.0, 16), (0.5, 16), (0.4, 32), (0.2, 128), (0.05, 256)):
@@ -292,7 +307,7 @@ def test_weighted_quantiles():
 
 
 def test_degrees_by_what_they_are_worth(mirror, tmp_path):
-    """Harmonics are kept up to the highest degree that the photos show: three, two, one, none."""
+    """Check that spherical harmonics are kept up to the highest degree that the photos show, from three down to zero."""
     changes = ["needs.specular=on", "needs.reflections=off", "needs.light=on", "residual.start=0.5"]
     made = trainer(mirror, tmp_path / "run", *changes, total=10)
     made.run(stop=lambda: made.state.iteration == 6)
@@ -323,16 +338,16 @@ def test_what_all_have_alike_is_said_once(mirror, tmp_path):
 
 
 def photographed(state, photo, noise=0.0):
-    """Replace a photo by the model's own rendering with noise."""
+    """Replace a photo by the model's own rendering, with Gaussian noise of standard deviation `noise`."""
     color = state.render(photo.camera).color
     color = color + noise * torch.randn(color.shape, generator=torch.Generator().manual_seed(0))
     return photo._replace(image=(color.clamp(0, 1) * 255).round().byte(), mask=torch.full_like(photo.mask, 255))
 
 
 def test_specular_on_synthetic_surfels(mirror, tmp_path):
-    """Specular shading gains over 3 dB in photos of a mirror, and under 0.3 dB in photos of a matte ball.
+    """Check that specular shading gains over 3 dB in photos of a mirror, and under 0.3 dB in photos of a matte ball.
 
-    Photos are renderings of the model itself.
+    The photos are renderings of the model itself.
     """
     made = trainer(mirror, tmp_path / "run", total=10)
     light = torch.randn(made.state.light.shape, generator=torch.Generator().manual_seed(1))
@@ -346,7 +361,10 @@ def test_specular_on_synthetic_surfels(mirror, tmp_path):
 
 
 def test_shares_are_weights(mirror, tmp_path):
-    """Blended shares add up to the picture's alpha. As weights, they average a constant to that constant."""
+    """Check the blended shares: the weights by which each surfel contributes to the pixels, summed over the pixels.
+
+    Over all surfels, the weights add up to the sum of alpha. The weighted mean of a constant map is the same constant.
+    """
     made = trainer(mirror, tmp_path / "run", total=10)
     photo, surfels = made.state.photo(0), made.state.surfels()
     alpha = made.state.render(photo.camera).alpha
@@ -360,7 +378,10 @@ def test_shares_are_weights(mirror, tmp_path):
 
 
 def test_training_does_not_load_torchs_compiler(mirror, tmp_path):
-    """Training imports neither torch._dynamo (2 s) nor sympy (0.5 s); torch imports sympy if `backward` gets a gradient."""
+    """Check that training imports neither torch._dynamo (takes 2 s) nor sympy (0.5 s).
+
+    torch imports sympy if `backward` is called with a gradient.
+    """
     program = """
 import sys
 from pathlib import Path

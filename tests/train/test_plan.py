@@ -1,4 +1,4 @@
-"""Test that a training which is given a time ends on time, however long an iteration takes."""
+"""Test that a training with a given duration ends on time, however long an iteration takes."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,10 @@ def clock(monkeypatch) -> _Time:
 def _train(
     clock: _Time, made: Plan, pace, paused: float = 0.0, start: float = 12.0, first: int = 0, growth: float = 1.5
 ) -> tuple[int, float]:
-    """Follow a plan as a trainer does; return the iterations, and the seconds until the asset is written, without pauses."""
+    """Follow a plan as a trainer does. Return the number of iterations, and the seconds until the asset is written.
+
+    The seconds do not include pauses.
+    """
     begun = clock.now
     clock.now += start
     made.begin(first, growth)
@@ -54,9 +57,9 @@ def test_it_ends_on_time_whatever_an_iteration_takes(clock, pace, minutes):
 
 
 def test_where_iterations_grow_slower_as_expected_their_number_is_known_at_once(clock):
-    """If iterations slow down as predicted, the planned total is right to 2 % from the start.
+    """Check that the planned number of iterations is right to 2 % from the start, if iterations slow down as predicted.
 
-    Schedules follow the fraction of iterations done, so the total must not change.
+    Learning rates follow the fraction of iterations done, so the planned number must not change.
     """
     made, asked = Plan(5), []
     whole = made.total

@@ -1,4 +1,4 @@
-"""Test training a region of a capture: only the ball in the box remains, and the result is upright as asked."""
+"""Test training a region (a box) of a capture. The result holds only the ball inside the box, and `region.up` points upwards."""
 
 import json
 
@@ -33,7 +33,7 @@ RIGHT = ["region.centre=[0.62, 0.0, 0.0]", "region.size=[1.2, 1.2, 1.2]"]
 
 @pytest.fixture(scope="module", params=["masks", "no masks"])
 def balls(request, tmp_path_factory):
-    """Write a capture of two mirror balls that occlude each other in some photos, with masks or on a grey background."""
+    """Write a capture of two mirror balls, with masks or on a grey background. The balls occlude each other in some photos."""
     folder = tmp_path_factory.mktemp("balls")
     write_ball_capture(folder, 48, TWO, samples=2)
     if request.param == "no masks":
@@ -109,7 +109,10 @@ def test_a_box_with_nothing_in_it_is_said_in_a_line(balls, tmp_path):
 
 
 def test_up_turns_the_result_and_nothing_else(ball_capture, tmp_path):
-    """`region.up` turns the result, but a run renders as before through its own cameras, under the same light."""
+    """Check that `region.up` rotates the result together with its cameras and environment.
+
+    So the run renders the same pictures as without `region.up`.
+    """
     up = np.array([0.6, 0.0, 0.8])
     folders = [tmp_path / "plain", tmp_path / "turned"]
     for folder, words in zip(folders, ([], [f"region.up={up.tolist()}"]), strict=True):

@@ -1,4 +1,4 @@
-"""Test the residual: colour by direction that is added to the shaded picture."""
+"""Test the residual: a colour that depends on direction and is added to the shaded picture."""
 
 import json
 
@@ -59,7 +59,10 @@ def test_it_learns_when_material_and_light_have(ball_capture, tmp_path):
 
 
 def test_it_adds_its_blend_to_the_picture(learned):
-    """The picture gains the blend of the surfels' residuals Σ_k c_k Y_k(d), d being the direction from the camera."""
+    """Check that the residuals of the surfels are blended and added to the picture.
+
+    The residual of a surfel is Σ_k c_k Y_k(d). d is the direction from the camera to the surfel.
+    """
     run, camera = open_run(learned.state.folder), learned.state.test[0].camera
     surfels = run.surfels()
     ways = surfels.positions.double() - torch.from_numpy(camera.position)

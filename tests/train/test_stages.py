@@ -75,7 +75,7 @@ def test_learns_and_renders_as_it_trained(ball_capture, tmp_path, changes):
 
 
 def test_the_papers_schedule_runs_to_its_end(ball_capture, tmp_path):
-    """The preset `paper`, shortened to 300 iterations, runs all its stages and gains 4 dB."""
+    """Check that the preset `paper`, shortened to 300 iterations, runs all its stages and gains 4 dB."""
     changes = ["train.iterations=300", "densify.every=20", "propagation.every=100", "rates.environment=0.05"]
     changes += ["propagation.rest=10", "indirect.every=60", "indirect.resolution=32"]
     made = trainer(ball_capture, tmp_path / "run", "paper", *changes)
@@ -111,9 +111,10 @@ def test_all_grow_faint_and_mirrors_grow(ball_capture, tmp_path):
 
 @pytest.mark.parametrize("waves", [1, 5, 15])
 def test_the_light_diffuses_as_heat_does(ball_capture, tmp_path, waves):
-    """A step of diffusion scales a cosine across a cubemap face by 1 − 4 c sin²(θ / 2), with c = 0.5 · 6.4 · (16 / 64)².
+    """Check one step of diffusion of the environment's light against the heat equation.
 
-    With insulated borders, the cosine is an eigenvector of the discrete Laplacian.
+    A cosine across a cubemap face is an eigenvector of the discrete Laplacian with insulated borders. So a step multiplies the cosine
+    by 1 − 4 c sin²(θ / 2), with c = 0.5 · 6.4 · (16 / 64)². θ is the phase between neighbouring texels.
     """
     changes = ["environment.diffusion=6.4", "rates.environment=0.5", "train.iterations=10"]
     made = trainer(ball_capture, tmp_path / "run", "quick", *changes)

@@ -37,7 +37,7 @@ def ball(ball_capture, tmp_path_factory):
 
 
 def test_the_ball_is_recovered(ball):
-    """Held-out views, normals, depth, metallic and light are close to the ground truth of the ball."""
+    """Check that held-out views, normals, depth, metallic and light are close to the ground truth of the ball."""
     assert held_out_psnr(ball.state) > 30
     for view in ball.state.test:
         seen, ray = ball.state.render(view.camera), scenes.camera_rays(view.camera).double().numpy().reshape(-1, 3)
@@ -67,9 +67,9 @@ def test_the_asset_renders_as_the_training_did(ball):
 
 
 def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
-    """In the asset, only the column of normals is turned outward; surfels keep their rotation.
+    """Check that writing the asset turns its normals outward, but does not change the rotations of surfels.
 
-    Near the horizon, shading depends on which side of a surfel is its front.
+    The rotations must stay, because shading near the horizon depends on which side of a surfel is its front.
     """
     made = trainer(ball_capture, tmp_path / "run", total=10)
     made.run()
@@ -128,7 +128,7 @@ REGION = ["region.centre=[0.0, 0.0, 0.4]", "region.size=[2.5, 2.5, 1.2]", "regio
 
 @pytest.mark.parametrize("changes", [[], ["shading=sh"], ["diffuse=sh"], INDIRECT, TURNING, STAGES, REGION])
 def test_a_resumed_run_is_the_same_run(ball_capture, tmp_path, changes):
-    """A run that is resumed from a checkpoint gives the same parameters, bit for bit, with densification too."""
+    """Check that a resumed run gives the same parameters as an uninterrupted run, bit for bit, with densification too."""
     changes = [*changes, "train.checkpoint_every=40", "densify.every=25"]
     whole = trainer(ball_capture, tmp_path / "whole", *changes, total=80)
     whole.run()
@@ -170,7 +170,10 @@ def test_shading_sh_learns_colour_alone(ball_capture, tmp_path):
 
 
 def test_sh_diffuse_leaves_an_albedo_that_relights(ball_capture, tmp_path):
-    """With diffuse=sh, a dielectric's albedo is its colour over the received light; a metal's is its reflectance."""
+    """Check the albedo in the asset of a training with diffuse=sh.
+
+    A dielectric's albedo is its colour divided by irradiance / π. A metal's albedo is its reflectance.
+    """
     made = trainer(ball_capture, tmp_path / "run", "diffuse=sh", "surfels.metallic=0.1", total=100)
     made.run()
     reflectance = torch.tensor([0.9, 0.6, 0.3])
