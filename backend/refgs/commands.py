@@ -6,13 +6,10 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from refgs import train_job
-from refgs.capture import read_cameras, read_capture
-from refgs.capture.poses import in_frame
 from refgs.errors import InputError
 from refgs.export.export_job import export as export_run
 from refgs.paths import clone_root
@@ -116,6 +113,10 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
     if format not in ("png", "exr"):
         raise InputError(f"--format {format}: take png or exr")
     check_finished(folder)  # before torch is imported
+    import numpy as np
+
+    from refgs.capture import read_cameras
+    from refgs.capture.poses import in_frame
     from refgs.compare.pictures import color_picture, maps, picture, write_png
     from refgs.formats.exr import write_exr
     from refgs.run import open_run
@@ -171,6 +172,7 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     if split not in ("test", "train"):
         raise InputError(f"--split {split}: take test or train")
     check_finished(folder)  # before torch is imported
+    from refgs.capture import read_capture
     from refgs.compare.truth import GroundTruth
     from refgs.report.evaluate import evaluate as measure
     from refgs.report.figures import DETAILS, HEADLINE, in_words, relit_in_words

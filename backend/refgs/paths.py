@@ -48,6 +48,12 @@ def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
         raise
 
 
+def check_folder(folder: Path) -> None:
+    """Raise InputError unless the folder of a capture exists."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
+
+
 def clone_root() -> Path:
     """Return the repository's root, which holds the benchmark scenes and the Blender extension; neither is in the package."""
     if not (ROOT / "blender_manifest.toml").exists():

@@ -10,16 +10,16 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from refgs.capture import Capture, read_capture
 from refgs.errors import InputError
 from refgs.events import Report
 from refgs.lock import RunLock
-from refgs.paths import disk_errors_named
+from refgs.paths import check_folder, disk_errors_named
 from refgs.run_folder import check_free, read_run_facts, update_metrics
 from refgs.settings import Settings, load_settings
 from refgs.train.plan import Plan
 
 if TYPE_CHECKING:
+    from refgs.capture import Capture
     from refgs.train.state import State
     from refgs.train.trainer import Trainer
 
@@ -102,7 +102,10 @@ def _check_unfinished(out: Path) -> None:
         raise InputError(f"{out}: this training has ended; there is nothing to resume")
 
 
-def _read_capture(folder: Path, settings: Settings, out: Path, facts: dict | None) -> Capture:
+def _read_capture(folder: Path, settings: Settings, out: Path, facts: dict | None) -> "Capture":
+    check_folder(folder)  # before numpy is imported
+    from refgs.capture import read_capture
+
     capture = read_capture(folder, settings.region)
     if facts is not None and capture.fingerprint() != facts["fingerprint"]:
         raise InputError(f"{folder} is not the capture that {out} was trained on, or it was changed since")
@@ -110,7 +113,7 @@ def _read_capture(folder: Path, settings: Settings, out: Path, facts: dict | Non
 
 
 def _start(
-    capture: Capture,
+    capture: "Capture",
     settings: Settings,
     preset: str | None,
     changes: list[str],
@@ -135,7 +138,7 @@ def _start(
     return trainer
 
 
-def _resume(capture: Capture, settings: Settings, out: Path, plan: Plan, device: str, report: Report) -> "Trainer":
+def _resume(capture: "Capture", settings: Settings, out: Path, plan: Plan, device: str, report: Report) -> "Trainer":
     """Make the trainer of a run and load its last checkpoint."""
     from refgs.train.trainer import Trainer
 

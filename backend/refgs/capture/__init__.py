@@ -20,6 +20,7 @@ from refgs.capture.poses import in_frame
 from refgs.capture.region import Region, find_region, is_near, region_in, run_frame, sample_silhouettes, up_direction
 from refgs.capture.types import Capture, View
 from refgs.errors import InputError, NoCameras
+from refgs.paths import check_folder
 from refgs.settings import RegionSettings
 
 __all__ = [
@@ -93,8 +94,7 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
 
 def _check_layout(folder: Path) -> str:
     """Return the layout of a capture. Raise InputError if the folder holds none."""
-    if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
+    check_folder(folder)
     layout = find_layout(folder)
     if layout is not None:
         return layout
