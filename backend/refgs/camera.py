@@ -1,4 +1,4 @@
-"""Pinhole cameras in OpenCV's convention."""
+"""Define pinhole cameras in OpenCV's convention."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""Parse the command line. What a command needs is imported in it, so that help and wrong arguments are answered at once."""
+"""Parse the command line. Each command imports its own modules, so that help and wrong arguments are answered at once."""
 
 import signal
 import sys
@@ -18,7 +18,7 @@ RunFolder = Annotated[Path, typer.Argument(help="run folder, made by `refgs trai
 
 @app.command()
 def check(capture: Annotated[Path, typer.Argument(help="folder with photos and cameras")]) -> None:
-    """Check a capture: read all of it and list what it holds and what is wrong with it."""
+    """Check a capture: read all of it, list its contents and its faults."""
     from refgs.capture import read_capture
     from refgs.capture.check import describe
 

@@ -1,8 +1,8 @@
 """Time the parts of a training: forward and backward passes, and work at intervals.
 
 `timed` marks a function or an autograd Function as a part; it is timed while a clock watches an iteration. A part called within
-another one counts as the outer part. On the CPU every iteration is watched, for about 25 µs. A card runs asynchronously: one of
-`SAMPLED` iterations is watched, by events on its stream, and counts for the others.
+another part counts as the outer one. On the CPU every iteration is watched, which costs about 25 µs. A card runs asynchronously: one of
+`SAMPLED` iterations is watched, by events on the card's stream, and stands for the others.
 """
 
 import functools

@@ -54,7 +54,7 @@ def job_report(what: str):
 
 
 def poses(folder: Path) -> None:
-    """Find the cameras of photos. Started again after an interruption, it resumes."""
+    """Find the cameras of photos. An interrupted search resumes when the command is run again."""
     from refgs.capture.motion import find_cameras
 
     with job_report("finding cameras") as report:
@@ -155,7 +155,7 @@ def _check_passes(run, passes: list[str], format: str) -> None:
 
 
 def _relight(run, hdri: Path):
-    """Return the light of a panorama; inter-reflection under it is traced here, where the run has any."""
+    """Make the light of a panorama, and trace the run's inter-reflection under it, if the run has any."""
     from refgs.formats.panorama import read_environment
 
     if run.environment is None:

@@ -1,4 +1,4 @@
-"""Run every step on a capture that is rendered here, up to relit pictures in Blender."""
+"""Run every step of RefGS on a rendered capture, up to relit pictures in Blender."""
 
 import json
 import os

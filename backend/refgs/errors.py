@@ -1,4 +1,4 @@
-"""Errors and warnings about the user's input."""
+"""Define errors and warnings about the user's input."""
 
 
 class InputError(Exception):
@@ -14,4 +14,4 @@ class NoCameras(InputError):
 
 
 class InputWarning(UserWarning):
-    """Wrong input of which the right part was used. The message is one line, as an InputError's."""
+    """Partly wrong input: the right part was used. The message is one line, as in an InputError."""

@@ -1,4 +1,4 @@
-"""Events of a job, for whoever shows its progress."""
+"""Define the type of functions that receive a job's events."""
 
 from collections.abc import Callable
 from typing import Any

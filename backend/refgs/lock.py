@@ -1,6 +1,6 @@
 """Lock a run folder while a process works in it. Other processes see the lock, read the training's progress, and can stop it.
 
-The operating system holds the lock and frees it when the process ends, however it ends. The Blender extension looks at the same
+The operating system holds the lock, and frees it when the process ends, even if it is killed. The Blender extension looks at the same
 files on its own; it imports nothing from here.
 """
 

@@ -1,4 +1,4 @@
-"""Paths of the program's own files, and writing files whole or not at all."""
+"""Find the program's own files; write files whole or not at all."""
 
 import errno
 import os

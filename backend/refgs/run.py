@@ -63,13 +63,13 @@ class Run:
         return [c.fitted(side) for c, split in zip(self.cameras, self.splits, strict=True) if split == "train"]
 
     def light(self, panorama: np.ndarray) -> Environment:
-        """Make a light for `render` of an equirectangular picture (`light_of`)."""
+        """Make a light for `render` from an equirectangular picture (see `light_of`)."""
         return light_of(panorama, self.settings)
 
     def relit(self, light: Environment, progress: Progress = lambda done, total: None) -> Surfels:
         """Relight the surfels, with inter-reflection where the run has a mesh to trace it on.
 
-        The first light takes seconds, another one less, and the last one again nothing. `progress` is called while rays are traced.
+        The first light takes seconds, the next ones less. The last light again takes no time. `progress` is called while rays are traced.
         """
         if self.occluder is None:
             return self.surfels().without_directions()  # learned under the recovered light: wrong under this one
@@ -134,7 +134,7 @@ def create_run(
 
 
 def record_changes(folder: Path, rows: dict[str, dict]) -> None:
-    """Add changes of settings to run.toml's [changed]. A setting's `asked` stays as it was first recorded."""
+    """Add changed settings to the table [changed] of run.toml. The value that was asked for stays as first recorded."""
     if not rows:
         return
     tables = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
@@ -176,6 +176,6 @@ def open_run(folder: Path) -> Run:
 
 
 def light_of(panorama: np.ndarray, settings: Settings, reference: Camera | None = None) -> Environment:
-    """Make the light of a run of an equirectangular picture (H, W, 3): linear radiance, in Blender's orientation."""
+    """Make a run's light from an equirectangular picture (H, W, 3) of linear radiance, in Blender's orientation."""
     panorama = method_of(settings.render).light.from_linear(panorama)
     return Environment.from_panorama(panorama, settings.environment.resolution, reference)

@@ -19,7 +19,7 @@ def check_free(folder: Path) -> None:
 
 
 def check_finished(folder: Path) -> tuple[dict, Settings]:
-    """Return what `read_run_facts` does. Raise InputError unless the folder holds a run whose training has ended."""
+    """Raise InputError unless the folder holds a run whose training has ended. Returns the result of `read_run_facts`."""
     facts, settings = read_run_facts(folder)
     if not (folder / "splats.ply").exists():
         raise InputError(
@@ -50,7 +50,7 @@ def _release(version: str) -> tuple[int, ...]:
 
 
 def update_metrics(folder: Path, facts: dict[str, Any]) -> None:
-    """Merge figures into a run's metrics.json; one of the same name, at any depth, is replaced."""
+    """Merge figures into a run's metrics.json. New figures replace those of the same name, at any depth."""
 
     def merged(known: dict, new: dict) -> dict:
         both = {key: merged(known[key], new[key]) for key in new if isinstance(known.get(key), dict)}

@@ -1,4 +1,4 @@
-"""Settings: keys, ranges and descriptions. The values are in presets/*.toml; docs/settings.md lists all."""
+"""Declare all settings: keys, ranges and descriptions. Values are in presets/*.toml; docs/settings.md lists all settings."""
 
 import tomllib
 from pathlib import Path

@@ -1,6 +1,6 @@
-"""Train, and report progress: what the command line (`commands`) and the job protocol (`worker`) share.
+"""Train a capture and report progress, for the command line (`commands`) and the job protocol (`worker`).
 
-Importing torch takes seconds. It is imported only once everything that can be wrong without it has been checked.
+Importing torch takes seconds. So everything that does not need torch is checked first.
 """
 
 import sys
@@ -185,7 +185,7 @@ def _costs(trainer: "Trainer") -> dict[str, Any]:
 
 @contextmanager
 def _card_memory(what: str | None = None) -> Iterator[None]:
-    """Raise InputError, with the line `what`, where the card's memory does not suffice."""
+    """Raise InputError with the message `what` if the card runs out of memory."""
     import torch
 
     from refgs.train.densify import full_card
@@ -198,7 +198,7 @@ def _card_memory(what: str | None = None) -> Iterator[None]:
 
 @contextmanager
 def _logged(out: Path) -> Iterator[None]:
-    """Write the traceback of an error that is not the user's to log.txt."""
+    """Write the traceback of an internal error to log.txt. Errors of the user's input pass through."""
     try:
         yield
     except InputError:

@@ -62,7 +62,7 @@ class Export(_Command):
 
 
 class During(_Command):
-    """Command to a running job. "stop" ends a training here and writes its asset; "cancel" leaves it to be resumed."""
+    """Command to a running job. "stop" ends a training and writes its asset; "cancel" ends it with a checkpoint, to be resumed."""
 
     command: Literal["preview", "pause", "resume", "stop", "cancel"]
 

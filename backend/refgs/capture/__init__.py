@@ -202,7 +202,7 @@ def _narrow(whole: Region, box: Box, views: list[View], silhouettes: list) -> tu
 
 
 def _in_run_frame(capture: Capture, unit: float) -> Capture:
-    """Move a capture from its own frame into the run's, which is smaller by `unit`."""
+    """Convert a capture to the run's coordinates: move and rotate it, and divide all lengths by `unit`."""
     to_run = np.linalg.inv(capture.to_capture)
     points = capture.points
     return replace(

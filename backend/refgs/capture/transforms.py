@@ -100,7 +100,7 @@ def frame_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> tup
 
 
 def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> list[View]:
-    """Make the views of frames, in the file's world; photos are relative to `file`. Raises InputError."""
+    """Convert the file's frames to views, in the file's world coordinates. Photo paths are relative to `file`. Raises InputError."""
     folder = file.parent
     found = [(frame, split, find_image(folder / frame.path)) for frame, split in frames]
     report_missing(file, [frame.path for frame, _, path in found if path is None], len(found))

@@ -1,4 +1,4 @@
-"""Blend splats at points of a surface, as a renderer in front of each point would."""
+"""Blend splats at points of a surface, as a renderer does that looks straight at each point."""
 
 from collections.abc import Callable
 

@@ -1,6 +1,6 @@
-"""Export of a run: checks, then splats or the textured mesh.
+"""Export a run's textured mesh or its splats.
 
-Importing torch takes seconds. It is imported only once everything that can be wrong without it has been checked.
+Importing torch takes seconds. So everything that does not need torch is checked first.
 """
 
 import warnings
@@ -65,7 +65,7 @@ def _check_names(target: Path | None, splats: list[Path]) -> None:
 
 
 def _mesh_files(target: Path | None) -> list[Path]:
-    """Return the mesh's file and what is written beside it."""
+    """Return the mesh's file and its companions: the folder of textures and, for OBJ, the MTL file."""
     from refgs.formats.textures import FOLDER
 
     if target is None:
@@ -81,7 +81,7 @@ def _check_absent(files: list[Path], overwrite: bool) -> None:
 
 
 def _read_source(folder: Path, is_run: bool, report: Report) -> "tuple[Run | None, Splats]":
-    """Open the run, or read the PLY file of splats; report what was left out of it."""
+    """Open the run, or read the PLY file of splats. Reports rows that were left out as a warning."""
     from refgs.formats.splats import read_splats
     from refgs.run import open_run
 
