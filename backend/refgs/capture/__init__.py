@@ -1,4 +1,4 @@
-"""Read captures: from a folder on disk to cameras and images. Each layout has a module."""
+"""Read the cameras and images of a capture from its folder. Each layout has a module."""
 
 import hashlib
 import os
@@ -52,8 +52,8 @@ def find_layout(folder: Path) -> str | None:
 def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
     """Read the cameras of a capture and find the run's frame.
 
-    `wanted` names a region, an up direction or both, in the frame that the run would have without them. Photos are not decoded:
-    only their headers and some masks are read. Raises InputError, one line for the artist.
+    `wanted` holds a box, an up direction or both. They are given in the frame of a run without them. Only the photos' headers and
+    some masks are read; photos are not decoded. Raises InputError, one line for the artist.
     """
     folder = Path(folder)
     layout = _check_layout(folder)
@@ -108,7 +108,7 @@ def _check_layout(folder: Path) -> str:
 
 
 def _read(folder: Path, layout: str) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
-    """Read the views, the points and their colours, None without points, and warnings."""
+    """Return the views, the points, their colours, and warnings. Points and colours are None if the layout has none."""
     match layout:
         case "nerf-blender":
             return read_nerf_blender(folder), None, None, []
@@ -127,7 +127,7 @@ def _check_photos(views: list[View]) -> None:
 
 
 def _shared_photos(views: list[View]) -> list[str]:
-    """Return a warning if photos are both trained and tested on."""
+    """Return a warning if a photo is in both the training and the test split."""
     tested, trained = ({view.image_path for view in views if view.split == split} for split in ("test", "train"))
     shared = tested & trained
     if not shared:
@@ -137,7 +137,7 @@ def _shared_photos(views: list[View]) -> list[str]:
 
 
 def _hold_out(views: list[View]) -> list[View]:
-    """Keep the capture's own split; without one, hold out every eighth view by name."""
+    """Keep the capture's own split into training and test views. Without a split, hold out every eighth view by name."""
     if any(view.split == "test" for view in views):
         return views
     views = sorted(views, key=lambda view: view.image_path.as_posix())
@@ -157,7 +157,7 @@ def _check_cameras(folder: Path, views: list[View]) -> None:
 
 
 def _unique_names(views: list[View]) -> list[View]:
-    """Make camera names unique in each split: photos of one name in two folders are prefixed with their folders."""
+    """Make camera names unique in each split. If photos in two folders have the same name, prefix it with the folder."""
     names = Counter((view.split, view.camera.name) for view in views)
     top = os.path.commonpath([view.image_path.parent for view in views])
 
@@ -174,7 +174,7 @@ def _unique_names(views: list[View]) -> list[View]:
 
 
 def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.ndarray]], list[str]]:
-    """Return the views, small masks of some, and warnings. Masks that are opaque everywhere are dropped from the views."""
+    """Return the views, reduced masks of some views, and warnings. Drop the masks if all of them are opaque everywhere."""
     silhouettes = sample_silhouettes(views)
     if silhouettes or not any(view.masked for view in views):
         return views, silhouettes, []
@@ -184,9 +184,10 @@ def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.nda
 
 
 def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return run → capture, (4, 4), and its scale. The region of interest is at the run's origin with radius 1, up is +Z.
+    """Return the similarity (4, 4) from the run's frame to the capture's, and its scale.
 
-    A NeRF-Blender capture keeps its own frame, as long as size and place of the region suit float32.
+    In the run's frame the region of interest is a ball of radius 1 about the origin, and up is +Z. A NeRF-Blender capture keeps its own
+    frame if float32 is exact enough at the region's size and place.
     """
     if layout == "nerf-blender":
         if is_near(region):
@@ -196,7 +197,7 @@ def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray,
 
 
 def _narrow(whole: Region, box: Box, views: list[View], silhouettes: list) -> tuple[Region, float]:
-    """Return the region of interest inside a box, and the radius of a ball about its centre that holds the whole region."""
+    """Return the region of interest inside a box, and the radius of a ball about its centre that holds the region `whole`."""
     region = region_in(box, views, silhouettes)
     return region, whole.radius + float(np.linalg.norm(whole.centre - region.centre))
 

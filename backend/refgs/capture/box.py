@@ -1,4 +1,4 @@
-"""Boxes around the wanted part of a capture."""
+"""Describe the wanted part of a capture by a box."""
 
 from dataclasses import dataclass
 
@@ -9,13 +9,13 @@ from refgs.settings import RegionSettings
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """Box in some frame. `matrix` (4, 4) maps the cube −1..1 onto it: its columns are half the edges, and the centre."""
+    """Box with any rotation. `matrix` (4, 4) maps the cube −1..1 onto the box: its columns are the three half edges and the centre."""
 
     matrix: np.ndarray
 
     @classmethod
     def of(cls, region: RegionSettings) -> "Box":
-        """Make the box that settings describe."""
+        """Make the box that the settings `region` describe."""
         from scipy.spatial.transform import Rotation  # slow to import, and few captures have a region
 
         turn = Rotation.from_euler("xyz", region.rotation, degrees=True).as_matrix()
@@ -33,16 +33,16 @@ class Box:
 
     @property
     def radius(self) -> float:
-        """Half the box's diagonal."""
+        """Return half the length of the box's diagonal."""
         return float(np.linalg.norm(self.matrix[:3, :3]))
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Tell which points (N, 3) lie in the box, (N,)."""
+        """Mark the points (N, 3) that lie in the box, as bool (N,)."""
         inverse = np.linalg.inv(self.matrix)
         return (np.abs(points @ inverse[:3, :3].T + inverse[:3, 3]) <= 1).all(axis=-1)
 
     def grid(self, side: int) -> np.ndarray:
-        """Return a regular grid of points (side³, 3) over the box, with its corners."""
+        """Return a regular grid of points (side³, 3) over the box, corners included."""
         axis = np.linspace(-1, 1, side)
         cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
         return cube @ self.matrix[:3, :3].T + self.centre

@@ -1,4 +1,4 @@
-"""Camera files: JSON for `refgs render --cameras`, and a run folder's cameras.json."""
+"""Read and write camera files: JSON for `refgs render --cameras`, and a run folder's cameras.json."""
 
 import json
 from pathlib import Path
@@ -18,8 +18,8 @@ from refgs.paths import write_text
 def read_cameras(file: Path) -> list[Camera]:
     """Read the cameras of a NeRF-Blender or nerfstudio JSON, in the capture's frame, named after their `file_path`.
 
-    Photos are opened only for their size, where the file names none. A distorted lens becomes the pinhole that its photo is
-    undistorted to. A run's cameras.json is moved to the capture's frame too. Raises InputError.
+    A photo is opened only if the file does not name its size. A camera with a distorted lens is replaced by the pinhole camera of the
+    undistorted photo. Cameras of a run's cameras.json are transformed to the capture's frame. Raises InputError.
     """
     file = Path(file)
     shared, frames = read_frames(file)
@@ -41,9 +41,9 @@ def write_cameras(
 ) -> None:
     """Write the run folder's cameras.json: undistorted cameras in the run's frame, with OpenGL axes.
 
-    `photo` is each photo's file, relative to the capture's folder. If the light is fixed to the "camera", `light_of` names the photo
-    in whose frame environment.exr is. `exposures` holds factors for some training photos: radiance times this factor is as bright
-    as the photo.
+    The key `photo` is the photo's file, relative to the capture's folder. If the light is fixed to the "camera", the key `light_of`
+    names a photo: environment.exr is in the frame of its camera. `exposures` holds factors for some training photos: radiance times
+    this factor is as bright as the photo.
     """
     frames = []
     for view in capture.views:
@@ -76,7 +76,11 @@ def _from(folder: Path, file: Path) -> Path:
 
 
 def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float]]:
-    """Read a run folder's cameras.json: cameras in the run's frame, their splits, run → capture (4, 4), and exposures (default 1)."""
+    """Read a run folder's cameras.json.
+
+    Return the cameras in the run's frame, their splits, the similarity (4, 4) from the run's frame to the capture's, and exposures
+    (default 1).
+    """
     file = Path(file)
     shared, frames = read_frames(file)
     cameras = [frame_camera(frame)[0] for frame in frames]

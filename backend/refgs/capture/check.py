@@ -1,4 +1,4 @@
-"""Check a capture: decode all of it, and list what it holds and what looks wrong."""
+"""Check a capture: decode all photos and masks, list its contents, and warn of likely mistakes."""
 
 import math
 from collections import Counter
@@ -27,10 +27,11 @@ LAYOUTS = {
 
 
 def check(capture: Capture, out: Path) -> dict[str, Any]:
-    """Check a capture and write what another program needs to show it: a cameras.json as a run's, and masked thumbnails of some photos.
+    """Check a capture, and write a cameras.json and masked thumbnails of some photos, with which another program can show it.
 
     Files of an earlier check in the folder `out` are replaced. Returns the paths `capture`, `cameras` and `thumbnails`; `centre` and
-    `radius` of the region of interest, in the frame of cameras.json; and `lines`, those of `describe`. Raises InputError as it does.
+    `radius` of the region of interest, in the frame of cameras.json; and `lines`, the result of `describe`. Raises InputError for a
+    photo or mask that cannot be read.
     """
     out.mkdir(parents=True, exist_ok=True)
     lines = describe(capture, out)
@@ -46,10 +47,10 @@ def check(capture: Capture, out: Path) -> dict[str, Any]:
 
 
 def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
-    """Describe what the capture holds, in lines; then add one `Warning: …` line for each thing that looks wrong.
+    """Return lines that describe the contents of the capture, followed by a line `Warning: …` for each likely mistake.
 
-    Decodes every photo and mask, and writes thumbnails of some to the folder `thumbnails`, if given. Raises InputError if any cannot
-    be read: how many, and the first.
+    Decodes every photo and mask, and writes thumbnails of some photos to the folder `thumbnails`, if given. Raises InputError if files
+    cannot be read: the message has their number and the name of the first.
     """
     statistics = _decode_all(capture, thumbnails)
     return [
@@ -79,9 +80,9 @@ class _Statistics:
 
 
 def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
-    """Measure sharpness inside the mask, away from its edge: energy of the Laplacian over energy of the gradient.
+    """Measure the sharpness inside the mask, away from its edge: energy of the Laplacian divided by energy of the gradient.
 
-    Contrast cancels out. A uniform picture has 0.
+    The quotient does not depend on contrast. It is 0 for a uniform picture.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     inside = cv2.erode(inside.astype(np.uint8), np.ones((7, 7), np.uint8), borderValue=0) > 0
@@ -91,7 +92,7 @@ def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
 
 
 def _spread(count: int) -> list[int]:
-    """Return the indices of the views with thumbnails."""
+    """Choose the views that get thumbnails, evenly: return their indices."""
     return sorted({round(number) for number in np.linspace(0, count - 1, THUMBNAILS)})
 
 

@@ -1,7 +1,7 @@
-"""Read COLMAP captures: a sparse model in `sparse/0` or `sparse`, binary or text, with photos in `images` or beside it.
+"""Read COLMAP captures: a sparse model in `sparse/0` or `sparse`, binary or text, with photos in `images` or in the capture's folder.
 
-Ref-NeRF's real scenes and mip-NeRF 360's also have reduced photos in `images_2`, `images_4` and `images_8`. Naming such a folder
-uses its photos; their suffix may differ from that in the model.
+The real scenes of Ref-NeRF and those of mip-NeRF 360 also have reduced photos in `images_2`, `images_4` and `images_8`. If such a folder
+is named as the capture, its photos are used. Their file suffix may differ from the suffix in the model.
 """
 
 import re
@@ -20,9 +20,9 @@ from refgs.formats.colmap import SUPPORTED, Image, Intrinsics, model_files, read
 
 
 def find_model(folder: Path) -> tuple[Path, Path] | None:
-    """Return the folders of a capture's photos and of its sparse model; None without a model.
+    """Return the folder of a capture's photos and the folder of its sparse model. Return None if there is no model.
 
-    `folder` is the capture's, or one with its reduced photos.
+    `folder` is the capture's folder, or its subfolder with reduced photos.
     """
     reduced = re.fullmatch(r"images_\d+", folder.name)
     root, photos = (folder.parent, folder) if reduced else (folder, folder / "images")
@@ -88,7 +88,7 @@ def _camera(image: Image, intrinsics: Intrinsics, where: str) -> tuple[Camera, L
 
 
 def _rotation(q: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix of a quaternion wxyz, which need not be normalised. A zero one gives NaN."""
+    """Return the rotation matrix of a quaternion wxyz of any length. A zero quaternion gives NaN."""
     with np.errstate(invalid="ignore"):
         w, x, y, z = q / np.linalg.norm(q)
     return np.array(

@@ -1,4 +1,4 @@
-"""Find a capture's photos and masks on disk, and make views of them."""
+"""Find the photos and masks of a capture on disk, and make a view of each photo."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,10 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 
 
 def find_image(path: Path, any_suffix: bool = False) -> Path | None:
-    """Return the file at `path`, or at `path` with an image suffix added (with `any_suffix`: or replaced); None if absent."""
+    """Return the file at `path`, or else at `path` with an image suffix added. Return None if both are absent.
+
+    With `any_suffix` also try other image suffixes in place of the suffix of `path`.
+    """
     if path.is_file():
         return path
     if any_suffix and path.suffix.lower() in IMAGE_SUFFIXES:
@@ -23,7 +26,7 @@ def find_image(path: Path, any_suffix: bool = False) -> Path | None:
 
 
 def find_photos(folder: Path) -> list[Path]:
-    """Return the photos in `images`, or in the folder itself without such a folder, sorted by name. NAME_alpha.png are masks."""
+    """Return the photos in the subfolder `images`, or else in the folder itself, sorted by name. NAME_alpha.png is a mask, not a photo."""
     top = folder / "images" if (folder / "images").is_dir() else folder
     found = {path.name: path for path in sorted(top.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES}
     masks = {f"{path.stem}_alpha.png" for path in found.values()}
@@ -31,7 +34,7 @@ def find_photos(folder: Path) -> list[Path]:
 
 
 def report_missing(source: Path, missing: list[str], total: int) -> None:
-    """Raise InputError if `source` names photos that are missing."""
+    """Raise InputError if photos that the file `source` names are missing."""
     if missing:
         raise InputError(
             f"{source}: {len(missing)} of the {total} images it names are missing, the first is {missing[0]}. "
@@ -40,9 +43,10 @@ def report_missing(source: Path, missing: list[str], total: int) -> None:
 
 
 class Masks:
-    """Masks of a capture: NAME.any or NAME.jpg.any in its folder `masks`, in the photos' sub-folders if there are any.
+    """Masks of a capture: for NAME.jpg, the file NAME.png or NAME.jpg.png in the folder `masks`, with any image suffix.
 
-    Otherwise NAME_alpha.png beside the photo, as in the scene `ball` of Shiny Blender.
+    If photos are in subfolders, `masks` has the same subfolders. Without such a mask NAME_alpha.png beside the photo is used, as in the
+    scene `ball` of Shiny Blender.
     """
 
     def __init__(self, folder: Path):
@@ -55,7 +59,7 @@ class Masks:
         }
 
     def find(self, image: Path, named: object, where: str) -> Path | None:
-        """Return a photo's mask: the file `named` relative to the folder, otherwise one of the photo's name; None if absent."""
+        """Return the mask of a photo: the file `named`, relative to the folder, or else a mask with the photo's name. None if absent."""
         if named:
             path = find_image(self.folder / str(named).replace("\\", "/"))
             if path is None:
@@ -78,9 +82,10 @@ def photo_view(
     where: str,
     mask_below: float | None = None,
 ) -> View:
-    """Make the view of a photo. `as_given` holds its camera and lens as the capture's file has them.
+    """Make the view of a photo. `as_given` is the camera and lens from the capture's file.
 
-    Intrinsics for another resolution are scaled to the photo's. Raises InputError if the aspect ratio or the mask's size differs.
+    Intrinsics are scaled to the photo's resolution if they were given for another one. Raises InputError if the camera has another
+    aspect ratio than the photo, or the mask another size.
     """
     width, height, has_alpha = read_header(image)
     camera, lens = as_given

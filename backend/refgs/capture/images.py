@@ -1,4 +1,4 @@
-"""Load photos and masks for training: undistorted, reduced, 8-bit sRGB with straight alpha."""
+"""Load photos and masks for training: undistort and reduce them to 8-bit sRGB with straight alpha."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -27,7 +27,7 @@ class LoadedView:
 
 
 def read_header(path: Path) -> tuple[int, int, bool]:
-    """Read width, height and whether there is an alpha channel, without decoding. Raises InputError naming the file."""
+    """Return a picture's width, height, and True if it has an alpha channel. Decodes no pixels. Raises InputError naming the file."""
     with _open(path) as picture:
         return *picture.size, picture.has_transparency_data
 
@@ -35,7 +35,7 @@ def read_header(path: Path) -> tuple[int, int, bool]:
 def read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Decode a photo to RGB (H, W, 3) and alpha (H, W) uint8. EXIF rotation is ignored, as in COLMAP and nerfstudio.
 
-    16-bit and greyscale files become 8-bit RGB. Raises InputError naming a file that is truncated or unreadable.
+    16-bit and greyscale files are converted to 8-bit RGB. Raises InputError naming a file that is truncated or unreadable.
     """
     with _open(path) as picture:
         pixels = np.asarray(_decode(picture, path))
@@ -43,9 +43,10 @@ def read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def read_mask(path: Path, below: float | None = None) -> np.ndarray:
-    """Read a mask file as alpha (H, W) uint8: white is the object. Alpha channels and 0/1 masks are read too.
+    """Read a mask file as alpha (H, W) uint8: white is the object.
 
-    With `below` the file is a depth map: the object is where depth is below this part of its range.
+    The file may also have an alpha channel, or the values 0 and 1. If `below` is given, the file is a depth map: the object is where
+    depth is less than `below` times its largest code.
     """
     image, alpha = read_image(path)
     if below is not None:
@@ -65,8 +66,8 @@ def read_alpha(view: View) -> np.ndarray | None:
 def load_view(view: View, max_side: int | None = None) -> LoadedView:
     """Load a view: decode, mask and undistort it, and reduce its longer side to `max_side` pixels (None: keep its size).
 
-    Pixels are averaged by area in linear light, as by a coarser sensor. They are weighted by alpha, so that colours outside the mask
-    do not bleed into its edge. Raises InputError naming the file.
+    Linear radiance is averaged over the area of each reduced pixel, as by a coarser sensor. Pixels are weighted by alpha, so that
+    colours outside the mask do not bleed into its edge. Raises InputError naming the file.
     """
     image, own_alpha = read_image(view.image_path)
     alpha = own_alpha if view.has_alpha else None
@@ -111,7 +112,7 @@ def _open(path: Path) -> Image.Image:
 
 
 def _decode(picture: Image.Image, path: Path) -> Image.Image:
-    """Decode to 8-bit RGB or RGBA. Pillow, unlike OpenCV, detects a truncated file."""
+    """Decode a picture to 8-bit RGB or RGBA. Pillow is used, because OpenCV does not detect a truncated file."""
     try:
         if picture.mode.startswith("I;16"):
             values = np.asarray(picture, dtype=np.float64) / 257
@@ -131,7 +132,7 @@ def _reason(error: Exception) -> str:
 
 @cache
 def _decoding_table() -> np.ndarray:
-    """Return the 256 codes of a photo as linear float32."""
+    """Return the linear radiance of each 8-bit sRGB code, float32 (256,)."""
     return srgb_decode(np.arange(256) / 255).astype(np.float32)
 
 

@@ -1,12 +1,12 @@
-"""Undistort lenses: Brown's radial and tangential model, as in OpenCV, COLMAP and nerfstudio, and the pinhole that replaces it.
+"""Undistort photos by Brown's radial and tangential lens model, as in OpenCV, COLMAP and nerfstudio.
 
 With (x, y) = (X/Z, Y/Z) and r² = x² + y²,
     x' = x·(1 + k1·r² + k2·r⁴ + k3·r⁶ + k4·r⁸) + 2·p1·x·y + p2·(r² + 2x²)
     y' = y·(1 + k1·r² + k2·r⁴ + k3·r⁶ + k4·r⁸) + p1·(r² + 2y²) + 2·p2·x·y
 and the pixel is (fx·x' + cx, fy·y' + cy).
 
-Photos are undistorted onto a pinhole of the same size in pixels. Its focal lengths are scaled by the smallest factor at which every
-pixel lies inside the photo. So no invented or black pixels need masking; the photo loses a thin strip at its edges.
+The undistorted photo is that of a pinhole camera with the same size in pixels. Its focal lengths are scaled by the smallest factor at
+which every pixel samples the inside of the photo. So there are no black pixels to mask, and a thin strip at the photo's edges is lost.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ class Lens:
     tangential: tuple[float, float]
 
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the ray through (x, y, 1) meets the distorted image plane at unit distance."""
+        """Return the distorted position (x', y') of the undistorted position (x, y) on the image plane at unit distance."""
         k1, k2, k3, k4 = self.radial
         p1, p2 = self.tangential
         r2 = x * x + y * y
@@ -49,13 +49,16 @@ class Lens:
         return replace(camera, fx=self.fx * factor, fy=self.fy * factor, cx=self.cx, cy=self.cy)
 
     def maps(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return where each pixel of the pinhole `camera` samples the photo: two float32 (H, W) for cv2.remap."""
+        """Return the photo's column and row for each pixel of the pinhole `camera`: two float32 (H, W) for cv2.remap."""
         return _maps(self, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 @lru_cache(maxsize=64)
 def _focal_factor(lens: Lens, width: int, height: int) -> float | None:
-    """Find the smallest factor on the focal lengths at which every pixel of the pinhole lies inside the photo; None above 2."""
+    """Find the smallest factor on the focal lengths at which every pixel of the pinhole lies inside the photo.
+
+    Return None if the factor would be above 2.
+    """
     u, v = np.meshgrid(np.linspace(0, width, 65), np.linspace(0, height, 65))
 
     def fits(factor: float) -> bool:
