@@ -1,1 +1,1 @@
-"""Metrics, pictures and ground truth: errors of renderings, light and meshes."""
+"""Measure the errors of renderings, light and meshes, and draw them as pictures."""

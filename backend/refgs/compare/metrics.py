@@ -1,4 +1,4 @@
-"""Error measures of pictures and lights.
+"""Measure the errors of pictures and lights.
 
 Pictures are (height, width, 3) float arrays; "encoded" means sRGB in 0..1, "linear" means radiance. The figure of several views is
 the mean over the views.

@@ -1,4 +1,4 @@
-"""Renderings as arrays to compare, and as pictures to look at."""
+"""Convert renderings to arrays to compare, and to pictures to look at."""
 
 from pathlib import Path
 

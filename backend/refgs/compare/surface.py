@@ -1,4 +1,4 @@
-"""Errors of a mesh against the true one."""
+"""Measure the errors of a mesh against the true one."""
 
 import numpy as np
 import trimesh

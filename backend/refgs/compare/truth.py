@@ -1,4 +1,4 @@
-"""Ground truth of a capture, and errors of renderings against it."""
+"""Read the ground truth of a capture, and measure the errors of renderings against it."""
 
 from pathlib import Path
 

@@ -1,1 +1,1 @@
-"""Evaluation of runs, and the report page."""
+"""Evaluate runs and write the report page."""

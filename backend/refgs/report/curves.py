@@ -1,4 +1,4 @@
-"""Curves of error against run time: Pareto fronts, knees, times to given errors.
+"""Analyse curves of error against run time: Pareto fronts, knees, times to given errors.
 
 Errors and times are compared by their logarithms, so that a 10 % change counts the same everywhere.
 """

@@ -1,4 +1,4 @@
-"""Evaluation of a run: its views against photos, and its maps, light and mesh against ground truth."""
+"""Evaluate a run: compare its views with photos, and its maps, light and mesh with ground truth."""
 
 import time
 from collections.abc import Callable, Iterator

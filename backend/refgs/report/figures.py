@@ -1,4 +1,4 @@
-"""Names and formats of figures, for the console and the page."""
+"""Name and format figures for the console and the page."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator

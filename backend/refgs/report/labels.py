@@ -1,4 +1,4 @@
-"""Labels of runs that are shown side by side: the settings in which they differ."""
+"""Label runs that are shown side by side, by the settings in which they differ."""
 
 from collections import Counter, defaultdict
 from collections.abc import Hashable
