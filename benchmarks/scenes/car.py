@@ -7,7 +7,7 @@ from scripts.demo.shapes import Material, Scene, join, mix, step
 
 
 def paint(points: np.ndarray) -> np.ndarray:
-    """Paint it blue-green with flames from the front wheels, and two cream stripes from front to back."""
+    """Compute base colours of the paint: blue-green, with flames from the front wheels and two cream stripes from front to back."""
     x, y, z = points.T
     flame = 0.10 - 0.30 * np.abs(np.sin(9 * z + 0.6)) - 0.10 * np.sin(21 * z)
     flames = step(-0.02, 0.02, x - flame) * step(0.16, 0.20, np.abs(y))

@@ -7,7 +7,7 @@ from scripts.demo.shapes import Material, Scene, join, mix, step
 
 
 def stripes(points: np.ndarray) -> np.ndarray:
-    """Paint it off-white; a red stripe from front to back between two blue ones."""
+    """Compute base colours of the shell: off-white, with a red stripe from front to back between two blue stripes."""
     across = np.abs(points[:, 1])
     red, blue = 1 - step(0.085, 0.10, across), step(0.13, 0.145, across) * (1 - step(0.175, 0.19, across))
     return mix((0.70, 0.68, 0.62), (0.50, 0.04, 0.03), red) + blue[:, None] * (np.array([0.03, 0.09, 0.35]) - 0.66)

@@ -15,7 +15,7 @@ def clay(points: np.ndarray) -> np.ndarray:
 
 
 def green(points: np.ndarray) -> np.ndarray:
-    """Paint it darker below and lighter towards the tops."""
+    """Compute base colours of the cactus: darker below, lighter towards the tops."""
     return mix((0.05, 0.15, 0.06), (0.14, 0.32, 0.10), step(-0.4, 0.9, points[:, 2]))
 
 

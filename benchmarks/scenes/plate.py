@@ -7,7 +7,7 @@ from scripts.demo.shapes import Material, Scene, join, lathe, mix, moved, step
 
 
 def glaze(points: np.ndarray) -> np.ndarray:
-    """Paint it white, with a blue line within a wreath of leaves on the rim."""
+    """Compute base colours of the plate: white, with a blue line inside a wreath of leaves on the rim."""
     radius, angle = np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
     line = 1 - step(0.010, 0.020, np.abs(radius - 0.66))
     leaf = 1 - step(-0.008, 0.008, np.abs(radius - 0.83) - 0.07 * np.abs(np.sin(12 * angle)) ** 0.7)

@@ -7,7 +7,7 @@ from scripts.demo.shapes import Material, Scene, join, mix, step
 
 
 def glaze(points: np.ndarray) -> np.ndarray:
-    """Glaze it blue-green from above, running down over cream in uneven drops."""
+    """Compute base colours of the glaze: blue-green from above, running down over cream in uneven drops."""
     angle = np.arctan2(points[:, 1], points[:, 0])
     edge = -0.12 + 0.07 * np.sin(5 * angle + 0.7) + 0.05 * np.sin(8 * angle) + 0.03 * np.sin(19 * angle)
     over = step(-0.025, 0.025, points[:, 2] - edge)

@@ -44,7 +44,10 @@ def outcome(
     exact_by: Sequence[Tensor],
     terms: Sequence[Tensor] | None = None,
 ) -> Found:
-    """Combine the errors of values and gradients; an error of a gradient counts a tenth."""
+    """Return the larger of two errors: that of the values `found`, and a tenth of that of the gradients `by`.
+
+    `expected` and `exact_by` are the float64 values and gradients. `terms` are the magnitudes that cancel in the gradients, if known.
+    """
     finite = all(bool(v.isfinite().all()) for v in (*found, *by))
     return Found(finite, max(worst(found, expected), 0.1 * worst(by, exact_by, terms)))
 

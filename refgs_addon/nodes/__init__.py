@@ -43,7 +43,7 @@ def out(node: bpy.types.Node, name: str | None = None) -> bpy.types.NodeSocket:
 
 
 def math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
-    """Add a math node for sockets and numbers; return its output."""
+    """Add a math node and return its output. Each of `inputs` is a socket or a number."""
     return out(add(tree, "ShaderNodeMath", dict(enumerate(inputs)), operation=operation))
 
 

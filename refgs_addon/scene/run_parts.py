@@ -1,4 +1,4 @@
-"""Find the parts of an imported run, and show one of them."""
+"""Find the parts of an imported run, which are splats and mesh, and show one of them."""
 
 import bpy
 

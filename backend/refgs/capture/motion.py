@@ -85,10 +85,11 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
 
 
 def pairs(count: int) -> list[tuple[int, int]]:
-    """Choose the pairs of photos to match, by index in the order of names: every pair of up to ALL_PAIRS photos.
+    """Choose the pairs of photos to match, as indices into the photos sorted by name.
 
-    Of more photos, match each with the next ten and with some at powers of two, cyclically, as one walks around an object; and every
-    tenth with every tenth, for further rounds.
+    Up to ALL_PAIRS photos, match every pair. With more, match each photo with the next ten, and with photos at distances of powers of two.
+    Indices wrap around, because photographers walk around an object. Also match every tenth photo with every other tenth, to link several
+    rounds.
     """
     if count <= ALL_PAIRS:
         return list(combinations(range(count), 2))

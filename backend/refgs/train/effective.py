@@ -55,11 +55,11 @@ class Effective:
         return replace(self, settings=settings, changes=self.changes | changes)
 
     def chosen(self) -> dict[str, str]:
-        """Say what the photos decided, and why. This is the table [chosen] of run.toml."""
+        """List the settings that the photos chose, with the reasons: the table [chosen] of run.toml."""
         return {key: f"{change.became}: {change.why}" for key, change in self.changes.items() if change.by == "photos"}
 
     def rows(self) -> dict[str, dict[str, Any]]:
-        """List the changes. This is the table [changed] of run.toml."""
+        """List the settings whose value in effect differs from the value asked for: the table [changed] of run.toml."""
         return {key: asdict(change) for key, change in self.changes.items()}
 
 

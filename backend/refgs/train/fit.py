@@ -90,9 +90,10 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
 
 
 def _scheduled(settings: Settings, iterations: float, usual: float) -> Settings:
-    """Scale a schedule to a number of iterations, and the rates by the inverse square root of `iterations / usual`.
+    """Scale a schedule to `iterations`, and multiply its learning rates by √(usual / iterations).
 
-    A step has the noise of one view. With such rates, the noise of all steps adds up to the same.
+    `usual` is the number of iterations for which the rates were chosen. Each step has the noise of one view. With these rates the noise of
+    all steps adds up to the same amount, however many steps there are.
     """
     tables, part = settings.model_dump(), iterations / settings.train.iterations
     for section, name in (("train", "iterations"), *SCHEDULE):

@@ -1,6 +1,6 @@
-"""Learn the environment's light: refine its resolution, diffuse between texels, measure its mean.
+"""Learn the environment's light: refine its resolution, diffuse between texels, measure its mean radiance.
 
-The objective holds the mean grey.
+A term of the loss keeps this mean grey, so that the light does not take on the colours of the object.
 """
 
 import math
@@ -92,7 +92,7 @@ def diffuse(state: State) -> None:
 def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
     """Average the light's radiance (3,) over the directions that the object mirrors.
 
-    Returns None where the objective does not hold the mean grey.
+    Returns None if the loss has no term that keeps this mean grey.
     """
     if light is None or state.settings.loss.light == 0:
         return None
