@@ -9,6 +9,7 @@ from refgs.capture import Box, Capture, LoadedView
 from refgs.errors import InputError
 from refgs.geometry.hull import visual_hull_points
 from refgs.model.surfels import Parameters, initial_parameters
+from refgs.render.baselines import axes_of
 from refgs.settings import Settings, SurfelSettings
 
 GEOMETRY = ("position", "rotation", "scale", "opacity")
@@ -53,7 +54,7 @@ def _initial(positions, normals, spacing, colours, surfels: SurfelSettings, opac
         normals,
         spacing,
         colours,
-        axes=3 if surfels.primitive == "3dgs" else 2,
+        axes=axes_of(surfels),
         opacity=opacity,
         sh_degree=surfels.sh_degree,
         albedo=surfels.albedo,
