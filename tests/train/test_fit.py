@@ -9,7 +9,7 @@ import pytest
 from refgs import train_job
 from refgs.capture import read_capture
 from refgs.settings import load_settings
-from refgs.train.fit import FASTEST, REHEARSED, between, fitting
+from refgs.train.fit import FASTEST, REHEARSED, _scheduled, between, fitting
 from refgs.train.plan import Plan
 
 QUICK, STANDARD = load_settings("quick"), load_settings("standard")
@@ -23,6 +23,15 @@ def test_it_lies_between_the_presets():
     assert half.loss == STANDARD.loss and half.rates == STANDARD.rates
     beyond = between(QUICK, STANDARD, 2.0)
     assert beyond.surfels.budget == 150_000 and beyond.environment.resolution == 256 and beyond.image.max_side == 1600
+
+
+@pytest.mark.parametrize("part, factor", [(0.25, 2), (0.5, 2**0.5), (1.01, 1), (1.99, 1), (4, 0.5**0.5)])
+def test_rates_change_only_beyond_the_presets(part, factor):
+    """Check the learning rates of a schedule that has `part` times the iterations of `quick`; `standard` has twice as many."""
+    assert STANDARD.train.iterations == 2 * QUICK.train.iterations
+    rates = _scheduled(QUICK, part * QUICK.train.iterations, QUICK, STANDARD).rates
+    assert rates.position == pytest.approx(factor * QUICK.rates.position)
+    assert rates.decay == QUICK.rates.decay
 
 
 def test_more_time_brings_more_of_all(ball_capture, tmp_path):

@@ -63,12 +63,12 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
         state.report = report
         for event in said:
             report(*event)
-        settings = _scheduled(state.settings, max(count, 1.0) + REHEARSED, quick.train.iterations)
+        settings = _scheduled(state.settings, max(count, 1.0) + REHEARSED, quick, standard)
         state.effective = state.effective.moved_to(settings, "plan", why)
         state.total = settings.train.iterations
     else:
         del trainer  # first, for its memory
-        settings = _scheduled(found, count, min(count, standard.train.iterations))
+        settings = _scheduled(found, count, quick, standard)
         trainer = Trainer(capture, Effective.of(quick).moved_to(settings, "plan", why), folder, report, plan, device)
     settings = trainer.state.settings
     found = f"{settings.train.iterations:,} iterations, {settings.surfels.budget:,} surfels at most"
@@ -89,13 +89,14 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
     return validate(tables, "a time")
 
 
-def _scheduled(settings: Settings, iterations: float, usual: float) -> Settings:
-    """Scale a schedule to `iterations`, and multiply its learning rates by √(usual / iterations).
+def _scheduled(settings: Settings, iterations: float, quick: Settings, standard: Settings) -> Settings:
+    """Scale a schedule to `iterations`; with fewer than `quick` has, or more than `standard`, adapt the learning rates.
 
-    `usual` is the number of iterations for which the rates were chosen. Each step has the noise of one view. With these rates the noise of
-    all steps adds up to the same amount, however many steps there are.
+    The rates were chosen for numbers between those two. Beyond, they are multiplied by √(nearest such number / iterations): each step has
+    the noise of one view, and with these rates the noise of all steps adds up to the same amount, however many steps there are.
     """
     tables, part = settings.model_dump(), iterations / settings.train.iterations
+    usual = min(max(iterations, quick.train.iterations), standard.train.iterations)
     for section, name in (("train", "iterations"), *SCHEDULE):
         tables[section][name] = max(1, round(part * tables[section][name]))
     for name in RATES:
