@@ -123,15 +123,22 @@ class Bench:
                 self.rows.append(Row(self.name, scene, variant, figure, value, unit, *self.where))
 
     def runs(self, ways: dict[str, Way]) -> Iterator[tuple[str, dict[str, Path]]]:
-        """Train and evaluate each scene in each way, in OUT/[PRESET/]WAY/SCENE; yield the scene and the runs that succeeded."""
+        """Train and evaluate each scene in each way, in OUT/[PRESET/]WAY/SCENE; yield the scene and the runs that succeeded.
+
+        Raise InputError if `--ways` names an unknown way.
+        """
         options = self.options
+        chosen = options.ways or [*ways]
+        if unknown := [name for name in chosen if name not in ways]:
+            raise InputError(f"--ways: no way is called {', '.join(unknown)}: there are {', '.join(ways)}")
         preset = getattr(options, "preset", "")
         if preset:
             load_settings(preset)  # report a wrong preset before anything is trained
         out = (options.out or clone_root() / "demo" / self.name) / Path(preset).stem
         for capture in find_scenes(options.scenes, options.only):
             done: dict[str, Path] = {}
-            for name, (words, minutes) in ways.items():
+            for name in chosen:
+                words, minutes = ways[name]
                 if isinstance(minutes, str):
                     if minutes not in done:
                         continue
@@ -169,6 +176,7 @@ def scene_options(parser: argparse.ArgumentParser, preset: str | None = None) ->
     parser.add_argument("--scenes", type=Path, required=True, help="folder of captures by benchmarks.scenes")
     parser.add_argument("--out", type=Path, help="folder for the runs (default: demo/BENCHMARK)")
     parser.add_argument("--only", nargs="+", metavar="SCENE", help="measure these scenes")
+    parser.add_argument("--ways", nargs="+", metavar="WAY", help="train in these ways, in this order")
     if preset:
         parser.add_argument("--preset", default=preset, help=f"a preset's name or a TOML file ({preset})")
     return parser

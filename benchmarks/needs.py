@@ -62,10 +62,9 @@ def deciding(run: Path) -> float:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Train the missing runs; print what leaving out saves and what it costs in quality."""
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]), preset="quick")
-    parser.add_argument("--ways", nargs="+", choices=CHANGES, default=[*CHANGES], help="train in these ways")
     bench = Bench("needs", parser, arguments)
     preset = ("--preset", bench.options.preset)
-    ways = {way: Way((*preset, *(word for c in CHANGES[way] for word in ("--set", c)))) for way in bench.options.ways}
+    ways = {way: Way((*preset, *(word for c in changes for word in ("--set", c)))) for way, changes in CHANGES.items()}
     for scene, runs in bench.runs(ways):
         everything = figures(runs[ON])["processor_seconds"] if ON in runs else None
         for way, run in runs.items():
