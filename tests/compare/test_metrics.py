@@ -18,11 +18,14 @@ def test_psnr_of_a_known_error():
     assert metrics.psnr(reference, reference) == 100.0
 
 
+def luminance(a, b):
+    """Compute the luminance term of SSIM (Wang et al. 2004, Eq. 6 with K1 = 0.01)."""
+    return (2 * a * b + 0.01**2) / (a * a + b * b + 0.01**2)
+
+
 def test_ssim_of_flat_pictures_is_the_luminance_term():
-    a, b = 0.3, 0.6
     flat = np.ones((24, 24, 3))
-    expected = (2 * a * b + 0.01**2) / (a * a + b * b + 0.01**2)  # Wang et al. 2004, Eq. 6 with K1 = 0.01
-    assert metrics.ssim(a * flat, b * flat) == pytest.approx(expected, abs=1e-9)
+    assert metrics.ssim(0.3 * flat, 0.6 * flat) == pytest.approx(luminance(0.3, 0.6), abs=1e-9)
 
 
 def test_ssim_falls_with_noise():
@@ -49,12 +52,10 @@ def test_normal_error_is_the_angle_whatever_the_length():
 
 def test_missing_normals_count_as_ninety_degrees_and_the_background_not_at_all():
     reference, alpha = unit_normals((10, 10)), np.ones((10, 10))
-    covered = alpha.copy()
+    covered, rendered, normals = alpha.copy(), alpha.copy(), reference.copy()
     covered[5:] = 0.4  # background is ignored
-    normals = reference.copy()
     normals[5:] *= -1
     normals[0] = 0  # no normal
-    rendered = alpha.copy()
     rendered[1] = 0.05  # rendered almost transparent: counts as missing
     normals[2] = np.nan
     assert metrics.normal_mae_degrees(normals, reference, rendered, covered) == pytest.approx(90 * 3 / 5, abs=1e-5)
@@ -66,10 +67,9 @@ def test_flip_of_flat_greys_is_the_papers_colour_distance():
     # Andersson et al. 2020, §4.1: flat pictures have no features, so FLIP compares colours only. The colour error is the lightness
     # difference to the power 0.7. It is divided by the largest error, 41.28, which is between green and blue. Shares above 0.4 are mapped
     # to 0.95 … 1.
-    black, white = np.zeros((32, 32, 3)), np.ones((32, 32, 3))
-    largest = 41.28
+    white, largest = np.ones((32, 32, 3)), 41.28
     expected = 0.95 + 0.05 * (100**0.7 - 0.4 * largest) / (0.6 * largest)
-    assert metrics.flip(black, white) == pytest.approx(expected, abs=1e-3)
+    assert metrics.flip(0 * white, white) == pytest.approx(expected, abs=1e-3)
     lightness = 116 * np.cbrt(srgb_decode(np.array([0.5, 0.55]))) - 16
     expected = 0.95 * abs(lightness[1] - lightness[0]) ** 0.7 / (0.4 * largest)
     assert metrics.flip(0.55 * white, 0.5 * white) == pytest.approx(expected, rel=0.02)
@@ -95,39 +95,35 @@ def test_normal_ssim_is_of_encoded_normals_over_white():
     up[..., 2] = 1
     side, ones = up[..., [2, 0, 1]], np.ones((24, 24))
     assert metrics.normal_ssim(up, up, ones, ones) == pytest.approx(1)
-
-    def luminance(a, b):
-        return (2 * a * b + 0.01**2) / (a * a + b * b + 0.01**2)
-
-    # (½, ½, 1) against (1, ½, ½) is flat: only the luminance term of Wang et al. is left.
-    assert metrics.normal_ssim(up, side, ones, ones) == pytest.approx((2 * luminance(0.5, 1) + 1) / 3)
+    # (½, ½, 1) against (1, ½, ½) is flat: only the luminance term is left.
+    expected = pytest.approx((2 * luminance(0.5, 1) + 1) / 3)
+    assert metrics.normal_ssim(up, side, ones, ones) == expected
     # Uncovered pixels are white, whatever their normal is.
-    normals = up.copy()
-    normals[:] = np.nan
-    assert metrics.normal_ssim(normals, up, 0 * ones, ones) == pytest.approx((2 * luminance(0.5, 1) + 1) / 3)
+    assert metrics.normal_ssim(np.full_like(up, np.nan), up, 0 * ones, ones) == expected
 
 
 def test_base_colours_are_aligned_by_one_scale_a_channel_for_all_views():
-    truth = RANDOM.uniform(0.1, 0.9, (2, 12, 10, 3))
-    tint = np.array([0.5, 0.8, 1.1])
+    truth, tint = RANDOM.uniform(0.1, 0.9, (2, 12, 10, 3)), np.array([0.5, 0.8, 1.1])
     mask = RANDOM.uniform(size=(12, 10)) > 0.4
     wrong = truth * tint
     wrong[:, ~mask] = 7  # background pixels, which must not count
-    result = metrics.aligned_psnr([metrics.channel_products(a, b, mask) for a, b in zip(wrong, truth, strict=True)])
+
+    def aligned():
+        return metrics.aligned_psnr([metrics.channel_products(a, b, mask) for a, b in zip(wrong, truth, strict=True)])
+
+    result = aligned()
     assert result["psnr_aligned"] == pytest.approx(100, abs=1e-6)
     assert result["scale"] == pytest.approx(1 / tint)
     by_hand = [-10 * np.log10(((a - b)[mask] ** 2).mean()) for a, b in zip(wrong, truth, strict=True)]
     assert result["psnr_raw"] == pytest.approx(np.mean(by_hand))
     wrong[1] = truth[1] * 2 * tint  # the two views now need different scales
-    result = metrics.aligned_psnr([metrics.channel_products(a, b, mask) for a, b in zip(wrong, truth, strict=True)])
-    assert result["psnr_aligned"] < 30
+    assert aligned()["psnr_aligned"] < 30
 
 
 def test_one_scale_for_all_views_is_found_and_a_sun_does_not_decide_it():
     truth = [np.dstack([RANDOM.uniform(0, 0.9, (20, 20, 3)), np.ones((20, 20))]) for _ in range(2)]
     images = [view * [0.5, 0.5, 0.5, 1] for view in truth]
-    truth[0][3, 3, :3] = 4000.0
-    images[0][3, 3, :3] = 3.0
+    truth[0][3, 3, :3], images[0][3, 3, :3] = 4000.0, 3.0
     result = metrics.relit(lambda: zip(images, truth, strict=True))
     assert result["scale"] == pytest.approx(2)
     assert result["psnr_aligned"] == pytest.approx(100) and result["psnr_raw"] < 20
@@ -138,19 +134,16 @@ def test_one_scale_for_all_views_is_found_and_a_sun_does_not_decide_it():
 
 def test_an_exposure_is_fitted_where_the_photo_tells():
     radiance, alpha = RANDOM.uniform(0, 1, (8, 9, 3)), np.ones((8, 9))
-    alpha[:2] = 0
     photo = srgb_encode(1.5 * radiance)
-    photo[:2] = 0.3
+    alpha[:2], photo[:2] = 0, 0.3
     assert (photo > 1).any()
     assert metrics.fitted_exposure(radiance, alpha, photo.clip(0, 1)) == pytest.approx(1.5)
     assert metrics.fitted_exposure(radiance, 0 * alpha, photo) == 1
 
 
 def test_uncovered_pixels_are_white_on_both_sides():
-    empty = np.zeros((12, 12, 4))
-    black = empty.copy()
-    black[..., 3] = 1
-    assert metrics.relit(lambda: [(empty, black)])["psnr_raw"] == pytest.approx(0)
+    pair = np.zeros((12, 12, 4)), np.tile([0.0, 0, 0, 1], (12, 12, 1))
+    assert metrics.relit(lambda: [pair])["psnr_raw"] == pytest.approx(0)
 
 
 def test_environment_error_ignores_scale_and_size_and_measures_the_log():
@@ -172,7 +165,7 @@ def test_environment_pixels_count_by_solid_angle():
 
 
 def lamps(turn=0.0, lift=0.0, height=64):
-    """Make a panorama of a dim room with two lamps, the second half as bright as the first.
+    """Make a panorama of a dim room with two lamps: the higher one is half as bright as the other.
 
     The lamps are turned about the vertical by `turn` degrees and raised by `lift` degrees.
     """

@@ -1,28 +1,24 @@
 """Test the comparison of a mesh with the true mesh."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 
-from refgs.camera import Camera
 from refgs.compare import surface
 from refgs.formats.mesh import Mesh
+from tests.makers.distances import look_at
 
 
-def ball(radius=1.0, subdivisions=5, centre=(0, 0, 0)):
-    sphere = trimesh.creation.icosphere(subdivisions, radius)
-    return Mesh(np.array(sphere.vertices) + centre, np.array(sphere.faces))
+def ball(radius=1.0):
+    sphere = trimesh.creation.icosphere(5, radius)
+    return Mesh(np.array(sphere.vertices), np.array(sphere.faces))
 
 
 def camera(axis, distance=6.0):
-    """Place a camera at `distance` along an axis, looking at the origin; with a negative distance it looks away."""
-    forward = -np.asarray(axis, float)
-    right = np.cross(forward, [0.3, 0.5, 0.8])
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    matrix[:3, 3] = -matrix[:3, :3] @ (distance * np.asarray(axis, float))
-    return Camera("view", 64, 64, 100.0, 100.0, 32.0, 32.0, matrix)
+    """Place a camera at `distance` along an axis, looking at the origin."""
+    return replace(look_at(distance * np.asarray(axis), 64), fx=100.0, fy=100.0)
 
 
 ALL_ROUND = [camera(sign * axis) for axis in np.eye(3) for sign in (1, -1)]
@@ -51,27 +47,24 @@ def test_the_same_mesh_is_nowhere_off_however_it_is_cut_into_triangles():
 
 
 def test_what_no_camera_sees_is_left_out():
-    truth = ball()
-    inner = ball(0.4)
-    hollow = Mesh(
-        np.concatenate([truth.vertices, inner.vertices]),
-        np.concatenate([truth.faces, inner.faces + len(truth.vertices)]),
-    )
+    truth, inner, above = ball(), ball(0.4), camera([0, 0, 1])
+    faces = np.concatenate([truth.faces, inner.faces + len(truth.vertices)])
+    hollow = Mesh(np.concatenate([truth.vertices, inner.vertices]), faces)
     assert surface.compare(hollow, truth, ALL_ROUND)["chamfer"] < 1e-3
     # A camera above sees only the upper half, so half a ball has no error there.
-    upper = truth.faces[truth.vertices[truth.faces][..., 2].min(axis=1) > -0.05]
-    half = Mesh(truth.vertices, upper)
-    assert surface.compare(half, truth, [camera(np.eye(3)[2])])["chamfer"] < 1e-3
+    half = Mesh(truth.vertices, truth.faces[truth.vertices[truth.faces][..., 2].min(axis=1) > -0.05])
+    assert surface.compare(half, truth, [above])["chamfer"] < 1e-3
     assert surface.compare(half, truth, ALL_ROUND)["chamfer"] > 0.05
-    assert surface.compare(truth, truth, [camera(np.eye(3)[2], -6.0)]) == {}, "it looks away"
+    turned = replace(above, world_to_camera=np.diag([-1.0, 1, -1, 1]) @ above.world_to_camera)
+    assert surface.compare(truth, truth, [turned]) == {}, "it looks away"
 
 
 def test_seen_points_are_those_on_the_cameras_side():
     mesh = ball()
     points = mesh.vertices
-    seen = surface.seen(mesh, points, [camera(np.eye(3)[0])], 1e-3)
+    seen = surface.seen(mesh, points, [camera([1, 0, 0])], 1e-3)
     assert seen[points[:, 0] > 1 / 6 + 0.05].all() and not seen[points[:, 0] < 1 / 6 - 0.05].any()
-    near = surface.seen(mesh, points, [camera(np.eye(3)[0], 2.0)], 1e-3)
+    near = surface.seen(mesh, points, [camera([1, 0, 0], 2.0)], 1e-3)
     # The field of view ends at a tangent of 0.32 at the sides and 0.45 in the corners. Points outside it are not seen.
     aside = np.linalg.norm(points[:, 1:], axis=1) / (2.0 - points[:, 0])
     assert near[(points[:, 0] > 0.6) & (aside < 0.31)].all() and not near[aside > 0.46].any()

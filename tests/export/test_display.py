@@ -1,6 +1,7 @@
 """Test the splats for viewers without lights: they look like the run and have the properties that such viewers read."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +13,12 @@ from refgs.compare.metrics import psnr
 from refgs.errors import InputError
 from refgs.export.display import displayed
 from refgs.export.export_job import export
-from refgs.formats.splats import THIN, Splats, read_splats, write_display_splats, write_splats
+from refgs.formats.splats import THIN, read_splats, write_display_splats, write_splats
 from refgs.model.surfels import from_splats
 from refgs.render.renderer import render
 from refgs.run import open_run
 from tests.makers.ball import write_run
-from tests.makers.splats import make
+from tests.makers.splats import chosen, make
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def test_they_show_what_the_run_shows_from_new_views_too(run):
     splats = displayed(run, lambda done, total: said.append((done, total)))
     assert said[-1][0] == said[-1][1] == len(said)
     unseen = [camera for camera, split in zip(run.cameras, run.splits, strict=True) if split == "test"]
-    flat = splats.__class__(**{**splats.__dict__, "sh": splats.sh[:, :1]})
+    flat = replace(splats, sh=splats.sh[:, :1])
     assert splats.sh.shape == (3000, 16, 3)
     assert quality(run, splats, unseen) > quality(run, flat, unseen) + 3
     assert quality(run, splats, unseen) > 27
@@ -52,8 +53,7 @@ def test_they_show_what_the_run_shows_from_new_views_too(run):
 def test_the_file_is_what_viewers_of_gaussians_read(run, tmp_path):
     write_display_splats(tmp_path / "a.ply", run.splats)
     vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
-    names = [p.name for p in vertex.properties]
-    assert names == [
+    assert [p.name for p in vertex.properties] == [
         *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
         *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
     ]
@@ -73,11 +73,10 @@ def test_few_splats_are_written_too(tmp_path, count):
 def test_splats_alone_are_exported_unless_the_mesh_is_named(run, tmp_path, monkeypatch):
     monkeypatch.setattr("refgs.export.display.ITERATIONS", 10)
     before, said = sorted(run.folder.iterdir()), []
-    files = export(
-        run.folder, None, None, tmp_path / "a.ply", tmp_path / "b.ply", False, lambda *event: said.append(event)
-    )
+    wanted = [tmp_path / "a.ply", tmp_path / "b.ply"]
+    files = export(run.folder, None, None, *wanted, False, lambda *event: said.append(event))
     assert said[-1] == ("progress", {"stage": "colours", "done": 10, "total": 10})
-    assert files == [tmp_path / "a.ply", tmp_path / "b.ply"] and all(file.exists() for file in files)
+    assert files == wanted and all(file.exists() for file in files)
     assert sorted(run.folder.iterdir()) == before
     assert len(PlyData.read(str(tmp_path / "b.ply"))["vertex"].properties) == 17 + 45
     with pytest.raises(InputError, match=r"b\.ply exists: add --overwrite"):
@@ -90,9 +89,9 @@ def test_a_run_of_few_splats_leaves_in_every_format(run, tmp_path, monkeypatch, 
     monkeypatch.setattr("refgs.export.display.ITERATIONS", 3)
     folder = tmp_path / "des éclats, été"
     shutil.copytree(run.folder, folder, ignore=shutil.ignore_patterns("mesh.glb"))
-    splats = {name: value[:count] for name, value in vars(run.splats).items() if isinstance(value, np.ndarray)}
-    splats |= {"positions": np.zeros((count, 3), np.float32), "scales": np.full((count, 2), 0.3, np.float32)}
-    write_splats(folder / "splats.ply", Splats(**splats))
+    splats = chosen(run.splats, slice(count))
+    splats.positions[:], splats.scales[:] = 0, 0.3
+    write_splats(folder / "splats.ply", splats)
 
     def leave(mesh=None, ours=None, display=None):
         return export(folder, mesh, 64, ours, display, False, lambda event, facts: None)

@@ -6,9 +6,8 @@ import torch
 import trimesh
 
 from refgs.export.unshadowed import LEAST, unshadowed
-from refgs.formats.mesh import Mesh
 from refgs.model.surfels import to_splats
-from tests.makers.occluders import bowl, even, mirrors, surfels
+from tests.makers.occluders import as_occluder, bowl, even, mirrors, surfels
 
 
 @pytest.mark.parametrize("albedo", [0.1, 0.5, 0.8])
@@ -30,16 +29,13 @@ def test_the_shadow_of_a_bowl_goes(albedo, monkeypatch):
 def test_what_is_convex_stays_as_it_is():
     ball = trimesh.creation.icosphere(4)
     seen = surfels(np.asarray(ball.vertices), np.asarray(ball.vertices), 0.6)
-    found = unshadowed(to_splats(seen), seen, Mesh(ball.vertices, np.asarray(ball.faces)), even())
+    found = unshadowed(to_splats(seen), seen, as_occluder(ball).mesh, even())
     assert np.abs(found.albedo - 0.6).max() < 0.01
 
 
 def test_the_dark_is_not_made_white():
     """Between two plates that nearly touch, base colours are brightened by at most 1 / LEAST."""
-    low, high = (trimesh.creation.box((2, 2, 0.1)) for _ in range(2))
-    low.apply_translation([0, 0, -0.05])
-    high.apply_translation([0, 0, 0.11])
-    both = trimesh.util.concatenate([low, high.subdivide()])
+    low, high = (trimesh.creation.box((2, 2, 0.1)).apply_translation([0, 0, z]) for z in (-0.05, 0.11))
     seen = surfels(np.zeros((4, 3)), np.tile([0.0, 0.0, 1.0], (4, 1)), 0.1)
-    found = unshadowed(to_splats(seen), seen, Mesh(both.vertices, np.asarray(both.faces)), even())
+    found = unshadowed(to_splats(seen), seen, as_occluder(low, high.subdivide()).mesh, even())
     assert (found.albedo <= 0.1 / LEAST + 1e-6).all()

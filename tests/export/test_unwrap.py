@@ -2,19 +2,19 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from refgs.export.unwrap import PART, layout, unwrap
 from refgs.formats.mesh import Mesh
 from refgs.geometry.mesh import smooth_normals
+from tests.makers.painted_ball import ball
 
 
 @pytest.fixture(scope="module")
 def bumpy():
     """Make a wavy sphere, large enough to be unwrapped in several parts."""
-    sphere = trimesh.creation.icosphere(4)
-    vertices = np.array(sphere.vertices) * (1 + 0.15 * np.sin(5 * sphere.vertices).prod(axis=1, keepdims=True))
-    return Mesh(vertices, np.array(sphere.faces), smooth_normals(vertices, sphere.faces))
+    sphere = ball(4)
+    vertices = sphere.vertices * (1 + 0.15 * np.sin(5 * sphere.vertices).prod(axis=1, keepdims=True))
+    return Mesh(vertices, sphere.faces, smooth_normals(vertices, sphere.faces))
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +36,8 @@ def test_nothing_overlaps(unwrapped):
         low, high = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
         x, y = np.meshgrid(np.arange(low[0], high[0]) + 0.5, np.arange(low[1], high[1]) + 0.5)
         a, b = corners[1] - corners[0], corners[2] - corners[0]
-        area = a[0] * b[1] - a[1] * b[0]
-        s = ((x - corners[0, 0]) * b[1] - (y - corners[0, 1]) * b[0]) / area
-        t = ((y - corners[0, 1]) * a[0] - (x - corners[0, 0]) * a[1]) / area
+        area, x, y = a[0] * b[1] - a[1] * b[0], x - corners[0, 0], y - corners[0, 1]
+        s, t = (x * b[1] - y * b[0]) / area, (y * a[0] - x * a[1]) / area
         inside = (s > 1e-3) & (t > 1e-3) & (s + t < 1 - 1e-3)
         count[low[1] : high[1], low[0] : high[0]] += inside
     assert count.max() == 1 and count.mean() > 0.3

@@ -24,9 +24,8 @@ def test_the_file_says_what_it_is(tmp_path):
         header = file.header()
         assert list(file.channels()) == ["RGB"]
         assert header["compression"] == OpenEXR.ZIP_COMPRESSION
-        np.testing.assert_allclose(
-            header["chromaticities"], (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329), rtol=1e-6
-        )
+        rec709 = 0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329
+        np.testing.assert_allclose(header["chromaticities"], rec709, rtol=1e-6)
 
 
 def test_of_several_parts_the_first_in_colour_is_read(tmp_path):

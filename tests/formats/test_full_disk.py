@@ -1,6 +1,5 @@
 """Test writing to a full or read-only disk: the old file stays, and no partial file is left."""
 
-import dataclasses
 import errno
 import subprocess
 
@@ -15,16 +14,14 @@ from refgs.formats.splats import write_display_splats, write_splats
 from refgs.formats.textures import Textures
 from tests.makers.box import textured_box
 from tests.makers.disk import fill
-from tests.makers.splats import make
+from tests.makers.splats import arrays, make
 
 RNG = np.random.default_rng(2)
 
 
 def noisy_box(path, side):
     mesh, textures = textured_box()
-    maps = {field.name: getattr(textures, field.name) for field in dataclasses.fields(textures)}
-    del maps["specular"]
-    noise = {name: RNG.random((side, side, *value.shape[2:])).astype(np.float32) for name, value in maps.items()}
+    noise = {n: RNG.random((side, side, *v.shape[2:])).astype(np.float32) for n, v in arrays(textures).items()}
     write_glb(path, mesh, Textures(**noise))
 
 

@@ -1,6 +1,4 @@
 import io
-import json
-import struct
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +11,7 @@ from refgs.color import srgb_encode
 from refgs.formats.exr import read_exr
 from refgs.formats.gltf import write_glb
 from refgs.formats.tangents import vertex_tangents
-from tests.makers.box import textured_box
+from tests.makers.box import read_glb, textured_box
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +25,7 @@ def written(tmp_path_factory):
 def test_what_mirrors_nothing_is_written_so(written, tmp_path):
     _, mesh, textures = written
     write_glb(tmp_path / "mesh.glb", mesh, replace(textures, specular=0.0))
-    data = (tmp_path / "mesh.glb").read_bytes()
-    gltf = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    gltf, _ = read_glb(tmp_path / "mesh.glb")
     assert gltf["materials"][0]["extensions"] == {"KHR_materials_specular": {"specularFactor": 0.0}}
     assert gltf["extensionsUsed"] == ["KHR_materials_specular"] and "extensionsRequired" not in gltf
 
@@ -47,9 +44,7 @@ def test_the_folder_holds_what_it_should(written):
 
 def test_gltf_is_y_up_and_routes_its_channels(written):
     folder, mesh, textures = written
-    data = (folder / "mesh.glb").read_bytes()
-    length = struct.unpack("<I", data[12:16])[0]
-    gltf, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
+    gltf, binary = read_glb(folder / "mesh.glb")
     material = gltf["materials"][0]
     assert material["doubleSided"] and material["name"] == "RefGS"
     surface = material["pbrMetallicRoughness"]
@@ -60,13 +55,11 @@ def test_gltf_is_y_up_and_routes_its_channels(written):
         start = view.get("byteOffset", 0)
         return np.asarray(Image.open(io.BytesIO(binary[start : start + view["byteLength"]])))
 
-    np.testing.assert_array_equal(
-        picture(surface["metallicRoughnessTexture"])[5, 5], [round(0.9 * 255), round(0.3 * 255), round(0.75 * 255)]
-    )
+    channels = [round(value * 255) for value in (0.9, 0.3, 0.75)]  # occlusion, roughness, metallic
+    np.testing.assert_array_equal(picture(surface["metallicRoughnessTexture"])[5, 5], channels)
     np.testing.assert_array_equal(picture(material["normalTexture"])[5, 5], [204, 128, 230])
     assert np.abs(picture(surface["baseColorTexture"]) / 255 - srgb_encode(textures.base_color)).max() < 0.51 / 255
-    primitive = gltf["meshes"][0]["primitives"][0]["attributes"]
-    assert {"POSITION", "NORMAL", "TEXCOORD_0"} <= primitive.keys()
+    assert {"POSITION", "NORMAL", "TEXCOORD_0"} <= gltf["meshes"][0]["primitives"][0]["attributes"].keys()
 
     again = trimesh.load(folder / "mesh.glb", process=False).to_geometry()
     np.testing.assert_allclose(again.bounds, [[-1, 0, -2], [1, 6, 2]], atol=1e-6)
@@ -88,17 +81,17 @@ def test_blender_imports_it_upright_with_the_right_material(written):
 
     def source(socket):
         link = socket.links[0]
-        if link.from_node.type == "SEPARATE_COLOR":
-            return link.from_socket.name, link.from_node.inputs[0].links[0].from_node.image
-        return link.from_socket.name, link.from_node.image
+        node = (
+            link.from_node.inputs[0].links[0].from_node if link.from_node.type == "SEPARATE_COLOR" else link.from_node
+        )
+        return link.from_socket.name, node.image.colorspace_settings.name
 
-    assert source(shader.inputs["Base Color"])[1].colorspace_settings.name == "sRGB"
-    for name, channel in (("Metallic", "Blue"), ("Roughness", "Green")):
-        socket, image = source(shader.inputs[name])
-        assert socket == channel and image.colorspace_settings.name == "Non-Color"
+    assert source(shader.inputs["Base Color"])[1] == "sRGB"
+    assert source(shader.inputs["Metallic"]) == ("Blue", "Non-Color")
+    assert source(shader.inputs["Roughness"]) == ("Green", "Non-Color")
     bend = shader.inputs["Normal"].links[0].from_node
     assert bend.type == "NORMAL_MAP" and bend.space == "TANGENT"
-    assert source(bend.inputs["Color"])[1].colorspace_settings.name == "Non-Color"
+    assert source(bend.inputs["Color"])[1] == "Non-Color"
 
     # The normal map was baked for `vertex_tangents`: Blender must compute the same tangents.
     data = found.data
@@ -106,12 +99,10 @@ def test_blender_imports_it_upright_with_the_right_material(written):
     turn = np.array(found.matrix_world.to_3x3())
     tangents, signs = vertex_tangents(mesh)
     place = cKDTree(np.concatenate([mesh.vertices, mesh.uv], axis=1))
-    checked = 0
+    assert len(data.loops) == 3 * len(mesh.faces)
     for loop, uv in zip(data.loops, data.uv_layers[0].uv, strict=True):
         position = found.matrix_world @ data.vertices[loop.vertex_index].co
         distance, index = place.query([*position, *uv.vector])
         assert distance < 1e-4
         assert np.dot(loop.tangent, tangents[index] @ turn) > 0.999
         assert loop.bitangent_sign == signs[index]
-        checked += 1
-    assert checked == 3 * len(mesh.faces)

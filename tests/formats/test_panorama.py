@@ -56,7 +56,7 @@ def test_sampling_is_smooth_across_the_seam_and_finite_at_the_poles():
 
 @pytest.fixture
 def seen(tmp_path):
-    """Return a function that renders a panorama by Cycles, seen in a direction (x, y, z)."""
+    """Return a function that renders a panorama by Cycles, seen in a direction (x, y, z), and returns the mean colour."""
     bpy = pytest.importorskip("bpy")
     mathutils = pytest.importorskip("mathutils")
     bpy.ops.wm.read_factory_settings(use_empty=True)

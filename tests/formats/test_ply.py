@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import tracemalloc
 import warnings
 
 import numpy as np
@@ -26,9 +27,9 @@ LAYOUTS = {
     "without normals": [*GEOMETRY, "scale_0", "scale_1"],
     "Ref-Gaussian": [
         *(*GEOMETRY, "scale_0", "scale_1", "refl_strength", "roughness", "metalness"),
-        *(f"ori_color_{i}" for i in range(3)),
+        *("ori_color_0", "ori_color_1", "ori_color_2"),
     ],
-}  # fmt: skip
+}
 
 
 def table(names, count=COUNT, kind="<f4"):
@@ -40,9 +41,15 @@ def table(names, count=COUNT, kind="<f4"):
     return rows
 
 
-def save(path, rows, *more, text=False, byte_order="<"):
-    PlyData([PlyElement.describe(rows, "vertex"), *more], text=text, byte_order=byte_order).write(str(path))
+def save(path, rows, *more, format="<"):
+    """Write rows as a PLY file: `format` is text, or the byte order of binary numbers, < or >."""
+    how = {"text": True} if format == "text" else {"byte_order": format}
+    PlyData([PlyElement.describe(rows, "vertex"), *more], **how).write(str(path))
     return path
+
+
+def vertices(path):
+    return PlyData.read(str(path))["vertex"].data
 
 
 def stacked(rows, *names):
@@ -61,23 +68,21 @@ def covariances(rows):
 def test_other_programs_splats(tmp_path, layout):
     rows = table(LAYOUTS[layout])
     splats = read_splats(save(tmp_path / "des éclats.ply", rows))
-    assert len(splats) == COUNT and splats.scales.shape[1] == sum(
-        name.startswith("scale_") for name in rows.dtype.names
-    )
+    axes = sum(name.startswith("scale_") for name in rows.dtype.names)
+    assert splats.scales.shape == (COUNT, axes)
     np.testing.assert_array_equal(splats.positions, stacked(rows, "x", "y", "z"))
     np.testing.assert_allclose(splats.opacities, 1 / (1 + np.exp(-rows["opacity"])), rtol=1e-6)
-    axes = Rotation.from_quat(splats.rotations[:, [1, 2, 3, 0]]).as_matrix()
-    np.testing.assert_allclose(splats.normals, axes[:, :, 2], atol=1e-5)
+    turn = Rotation.from_quat(splats.rotations[:, [1, 2, 3, 0]]).as_matrix()
+    np.testing.assert_allclose(splats.normals, turn[:, :, 2], atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(splats.rotations, axis=1), 1, atol=1e-4)
-    assert (splats.scales[:, -1:] <= splats.scales).all() or splats.scales.shape[1] == 2
+    assert (splats.scales[:, -1:] <= splats.scales).all() or axes == 2
     write_splats(tmp_path / "ours.ply", splats)
-    ours = PlyData.read(str(tmp_path / "ours.ply"))["vertex"].data
-    np.testing.assert_allclose(covariances(ours), covariances(rows), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(covariances(vertices(tmp_path / "ours.ply")), covariances(rows), rtol=1e-4, atol=1e-5)
     write_display_splats(tmp_path / "display.ply", splats)
-    shown = PlyData.read(str(tmp_path / "display.ply"))["vertex"].data
+    shown = vertices(tmp_path / "display.ply")
     # The squared thickness that flat splats are given.
     thin = 3e-3 * np.exp(2 * np.minimum(rows["scale_0"], rows["scale_1"]))
-    slack = 1e-5 if splats.scales.shape[1] == 3 else thin[:, None, None] + 1e-5
+    slack = 1e-5 if axes == 3 else thin[:, None, None] + 1e-5
     assert (np.abs(covariances(shown) - covariances(rows)) <= slack + 1e-4 * np.abs(covariances(rows))).all()
     for name in ("f_dc_1", "f_rest_17"):
         if name in rows.dtype.names:
@@ -101,20 +106,16 @@ def test_materials_of_ref_gaussian(tmp_path):
     np.testing.assert_allclose(splats.metallic, 1 / (1 + np.exp(-rows["refl_strength"])), rtol=1e-5)
     np.testing.assert_allclose(splats.roughness, 1 / (1 + np.exp(-rows["roughness"])), rtol=1e-5)
     write_splats(tmp_path / "b.ply", splats)
-    again = read_splats(tmp_path / "b.ply")
-    np.testing.assert_array_equal(again.roughness, splats.roughness)
-    assert "metalness" in PlyData.read(str(tmp_path / "b.ply"))["vertex"].data.dtype.names
+    np.testing.assert_array_equal(read_splats(tmp_path / "b.ply").roughness, splats.roughness)
+    assert "metalness" in vertices(tmp_path / "b.ply").dtype.names
 
 
 @pytest.mark.parametrize("kind", ["<f4", ">f8"])
 @pytest.mark.parametrize("format", ["text", "<", ">"])
 def test_formats(tmp_path, format, kind):
     rows = table(LAYOUTS["3DGS"], kind=kind)
-    splats = read_splats(
-        save(tmp_path / "a.ply", rows, text=format == "text", byte_order="<" if format == "text" else format)
-    )
-    plain = read_splats(save(tmp_path / "b.ply", rows))
-    for name, value in arrays(plain).items():
+    splats = read_splats(save(tmp_path / "a.ply", rows, format=format))
+    for name, value in arrays(read_splats(save(tmp_path / "b.ply", rows))).items():
         np.testing.assert_allclose(getattr(splats, name), value, rtol=1e-6, atol=1e-7)
 
 
@@ -155,7 +156,7 @@ def test_rows_that_are_not_finite_are_left_out(tmp_path):
     np.testing.assert_array_equal(splats.positions, stacked(rows, "x", "y", "z")[kept])
     assert splats.opacities[[35, 36]].tolist() == [1, 0]
     write_splats(tmp_path / "b.ply", splats)
-    np.testing.assert_array_equal(PlyData.read(str(tmp_path / "b.ply"))["vertex"]["semantic"], kept)
+    np.testing.assert_array_equal(vertices(tmp_path / "b.ply")["semantic"], kept)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(read_splats(tmp_path / "b.ply")) == len(kept)
@@ -165,7 +166,7 @@ def in_header(old, new):
     return lambda data: data.replace(old, new, 1)
 
 
-@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("format", ["<", "text"])
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
@@ -196,8 +197,8 @@ def in_header(old, new):
         (in_header(b"property float opacity\n", b"property float metallic\n"), "lacks opacity, albedo_r"),
     ],
 )
-def test_broken_files_are_named(tmp_path, text, spoil, says):
-    path = save(tmp_path / "a.ply", table(LAYOUTS["3DGS"]), text=text)
+def test_broken_files_are_named(tmp_path, format, spoil, says):
+    path = save(tmp_path / "a.ply", table(LAYOUTS["3DGS"]), format=format)
     path.write_bytes(spoil(path.read_bytes()))
     with pytest.raises(InputError, match=says) as said:
         read_splats(path)
@@ -224,7 +225,7 @@ def test_no_damage_is_a_fault_of_ours(tmp_path, format):
     rng = np.random.default_rng(7)
     rows = table(LAYOUTS["2DGS"], 6)
     face = PlyElement.describe(np.array([([0, 1, 2],)], [("vertex_indices", "O")]), "face")
-    path = save(tmp_path / "a.ply", rows, face, text=format == "text", byte_order="<" if format == "text" else format)
+    path = save(tmp_path / "a.ply", rows, face, format=format)
     whole = path.read_bytes()
     header = whole.index(b"end_header") + 12
     refused = 0
@@ -254,9 +255,7 @@ def test_no_damage_is_a_fault_of_ours(tmp_path, format):
 
 
 def test_a_giant_count_reserves_nothing(tmp_path):
-    import tracemalloc
-
-    path = save(tmp_path / "a.ply", table(LAYOUTS["3DGS"]), text=True)
+    path = save(tmp_path / "a.ply", table(LAYOUTS["3DGS"]), format="text")
     path.write_bytes(path.read_bytes().replace(b"vertex 50", b"vertex 4000000000"))
     tracemalloc.start()
     with pytest.raises(InputError, match="truncated"):
@@ -274,8 +273,8 @@ def test_the_command_line_converts_them(tmp_path):
     assert said.returncode == 0
     left_out = f"{source}: 1 of 50 splats have positions that are not finite: left out"
     assert left_out.replace(" ", "") in "".join(said.stdout.split()) and not said.stderr
-    vertex = PlyData.read(str(shown))["vertex"]
-    assert vertex.count == COUNT - 1 and "scale_2" in vertex and "metallic" not in vertex
+    vertex = vertices(shown)
+    assert len(vertex) == COUNT - 1 and "scale_2" in vertex.dtype.names and "metallic" not in vertex.dtype.names
     assert len(read_splats(ours)) == COUNT - 1
     with pytest.raises(InputError, match="is no run folder, so there is no mesh: add --splats"):
         export(source, None, None, None, None, False, lambda event, facts: None)

@@ -30,8 +30,8 @@ def test_layout_is_what_other_programs_expect(tmp_path):
     splats.opacities[0] = 1
     write_splats(tmp_path / "s.ply", splats)
     data = PlyData.read(tmp_path / "s.ply")
-    assert not data.text and data.byte_order == "<" and [e.name for e in data.elements] == ["vertex"]
-    vertex = data["vertex"]
+    (vertex,) = data.elements
+    assert not data.text and data.byte_order == "<" and vertex.name == "vertex"
     assert [p.name for p in vertex.properties] == (
         ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
         + [f"f_rest_{i}" for i in range(45)]

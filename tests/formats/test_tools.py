@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from refgs.formats.gltf import write_glb
 from refgs.formats.splats import Splats, read_splats, write_display_splats
-from tests.makers.box import textured_box
+from tests.makers.box import read_glb, textured_box
 
 TOOLS = Path(__file__).parents[1] / "tools"
 NODE = shutil.which("node")
@@ -114,9 +114,7 @@ def test_gltf_of_splats(tmp_path):
     splats = discs()
     write_display_splats(tmp_path / "a.ply", splats)
     transform(tmp_path / "a.ply", tmp_path / "a.glb", "-r", "-90,0,0")
-    data = (tmp_path / "a.glb").read_bytes()
-    length = int.from_bytes(data[12:16], "little")
-    gltf, binary = json.loads(data[20 : 20 + length]), data[28 + length :]
+    gltf, binary = read_glb(tmp_path / "a.glb")
     assert "KHR_gaussian_splatting" in gltf["extensionsUsed"]
     (primitive,) = gltf["meshes"][0]["primitives"]
     rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
@@ -133,12 +131,11 @@ def test_gltf_of_splats(tmp_path):
     order = cKDTree(values("KHR_gaussian_splatting:SCALE", 3)).query(scales)[1]
     np.testing.assert_allclose(values("KHR_gaussian_splatting:SCALE", 3)[order], scales, rtol=1e-5)
     x, y, z = splats.positions.T
+    constant = values("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0", 3)[order]
     # glTF's up axis is +Y.
     np.testing.assert_allclose(values("POSITION", 3)[order], np.stack([-x, z, y], axis=1), atol=1e-6)
     np.testing.assert_allclose(values("KHR_gaussian_splatting:OPACITY", 1)[order, 0], splats.opacities, atol=1e-5)
-    np.testing.assert_allclose(
-        values("KHR_gaussian_splatting:SH_DEGREE_0_COEF_0", 3)[order], splats.sh[:, 0], atol=1e-6
-    )
+    np.testing.assert_allclose(constant, splats.sh[:, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize("specular", [1.0, 0.0])

@@ -13,6 +13,10 @@ DISCS = [mask(view, sphere) for view in VIEWS]
 VOXEL = 2.2 / 48
 
 
+def hull(masks, cameras=VIEWS, count=500, resolution=48):
+    return visual_hull_points(masks, cameras, (0, 0, 0), 1.5, count, resolution=resolution)
+
+
 def degrees(a, b):
     return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
 
@@ -30,9 +34,8 @@ def expected(masks, cameras, low, high, resolution):
         height, width = alpha.shape
         camera = camera.resized(width, height)
         local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        x, y = (
-            f * local[..., a] / local[..., 2] + c for a, f, c in ((0, camera.fx, camera.cx), (1, camera.fy, camera.cy))
-        )
+        x = camera.fx * local[..., 0] / local[..., 2] + camera.cx
+        y = camera.fy * local[..., 1] / local[..., 2] + camera.cy
         inside = (local[..., 2] > 0) & (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
         column, row = np.clip(x - 0.5, 0, width - 1), np.clip(y - 0.5, 0, height - 1)
         left, top = column.astype(int), row.astype(int)
@@ -81,8 +84,7 @@ def test_points_lie_evenly_on_the_hull_of_a_sphere():
     assert positions.shape == normals.shape == (2000, 3) and spacing.shape == (2000,)
     assert positions.dtype == normals.dtype == spacing.dtype == np.float32
     distance = sphere(positions)
-    assert np.abs(distance).max() < VOXEL
-    assert abs(distance.mean()) < 0.2 * VOXEL
+    assert np.abs(distance).max() < VOXEL and abs(distance.mean()) < 0.2 * VOXEL
     angle = degrees(normals, gradient(sphere, positions))
     assert angle.mean() < 2.5 and angle.max() < 12
     # `even` is the spacing of 2000 points in a hexagonal pattern. The spacing of random points would vary by a third.
@@ -103,9 +105,7 @@ def test_some_points_lie_inside():
 
 
 def test_a_hole_through_the_object_stays_open():
-    positions, normals, _ = visual_hull_points(
-        [mask(view, torus) for view in VIEWS], VIEWS, (0, 0, 0), 1.5, 2000, resolution=64
-    )
+    positions, normals, _ = hull([mask(view, torus) for view in VIEWS], count=2000, resolution=64)
     assert np.abs(torus(positions)).max() < 0.1
     assert np.hypot(positions[:, 0], positions[:, 1]).min() > 0.4
     assert degrees(normals, gradient(torus, positions)).mean() < 5
@@ -114,8 +114,7 @@ def test_a_hole_through_the_object_stays_open():
 def test_integer_masks_and_other_image_sizes():
     alphas = [np.round(255 * disc).astype(np.uint8) for disc in DISCS]
     alphas[3] = alphas[3][::2, ::2]
-    positions, _, _ = visual_hull_points(alphas, VIEWS, (0, 0, 0), 1.5, 500, resolution=48)
-    assert np.abs(sphere(positions)).max() < VOXEL
+    assert np.abs(sphere(hull(alphas)[0])).max() < VOXEL
 
 
 @pytest.mark.parametrize("damage", [np.zeros_like, lambda m: m * (np.arange(128) < 64), lambda m: np.roll(m, 40, 1)])
@@ -123,16 +122,14 @@ def test_one_bad_mask_does_not_destroy_the_object(damage, caplog):
     alphas = [*DISCS]
     alphas[7] = damage(alphas[7])
     with caplog.at_level(logging.WARNING):
-        positions, _, _ = visual_hull_points(alphas, VIEWS, (0, 0, 0), 1.5, 500, resolution=48)
-    assert np.abs(sphere(positions)).max() < VOXEL
-    assert "left out" in caplog.text
+        positions, _, _ = hull(alphas)
+    assert np.abs(sphere(positions)).max() < VOXEL and "left out" in caplog.text
 
 
 def test_close_ups_do_not_carve_what_they_do_not_see():
     near = [look_at(1.6 * view.position / 4.5, 128, f"near{i}") for i, view in enumerate(VIEWS[:8])]
     alphas = [np.ones((128, 128), np.float32)] * 8
-    positions, _, _ = visual_hull_points(DISCS + alphas, VIEWS + near, (0, 0, 0), 1.5, 500, resolution=48)
-    assert np.abs(sphere(positions)).max() < VOXEL
+    assert np.abs(sphere(hull(DISCS + alphas, VIEWS + near)[0])).max() < VOXEL
 
 
 def test_the_same_seed_gives_the_same_points():
@@ -143,8 +140,8 @@ def test_the_same_seed_gives_the_same_points():
 def test_masks_without_a_common_object():
     blank = [np.zeros((128, 128), np.uint8)] * len(VIEWS)
     with pytest.raises(InputError, match="0 of 32 masks"):
-        visual_hull_points(blank, VIEWS, (0, 0, 0), 1.5, 100, resolution=32)
+        hull(blank, resolution=32)
     corner = np.zeros((128, 128), np.float32)
     corner[5:10, 5:10] = 1
     with pytest.raises(InputError, match="no common object"):
-        visual_hull_points([corner] * len(VIEWS), VIEWS, (0, 0, 0), 1.5, 100, resolution=32)
+        hull([corner] * len(VIEWS), resolution=32)

@@ -8,7 +8,7 @@ CORNERS = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), axis=-1)
 
 
 def blocks_about(sdf, blocks, band=6.0):
-    """Return the blocks of a cube whose centres are within `band` voxels of the surface, and their signed distances."""
+    """Cut a cube into blocks. Return those near the surface (B, 3), within `band` voxels, and the signed distances of their voxels."""
     block = np.stack(np.meshgrid(*[np.arange(blocks)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     block = block[np.abs(sdf(BLOCK * block + BLOCK / 2)) < band]
     return block, sdf(BLOCK * block[:, None] + CORNERS).astype(np.float32)
@@ -27,12 +27,11 @@ def test_it_is_the_surface_of_the_whole_grid_across_chunks():
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert len(mesh.vertices) == len(vertices) and len(mesh.faces) == len(faces)
     assert solid.is_watertight and solid.euler_number == 2 and solid.volume > 0
-    nearest = np.abs(np.sort(mesh.vertices, axis=0) - np.sort(vertices, axis=0))
-    assert nearest.max() < 1e-4
+    assert np.abs(np.sort(mesh.vertices, axis=0) - np.sort(vertices, axis=0)).max() < 1e-4
 
 
 def test_a_surface_on_the_planes_between_chunks_has_no_cracks():
-    """A surface that passes exactly through voxel centres is watertight. There a vertex lies on many edges at once."""
+    """A surface that passes exactly through voxel centres is watertight, although many of its vertices coincide there."""
     for middle, radius in ((64.0, 32.0), (64.0, 20.5), (63.5, 30.0)):
         mesh = isosurface(*blocks_about(lambda p, m=middle, r=radius: np.abs(p - m).max(axis=-1) - r, 32))
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -44,11 +43,10 @@ def test_a_surface_on_the_planes_between_chunks_has_no_cracks():
 def test_space_between_costs_nothing():
     """Two balls far apart are meshed from their own blocks; a grid around both would take 17 TB."""
     block, signed = blocks_about(ball([30.0, 30.0, 30.0], 12.0), 16)
-    far = 4096
-    mesh = isosurface(np.concatenate([block, block + far]), np.concatenate([signed, signed]))
+    mesh = isosurface(np.concatenate([block, block + 4096]), np.concatenate([signed, signed]))
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert solid.is_watertight and solid.body_count == 2
-    assert np.abs(mesh.vertices.max(axis=0) - (BLOCK * far + 42)).max() < 0.1
+    assert np.abs(mesh.vertices.max(axis=0) - (BLOCK * 4096 + 42)).max() < 0.1
 
 
 def test_what_is_not_known_has_no_faces():

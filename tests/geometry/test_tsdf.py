@@ -16,10 +16,10 @@ def tensors(maps, device="cpu"):
 
 
 def fused(sdf, resolution, views=VIEWS, noise=0.0, radius=1.3, device="cpu"):
-    pictures = [depth(view, sdf) for view in views]
+    depths, alphas = zip(*(depth(view, sdf) for view in views), strict=True)
     rng = np.random.default_rng(0)
-    depths = tensors([d + noise * rng.normal(size=d.shape).astype(np.float32) for d, _ in pictures], device)
-    mesh = fuse(depths, tensors([a for _, a in pictures], device), views, (0.05, 0, 0), radius, resolution)
+    noisy = [d + noise * rng.normal(size=d.shape).astype(np.float32) for d in depths]
+    mesh = fuse(tensors(noisy, device), tensors(alphas, device), views, (0.05, 0, 0), radius, resolution)
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
@@ -34,22 +34,18 @@ def test_error_falls_with_the_voxel(shape):
         mesh = fused(shape, resolution)
         error = np.abs(shape(mesh.vertices))
         assert error.max() < 2.6 / resolution
-        assert outward(mesh, shape).mean() > 0.999
-        assert mesh.is_watertight
+        assert outward(mesh, shape).mean() > 0.999 and mesh.is_watertight
         errors.append(np.sqrt((error**2).mean()))
-    assert errors[1] < 0.55 * errors[0]
-    assert errors[1] < 0.2 * 2.6 / 64
+    assert errors[1] < 0.55 * errors[0] and errors[1] < 0.2 * 2.6 / 64
     assert mesh.euler_number == (0 if shape is torus else 2)
 
 
 def test_noise_averages_out():
-    mesh = fused(sphere, 64, noise=0.04)
-    assert np.abs(sphere(mesh.vertices)).mean() < 0.01
+    assert np.abs(sphere(fused(sphere, 64, noise=0.04).vertices)).mean() < 0.01
 
 
 def test_what_no_view_saw_has_no_surface():
-    above = [view for view in VIEWS if view.position[2] > 2.5]
-    mesh = fused(sphere, 64, views=above)
+    mesh = fused(sphere, 64, views=[view for view in VIEWS if view.position[2] > 2.5])
     assert not mesh.is_watertight
     assert np.abs(sphere(mesh.vertices)).max() < 2 * 2.6 / 64
     assert mesh.vertices[:, 2].min() > -0.76 and mesh.vertices[:, 2].max() > 0.97
@@ -66,13 +62,11 @@ def test_a_room_seen_from_inside_faces_the_cameras():
 
 
 def test_one_wrong_depth_map_is_outvoted():
-    pictures = [depth(view, sphere) for view in VIEWS]
-    depths = [d for d, _ in pictures]
-    depths[5] = np.where(depths[5] > 0, depths[5] - 0.3, 0)
-    mesh = fuse(tensors(depths), tensors([a for _, a in pictures]), VIEWS, (0, 0, 0), 1.4, 64)
+    depths, alphas = zip(*(depth(view, sphere) for view in VIEWS), strict=True)
+    depths[5][depths[5] > 0] -= 0.3
+    mesh = fuse(tensors(depths), tensors(alphas), VIEWS, (0, 0, 0), 1.4, 64)
     parts = trimesh.Trimesh(mesh.vertices, mesh.faces).split(only_watertight=False)
-    largest = max(parts, key=lambda part: part.area)
-    assert np.abs(sphere(largest.vertices)).max() < 0.05
+    assert np.abs(sphere(max(parts, key=lambda part: part.area).vertices)).max() < 0.05
 
 
 def test_nothing_to_see():

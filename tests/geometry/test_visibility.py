@@ -4,15 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from refgs.formats.mesh import Mesh
-from refgs.geometry.visibility import Occluder
-from tests.makers.occluders import plate
+from tests.makers.occluders import as_occluder, inside, plate
 
 FRAMES = [(1.0, 0.0), (1e-3, 0.0), (1e3, 0.0), (1.0, 1e4)]
-
-
-def placed(shape: trimesh.Trimesh, scale: float, moved: float) -> Occluder:
-    return Occluder(Mesh(shape.vertices * scale + moved, np.asarray(shape.faces)))
 
 
 def directions(count: int, seed: int = 0) -> np.ndarray:
@@ -32,14 +26,14 @@ def test_nothing_is_hidden_on_a_sphere(scale, moved):
     angle = np.radians(np.random.default_rng(2).uniform(1, 90, len(normals)))[:, None]
     outward = np.cos(angle) * tangent + np.sin(angle) * normals
     for size in (0.99, 1.0, 1.01):
-        occluder = placed(trimesh.creation.icosphere(5, radius=size), scale, moved)
+        occluder = as_occluder(trimesh.creation.icosphere(5, radius=size), scale=scale, moved=moved)
         assert occluder.visible(normals * scale + moved, normals, outward).all()
 
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_two_plates_that_face_each_other(scale, moved):
     """From the lower plate, exactly the directions that meet the upper plate are occluded."""
-    occluder = placed(trimesh.util.concatenate(plate(0.0, 1), plate(1.0, -1)), scale, moved)
+    occluder = as_occluder(plate(0.0, 1), plate(1.0, -1), scale=scale, moved=moved)
     rng = np.random.default_rng(3)
     points = np.concatenate([rng.uniform(-0.9, 0.9, (20_000, 2)), np.zeros((20_000, 1))], axis=1)
     ways = directions(20_000, seed=4)
@@ -57,9 +51,7 @@ def test_two_plates_that_face_each_other(scale, moved):
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_the_inside_of_a_bowl(scale, moved):
     """From the bottom of a half sphere, exactly the directions within 45° of its axis are free."""
-    ball = trimesh.creation.icosphere(5)
-    bowl = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0][:, ::-1], process=False)
-    occluder = placed(bowl, scale, moved)
+    occluder = as_occluder(inside(0.0), scale=scale, moved=moved)
     ways = directions(20_000, seed=5)
     ways = ways[ways[:, 2] > 0.05]
     pole = np.tile([0.0, 0.0, -1.0], (len(ways), 1))
@@ -72,5 +64,5 @@ def test_the_inside_of_a_bowl(scale, moved):
 def test_a_point_below_the_mesh_is_not_in_its_shadow():
     """Points inside the mesh are not occluded by it: surfels may lie below the mesh that was fused from them."""
     normals = directions(2000)
-    occluder = placed(trimesh.creation.icosphere(5), 1.0, 0.0)
+    occluder = as_occluder(trimesh.creation.icosphere(5))
     assert occluder.visible(0.8 * normals, normals, normals).all()

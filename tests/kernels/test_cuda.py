@@ -13,7 +13,6 @@ pytest.importorskip("cuda.bindings.nvrtc", reason="NVIDIA has nothing for this s
 # A usual test run compiles only for the oldest and the newest architecture; each takes 25 seconds on one core.
 BETWEEN = [pytest.param(name, marks=pytest.mark.slow) for name in ("sm_80", "sm_86", "sm_89", "sm_90")]
 ARCHITECTURES = ["sm_75", *BETWEEN, "sm_120"]
-ELF = b"\x7fELF"
 
 
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
@@ -21,7 +20,7 @@ ELF = b"\x7fELF"
 def test_compiles_without_a_card_with_the_layouts_of_python(source, architecture, tmp_path, monkeypatch):
     monkeypatch.setattr(cuda, "HERE", asserted(tmp_path / "sources"))
     code = cuda.compile_source(source, architecture)
-    assert code.startswith(ELF)
+    assert code.startswith(b"\x7fELF")
     for name, home in cuda.KERNELS.items():
         assert (name.encode() in code) == (home == source)
 

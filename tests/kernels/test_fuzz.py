@@ -70,7 +70,7 @@ ANYTHING = st.floats(allow_nan=False, width=32)
 @FUZZ
 @given(st.lists(st.tuples(*[ANYTHING] * 9), min_size=1, max_size=6), st.floats(0, 1, width=32))
 def test_rasteriser_takes_any_number(rows, opacity):
-    """The picture is finite for any float32 but NaN, also infinite and denormal numbers."""
+    """The picture is finite for all float32 input except NaN, even for infinite and denormal numbers."""
     rows = torch.tensor(rows)
     position, rotation, scale = (v.contiguous().requires_grad_() for v in rows.split((3, 4, 2), dim=1))
     opacities = torch.full((len(rows),), opacity).requires_grad_()
@@ -155,12 +155,9 @@ CARDS_NAN = float(np.uint32(0x7FFFFFFF).view(np.float32))
 def test_activations(numbers):
     """NaN stays NaN. Other raw values give activated values that are finite and monotonic."""
     raw = torch.tensor(sorted(numbers, key=lambda x: (math.isnan(x), x)))
-    count = len(raw)
     rest = ("position", "rotation", "sh_dc", "sh_rest", "received", "indirect_dc", "indirect_rest")
-    named = {name: torch.zeros(count, 1, 3) for name in rest}
-    for name in ("scale", "opacity", "albedo", "metallic", "roughness"):
-        named[name] = raw.clone()
-    values, known = activate(named), ~raw.isnan()
+    learned = ("scale", "opacity", "albedo", "metallic", "roughness")
+    values, known = activate(dict.fromkeys(rest, torch.zeros(len(raw), 1)) | dict.fromkeys(learned, raw)), ~raw.isnan()
     for value in (values.scales, values.opacities, values.albedo, values.metallic, values.roughness):
         assert torch.equal(value.isnan(), ~known)
         assert value[known].isfinite().all() and (value[known].diff() >= -1e-6 * value[known][1:]).all()

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.spatial import ConvexHull
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from refgs.formats.mesh import Mesh
@@ -28,23 +28,17 @@ def surfels(coefficients: int, count: int = 1000):
     return values, positions, torch.nn.functional.normalize(normals, dim=1)
 
 
-def expected(values, offset, positions, camera, normals):
-    along = reference.unit(positions.double() - torch.from_numpy(camera.position))
-    if normals is not None:
-        along = along - 2 * (along * normals).sum(dim=-1, keepdim=True) * normals
-    basis = harmonics.basis(along, math.isqrt(values.shape[1]) - 1)
-    return offset + torch.einsum("nk,nkc->nc", basis, values.double()), basis
-
-
 @pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_matches_reference(mirrored, coefficients, device):
-    values, positions, normals = surfels(coefficients)
-    camera, normals = scenes.camera(40, 30), normals if mirrored else None
-    exact, basis = expected(values, 0.5, positions, camera, normals)
+    (values, positions, normals), camera = surfels(coefficients), scenes.camera(40, 30)
+    along = reference.unit(positions.double() - torch.from_numpy(camera.position))
+    if mirrored:
+        along = along - 2 * (along * normals).sum(dim=-1, keepdim=True) * normals
+    basis = harmonics.basis(along, math.isqrt(coefficients) - 1)
+    exact = 0.5 + torch.einsum("nk,nkc->nc", basis, values.double())
     constant, rest = (v.to(device).contiguous().requires_grad_() for v in values.split([1, coefficients - 1], dim=1))
-    placed = None if normals is None else normals.to(device)
-    color = directional(constant, rest, 0.5, positions.to(device), camera, placed)
+    color = directional(constant, rest, 0.5, positions.to(device), camera, normals.to(device) if mirrored else None)
     assert (color.cpu() - exact.clamp_min(0)).abs().max() / exact.abs().max() <= 1e-5
     upstream = torch.randn(color.shape, generator=torch.Generator().manual_seed(1))
     by = torch.cat(torch.autograd.grad(color, [constant, rest], upstream.to(device)), dim=1)
@@ -65,7 +59,7 @@ def test_same_bits_for_any_number_of_threads():
 
 
 def turned(values, turn):
-    """Rotate harmonics (N, K, 3), so that their value along d becomes their value along the rotated d."""
+    """Rotate harmonics (N, K, 3) by a matrix (3, 3): what they were along a direction, they become along the rotated direction."""
     directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(2)).double())
     degree = math.isqrt(values.shape[1]) - 1
     before, after = (harmonics.basis(d, degree) for d in (directions, directions @ turn.T))
@@ -78,7 +72,7 @@ TURN = torch.from_numpy(Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix())
 @pytest.mark.parametrize("coefficients", [4, 9, 16])
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_harmonics_are_of_the_world(mirrored, coefficients):
-    """A rotated surfel with rotated harmonics keeps its colour; with the same harmonics it does not."""
+    """Rotating a surfel and its harmonics about the camera keeps its colour; rotating the surfel alone changes it."""
     values, positions, normals = surfels(coefficients)
     camera, turn = scenes.camera(40, 30), TURN.float()
     middle = torch.from_numpy(camera.position).float()  # rotate about the camera, so that it need not move
@@ -103,12 +97,7 @@ def test_a_picture_turns_with_its_object():
     sh, indirect = 0.3 * torch.randn(2, count, 16, 3, generator=generator)
     indirect[:, 0] += 2
     materials = torch.rand(5, count, generator=generator)
-    points = np.random.default_rng(0).normal(size=(2000, 3))
-    points *= 20 / np.linalg.norm(points, axis=1, keepdims=True)
-    faces = ConvexHull(points).simplices
-    a, b, c = (points[faces[:, i]] for i in range(3))
-    outward = np.einsum("fa,fa->f", np.cross(b - a, c - a), a) > 0
-    faces[outward] = faces[outward][:, ::-1]
+    room = trimesh.creation.icosphere(4, 20)
     camera, environment = scenes.camera(40, 30), Environment(torch.ones(6 * 16**2, 3))
     settings = load_settings("quick", ["diffuse=sh"]).render
 
@@ -117,20 +106,15 @@ def test_a_picture_turns_with_its_object():
         pose[:3, :3] = pose[:3, :3] @ turn.T
         quaternions = Rotation.from_quat(rotations.numpy()[:, [1, 2, 3, 0]])
         quaternions = (Rotation.from_matrix(turn) * quaternions).as_quat()[:, [3, 0, 1, 2]]
-        made = Surfels(
+        placed = [
             positions @ torch.from_numpy(turn).float().T,
             torch.from_numpy(quaternions).float(),
             scales,
             opacities,
-            sh[:, :1].contiguous(),
-            sh[:, 1:].contiguous(),
-            materials[:3].T.contiguous(),
-            *materials[3:],
-            torch.ones(count, 3),
-            indirect[:, :1].contiguous(),
-            indirect[:, 1:].contiguous(),
-        )
-        occluder = Occluder(Mesh(points @ turn.T, faces))
+        ]
+        colours = [*sh.split([1, 15], dim=1), materials[:3].T, *materials[3:]]
+        made = Surfels(*placed, *colours, torch.ones(count, 3), *indirect.split([1, 15], dim=1))
+        occluder = Occluder(Mesh(room.vertices @ turn.T, room.faces[:, ::-1]))
         seen = dataclasses.replace(camera, world_to_camera=pose)
         return render(made, environment, seen, torch.zeros(3), settings, 0.1, occluder)
 

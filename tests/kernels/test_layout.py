@@ -3,9 +3,9 @@
 In test_build.py and test_cuda.py the compilers check that the layouts agree.
 """
 
-import ctypes
 import functools
 import importlib.util
+from ctypes import c_double, c_float, c_int16, c_int32, c_int64, c_void_p
 
 import pytest
 
@@ -51,20 +51,12 @@ def sources(monkeypatch, tmp_path):
 def test_fields_are_read(sources):
     (sources / "whole.cpp").write_text(WHOLE)
     (sources / "part.h").write_text(PART)
-    whole, part = struct("Whole", "whole.cpp"), struct("Part", "part.h")
-    assert whole is struct("Whole", "whole.cpp") and issubclass(whole, struct("Base", "part.h"))
-    assert fields(part) == [("x", ctypes.c_int16), ("y", ctypes.c_int16 * 5)]
-    assert fields(whole) == [
-        ("a", ctypes.c_void_p),
-        ("b", ctypes.c_void_p),
-        ("c", ctypes.c_double * 3),
-        ("d", ctypes.c_double),
-        ("parts", part * 2),
-        ("one", part),
-        ("first", ctypes.c_int64),
-        ("second", ctypes.c_float),
-        ("third", ctypes.c_int32),
-    ]
+    whole, part, base = struct("Whole", "whole.cpp"), struct("Part", "part.h"), struct("Base", "part.h")
+    assert whole is struct("Whole", "whole.cpp") and issubclass(whole, base)
+    assert fields(part) == [("x", c_int16), ("y", c_int16 * 5)]
+    assert fields(base) == [("first", c_int64), ("second", c_float), ("third", c_int32)]
+    numbers = [("a", c_void_p), ("b", c_void_p), ("c", c_double * 3), ("d", c_double)]
+    assert fields(whole) == [*numbers, ("parts", part * 2), ("one", part), *fields(base)]
 
 
 @pytest.mark.parametrize(

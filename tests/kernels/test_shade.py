@@ -12,6 +12,7 @@ from refgs.model.environment import Environment
 from refgs.render import reference
 from refgs.render.shade import mirror_directions, shade, shade_splats
 from tests.makers import scenes
+from tests.makers.errors import check_near
 
 NAMES = ("features", "alpha", "levels", "exposure")
 # Shading has kinks, where derivatives jump. Pixels within MARGIN of one are left out of the gradients; tests check that they are few.
@@ -23,7 +24,7 @@ TURN = reference.rotation_matrices(torch.tensor([[0.8, 0.3, -0.4, 0.5]], dtype=t
 
 
 class Light:
-    """Stand-in for an Environment, whose levels and exposure are leaves with gradients."""
+    """Stand-in for an Environment: its roughness levels and its exposure are leaves that get gradients."""
 
     def __init__(self, dtype: torch.dtype, device: torch.device | str = "cpu", resolution: int = 16):
         generator = torch.Generator().manual_seed(2)
@@ -37,56 +38,43 @@ class Light:
 
 
 def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
-    """Make random maps of features and alpha that vary over five pixels; a third of the pixels is empty.
+    """Make smooth random maps of features (H, W, C) and alpha (H, W). A third of the pixels is empty.
 
-    The features are normal, material, `colours` colours by direction, and position. Positions are displaced by up to ten pixels.
+    The features are normal, material, `colours` RGB colours, and position. Positions lie up to ten pixels beside their pixel.
     """
     generator = torch.Generator().manual_seed(1)
 
-    def smooth(values: Tensor) -> Tensor:
-        size = camera.height, camera.width
-        return torch.nn.functional.interpolate(values[None], size, mode="bilinear")[0].permute(1, 2, 0)
-
     def uniform(channels: int, low: float = 0.0, high: float = 1.0) -> Tensor:
-        coarse = torch.rand(channels, -(-camera.height // 5), -(-camera.width // 5), generator=generator)
-        return low + (high - low) * smooth(coarse)
+        coarse = torch.rand(1, channels, -(-camera.height // 5), -(-camera.width // 5), generator=generator)
+        smooth = torch.nn.functional.interpolate(coarse, (camera.height, camera.width), mode="bilinear")
+        return low + (high - low) * smooth[0].permute(1, 2, 0)
 
     view = torch.from_numpy(camera.world_to_camera).float()
-    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    at = torch.stack([x, y], dim=-1) + uniform(2, -10, 10) * uniform(1) ** 2
-    focal, middle = torch.tensor([camera.fx, camera.fy]), torch.tensor([camera.cx, camera.cy])
-    depth = uniform(1, 1.5, 4)
-    point = torch.cat([(at - middle) / focal * depth, depth], dim=-1)
-    position = (point - view[:3, 3]) @ view[:3, :3]
+    shift = uniform(2, -10, 10) * uniform(1) ** 2 / torch.tensor([camera.fx, camera.fy])
+    rays = scenes.camera_rays(camera) + shift @ view[:2, :3]
+    position = torch.from_numpy(camera.position).float() + uniform(1, 1.5, 4) * rays
     normal = (-view[2, :3] + uniform(3, -0.7, 0.7)) * uniform(1, 0.5, 1)
     parts = [normal, uniform(5), *([uniform(3 * colours, 0, 2)] if colours else []), position]
     alpha = (uniform(1, -0.5, 1).clamp_min(0))[..., 0]
     return torch.cat(parts, dim=-1), alpha
 
 
-def visible(alpha: Tensor) -> Tensor:
-    """Make a random visibility map with free, occluded and partly occluded pixels."""
-    return (2 * torch.rand(alpha.shape, generator=torch.Generator().manual_seed(4)) - 0.5).clamp(0, 1)
-
-
 @functools.cache
 def case(appearance: bool, indirect: bool, size: tuple[int, int]):
+    """Make a camera, inputs and upstream gradients; return them with the reference's maps, safe pixels and gradients.
+
+    Safe pixels are not near a kink. With `indirect` light there is a visibility map of free, occluded and partly occluded pixels.
+    """
     camera = scenes.camera(*size)
     mean, alpha = means(camera, 2 if indirect else int(appearance))
     inputs = (mean * alpha[..., None], alpha)
     light = Light(torch.float64)
     exact = [*(v.double().requires_grad_() for v in inputs), light.levels, light.exposure]
-    visibility = visible(alpha) if indirect else None
-    *maps, margin = reference.shade(
-        *exact[:3],
-        light.sides,
-        camera,
-        BACKGROUND.double(),
-        None if visibility is None else visibility.double(),
-        light.exposure,
-        TURN,
-        by_direction=appearance,
-    )
+    visibility = None
+    if indirect:
+        visibility = (2 * torch.rand(alpha.shape, generator=torch.Generator().manual_seed(4)) - 0.5).clamp(0, 1)
+    background, how = BACKGROUND.double(), {"by_direction": appearance}
+    *maps, margin = reference.shade(*exact[:3], light.sides, camera, background, visibility, exact[3], TURN, **how)
     safe = margin > MARGIN
     generator = torch.Generator().manual_seed(3)
     upstream = [torch.randn(m.shape, generator=generator) * safe[..., None] for m in maps[:3]]
@@ -94,15 +82,8 @@ def case(appearance: bool, indirect: bool, size: tuple[int, int]):
     return camera, inputs, visibility, [m.detach() for m in maps], safe, upstream, gradients
 
 
-def run(
-    camera: Camera,
-    inputs: tuple[Tensor, ...],
-    visibility: Tensor | None,
-    upstream: list[Tensor],
-    device: torch.device,
-    by_direction: bool = False,
-) -> tuple[list[Tensor], list[Tensor]]:
-    """Shade on a device; return the maps and gradients, moved to the CPU."""
+def run(camera, inputs, visibility, upstream, device, by_direction=False) -> tuple[list[Tensor], list[Tensor]]:
+    """Shade the inputs (features, alpha) on a device; return the maps and gradients, moved to the CPU."""
     light = Light(torch.float32, device)
     leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels, light.exposure]
     visibility = None if visibility is None else visibility.to(device)
@@ -118,38 +99,32 @@ def test_matches_reference(indirect, appearance, size, device):
     camera, inputs, visibility, maps, safe, upstream, gradients = case(appearance, indirect, size)
     assert safe.float().mean() > 0.9
     found, by = run(camera, inputs, visibility, upstream, device, appearance)
-    for value, expected in zip(found, maps, strict=True):
-        error = (value - expected)[safe].abs().max() / expected.abs().max()
-        assert error <= FORWARD
-    for name, value, expected in zip(NAMES, by, gradients, strict=False):
-        error = (value - expected).abs().max() / expected.abs().max()
-        assert error <= GRADIENT, (name, error.item())
+    check_near(("color", "normal", "material", "radiance"), [v[safe] for v in found], [v[safe] for v in maps], FORWARD)
+    check_near(NAMES, by, gradients, GRADIENT)
 
 
 @pytest.mark.parametrize("how", ["display", "mirror", "matte"])
 def test_other_ways_match_reference(how, device):
-    """Display colours, mirrors and matte surfaces match the reference.
+    """Shading as display colours, as mirrors and as matte surfaces matches the reference.
 
     Display colours are not encoded as sRGB. For mirrors, metallic is the share of mirrored light.
     """
     by_direction = how != "matte"
     camera, (features, alpha), *_ = case(by_direction, False, (45, 30))
     features = features if by_direction else features[..., :6].contiguous()
+    options = {"by_direction": by_direction, how: True}
     inputs, light = (features, alpha), Light(torch.float64)
     exact = [*(v.double().requires_grad_() for v in inputs), light.levels]
-    picture, *_, margin = reference.shade(
-        *exact, light.sides, camera, BACKGROUND.double(), turn=TURN, by_direction=by_direction, **{how: True}
-    )
-    upstream = torch.randn(picture.shape, generator=torch.Generator().manual_seed(5)) * (margin > MARGIN)[..., None]
-    assert (margin > MARGIN).float().mean() > 0.9
+    picture, *_, margin = reference.shade(*exact, light.sides, camera, BACKGROUND.double(), turn=TURN, **options)
+    safe = margin > MARGIN
+    upstream = torch.randn(picture.shape, generator=torch.Generator().manual_seed(5)) * safe[..., None]
+    assert safe.float().mean() > 0.9
     light = Light(torch.float32, device)
     leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels]
-    found = shade(*leaves[:2], light, camera, BACKGROUND, by_direction=by_direction, **{how: True}).color
-    error = (found.detach().cpu() - picture).abs() * (margin > MARGIN)[..., None]
-    assert error.max() <= FORWARD * picture.abs().max()
+    found = shade(*leaves[:2], light, camera, BACKGROUND, **options).color
+    check_near(["picture"], [found[safe]], [picture[safe]], FORWARD)
     wanted = torch.autograd.grad(picture, exact, upstream.double())
-    for value, expected in zip(torch.autograd.grad(found, leaves, upstream.to(device)), wanted, strict=True):
-        assert (value.cpu() - expected).abs().max() <= GRADIENT * expected.abs().max()
+    check_near(NAMES[:3], torch.autograd.grad(found, leaves, upstream.to(device)), wanted, GRADIENT)
 
 
 @pytest.mark.parametrize("more", [0, 5, 8], ids=["matte", "material", "and colour"])
@@ -172,18 +147,11 @@ def test_surfels_match_reference(count, more, device):
     found = shade_splats(leaves[0], light, camera)
     assert ((found.detach().cpu() - expected).abs() * safe).max() <= FORWARD * expected.abs().max()
     wanted = torch.autograd.grad(expected, exact, upstream.double())
-    for name, value, exact_value in zip(
-        ("features", "levels"),
-        torch.autograd.grad(found, leaves, upstream.to(device)),
-        wanted,
-        strict=False,
-    ):
-        error = (value.cpu() - exact_value).abs().max() / exact_value.abs().max().clamp_min(1e-9)
-        assert error <= GRADIENT, (name, float(error))
+    check_near(("features", "levels"), torch.autograd.grad(found, leaves, upstream.to(device)), wanted, GRADIENT)
 
 
 def test_mirror_directions(device):
-    """The mirror directions are those about the reference's blended normals, and zero where nothing is covered."""
+    """Views are mirrored at the reference's blended normals. Mirror directions are zero in pixels that nothing covers."""
     camera, (features, alpha), _, maps, _, _, _ = case(False, True, (37, 70))
     covered = alpha > reference.COVERED
     normal, ray = reference.unit(maps[1][covered]), reference.unit(scenes.camera_rays(camera)[covered].double())
@@ -193,20 +161,14 @@ def test_mirror_directions(device):
     assert found[~covered].eq(0).all()
 
 
-def test_same_bits_for_any_number_of_threads():
+def test_same_bits_from_call_to_call_for_any_number_of_threads(device):
     camera, inputs, visibility, _, _, upstream, _ = case(False, True, (37, 70))
 
     def all_of_it() -> list[Tensor]:
-        maps, gradients = run(camera, inputs, visibility, upstream, torch.device("cpu"))
+        maps, gradients = run(camera, inputs, visibility, upstream, device)
         return [*maps, *gradients]
 
     scenes.check_same_bits_for_any_number_of_threads(all_of_it)
-
-
-def test_same_bits_from_call_to_call(device):
-    camera, inputs, visibility, _, _, upstream, _ = case(False, True, (37, 70))
-    (maps, by), (maps_again, by_again) = (run(camera, inputs, visibility, upstream, device) for _ in range(2))
-    assert all(torch.equal(a, b) for a, b in zip([*maps, *by], [*maps_again, *by_again], strict=True))
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-10, 1e10, 1e30])
@@ -214,12 +176,11 @@ def test_gradients_of_any_size(scale, device):
     """Gradients are summed as integers: tiny, huge, and tiny beside huge ones keep their precision."""
     camera, inputs, visibility, _, _, upstream, gradients = case(False, False, (37, 70))
     _, by = run(camera, inputs, visibility, [u * scale for u in upstream], device)
-    for value, expected in zip(by, gradients, strict=True):
-        assert (value / scale - expected).abs().max() <= GRADIENT * expected.abs().max()
+    check_near(NAMES, [value / scale for value in by], gradients, GRADIENT)
     mixed = [u.clone() for u in upstream]
     for u in mixed:
         u[:35] *= 1e-6
-    small, large = (b for b in (run(camera, inputs, visibility, u, device)[1][0] for u in (mixed, upstream)))
+    small, large = (run(camera, inputs, visibility, u, device)[1][0] for u in (mixed, upstream))
     reach = slice(0, 35 - 10)  # rows out of reach of the large gradients below
     assert (1e6 * small[reach] - large[reach]).abs().max() <= GRADIENT * large[reach].abs().max()
 
@@ -247,7 +208,7 @@ def test_one_pixel(device):
     """A single pixel, a row and a column are shaded although they lack neighbours to interpolate."""
     light, mean = Light(torch.float32, device), torch.tensor([0, 0, -1, 0.5, 0.5, 0.5, 0, 0.5, 0, 0, 3.0])
     for size in ((1, 1), (1, 5), (5, 1)):
-        camera = Camera("small", *size, 50, 50, size[0] / 2, size[1] / 2, torch.eye(4, dtype=torch.float64).numpy())
+        camera = Camera("small", *size, 50, 50, size[0] / 2, size[1] / 2, np.eye(4))
         features = mean.to(device).expand(size[1], size[0], 11).clone().requires_grad_()
         alpha = torch.ones(size[1], size[0], device=device)
         shaded = shade(features, alpha, light, camera, BACKGROUND)
@@ -258,12 +219,11 @@ def test_one_pixel(device):
 
 def white_ball(metallic: float, roughness: float, side: int = 64) -> Tensor:
     """Shade a white ball under a light of radiance 1, seen by a nearly orthographic camera."""
-    camera = Camera("far", side, side, 1e4, 1e4, side / 2, side / 2, torch.eye(4, dtype=torch.float64).numpy())
+    camera = Camera("far", side, side, 1e4, 1e4, side / 2, side / 2, np.eye(4))
     y, x = torch.meshgrid(*[(torch.arange(side) + 0.5) / side * 2 - 1] * 2, indexing="ij")
     inside = x**2 + y**2 < 1
     normal = torch.stack([x, y, -torch.sqrt((1 - x**2 - y**2).clamp_min(0))], dim=-1)
-    pixel = torch.stack([x, y], dim=-1) * side / 2
-    position = torch.cat([pixel / 1e4, torch.ones(side, side, 1)], dim=-1)
+    position = scenes.camera_rays(camera)  # at a depth of 1
     material = torch.tensor([1.0, 1.0, 1.0, metallic, roughness]).expand(side, side, 5)
     alpha = inside.float()
     features = torch.cat([normal, material, position], dim=-1) * alpha[..., None]

@@ -17,43 +17,28 @@ def raw() -> dict[str, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     values = {name: 6 * torch.randn(COUNT, *shape, generator=generator) for name, shape in ACTIVATED.items()}
     values["opacity"][:4] = values["metallic"][:4] = torch.tensor([-90, 90, -1e4, 1e4])
-    rest = {
-        "position": (3,),
-        "rotation": (4,),
-        "sh_dc": (1, 3),
-        "sh_rest": (0, 3),
-        "received": (3,),
-        "indirect_dc": (1, 3),
-        "indirect_rest": (0, 3),
-    }
-    return values | {name: torch.zeros(COUNT, *shape) for name, shape in rest.items()}
-
-
-def values(surfels) -> list[torch.Tensor]:
-    return [surfels.scales, surfels.opacities, surfels.albedo, surfels.metallic, surfels.roughness]
+    rest = ("position", "rotation", "sh_dc", "sh_rest", "received", "indirect_dc", "indirect_rest")
+    return values | dict.fromkeys(rest, torch.zeros(COUNT, 1))
 
 
 @pytest.mark.parametrize("constant", [None, "metallic"])
 def test_activations(device, constant):
     exact = {name: value.double().requires_grad_(name != constant) for name, value in raw().items()}
-    expected = [exact["scale"].exp(), *(exact[name].sigmoid() for name in list(ACTIVATED)[1:])]
-    expected[3] = 3 * expected[3] ** 2 - 2 * expected[3] ** 3
+    expected = {name: exact[name].exp() if name == "scale" else exact[name].sigmoid() for name in ACTIVATED}
+    expected["metallic"] = 3 * expected["metallic"] ** 2 - 2 * expected["metallic"] ** 3
     leaves = {name: value.to(device).requires_grad_(name != constant) for name, value in raw().items()}
-    got = values(activate(leaves))
-    for value, reference in zip(got, expected, strict=True):
-        assert ((value.cpu() - reference).abs() <= 7e-7 * reference + 1e-30).all()
+    surfels = activate(leaves)
+    values = surfels.scales, surfels.opacities, surfels.albedo, surfels.metallic, surfels.roughness
+    got = dict(zip(ACTIVATED, values, strict=True))
+    for name, value in got.items():
+        assert ((value.cpu() - expected[name]).abs() <= 7e-7 * expected[name] + 1e-30).all(), name
+        assert value.requires_grad == (name != constant), name
     learned = [name for name in ACTIVATED if name != constant]
-    upstream = [torch.randn(v.shape, generator=torch.Generator().manual_seed(i)) for i, v in enumerate(got)]
-    moving = [i for i, name in enumerate(ACTIVATED) if name != constant]
-    assert [v.requires_grad for v in got] == [i in moving for i in range(len(got))]
-    by = torch.autograd.grad(
-        [got[i] for i in moving], [leaves[n] for n in learned], [upstream[i].to(device) for i in moving]
-    )
-    exact_by = torch.autograd.grad(
-        [expected[i] for i in moving], [exact[n] for n in learned], [upstream[i].double() for i in moving]
-    )
-    for g, reference in zip(by, exact_by, strict=True):
-        assert ((g.cpu() - reference).abs() <= 1e-6 * reference.abs() + 1e-6).all()
+    upstream = [torch.randn(got[n].shape, generator=torch.Generator().manual_seed(i)) for i, n in enumerate(learned)]
+    by = torch.autograd.grad([got[n] for n in learned], [leaves[n] for n in learned], [u.to(device) for u in upstream])
+    exact_by = torch.autograd.grad([expected[n] for n in learned], [exact[n] for n in learned], upstream)
+    for name, g, reference in zip(learned, by, exact_by, strict=True):
+        assert ((g.cpu() - reference).abs() <= 1e-6 * reference.abs() + 1e-6).all(), name
 
 
 @pytest.mark.parametrize("metallic", [0.001, 0.2, 0.5, 0.97])

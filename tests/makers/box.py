@@ -1,3 +1,5 @@
+import json
+
 import numpy as np
 import trimesh
 
@@ -21,3 +23,10 @@ def textured_box():
     ramp = np.broadcast_to(np.linspace(0, 1, SIZE, dtype=np.float32), (SIZE, SIZE))
     colour = np.dstack([ramp, full(0.2), ramp.T])
     return mesh, Textures(colour, full(0.75), full(0.3), full(0.9), full(0.6, 0, 0.8), np.ones((SIZE, SIZE), bool))
+
+
+def read_glb(file):
+    """Read a binary glTF file: its JSON as a mapping, and the bytes of its buffer."""
+    data = file.read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    return json.loads(data[20 : 20 + length]), data[28 + length :]

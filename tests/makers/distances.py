@@ -39,13 +39,17 @@ def look_at(eye, size: int, name: str = "view") -> Camera:
     return Camera(name, size, size, focal, focal, size / 2, size / 2, matrix)
 
 
-def around(count: int, size: int, distance: float = 4.5) -> list[Camera]:
-    """Place cameras evenly on a whole sphere, all looking at the origin."""
+def spread(count: int) -> np.ndarray:
+    """Spread unit vectors (count, 3) evenly over the sphere, along a spiral."""
     i = np.arange(count) + 0.5
     z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
     ring = np.sqrt(1 - z * z)
-    eyes = distance * np.stack([np.cos(phi) * ring, np.sin(phi) * ring, z], axis=1)
-    return [look_at(eye, size, f"view{k}") for k, eye in enumerate(eyes)]
+    return np.stack([np.cos(phi) * ring, np.sin(phi) * ring, z], axis=1)
+
+
+def around(count: int, size: int, distance: float = 4.5) -> list[Camera]:
+    """Place cameras evenly on a whole sphere, all looking at the origin."""
+    return [look_at(distance * ray, size, f"view{k}") for k, ray in enumerate(spread(count))]
 
 
 def depth(camera: Camera, sdf) -> tuple[np.ndarray, np.ndarray]:

@@ -24,12 +24,22 @@ def plate(z: float, up: int) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.stack([x, y, np.full_like(x, z)], axis=-1).reshape(-1, 3), faces, process=False)
 
 
+def inside(height: float, level: int = 5) -> trimesh.Trimesh:
+    """Make the inside of the unit sphere up to a height; its faces face the middle."""
+    ball = trimesh.creation.icosphere(level)
+    return trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < height][:, ::-1], process=False)
+
+
+def as_occluder(*shapes: trimesh.Trimesh, scale: float = 1.0, moved: float = 0.0) -> Occluder:
+    """Make an occluder of all shapes together. They are scaled, then moved by `moved` along each axis."""
+    whole = trimesh.util.concatenate(shapes)
+    return Occluder(Mesh(whole.vertices * scale + moved, np.asarray(whole.faces)))
+
+
 @functools.cache
 def bowl() -> tuple[Occluder, np.ndarray, np.ndarray]:
     """Make a bowl: the inside of the lower half of the unit sphere. Return it with points on it and their normals."""
-    ball = trimesh.creation.icosphere(5)
-    inside = ball.faces[ball.triangles_center[:, 2] < 0][:, ::-1]
-    occluder = Occluder(Mesh(ball.vertices, inside))
+    occluder = as_occluder(inside(0.0))
     points = trimesh.creation.icosphere(3).vertices
     points = points[points[:, 2] < -0.1]
     return occluder, points * (1 + occluder.lift - 0.002), -points

@@ -6,7 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from refgs.formats.mesh import Mesh
 from refgs.formats.splats import Splats
+from refgs.formats.tangents import vertex_tangents
 from refgs.geometry.mesh import smooth_normals
+from tests.makers.distances import spread
 
 
 def paint(p: np.ndarray) -> np.ndarray:
@@ -16,10 +18,7 @@ def paint(p: np.ndarray) -> np.ndarray:
 
 def sphere_of_splats(count: int = 4000, radius: float = 1.0, outward: float = 1.0) -> Splats:
     """Cover a sphere evenly with painted splats, each as large as the spacing between them."""
-    i = np.arange(count) + 0.5
-    z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
-    ring = np.sqrt(1 - z * z)
-    n = np.stack([np.cos(phi) * ring, np.sin(phi) * ring, z], axis=1)
+    n = spread(count)
     u = np.cross(n, [0.3, 0.5, 0.8])
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     rotations = Rotation.from_matrix(np.stack([u, np.cross(n, u), n], axis=2)).as_quat()[:, [3, 0, 1, 2]]
@@ -39,9 +38,9 @@ def sphere_of_splats(count: int = 4000, radius: float = 1.0, outward: float = 1.
     )
 
 
-def ball(level: int = 3) -> Mesh:
-    """Make a triangle mesh of the unit sphere, with smooth normals."""
-    sphere = trimesh.creation.icosphere(level)
+def ball(level: int = 3, radius: float = 1.0) -> Mesh:
+    """Make a triangle mesh of a sphere, with smooth normals."""
+    sphere = trimesh.creation.icosphere(level, radius)
     return Mesh(np.array(sphere.vertices), np.array(sphere.faces), smooth_normals(sphere.vertices, sphere.faces))
 
 
@@ -63,6 +62,13 @@ def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
     def at(row, column):
         return texture[row.clip(0, size - 1), column.clip(0, size - 1)]
 
-    return (at(y0, x0) * (1 - s) + at(y0, x0 + 1) * s) * (1 - t) + (
-        at(y0 + 1, x0) * (1 - s) + at(y0 + 1, x0 + 1) * s
-    ) * t
+    above, below = (at(y, x0) * (1 - s) + at(y, x0 + 1) * s for y in (y0, y0 + 1))
+    return above * (1 - t) + below * t
+
+
+def shaded_normals(mesh: Mesh, normal_map: np.ndarray, faces, weights, uv) -> np.ndarray:
+    """Compute the normals (P, 3) that a renderer shades with at points by `on_surface`; they are not normalised."""
+    tangents, signs = vertex_tangents(mesh)
+    n, t = (np.einsum("nk,nkc->nc", weights, a[faces]) for a in (mesh.normals, tangents))
+    c = look_up(normal_map, uv)
+    return c[:, :1] * t + c[:, 1:2] * signs[faces[:, :1]] * np.cross(n, t) + c[:, 2:] * n

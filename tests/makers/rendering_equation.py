@@ -46,14 +46,18 @@ class View(NamedTuple):
         return cls(np.array([sine, 0, cosine]), np.array([-sine, 0, cosine]))
 
 
-def lights(sun: np.ndarray) -> dict[str, Radiance]:
-    """Return the lights by name, as functions from directions (P, 3) to radiance (P,); `sun` is the sun's direction."""
-    slope = np.array([-0.48, 0.48, 0.424])
-    return {
+def light_and_view(kind: str, angle: float) -> tuple[Radiance, View]:
+    """Return a light as a function from directions (P, 3) to radiance (P,), and the view at an angle to the normal.
+
+    The sun is in the mirror direction.
+    """
+    view, slope = View.at(angle), np.array([-0.48, 0.48, 0.424])
+    lights = {
         "constant": lambda d: np.ones(len(d)),
         "gradient": lambda d: 1 + d @ slope,
-        "sun": lambda d: 0.2 + 20 * np.exp(SHARPNESS * (d @ sun - 1)),
+        "sun": lambda d: 0.2 + 20 * np.exp(SHARPNESS * (d @ view.mirrored - 1)),
     }
+    return lights[kind], view
 
 
 class Reflected(NamedTuple):
@@ -77,6 +81,12 @@ class Reflected(NamedTuple):
         return cls(scale, dielectric * scale, (1 - dielectric * scale) * material.albedo)
 
 
+def even(angle: float, roughness: float, material: Material) -> float:
+    """Compute the exact outgoing radiance under the constant light."""
+    reflected = Reflected.of(material, View.at(angle).way[2], roughness)
+    return reflected.specular + reflected.base
+
+
 def half_vectors(sine, cosine, alpha: float, u: np.ndarray, phi: np.ndarray) -> np.ndarray:
     """Sample half vectors (..., 3) about +z by the distribution of visible normals (Heitz 2018).
 
@@ -91,14 +101,13 @@ def half_vectors(sine, cosine, alpha: float, u: np.ndarray, phi: np.ndarray) -> 
     return half / np.linalg.norm(half, axis=-1, keepdims=True)
 
 
-def monte_carlo(
-    light: Radiance, sun: np.ndarray, view: View, roughness: float, material: Material, samples: int, seed: int = 0
-) -> tuple[float, float]:
+def monte_carlo(kind: str, angle: float, roughness: float, material: Material, samples=30_000) -> tuple[float, float]:
     """Integrate the rendering equation; return outgoing radiance and its standard error.
 
     A third of the samples follows the visible normals (Heitz 2018), a third the cosine, a third the sun. The balance heuristic weights
     them."""
-    rng, alpha, v = np.random.default_rng(seed), roughness**2, view.way
+    light, (v, sun) = light_and_view(kind, angle)
+    rng, alpha = np.random.default_rng(0), roughness**2
     n = samples // 3
     u, phi = rng.random((3, n)), 2 * np.pi * rng.random((3, n))
 
@@ -151,8 +160,9 @@ def lobe_mean(light: Radiance, axes: np.ndarray, roughness: np.ndarray) -> np.nd
     return means
 
 
-def split_sum(light: Radiance, view: View, roughness: float, material: Material) -> float:
+def split_sum(kind: str, angle: float, roughness: float, material: Material) -> float:
     """Compute outgoing radiance by the split sum (Eq. 7 and 8), both factors exact, plus Lambert's diffuse part."""
+    light, view = light_and_view(kind, angle)
     filtered = lobe_mean(light, view.mirrored[None], np.array([roughness]))[0]
     d, area = (v.numpy() for v in (cubemap.texel_directions(128), cubemap.texel_solid_angles(128)))
     received = (light(d) * np.maximum(d[:, 2], 0)) @ area / np.pi
@@ -183,7 +193,8 @@ def environment(light: Radiance, resolution: int = RESOLUTION) -> Environment:
     return Environment(radiance[:, None].expand(-1, 3).contiguous())
 
 
-def shaded(light: Radiance, view: View, materials: list[tuple[float, Material]]) -> Tensor:
-    """Compute outgoing radiance (P,) of materials by the kernels, one pixel for each."""
+def shaded(kind: str, angle: float, materials: list[tuple[float, Material]]) -> Tensor:
+    """Compute outgoing radiance (P,) by the kernels, one pixel for each roughness and material."""
+    light, view = light_and_view(kind, angle)
     features, camera = pixels(view, materials)
     return shade(features, torch.ones(1, len(materials)), environment(light), camera, torch.zeros(3)).radiance[0, :, 0]

@@ -1,11 +1,18 @@
+from dataclasses import replace
+
 import numpy as np
 
 from refgs.formats.splats import Splats
 
 
 def arrays(splats):
-    """Return the arrays of splats as a mapping by name."""
+    """Return the arrays of splats or textures as a mapping by name."""
     return {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
+
+
+def chosen(splats, which):
+    """Copy the splats that indices, a mask or a slice select."""
+    return replace(splats, **{name: np.array(value[which]) for name, value in arrays(splats).items()})
 
 
 def make(count=7, coefficients=16, indirect=0):

@@ -31,10 +31,8 @@ def errors(radiance: torch.Tensor, fine: torch.Tensor, rows: int) -> list[float]
 
 def light(side: int) -> torch.Tensor:
     """Make a cubemap of a striped sky with a soft sun."""
-    d = cubemap.texel_directions(side)
-    sun = torch.exp(
-        20 * (d @ torch.nn.functional.normalize(torch.tensor([0.3, 0.5, 0.8], dtype=torch.float64), dim=0) - 1)
-    )
+    d, towards = cubemap.texel_directions(side), torch.tensor([0.3, 0.5, 0.8], dtype=torch.float64)
+    sun = torch.exp(20 * (d @ towards / towards.norm() - 1))
     stripes = 0.3 + 0.2 * torch.sin(6 * d[:, 2])
     return torch.stack([stripes + 5 * sun, stripes + 3 * sun, stripes + sun], dim=-1).float()
 
@@ -50,7 +48,7 @@ def test_levels_of_large_cubemaps_match_direct_integration(side):
 
 
 def test_smaller_cells_bring_the_error_down(monkeypatch):
-    """Four times as many cells at least halve the error of every level.
+    """Summing over four times as many cells of the light at least halves the error of every level.
 
     The light is constant within a texel. The sharpest lobe is left out: it is no wider than a texel, so its error is small from the start.
     """
@@ -106,6 +104,5 @@ def test_a_sun_leaves_what_faces_away_from_it_dark():
 def test_panorama_round_trip():
     """A smooth light is the same after cubemap → panorama → cubemap, to 0.5 %."""
     original = light(64)
-    panorama = Environment(original).panorama(256)
-    back = Environment.from_panorama(panorama, 64).radiance
+    back = Environment.from_panorama(Environment(original).panorama(256), 64).radiance
     assert float((back - original).abs().mean() / original.mean()) < 0.005

@@ -82,9 +82,8 @@ def test_the_integral_converges():
     """With 32 nodes the integral's error is below 2.5e-5, a 40th of the table's tolerance; with 64, below 1e-7."""
     points = grid(np.array([0.02, 0.05, 0.3, 0.7, 1 - 1e-9]), np.array([0.03, 0.05, 0.1, 0.3, 1.0]))
     finest = integrate(*points, 96)
-    found = [abs(integrate(*points, nodes) - finest).max() for nodes in (16, 32, 64)]
-    print("the integral's error by 16, 32, 64 nodes:", found)
-    assert found[1] < 2.5e-5 and found[2] < 1e-7
+    found = [abs(integrate(*points, nodes) - finest).max() for nodes in (32, 64)]
+    assert found[0] < 2.5e-5 and found[1] < 1e-7, found
 
 
 def test_table_everywhere():
@@ -95,10 +94,9 @@ def test_table_everywhere():
     n_v, roughness = grid(np.linspace(0.02, 1 - 1e-9, 59), np.linspace(0.03, 1, 61))
     exact = integrate(n_v, roughness, 32)
     fg0, fg1, average, coat = reference.table(torch.from_numpy(n_v), torch.from_numpy(roughness)).numpy().T
-    cosine, weight = np.polynomial.legendre.leggauss(32)
-    cosine = (cosine + 1) / 2
-    rows = np.linspace(0.03, 1, 61)
-    energy = integrate(*grid(cosine, rows), 32)[:2].sum(axis=0).reshape(61, 32)
+    x, weight = np.polynomial.legendre.leggauss(32)
+    cosine = (x + 1) / 2
+    energy = integrate(*grid(cosine, np.linspace(0.03, 1, 61)), 32)[:2].sum(axis=0).reshape(61, 32)
     average_energy = np.repeat(energy @ (cosine * weight), 59)
     coat_exact = exact[2] * bounces((dielectric(cosine) * cosine) @ weight, exact[0] + exact[1], average_energy)
     pairs = {
@@ -112,10 +110,7 @@ def test_table_everywhere():
     for name, (found, expected) in pairs.items():
         error = abs(found - expected)
         at = error.argmax()
-        print(
-            f"{name}: {error[at]:.1e} at N·V {n_v[at]:.3f}, roughness {roughness[at]:.3f}; RMS {(error**2).mean() ** 0.5:.0e}"
-        )
-        assert error[at] < 1e-3, name
+        assert error[at] < 1e-3, f"{name}: {error[at]:.1e} at N·V {n_v[at]:.3f}, roughness {roughness[at]:.3f}"
 
 
 @pytest.mark.parametrize(("roughness", "angle", "metal", "black"), CYCLES)

@@ -1,13 +1,13 @@
-import refgs  # noqa: F401, I001  before torch
 import numpy as np
 import torch
 import trimesh
-from tests.makers.distances import around, look_at
 
-from refgs.render import extract as module
-from refgs.render.extract import extract
 from refgs.geometry.mesh import clean
 from refgs.model.surfels import Surfels
+from refgs.render import extract as module
+from refgs.render.extract import extract
+from tests.makers.distances import around, look_at, spread
+from tests.makers.occluders import surfels
 
 VIEWS = around(24, 96)
 NEAR = 0.01
@@ -15,27 +15,8 @@ NEAR = 0.01
 
 def sheet(positions, normals, size, opacity):
     """Make round surfels of the same size at positions (N, 3), facing along normals (N, 3)."""
-    # Quaternions that rotate +Z to the normals, not normalised.
-    turn = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], 0 * normals[:, 0]], axis=1)
-    count = len(positions)
-    rows = [positions, turn, np.full((count, 2), size), np.broadcast_to(opacity, count)]
-    tensors = [torch.tensor(row, dtype=torch.float32) for row in rows]
-    nothing = torch.zeros(count, 0, 3)
-    return Surfels(
-        *tensors, *[nothing] * 2, torch.ones(count, 3), *[torch.ones(count)] * 2, torch.ones(count, 3), nothing, nothing
-    )
-
-
-def joined(*parts):
-    return Surfels(*(torch.cat(values) for values in zip(*parts, strict=True)))
-
-
-def spread(count):
-    """Return `count` unit vectors spread evenly over the sphere."""
-    i = np.arange(count) + 0.5
-    z, phi = 1 - 2 * i / count, i * np.pi * (3 - 5**0.5)
-    ring = np.sqrt(1 - z * z)
-    return np.stack([np.cos(phi) * ring, np.sin(phi) * ring, z], axis=1)
+    opacities = torch.tensor(np.broadcast_to(opacity, len(positions)), dtype=torch.float32)
+    return surfels(positions, normals)._replace(scales=torch.full((len(positions), 2), size), opacities=opacities)
 
 
 def ball(opacity, thickness, count=12000):
@@ -45,19 +26,19 @@ def ball(opacity, thickness, count=12000):
     return sheet((1 - depth) * normals, normals, 0.03, opacity)
 
 
-def radii(surfels, resolution=64):
-    mesh, _ = extract(surfels, VIEWS, NEAR, np.zeros(3), 1.3, resolution)
+def radii(shape, resolution=64):
+    mesh, _ = extract(shape, VIEWS, NEAR, np.zeros(3), 1.3, resolution)
     return np.linalg.norm(mesh.vertices, axis=1)
 
 
 def test_a_ball_of_one_layer():
-    surfels = ball(0.95, 0.0)
-    coarse, fine = (radii(surfels, resolution) - 1 for resolution in (32, 64))
+    layer = ball(0.95, 0.0)
+    coarse, fine = (radii(layer, resolution) - 1 for resolution in (32, 64))
     assert np.abs(fine).max() < 0.015 and abs(fine.mean()) < 0.7 * abs(coarse.mean())
 
 
 def test_what_is_hardly_there_has_no_surface():
-    """Nearly transparent surfels give no surface. The picture's alpha decides, not that of the surfels that give the depth."""
+    """Nearly transparent surfels give no surface, because the picture's alpha is too low where they are drawn."""
     assert len(radii(ball(0.004, 0.1))) == 0
 
 
@@ -71,10 +52,8 @@ def test_voxels_are_no_finer_than_pixels():
     assert coarse < fine == finer == len(radii(layer, 104))
 
 
-ARC = [
-    look_at([4.5 * np.cos(turn) * np.cos(0.4), 4.5 * np.sin(turn) * np.cos(0.4), 4.5 * np.sin(0.4)], 96)
-    for turn in np.linspace(-1.2, 1.2, 16)
-]
+HIGH, FLAT = 4.5 * np.sin(0.4), 4.5 * np.cos(0.4)
+ARC = [look_at([FLAT * np.cos(turn), FLAT * np.sin(turn), HIGH], 96) for turn in np.linspace(-1.2, 1.2, 16)]
 
 
 def place():
@@ -86,7 +65,8 @@ def place():
     eyes = np.stack([camera.position for camera in ARC])
     fog = eyes[rng.integers(len(eyes), size=400)] * rng.uniform(0.35, 0.9, (400, 1)) + 0.3 * rng.normal(size=(400, 3))
     fog = sheet(fog, spread(400), 0.1, rng.uniform(0.03, 0.15, 400))
-    return joined(ball(0.8, 0.02), ground, sheet(60 * walls, walls, 3.0, 0.95), fog)
+    parts = ball(0.8, 0.02), ground, sheet(60 * walls, walls, 3.0, 0.95), fog
+    return Surfels(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def test_a_foreground_without_masks(monkeypatch):

@@ -7,50 +7,37 @@ import pytest
 import torch
 import trimesh
 
-from refgs.camera import Camera
-from refgs.formats.mesh import Mesh
-from refgs.geometry.visibility import Occluder
 from refgs.model import cubemap, harmonics
 from refgs.model.environment import Environment
-from refgs.model.surfels import Surfels
 from refgs.render import reference, relight
 from refgs.render.directional import directional
-from tests.makers.occluders import bowl, even, mirrors, plate, surfels
+from tests.makers.distances import look_at
+from tests.makers.occluders import as_occluder, bowl, even, mirrors, plate, surfels
+
+
+def colour(directions: torch.Tensor) -> torch.Tensor:
+    """Compute the radiance (P, 3) of the light `colourful` from directions (P, 3)."""
+    x, y, z = directions.unbind(-1)
+    return torch.stack([1 + 0.5 * x, 1 + 0.8 * z, 1 - 0.6 * y * x], dim=1)
 
 
 def colourful() -> Environment:
-    x, y, z = cubemap.texel_directions(32).float().unbind(-1)
-    return Environment(torch.stack([1 + 0.5 * x, 1 + 0.8 * z, 1 - 0.6 * y * x], dim=1))
-
-
-def plates(*shapes: trimesh.Trimesh) -> Occluder:
-    mesh = trimesh.util.concatenate(shapes)
-    return Occluder(Mesh(mesh.vertices, np.asarray(mesh.faces)))
-
-
-def received(points: Surfels, occluder: Occluder, light: Environment, directions: int = relight.DIRECTIONS, bounces=4):
-    return relight._gather(relight.Transport(points, occluder, directions), light, bounces)[0]
+    return Environment(colour(cubemap.texel_directions(32).float()))
 
 
 def test_an_open_plane_has_the_whole_light():
-    """An unoccluded plane receives the diffuse light of the environment exactly, and is relit by the split sum to 0.02."""
+    """An unoccluded plane receives the diffuse light of the environment exactly. Its relit colour is exact to 0.02."""
     light, up = colourful(), np.tile([0.0, 0.0, 1.0], (5, 1))
     plane = surfels(np.zeros((5, 3)), up)
-    transport = relight.Transport(plane, plates(plate(0.0, 1)))
+    transport = relight.Transport(plane, as_occluder(plate(0.0, 1)))
     assert torch.equal(relight._gather(transport, light, 4)[0], light.diffuse(transport.normals))
     lit = relight.relit(transport, light)
     for angle in (0.0, 0.5, 1.0, 1.3):
-        camera = looking_down(np.array([3 * math.sin(angle), 0, 3 * math.cos(angle)]))
+        camera = look_at([3 * math.sin(angle), 0, 3 * math.cos(angle)], 8)
         found = directional(lit.sh_dc, lit.sh_rest, 0.5, lit.positions, camera)[0]
         dielectric = reference.table(torch.tensor([math.cos(angle)]), torch.tensor([0.5]))[0, 3]
         exact = (1 - dielectric) * 0.5 * light.diffuse(transport.normals)[0]
         torch.testing.assert_close(found, exact, rtol=0, atol=0.02)
-
-
-def looking_down(position: np.ndarray) -> Camera:
-    matrix = np.eye(4)
-    matrix[:3, 3] = -position
-    return Camera("c", 8, 8, 8.0, 8.0, 4.0, 4.0, matrix)
 
 
 def test_between_two_plates():
@@ -58,7 +45,7 @@ def test_between_two_plates():
 
     Four times as many directions at least halve the error.
     """
-    occluder = plates(plate(0.0, 1), plate(1.0, -1))
+    occluder = as_occluder(plate(0.0, 1), plate(1.0, -1))
     middle = surfels(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), albedo=0.0)
     a = 1 / (1 - occluder.lift)
     hidden = 4 / math.pi * a / math.sqrt(1 + a * a) * math.atan(a / math.sqrt(1 + a * a))
@@ -66,9 +53,7 @@ def test_between_two_plates():
     for directions in (256, 1024, 4096):
         transport = relight.Transport(middle, occluder, directions)
         errors.append(float((relight._past_the_object(transport, even()) - (1 - hidden)).abs().max()))
-    assert errors[0] < 0.04
-    assert errors[1] < errors[0] / 2
-    assert errors[2] < errors[1] / 2
+    assert errors[0] < 0.04 and errors[1] < errors[0] / 2 and errors[2] < errors[1] / 2, errors
 
 
 @pytest.mark.parametrize("albedo", [0.0, 0.5, 0.9])
@@ -76,16 +61,16 @@ def test_inside_a_matte_bowl(albedo, monkeypatch):
     """Every point of a matte bowl receives x = 1/2 + albedo · x / 2: it sees half sky, half bowl."""
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
-    found = received(surfels(points, normals, albedo), occluder, even(), bounces=20)
+    found, _ = relight._gather(relight.Transport(surfels(points, normals, albedo), occluder), even(), 20)
     exact = 0.5 / (1 - albedo / 2)
     assert abs(float(found.mean()) / exact - 1) < 0.01
     assert float((found / exact - 1).square().mean().sqrt()) < 0.02
 
 
 def test_what_training_takes_of_it(monkeypatch):
-    """The received share of light that training reads is 2/3 in a bowl and 1 on a convex ball.
+    """Surfels receive 2/3 of an unoccluded surface's light in a bowl, and all of it on a convex ball. Training reads this share.
 
-    It is relative to an unoccluded surface. It holds whichever way normals point, and when only some surfels are probed.
+    The share does not depend on the side to which normals point, and is nearly the same if only some surfels are probed.
     """
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
@@ -97,7 +82,7 @@ def test_what_training_takes_of_it(monkeypatch):
         assert abs(float(found.mean()) * 1.5 - 1) < 0.01 and float((found * 1.5 - 1).square().mean().sqrt()) < error
     ball = trimesh.creation.icosphere(4)
     outside = surfels(np.asarray(ball.vertices), np.asarray(ball.vertices))
-    convex = relight.received(outside, Occluder(Mesh(ball.vertices, np.asarray(ball.faces))), colourful())
+    convex = relight.received(outside, as_occluder(ball), colourful())
     assert (convex - 1).abs().max() < 0.01
 
 
@@ -116,30 +101,26 @@ def test_a_white_bowl_under_an_even_sky_cannot_be_seen(part, monkeypatch):
 
 
 def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
-    """A mirror that faces down reflects the light from below, exact to 0.05 in every direction."""
+    """A point under a mirror that faces down sees the light from below in it, exact to 0.05 in every direction."""
     light = colourful()
     mirrors(monkeypatch, 1.0)
-    occluder = plates(plate(1.0, -1))
     below = surfels(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))._replace(roughness=torch.tensor([0.05]))
-    transport = relight.Transport(below, occluder)
+    transport = relight.Transport(below, as_occluder(plate(1.0, -1)))
     levels = cubemap.in_texel_order(light.levels, light.sides)
     first, _, _ = relight._first(transport, slice(0, len(transport.direction)), levels, light.sides)
     ways = transport.directions[transport.direction.long()] * torch.tensor([1.0, 1.0, -1.0])
-    x, y, z = ways.unbind(-1)
-    exact = torch.stack([1 + 0.5 * x, 1 + 0.8 * z, 1 - 0.6 * y * x], dim=1)
     free = transport.free
     assert free.float().mean() > 0.9
-    torch.testing.assert_close(first[free], exact[free], rtol=0, atol=0.05)
+    torch.testing.assert_close(first[free], colour(ways)[free], rtol=0, atol=0.05)
 
 
 def test_a_light_that_the_object_hides_reaches_nothing():
     """A point between two plates receives less than 0.1 % of the sun that a point above them receives in full."""
     radiance = torch.full((6 * 32**2, 3), 1e-3)
-    directions = cubemap.texel_directions(32)
-    radiance[(directions[:, 2] > 0.99)] = 100.0
-    occluder = plates(plate(0.0, 1), plate(1.0, -1))
+    radiance[cubemap.texel_directions(32)[:, 2] > 0.99] = 100.0
+    occluder = as_occluder(plate(0.0, 1), plate(1.0, -1))
     up = np.tile([0.0, 0.0, 1.0], (2, 1))
-    below = surfels(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.5]]), up, albedo=0.0)
-    found = relight._past_the_object(relight.Transport(below, occluder), Environment(radiance))
+    points = surfels(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.5]]), up, albedo=0.0)
+    found = relight._past_the_object(relight.Transport(points, occluder), Environment(radiance))
     assert float(found[0].max()) < 1e-3 * float(found[1].max())
     torch.testing.assert_close(found[1], Environment(radiance).diffuse(torch.tensor([[0.0, 0.0, 1.0]]))[0])

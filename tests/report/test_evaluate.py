@@ -28,6 +28,9 @@ def dusk(direction):
     return sky(direction[..., [1, 2, 0]]) * [1.0, 0.6, 0.3]
 
 
+DUSK = Environment.from_panorama(dusk(directions(64, 128)).astype(np.float32), 16)
+
+
 def turned(light, turn, height=64):
     """Sample `light` as a panorama, rotated by `turn`."""
     return light(directions(height, 2 * height) @ turn)
@@ -35,19 +38,17 @@ def turned(light, turn, height=64):
 
 def write_truth(folder, run, views):
     """Write every kind of ground truth, made from the run itself: without further changes all errors are zero."""
-    lights = {"light": sky, "relight/dusk": dusk}
-    for name, light in lights.items():
+    for name, light in {"light": sky, "relight/dusk": dusk}.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_exr(folder / f"{name}.exr", turned(light, TURN))
     box = BOX.copy()
     box.vertices = SCALE * box.vertices @ TURN.T + MOVE
     box.export(folder / "mesh.ply")
-    relit = Environment.from_panorama(dusk(directions(64, 128)).astype(np.float32), 16)
     for view in views:
         images = maps(run.render(view.camera))
         images["normal"] = images["normal"] @ TURN.T
         images["visibility"] = np.ones_like(images["alpha"])
-        images["relight/dusk"] = maps(run.render(view.camera, relit))["color"]
+        images["relight/dusk"] = maps(run.render(view.camera, DUSK))["color"]
         for name in ("alpha", "normal", "albedo", "roughness", "metallic", "visibility", "color", "relight/dusk"):
             (folder / name).mkdir(exist_ok=True)
             write_exr(folder / name / f"{view.camera.name}.exr", images[name])
@@ -56,10 +57,8 @@ def write_truth(folder, run, views):
 
 @pytest.fixture(scope="module")
 def made(ball_capture, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("evaluate")
-    capture = read_capture(ball_capture)
-    run = write_run(folder / "run", capture)
-    views = capture.test_views
+    folder, capture = tmp_path_factory.mktemp("evaluate"), read_capture(ball_capture)
+    run, views = write_run(folder / "run", capture), capture.test_views
     return run, write_truth(folder / "truth", open_run(run), views), views
 
 
@@ -68,15 +67,15 @@ def fewer_points(monkeypatch):
     monkeypatch.setattr(surface, "POINTS", 2000)
 
 
-def figures(run):
+def evaluated(run, truth):
+    commands.evaluate(run, "test", truth)
     return json.loads((run / "metrics.json").read_text())
 
 
 def test_a_run_that_is_the_truth_has_no_error_in_whatever_frame(made, capsys):
     run, truth, views = made
     update_metrics(run, {"relight": {"dusk": {"mesh": {"psnr_raw": 20.0}}}, "psnr": 1.0})
-    commands.evaluate(run, "test", truth)
-    found = figures(run)
+    found = evaluated(run, truth)
     assert found["views"] == len(views) == 4 and found["splats"] == 3000 and found["frames_per_second"] > 0
     assert found["psnr"] > 15 and 0 < found["ssim"] < 1 and 0 < found["flip"] < 0.5
     assert found["lpips"] is None and found["lpips_reason"]
@@ -95,11 +94,9 @@ def test_a_run_that_is_the_truth_has_no_error_in_whatever_frame(made, capsys):
     name = views[0].camera.name
     for kind in ("photo", "color", "normal", "true_normal", "true_albedo", "true_visibility", "metallic"):
         assert (run / "pictures" / "test" / kind / f"{name}.png").exists()
-    pictures = [cv2.imread(str(run / "pictures" / f"environment{which}.png")) for which in ("", "_truth")]
-    np.testing.assert_array_equal(
-        pictures[0], np.rint(255 * srgb_encode(sky(directions(64, 128))).clip(0, 1))[..., ::-1]
-    )
-    assert np.abs(pictures[0].astype(int) - pictures[1]).max() < 12, "both in the run's frame, at one exposure"
+    found, true = (cv2.imread(str(run / "pictures" / f"environment{which}.png")) for which in ("", "_truth"))
+    np.testing.assert_array_equal(found, np.rint(255 * srgb_encode(sky(directions(64, 128))).clip(0, 1))[..., ::-1])
+    assert np.abs(found.astype(int) - true).max() < 12, "both in the run's frame, at one exposure"
     for kind in ("truth", "refgs"):
         assert (run / "pictures" / "relight" / kind / f"dusk_{name}.png").exists()
 
@@ -114,18 +111,17 @@ def test_known_errors_are_found(made, tmp_path):
         images = maps(there.render(view.camera))
         write_exr(truth / "albedo" / name, images["albedo"] * [0.5, 0.8, 1.0])
         write_exr(truth / "roughness" / name, images["roughness"] + 0.125)
-        hidden = np.ones_like(images["alpha"])
-        hidden[: view.camera.height // 2] = 0
-        write_exr(truth / "visibility" / name, hidden)
+        visible = np.ones_like(images["alpha"])
+        visible[: view.camera.height // 2] = 0
+        write_exr(truth / "visibility" / name, visible)
         normal = images["normal"] @ TURN.T
         axis = np.cross(normal, view.camera.position @ TURN.T)  # tilt the normal about a tangent
         axis /= np.linalg.norm(axis, axis=-1, keepdims=True) + 1e-12
         write_exr(truth / "normal" / name, np.cos(0.2) * normal + np.sin(0.2) * np.cross(axis, normal))
-        image = maps(there.render(view.camera, Environment.from_panorama(dusk(directions(64, 128)), 16)))["color"]
+        image = maps(there.render(view.camera, DUSK))["color"]
         write_exr(truth / "relight" / "dusk" / name, image * np.float32([0.5, 0.5, 0.5, 1]))
     write_exr(truth / "light.exr", 2 * turned(sky, TURN @ tilt))
-    commands.evaluate(run, "test", truth)
-    found = figures(run)
+    found = evaluated(run, truth)
     assert found["albedo"]["psnr_aligned"] > 90 and found["albedo"]["scale"] == pytest.approx([0.5, 0.8, 1], abs=1e-4)
     assert found["albedo"]["psnr_raw"] == pytest.approx(-10 * np.log10(0.7**2 * (0.5**2 + 0.2**2) / 3), abs=0.05)
     assert found["roughness_mae"] == pytest.approx(0.125, abs=1e-4)
@@ -139,12 +135,11 @@ def test_known_errors_are_found(made, tmp_path):
 def test_only_what_is_there_is_measured(made, tmp_path):
     run, truth, _ = made
     (run / "metrics.json").unlink(missing_ok=True)
-    commands.evaluate(run, "test", None)
     photos_only = {"psnr", "ssim", "flip", "lpips", "lpips_reason", "views", "split", "splats"}
-    assert figures(run).keys() == photos_only | {"frames_per_second", "frames_device"}
+    photos_only |= {"frames_per_second", "frames_device"}
+    assert evaluated(run, None).keys() == photos_only
     (tmp_path / "light.exr").write_bytes((truth / "light.exr").read_bytes())
-    commands.evaluate(run, "test", tmp_path)
-    assert figures(run).keys() - photos_only == {"environment", "frames_per_second", "frames_device"}
+    assert evaluated(run, tmp_path).keys() - photos_only == {"environment"}
 
 
 def test_normals_that_a_data_set_brings_are_the_truth_where_there_is_no_other(made, monkeypatch):
@@ -157,28 +152,25 @@ def test_normals_that_a_data_set_brings_are_the_truth_where_there_is_no_other(ma
         return np.where(images["alpha"][..., None] > 0.5, -images["normal"] @ TURN.T, 0), images["alpha"]
 
     monkeypatch.setattr("refgs.compare.truth.published_normals", published)
-    commands.evaluate(run, "test", None)
-    assert len(asked) == 4 and figures(run)["normal_mae_degrees"] == pytest.approx(180, abs=0.1)
-    commands.evaluate(run, "test", truth)
-    assert len(asked) == 4 and figures(run)["normal_mae_degrees"] < 0.1
+    assert evaluated(run, None)["normal_mae_degrees"] == pytest.approx(180, abs=0.1) and len(asked) == 4
+    assert evaluated(run, truth)["normal_mae_degrees"] < 0.1 and len(asked) == 4
 
 
 def test_a_missing_file_is_one_line(made, tmp_path):
     run, truth, views = made
-    (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no ground truth in it"):
-        GroundTruth(tmp_path / "empty", np.eye(4))
+        GroundTruth(tmp_path, np.eye(4))
     for name in ("albedo", "relight/dusk"):
         file = truth / name / f"{views[2].camera.name}.exr"
         kept = file.rename(tmp_path / "kept.exr")
         with pytest.raises(InputError, match=f"{views[2].camera.name}.exr is missing"):
             commands.evaluate(run, "test", truth)
         kept.rename(file)
-    known = GroundTruth(truth, np.eye(4))
+    known, smaller = GroundTruth(truth, np.eye(4)), views[0].camera.resized(32, 32)
     with pytest.raises(InputError, match="its size is not the view's"):
-        known.view("albedo", views[0].camera.resized(32, 32))
+        known.view("albedo", smaller)
     with pytest.raises(InputError, match="it should be 32×32"):
-        known.relit("dusk", views[0].camera.resized(32, 32))
+        known.relit("dusk", smaller)
     (tmp_path / "grey" / "normal").mkdir(parents=True)
     write_exr(tmp_path / "grey" / "normal" / f"{views[0].camera.name}.exr", np.ones((64, 64)))
     with pytest.raises(InputError, match="one channel where there should be 3"):

@@ -19,13 +19,10 @@ VIEWS = [f"test_{i:03d}" for i in range(8)]
 class Page(HTMLParser):
     """Parsed page: pictures with their captions, text, tags, and every address that a browser would load."""
 
-    def __init__(self, text: str):
+    def __init__(self, html: str):
         super().__init__()
-        self.images: list[tuple[str, str]] = []
-        self.addresses: list[str] = []
-        self.words: list[str] = []
-        self.tags: list[str] = []
-        self.feed(text)
+        self.html, self.images, self.addresses, self.words, self.tags = html, [], [], [], []
+        self.feed(html)
 
     def handle_starttag(self, tag, attributes):
         found = dict(attributes)
@@ -42,14 +39,22 @@ class Page(HTMLParser):
         return re.sub(r"\s+", " ", " ".join(self.words))
 
 
-def decibels(times):
-    return 20 * np.log10(times)
+def reported(*runs, out=None):
+    """Write the report page of runs, by default beside the first one, and parse it."""
+    out = out or runs[0] / "report.html"
+    write_report(runs, out)
+    return Page(out.read_text(encoding="utf-8"))
 
 
 def picture(path, value, side=24, channels=3):
     path.parent.mkdir(parents=True, exist_ok=True)
     shape = (side, side, channels) if channels > 1 else (side, side)
     cv2.imwrite(str(path), np.full(shape, value, np.uint8))
+
+
+def pixels(address):
+    """Decode the picture of a data address."""
+    return cv2.imdecode(np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8), -1)
 
 
 @pytest.fixture
@@ -64,47 +69,30 @@ def run(tmp_path):
     for kind in ("truth", "splats", "mesh"):
         picture(folder / f"pictures/relight/{kind}/studio_test_002.png", 50, channels=4)
     picture(folder / "pictures/environment.png", 70)
-    relight = {"studio": {"splats": {"psnr_raw": 21.25, "psnr_aligned": 23.5}, "mesh": {"psnr_raw": 20.75}}}
-    relight["studio"]["refgs"] = {"psnr_raw": 24.5, "flip_raw": 0.125, "flip_aligned": 0.111}
+    studio = {"splats": {"psnr_raw": 21.25, "psnr_aligned": 23.5}, "mesh": {"psnr_raw": 20.75}}
+    studio["refgs"] = {"psnr_raw": 24.5, "flip_raw": 0.125, "flip_aligned": 0.111}
     figures = {"psnr": 29.604, "ssim": 0.94126, "normal_mae_degrees": 4.2, "seconds": 431.2, "splats": 19832}
-    figures |= {"peak_memory_bytes": 2**31, "relight": relight, "environment": {"log_rmse": 0.3125}, "split": "test"}
+    figures |= {"relight": {"studio": studio}, "environment": {"log_rmse": 0.3125}}
+    figures |= {"peak_memory_bytes": 2**31, "split": "test"}
     (folder / "metrics.json").write_text(json.dumps(figures))
-    lines = [
-        {
-            "seconds": s,
-            "iteration": 10 * s,
-            "loss": 1 / s,
-            "psnr_train": 22 + decibels(s),
-            "psnr_test": 20 + decibels(s),
-        }
-        for s in range(1, 9)
-    ]
+    lines = [{"seconds": s, "iteration": 10 * s, "loss": 1 / s} for s in range(1, 9)]
+    for line in lines:
+        decibels = 20 * np.log10(line["seconds"])
+        line |= {"psnr_train": 22 + decibels, "psnr_test": 20 + decibels}
     lines[-1]["parts"] = {"raster": 6, "shading": 2, "measuring": 2}
     (folder / "history.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    (folder / "needs.json").write_text(
-        '[{"what": "412 surfels", "why": "no view sees them", "saved": "2 %", "cost": "-0.125 dB"}]'
-    )
+    needs = [{"what": "412 surfels", "why": "no view sees them", "saved": "2 %", "cost": "-0.125 dB"}]
+    (folder / "needs.json").write_text(json.dumps(needs))
     (folder / "run.toml").write_text('[run]\ncapture = "/far/away/urn"\n\n[settings.train]\niterations = 4000\n')
     return folder
 
 
 def test_everything_is_on_the_page_and_in_the_page(run):
-    out = run / "report.html"
-    write_report([run], out)
-    page = Page(out.read_text(encoding="utf-8"))
-    for words in (
-        *("vases/first <run>", "29.60 dB", "0.9413", "4.20°", "7 min 11 s", "19,832", "2.00 GiB", "“urn”"),
-        *(
-            "21.25 / 23.50",
-            "20.75",
-            "0.312",
-            "studio surfels (RefGS) 24.50 dB, FLIP 0.125 / 0.111",
-            "412 surfels",
-            "no view sees them",
-            "2 %",
-            "iterations = 4000",
-        ),
-    ):
+    page = reported(run)
+    figures = "29.60 dB", "0.9413", "4.20°", "7 min 11 s", "19,832", "2.00 GiB", "21.25 / 23.50", "20.75", "0.312"
+    relit = "studio surfels (RefGS) 24.50 dB, FLIP 0.125 / 0.111"
+    settings = "412 surfels", "no view sees them", "2 %", "iterations = 4000"
+    for words in ("vases/first <run>", "“urn”", *figures, relit, *settings):
         assert words in page.text, words
     assert "is not there" not in page.text
     kinds = [kind for kind, _ in page.images]
@@ -114,7 +102,7 @@ def test_everything_is_on_the_page_and_in_the_page(run):
         assert kinds.count(kind) == 1
     assert all(address.startswith(("data:image/png;base64,", "#")) for address in page.addresses)
     assert not {"script", "link", "iframe"} & set(page.tags)
-    shown = cv2.imdecode(np.frombuffer(base64.b64decode(page.images[0][1].split(",")[1]), np.uint8), -1)
+    shown = pixels(page.images[0][1])
     assert shown.shape == (24, 24, 4) and (shown == 50).all()
     assert sorted(path.name for path in run.glob("report*")) == ["report.csv", "report.html"]
 
@@ -131,22 +119,21 @@ def places(svg, gid):
 
 def test_the_charts_draw_the_history(run):
     """Errors that are a power of time are drawn as straight lines. Bars are proportional to seconds."""
-    write_report([run], run / "report.html")
-    errors, parts = charts((run / "report.html").read_text(encoding="utf-8"))
+    page = reported(run)
+    errors, parts = charts(page.html)
     for words in ("held-out views: RMS error", "training views: RMS error", "training loss", "seconds of training"):
         assert words in errors
     assert "currentColor" in errors and "knee" not in errors, "a power law has none"
-    test, train, loss = places(errors, "curve")
-    for line, slope in ((test, 1.0), (train, 1.0), (loss, 1.0)):
-        assert len(line) == 8
-        x, y = line.T
-        assert (np.diff(x) > 0).all() and (np.diff(y) > 0).all(), "a falling error falls on the page"
-        np.testing.assert_allclose(np.diff(y) / np.diff(x), slope * np.diff(y)[0] / np.diff(x)[0], rtol=1e-2)
+    curves = places(errors, "curve")
+    assert [len(line) for line in curves] == [8, 8, 8]
+    for line in curves:
+        across, down = np.diff(line, axis=0).T
+        assert (across > 0).all() and (down > 0).all(), "a falling error falls on the page"
+        np.testing.assert_allclose(down / across, down[0] / across[0], rtol=1e-2)
     bars = [re.findall(r"[ML] (\S+) \S+", path) for path in re.findall(r'<path d="([^"]+)" clip-path', parts)]
     widths = [max(map(float, bar)) - min(map(float, bar)) for bar in bars if len(bar) >= 4]
     assert widths[0] == pytest.approx(3 * widths[1], rel=1e-3), "raster took three times as long as shading"
-    text = Page((run / "report.html").read_text(encoding="utf-8")).text
-    assert "raster 6 s, 60.0%" in text and "measuring 2 s, 20.0%" in text
+    assert "raster 6 s, 60.0%" in page.text and "measuring 2 s, 20.0%" in page.text
 
 
 def test_the_figures_are_beside_the_page(run):
@@ -154,17 +141,14 @@ def test_the_figures_are_beside_the_page(run):
     with open(run / "report.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["run", "iteration", "seconds", "quantity", "value", "mark"]
-    test = [row for row in rows if row["quantity"] == "test_rmse" and row["mark"] != "reaches"]
+    every = [row for row in rows if row["quantity"] == "test_rmse"]
+    test = [row for row in every if row["mark"] != "reaches"]
     assert [(row["iteration"], row["seconds"]) for row in test] == [(str(10 * s), str(s)) for s in range(1, 9)]
     np.testing.assert_allclose([float(row["value"]) for row in test], [0.1 / s for s in range(1, 9)], rtol=1e-4)
     assert {row["run"] for row in rows} == {"vases/first <run>"} and {row["mark"] for row in test} == {"front"}
     spent = {row["quantity"]: float(row["value"]) for row in rows if row["quantity"].startswith("part: ")}
     assert spent == {"part: raster": 6, "part: shading": 2, "part: measuring": 2}
-    reached = [
-        (float(row["value"]), float(row["seconds"]))
-        for row in rows
-        if row["quantity"] == "test_rmse" and row["mark"] == "reaches"
-    ]
+    reached = [(float(row["value"]), float(row["seconds"])) for row in every if row["mark"] == "reaches"]
     assert len(reached) > 2
     for error, seconds in reached:
         assert seconds == pytest.approx(0.1 / error, rel=1e-3)
@@ -174,18 +158,14 @@ def test_several_runs_stand_side_by_side_and_the_best_is_marked(run, tmp_path):
     other = tmp_path / "vases" / "second"
     picture(other / "pictures/test/color/test_000.png", 1)
     (other / "metrics.json").write_text(json.dumps({"psnr": 26.0, "normal_mae_degrees": 3.0}))
-    out = tmp_path / "pages" / "both.html"
-    write_report([run, other], out)
-    html = out.read_text(encoding="utf-8")
-    assert re.findall(r'class="best">([^<]+)<', html) == ["29.60 dB", "3.00°"]
-    page = Page(html)
+    page = reported(run, other, out=tmp_path / "pages" / "both.html")
+    assert re.findall(r'class="best">([^<]+)<', page.html) == ["29.60 dB", "3.00°"]
     assert "vases/second" in page.text and "26.00 dB" in page.text
     assert "vases/second : run.toml is not there" in page.text.replace("second:", "second :")
 
 
 def test_an_empty_folder_gives_a_page_that_says_what_is_missing(tmp_path):
-    write_report([tmp_path], tmp_path / "report.html")
-    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+    page = reported(tmp_path)
     for name in ("run.toml", "metrics.json", "history.jsonl", "needs.json", "pictures/test", "pictures/relight"):
         assert f"{name} is not there" in page.text
     assert not page.images and "svg" not in page.tags
@@ -199,25 +179,20 @@ def test_broken_parts_are_left_out(run):
         file.write('\n[1]\n{"seconds": null, "loss": 1}\n{"seconds": 9, "loss": NaN}\n{"seconds": 10, "lo')
     for path in run.glob("pictures/test/photo/*.png"):
         path.write_bytes(path.read_bytes()[:30])
-    write_report([run], run / "report.html")
-    page = Page((run / "report.html").read_text(encoding="utf-8"))
+    page = reported(run)
     assert "metrics.json cannot be read" in page.text
     assert "svg" in page.tags and "photo" not in dict(page.images) and "rendered" in dict(page.images)
 
 
 def test_figures_that_are_no_numbers_are_left_out(tmp_path):
     (tmp_path / "metrics.json").write_text('{"psnr": NaN, "lpips": null, "views": 8, "split": "test", "flag": true}')
-    write_report([tmp_path], tmp_path / "report.html")
-    text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
+    text = reported(tmp_path).text
     assert "views 8" in text and "PSNR" not in text and "nan" not in text and "flag" not in text
 
 
 def test_large_pictures_are_made_smaller(tmp_path):
     picture(tmp_path / "pictures/test/photo/a.png", 90, side=1600)
-    write_report([tmp_path], tmp_path / "report.html")
-    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
-    data = base64.b64decode(dict(page.images)["photo"].split(",")[1])
-    assert cv2.imdecode(np.frombuffer(data, np.uint8), -1).shape == (512, 512, 3)
+    assert pixels(dict(reported(tmp_path).images)["photo"]).shape == (512, 512, 3)
 
 
 def test_a_folder_that_is_not_there_is_one_line(tmp_path):
