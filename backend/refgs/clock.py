@@ -26,7 +26,7 @@ class Clock:
         self._events: list[tuple[str, torch.cuda.Event, torch.cuda.Event]] = []
 
     def resume(self, seconds: dict[str, float]) -> None:
-        """Add the seconds counted before a resume."""
+        """Add the seconds that were counted before the training was interrupted."""
         for name, value in seconds.items():
             self._add(name, value)
 
@@ -50,9 +50,9 @@ class Clock:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Count work at intervals as one part, without the `part`s nested in it.
+        """Count the work in this `with` as one part, less the time of the parts nested in it. Use it for work done only at intervals.
 
-        Its results must be on the CPU: a card is not waited for.
+        The results of the work must be on the CPU, because the clock does not wait for a card.
         """
         begun, known = time.perf_counter(), sum(self.seconds.values())
         before, self._within = self._within, True

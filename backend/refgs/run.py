@@ -134,7 +134,7 @@ def create_run(
 
 
 def record_changes(folder: Path, rows: dict[str, dict]) -> None:
-    """Add changed settings to the table [changed] of run.toml. The value that was asked for stays as first recorded."""
+    """Add changed settings to the table [changed] of run.toml. A key that is already there keeps its first `asked` value."""
     if not rows:
         return
     tables = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))

@@ -68,7 +68,7 @@ class During(_Command):
 
 
 class Keep(_Command):
-    """Tell whether jobs still run to their end after the input has closed. Takes effect at once, also during a job."""
+    """Command that says whether jobs still run to their end after the input has closed. It takes effect at once, also during a job."""
 
     command: Literal["keep"]
     on: bool
@@ -120,7 +120,7 @@ class Worker:
             raise KeyboardInterrupt
 
     def send(self, event: str, facts: dict[str, Any]) -> None:
-        """Write an event. If nobody reads it any more, end, unless told to keep running."""
+        """Write an event. If nobody reads the events any more, take no more commands, unless a `Keep` command said to go on."""
         try:
             self._events.write(json.dumps({"event": event} | facts) + "\n")
             self._events.flush()

@@ -1,4 +1,4 @@
-"""Read the cameras and images of a capture from its folder. Each layout has a module."""
+"""Read the cameras and photos of a capture from its folder. Each file layout (COLMAP, nerfstudio …) has its own module."""
 
 import hashlib
 import os
@@ -39,7 +39,7 @@ __all__ = [
 
 
 def find_layout(folder: Path) -> str | None:
-    """Return the layout of the cameras in a folder, as named in `Capture.layout`; None without cameras."""
+    """Return the layout of a folder's camera files: "nerf-blender", "nerfstudio", "colmap" or "nero". None without cameras."""
     if (folder / "transforms_train.json").is_file():
         return "nerf-blender"
     if (folder / "transforms.json").is_file():
@@ -50,10 +50,10 @@ def find_layout(folder: Path) -> str | None:
 
 
 def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
-    """Read the cameras of a capture and find the run's frame.
+    """Read the cameras of a capture and convert them to the run's frame, the coordinates of the training.
 
-    `wanted` holds a box, an up direction or both. They are given in the frame of a run without them. Only the photos' headers and
-    some masks are read; photos are not decoded. Raises InputError, one line for the artist.
+    `wanted` may hold a box around the wanted part, and an up direction. Both are in the run's frame as it is when nothing is wanted.
+    Only the photos' headers and some masks are read; photos are not decoded. Raises InputError, one line for the artist.
     """
     folder = Path(folder)
     layout = _check_layout(folder)
@@ -174,7 +174,7 @@ def _unique_names(views: list[View]) -> list[View]:
 
 
 def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.ndarray]], list[str]]:
-    """Return the views, reduced masks of some views, and warnings. Drop the masks if all of them are opaque everywhere."""
+    """Return the views, small masks of some of them, and warnings. If all masks are opaque everywhere, return the views without masks."""
     silhouettes = sample_silhouettes(views)
     if silhouettes or not any(view.masked for view in views):
         return views, silhouettes, []
@@ -197,7 +197,7 @@ def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray,
 
 
 def _narrow(whole: Region, box: Box, views: list[View], silhouettes: list) -> tuple[Region, float]:
-    """Return the region of interest inside a box, and the radius of a ball about its centre that holds the region `whole`."""
+    """Return the region of interest inside a box. Also return the radius at which a ball about its centre holds the region `whole`."""
     region = region_in(box, views, silhouettes)
     return region, whole.radius + float(np.linalg.norm(whole.centre - region.centre))
 

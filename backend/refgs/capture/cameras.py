@@ -41,9 +41,9 @@ def write_cameras(
 ) -> None:
     """Write the run folder's cameras.json: undistorted cameras in the run's frame, with OpenGL axes.
 
-    The key `photo` is the photo's file, relative to the capture's folder. If the light is fixed to the "camera", the key `light_of`
-    names a photo: environment.exr is in the frame of its camera. `exposures` holds factors for some training photos: radiance times
-    this factor is as bright as the photo.
+    The key `photo` is the photo's file, relative to the capture's folder. `light` says what the light is fixed to, "world" or "camera".
+    For "camera", the key `light_of` names a photo: environment.exr is in the frame of its camera. `exposures` maps names of training
+    photos to factors: radiance times this factor is as bright as the photo.
     """
     frames = []
     for view in capture.views:

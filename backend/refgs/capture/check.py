@@ -27,7 +27,7 @@ LAYOUTS = {
 
 
 def check(capture: Capture, out: Path) -> dict[str, Any]:
-    """Check a capture, and write a cameras.json and masked thumbnails of some photos, with which another program can show it.
+    """Check a capture. Write cameras.json and masked thumbnails of some photos, so that another program can show the capture.
 
     Files of an earlier check in the folder `out` are replaced. Returns the paths `capture`, `cameras` and `thumbnails`; `centre` and
     `radius` of the region of interest, in the frame of cameras.json; and `lines`, the result of `describe`. Raises InputError for a
@@ -67,7 +67,10 @@ def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
 
 
 class _Statistics:
-    """Statistics of a decoded photo: mask coverage (None without a mask), clipped part, mean code value, greyscale, sharpness."""
+    """Statistics of a photo. `coverage` is the fraction inside its mask (None without one); the rest is measured inside the mask.
+
+    `clipped` is the fraction of white pixels, `brightness` the mean 8-bit value, and `grey` is True for a photo without colour.
+    """
 
     def __init__(self, loaded: LoadedView):
         inside = np.ones(loaded.image.shape[:2], bool) if loaded.alpha is None else loaded.alpha > 127

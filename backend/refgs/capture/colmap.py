@@ -35,7 +35,10 @@ def find_model(folder: Path) -> tuple[Path, Path] | None:
 
 
 def read_colmap(photos: Path, model: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None]:
-    """Read the views, points (M, 3) and their colours (M, 3) in 0..1, in the model's frame. Raises InputError."""
+    """Read the views, the points (M, 3) and their colours (M, 3) in 0..1, in the model's frame. Raises InputError.
+
+    `photos` and `model` are folders, as from `find_model`. Points and colours are None if the model has no file of points.
+    """
     cameras_file, images_file, points_file = model_files(model)
     for file in (cameras_file, images_file):
         if not file.is_file():

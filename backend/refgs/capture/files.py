@@ -59,7 +59,10 @@ class Masks:
         }
 
     def find(self, image: Path, named: object, where: str) -> Path | None:
-        """Return the mask of a photo: the file `named`, relative to the folder, or else a mask with the photo's name. None if absent."""
+        """Return the mask of a photo: the file `named`, relative to the folder, or else a mask with the photo's name. None if absent.
+
+        Raises InputError, which begins with `where`, if the file `named` is missing.
+        """
         if named:
             path = find_image(self.folder / str(named).replace("\\", "/"))
             if path is None:
@@ -82,10 +85,10 @@ def photo_view(
     where: str,
     mask_below: float | None = None,
 ) -> View:
-    """Make the view of a photo. `as_given` is the camera and lens from the capture's file.
+    """Make the view of a photo. `as_given` is the camera and lens from the capture's file; `where` is the place in it, for errors.
 
-    Intrinsics are scaled to the photo's resolution if they were given for another one. Raises InputError if the camera has another
-    aspect ratio than the photo, or the mask another size.
+    `mask_below` is as in `View`. Intrinsics are scaled to the photo's resolution if they were given for another one. Raises InputError if
+    the camera has another aspect ratio than the photo, or the mask another size.
     """
     width, height, has_alpha = read_header(image)
     camera, lens = as_given

@@ -45,8 +45,8 @@ def read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 def read_mask(path: Path, below: float | None = None) -> np.ndarray:
     """Read a mask file as alpha (H, W) uint8: white is the object.
 
-    The file may also have an alpha channel, or the values 0 and 1. If `below` is given, the file is a depth map: the object is where
-    depth is less than `below` times its largest code.
+    An alpha channel, if the file has one, is the mask. A mask of the values 0 and 1 is scaled to 255. If `below` is given, the file is a
+    depth map instead: the object is where depth is less than `below` times the largest value that a pixel can have.
     """
     image, alpha = read_image(path)
     if below is not None:

@@ -42,14 +42,17 @@ class Lens:
         )
 
     def pinhole(self, camera: Camera, where: str) -> Camera:
-        """Return the undistorted camera for a photo of `camera`'s size. Raises InputError naming `where`."""
+        """Return the pinhole camera of the undistorted photo, with the pose and size of `camera`.
+
+        Raises InputError naming `where` if the distortion is too strong.
+        """
         factor = _focal_factor(self, camera.width, camera.height)
         if factor is None:
             raise InputError(f"{where}: the distortion is too strong for a perspective photo. Undistort it first.")
         return replace(camera, fx=self.fx * factor, fy=self.fy * factor, cx=self.cx, cy=self.cy)
 
     def maps(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the photo's column and row for each pixel of the pinhole `camera`: two float32 (H, W) for cv2.remap."""
+        """Return where to sample the distorted photo for each pixel of the pinhole `camera`: columns and rows, two float32 (H, W)."""
         return _maps(self, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 

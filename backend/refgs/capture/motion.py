@@ -1,14 +1,14 @@
 """Find the cameras of photos from the photos alone: structure from motion by COLMAP, through pycolmap.
 
-COLMAP runs in its own process, because its OpenMP conflicts with torch's on some systems, it cannot be interrupted, and an abort
-ends its process.
+COLMAP runs in its own process: its OpenMP conflicts with torch's on some systems, COLMAP cannot be interrupted, and when it aborts, its
+process ends.
 
-Masks are not used. Surroundings fixed to the object determine the cameras best; a shiny object alone does so poorly (5 of 66 photos of a
-polished head were placed by what is inside its masks). Behind a turntable the surroundings are fixed to the camera and mislead.
-Matches at the same pixel in both photos are dropped for that, which is not enough if the camera moved a little, too: then some cameras
-fit the turntable and others the surroundings (all 66 of that head were placed, 19° wrong on average). Such cameras contradict many of
-the matches they were found from, so the artist is warned. Dropping features that hardly move over many photos places only 8 of the 66,
-correctly.
+Masks are not used, because surroundings fixed to the object determine the cameras best. A shiny object alone determines them poorly: from
+the pixels inside the masks, only 5 of 66 photos of a polished head got a camera. With a turntable, the surroundings are fixed to the
+camera and mislead. Therefore matches at the same pixel in both photos are dropped. This is not enough if the camera also moved a little:
+then some cameras fit the turntable and others the surroundings (all 66 photos of the head got cameras, 19° wrong on average). Such cameras
+contradict many of the matches that they were found from, so the artist is warned. Dropping features that hardly move over many photos was
+tried: only 8 of the 66 photos then got cameras, though correct ones.
 """
 
 import hashlib
@@ -42,12 +42,12 @@ DOUBTED = (
 
 
 def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) -> dict[str, Any]:
-    """Find the cameras of the photos in a folder or in its `images`, and write its `sparse/0`.
+    """Find the cameras of the photos in a folder or in its subfolder `images`. Write them to the folder's `sparse/0`, a COLMAP model.
 
-    `report` gets "progress" with `stage` ("features", "matching" or "mapping"), `done` and `total`, and "warning" with `what`.
-    Returns the counts `placed` and `photos`, and `error`, the mean reprojection error in pixels. An interrupted run leaves
-    `sparse.tmp`, from which the next one resumes for the same photos. Raises InputError if there are no photos, if there are cameras
-    already, or if fewer than half of the photos could be placed.
+    `report` is called with "progress" and a dict of `stage` ("features", "matching" or "mapping"), `done` and `total`, or with "warning"
+    and a dict of the text `what`. Returns the counts `placed` (photos that got a camera) and `photos`, and `error`, the mean reprojection
+    error in pixels. An interrupted call leaves `sparse.tmp`, from which the next call for the same photos resumes. Raises InputError if
+    there are fewer than three photos, if there are cameras already, or if fewer than half of the photos got a camera.
     """
     folder = Path(folder)
     photos = find_photos(folder)
@@ -87,9 +87,9 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
 def pairs(count: int) -> list[tuple[int, int]]:
     """Choose the pairs of photos to match, as indices into the photos sorted by name.
 
-    Up to ALL_PAIRS photos, match every pair. With more, match each photo with the next ten, and with photos at distances of powers of two.
-    Indices wrap around, because photographers walk around an object. Also match every tenth photo with every other tenth, to link several
-    rounds.
+    Up to ALL_PAIRS photos, match every pair. With more, match each photo with the next ten, and with those 16, 32, 64 … places further on.
+    Indices wrap around, because photographers walk around an object. Also match the photos 0, 10, 20 … with one another, to link several
+    rounds about the object.
     """
     if count <= ALL_PAIRS:
         return list(combinations(range(count), 2))
@@ -99,9 +99,10 @@ def pairs(count: int) -> list[tuple[int, int]]:
 
 
 def epipolar_distance(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return the Sampson distance of matches from their epipolar lines, (M,), in the units of the rays.
+    """Return the Sampson distance (M,) of matches from their epipolar lines, on the image plane at depth 1.
 
-    `ours` and `theirs` (M, 2) are where the rays meet the plane at depth 1. `pose` (3, 4) maps points from our camera to theirs.
+    `ours` and `theirs` (M, 2) are the matched points of two photos on that plane. `pose` (3, 4) maps points from the first camera's frame
+    to the second's.
     """
     turn, shift = pose[:, :3], pose[:, 3]
     x, y = (np.column_stack([rays, np.ones(len(rays))]) for rays in (ours, theirs))
@@ -122,7 +123,7 @@ def _digest(photos: list[Path]) -> str:
 
 
 def _place_in_child(photos: list[Path], database: Path, model: Path, report: Callable) -> tuple[set[str], float, float]:
-    """Run `_place` in its own process, which ends with this call however it ends."""
+    """Run `_place` in its own process, and return its result. The process is killed when this call returns or raises."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_place, args=(photos, database, model, theirs), daemon=True)
@@ -144,7 +145,10 @@ def _place_in_child(photos: list[Path], database: Path, model: Path, report: Cal
 
 
 def _place(photos: list[Path], database: Path, model: Path, events: Connection) -> None:
-    """Place the photos. Send progress, and at the end (placed names, mean reprojection error in pixels, contradicted part of matches)."""
+    """Find the photos' cameras, and send progress to `events`. At the end send the result of three values.
+
+    They are the names of the photos that got a camera, the mean reprojection error in pixels, and the result of `_contradicted`.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     import pycolmap
 
@@ -173,9 +177,9 @@ def _place(photos: list[Path], database: Path, model: Path, events: Connection) 
 
 
 def _extract(photos: list[Path], database: Path, progress: Callable) -> None:
-    """Extract the features of all photos into the database. Photos of one size and focal length (EXIF) share a camera.
+    """Extract the features of all photos into the database. Photos of the same size and focal length (EXIF) share their intrinsics.
 
-    Then rename the photos in it to their indices, because a file of pairs cannot hold names with spaces.
+    Then rename the photos in the database to their indices, because a file of pairs cannot hold names with spaces.
     """
     import pycolmap
 
@@ -213,7 +217,7 @@ def _lens(camera) -> tuple[int, int, float]:
 
 
 def _match(count: int, database: Path, progress: Callable) -> None:
-    """Match pairs of photos, into the database."""
+    """Match the features of `pairs` of photos, and store the matches in the database."""
     import pycolmap
 
     verification = pycolmap.TwoViewGeometryOptions()
@@ -232,7 +236,10 @@ def _match(count: int, database: Path, progress: Callable) -> None:
 
 
 def _contradicted(found: Any, database: Path) -> float:
-    """Return the part of the matches that a model's cameras (a pycolmap.Reconstruction) contradict."""
+    """Return the fraction of matches that contradict the cameras `found` (a pycolmap.Reconstruction).
+
+    Such a match is more than MATCH_TOLERANCE pixels from its epipolar line.
+    """
     import pycolmap
 
     placed = set(found.reg_image_ids())
@@ -255,7 +262,7 @@ def _contradicted(found: Any, database: Path) -> float:
 
 
 def _map(photos: list[Path], database: Path, progress: Callable) -> Any:
-    """Return the model (a pycolmap.Reconstruction) that places most photos; None if none was found."""
+    """Find cameras from the matches. Return the model (a pycolmap.Reconstruction) with the most photos; None if there is none."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()

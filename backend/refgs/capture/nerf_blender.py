@@ -1,9 +1,9 @@
 """Read NeRF-Blender captures: `transforms_train.json` and `transforms_test.json` beside folders of RGBA PNGs.
 
-NeRF-Synthetic has this layout (see its README), and Shiny Blender. The latter adds NAME_normal.png, read as by the class `Blender` in
-`internal/datasets.py` of multinerf, Ref-NeRF's code, and NAME_alpha.png, which its `ball` needs. Without a test file the validation
-file replaces it. Pictures that no frame names are ignored: depth, disparity, and NeRF-Synthetic's NAME_normal_0000.png, whose
-encoding is undocumented.
+NeRF-Synthetic (see its README) and Shiny Blender have this layout. Shiny Blender adds NAME_normal.png, read as by the class `Blender` in
+`internal/datasets.py` of multinerf, Ref-NeRF's code, and NAME_alpha.png, the mask of its scene `ball`. If the test file is missing, the
+validation file is used for testing. Pictures that no frame names are ignored: depth, disparity, and NeRF-Synthetic's
+NAME_normal_0000.png, whose encoding is undocumented.
 """
 
 from dataclasses import replace

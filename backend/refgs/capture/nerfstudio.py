@@ -1,7 +1,7 @@
 """Read nerfstudio and instant-ngp captures: one `transforms.json` with intrinsics, shared or per frame, and optional masks.
 
-`train_filenames`, `test_filenames` and `val_filenames` are nerfstudio's split; validation replaces a missing test list.
-`ply_file_path` names its structure-from-motion points.
+`train_filenames`, `test_filenames` and `val_filenames` are nerfstudio's split. If the test list is missing, the validation list is used for
+testing. `ply_file_path` names the file of structure-from-motion points.
 """
 
 from pathlib import Path

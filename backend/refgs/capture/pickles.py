@@ -1,7 +1,7 @@
 """Read pickled NumPy arrays safely.
 
-`pickle.load` calls any function that a file names, and captures come from untrusted sources. Here the few names that a pickled array
-needs stand for plain containers, any other name is refused, and numbers come from the bytes alone.
+`pickle.load` calls any function that a file names, and captures come from untrusted sources. This reader knows only the few names that a
+pickled array needs, and replaces them by plain containers; any other name is refused. The arrays are then made from the containers' bytes.
 """
 
 import pickle
@@ -41,7 +41,7 @@ class _Refused(Exception):
 
 
 class _Dtype:
-    """Stand in for numpy.dtype: kinds as "f8"; the byte order is in the state."""
+    """Stand in for numpy.dtype. `kind` is a code such as "f8"; `order` is the byte order, from the pickled state."""
 
     def __init__(self, kind: str, *_):
         self.kind, self.order = kind, "="

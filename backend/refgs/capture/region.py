@@ -16,7 +16,7 @@ NEAR = 100.0  # largest distance from the origin in radii; largest radius, and i
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Ball in the cameras' frame. `bounded`: it holds one object; `because`: the reason in words."""
+    """Region of interest: a ball in the cameras' frame. `bounded` is True if it holds one object; `because` gives the reason in words."""
 
     centre: np.ndarray
     radius: float
@@ -27,7 +27,7 @@ class Region:
 def find_region(
     views: list[View], up: np.ndarray, points: np.ndarray | None, silhouettes: list[tuple[View, np.ndarray]]
 ) -> Region:
-    """Find the region of interest by the poses, then narrow it by masks, or without masks by structure-from-motion points."""
+    """Find the region of interest from the poses. Then narrow it by masks, or without masks by structure-from-motion points."""
     centre, distances, miss = look_at_centre(views)
     ahead = float((distances > 0).mean())
     if ahead < 0.75:
@@ -71,7 +71,7 @@ def region_in(box: Box, views: list[View], silhouettes: list[tuple[View, np.ndar
 def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the point nearest to all optical axes (least squares), its depth from each camera, and how far the axes miss it.
 
-    The miss is the median distance of the axes from the point, over the median depth. A weak pull towards the cameras' mean
+    How far they miss is the median distance of the axes from the point, divided by the median depth. A small weight on the cameras' mean
     position keeps the point finite if the axes are parallel.
     """
     positions = np.array([view.camera.position for view in views])
@@ -87,9 +87,9 @@ def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def up_direction(views: list[View]) -> np.ndarray:
-    """Find the world's up in the cameras' frame, (3,): perpendicular to the cameras' right axes, and close to their mean up.
+    """Find the world's up direction (3,), in the frame of the poses: perpendicular to the cameras' right axes, close to their mean up axis.
 
-    The mean up alone is tilted if all cameras look down. A camera's right axis stays horizontal however it is pitched.
+    The mean up axis alone is tilted if all cameras look down. A camera's right axis stays horizontal however the camera is pitched.
     """
     axes = np.array([view.camera.world_to_camera[:3, :3] for view in views])
     right, up = axes[:, 0], -axes[:, 1]

@@ -24,7 +24,7 @@ from refgs.errors import InputError
 
 @dataclass(frozen=True)
 class Frame:
-    """Entry of `frames`, completed by the values shared by all."""
+    """Entry of `frames` in the JSON `file`: its `values`, with those at the file's top level filled in."""
 
     values: dict
     file: Path
@@ -49,7 +49,7 @@ class Frame:
 
 
 def read_frames(file: Path) -> tuple[dict, list[Frame]]:
-    """Read the file's top level and its frames. Raises InputError for JSON of another format."""
+    """Read the values at the file's top level, and its frames. Raises InputError for JSON of another format."""
     try:
         data = json.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:

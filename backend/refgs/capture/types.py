@@ -17,10 +17,11 @@ Split = Literal["train", "test"]
 class View:
     """Photo and its pinhole camera.
 
-    `camera` is that of the full-size photo as `load_view` undistorts it. Its name is the last part of the photo's path without suffix,
-    unique within a split. `lens` is the distorted lens of the file; None if the file is a pinhole's. `has_alpha` marks the photo's own
-    alpha channel as its mask; a `mask_path` replaces it. With `mask_below` that file is a depth map, and the object is where depth is
-    below this part of its range. `normal_path` is a picture of the true normals, if published (`published_normals`).
+    `camera` is the pinhole camera of the full-size photo after `load_view` has undistorted it. Its name is the last part of the photo's
+    path without suffix, unique within a split. `lens` is the lens model that distorted the photo file; None without distortion.
+    `has_alpha` tells that the photo's own alpha channel is its mask; `mask_path` names a mask file instead. With `mask_below`, the mask
+    file is a depth map: the object is where depth is below this fraction of the map's range. `normal_path` is a picture of the true
+    normals, if the data set publishes them (`published_normals`).
     """
 
     camera: Camera
@@ -40,15 +41,15 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Photos with cameras in the run's frame, which has Z up.
+    """Photos with cameras, in the run's frame: the coordinates of the training, with Z up.
 
-    `to_capture` is a 4×4 float64 similarity, p_capture = to_capture @ p_run. For most NeRF-Blender captures it is the identity;
-    otherwise the region of interest has radius 1 about the run's origin. A wanted up direction rotates the run about its origin.
+    `to_capture` is a 4×4 float64 similarity, p_capture = to_capture @ p_run. For most NeRF-Blender captures it is the identity. For others
+    the region of interest has radius 1 about the run's origin. If the user sets an up direction, the run's frame is rotated to it.
     `points` (M, 3) are structure-from-motion points with `point_colors` (M, 3), sRGB-encoded in 0..1; None if the layout has none.
     `centre` (3,) and `radius` are the region of interest: the object, or a room's foreground. `bounded` is a guess: the photos surround
-    one object, or look at a place; `bounded_because` says why. A wanted `box` (in the run's frame) changes no frame, but narrows the
-    region of interest; a ball of radius `reach` about `centre` then holds all that the photos show. Without a box, `reach` is `radius`.
-    `warnings` are lines about what was left out or looks wrong.
+    one object, or look at a place; `bounded_because` says why. If the user sets a `box` (in the run's frame), it narrows the region of
+    interest, but changes no frame. A ball of radius `reach` about `centre` then holds the region of interest without the box; if there is
+    no box, `reach` is `radius`. `warnings` are lines about what was left out or looks wrong.
     """
 
     folder: Path

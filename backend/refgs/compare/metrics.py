@@ -1,7 +1,7 @@
 """Measure the errors of pictures and lights.
 
-Pictures are (height, width, 3) float arrays; "encoded" means sRGB in 0..1, "linear" means radiance. The figure of several views is
-the mean over the views.
+Pictures are (height, width, 3) float arrays; "encoded" means sRGB in 0..1, "linear" means radiance. Errors of several views are averaged
+over the views.
 """
 
 import importlib.util
@@ -123,16 +123,16 @@ def normal_ssim(normals: np.ndarray, reference: np.ndarray, alpha: np.ndarray, r
 
 
 def channel_products(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Means (3, 3) over a mask (h, w), by channel, of image², image · reference, reference²: the input of `aligned_psnr`."""
+    """Means over a mask (h, w) of image², image · reference and reference² (rows), for each channel (columns): input of `aligned_psnr`."""
     a, b = image[mask].astype(np.float64), reference[mask].astype(np.float64)
     return np.stack([(a * a).mean(0), (a * b).mean(0), (b * b).mean(0)])
 
 
 def aligned_psnr(views: list[np.ndarray]) -> dict[str, float | list[float]]:
-    """PSNR of linear base colours, mean over views, from each view's `channel_products`: psnr_raw, psnr_aligned, scale.
+    """Compute the PSNR of linear base colours, averaged over views. `views` are the results of `channel_products`.
 
-    Photos cannot tell a light's tint from its inverse on the base colours. psnr_aligned is therefore measured after the least-squares
-    `scale` of each channel, one for all views.
+    Returns psnr_raw, psnr_aligned and scale. Photos cannot tell a tinted light from tinted base colours, so psnr_aligned is measured after
+    each channel is multiplied by its least-squares `scale`, the same for all views.
     """
     aa, ab, bb = np.moveaxis(np.array(views), 1, 0)
     power = aa.sum(0)
@@ -148,11 +148,11 @@ def relit(
     pairs: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]],
     measures: tuple[Callable[[np.ndarray, np.ndarray], float], ...] = (psnr, flip),
 ) -> dict[str, float]:
-    """Measure views under another light, over white: psnr_raw, psnr_aligned, flip_raw, flip_aligned (by `measures`), and scale.
+    """Measure pictures under another light, over white. Returns psnr_raw, psnr_aligned, flip_raw, flip_aligned (by `measures`) and scale.
 
-    Each call of `pairs()` yields every view's picture and truth, premultiplied linear RGBA. Base colours and light share one free scale:
-    "aligned" figures are measured after multiplying radiance by the least-squares `scale`, one for all views. Pixels brighter than a
-    screen in either picture, such as a sun in a mirror, are left out of the fit: a few of them would dominate it.
+    Each call of `pairs()` yields every view's picture and truth, premultiplied linear RGBA. Photos do not tell the overall brightness of
+    the base colours, so "aligned" errors are measured after radiance is multiplied by the least-squares `scale`, the same for all views.
+    Pixels of 1 or brighter in either picture, such as a sun in a mirror, are left out of the fit: a few of them would dominate it.
     """
     product = power = 0.0
     for image, reference in pairs():
@@ -232,12 +232,12 @@ def find_lights(panorama: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lights_error(environment: np.ndarray, reference: np.ndarray) -> tuple[float, int] | None:
-    """Mean angular error of the brightest lights in degrees, and how many there are; None if there are none.
+    """Measure the mean angular error of the brightest lights in degrees. Returns it and the number of lights; None if there are none.
 
-    True lights (`find_lights`, at most 128 rows) are at least twice as bright as the mean and a quarter as bright as the brightest; at most
-    MOST_LIGHTS count. They are matched one to one, by the least sum of angles, to the brightest lights of the recovered panorama, twice as
-    many. A light without a match within LOST_LIGHT counts as LOST_LIGHT. The mean is weighted by the true brightness. A scale of the
-    radiance has no effect.
+    True lights (`find_lights`, in at most 128 rows) are at least twice as bright as the mean and a quarter as bright as the brightest. The
+    brightest MOST_LIGHTS of them count. They are matched one to one with lights of the recovered panorama, of which the brightest twice as
+    many are candidates, so that the sum of angles is least. A light without a match within LOST_LIGHT counts as LOST_LIGHT. The mean is
+    weighted by the true brightness. A scale of the radiance has no effect.
     """
     recovered, truth = (resized(x, min(128, len(environment), len(reference))) for x in (environment, reference))
     lights, bright = find_lights(truth)

@@ -23,11 +23,11 @@ def radius(mesh: Mesh) -> float:
 
 
 def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
-    """Measure the Chamfer distance, in radii of the true mesh, and the normal consistency of two meshes in one frame.
+    """Measure two meshes in one frame: `chamfer`, in radii of the true mesh, and `normal_consistency`.
 
-    POINTS even samples on each mesh are matched to the nearest points of the other. The figures are the mean distance and the mean absolute
-    cosine between the faces' normals, averaged over both directions. A sample counts only if a camera sees it, by rays against its own
-    mesh: photos do not show the rest. The nearest point may be unseen. Returns {} if no sample of a mesh is seen.
+    Each of POINTS samples on one mesh is matched to the nearest point of the other, in both directions. `chamfer` is the mean distance,
+    `normal_consistency` the mean absolute cosine between the two faces' normals. A sample counts only if some camera sees it, not occluded
+    by its own mesh, because photos do not show the rest. The nearest point may be unseen. Returns {} if no sample of a mesh is seen.
     """
     unit = radius(truth)
     samples = []
@@ -43,7 +43,7 @@ def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
 
 
 def seen(mesh: Mesh, points: np.ndarray, cameras: list[Camera], offset: float) -> np.ndarray:
-    """Mark the points (P, 3) of a mesh that any camera sees, unoccluded by the mesh: (P,). Rays start `offset` from their point."""
+    """Mark the points (P, 3) on a mesh that some camera sees, not occluded by the mesh: bool (P,). Rays start `offset` off the points."""
     middle = mesh.vertices.mean(axis=0)  # Embree traces in float32: centre the mesh
     scene = EmbreeScene()
     TriangleMesh(scene, (mesh.vertices[mesh.faces] - middle).astype(np.float32))

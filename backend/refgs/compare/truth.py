@@ -18,10 +18,10 @@ PASSES = ("normal", "albedo", "roughness", "metallic", "visibility")
 
 
 class GroundTruth:
-    """Folder of ground truth, read in the run's frame. Every part is optional.
+    """Read a folder of ground truth, converted to the run's frame (the coordinates of the training). Every file is optional.
 
-    light.exr; mesh.ply; normal, albedo, roughness, metallic, visibility/VIEW.exr, with alpha/VIEW.exr;
-    relight/HDRI.exr with relight/HDRI/VIEW.exr (see `scripts.demo.capture`).
+    The files are light.exr; mesh.ply; PASS/VIEW.exr for each of PASSES, with alpha/VIEW.exr; and relight/HDRI.exr, another light, with
+    relight/HDRI/VIEW.exr, the views under it (see `scripts.demo.capture`).
     """
 
     def __init__(self, folder: Path, to_capture: np.ndarray):
@@ -42,7 +42,7 @@ class GroundTruth:
         return {name: self.view(name, camera) for name in self.passes}, self.view("alpha", camera)
 
     def view(self, name: str, camera: Camera) -> np.ndarray:
-        """Read a pass of a view, float32 (h, w) or (h, w, channels)."""
+        """Read the pass `name` of the view that `camera` names, float32 (h, w) or (h, w, 3)."""
         file = self.folder / name / f"{camera.name}.exr"
         pixels = read_exr(file)
         if pixels.shape[:2] != (camera.height, camera.width):
@@ -55,7 +55,7 @@ class GroundTruth:
         return pixels[..., :3] @ self._turn.T.astype(np.float32) if name == "normal" else pixels[..., :3]
 
     def panorama(self, name: str) -> np.ndarray:
-        """Read a light, equirectangular in Blender's orientation."""
+        """Read the light NAME.exr and turn it to the run's frame: equirectangular (H, W, 3), in Blender's orientation."""
         panorama = read_environment(self.folder / f"{name}.exr")
         return sample(panorama, directions(*panorama.shape[:2]) @ self._turn.astype(np.float32))
 
@@ -82,7 +82,7 @@ def read_relit(file: Path, size: tuple[int, int] | None = None) -> np.ndarray:
 def known_maps(
     truth: GroundTruth | None, view: View, camera: Camera, to_capture: np.ndarray
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Read the true maps of a view and its alpha, as `GroundTruth.maps` does; without any, take the data set's own normals.
+    """Read the true maps of a view and its alpha, as `GroundTruth.maps` does. Without such maps, read the data set's published normals.
 
     `camera` is the view's camera, resized to the rendering.
     """
@@ -94,9 +94,9 @@ def known_maps(
 
 
 def errors(images: dict[str, np.ndarray], known: dict[str, np.ndarray], true_alpha: np.ndarray) -> dict:
-    """Errors of a view's maps (`pictures.maps`) against the true ones; {} if the object covers no pixel.
+    """Measure the errors of a view's maps (`pictures.maps`) against the true ones, by name; {} if the object covers no pixel.
 
-    For base colour they are the view's `metrics.channel_products`, because `metrics.aligned_psnr` compares all views at once.
+    For base colour, return the view's `metrics.channel_products` instead: `metrics.aligned_psnr` later compares all views at once.
     """
     figures, covered, alpha = {}, true_alpha >= metrics.COVERED, images["alpha"]
     for name, true in known.items() if covered.any() else ():

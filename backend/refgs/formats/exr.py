@@ -39,8 +39,8 @@ def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
 def read_exr(path: str | os.PathLike) -> np.ndarray:
     """Read an EXR as float32: (H, W, 4) RGBA, (H, W, 3) RGB, or (H, W) for a single channel.
 
-    Of several parts the first with R, G and B is read, else the first. Raises InputError for a file that is missing or broken, or has
-    other channels.
+    If the file has several parts, read the first one with R, G and B, or else the first. Raises InputError for a file that is missing or
+    broken, or has other channels.
     """
     path = Path(path)
     if not path.is_file():

@@ -73,7 +73,7 @@ def _check_header(file, path: Path) -> None:
 
 
 def _elements(lines: list[list[str]], path: Path) -> list[tuple[int, list[int]]]:
-    """Parse a header's elements: each one's count of rows, and the least bytes of each property."""
+    """Parse a header's elements. Return, for each, the number of rows, and the smallest size of each property in bytes."""
     elements: list[tuple[int, list[int]]] = []
     for line in lines:
         match line:

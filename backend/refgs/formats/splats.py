@@ -273,7 +273,7 @@ def _other_elements(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[
 def _without_nonfinite(splats: Splats, path: Path) -> Splats:
     """Remove the splats with a value that is not finite, with an InputWarning.
 
-    Elements other than `vertex` are removed with them, because they may refer to rows by index.
+    If any splat is removed, drop all elements other than `vertex`, because they may refer to its rows by index.
     """
     values = {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
     wrong = [name for name, value in values.items() if not np.isfinite(value).all()]

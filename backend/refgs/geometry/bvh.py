@@ -26,7 +26,7 @@ def _spread_bits(v: Tensor) -> Tensor:
 class Tree:
     """Bounding volume hierarchy of a mesh: a complete binary tree over its triangles in Morton order (Lauterbach et al. 2009).
 
-    Vertices are stored as (vertex − `centre`) / `size`. `lift` is in units of `size`.
+    Vertices are stored as (vertex − `centre`) / `size`. `lift` is the height above the surface at which rays start, in units of `size`.
     """
 
     def __init__(self, mesh: Mesh, centre: np.ndarray, size: float, lift: float, device: torch.device):

@@ -1,4 +1,4 @@
-"""Fuse depth maps into a mesh by truncated signed distances, in a band about the surface.
+"""Fuse depth maps into a mesh by truncated signed distances, stored only in voxels near the surface.
 
 Curless and Levoy 1996, "A Volumetric Method for Building Complex Models from Range Images".
 """
@@ -33,9 +33,10 @@ def fuse(
     """Fuse depth maps into a surface inside the cube of half-side `radius` about `centre`.
 
     `depths` (H, W) are distances along the camera's axis in world units, already divided by alpha. `alphas` (H, W) are in 0..1. All are
-    float32 and on one device, which fuses them. A pixel with alpha below 0.5 is background, and its whole ray is empty: silhouettes of
-    a masked object carve, a capture without masks, whose alpha is 1, is not carved. Pixels beside a jump in depth or alpha have little
-    weight. They vote for the surface but not for empty space before it, where the ray may have missed a neighbour by half a pixel.
+    float32 and on one device, which fuses them. A pixel with alpha below 0.5 is background: space along its whole ray is empty. So the
+    silhouettes of a masked object carve the surface; without masks alpha is 1, and nothing is carved. Pixels beside a jump in depth or
+    alpha have little weight. They vote for the surface but not for empty space before it, where the ray may have missed a neighbour by half
+    a pixel.
 
     Only voxels near a pixel's depth, in its block or the blocks around it, are kept. So time and memory grow with the surface, not with
     the cube. Faces point outwards. The mesh is open where nothing was seen, and empty where there is no surface.
@@ -139,7 +140,7 @@ class _View:
     def vote(self, block: Tensor, total: Tensor, weight: Tensor) -> None:
         """Add this view's weighted signed distances and weights to `total` and `weight` (M, BLOCK³) of blocks (M, 3).
 
-        Distances are divided by the truncation.
+        Signed distances are divided by the truncation distance.
         """
         x, y, z = self._project(block)
         inverse = 1 / torch.where(z.abs() > 1e-12, z, 1e-12)

@@ -1,1 +1,1 @@
-"""Pictures from surfels: rasterising, shading, comparing."""
+"""Render surfels: rasterise and shade them, relight them, and extract their surface."""

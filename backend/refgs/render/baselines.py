@@ -62,7 +62,7 @@ class LinearLight:
 
 
 class ScreenLight(LinearLight):
-    """Light in a screen's numbers, 0..1; pictures show them as they are."""
+    """Light as display-encoded (sRGB) values 0..1, which pictures show unchanged."""
 
     display = True
     brightest = 12.0  # raw texel; beyond it, float32's logistic function has no slope
@@ -88,10 +88,11 @@ LINEAR, SCREEN = LinearLight(), ScreenLight()
 
 @dataclass(frozen=True)
 class Method:
-    """Way of turning surfels and light into pictures. The defaults are RefGS's own.
+    """Method of rendering surfels under a light. The defaults are RefGS's own method.
 
-    `draw` replaces the deferred path of `render` and takes the same arguments. `unread` names parameters that no picture reads. `constants`
-    are raw values of parameters that are equal for all surfels. Neither learn. `left_out` are rows of needs.json.
+    `draw`, if given, replaces the deferred shading of `render` and takes the same arguments. `unread` names parameters that do not affect
+    pictures. `constants` maps parameters that are equal for all surfels to their raw values. Neither kind is trained. `left_out` are the
+    rows that needs.json gets for what the method does without.
     """
 
     lit: bool = True

@@ -1,4 +1,4 @@
-"""The first factor of the split sum (paper Eq. 7): the reflectance of a metallic-roughness material under uniform light.
+"""Tabulate the first factor of the split sum (paper Eq. 7): the reflectance of a metallic-roughness material under uniform light.
 
 The material is Blender's Principled BSDF with its defaults: GGX, height-correlated Smith shadowing, and multiple scattering between
 microfacets (Kulla and Conty, "Revisiting Physically Based Shading at Imageworks", 2017). Metals have Schlick's Fresnel term,
@@ -17,14 +17,14 @@ LEAST_N_V = 1e-4  # as in light.h
 
 
 def fresnel(cosine: np.ndarray) -> np.ndarray:
-    """Fresnel reflectance of a dielectric for unpolarised light, by the cosine to the normal."""
+    """Compute the Fresnel reflectance of a dielectric for unpolarised light, from the cosine between light and normal."""
     inside = np.sqrt(IOR**2 - 1 + cosine**2)  # IOR times the refracted ray's cosine
     across, along = (IOR**2 * cosine - inside) / (IOR**2 * cosine + inside), (cosine - inside) / (cosine + inside)
     return (across**2 + along**2) / 2
 
 
 def bounces(average_fresnel, energy, average_energy):
-    """The factor by which multiple scattering raises a lobe of one bounce (Kulla and Conty 2017).
+    """Return the factor by which multiple scattering makes a specular lobe brighter than one bounce does (Kulla and Conty 2017).
 
     `energy` is the albedo of a white lobe of one bounce, `average_energy` its mean over the cosine-weighted hemisphere, `average_fresnel`
     the mean Fresnel term.
@@ -34,7 +34,7 @@ def bounces(average_fresnel, energy, average_energy):
 
 
 def _gauss(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Quadrature points and weights over 0..1, dense at both ends, where an integrand may behave like a square root."""
+    """Return quadrature points and weights over 0..1, dense at both ends, where an integrand may behave like a square root."""
     x, weight = np.polynomial.legendre.leggauss(nodes)
     angle = np.pi / 4 * (x + 1)
     return np.sin(angle) ** 2, weight * np.pi / 4 * np.sin(2 * angle)

@@ -14,7 +14,8 @@ def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirec
     """Collect the features (N, C) of surfels, as a camera sees them, in the order that `shade` reads.
 
     First come normals and albedo. Unless the settings reflect nothing, these follow: metallic and roughness; colour by direction (`diffuse
-    = "sh"`) or the received part of the irradiance (with `indirect`); radiance from the object itself (with `indirect`); positions.
+    = "sh"`) or irradiance divided by that of an unoccluded surface (with `indirect`); radiance from the object itself (with `indirect`);
+    positions.
     """
     normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
     if settings.reflection == "none":

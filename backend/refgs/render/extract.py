@@ -23,12 +23,12 @@ NEARLY_ALL = 0.99  # of the surfels: what the cube holds
 def extract(
     surfels: Surfels, cameras: Sequence[Camera], near: float, centre: np.ndarray, radius: float, resolution: int
 ) -> tuple[Mesh, float]:
-    """The surface that the foreground's surfels show to cameras: as `refgs.geometry.tsdf.fuse` makes it, not cleaned.
+    """Fuse the cameras' depth maps of the foreground's surfels into a mesh, not cleaned. Return it and the width of its voxels.
 
-    The foreground is what lies in the region of interest, the ball of `radius` about `centre`, and so much of what is around it as half of
-    the cameras show. The rest is left out, whether it stands before the foreground or behind it. Voxels are the foreground's width /
-    `resolution` wide, but no finer than pixels are there, in the median; how wide comes with it. Surfels nearer than `near` (world
-    units) are not seen."""
+    The foreground is the region of interest, the ball of `radius` about `centre`, and the surroundings near it that at least half of the
+    cameras show. Other surfels are left out, even in front of the foreground. A voxel is as wide as the foreground / `resolution`, but not
+    narrower than a typical pixel at the surface. Surfels nearer to a camera than `near` (world units) are not drawn.
+    """
     shown, half = _foreground(surfels.positions.numpy(force=True), cameras, centre, radius)
     surfels = surfels.chosen(torch.from_numpy(shown).to(surfels.positions.device))
     maps = [trimmed_depth(*discs(surfels, camera), camera, near, UPPER, LOWER) for camera in cameras]
@@ -46,7 +46,10 @@ def extract(
 def _foreground(
     points: np.ndarray, cameras: Sequence[Camera], centre: np.ndarray, radius: float
 ) -> tuple[np.ndarray, float]:
-    """Which of the points (N, 3) belong to it, and the half-side of a cube about the centre that holds nearly all of them, and the ball."""
+    """Mark the points (N, 3) in the foreground (see `extract`): bool (N,). Also return half the side of a cube about the centre.
+
+    The cube holds nearly all of the marked points, and the ball of `radius`.
+    """
     distance = np.linalg.norm(points - centre, axis=1)
     shows = np.mean([inside(camera, *project(camera, points)) for camera in cameras], axis=0)
     shown = (distance < radius) | ((distance < REACH * radius) & (shows >= SHOWN))

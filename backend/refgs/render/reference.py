@@ -41,8 +41,8 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Rasterise float64 tensors as `refgs.render.rasterize.rasterize` does, with the depth of `trimmed_depth`.
 
-    Also returns a margin (H, W): the smallest relative distance of a comparison that the pixel's value depends on from its threshold. Where
-    it is tiny, rounding can change the value."""
+    Also returns a margin (H, W). A pixel's value depends on comparisons with thresholds; the margin is the smallest relative distance to a
+    threshold. Where the margin is tiny, rounding can change the value."""
     view = torch.from_numpy(camera.world_to_camera).to(positions.dtype)
     centre = positions @ view[:3, :3].T + view[:3, 3]
     drawn = (centre[:, 2] >= near) & (centre[:, 2] <= FAR) & (opacities >= ALPHA_CUT)

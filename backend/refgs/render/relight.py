@@ -1,8 +1,8 @@
 """Relight surfels: compute shadows on the object, and the light that it reflects onto itself, under another environment.
 
 All surfels trace rays in the same directions. Each direction stands for its cell of the sphere, so that a small sun falls into one
-of them, whole. Rays are traced once; each light then takes a few matrix products. The point that a ray hits reflects, by the split
-sum, the environment's light where its mirror direction is free, and the light of the bounce before.
+of them, whole. Rays are traced once; each light then takes a few matrix products. A point that a ray hits reflects two kinds of light, by
+the split sum: the environment's, where the point's mirror direction is not occluded, and that of the previous bounce.
 """
 
 import math

@@ -54,7 +54,8 @@ class _Work(struct("Shade", "pixels.h")):
 class _Padding(NamedTuple):
     """Index tables of stacked cubemaps whose faces are padded by one cell.
 
-    `texel` is the texel under each cell, in the order of orbits. The cells of texel i are `cell[starts[i]:starts[i + 1]]`, int32.
+    `texel` is the texel under each cell, in orbit order (`cubemap.orbit_order`). The cells of texel i are
+    `cell[starts[i]:starts[i + 1]]`, int32.
     `first_cells` and `first_lines` say where each level starts, in cells and in rows of cells; there are `lines` rows.
     """
 
@@ -187,16 +188,16 @@ def shade(
 
     - normal in world space, albedo, metallic, roughness;
     - with `by_direction`, colour by direction (3), which replaces integrated diffuse light (the paper's substitute);
-    - with a `visibility` (H, W) in 0..1: the received part of the irradiance (3), unless colour by direction is there, and radiance from
-      the object itself (3), which replaces the environment's where the visibility is 0 (Eq. 9);
+    - with a `visibility` (H, W) in 0..1: irradiance divided by that of an unoccluded surface (3), unless colour by direction is there; and
+      radiance from the object itself (3), which replaces the environment's where the visibility is 0 (Eq. 9);
     - position.
 
     With `matte` they are normal and albedo alone. The picture is then albedo times irradiance, and its material has metallic 0,
     roughness 1.
 
     Radiance is multiplied by `exposure`, a scalar (default 1), before it is encoded. With `display`, light and materials are a screen's
-    numbers and nothing is encoded. With `mirror`, the sharp light is mirrored and metallic is its share (Ye et al., 3DGS-DR, 2024). The
-    blended normal's bias towards the camera is removed first, by the blended position: see blended.h.
+    numbers and nothing is encoded. With `mirror`, a sharp mirror image of the light is weighted by metallic (Ye et al., 3DGS-DR, 2024).
+    The blended normal's bias towards the camera is removed first, by the blended position: see blended.h.
 
     All tensors are float32, on the CPU or on one card. Differentiable in features, alpha, the light and the exposure. The result does not
     depend on the number of threads, and a card returns the same bits each time. On a card, if any derivative is not finite, all are NaN.
