@@ -1,4 +1,4 @@
-"""Compute floors: the least time that each part can take on this machine.
+"""Compute floors: the least time that each part of the program can take on this machine.
 
 A part needs operations, which are counted by hand from the kernels' formulas. It also needs to move every input and output once between
 memory and processor. The floor is the longer of the two times.
@@ -25,14 +25,14 @@ SHADING_OPERATIONS = 410 + 1000
 
 
 class Need(NamedTuple):
-    """Numbers of operations and of bytes that a part of the program needs."""
+    """Hold how many operations a part of the program does, and how many bytes it moves."""
 
     operations: float
     bytes: float
 
 
 class Machine(NamedTuple):
-    """Operations and bytes a second that a machine can do at most."""
+    """Hold how many operations and bytes a second a machine can do at most."""
 
     operations: float
     bytes: float
@@ -43,12 +43,15 @@ class Machine(NamedTuple):
         return cls(arithmetic(device=device), bandwidth(device=device))
 
     def floor(self, need: Need) -> float:
-        """Compute the least milliseconds that a need takes."""
+        """Compute the least time in milliseconds for a part's operations and bytes."""
         return 1e3 * max(need.operations / self.operations, need.bytes / self.bytes)
 
 
 def covered_pairs(surfels: list[torch.Tensor], camera: Camera) -> float:
-    """Estimate the pairs of surfel and pixel on a ball, by adding up the projected areas of the surfels that face the camera."""
+    """Estimate how many pairs of a surfel and a pixel that it covers there are, for surfels on the unit ball.
+
+    The estimate adds up the projected areas of the surfels that face the camera.
+    """
     positions, _, scales, opacities, _ = (v.detach().double() for v in surfels)
     towards = torch.from_numpy(camera.position).to(positions) - positions
     # On the unit ball, positions are the normals.
@@ -60,7 +63,7 @@ def covered_pairs(surfels: list[torch.Tensor], camera: Camera) -> float:
 
 
 def raster(surfels: list[torch.Tensor], camera: Camera) -> tuple[Need, Need]:
-    """Count the needs of the rasteriser on a ball, forward and backward."""
+    """Count the rasteriser's operations and bytes for surfels on the unit ball: of the forward pass, and of the backward pass."""
     pixels, channels = camera.width * camera.height, surfels[-1].shape[1]
     given, maps, pairs = sum(v.nbytes for v in surfels), 4 * pixels * (channels + 2), covered_pairs(surfels, camera)
     forward = Need(pairs * (FORWARD_OPERATIONS + CHANNEL_OPERATIONS[0] * channels), given + maps)
@@ -68,22 +71,23 @@ def raster(surfels: list[torch.Tensor], camera: Camera) -> tuple[Need, Need]:
 
 
 def ssim(pixels: int) -> Need:
-    """Count the need of D-SSIM and its derivative, for two images of three channels."""
+    """Count the operations and bytes of D-SSIM and its derivative, for two images of three channels."""
     return Need(3 * pixels * SSIM_OPERATIONS, 3 * pixels * 4 * 3)
 
 
 def shading(covered: int, pixels: int) -> Need:
-    """Count the need of deferred shading, forward and backward.
+    """Count the operations and bytes of deferred shading, forward and backward.
 
-    It reads eleven channels and alpha twice, writes their derivatives, writes fourteen numbers and reads eleven derivatives.
+    It reads eleven channels and alpha twice, writes their derivatives, writes fourteen numbers and reads eleven derivatives. Only
+    `covered` of the `pixels` need operations.
     """
     return Need(covered * SHADING_OPERATIONS, 4 * pixels * (3 * 12 + 14 + 11))
 
 
 def prefiltering(side: int) -> Need:
-    """Count the need of prefiltering a cubemap, forward and backward.
+    """Count the operations and bytes of prefiltering a cubemap of 6·side² texels, forward and backward.
 
-    Each reads the matrix once; one number of it serves all symmetries.
+    Each pass reads the filter's matrix once. A number of the matrix serves all symmetries of the cubemap.
     """
     numbers = matrices(side, torch.device("cpu"))[0].numbers.numel()
     texels = 6 * sum(s * s for s in level_sides(side))

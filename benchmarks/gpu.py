@@ -120,7 +120,7 @@ def gsplat_step(
 def measure_raster(
     bench: Bench, device: torch.device, sizes: Sequence[tuple[int, int, int]] = SIZES, rounds: int = ROUNDS
 ) -> None:
-    """Record the rasteriser's times at each size, beside its floors and gsplat's times."""
+    """Record the rasteriser's times at each size, beside its floors (the least possible times) and gsplat's times."""
     machine = Machine.measured(device)
     for splats, width, height in sizes:
         surfels, camera = make_ball(splats, width, height, device)
@@ -167,7 +167,7 @@ def measure_frames(
 
 
 def measure_iteration(bench: Bench, device: torch.device, rounds: int = ROUNDS) -> None:
-    """Record the time of an iteration of the deferred stage, and of each kernel in it."""
+    """Record the time of a training iteration with deferred shading, and of each kernel in it."""
     with TemporaryDirectory() as folder:
         trainer = make_trainer(Path(folder), device.type)
         times = milliseconds(trainer.step, device, rounds)
@@ -186,7 +186,7 @@ def measure_iteration(bench: Bench, device: torch.device, rounds: int = ROUNDS) 
 
 
 def measure_trainings(bench: Bench, device: torch.device, folder: Path) -> None:
-    """Train the scene by both presets; render its capture if it is missing."""
+    """Train a scene by the presets `standard` and `paper`, and record times and quality. Render its capture if that is missing."""
     name, side, views = SCENE
     capture = folder / f"{name}-{side}"
     if not capture.exists():

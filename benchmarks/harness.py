@@ -1,7 +1,7 @@
-"""Run benchmarks: find scenes, train runs, record rows of figures, print tables of rows.
+"""Run benchmarks: find scenes, train on them, record measured figures as rows, print tables of the rows.
 
-A benchmark trains the runs that are missing, records rows, and names its tables. A table is printed with the kept figures in brackets.
-`--csv FILE` writes the rows. docs/measurements.csv keeps them; `refgs bench page` makes docs/measurements.md from it.
+A benchmark trains only runs that do not exist yet. Its tables show the figures kept in docs/measurements.csv in brackets. `--csv FILE`
+writes the rows. `refgs bench page` makes docs/measurements.md from docs/measurements.csv.
 """
 
 import argparse
@@ -31,7 +31,7 @@ console = Console(soft_wrap=True, width=None if sys.stdout.isatty() else 200)  #
 
 
 class Row(NamedTuple):
-    """Measured figure. Its value is a float, or a string for a word such as the name of a preset."""
+    """Hold one measured figure, a row of the CSV. `value` is a number, or a word such as the name of a preset."""
 
     benchmark: str
     scene: str
@@ -45,7 +45,10 @@ class Row(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Column of a table: its heading, figure and format. If it names no variant, it shows that of the table's line."""
+    """Describe a column of a table: its heading, its figure and the number's format.
+
+    It shows the figure of `variant`. If that is None, it shows the variant of each line.
+    """
 
     heading: str
     figure: str
@@ -54,7 +57,7 @@ class Column(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Layout of a table: a line for each scene, or for each scene and variant, then the mean over the scenes `mean`."""
+    """Describe a table: a line for each scene, or for each scene and variant. The last line is the mean over the scenes in `mean`."""
 
     title: str
     benchmark: str
@@ -64,7 +67,10 @@ class Table(NamedTuple):
     mean: tuple[str, ...] = ()
 
     def lines(self, rows: Sequence[Row], kept: Sequence[Row] = ()) -> list[list[str]]:
-        """List the table's lines, headings first; kept figures are in brackets. Lines and columns without figures are left out."""
+        """List the table's lines, headings first. Lines and columns without figures are left out.
+
+        `kept` are earlier figures, which are shown in brackets.
+        """
         found, before = ({r[1:4]: r.value for r in some if r.benchmark == self.benchmark} for some in (rows, kept))
         lines = dict.fromkeys(
             (r.scene, r.variant if self.variant else "") for r in rows if r.benchmark == self.benchmark
@@ -94,19 +100,22 @@ def _cell(value: float | str | None, kept: float | str | None, form: str) -> str
 
 
 def mean(values: Sequence[float | str | None]) -> float | None:
-    """Average the values; None if one is missing or a word, because columns would then average different scenes."""
+    """Average the values. Return None if one is missing or is a word: columns would then average different scenes."""
     return sum(values) / len(values) if values and all(isinstance(v, float | int) for v in values) else None
 
 
 class Way(NamedTuple):
-    """Way to train: options of `refgs train`, and optionally minutes: a number, or the name of a way that takes as long."""
+    """Describe one way to train: `words` are options of `refgs train`.
+
+    `minutes` limits the time: a number, or the name of another way, whose measured time is taken.
+    """
 
     words: tuple[object, ...]
     minutes: float | str | None = None
 
 
 class Bench:
-    """Benchmark that runs: its options, the rows measured so far, and the runs that failed."""
+    """Hold a running benchmark: its options, the rows measured so far, and the runs that failed."""
 
     def __init__(self, name: str, parser: argparse.ArgumentParser, arguments: Sequence[str] | None):
         parser.prog = f"refgs bench {name}"
@@ -117,15 +126,16 @@ class Bench:
         self.where = this_machine(), date.today().isoformat(), commit()
 
     def record(self, scene: str, variant: str, unit: str, **figures: float | str | None) -> None:
-        """Add figures of a scene and variant to the rows; skip those that are None, which were not measured."""
+        """Add figures of a scene and variant to the rows. Skip figures that are None, which were not measured."""
         for figure, value in figures.items():
             if value is not None:
                 self.rows.append(Row(self.name, scene, variant, figure, value, unit, *self.where))
 
     def runs(self, ways: dict[str, Way]) -> Iterator[tuple[str, dict[str, Path]]]:
-        """Train and evaluate each scene in each way, in OUT/[PRESET/]WAY/SCENE; yield the scene and the runs that succeeded.
+        """Train and evaluate each scene in each way, in OUT/[PRESET/]WAY/SCENE.
 
-        Raise InputError if `--ways` names an unknown way.
+        Yields the scene's name, and the folders of its successful runs by way. Raises InputError if
+        `--ways` names an unknown way.
         """
         options = self.options
         chosen = options.ways or [*ways]
@@ -210,7 +220,10 @@ def call(*arguments: object) -> int:
 def train(
     capture: Path, run: Path, words: Iterable[object], minutes: float | None = None, truth: Path | None = None
 ) -> bool:
-    """Train and evaluate a run; return True on success. Resume an interrupted run; skip a finished one."""
+    """Train and evaluate a run; return True on success. Resume an interrupted run; skip a finished one.
+
+    `words` are options of `refgs train`; `truth` is the folder of ground truth.
+    """
     if figures(run) is not None:
         return True
     if not (run / "splats.ply").exists():
@@ -232,7 +245,7 @@ def figures(run: Path) -> dict | None:
 
 
 def relit(found: dict, figure: str) -> float | None:
-    """Average a figure over all lights with which a run was relit."""
+    """Average a figure over all lights with which a run was relit. `found` is the run's metrics.json."""
     return mean([light.get("refgs", {}).get(figure) for light in found.get("relight", {}).values()])
 
 

@@ -1,7 +1,7 @@
-"""Time a training iteration of the deferred stage, part by part.
+"""Time a training iteration with deferred shading, part by part.
 
-The scene is made without Blender: 256×256 photos of a metal ball that fills most of the frame, 20,000 surfels on its hull. Each part is
-timed by running the iteration's own functions up to it.
+The scene is made without Blender: 256×256 photos of a metal ball that fills most of the frame, 20,000 surfels on its visual hull. Each
+part is timed by running the iteration's own functions up to it.
 """
 
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
@@ -44,7 +44,7 @@ def measure() -> dict[str, list[float]]:
 
 
 def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
-    """Time the parts of one iteration, then one whole iteration."""
+    """Time the parts of one iteration, then one whole iteration. Add the seconds to `rows`."""
     photo, settings, clock = trainer.state.photos[0], trainer.state.settings, time.perf_counter
 
     def record(name: str, since: float) -> float:

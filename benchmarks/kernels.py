@@ -146,7 +146,7 @@ def _prefilter(side: int) -> Callable[[], None]:
 
 
 def _needs() -> dict[str, floors.Need]:
-    """Count the needs of the steps that have a floor."""
+    """Count the operations and bytes of the steps that have a floor (a least possible time)."""
     surfels, camera = ball()
     forward, backward = floors.raster(surfels, camera)
     covered = int((rasterize(*surfels, camera, near=0.1).alpha > 1 / 255).sum())
@@ -157,7 +157,7 @@ def _needs() -> dict[str, floors.Need]:
 
 
 def measure_all(bench: Bench, threads: int = THREADS) -> None:
-    """Record the times of each part on each instruction set, and its floor."""
+    """Record the times of each step on each instruction set, and its floor (the least possible time)."""
     before, chosen = torch.get_num_threads(), os.environ.get("REFGS_ISA")
     torch.set_num_threads(threads)
     try:

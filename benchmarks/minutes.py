@@ -41,7 +41,10 @@ def course(run: Path) -> list[tuple[float, float]]:
 
 
 def best(presets: dict[str, Path], seconds: float) -> tuple[float, str] | None:
-    """Return the best PSNR that a preset's run had reached after these seconds, and the preset; None if none had begun."""
+    """Return the best PSNR that a preset's run had reached after these seconds, and the preset's name.
+
+    Returns None if no run had been measured by then.
+    """
     reached = [(psnr, name) for name, run in presets.items() for at, psnr in course(run) if at <= seconds]
     return max(reached, default=None)
 
@@ -51,7 +54,7 @@ def _lines(run: Path) -> list[dict]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train the missing runs; print the PSNR of each time."""
+    """Train the missing runs; print the PSNR that each run reaches, and the time it takes."""
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]))
     parser.add_argument("--minutes", nargs="+", type=float, default=[2, 5, 10, 20])
     bench = Bench("minutes", parser, arguments)

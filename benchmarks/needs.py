@@ -1,4 +1,4 @@
-"""Measure which parts of the method scenes leave out, and how much that saves: `refgs bench needs --scenes DIR`.
+"""Measure which parts of the method scenes do without, and how much time that saves: `refgs bench needs --scenes DIR`.
 
 A need is a part of the method that a scene may do without.
 
@@ -48,19 +48,19 @@ TABLES = (
 
 
 def left_out(run: Path) -> str:
-    """List the needs that a run left out."""
+    """List the parts of the method that a run left out, as one text."""
     needs = json.loads((run / "needs.json").read_text(encoding="utf-8"))
     return ", ".join(need["need"] for need in needs if not need.get("needed", True))
 
 
 def deciding(run: Path) -> float:
-    """Compute the percentage of a run's seconds that the decisions took."""
+    """Compute the percentage of a run's seconds spent on deciding what the scene needs."""
     last = json.loads((run / "history.jsonl").read_text(encoding="utf-8").splitlines()[-1])
     return 100 * last["parts"].get("deciding", 0.0) / last["seconds"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train the missing runs; print what leaving out saves and what it costs in quality."""
+    """Train the missing runs; print the time that leaving out parts of the method saves, and the quality that it costs."""
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]), preset="quick")
     bench = Bench("needs", parser, arguments)
     preset = ("--preset", bench.options.preset)

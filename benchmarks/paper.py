@@ -69,7 +69,7 @@ def tables() -> list[Table]:
 
 
 def record(bench: Bench, scene: Scene, found: dict) -> None:
-    """Add a scene's figures to the rows."""
+    """Add a scene's figures to the rows. `found` is its run's metrics.json."""
     seconds = found.get("training_seconds")
     bench.record(scene.name, scene.data_set, "dB", psnr=found["psnr"])
     bench.record(scene.name, scene.data_set, "", ssim=found.get("ssim"), lpips=found.get("lpips"))

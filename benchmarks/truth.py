@@ -1,7 +1,7 @@
 """Measure the method on scenes with ground truth: `refgs bench truth --scenes DIR`.
 
-Each scene is trained by a preset and compared with all its ground truth. Plain colour by direction (`shading=sh`) is trained for the same
-time, to compare the novel views.
+Each scene is trained by a preset and compared with all its ground truth. To compare novel views, plain view-dependent colour
+(`shading=sh`) is trained for the same time.
 """
 
 import argparse
@@ -45,7 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def record(bench: Bench, scene: str, way: str, found: dict) -> None:
-    """Add a run's figures to the rows; colour by direction has no materials and no light."""
+    """Add a run's figures to the rows. `found` is its metrics.json.
+
+    Figures of materials and light are missing for plain view-dependent colour.
+    """
     bench.record(scene, way, "dB", psnr=found["psnr"], albedo=found.get("albedo", {}).get("psnr_aligned"))
     bench.record(scene, way, "dB", relit=relit(found, "psnr_raw"), relit_aligned=relit(found, "psnr_aligned"))
     bench.record(scene, way, "°", normals=found.get("normal_mae_degrees"))

@@ -1,4 +1,4 @@
-"""Define the error that the artist can fix."""
+"""Define the error for problems that the artist can fix."""
 
 
 class InputError(Exception):

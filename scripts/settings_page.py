@@ -53,7 +53,7 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def _allowed(key: str, info: FieldInfo) -> str | None:
-    """Return the values to list for a setting; None if all values but one only serve comparison with papers."""
+    """Describe a setting's allowed values. Return None if all values but one only serve comparison with papers."""
     if get_origin(info.annotation) is Literal:
         values = [value for value in get_args(info.annotation) if value not in COMPARISON.get(key, ())]
         return ", ".join(map(str, values)) if len(values) > 1 else None

@@ -27,7 +27,7 @@ def sky(direction: np.ndarray) -> np.ndarray:
 
 
 def meet(origin: np.ndarray, ray: np.ndarray, balls: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Intersect unit rays (P, 3) with balls; return hits (P,), the first points (P, 3) and their normals (P, 3)."""
+    """Intersect unit rays (P, 3) with balls (B, 4); return hits (P,), the first points (P, 3) and their normals (P, 3)."""
     apart = origin[:, None] - balls[:, :3]
     b = (apart * ray[:, None]).sum(-1)
     inside = b * b - ((apart**2).sum(-1) - balls[:, 3] ** 2)
@@ -122,9 +122,11 @@ def photo(
 ) -> np.ndarray:
     """Compute a photo, RGBA in 0..1, of balls (B, 4), given by centre and radius.
 
-    A ball is a mirror with Schlick's Fresnel, has three horizontal bands of materials (BANDS), or is matte with a pattern.
+    A ball is a mirror with Schlick's Fresnel. With `bands` it has three horizontal bands of materials (BANDS); with `matte` it is matte
+    with a pattern.
 
-    Alpha is the mean over `samples`² rays a pixel. The mirrors' sky is fixed or turns with the camera about z. `stops` is the exposure.
+    Alpha is the mean over `samples`² rays a pixel. The mirrors' sky stands still, or with `turning` rotates with the camera about z.
+    `stops` is the exposure in powers of two, `angle` the field of view in radians.
     """
     focal = 0.5 * size / np.tan(angle / 2)
     grid = (np.arange(size * samples) + 0.5) / samples
@@ -183,7 +185,8 @@ def write_ball_capture(
 ) -> None:
     """Write a NeRF-Blender capture of balls with 24 training and 4 test views.
 
-    `stops` are the exposures of the training views, repeated in turn."""
+    `stops` are the exposures of the training views, in powers of two, repeated in turn. Other arguments: see `photo`.
+    """
     angle = ANGLE if distance == DISTANCE else 2 * np.arctan(np.tan(ANGLE / 2) * DISTANCE / distance)
     steps = np.arange(VIEWS + 4) + 0.5
     z = 0.9 - 1.5 * steps / len(steps)

@@ -7,7 +7,7 @@ from scripts.demo.shapes import Material, Mesh, Scene, join, lathe, mix, moved, 
 
 
 def clay(points: np.ndarray) -> np.ndarray:
-    """Paint terracotta with a band of triangles."""
+    """Compute base colours of terracotta with a band of triangles."""
     angle, z = np.arctan2(points[:, 1], points[:, 0]), points[:, 2]
     wave = np.abs((angle * 8 / np.pi) % 2 - 1)  # a zigzag, 16 a turn
     band = step(0.0, 0.02, z + 0.72 - 0.17 * wave) * (1 - step(0.0, 0.02, z + 0.50))
@@ -63,7 +63,7 @@ def build() -> Scene:
 
 
 def _flower() -> Mesh:
-    """Let eight petals stand about a hollow."""
+    """Make a flower of eight petals around a hollow."""
     bell = [
         (0.0, 0.0),
         (0.06, 0.01),

@@ -15,7 +15,7 @@ def glaze(points: np.ndarray) -> np.ndarray:
 
 
 def skin(points: np.ndarray) -> np.ndarray:
-    """Paint an apple: red, yellow about the stalk, with fine streaks."""
+    """Compute base colours of an apple: red, yellow about the stalk, with fine streaks."""
     x, y = points[:, 0] + 0.36, points[:, 1] - 0.28
     angle, radius = np.arctan2(y, x), np.hypot(x, y)
     streaks = 0.5 + 0.25 * np.sin(17 * angle) + 0.25 * np.sin(29 * angle + 1)

@@ -19,7 +19,7 @@ FAR = 0.25  # beyond the width of any blend
 
 
 def ellipsoid(centre, radii) -> Solid:
-    """Ellipsoid along the axes; exact near its surface."""
+    """Make an ellipsoid along the axes. Its distances are accurate near its surface."""
     centre, radii = np.asarray(centre, float), np.asarray(radii, float)
 
     def distance(points):
@@ -32,7 +32,7 @@ def ellipsoid(centre, radii) -> Solid:
 
 
 def box(centre, half, round: float) -> Solid:
-    """Box along the axes with edges of radius `round`; `half` is half its size."""
+    """Make a box along the axes, with edges of radius `round`; `half` (3,) is half its size."""
     centre, inner = np.asarray(centre, float), np.asarray(half, float) - round
 
     def distance(points):
@@ -43,7 +43,7 @@ def box(centre, half, round: float) -> Solid:
 
 
 def ring(centre, axis, radius: float, thickness: float) -> Solid:
-    """Torus about `axis`; `thickness` is its tube's radius."""
+    """Make a torus about `axis`; `thickness` is its tube's radius."""
     centre, axis = np.asarray(centre, float), np.asarray(axis, float) / np.linalg.norm(axis)
 
     def distance(points):
@@ -55,7 +55,7 @@ def ring(centre, axis, radius: float, thickness: float) -> Solid:
 
 
 def disc(centre, axis, radius: float, half: float, round: float) -> Solid:
-    """Cylinder about `axis`, `half` its height, with edges of radius `round`."""
+    """Make a cylinder about `axis`, with edges of radius `round`; `half` is half its height."""
     centre, axis = np.asarray(centre, float), np.asarray(axis, float) / np.linalg.norm(axis)
 
     def distance(points):
@@ -74,7 +74,7 @@ def disc(centre, axis, radius: float, half: float, round: float) -> Solid:
 
 
 def sweep(path, radii) -> Solid:
-    """Round limb along a cubic spline through `path` (n, 3), with radii (n,) or one; its ends are half balls.
+    """Make a round limb along a cubic spline through `path` (n, 3), with radii (n,) or one radius. Its ends are half balls.
 
     Distances are capped at FAR.
     """
@@ -120,14 +120,15 @@ def carve(width: float, solid: Solid, *tools: Solid) -> Solid:
 
 
 def mirrored(solid: Solid) -> Solid:
-    """Mirror the solid's half of y > 0."""
+    """Make a symmetric solid: replace the half at y < 0 by the mirror image of the half at y > 0."""
     return lambda points: solid(np.stack([points[:, 0], np.abs(points[:, 1]), points[:, 2]], axis=1))
 
 
 def sculpt(solid: Solid, low, high, cell: float, material: int) -> Mesh:
     """Mesh the surface of a solid within `low` to `high` (3,), in triangles of about `cell`.
 
-    Marching cubes; then vertices slide along the surface until the triangles are even, as mirrors need.
+    Marching cubes find the triangles. Then vertices slide along the surface until the triangles are even, because mirrors show uneven
+    ones. `material` is the index of all faces' material.
     """
     block = 4
     low = np.asarray(low, float) - 2 * cell

@@ -10,7 +10,7 @@ SLICE = (0.36, 0.05, 0.25)  # half a slice
 
 
 def toast(points: np.ndarray) -> np.ndarray:
-    """Toast bread: golden in the middle, brown towards the crust, darker where the grid was hot."""
+    """Compute base colours of toast: golden in the middle, brown towards the crust, darker where the grid was hot."""
     x, z = points[:, 0] / SLICE[0], (points[:, 2] - 0.36) / SLICE[2]
     crust = step(0.55, 1.0, np.maximum(np.abs(x), np.abs(z)))
     grid = 0.5 + 0.5 * np.cos(7 * np.pi * x)
@@ -27,7 +27,10 @@ MATERIALS = (
 
 
 def build() -> Scene:
-    """Build a body 1.24 long, 0.68 wide and 0.8 high. Both long sides are concave mirrors of radius 0.9, the tray's rim of 0.2."""
+    """Build a toaster 1.24 long, 0.68 wide and 0.8 high.
+
+    Both long sides are concave mirrors of radius 0.9. The tray's rim is a concave mirror of radius 0.2.
+    """
     body = carve(
         0.04,
         box((0, 0, -0.08), (0.62, 0.34, 0.40), 0.09),

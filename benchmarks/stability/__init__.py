@@ -1,4 +1,4 @@
-"""Run stiff and extreme cases through every kernel and through training: `refgs stability [--only WORD]`.
+"""Test every kernel and the training in extreme and ill-conditioned cases: `refgs stability [--only WORD]`.
 
-Each module is a group of cases, a list CASES. docs/stability.md keeps the tables.
+Each module has a group of cases, in its list CASES. docs/stability.md keeps the printed tables.
 """

@@ -1,4 +1,4 @@
-"""Run the cases and print a Markdown table row by row; exit with status 1 if a case fails."""
+"""Run the stability cases and print a Markdown table row by row; exit with status 1 if a case fails."""
 
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
 

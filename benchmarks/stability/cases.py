@@ -1,4 +1,4 @@
-"""Define a case and write its outcome."""
+"""Define a stability case, and format its outcome as a row of a table."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,9 +7,10 @@ NEVER = -1
 
 
 class Found(NamedTuple):
-    """Outcome of a case: whether all values are finite, the error, and when a disturbed training recovered.
+    """Hold the outcome of a case: whether all values are finite, the error, and how long a disturbed training took to recover.
 
-    `recovered` counts iterations; it is NEVER if the training did not recover.
+    `error` is in the unit of its case. `recovered` is a number of iterations, NEVER if the training did not recover, or None if nothing
+    was disturbed.
     """
 
     finite: bool
@@ -18,9 +19,10 @@ class Found(NamedTuple):
 
 
 class Case(NamedTuple):
-    """Stiff or extreme case. The error of `run` compared with `against` may be at most `most`.
+    """Describe a stiff or extreme case. It passes if all values are finite and its error is at most `most`.
 
-    `because` says why so much is allowed; `guard` says what the program does about the case.
+    `run` computes the error, compared with what `against` names. `because` says why an error of that size is allowed; `guard` says what
+    the program does in such a case.
     """
 
     name: str

@@ -1,6 +1,6 @@
 """Compare float32 kernels with the float64 reference.
 
-Errors of values and gradients are the largest ones, relative to the largest value of their tensor.
+The error of a tensor, of values or of gradients, is its largest error divided by its largest value.
 """
 
 from collections.abc import Sequence
@@ -22,13 +22,15 @@ FLOAT32 = "float32, sums of hundreds of terms"
 
 
 class Undecided(Exception):
-    """Raised if too much of a picture depends on comparisons that rounding can flip."""
+    """Report that too much of a picture depends on comparisons that rounding can flip."""
 
 
 def worst(found: Sequence[Tensor], expected: Sequence[Tensor], terms: Sequence[Tensor] | None = None) -> float:
-    """Find the largest error of pairs of tensors, each relative to its largest value, or to its cancelling `terms` if larger.
+    """Return the largest error over pairs of tensors, each error relative to the largest expected value of its tensor.
 
-    If the expected value is zero, the error is absolute."""
+    `terms` are the magnitudes that cancel in the values. Where these are larger, the error is relative to them. If all of them are zero,
+    the error is absolute.
+    """
     errors = [0.0]
     for value, exact, summed in zip(found, expected, terms or expected, strict=True):
         if exact.numel():
@@ -44,18 +46,20 @@ def outcome(
     exact_by: Sequence[Tensor],
     terms: Sequence[Tensor] | None = None,
 ) -> Found:
-    """Return the larger of two errors: that of the values `found`, and a tenth of that of the gradients `by`.
+    """Check that all values are finite, and return the larger of two errors: that of the values, and a tenth of that of the gradients.
 
-    `expected` and `exact_by` are the float64 values and gradients. `terms` are the magnitudes that cancel in the gradients, if known.
+    `found` are the float32 values and `by` their gradients; `expected` and `exact_by` are the same in float64. `terms` are the magnitudes
+    that cancel in the gradients, if known.
     """
     finite = all(bool(v.isfinite().all()) for v in (*found, *by))
     return Found(finite, max(worst(found, expected), 0.1 * worst(by, exact_by, terms)))
 
 
 def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest: int | None = None) -> Found:
-    """Compare the rasteriser forward and backward.
+    """Compare the rasteriser with the float64 reference, forward and backward.
 
-    With `nearest`, the reference draws only so many surfels, which occlude the rest.
+    `inputs` are the surfels' tensors. With `nearest`, the reference draws only that many surfels, those nearest to the camera; they must
+    occlude all others.
     """
     order = None if nearest is None else _order(inputs, camera)
     few = inputs if order is None else [v[order[:nearest]] for v in inputs]
@@ -82,7 +86,7 @@ def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest:
 
 
 def _learned(by: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
-    """Convert derivatives to those by position, rotation angle and log scale; keep the others."""
+    """Convert derivatives by quaternion and scale to derivatives by rotation angle and log scale; keep the others."""
     position, rotation, scale, *rest = by
     return [position, rotation * inputs[1].double().norm(dim=-1, keepdim=True), scale * inputs[2].double(), *rest]
 
@@ -94,13 +98,13 @@ def _terms(
     exact_by: Sequence[Tensor],
     generator: torch.Generator,
 ) -> list[Tensor]:
-    """Bound the terms that cancel in each derivative: where a gradient cancels larger terms, its error is relative to them.
+    """Bound the terms that cancel in each derivative. Where a gradient cancels larger terms, its error is relative to them.
 
-    - By alpha: what a surfel adds, less what it occludes. The latter is the pixel's total left by the surfels in front, over 1 - alpha: it
-      rounds as the total does, however small it is. The transmittance's derivative is over 1 - alpha, too, so totals of either sign
-      are propagated back by it.
-    - By rotation and scale: a disc turns and stretches about a centre that the same pixels move. Turning is a difference of what moving
-      gives, times the radius; stretching is a difference of what turning gives.
+    - By alpha: a derivative is what the surfel adds, less what it occludes. What it occludes is computed from the pixel's total, divided
+      by 1 - alpha. So it has the rounding error of the total, however small it is itself. The derivative of the transmittance is divided
+      by 1 - alpha, too. So totals of random sign are propagated back.
+    - By rotation and scale: the same pixels move, turn and stretch a disc. A derivative by rotation is a difference of derivatives by
+      position, times the radius. A derivative by scale is a difference of derivatives by rotation.
     """
     features, depth, alpha = (m.detach() for m in maps)
     by_features, by_depth, by_alpha = upstream
@@ -120,9 +124,11 @@ def _order(inputs: Sequence[Tensor], camera: Camera) -> Tensor:
 
 
 def shading(features: Tensor, alpha: Tensor, radiance: Tensor, camera: Camera, kink: bool = False) -> Found:
-    """Compare deferred shading forward and backward, of maps as `shade` takes them, under a light (6·R², 3).
+    """Compare deferred shading with the float64 reference, forward and backward.
 
-    Where all of the picture lies on a `kink`, gradients only have to be finite."""
+    `features` and `alpha` are the maps that `shade` takes; `radiance` (6·R², 3) is the light. Set `kink` where the derivative jumps in all
+    of the picture: gradients then only have to be finite.
+    """
     light = Environment(radiance)
     light.levels = light.levels.requires_grad_()
     background = torch.tensor([0.2, 0.5, 1.0])

@@ -1,4 +1,4 @@
-"""Cases of unusual surfels and cameras, for the rasteriser and other kernels that read positions."""
+"""Test the rasteriser, and other kernels that read positions, with unusual surfels and cameras."""
 
 import dataclasses
 from functools import partial
@@ -24,7 +24,7 @@ WIDTH, HEIGHT, COUNT = 40, 28, 90
 def camera(
     focal: float = 1.1, centre: tuple[float, float] | None = None, size: tuple[int, int] = (WIDTH, HEIGHT)
 ) -> Camera:
-    """Make a rotated camera; `focal` is in image widths, `centre` in pixels."""
+    """Make a rotated camera. `focal` is the focal length in image widths, `centre` the principal point in pixels."""
     return dataclasses.replace(scenes.camera(*size, centre), fx=focal * size[0], fy=focal * size[0])
 
 
@@ -37,7 +37,11 @@ def surfels(
     aspect: float = 3.0,
     edge_on: float | None = None,
 ) -> list[Tensor]:
-    """Spread surfels over a camera's picture, sized in pixels; normals are random or within `edge_on` radians of edge-on."""
+    """Make `count` surfels at random places in a camera's picture. Returns the rasteriser's input tensors.
+
+    `pixels` is the range of standard deviations in pixels, `depth` the range of depths, `aspect` the largest ratio of the two scales.
+    Normals are random, or with `edge_on`, discs are seen edge-on to within that many radians.
+    """
     rng = np.random.default_rng(0)
     z = rng.uniform(*depth, count)
     at = rng.uniform(0, 1, (count, 2)) * [view.width, view.height]
@@ -74,7 +78,7 @@ def seen(focal: float = 1.1, centre: tuple[float, float] | None = None, **how) -
 
 
 def on_the_camera() -> Found:
-    """Put some surfels at the camera's centre, some within 1e-7 of it and some behind."""
+    """Compare the rasteriser with float64 where surfels lie at the camera's centre, about 1e-7 from it, or behind the camera."""
     view = camera()
     position, *rest = surfels(view)
     here = torch.from_numpy(view.position).float()
@@ -85,7 +89,7 @@ def on_the_camera() -> Found:
 
 
 def towards_the_camera() -> Found:
-    """Compare colour by direction and normals of surfels 0, 1e-7 … 1e5 from the camera."""
+    """Compare view-dependent colours and normals with float64, for surfels at distances 0, 1e-7 … 1e5 from the camera."""
     view, generator = camera(), torch.Generator().manual_seed(0)
     way = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator, dtype=torch.float64), dim=-1)
     distance = torch.tensor([0.0, 1e-7, 1e-3, 1.0, 1e5], dtype=torch.float64).repeat(60)[:, None]
@@ -114,7 +118,7 @@ def across_near() -> Found:
 
 
 def coincident(count: int = 3000) -> Found:
-    """Compare the rasteriser with all surfels in the same place, in different colours."""
+    """Compare the rasteriser with float64 where all surfels lie in the same place, in different colours."""
     view = camera(size=(16, 12))
     one = surfels(view, 1, pixels=(3.0, 3.0), depth=(2.0, 2.0))
     generator = torch.Generator().manual_seed(0)
@@ -125,7 +129,7 @@ def coincident(count: int = 3000) -> Found:
 
 
 def ties() -> Found:
-    """Give all surfels the same depth, bit for bit: they are drawn in their order."""
+    """Compare the rasteriser with float64 where all surfels have exactly the same depth, and are drawn in the order of their index."""
     view = dataclasses.replace(camera(), world_to_camera=np.eye(4))
     position, *rest = surfels(view)
     position[:, 2] = 2.0
@@ -133,9 +137,11 @@ def ties() -> Found:
 
 
 def one_pixel(count: int = 1_000_000) -> Found:
-    """Put all surfels, smaller than a pixel, into one pixel.
+    """Compare the rasteriser with float64 where all surfels lie in one pixel and are smaller than it.
 
-    They lie about its centre: on it, rounding decides between the surfel's distance and the low-pass filter's, both zero."""
+    They lie around the pixel's centre, not on it. There the surfel's distance and the low-pass filter's distance are both zero, and
+    rounding would choose between them.
+    """
     view = camera(size=(3, 3))
     _, rotation, scale, opacity, features = surfels(view, count, pixels=(0.01, 0.38), depth=(1.0, 1.0))
     depth = np.concatenate([np.linspace(1, 2, 20_000), np.linspace(2, 3, count - 20_000)])[:, None]

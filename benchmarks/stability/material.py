@@ -1,4 +1,4 @@
-"""Test shading, prefilter, D-SSIM, activations, optimiser and rays with unusual materials and lights."""
+"""Test shading, prefilter, D-SSIM, activations, optimiser and ray tracing with extreme materials, lights and images."""
 
 from functools import partial
 
@@ -24,9 +24,10 @@ SIDE, RESOLUTION = 32, 16
 
 
 def ball(grazing: float | None = None) -> tuple[Tensor, Tensor, Camera]:
-    """Make normals and positions (H, W, 3), float64, of a ball that fills the image of a far camera.
+    """Make the normals and positions (H, W, 3), float64, and the camera of a ball that fills the image from far away.
 
-    With `grazing`, all normals have this cosine with the view instead."""
+    With `grazing`, all normals have this cosine with the view direction instead.
+    """
     view = Camera("far", SIDE, SIDE, 1e3, 1e3, SIDE / 2 + 0.13, SIDE / 2 - 0.17, np.eye(4))
     y, x = torch.meshgrid(*[(torch.arange(SIDE, dtype=torch.float64) + 0.5) / SIDE * 1.2 - 0.6] * 2, indexing="ij")
     normal = torch.stack([x, y, -torch.sqrt(1 - x**2 - y**2)], dim=-1)
@@ -44,7 +45,7 @@ def ball(grazing: float | None = None) -> tuple[Tensor, Tensor, Camera]:
 
 
 def light(sun: float = 0.0, scale: float = 1.0) -> Tensor:
-    """Make smooth radiance (6·R², 3) with a sun in one texel that the ball mirrors."""
+    """Make smooth radiance (6·R², 3) times `scale`, and add `sun` to one texel that the ball mirrors."""
     way = cubemap.texel_directions(RESOLUTION)
     radiance = scale * torch.exp(0.7 * way + 0.2 * torch.sin(5 * way[:, [1, 2, 0]]))
     radiance[int((way @ torch.tensor([0.3, 0.4, -0.87], dtype=torch.float64)).argmax())] += sun
@@ -60,7 +61,10 @@ def lit(
     scale: float = 1.0,
     kink: bool = False,
 ) -> Found:
-    """Compare shading of a ball whose material is partly given and otherwise random."""
+    """Compare the shading of a ball with float64. Material values that are not given are random.
+
+    `grazing` is explained at `ball`, `sun` and `scale` at `light`, `kink` at `compare.shading`.
+    """
     normal, position, view = ball(grazing)
     generator = torch.Generator().manual_seed(0)
     material = 0.05 + 0.9 * torch.rand(SIDE, SIDE, 5, generator=generator, dtype=torch.float64)
@@ -73,7 +77,10 @@ def lit(
 
 
 def one_sun(radiance: float) -> Found:
-    """Check that the prefilter is linear, both ways: smooth light with a sun gives the float64 sum of the two."""
+    """Check that the prefilter is linear, forward and backward.
+
+    Smooth light with a sun of this radiance must give the sum of the results for the smooth light and for the sun alone.
+    """
     smooth, texel = light(), light(sun=1.0) - light()
     both = (smooth + radiance * texel).requires_grad_()
     found = prefilter(both, RESOLUTION)
@@ -90,7 +97,10 @@ def one_sun(radiance: float) -> Found:
 
 
 def likeness(kind: str) -> Found:
-    """Compare D-SSIM of two images with float64."""
+    """Compare D-SSIM of two images, and its gradient, with float64.
+
+    `kind` names the images: "constant", "black and white", "noise" or "over-exposed".
+    """
     generator = torch.Generator().manual_seed(0)
     image, target = torch.rand(2, 30, 40, 3, generator=generator)
     if kind == "constant":
@@ -109,7 +119,7 @@ def likeness(kind: str) -> Found:
 
 
 def activations() -> Found:
-    """Compare activations of raw values 0 … ±1e4 with float64; within the limits of training no slope is zero."""
+    """Compare activations of raw values 0 … ±1e4 with float64. Check that no slope is zero within the limits of training."""
     raw = torch.tensor([-1e4, -87, -12, -6, -1, 0, 1, 6, 12, 87, 1e4])
     names = ("scale", "opacity", "albedo", "metallic", "roughness")
     empty = {
@@ -138,7 +148,7 @@ def activations() -> Found:
 
 
 def steps(size: float) -> Found:
-    """Compare a hundred steps of Adam on gradients of a given size with torch's in float64."""
+    """Compare a hundred steps of Adam, on random gradients of a given size, with torch's Adam in float64."""
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(1000, generator=generator)
     gradients = size * torch.randn(100, 1000, generator=generator)
@@ -151,7 +161,10 @@ def steps(size: float) -> Found:
 
 
 def rays(scale: float, offset: float) -> Found:
-    """Trace the mirror directions of a hollow, scaled and moved; return the share whose visibility is wrong."""
+    """Trace rays in random directions inside a ball with an opening. Return the share of rays whose visibility is wrong.
+
+    `scale` and `offset` scale and move the ball and the rays.
+    """
     shape = trimesh.creation.icosphere(4)
     open_side = shape.triangles_center[:, 2] < 0.3
     mesh = Mesh(shape.vertices * scale + offset, np.asarray(shape.faces)[open_side][:, ::-1])

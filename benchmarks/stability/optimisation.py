@@ -28,14 +28,17 @@ AT, UNTIL, LONG = 50, 90, 300  # iterations: start and end of a disturbance, len
 def disturbed(
     start: Callable[[Trainer], None], end: Callable[[Trainer], None] | None = None, total: int = TOTAL
 ) -> Found:
-    """Compare a disturbed training with an undisturbed one: dB lost at the end, and when it recovered."""
+    """Train with and without a disturbance. Return the dB lost at the end, and when the disturbed training recovered.
+
+    `start` makes the disturbance at iteration AT; `end`, if given, undoes it at iteration UNTIL.
+    """
     course = train(ball(), total=total, disturb={AT: start} | ({UNTIL: end} if end else {}))
     since = UNTIL if end else AT
     return Found(course.finite, max(0.0, usual(total).end - course.end), course.back_after(since, usual(total)))
 
 
 def faster(factor: float, geometry: bool) -> Callable[[Trainer], None]:
-    """Scale the rates of geometry, or those of light and materials."""
+    """Return a disturbance that multiplies the learning rates of geometry, or those of light and materials, by `factor`."""
 
     def change(made: Trainer) -> None:
         rates = made.state.settings.rates
@@ -51,7 +54,7 @@ def _set(made: Trainer, section: str, values: dict[str, float]) -> None:
 
 
 def heavier(factor: float) -> Callable[[Trainer], None]:
-    """Scale all loss weights but that of D-SSIM, which is a share."""
+    """Return a disturbance that multiplies all loss weights by `factor`, except D-SSIM's, which is a fraction of the colour loss."""
 
     def change(made: Trainer) -> None:
         loss = made.state.settings.loss
@@ -62,7 +65,7 @@ def heavier(factor: float) -> Callable[[Trainer], None]:
 
 
 def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
-    """Make one number of a gradient NaN, once or in every step from now on."""
+    """Return a disturbance that sets one number of a parameter's gradient to NaN, once or in every later step."""
 
     def change(made: Trainer) -> None:
         judge = made.guard.judge
@@ -87,7 +90,7 @@ def nan_value(name: str) -> Callable[[Trainer], None]:
 
 
 def stopped() -> Found:
-    """Make all further gradients NaN: the training returns to the checkpoint, then ends with one line."""
+    """Check that a training whose gradients stay NaN goes back to its checkpoint, then ends with a one-line error."""
     try:
         train(ball(), disturb={AT: nan_gradient("albedo", every=True)})
     except InputError as error:
@@ -101,7 +104,7 @@ def with_settings(*changes: str, total: int = TOTAL) -> Found:
 
 
 def trajectories() -> Found:
-    """Take thirty steps of Adam twice: with the kernels, and in float64.
+    """Take thirty steps of Adam twice: with the float32 kernels, and with the float64 reference.
 
     Returns the difference of the two final pictures, divided by how much the picture changed during the steps.
     """
@@ -158,7 +161,7 @@ def bits(made: Trainer) -> list[Tensor]:
 
 
 def resumed() -> Found:
-    """Stop a training in each stage and resume it; return the share of tensors that differ."""
+    """Stop a training in each stage (see CUTS) and resume it. Return the share of tensors that differ from an uninterrupted training's."""
     whole = trainer(ball(), *STAGES, total=100)
     copies: dict[int, Path] = {}
     for cut, in_stage in CUTS.items():
@@ -186,7 +189,7 @@ def same(whole: Trainer, others: list[Trainer]) -> Found:
 
 
 def threads() -> Found:
-    """Run the same training on one, two and three threads."""
+    """Run the same training on one, two and three threads. Return the share of tensors that differ."""
     before, made = torch.get_num_threads(), []
     try:
         for count in (1, 2, 3):

@@ -1,4 +1,4 @@
-"""Train on unusual captures."""
+"""Train on unusual captures, and compare the held-out PSNR with that of the usual capture."""
 
 import functools
 from collections.abc import Callable
@@ -15,12 +15,12 @@ NOISE = 0.7  # dB: another seed changes less than this (docs/stability.md)
 
 
 def against(course: Course, least: float) -> Found:
-    """Compute by how many decibels the held-out views miss their target."""
+    """Return by how many dB a training's final PSNR on held-out views falls short of `least`; 0 if it does not."""
     return Found(course.finite, max(0.0, least - course.end))
 
 
 def elsewhere(scale: float, offset: float) -> Found:
-    """Train the scene scaled and moved; check that the splats lie at the new place."""
+    """Train on a scaled and moved scene. Check that the splats lie where the scene is, and return how many dB the PSNR changes."""
 
     def pose(matrix: np.ndarray) -> np.ndarray:
         matrix[:3, 3] = scale * matrix[:3, 3] + offset
@@ -47,7 +47,7 @@ def of_these(**how) -> Found:
 
 
 def refused(make: Callable[[], object]) -> Found:
-    """Check that the capture is refused with a one-line error."""
+    """Check that a bad capture is refused with a one-line error. `make` trains on the capture."""
     try:
         make()
     except InputError as error:
@@ -56,7 +56,7 @@ def refused(make: Callable[[], object]) -> Found:
 
 
 def mixed(pixels: np.ndarray, index: int) -> np.ndarray:
-    """Resize every third photo to 24×24 pixels, so that photos differ in size."""
+    """Resize a photo to 24×24 pixels if `index` is 1, 4, 7 …, so that the capture has photos of two sizes."""
     if index % 3 == 0:
         return pixels
     from PIL import Image
@@ -92,7 +92,7 @@ LEAST = "as a picture without detail"
 
 
 def _poor(name: str, photo, least: float, guard: str, total: int = TOTAL) -> Case:
-    """Train on uninformative photos; check that the result has at least so many dB."""
+    """Make a case that trains on uninformative photos. It passes if held-out views reach `least` dB."""
     run = functools.partial(photographed, photo, lambda: least, total)
     return _case(name, run, guard, 0.0, LEAST, f"{least:g} dB")
 

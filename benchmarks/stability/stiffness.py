@@ -1,7 +1,7 @@
 """Measure in float64 how well photos tell light from material.
 
-It takes pairs of changes that may compensate each other. For each pair it computes the singular values of the pictures' Jacobian, and the
-effect of each loss weight on them.
+A change of the light and a change of the material may cancel in the pictures. For each such pair, compute the singular values of the
+pictures' Jacobian, and the effect of each loss weight on the pair.
 """
 
 from collections.abc import Callable
@@ -40,13 +40,19 @@ TRADES = {
 
 
 class Scene(NamedTuple):
-    """Ball under a light; `materials` are base colour, metallic and roughness of its left half, then of its right."""
+    """Describe a ball under a light. `light` maps directions to radiance.
+
+    `materials` are (base colour, metallic, roughness) of the left half and of the right half, or one for both.
+    """
 
     light: Callable
     materials: tuple[tuple[Tensor, float, float], ...]
 
     def radiance(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute the radiance of the light, and its changes by a tint and by a blur of a sixteenth of a face, (6·R², 3) each."""
+        """Compute three maps (6·R², 3): the light's radiance, its change by a tint, and its change by a blur.
+
+        The blur averages neighbouring texels; a texel is a sixteenth of a face's side.
+        """
         base = torch.from_numpy(self.light(cubemap.texel_directions(RESOLUTION).numpy())).float()
         faces = torch.nn.functional.pad(
             base.view(6, RESOLUTION, RESOLUTION, 3).permute(0, 3, 1, 2), (1,) * 4, mode="replicate"
@@ -55,7 +61,7 @@ class Scene(NamedTuple):
         return base, base * torch.tensor([1.0, 0.0, -1.0]), mean - base
 
     def pictures(self, change: Tensor) -> Tensor:
-        """Render the sRGB pictures after the changes (8,), flattened."""
+        """Render all views after the eight changes `change` (8,), as sRGB values in one vector (P,)."""
         normal, position, view = ball()
         base, tint, blur = (prefilter.prefilter(radiance, RESOLUTION).double() for radiance in self.radiance())
         levels = (1 + change[LIGHT]) * base + change[LIGHT_TINT] * tint + change[BLUR] * blur
@@ -87,7 +93,10 @@ class Scene(NamedTuple):
         return torch.stack(columns, dim=1) / (2 * STEP) / len(columns[0]) ** 0.5
 
     def weights(self, change: Tensor) -> dict[str, Tensor]:
-        """Compute each loss term after a change, with the weights of the preset `standard` at the end of a training."""
+        """Compute each weighted loss term after the eight changes `change` (8,).
+
+        The weights are those of the preset `standard` at the end of a training.
+        """
         loss = load_settings("standard").loss
         base, tint, blur = (radiance.double().mean(dim=0) for radiance in self.radiance())
         mean = (1 + change[LIGHT]) * base + change[LIGHT_TINT] * tint + change[BLUR] * blur
@@ -101,7 +110,7 @@ class Scene(NamedTuple):
         }
 
     def derivatives(self, weight: str) -> tuple[Tensor, Tensor]:
-        """Compute the first (8,) and second (8, 8) derivatives of a loss term."""
+        """Compute the first (8,) and second (8, 8) derivatives of a loss term by the eight changes."""
         at = torch.zeros(8).double()
         return tuple(
             derivative(lambda change: self.weights(change)[weight], at)
@@ -124,7 +133,10 @@ SCENES = {
 
 
 def condition(hessian: Tensor) -> str:
-    """Divide the largest eigenvalue by the smallest; "no minimum" if the smallest is negative, "∞" if it is zero."""
+    """Return the condition number of a 2×2 Hessian as text.
+
+    It is "no minimum" if the smaller eigenvalue is negative, and "∞" if that is zero.
+    """
     low, high = torch.linalg.eigvalsh(hessian).tolist()
     if abs(low) < ROUNDING * high:
         return "∞"
@@ -132,7 +144,7 @@ def condition(hessian: Tensor) -> str:
 
 
 def tables() -> list[tuple[str, list[str], list[list[str]]]]:
-    """Make the tables that are printed after the cases: title, headings, rows."""
+    """Make the table of how well each scene tells the changes of each pair apart: title, headings, rows."""
     weights, rows = ("loss.light", "loss.metallic", "loss.matte", "loss.exposure"), []
     for name, scene in SCENES.items():
         jacobian = scene.jacobian()
@@ -165,7 +177,7 @@ def by_autograd() -> Found:
 
 
 def said() -> Found:
-    """Train an all-metal ball; check that the report calls the light's scale ambiguous, but not metallic."""
+    """Train an all-metal ball. Check that the report calls the light's scale and white balance ambiguous, but not the metallic value."""
     trades = ambiguities(train(capture(), total=300).trainer.state)
     right = "what" in trades["light_scale"] and "what" in trades["white_balance"] and "what" not in trades["metal"]
     return Found(all(v["left"] <= v["alone"] for v in trades.values()), 0.0 if right else 1.0)

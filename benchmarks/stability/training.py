@@ -1,4 +1,4 @@
-"""Train a small metal ball, undisturbed or disturbed, for the cases to compare."""
+"""Train on a small metal ball, undisturbed or disturbed, for the stability cases to compare."""
 
 import atexit
 import functools
@@ -50,7 +50,10 @@ def changed(
     photo: Callable[[np.ndarray, int], np.ndarray] = lambda pixels, index: pixels,
     views: int | None = None,
 ) -> Path:
-    """Copy the ball's capture with changed camera-to-world matrices, or changed photos (H, W, 4) in 0..1."""
+    """Copy the ball's capture and return the new folder. Only the first `views` training views are kept.
+
+    `pose` changes each camera-to-world matrix, `photo` changes each photo (H, W, 4) in 0..1, given its index.
+    """
     folder = Path(tempfile.mkdtemp(dir=workspace()))
     for split in ("train", "test"):
         frames = json.loads((ball() / f"transforms_{split}.json").read_text())
@@ -66,7 +69,7 @@ def changed(
 
 
 class Course(NamedTuple):
-    """Finished training: its held-out PSNR in dB by iteration, its warnings, and the trainer."""
+    """Hold a finished training: its held-out PSNR in dB by iteration, its warnings, and the trainer."""
 
     psnr: dict[int, float]
     said: list[str]
@@ -89,7 +92,10 @@ class Course(NamedTuple):
         return self.trainer.state.render(view.camera)
 
     def back_after(self, start: int, undisturbed: "Course") -> int:
-        """Count the iterations from `start` until all later measurements are within BACK of the undisturbed training."""
+        """Count the iterations from `start` until PSNR stays no more than BACK dB below an undisturbed training's.
+
+        Returns NEVER if that is not reached by the end.
+        """
         late = [i for i in self.psnr if i > start and self.psnr[i] < undisturbed.psnr.get(i, undisturbed.end) - BACK]
         return NEVER if late and max(late) == max(self.psnr) else max(late, default=start - LOOK) + LOOK - start
 
@@ -110,7 +116,10 @@ def trainer(
 def train(
     capture: Path, *changes: str, total: int = TOTAL, disturb: dict[int, Callable[[Trainer], None]] | None = None
 ) -> Course:
-    """Train to the end; `disturb` maps iterations to functions that are called before them."""
+    """Train on a capture to the end, and measure the held-out PSNR every LOOK iterations.
+
+    `changes` are settings. `disturb` maps an iteration to a function that is called at that iteration.
+    """
     said: list[str] = []
     made, psnr = trainer(capture, *changes, total=total, said=said), {}
     for end in range(LOOK, total + 1, LOOK):

@@ -35,7 +35,7 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
 
 
 def light_of(path: Path) -> str:
-    """Return the name of the view that the recovered light is right for, or "" for a light that stood still.
+    """Read from cameras.json the name of the view for which the recovered light is right, or "" if the light stood still.
 
     A light that turned with the camera is different in each view.
     """
@@ -111,7 +111,7 @@ def photo_shown(camera: bpy.types.Object | None) -> float:
 
 
 def next_camera(scene: bpy.types.Scene, collection: bpy.types.Collection, steps: int = 1) -> bpy.types.Object:
-    """Step to another camera of a run or a capture: make the one `steps` further in the photos' order the scene's camera.
+    """Make another camera of a run or a capture the scene's camera: the one `steps` further in the order of the photos.
 
     If the old camera shows its photo, the new camera shows its own. Raises InputError where there are no cameras.
     """

@@ -45,7 +45,7 @@ def is_watched(job: jobs.Job) -> bool:
 
 
 def update() -> None:
-    """Put the previews that the thread has read into the scene, and let the thread read the next ones."""
+    """Put the previews that a background thread has read into the scene, and let the thread read the next ones."""
     for live in list(_shown):
         deleted = live.item not in bpy.data.objects
         if live.job.ended or deleted or live.scene not in bpy.data.scenes:

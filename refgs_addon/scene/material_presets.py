@@ -1,4 +1,4 @@
-"""Read and save material presets, as Blender preset files. The add-on brings some, and the artist can save more."""
+"""Read and save material presets, as Blender preset files. The add-on comes with some, and the artist can save more."""
 
 import runpy
 from pathlib import Path

@@ -52,8 +52,9 @@ def training_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
 def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
     """Show the box that limits the training. Make the box if there is none.
 
-    A new box surrounds the ball that the cameras look at, as found by the capture's last check. Without a check the box is 2 m wide
-    around the origin. There the trainer moves that ball, with a radius of 1 m, except for captures in NeRF-Blender's layout.
+    A new box surrounds the ball that the cameras look at, as found by the capture's last check. Without a check the box is 2 m wide around
+    the origin, because the trainer moves that ball there and scales it to a radius of 1 m. Only captures in NeRF-Blender's layout are not
+    moved.
     """
     box = training_region(scene)
     if box is None:

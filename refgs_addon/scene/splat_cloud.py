@@ -252,7 +252,10 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
     reach = np.maximum(np.where(np.isfinite(beside), 64 * beside, 1), 1e-24)
 
     def gather(order: np.ndarray) -> np.ndarray:
-        """Sum over each splat's neighbours, in its tangent plane: w uu, w uv, w vv, w u dn, w v dn."""
+        """Sum products over each splat's neighbours: w·u·u, w·u·v, w·v·v, w·u·dn, w·v·dn.
+
+        u and v are a neighbour's offset in the splat's tangent plane, dn is the difference of the normals along u and v, w is the weight.
+        """
         place, facing_way, *axes, width = (values[order] for values in (position, normal, *tangents, reach))
         found = np.zeros((7, count), np.float32)
         for steps in _STEPS:

@@ -29,7 +29,10 @@ class ShowCameras(OnJob, bpy.types.Operator):
 
 
 def draw_capture(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job) -> None:
-    """Draw some of the photos of a checked capture, and a button that shows its cameras. `job` is the check."""
+    """Draw some of the photos of a checked capture, and a button that shows its cameras.
+
+    `job` is the check, `number` its index in the list of jobs.
+    """
     checked = job.results.get("check", {})
     if "cameras" not in checked:
         return

@@ -68,7 +68,7 @@ class RemoveEdit(_OfEdit, bpy.types.Operator):
 
 
 class SetMaterial(_OfEdit, bpy.types.Operator):
-    """Replace Blender's own preset operator, which cannot be undone."""
+    """Set an edit to the values of a preset. Blender's own operator for presets cannot be undone."""
 
     bl_idname = "refgs.set_material"
     bl_label = "Set Material"

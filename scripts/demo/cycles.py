@@ -16,10 +16,10 @@ VECTORS, SCALARS = ("normal", "albedo"), ("roughness", "metallic", "depth")
 
 
 class Renderer:
-    """Renders one object, square pictures of `size` pixels, 40° wide; Blender's current file is replaced.
+    """Render one object in square pictures of `size` pixels, 40° wide. Blender's current file is replaced.
 
-    Pictures are to be compared: a box filter one pixel wide (a pixel is the mean over its own square), a fixed number of samples, no
-    clamping of bright paths; then Intel's denoiser.
+    The settings suit pictures that are to be compared: a box filter one pixel wide (a pixel is the mean over its own square), a fixed
+    number of samples, and no clamping of bright paths. Then Intel's denoiser runs.
     """
 
     def __init__(self, mesh: Mesh, materials: tuple[Material, ...], size: int, samples: int):
@@ -70,7 +70,7 @@ class Renderer:
         scene.render.image_settings.color_depth = "32"
 
     def set_light(self, path: Path) -> None:
-        """Light the world by this panorama (EXR, linear, Blender's orientation)."""
+        """Light the object by a panorama (EXR, linear, Blender's orientation)."""
         self._panorama.image = bpy.data.images.load(str(path))
 
     def render(self, camera_to_world: np.ndarray, seed: int) -> dict[str, np.ndarray]:

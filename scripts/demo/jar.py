@@ -35,7 +35,7 @@ def build() -> Scene:
 
 
 def _flutes(angle: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Cut sixteen shallow grooves that fade towards both ends of the body."""
+    """Return factors of the radius that cut sixteen shallow grooves. The grooves fade towards both ends of the body."""
     fade = np.clip((z + 0.66) / 0.25, 0, 1) * np.clip((0.09 - z) / 0.2, 0, 1)
     fade = fade * fade * (3 - 2 * fade)
     return 1 + 0.022 * fade * (np.cos(16 * angle) - 1)

@@ -1,4 +1,6 @@
-"""Photograph objects from a command line: `NAME --out DIR` writes a capture with ground truth, `all` each into DIR/NAME.
+"""Photograph objects from a command line: `NAME --out DIR` writes a capture with ground truth.
+
+With `all` in place of NAME, each object's capture is written into DIR/NAME.
 
 Standard output carries JSON lines: {"event": "progress", "done": 3, "total": 104, "what": "train views"}. Blender's own messages go to
 standard error. If the input is wrong, one line says so and the exit status is 2.

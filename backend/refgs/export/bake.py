@@ -82,7 +82,7 @@ def _enlarged_rows(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
 
 
 def _pad(maps: list[np.ndarray], mask: np.ndarray) -> None:
-    """Fill texels outside the mask with the values of the nearest one in it."""
+    """Fill each texel outside the mask with the values of the nearest texel inside it."""
     nearest = distance_transform_edt(~mask, return_distances=False, return_indices=True)
     for rows in _row_blocks(len(mask)):
         for values in maps:

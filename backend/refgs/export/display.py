@@ -19,11 +19,11 @@ DEGREE = 3
 
 
 def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Splats:
-    """Learn harmonics of degree 3 that reproduce the run's renderings, sRGB-encoded, and put them into its splats.
+    """Learn spherical harmonics of degree 3 that reproduce the run's renderings, and put them into its splats.
 
-    Geometry is unchanged. Adam minimises the squared error to renderings of the training cameras under the run's light. Harmonics of
-    degree 3 show mirror images blurred. `progress` is called with the iterations done and their total. A run that learned colour by
-    direction has such harmonics already: its splats are returned.
+    The harmonics are sRGB-encoded colours by direction. Geometry is unchanged. Adam minimises the squared error to renderings of the
+    training cameras under the run's light. Harmonics of degree 3 show mirror images blurred. `progress` is called with the iterations done
+    and their total. A run that learned colour by direction has such harmonics already: its splats are returned.
     """
     splats = run.splats
     if run.environment is None:

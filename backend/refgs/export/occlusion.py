@@ -12,9 +12,9 @@ _CHUNK = 1 << 14  # vertices at a time
 
 
 def openness(mesh: Mesh) -> np.ndarray:
-    """Measure the part (V,) of a uniform light that reaches each vertex past the mesh: glTF's occlusion, 1 where nothing occludes.
+    """Measure the fraction (V,) of a uniform light that reaches each vertex, where the mesh does not block it.
 
-    Rays about the vertex's normal are distributed as the cosine.
+    This is glTF's occlusion: 1 where nothing occludes. Rays about the vertex's normal are distributed as the cosine.
     """
     middle = mesh.vertices.mean(axis=0)  # subtracted, because rays are traced in single precision
     vertices = (mesh.vertices - middle).astype(np.float32)

@@ -18,10 +18,10 @@ PASSES = 3
 
 
 def unshadowed(splats: Splats, surfels: Surfels, mesh: Mesh, light: Environment) -> Splats:
-    """Divide the base colour of matte splats by the received part of the irradiance: direct light past the `mesh`, and light from it.
+    """Divide the base colour of matte splats by the fraction of the irradiance that reaches them.
 
-    Metals are unchanged. Shadows are in the colours if the training traced no mesh. `light` is that of the training; `surfels` are the
-    splats as tensors.
+    That fraction is the direct light that the `mesh` does not block, and the light that the mesh reflects. Metals are unchanged. Shadows
+    are in the colours if the training traced no mesh. `light` is that of the training; `surfels` are the splats as tensors.
     """
     shadowed, occluder = surfels.albedo, Occluder(mesh)
     matt = 1 - surfels.metallic[:, None]

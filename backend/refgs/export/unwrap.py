@@ -53,7 +53,7 @@ def unwrap(mesh: Mesh) -> Mesh:
 
 
 def _parts(mesh: Mesh) -> list[np.ndarray]:
-    """Split the mesh: the face indices of each part."""
+    """Split the mesh into parts of at most PART triangles. Return the face indices of each part."""
     middle, done, left = mesh.vertices[mesh.faces].mean(axis=1), [], [np.arange(len(mesh.faces))]
     while left:
         part = left.pop()

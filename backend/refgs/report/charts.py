@@ -96,7 +96,10 @@ def _draw_errors(axes: Axes, curves: list[Curve], runs: list[str]) -> None:
 
 
 def parts_chart(parts: dict[str, dict[str, float]]) -> str:
-    """Draw a bar for each run: its seconds by part. Returns "" if no run has them."""
+    """Draw a bar for each run, divided into the seconds of each part of the work (see PARTS).
+
+    `parts` maps a run to its seconds by part. Returns "" if it is empty.
+    """
     if not parts:
         return ""
     with _drawing(11.7, 0.9 + 0.42 * len(parts)) as (figure, made):

@@ -99,7 +99,10 @@ def knee(found: Curve) -> int | None:
 
 
 def time_to(found: Curve, error: float) -> float | None:
-    """Seconds until an error was reached, interpolated between logarithms; None if it was not reached."""
+    """Return the seconds until an error was reached, or None if it was not reached.
+
+    The seconds are interpolated between logarithms.
+    """
     reached = np.flatnonzero(found.errors <= error)
     if not len(reached):
         return None

@@ -1,4 +1,4 @@
-"""Name and format figures for the console and the page."""
+"""Name the figures of metrics.json, such as PSNR, and format them for the console and the report page."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +13,7 @@ RELIT = {
 
 
 class Quantity(NamedTuple):
-    """Figure in metrics.json: its key (nested keys joined by dots), its heading, and its format.
+    """Describe a figure of metrics.json: its key (nested keys joined by dots), its heading, and its format.
 
     `better` is max or min, or None where no direction is better.
     """
@@ -75,13 +75,16 @@ def flatten(values: object, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 
 def in_words(metrics: dict, figures: list[Quantity]) -> list[str]:
-    """Format those of the figures that are known, each with its name."""
+    """Format each of the figures that `metrics` contains, together with its heading."""
     known = dict(flatten(metrics))
     return [f"{heading} {text(known[key])}" for key, heading, text, _ in figures if key in known]
 
 
 def relit_pair(figures: dict[str, float], prefix: str) -> str:
-    """Format PSNR and FLIP of relit pictures: raw / after one scale. An example of `prefix` is "relight.studio.mesh"."""
+    """Format PSNR and FLIP of relit pictures: as they are / after one scale aligns them.
+
+    `prefix` is the keys' beginning, such as "relight.studio.mesh".
+    """
     parts = []
     for name, text in (("psnr", "{:.2f}"), ("flip", "{:.3f}")):
         found = [figures.get(f"{prefix}.{name}_{which}") for which in ("raw", "aligned")]
@@ -91,7 +94,7 @@ def relit_pair(figures: dict[str, float], prefix: str) -> str:
 
 
 def relit_in_words(metrics: dict) -> list[str]:
-    """Format a line for each light and each kind of asset lit by it."""
+    """Format a line of PSNR and FLIP for each light, and for each kind of asset relit by it: refgs, splats, mesh."""
     known = dict(flatten(metrics))
     lit = [(hdri, kind) for hdri, kinds in metrics.get("relight", {}).items() for kind in kinds]
     return [

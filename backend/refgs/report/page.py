@@ -268,12 +268,12 @@ def _duration_or_dash(seconds: float | None) -> str:
 
 
 def _parts(page: RunPage) -> dict[str, float]:
-    """Read the seconds by part from the last line of the history that has them."""
+    """Read the seconds of each part of the work from the last line of the history that has them."""
     return next((dict(flatten(line["parts"])) for line in reversed(page.history) if line.get("parts")), {})
 
 
 def _parts_table(parts: dict[str, dict[str, float]]) -> list[dict]:
-    """Make a row for each part: seconds and percentage for each run."""
+    """Make a row for each part of the work (see `charts.PARTS`): seconds and percentage for each run."""
     rows = []
     for name, title in PARTS.items():
         seconds = [spent.get(name, 0.0) for spent in parts.values()]

@@ -29,7 +29,7 @@ def _redder(of: Explanation, size: float) -> Explanation:
 
 
 def _blurred(of: Explanation, size: float) -> Explanation:
-    """Blend the mean of each texel's neighbours into the texel; `size` is the mean's weight.
+    """Blur the light: blend the mean of each texel's neighbours into the texel. `size` is the mean's weight.
 
     Neighbours lie on the same face, up to a sixteenth of the face's side away.
     """

@@ -93,7 +93,8 @@ def _with_relightable_albedo(surfels: Surfels, environment: Environment, state: 
 def _received(surfels: Surfels, environment: Environment, state: State) -> Tensor:
     """Compute irradiance / π of each surfel (N, 3).
 
-    If the light turned with the camera, irradiance is the mean over the photos on the side seen, weighted by the cosine to the camera.
+    If the light turned with the camera, this is a mean over the photos. In each photo the irradiance is that of the surfel's side towards
+    the camera, weighted by the cosine to the camera.
     """
     normals = surfels.normals()
     if environment.reference is None:

@@ -1,4 +1,4 @@
-"""Divide surfels where the picture asks for more, remove faint ones, reset opacities, propagate normals."""
+"""Divide surfels where the picture needs more detail, remove faint ones, reset opacities, propagate normals."""
 
 import math
 from collections.abc import Sequence
@@ -20,12 +20,15 @@ LEAST_SURFELS = 1000
 
 
 def faint_now(state: State, opacity: float = SEEN) -> bool:
-    """Tell whether the last opacity reset is too recent for needed surfels to be back at `opacity`."""
+    """Tell whether surfels may still be faint because of the last opacity reset.
+
+    This ends once surfels that the picture needs have had time to reach `opacity` again.
+    """
     return faint(state.settings.densify, state.settings.rates, state.iteration, state.total, opacity)
 
 
 def densify_due(state: State, progress: float) -> None:
-    """Remove and divide surfels at the iterations that are due for it."""
+    """Remove faint surfels and divide others, if this iteration is scheduled for it."""
     settings, budget = state.settings.densify, state.settings.surfels.budget
     if state.iteration % settings.every or progress < settings.start or faint_now(state, settings.prune_opacity):
         return
@@ -54,7 +57,7 @@ def since_propagation(state: State) -> int | None:
 
 
 def reshape_due(state: State) -> None:
-    """Propagate normals or reset opacities at the iterations that are due for it."""
+    """Propagate normals or reset opacities, if this iteration is scheduled for it."""
     settings, iteration = state.settings.densify, state.iteration
     if since_propagation(state) == 0:
         with state.clock.part("densification"):
@@ -109,10 +112,10 @@ def reset_opacity(parameters: Parameters, optimizer: Adam) -> None:
 
 
 def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total: int, opacity: float) -> bool:
-    """Tell whether the last opacity reset is too recent for needed surfels to be back at `opacity`.
+    """Tell whether surfels may still be faint because of the last opacity reset before `iteration`.
 
-    Adam moves a logit by about its rate in each iteration that sees the surfel, and the rate decays. Surfels get four times as long as
-    this takes.
+    This ends once surfels that the picture needs have had time to reach `opacity` again. Adam moves a logit by about its rate in each
+    iteration that sees the surfel, and the rate decays. Surfels get four times as long as this takes.
     """
     every = settings.reset_every
     last = min(iteration, math.ceil(settings.stop * total)) - 1  # a reset at the end of this iteration does not count

@@ -21,7 +21,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Effective:
-    """Hold the settings that a training goes by.
+    """Hold a training's settings in effect, and how each came to differ from the setting that was asked for.
 
     The user's own settings are in `asked` and never change.
     """
@@ -36,20 +36,20 @@ class Effective:
         return cls(asked, asked)
 
     def changed(self, key: str, value: Any, by: By, why: str) -> "Effective":
-        """Change one setting, given by its key `section.name`."""
+        """Return a copy in which one setting, given by its key `section.name`, is changed. The copy records the cause and the reason."""
         section, name = key.split(".")
         table = getattr(self.settings, section).model_copy(update={name: value})
         return self.moved_to(self.settings.model_copy(update={section: table}), by, why)
 
     def noted(self, key: str, value: Any, by: By, why: str) -> "Effective":
-        """Record the change of a number without changing `settings`.
+        """Return a copy that records the change of a number, without changing `settings`.
 
         The training's state holds this number itself, such as how many iterations there are.
         """
         return replace(self, changes=self.changes | {key: Change(_numbers(self.asked)[key], value, by, why)})
 
     def moved_to(self, settings: Settings, by: By, why: str) -> "Effective":
-        """Take other settings, and record each setting that differs as a change."""
+        """Return a copy with other settings. The copy records each setting that differs as a change."""
         asked, before, after = (_numbers(s) for s in (self.asked, self.settings, settings))
         changes = {key: Change(asked[key], value, by, why) for key, value in after.items() if value != before[key]}
         return replace(self, settings=settings, changes=self.changes | changes)
@@ -59,7 +59,7 @@ class Effective:
         return {key: f"{change.became}: {change.why}" for key, change in self.changes.items() if change.by == "photos"}
 
     def rows(self) -> dict[str, dict[str, Any]]:
-        """List the settings whose value in effect differs from the value asked for: the table [changed] of run.toml."""
+        """List the settings that were changed, with the value asked for and the new value: the table [changed] of run.toml."""
         return {key: asdict(change) for key, change in self.changes.items()}
 
 

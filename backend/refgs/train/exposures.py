@@ -1,4 +1,4 @@
-"""Stop learning the photos' exposures, one number a view, where the photos have no exposures of their own."""
+"""Stop learning an exposure for each photo, if the photos turn out to have equal exposures."""
 
 import math
 
@@ -14,7 +14,7 @@ ALIKE = math.log(2) / 3
 
 @torch.no_grad()
 def leave_out_alike(state: State, progress: float) -> None:
-    """Stop learning exposures once they are known to agree, if the setting `light.exposure` is "auto"."""
+    """Stop learning exposures if they have converged to equal values, and the setting `light.exposure` is "auto"."""
     settings = state.settings
     if state.exposures is None or settings.light.exposure != "auto" or state.initial:
         return

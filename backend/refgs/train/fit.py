@@ -18,12 +18,12 @@ STEPS, MOST = 64, 2.0  # steps in which settings richer than quick are tried, an
 
 
 def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, device: str, report: Report) -> Trainer:
-    """Make a trainer of a capture. Its settings fit into the time of `plan`.
+    """Make a trainer for a capture. Its settings are chosen to fit into the time of `plan`.
 
     All numbers are interpolated geometrically between the presets `quick` and `standard`, and extrapolated as far again beyond `standard`.
     If the time is too short for `quick`, or longer than the richest settings take, the number of iterations changes instead.
 
-    A rehearsal measures the pace: some iterations with `quick`. If the trainer keeps the settings of `quick`, the rehearsal's iterations
+    Some iterations with `quick`, the rehearsal, measure the pace. If the trainer keeps the settings of `quick`, the rehearsal's iterations
     are the training's first.
     """
     quick, standard = (load_settings(preset, changes) for preset in ("quick", "standard"))
@@ -78,7 +78,10 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
 
 
 def between(quick: Settings, standard: Settings, part: float) -> Settings:
-    """Interpolate two presets geometrically, or extrapolate; the cubemap's side is rounded down to a power of two."""
+    """Interpolate two presets geometrically: `part` 0 is `quick`, 1 is `standard`, more extrapolates.
+
+    The cubemap's side is rounded down to a power of two.
+    """
     tables, ends = quick.model_dump(), standard.model_dump()
     for section, values in tables.items():
         for name, value in values.items():

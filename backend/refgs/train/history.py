@@ -25,7 +25,7 @@ def due(iteration: int) -> bool:
 
 
 def allowed(iteration: int, total: int, seconds: float) -> float:
-    """Return how many seconds measuring may have taken before this iteration.
+    """Return how many seconds measuring errors may have taken in total before this iteration, `seconds` after the start.
 
     Measuring may take SHARE of the training's expected time. This time is spread evenly over the history's lines, which are evenly spaced
     by the iteration's logarithm.

@@ -47,7 +47,7 @@ def resolution(settings: Settings, progress: float) -> int:
 
 @torch.no_grad()
 def refine_due(state: State, progress: float) -> None:
-    """Double the texels along a side at the iteration that is due for it."""
+    """Double the cubemap's texels along a side, once the training is far enough for it (see `resolution`)."""
     if not state.method.lit or len(state.light) >= 6 * resolution(state.settings, progress) ** 2:
         return
     side = math.isqrt(len(state.light) // 6)
@@ -58,7 +58,7 @@ def refine_due(state: State, progress: float) -> None:
 
 @torch.no_grad()
 def coarsen(state: State, side: int) -> None:
-    """Average the texels, so that `side` of them are left along a side."""
+    """Reduce the cubemap to `side` texels along a side by averaging texels."""
     fine = math.isqrt(len(state.light) // 6) // side
     _replace(state, state.light.view(6, side, fine, side, fine, 3).mean(dim=(2, 4)).reshape(-1, 3))
 
@@ -92,7 +92,7 @@ def diffuse(state: State) -> None:
 def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
     """Average the light's radiance (3,) over the directions that the object mirrors.
 
-    Returns None if the loss has no term that keeps this mean grey.
+    Returns None if the loss has no term on this mean. The term pulls the mean towards grey.
     """
     if light is None or state.settings.loss.light == 0:
         return None
@@ -106,7 +106,7 @@ def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
 def mirrored(
     surfels: Surfels, cameras: list[Camera], light: Environment, settings: RenderSettings, near: float
 ) -> Tensor:
-    """Weigh the light's texels (6·R²,) by solid angle if a camera sees them mirrored, by zero otherwise.
+    """Return weights (6·R²,) of the light's texels: the solid angle if a camera sees the texel mirrored, else zero.
 
     The weights sum to one. If no texel is seen, all texels count.
     """

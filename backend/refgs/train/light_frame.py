@@ -87,7 +87,7 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
 
 
 def _in_front(camera: Camera, positions: np.ndarray, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tell which of the points `some` are in the picture.
+    """Tell which of the points with indices `some` are in the picture.
 
     Return also how far each point is behind the foremost point at its pixel.
     """

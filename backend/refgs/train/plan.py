@@ -13,9 +13,9 @@ MIRRORED = 1.2  # factor of an iteration's time for inter-reflection: 1 without,
 
 
 def iterations_time(growth: float, progress: float) -> float:
-    """Integrate the time of iterations up to a progress of 0..1.
+    """Compute the relative time of all iterations up to a progress of 0..1.
 
-    An iteration takes 1 at first and `growth` at the end.
+    The time of an iteration is 1 at first and grows to `growth` at the end. All iterations would take 1 if it did not grow.
     """
     first, last = GROWS
     ramp = min(max(progress - first, 0.0), last - first)
@@ -46,7 +46,7 @@ class Plan:
         return self.before + time.perf_counter() - self._begun
 
     def wait(self, seconds: float) -> None:
-        """Leave out the seconds of a pause."""
+        """Exclude the seconds of a pause from the time spent."""
         self._begun += seconds
 
     def begin(self, iteration: int, growth: float) -> None:
@@ -57,7 +57,7 @@ class Plan:
         self._growth, self._marks = growth, [(iteration, self.spent)]
 
     def total(self, iteration: int, views: int) -> int | None:
-        """Plan the total number of iterations from the pace until now. Return None at iterations that do not plan.
+        """Plan the total number of iterations from the pace until now. Return None at iterations where no plan is due.
 
         `views` is the number of photos, all of which are rendered for the asset.
         """

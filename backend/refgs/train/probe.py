@@ -1,4 +1,4 @@
-"""Measure what pictures lose without a part of the method, and what time an iteration saves.
+"""Measure what pictures lose without a part of the method, and how much time an iteration saves without it.
 
 `refgs.train.needs` decides by these figures. All are of training views, at the time of the call. Decibels are computed from the mean
 squared error over all views looked at.
@@ -28,7 +28,7 @@ Change = Callable[[RenderInputs], RenderInputs]
 
 
 def pooled(environment: Environment, side: int) -> Environment:
-    """Average the light's texels, so that `side` of them are left along a side."""
+    """Reduce the light's cubemap to `side` texels along a side by averaging texels."""
     fine = environment.resolution // side
     texels = environment.radiance.reshape(6, side, fine, side, fine, 3).mean(dim=(2, 4))
     return Environment(texels.reshape(-1, 3), environment.reference)
@@ -74,14 +74,14 @@ def squared_errors(state: State, inputs: RenderInputs) -> list[float]:
 
 @torch.no_grad()
 def psnr_loss(state: State, change: Change) -> float:
-    """Compute how many dB of PSNR the training views lose by a change."""
+    """Compute how many dB of PSNR the training views lose by a change of what they are rendered from."""
     inputs = state.inputs()
     return decibels_lost(squared_errors(state, inputs), squared_errors(state, change(inputs)))
 
 
 @torch.enable_grad()
 def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: bool = False) -> float:
-    """Time an iteration without and with a change. Return the seconds saved in the iterations that are left.
+    """Time an iteration without and with a change. Return the seconds that the change saves in all iterations that are left.
 
     If `whole` is true, the first timing is of the whole photo, the second of the part that is trained on. The optimiser's step is left out
     of both.
@@ -104,8 +104,8 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
 def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: list[Tensor] | None = None) -> Tensor:
     """Compute each surfel's blending weight in each photo, summed over the photo's pixels (V, N).
 
-    If `maps` (H, W, C) of the photos are given, return each surfel's mean of the maps by that weight instead (N, C). Both are gradients of
-    a sum of constant features.
+    If `maps`, a map (H, W, C) for each photo, are given, return each surfel's mean of the maps by that weight instead (N, C). The weights
+    are computed as the gradient of a blended constant feature.
     """
     surfels, count, rows = Surfels(*(value.detach() for value in surfels)), len(surfels.positions), []
     width = 1 if maps is None else maps[0].shape[-1] + 1

@@ -1,4 +1,4 @@
-"""Set the learning rates of an iteration: decay them, and hold parameters still at some stages."""
+"""Set the learning rates of an iteration: decay them, and freeze some parameters in some stages of the training."""
 
 from refgs.train.densify import since_propagation
 from refgs.train.start import GEOMETRY
@@ -30,7 +30,7 @@ def _start_rate(state: State, name: str) -> float:
 
 
 def _frozen(state: State, progress: float) -> set[str]:
-    """List the parameters that hold still at this iteration."""
+    """List the parameters that do not learn at this iteration."""
     settings, frozen = state.settings, set()
     if state.from_hull and state.iteration < settings.train.light_first and state.method.deferred:
         frozen |= {*GEOMETRY}

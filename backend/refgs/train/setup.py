@@ -1,6 +1,6 @@
 """Set up a training: photos, the light's frame, surfels, the optimiser.
 
-Surfels are set up anew for the deferred stage.
+Reset colour, material and light when the training begins to shade pixels instead of surfels.
 """
 
 from pathlib import Path
@@ -38,7 +38,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
 
 
 def _choose_light_frame(state: State, start: Parameters, shown: int) -> None:
-    """Choose the light's frame from the photos, if the settings leave it to them.
+    """Choose the light's frame, the world's or the camera's, from the photos, if the settings leave it to them.
 
     The first `shown` of the initial surfels lie on the visual hull.
     """
@@ -78,7 +78,7 @@ def _start_learning(state: State) -> None:
 
 
 def _set_constants_aside(state: State) -> None:
-    """Move parameters that the shading never reads to the constants, where each has one row for all surfels."""
+    """Move parameters that the shading never reads to the constants. A constant has one row for all surfels."""
     method, diffuse = state.method, state.settings.render.diffuse
     unused = [*method.unread]
     if method.lit and diffuse == "irradiance":
@@ -96,9 +96,9 @@ def _set_constants_aside(state: State) -> None:
 
 @torch.no_grad()
 def start_deferred(state: State) -> None:
-    """End the first stage, in which surfels are shaded one by one.
+    """Start the deferred stage, in which pixels are shaded after blending. The first stage shades each surfel by itself.
 
-    Colour, material and light start anew on this stage's geometry (paper §3.3).
+    Colour, material and light are learned anew on the first stage's geometry (paper §3.3).
     """
     state.initial = False
     for name, row in start_appearance(state.settings).items():

@@ -130,7 +130,7 @@ def _thinned(capture: Capture, count: int, seed: int):
 
 
 def _random(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """Place points at random, uniform in the ball of interest, or in the region to train if there is one.
+    """Place points at random, uniform in the ball that the cameras look at, or in the region to train if there is one.
 
     In a room, or around a region, some points lie farther out, uniform in inverse distance.
     """

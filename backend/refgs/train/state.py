@@ -103,14 +103,14 @@ class State:
 
     @property
     def losses(self) -> LossSettings:
-        """Return the objective's weights. Matte surfels have no metallic or roughness, so these terms weigh nothing for them."""
+        """Return the loss weights. Without specular shading, the terms on metallic and roughness have the weight 0."""
         weights = self.settings.loss
         if self.settings.render.reflection == "none":
             return weights.model_copy(update={"even": 0.0, "metallic": 0.0, "matte": 0.0})
         return weights
 
     def surfels(self) -> Surfels:
-        """Activate the surfels. A parameter that does not learn has one value for all surfels."""
+        """Compute the surfels from their raw parameters. A parameter that does not learn has one value for all surfels."""
         count, late = len(self.parameters["position"]), self.residual_start
         values = activate({**self.parameters, **self.constant})
         unlearned = late == 1 or self.iteration < late * self.total
@@ -147,7 +147,7 @@ class State:
         return self.photos[view] if whole or self.crops is None else self.photos[view].part(*self.crops[view])
 
     def exposure(self, view: int) -> Tensor | None:
-        """Return the factor of a photo's radiance. Return None where photos have no exposures of their own."""
+        """Return a photo's exposure, a factor of its radiance. Return None where exposures are not learned."""
         return None if self.exposures is None else self.exposures[view].exp()
 
     def spread_cameras(self, least: int) -> list[Camera]:

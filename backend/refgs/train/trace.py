@@ -36,7 +36,7 @@ def why_not_traced(state: State) -> str:
 
 
 def trace_due(state: State, progress: float) -> None:
-    """Extract a new mesh and trace inter-reflection on it, if it is time for one."""
+    """Extract a new mesh and trace inter-reflection on it, if this iteration is scheduled for it."""
     settings = state.settings.indirect
     # Materials would no longer adapt to a mesh that is made after the residual has started to learn.
     learns = settings.start <= progress < state.residual_start

@@ -1,4 +1,4 @@
-"""Train by iterations of one view and one step. At stated iterations refine, decide, divide and record."""
+"""Train by iterations of one view and one step. At some iterations also refine the light, decide needs, divide surfels, record errors."""
 
 import time
 from collections.abc import Callable

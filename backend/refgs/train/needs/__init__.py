@@ -69,9 +69,9 @@ def evaluate_iteration(state: State, progress: float) -> None:
 
 
 def evaluate_mesh(state: State, hidden: float) -> None:
-    """Decide whether inter-reflection is needed, unless that is decided already.
+    """Decide whether inter-reflection is needed. If that is not decided now, only report how much the object mirrors itself.
 
-    Otherwise say how much the object mirrors itself. `hidden` is the part of the object's pixels that mirror the object.
+    `hidden` is the part of the object's pixels that mirror the object.
     """
     if not evaluate_due(state, "mesh", hidden):
         state.announce("reflections", f"with {Reflections.what}: {share_hidden(hidden)}")

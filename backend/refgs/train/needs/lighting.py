@@ -49,7 +49,7 @@ class Reflections(Need):
 
 
 def share_hidden(hidden: float) -> str:
-    """Say in words on what part of its pixels the object mirrors itself."""
+    """Describe in words on what part of its pixels the object mirrors itself."""
     return f"the object mirrors itself on {hidden:.1%} of it"
 
 
@@ -116,9 +116,10 @@ def resolvable(roughness: float, part: float, finest: int, coarsest: int) -> int
 
 
 class Degrees(Need):
-    """Decide whether the scene needs all degrees of harmonics.
+    """Decide whether the scene needs all degrees of spherical harmonics.
 
-    There are harmonics of the colour by direction that material and light leave over, and of the light that the object sends itself.
+    Two colours by direction are learned as harmonics: the one that material and light leave over, and the object's light that it mirrors
+    itself.
     """
 
     name, what = "degrees", "all degrees of harmonics"
@@ -163,6 +164,6 @@ class Degrees(Need):
 
 
 def _shortened(inputs: RenderInputs, field: str, count: int) -> RenderInputs:
-    """Keep only the first `count` coefficients of a field."""
+    """Keep only the first `count` harmonic coefficients of a field of the surfels, such as `sh_rest`."""
     values = {field: getattr(inputs.surfels, field)[:, :count]}
     return inputs._replace(surfels=inputs.surfels._replace(**values))
