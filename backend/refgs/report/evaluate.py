@@ -122,19 +122,13 @@ def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[
     write("environment_truth", true)
     error, scale = metrics.environment_log_rmse(light, true)
     figures: dict[str, float] = {"log_rmse": error, "scale": scale}
-    lights = metrics.lights_error(light, true)
-    if lights is not None:
+    if (lights := metrics.lights_error(light, true)) is not None:
         figures |= {"lights_degrees": lights[0], "lights": lights[1]}
     return {"environment": figures}
 
 
 def _measure_relit(
-    run: Run,
-    hdri: str,
-    cameras: list[Camera],
-    truth: GroundTruth,
-    pictures: Path,
-    next_step: Callable[[str], None],
+    run: Run, hdri: str, cameras: list[Camera], truth: GroundTruth, pictures: Path, next_step: Callable[[str], None]
 ) -> dict[str, float]:
     """Measure views under another light, and write pictures of the renderings and of the truth."""
     light = run.light(truth.panorama(f"relight/{hdri}"))
