@@ -10,6 +10,7 @@ from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import edited_materials, export_splats
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.splat_cloud import read_constants
+from tests.makers.blender import principled
 
 MATTE = {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
 
@@ -27,11 +28,8 @@ def say_once(folder, constants):
 
 
 def attributes(material):
-    return {node.attribute_name for node in material.node_tree.nodes if node.type == "ATTRIBUTE"}
-
-
-def principled(material):
-    return next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+    """List the names that a material's Attribute nodes read."""
+    return [node.attribute_name for node in material.node_tree.nodes if node.type == "ATTRIBUTE"]
 
 
 @pytest.mark.parametrize("constants", [MATTE, {"metallic": 1.0}, {}])
@@ -39,7 +37,7 @@ def test_the_material_reads_what_varies_alone(constants, run_folder, scene):
     say_once(run_folder, constants)
     run = import_run(run_folder, scene)
     material = run.splats.data.materials[0]
-    assert {"metallic", "roughness"} & attributes(material) == {"metallic", "roughness"} - {*constants}
+    assert {"metallic", "roughness"} & {*attributes(material)} == {"metallic", "roughness"} - {*constants}
     inputs = principled(material).inputs
     for name, socket in (("metallic", "Metallic"), ("roughness", "Roughness"), ("specular", "Specular IOR Level")):
         if name in constants:
@@ -54,9 +52,8 @@ def test_an_edit_has_it_read_all(run_folder, scene):
     add_edit(run.collection, "Everywhere", "Gold")
     add_edit(run.collection, "Box", "Gold")
     material = run.splats.data.materials[0]
-    assert {"metallic", "roughness", "edit_amount"} <= attributes(material)
-    assert principled(material).inputs["Specular IOR Level"].links
-    assert sum(node.type == "ATTRIBUTE" and node.attribute_name == "metallic" for node in material.node_tree.nodes) == 1
+    assert {"metallic", "roughness", "edit_amount"} <= {*attributes(material)}
+    assert principled(material).inputs["Specular IOR Level"].links and attributes(material).count("metallic") == 1
     new = edited_materials(run.splats)
     assert (new["metallic"] == 1).all() and (new["roughness"] < 1).all()
 

@@ -6,7 +6,6 @@ import bpy
 import numpy as np
 import pytest
 
-from refgs_addon import ui
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.panorama_world import IMAGE, ROTATION, STRENGTH
 from refgs_addon.scene.import_run import import_run
@@ -75,24 +74,20 @@ def test_blenders_own_and_the_artists_hdris_are_at_hand(scene, tmp_path):
     assert hdris(tmp_path / "not there") == hdris()
 
 
-def test_the_chooser_says_and_sets_what_lights_the_scene(run_folder, scene, monkeypatch, tmp_path):
+def test_the_chooser_says_and_sets_what_lights_the_scene(run_folder, addon, monkeypatch, tmp_path):
     write_panorama(tmp_path / "my room.exr", np.ones((8, 16, 3)))
     monkeypatch.setattr(light_panel, "hdri_folder", lambda: tmp_path)
-    ui.register()
-    try:
-        manager = bpy.context.window_manager
-        assert manager.refgs_light == "OTHER"
-        manager.refgs_light = str(hdris()[0])
-        assert scene.world.node_tree.nodes[IMAGE].image.name == hdris()[0].name  # in a new world
-        import_run(run_folder, scene)
-        assert manager.refgs_light == "RECOVERED"
-        nodes = scene.world.node_tree.nodes
-        nodes[STRENGTH].inputs["Strength"].default_value = 2.0
-        manager.refgs_light = str(tmp_path / "my room.exr")
-        assert nodes[IMAGE].image.name == "my room.exr" and manager.refgs_light == str(tmp_path / "my room.exr")
-        assert nodes[STRENGTH].inputs["Strength"].default_value == 2.0
-        manager.refgs_light = "RECOVERED"
-        assert nodes[IMAGE].image.name == "environment.exr"
-        assert nodes[STRENGTH].inputs["Strength"].default_value == 1.0
-    finally:
-        ui.unregister()
+    manager = bpy.context.window_manager
+    assert manager.refgs_light == "OTHER"
+    manager.refgs_light = str(hdris()[0])
+    assert addon.world.node_tree.nodes[IMAGE].image.name == hdris()[0].name  # in a new world
+    import_run(run_folder, addon)
+    assert manager.refgs_light == "RECOVERED"
+    nodes = addon.world.node_tree.nodes
+    strength = nodes[STRENGTH].inputs["Strength"]
+    strength.default_value = 2.0
+    manager.refgs_light = str(tmp_path / "my room.exr")
+    assert nodes[IMAGE].image.name == "my room.exr" and manager.refgs_light == str(tmp_path / "my room.exr")
+    assert strength.default_value == 2.0
+    manager.refgs_light = "RECOVERED"
+    assert nodes[IMAGE].image.name == "environment.exr" and strength.default_value == 1.0

@@ -44,8 +44,9 @@ def test_the_surfels_come_change_and_go(job, scene, tmp_path):
     preview(job, tmp_path, 20, 50)
     until(lambda: len(item.data.points) == 50)
     assert clouds() == [item] and len(bpy.data.pointclouds) == 1 and len(item.data.materials) == 1
+    preview(job, tmp_path, 30, 30)
     (tmp_path / "30.ply").write_bytes(b"half")  # an unreadable preview is skipped
-    job.preview = {"iteration": 30, "splats": str(tmp_path / "30.ply")}
+    live_splats.update()
     preview(job, tmp_path, 40, 20)
     until(lambda: len(item.data.points) == 20)
     job.state = "done"

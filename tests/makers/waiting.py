@@ -13,3 +13,9 @@ def until(condition: Callable[[], object], seconds: float = 30) -> None:
         assert time.monotonic() < end, [(job.name, job.state, job.line) for job in jobs.JOBS]
         jobs.poll()
         time.sleep(0.005)
+
+
+def final_state(job: jobs.Job) -> str:
+    """Wait until a job has ended, and return its state."""
+    until(lambda: job.ended)
+    return job.state
