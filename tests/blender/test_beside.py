@@ -12,7 +12,7 @@ from refgs_addon.errors import InputError
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.render_process import render_in_background
 from tests.makers.runs import write_panorama
-from tests.makers.waiting import until
+from tests.makers.waiting import final_state, until
 
 
 @pytest.fixture(autouse=True)
@@ -41,8 +41,7 @@ def test_what_cannot_be_rendered_is_said_in_one_line(run_folder, scene, tmp_path
     with pytest.raises(InputError, match="its folder does not exist"):
         render_in_background(scene, tmp_path / "not there" / "a.png")
     job = render_in_background(scene, tmp_path / "a.png", [tmp_path / "missing.exr"], size=8, samples=1)
-    until(lambda: job.ended, 120)
-    assert job.state == "failed" and "cannot read the light" in job.line
+    assert final_state(job, 120) == "failed" and "cannot read the light" in job.line
 
 
 def test_it_ends_when_it_is_put_away(run, scene, tmp_path):
@@ -50,5 +49,4 @@ def test_it_ends_when_it_is_put_away(run, scene, tmp_path):
     until(lambda: job.state == "running", 120)
     time.sleep(0.2)
     job.stop()
-    until(lambda: job.ended, 60)
-    assert job.state == "cancelled" and not (tmp_path / "a.png").exists()
+    assert final_state(job, 60) == "cancelled" and not (tmp_path / "a.png").exists()

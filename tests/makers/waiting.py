@@ -15,7 +15,7 @@ def until(condition: Callable[[], object], seconds: float = 30) -> None:
         time.sleep(0.005)
 
 
-def final_state(job: jobs.Job) -> str:
-    """Wait until a job has ended, and return its state."""
-    until(lambda: job.ended)
+def final_state(job: jobs.Job, seconds: float = 30) -> str:
+    """Wait until a job has ended, and return its state; fail after `seconds`."""
+    until(lambda: job.ended, seconds)
     return job.state
