@@ -11,7 +11,7 @@ from refgs.clock import Clock, timed
 
 @pytest.fixture
 def time(monkeypatch):
-    """Replace the clock's time by a fake one, whose `now` the test advances."""
+    """Replace the module `time` that the clock uses. The test advances the fake's `now`, in seconds."""
     fake = SimpleNamespace(now=0.0, perf_counter=lambda: fake.now)
     monkeypatch.setattr(clock, "time", fake)
     return fake

@@ -1,4 +1,4 @@
-"""Test the release zips, with the trainer's wheel and uv in them, and an installation, which downloads gigabytes."""
+"""Test the zips that are released, which hold the trainer's wheel and uv, and install from one, which downloads gigabytes."""
 
 import platform
 import subprocess
@@ -48,9 +48,9 @@ def test_the_zips(archives):
 
 @pytest.mark.timeout(3000)
 def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
-    """A released zip installs a working trainer by the real uv, and removes it again.
+    """Check that a released zip installs a working trainer by the real uv, and removes it again.
 
-    It uses this machine's Python, and torch from the package index because a mirror may have no other.
+    The installation uses this machine's Python and the package index's torch, because a mirror may have no other.
     """
     monkeypatch.setenv("UV_PYTHON_PREFERENCE", "only-system")
     monkeypatch.setenv("UV_TORCH_BACKEND", "")

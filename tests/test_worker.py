@@ -29,7 +29,7 @@ PATIENCE = 120  # seconds
 
 
 class Talk:
-    """Worker process and the events that it has sent."""
+    """Start a worker process, send it commands, and collect the events that it sends."""
 
     def __init__(self):
         pipe = subprocess.PIPE
@@ -70,7 +70,7 @@ def talk():
 
 
 def train(capture, run, *changes) -> dict:
-    """Return the arguments of a small training."""
+    """Return the fields of a command `train` that starts a small training."""
     return {"capture": str(capture), "out": str(run), "preset": "quick", "settings": [*SMALL, *changes]}
 
 
@@ -82,7 +82,7 @@ def run(talk, ball_capture, tmp_path):
 
 
 def test_jobs_one_after_another(talk, ball_capture, tmp_path):
-    """Jobs run in order. A wrong command is answered by one line and does not affect the next job."""
+    """Check that jobs run in order, and that a wrong command is answered by one line and does not affect the next job."""
     run = tmp_path / "größe 'a'"
     talk.tell("check", capture=str(ball_capture))
     talk.tell("check", capture=str(ball_capture), out=str(tmp_path / "found"))
@@ -139,7 +139,7 @@ def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture
 
 
 def test_photos_without_cameras(talk, tmp_path):
-    """The check reports photos without cameras. The search for their cameras can be interrupted and repeated."""
+    """Check that photos without cameras are reported, and that the search for their cameras can be interrupted and repeated."""
     for number in range(4):
         noise = np.random.default_rng(number).integers(0, 255, (96, 128, 3), np.uint8)
         cv2.imwrite(str(tmp_path / f"{number}.png"), noise)
@@ -180,7 +180,7 @@ def free(run) -> bool:
 
 
 def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
-    """A training with `keep` goes on after both pipes are closed, even if it was paused: it ends, and its mesh is exported."""
+    """Check that a training with `keep` runs to its end after both pipes are closed, even if it was paused, and exports its mesh."""
     run = tmp_path / "run"
     small = train(ball_capture, run, "train.iterations=60", "mesh.resolution=32", "mesh.triangles=500")
     commands = [
@@ -202,7 +202,7 @@ def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
 
 
 def test_what_waits_goes_with_the_input(talk, run):
-    """If the input is closed right after `stop`, the worker writes the surfels and drops the export that was waiting."""
+    """Check that a worker whose input is closed right after `stop` writes the surfels and drops the export that was waiting."""
     talk.tell("export", run=str(run), texture=64)
     talk.until("progress")
     talk.tell("stop")
@@ -221,7 +221,7 @@ def test_a_training_that_is_kept_no_longer(talk, run):
 
 
 def test_a_folder_that_is_trained_in(talk, ball_capture, run):
-    """While a process trains a run, another process cannot train it, but can read its progress and stop it.
+    """Check that while a process trains a run, another cannot train it, but can read its progress and stop it.
 
     After the process is killed, the run can be trained again.
     """

@@ -1,4 +1,4 @@
-"""Test that the trainer is installed and removed, with a fake uv."""
+"""Test that the add-on installs and removes the trainer. A fake stands in for the package installer uv."""
 
 import json
 import os
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def home(tmp_path, monkeypatch):
-    """Return a folder to install into. The add-on gets a bundled trainer and the fake uv."""
+    """Return the folder that the trainer is installed into. The add-on gets the wheels of a fake trainer and a fake uv."""
     monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     yield tmp_path / "user" / "trainer"
     jobs.stop_all()

@@ -35,7 +35,7 @@ def test_a_training_to_its_end(start, tmp_path):
 
 
 def test_one_that_is_silent_is_not_waited_for(tmp_path):
-    """Check that polling a job whose process has closed its output, but still runs, does not block the window."""
+    """Check that `poll` returns at once for a job whose process still runs but has closed its output."""
     ends_with_its_input = "import os, sys; print('{}', flush=True); os.close(1); sys.stdin.read(); os._exit(3)"
     arguments, commands = ("-c", ends_with_its_input), [{"command": "rest"}]
     job = jobs._add(jobs.Job("slow", Path(sys.executable), commands, tmp_path / "log.txt", arguments=arguments))
@@ -123,7 +123,7 @@ time.sleep(600)
 
 @pytest.fixture
 def killed(python, tmp_path):
-    """Start a second Blender that trains, kill it, and return the run folder."""
+    """Return a function that starts a process like Blender, which trains, kills it, and returns the run folder."""
 
     def killed(kept: str) -> Path:
         capture, run = tmp_path / "slow photos", tmp_path / "run"

@@ -1,4 +1,4 @@
-"""Provide Blender, as a Python module, to the tests. A process has one file, so each test starts with an empty one."""
+"""Provide Blender, as a Python module, to the tests. A process has one Blender file, so each test opens an empty one."""
 
 import pytest
 
@@ -22,7 +22,7 @@ def scene():
 
 @pytest.fixture
 def run(run_folder, scene):
-    """Import the run folder into the scene."""
+    """Import the run folder into the scene, and return the imported run."""
     from refgs_addon.scene.import_run import import_run
 
     return import_run(run_folder, scene)
@@ -30,7 +30,7 @@ def run(run_folder, scene):
 
 @pytest.fixture
 def addon(scene):
-    """Enable the add-on, and return the scene of an empty file."""
+    """Enable the add-on during the test, and return the empty scene."""
     from refgs_addon import preferences, ui
 
     enabled = bpy.context.preferences.addons.new()

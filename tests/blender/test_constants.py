@@ -1,4 +1,4 @@
-"""Test runs whose metallic, roughness or specular is constant: the file stores the value once, and no node reads it."""
+"""Test runs whose metallic, roughness or specular is the same for all splats: the file's header stores the value once."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ MATTE = {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
 
 
 def say_once(folder, constants):
-    """Move columns of the run's splats.ply to constants in the file's header."""
+    """Replace columns of the run's splats.ply by constants, a value by name, in the file's header."""
     file = folder / "splats.ply"
     data = PlyData.read(str(file))["vertex"].data
     rows = data[[name for name in data.dtype.names if name not in constants]].copy()
@@ -46,7 +46,7 @@ def test_the_material_reads_what_varies_alone(constants, run_folder, scene):
 
 
 def test_an_edit_has_it_read_all(run_folder, scene):
-    """Check that a matte run's material reads all attributes once an edit sets it to gold."""
+    """Check that a matte run's material has constants until an edit makes splats gold, and then reads all attributes."""
     say_once(run_folder, MATTE)
     run = import_run(run_folder, scene)
     add_edit(run.collection, "Everywhere", "Gold")
@@ -59,7 +59,7 @@ def test_an_edit_has_it_read_all(run_folder, scene):
 
 
 def test_what_is_exported_says_it_as_the_run_did(run_folder, scene, tmp_path):
-    """Check that an export keeps the constants, and writes columns instead once an edit makes the splats differ."""
+    """Check that an export keeps the constants of the file's header, and writes columns once an edit changes the values."""
     say_once(run_folder, MATTE)
     run = import_run(run_folder, scene)
     export_splats(run.collection, tmp_path / "same.ply")

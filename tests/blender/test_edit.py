@@ -1,4 +1,4 @@
-"""Test material edits: what they change, where they apply, and that the learned values stay."""
+"""Test material edits: what they change, where they apply, and that the run's learned values are kept."""
 
 import bpy
 import numpy as np
@@ -20,7 +20,7 @@ CHROME_ROUGHNESS = 0.02
 
 
 def drawn(run, name):
-    """Read an attribute of the splats as drawn, at the first corner of each quad."""
+    """Read an attribute of the splats as drawn, with all edits: one value a splat, from the first corner of its quad."""
     return attribute(evaluated_mesh(run.splats), name)[::4]
 
 
@@ -94,9 +94,9 @@ def test_what_is_like_the_splat_at_the_region(run):
 
 
 def test_the_mesh_follows_all_edits(run):
-    """Check that the splats' stored edits, composited over the learned material, give the edited material.
+    """Check that each splat's summed edits, over its learned material, give the drawn material.
 
-    The mesh must get the edits of the nearest splat.
+    Each corner of the mesh must get the edits of the nearest splat.
     """
     first = add_edit(run.collection, material="Gold")
     compat.set_modifier_input(first, "Color Amount", 0.7)

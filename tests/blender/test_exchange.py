@@ -81,7 +81,7 @@ def level(item):
 
 @pytest.mark.parametrize("specular", [1.0, 0.0])
 def test_what_mirrors_nothing_is_not_given_gloss(run_folder, scene, tmp_path, specular):
-    """Check that specular 0 survives the export. Of the two FBX importers only the one in Python reads the value."""
+    """Check that an export to FBX keeps specular 0. Only Blender's importer in Python reads the value back."""
     ending, read = IMPORTERS[1]
     mesh, textures = textured_box()
     write_glb(run_folder / "mesh.glb", mesh, replace(textures, specular=specular))

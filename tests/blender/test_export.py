@@ -44,7 +44,7 @@ def test_edits_are_written_and_nothing_else_changes(run, run_folder, tmp_path, p
 
 
 def test_a_viewer_without_lights_shows_the_new_colour(run, run_folder, tmp_path):
-    """Check that the colours that viewers without lights show change in proportion to the base colour."""
+    """Check that an edit scales the stored colours, which viewers without lights show, like the base colour."""
     rows = read_rows(run_folder / "splats.ply").copy()
     edit = add_edit(run.collection)
     run.splats.data.attributes["base_color"].data.foreach_set("color", [0.4, 0.4, 0.4, 1.0] * 40)

@@ -58,7 +58,7 @@ def test_registers_and_draws_without_numpy():
 
 
 def test_builds_and_validates(tmp_path):
-    """Check that the extension builds from a copy of the repository that contains runs and captures."""
+    """Check that the built zip holds the extension only, though the repository's folder also holds runs and captures."""
     clone, archive = tmp_path / "refgs", tmp_path / "refgs.zip"
     shutil.copytree(ROOT / "refgs_addon", clone / "refgs_addon")
     for name in ("__init__.py", "blender_manifest.toml", "LICENSE", "README.md"):

@@ -29,7 +29,7 @@ from tests.makers.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_col
 
 
 def stacked(columns, names):
-    """Stack columns of splats.ply, whose names are separated by spaces: (N, number of names)."""
+    """Stack columns of splats.ply, named as in "x y z", side by side: (N, number of names)."""
     return np.stack([columns[name] for name in names.split()], axis=1)
 
 
@@ -346,7 +346,7 @@ def without_materials(path):
 
 
 def header(old, new):
-    """Return a function that replaces words in a file's header."""
+    """Return a function that replaces bytes in a file, given by its path."""
     return lambda path: path.write_bytes(path.read_bytes().replace(old, new))
 
 

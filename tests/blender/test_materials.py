@@ -20,7 +20,7 @@ OURS = ["Brushed Steel", "Chrome", "Clay", "Copper", "Glazed Ceramic", "Gold", "
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """Return the path of the artist's presets, which does not exist yet."""
+    """Return the folder of the artist's own presets, which does not exist yet."""
     (tmp_path / "scripts").mkdir()
     monkeypatch.setenv("BLENDER_USER_SCRIPTS", str(tmp_path / "scripts"))
     return tmp_path / "scripts" / "presets" / "refgs_material"

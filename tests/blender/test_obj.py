@@ -21,7 +21,7 @@ def imported(file, mesh, textures):
 
 @pytest.fixture
 def box(tmp_path, scene):
-    """Return a textured box that went through an OBJ file, and its mesh as it was."""
+    """Write a textured box to an OBJ file and import it. Returns the imported object and the written mesh."""
     mesh, textures = textured_box()
     (tmp_path / "a run, été").mkdir()
     return imported(tmp_path / "a run, été" / "le pot.obj", mesh, textures), mesh

@@ -1,4 +1,4 @@
-"""Test the preferences' buttons, which install, stop, resume, use and remove the trainer, with a fake uv."""
+"""Test the preferences' buttons: install, stop, resume, use and remove the trainer. A fake stands in for uv."""
 
 import sys
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is 
 
 @pytest.fixture
 def online(addon, tmp_path, monkeypatch):
-    """Give the add-on a bundled trainer, a user folder for this test, and online access."""
+    """Give the enabled add-on online access, the wheels of a fake trainer and an own user folder."""
     monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     monkeypatch.setattr(preferences, "_folder", lambda name: tmp_path / name)
     bpy.context.preferences.system.use_online_access = True

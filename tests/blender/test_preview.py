@@ -29,12 +29,15 @@ def scene(scene):
 
 
 def coloured_sky(direction):
-    """Return a linear radiance that differs for every direction."""
+    """Return the sky's linear RGB radiance, which differs for every unit direction (…, 3)."""
     return 0.5 + 0.4 * np.asarray(direction)
 
 
 def sky_pixels(height=64):
-    """Draw the sky as a panorama in Blender's orientation: u = 0.5 - atan2(y, x) / 2π, v = asin(z) / π + 0.5 from below."""
+    """Draw the sky as a panorama (height, 2 × height, 3).
+
+    Blender looks a direction up at u = 0.5 - atan2(y, x) / 2π, v = asin(z) / π + 0.5, where v = 1 is the top row.
+    """
     u, v = np.meshgrid((np.arange(2 * height) + 0.5) / (2 * height), 1 - (np.arange(height) + 0.5) / height)
     azimuth, elevation = 2 * np.pi * (0.5 - u), np.pi * (v - 0.5)
     return coloured_sky(
@@ -55,7 +58,7 @@ def rendered(scene, tmp_path, camera, samples):
 
 
 def one_mirror(folder, normal):
-    """Write a run of one large opaque mirror splat at the origin: white, metallic, almost smooth."""
+    """Write a run of one large opaque splat at the origin that mirrors the sky: white, metallic, almost smooth."""
     folder.mkdir()
     z = np.asarray(normal, float)
     quaternion = np.array([1 + z[2], -z[1], z[0], 0]) / np.linalg.norm([1 + z[2], -z[1], z[0]])  # z to the normal
@@ -129,7 +132,7 @@ def test_relight_leaves_the_artists_own_world_alone(scene, tmp_path):
 
 
 def snapshot(owner):
-    """Read every plain property of a settings struct."""
+    """Read all settings of a Blender struct that are numbers, switches or text, by name."""
     kinds = (bool, int, float, str)
     names = [p.identifier for p in owner.bl_rna.properties if not p.is_readonly]
     return {name: getattr(owner, name) for name in names if isinstance(getattr(owner, name), kinds)}

@@ -1,4 +1,4 @@
-"""Test training from Blender with a fake worker: the scene's settings, the buttons, and the runs that a file lists."""
+"""Test training from Blender with a fake trainer: the scene's settings, the buttons, and the runs that the file lists."""
 
 import json
 import math
@@ -123,7 +123,7 @@ def test_a_capture_that_is_not_there(addon):
 
 @pytest.fixture
 def checked(addon, capture):
-    """Check a capture with the fake trainer. Returns the job and its number in the list."""
+    """Let the fake trainer check the capture. Returns the check's job and the job's number in the add-on's list."""
     job = training.check(addon)
     assert final_state(job) == "done"
     for number in range(2):
@@ -132,7 +132,7 @@ def checked(addon, capture):
 
 
 def test_the_curve_in_the_panel():
-    """Check that a PSNR linear in log time is drawn as a straight line, and that held-out views are drawn as dots on the line."""
+    """Check that the panel draws PSNR over log time: a line for training views, and dots for held-out views."""
     width, height = CURVE
     seconds = np.geomspace(0.5, 200, 60)
     trained = [(s, 20 + 5 * np.log10(s)) for s in seconds]
@@ -251,7 +251,7 @@ def test_taken_away_while_it_trains(addon, capture):
 
 
 def told(out):
-    """Read the settings, by name, that the fake trainer got."""
+    """Read the settings, by name, that the fake trainer got for the run folder `out`."""
     until(lambda: (out / "started").is_file() and (out / "started").read_text())
     words = dict(word.split("=", 1) for word in json.loads((out / "started").read_text())["settings"])
     return {key: value if value.isalpha() else json.loads(value) for key, value in words.items()}
