@@ -19,8 +19,6 @@ from refgs.kernels import load
 from tests.makers.emulate import emulate
 
 NO_CARD = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA card here")
-
-
 CARDS = ["emulated", pytest.param("cuda", marks=NO_CARD)]
 
 

@@ -217,7 +217,7 @@ def test_one_splat_and_a_mesh_without_faces(run_folder, scene, tmp_path):
     write_ply(run_folder / "splats.ply", random_columns(1))
     trimesh.Scene(trimesh.PointCloud(np.eye(3))).export(run_folder / "mesh.glb")
     run = import_run(run_folder, scene)
-    assert len(run.splats.data.points) == 1 and len(evaluated_mesh(run.splats).polygons) == 1
+    assert len(run.splats.data.points) == len(evaluated_mesh(run.splats).polygons) == 1
     assert [len(item.data.polygons) for item in run.mesh] == [0]
     (run_folder / "textures").mkdir()
     picture = bpy.data.images.new("picture", 4, 4)

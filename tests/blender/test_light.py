@@ -35,17 +35,13 @@ def room(height=48, seed=0):
 
 @pytest.mark.parametrize("turn", [0.0, 1.0, -2.5, 3.1])
 def test_the_turn_between_two_panoramas_is_found(turn, scene, tmp_path):
-    panorama = room()
-    write_panorama(tmp_path / "a.exr", panorama(0))
-    write_panorama(tmp_path / "b.exr", 2.5 * panorama(turn))
-    a, b = (load_panorama(tmp_path / f"{name}.exr") for name in "ab")
-    found, scale = best_rotation(a, b)
-    assert abs((found - turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(0.5)
-    assert scale == pytest.approx(2.5, rel=0.01)
-    write_panorama(tmp_path / "finer.exr", 2.5 * room(100)(turn))  # another size, not an integer multiple
-    found, scale = best_rotation(a, load_panorama(tmp_path / "finer.exr"))
-    assert abs((found - turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(1)
-    assert scale == pytest.approx(2.5, rel=0.02)
+    write_panorama(tmp_path / "a.exr", room()(0))
+    a = load_panorama(tmp_path / "a.exr")
+    for height, degrees, relative in ((48, 0.5, 0.01), (100, 1, 0.02)):  # the same size, and no integer multiple of it
+        write_panorama(tmp_path / f"{height}.exr", 2.5 * room(height)(turn))
+        found, scale = best_rotation(a, load_panorama(tmp_path / f"{height}.exr"))
+        assert abs((found - turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(degrees)
+        assert scale == pytest.approx(2.5, rel=relative)
 
 
 def test_an_hdri_is_matched_to_the_recovered_light(run_folder, scene, tmp_path):

@@ -40,9 +40,8 @@ def sky_pixels(height=64):
     """
     u, v = np.meshgrid((np.arange(2 * height) + 0.5) / (2 * height), 1 - (np.arange(height) + 0.5) / height)
     azimuth, elevation = 2 * np.pi * (0.5 - u), np.pi * (v - 0.5)
-    return coloured_sky(
-        np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1)
-    )
+    level = np.cos(elevation)
+    return coloured_sky(np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1))
 
 
 def camera_at(scene, eye):
