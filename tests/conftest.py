@@ -19,8 +19,6 @@ from refgs.kernels import load
 from tests.makers.emulate import emulate
 
 NO_CARD = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA card here")
-
-
 CARDS = ["emulated", pytest.param("cuda", marks=NO_CARD)]
 
 
@@ -37,7 +35,7 @@ def no_package_of_the_clone() -> None:
 
 @pytest.fixture(params=CARDS)
 def card(request, monkeypatch) -> torch.device:
-    """Run the test with emulated CUDA kernels and, if there is one, on a card. Returns the device for tensors.
+    """Run the test with emulated CUDA kernels and, if there is a CUDA card, on it. Returns the device for tensors.
 
     Tests of code that differs between CPU and CUDA use it.
     """
@@ -61,7 +59,7 @@ def device(request, monkeypatch) -> torch.device:
 
 @pytest.fixture(scope="session")
 def ball_capture(tmp_path_factory):
-    """Write a small capture whose ground truth is known by formula: a metal ball at 64 pixels."""
+    """Write a small capture of a metal ball, in photos of 64 × 64 pixels, whose ground truth is known by formula. Returns its folder."""
     folder = tmp_path_factory.mktemp("ball")
     write_ball_capture(folder, 64)
     return folder

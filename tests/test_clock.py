@@ -1,5 +1,7 @@
 """Test the clock that times the parts of a training, with a fake time that only the test advances."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -7,16 +9,10 @@ from refgs import clock
 from refgs.clock import Clock, timed
 
 
-class Time:
-    now = 0.0
-
-    def perf_counter(self):
-        return self.now
-
-
 @pytest.fixture
 def time(monkeypatch):
-    fake = Time()
+    """Replace the module `time` that the clock uses. The test advances the fake's `now`, in seconds."""
+    fake = SimpleNamespace(now=0.0, perf_counter=lambda: fake.now)
     monkeypatch.setattr(clock, "time", fake)
     return fake
 
@@ -111,11 +107,11 @@ def test_a_card_is_watched_in_one_of_many_iterations_cuda():
     for number in range(clock.SAMPLED):
         with watch.iteration(number):
             product(a)
-    events = [torch.cuda.Event(enable_timing=True) for _ in range(2)]
-    events[0].record()
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    start.record()
     for _ in range(clock.SAMPLED):
         a @ a
-    events[1].record()
+    end.record()
     torch.cuda.synchronize()
-    whole = events[0].elapsed_time(events[1]) / 1000
+    whole = start.elapsed_time(end) / 1000
     assert 0.2 * whole < watch.seconds["product"] < 5 * whole

@@ -11,23 +11,18 @@ from refgs.errors import InputError
 from refgs.paths import clone_root
 
 pytest.importorskip("bpy", reason="the demo needs Blender's Python module")
-SMALL = [
-    "train.iterations=80",
-    "surfels.start=2000",
-    "surfels.budget=3000",
-    "surfels.hull=48",
-    "environment.resolution=16",
-]
-SMALL += ["indirect.every=30", "indirect.resolution=32", "mesh.resolution=48", "mesh.triangles=1000", "mesh.texture=64"]
+SMALL = ["train.iterations=80", "surfels.start=2000", "surfels.budget=3000", "surfels.hull=48"]
+SMALL += ["environment.resolution=16", "indirect.every=30", "indirect.resolution=32"]
+SMALL += ["mesh.resolution=48", "mesh.triangles=1000", "mesh.texture=64"]
 
 
 def test_from_photos_to_the_report(tmp_path, monkeypatch):
     train, out = commands.train, tmp_path / "the demo"
-    monkeypatch.setattr(
-        commands,
-        "train",
-        lambda capture, run, preset, *words, resume: train(capture, run, preset, *words[:2], SMALL, resume),
-    )
+
+    def small(capture, run, preset, *words, resume):
+        return train(capture, run, preset, *words[:2], SMALL, resume)
+
+    monkeypatch.setattr(commands, "train", small)
     monkeypatch.setattr(demo, "HDRIS", ("studio",))
     monkeypatch.setattr(demo, "VIEWS", ("test_000",))
     words = ("--size", "48", "--train", "10", "--test", "1", "--samples", "1", "--relight", "studio")

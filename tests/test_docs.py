@@ -10,14 +10,11 @@ from refgs.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
-CODE = [
-    file
-    for name in ("backend", "refgs_addon", "tests", "benchmarks", "scripts")
-    for file in (ROOT / name).rglob("*.py")
-]
+FOLDERS = ("backend", "refgs_addon", "tests", "benchmarks", "scripts")
 LINK = re.compile(r"\]\((?!https?:)([^)#]*)(?:#([^)]*))?\)")
 COMMAND = re.compile(r"refgs ([a-z]+)\b([^\n`#|]*)")
 BUTTON = re.compile(r"\*\*(\w[^*]+)\*\*")
+EACH_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
 
 def anchors(page):
@@ -26,7 +23,7 @@ def anchors(page):
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@EACH_PAGE
 def test_links_lead_somewhere(page):
     for path, anchor in LINK.findall(page.read_text(encoding="utf-8")):
         target = page.parent / path if path else page
@@ -34,7 +31,7 @@ def test_links_lead_somewhere(page):
         assert not anchor or anchor in anchors(target), f"{path}#{anchor}: no such heading"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@EACH_PAGE
 def test_commands_and_options_exist(page):
     commands = typer.main.get_command(app).commands
     code = re.findall(r"```sh\n(.*?)```|`(refgs [^`]*)`", page.read_text(encoding="utf-8"), re.DOTALL)
@@ -54,6 +51,6 @@ def test_buttons_exist(name):
 
 
 def test_pages_that_the_code_names_exist():
-    for file in CODE:
+    for file in (file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py")):
         for page in re.findall(r"docs/[\w/-]+\.md", file.read_text(encoding="utf-8")):
             assert (ROOT / page).exists(), f"{file} names {page}"

@@ -79,9 +79,7 @@ def test_each_rule_finds_what_breaks_it(tmp_path, name, text, expected):
 
 
 def test_no_test_imports_another():
-    """Tests import shared code only from tests/makers."""
+    """Check that tests import shared code from tests/makers only, and no test from another."""
     for file in (ROOT / "tests").rglob("*.py"):
-        imported = re.findall(
-            r"^ *(?:from|import) ((?:tests\.|test_|makers|conftest)\S*)", file.read_text("utf-8"), re.MULTILINE
-        )
+        imported = re.findall(r"(?m)^ *(?:from|import) ((?:tests\.|test_|makers|conftest)\S*)", file.read_text("utf-8"))
         assert all(name.startswith("tests.makers") for name in imported), f"{file}: {imported}"

@@ -1,4 +1,4 @@
-"""Test the release zips, with the trainer's wheel and uv in them, and an installation, which downloads gigabytes."""
+"""Test the zips that are released, which hold the trainer's wheel and uv, and install from one, which downloads gigabytes."""
 
 import platform
 import subprocess
@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from refgs_addon import installation, jobs
-from tests.makers.waiting import until
+from tests.makers.waiting import final_state, until
 
 pytest.importorskip("bpy", reason="the extension is built with the tool in Blender's Python module")
 pytestmark = pytest.mark.slow
@@ -48,9 +48,9 @@ def test_the_zips(archives):
 
 @pytest.mark.timeout(3000)
 def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
-    """A released zip installs a working trainer by the real uv, and removes it again.
+    """Check that a released zip installs a working trainer by the real uv, and removes it again.
 
-    It uses this machine's Python, and torch from the package index because a mirror may have no other.
+    The installation uses this machine's Python and the package index's torch, because a mirror may have no other.
     """
     monkeypatch.setenv("UV_PYTHON_PREFERENCE", "only-system")
     monkeypatch.setenv("UV_TORCH_BACKEND", "")
@@ -70,10 +70,8 @@ def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
     assert job.ready["refgs"] == installation.bundled_version() == installation.installed(home)
     assert any(line.startswith("Fetching ") for line in lines)
     asked = jobs.query_trainer(installation.python(home), tmp_path / "asked.txt")
-    until(lambda: asked.ended, seconds=200)
-    assert asked.state == "done" and asked.ready == job.ready
+    assert final_state(asked, seconds=200) == "done" and asked.ready == job.ready
     program = "from refgs.settings import load_settings; print(load_settings('quick').train.iterations)"
     subprocess.run([installation.python(home), "-E", "-c", program], check=True, cwd=tmp_path)
     removed = jobs.remove(home, tmp_path / "removed.txt")
-    until(lambda: removed.ended, seconds=200)
-    assert removed.state == "done" and not home.exists()
+    assert final_state(removed, seconds=200) == "done" and not home.exists()

@@ -16,8 +16,7 @@ def test_every_preset_is_valid(name):
 
 def test_set_changes_one_value():
     settings = load_settings("quick", ["train.iterations=7", "shading=sh", "image.background=[0.0, 0.5, 1.0]"])
-    assert settings.train.iterations == 7
-    assert settings.render.shading == "sh"
+    assert settings.train.iterations == 7 and settings.render.shading == "sh"
     assert settings.image.background == (0.0, 0.5, 1.0)
 
 
@@ -94,16 +93,10 @@ def test_a_run_of_before_a_setting_still_opens():
 
 @pytest.mark.parametrize(
     ("made_by", "says"),
-    [
-        ("0.9.0", "update RefGS"),
-        ("1.0.0", "update RefGS"),
-        ("0.2.9", "is broken"),
-        ("one", "is broken"),
-        (5, "is broken"),
-    ],
+    [("0.9.0", "update RefGS"), ("1.0.0", "update RefGS"), *((wrong, "is broken") for wrong in ("0.2.9", "one", 5))],
 )
 def test_a_run_of_a_newer_release_is_not_read(tmp_path, made_by, says):
-    """A run of a newer minor or major release is refused. One of a newer patch release is read."""
+    """Check that a run of a newer minor or major release is refused. A run of a newer patch release is read."""
     (tmp_path / "run.toml").write_text(f"[run]\nrefgs = {json.dumps(made_by)}\n")
     with pytest.raises(InputError, match=says):
         read_run_facts(tmp_path)

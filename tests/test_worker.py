@@ -15,6 +15,7 @@ import pytest
 from refgs import train_job
 from refgs.errors import InputError
 from refgs.lock import LOCK, PROGRESS, STOP, RunLock
+from tests.makers.waiting import until
 
 SMALL = [
     "surfels.start=1000",
@@ -23,17 +24,16 @@ SMALL = [
     "environment.resolution=16",
     "train.iterations=100000",
 ]
+WORKER = [sys.executable, "-m", "refgs.cli", "worker"]
 PATIENCE = 120  # seconds
 
 
 class Talk:
-    """Worker process and the events that it has sent."""
+    """Start a worker process, send it commands, and collect the events that it sends."""
 
     def __init__(self):
-        command = [sys.executable, "-m", "refgs.cli", "worker"]
-        self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
-        )
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(WORKER, stdin=pipe, stdout=pipe, text=True, encoding="utf-8")
         self.lines: queue.Queue[str] = queue.Queue()
         self.heard: list[dict] = []
         threading.Thread(target=self._read, daemon=True).start()
@@ -56,6 +56,7 @@ class Talk:
         raise AssertionError(f"it ended before {event}: {self.heard[-3:]}")
 
     def end(self) -> int:
+        """Close the worker's input, and return its exit status."""
         self.process.stdin.close()
         return self.process.wait(timeout=PATIENCE)
 
@@ -68,13 +69,25 @@ def talk():
     talk.process.wait()
 
 
+def train(capture, run, *changes) -> dict:
+    """Return the fields of a command `train` that starts a small training."""
+    return {"capture": str(capture), "out": str(run), "preset": "quick", "settings": [*SMALL, *changes]}
+
+
+@pytest.fixture
+def run(talk, ball_capture, tmp_path):
+    """Start a training in the worker, and return its run folder."""
+    talk.tell("train", **train(ball_capture, tmp_path / "run"))
+    return tmp_path / "run"
+
+
 def test_jobs_one_after_another(talk, ball_capture, tmp_path):
-    """Jobs run in order. A wrong command is answered by one line and does not affect the next job."""
+    """Check that jobs run in order, and that a wrong command is answered by one line and does not affect the next job."""
     run = tmp_path / "größe 'a'"
     talk.tell("check", capture=str(ball_capture))
     talk.tell("check", capture=str(ball_capture), out=str(tmp_path / "found"))
     talk.tell("check", capture=str(tmp_path / "nothing"))
-    talk.tell("train", capture=str(ball_capture), out=str(run), preset="quick", settings=SMALL)
+    talk.tell("train", **train(ball_capture, run))
     talk.tell("train", capture=str(ball_capture), out=str(run), preset="quick")
     talk.tell("train", capture=str(ball_capture))
     talk.process.stdin.write("no JSON\n")
@@ -85,23 +98,15 @@ def test_jobs_one_after_another(talk, ball_capture, tmp_path):
     found = talk.until("done")
     assert Path(found["cameras"]).is_file() and len(found["thumbnails"]) == 12 and found["radius"] > 0
     failed = talk.until("failed")
-    assert (
-        failed["job"] == "check"
-        and not failed["no_cameras"]
-        and not failed["fault"]
-        and "nothing" in failed["what"]
-        and "\n" not in failed["what"]
-    )
+    assert failed["job"] == "check" and not failed["no_cameras"] and not failed["fault"]
+    assert "nothing" in failed["what"] and "\n" not in failed["what"]
     assert talk.until("progress").keys() >= {"iteration", "total", "seconds_left", "loss", "psnr", "splats"}
     wrong = [event["what"] for event in talk.heard if event["event"] == "warning"]
     assert len(wrong) >= 2 and "train.out Field required" in wrong[0] and "JSON" in wrong[1]
     talk.tell("stop")
     trained = talk.until("done")
-    assert (
-        trained["run"] == str(run)
-        and trained["psnr"] > 5
-        and any(x["what"] == "inter-reflection" for x in trained["left_out"])
-    )
+    assert trained["run"] == str(run) and trained["psnr"] > 5
+    assert any(part["what"] == "inter-reflection" for part in trained["left_out"])
     assert "holds another run" in talk.until("failed")["what"]
     assert talk.until("done")["mesh"] == str(run / "mesh.glb") and (run / "mesh.glb").exists()
     talk.tell("pause")
@@ -109,9 +114,7 @@ def test_jobs_one_after_another(talk, ball_capture, tmp_path):
     assert talk.end() == 0
 
 
-def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture, tmp_path):
-    run = tmp_path / "run"
-    talk.tell("train", capture=str(ball_capture), out=str(run), preset="quick", settings=SMALL)
+def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture, run):
     talk.until("progress")
     talk.tell("pause")
     paused = talk.until("paused")["iteration"]
@@ -136,11 +139,10 @@ def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture
 
 
 def test_photos_without_cameras(talk, tmp_path):
-    """The check reports photos without cameras. The search for their cameras can be interrupted and repeated."""
+    """Check that photos without cameras are reported, and that the search for their cameras can be interrupted and repeated."""
     for number in range(4):
-        cv2.imwrite(
-            str(tmp_path / f"{number}.png"), np.random.default_rng(number).integers(0, 255, (96, 128, 3), np.uint8)
-        )
+        noise = np.random.default_rng(number).integers(0, 255, (96, 128, 3), np.uint8)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), noise)
     talk.tell("check", capture=str(tmp_path))
     assert talk.until("failed")["no_cameras"]
     talk.tell("poses", capture=str(tmp_path))
@@ -154,28 +156,18 @@ def test_photos_without_cameras(talk, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")
-def test_a_terminated_training_can_be_resumed(talk, ball_capture, tmp_path):
-    run = tmp_path / "run"
-    talk.tell("train", capture=str(ball_capture), out=str(run), preset="quick", settings=SMALL)
+@pytest.mark.parametrize("left", [False, True])
+def test_a_terminated_training_ends_with_a_checkpoint(talk, run, left):
+    """Check a training that is not kept, and a kept training whose worker's input was closed."""
+    if left:
+        talk.tell("keep", on=True)
     talk.until("progress")
+    if left:
+        talk.process.stdin.close()
+    iteration = talk.until("progress")["iteration"]
     talk.process.terminate()
-    assert talk.until("cancelled")["iteration"] > 0
+    assert talk.until("cancelled")["iteration"] >= iteration > 0
     assert talk.process.wait(timeout=PATIENCE) == 0
-
-
-def train(capture, run, *changes) -> dict:
-    return {"capture": str(capture), "out": str(run), "preset": "quick", "settings": [*SMALL, *changes]}
-
-
-def ended(talk) -> int:
-    return talk.process.wait(timeout=PATIENCE)
-
-
-def until(condition) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 def free(run) -> bool:
@@ -188,17 +180,16 @@ def free(run) -> bool:
 
 
 def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
-    """A training with `keep` goes on after both pipes are closed, even if it was paused: it ends, and its mesh is exported."""
+    """Check that a training with `keep` runs to its end after both pipes are closed, even if it was paused, and exports its mesh."""
     run = tmp_path / "run"
+    small = train(ball_capture, run, "train.iterations=60", "mesh.resolution=32", "mesh.triangles=500")
     commands = [
-        {"command": "train"}
-        | train(ball_capture, run, "train.iterations=60", "mesh.resolution=32", "mesh.triangles=500"),
+        {"command": "train"} | small,
         {"command": "export", "run": str(run), "texture": 64},
         {"command": "keep", "on": True},
         {"command": "pause"},
     ]
-    words = [sys.executable, "-m", "refgs.cli", "worker"]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+    with subprocess.Popen(WORKER, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         process.stdin.write("\n".join(map(json.dumps, [*commands, ""])).encode())
         process.stdin.flush()
         while json.loads(process.stdout.readline())["event"] != "paused":
@@ -210,10 +201,8 @@ def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
     assert not any((run / name).exists() for name in (LOCK, PROGRESS, STOP))
 
 
-def test_what_waits_goes_with_the_input(talk, ball_capture, tmp_path):
-    """If the input is closed right after `stop`, the worker writes the surfels and drops the export that was waiting."""
-    run = tmp_path / "run"
-    talk.tell("train", **train(ball_capture, run))
+def test_what_waits_goes_with_the_input(talk, run):
+    """Check that a worker whose input is closed right after `stop` writes the surfels and drops the export that was waiting."""
     talk.tell("export", run=str(run), texture=64)
     talk.until("progress")
     talk.tell("stop")
@@ -221,9 +210,7 @@ def test_what_waits_goes_with_the_input(talk, ball_capture, tmp_path):
     assert (run / "splats.ply").exists() and not (run / "mesh.glb").exists()
 
 
-def test_a_training_that_is_kept_no_longer(talk, ball_capture, tmp_path):
-    run = tmp_path / "run"
-    talk.tell("train", **train(ball_capture, run))
+def test_a_training_that_is_kept_no_longer(talk, run):
     talk.tell("export", run=str(run))
     talk.tell("keep", on=True)
     talk.tell("keep", on=False)
@@ -233,26 +220,12 @@ def test_a_training_that_is_kept_no_longer(talk, ball_capture, tmp_path):
     assert free(run) and any((run / "checkpoints").glob("*.toml"))
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")
-def test_a_training_that_was_left_ends_when_it_is_terminated(talk, ball_capture, tmp_path):
-    run = tmp_path / "run"
-    talk.tell("train", **train(ball_capture, run))
-    talk.tell("keep", on=True)
-    talk.until("progress")
-    talk.process.stdin.close()
-    iteration = talk.until("progress")["iteration"]
-    talk.process.terminate()
-    assert talk.until("cancelled")["iteration"] >= iteration and ended(talk) == 0
-
-
-def test_a_folder_that_is_trained_in(talk, ball_capture, tmp_path):
-    """While a process trains a run, another process cannot train it, but can read its progress and stop it.
+def test_a_folder_that_is_trained_in(talk, ball_capture, run):
+    """Check that while a process trains a run, another cannot train it, but can read its progress and stop it.
 
     After the process is killed, the run can be trained again.
     """
-    run = tmp_path / "run"
-    talk.tell("train", **train(ball_capture, run))
-    until((run / PROGRESS).exists)
+    until((run / PROGRESS).exists, PATIENCE)
     assert json.loads((run / PROGRESS).read_text()).keys() == {"iteration", "total", "seconds_left"}
     words = (ball_capture, run, "quick", "cpu", None, [], True, lambda event, facts: None, lambda trainer: True)
     with pytest.raises(InputError, match="is in use: another process trains it") as refused:

@@ -1,4 +1,4 @@
-"""Test that the trainer is installed and removed, with a fake uv."""
+"""Test that the add-on installs and removes the trainer. A fake stands in for the package installer uv."""
 
 import json
 import os
@@ -11,7 +11,7 @@ import pytest
 
 from refgs_addon import installation, jobs
 from tests.makers.bring import bring
-from tests.makers.waiting import until
+from tests.makers.waiting import final_state, until
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is a script that Windows does not start")
 ROOT = Path(__file__).resolve().parents[2]
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def home(tmp_path, monkeypatch):
-    """Return a folder to install into. The add-on gets a bundled trainer and the fake uv."""
+    """Return the folder that the trainer is installed into. The add-on gets the wheels of a fake trainer and a fake uv."""
     monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     yield tmp_path / "user" / "trainer"
     jobs.stop_all()
@@ -29,10 +29,20 @@ def install(home):
     return jobs.install(home, home.parent / "logs" / "installation.txt")
 
 
+@pytest.fixture
+def hanging(home, monkeypatch):
+    """Start an installation that hangs while it fetches; return its job."""
+    monkeypatch.setenv("FAKE_UV", "hang")
+    job = install(home)
+    until(lambda: job.fraction > 0)
+    return job
+
+
 def ended(job):
-    until(lambda: job.ended)
+    """Wait until a job and its process have ended; return the job's state and line."""
+    state = final_state(job)
     assert job._process.wait(timeout=20) is not None
-    return job.state, job.line
+    return state, job.line
 
 
 def calls(home):
@@ -50,11 +60,8 @@ def alive(pid):
 def test_an_installation_to_its_end(home, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/nowhere")
     monkeypatch.setenv("UV_DEFAULT_INDEX", "mirror")
-    assert (
-        installation.bundled_version() == "9.9"
-        and not installation.installed(home)
-        and not installation.interrupted(home)
-    )
+    assert installation.bundled_version() == "9.9"
+    assert not installation.installed(home) and not installation.interrupted(home)
     job = install(home)
     assert ended(job)[0] == "done" and job.ready["refgs"] == "9.9"
     assert installation.installed(home) == "9.9" and installation.python(home).is_file()
@@ -79,13 +86,11 @@ def test_what_the_studio_has_set_stays(home, monkeypatch):
     assert "UV_TORCH_BACKEND" not in variables and "UV_PYTHON_PREFERENCE" not in variables
 
 
-def test_progress_stopping_and_going_on(home, monkeypatch):
-    monkeypatch.setenv("FAKE_UV", "hang")
-    job = install(home)
-    until(lambda: job.fraction > 0)
-    assert job.line.startswith("Fetching torch (850.5MiB) and 1 more: 0.1 of about ") and 0.005 < job.fraction < 0.03
-    job.stop()
-    assert ended(job) == ("cancelled", "Stopped")
+def test_progress_stopping_and_going_on(home, hanging, monkeypatch):
+    assert hanging.line.startswith("Fetching torch (850.5MiB) and 1 more: 0.1 of about ")
+    assert 0.005 < hanging.fraction < 0.03
+    hanging.stop()
+    assert ended(hanging) == ("cancelled", "Stopped")
     until(lambda: not alive(calls(home)[-1]["pid"]))
     assert installation.interrupted(home) and not installation.installed(home) and (home / "cache" / "torch").exists()
     monkeypatch.delenv("FAKE_UV")
@@ -94,26 +99,20 @@ def test_progress_stopping_and_going_on(home, monkeypatch):
     assert ended(install(home))[0] == "done" and installation.installed(home) == "9.9" and not half.exists()
 
 
-def test_two_blenders_do_not_install_at_once(home, monkeypatch):
-    monkeypatch.setenv("FAKE_UV", "hang")
-    first = install(home)
-    until(lambda: first.fraction > 0)
+def test_two_blenders_do_not_install_at_once(home, hanging):
     for second in (install(home), jobs.remove(home, home.parent / "logs" / "removal.txt")):
         state, line = ended(second)
         assert state == "failed" and line.startswith("another Blender installs or removes the trainer")
-    assert not first.ended and (home / "cache" / "torch").exists()
+    assert not hanging.ended and (home / "cache" / "torch").exists()
 
 
 @pytest.mark.parametrize("how", ["Blender", "the process"])
-def test_killed_in_the_middle(home, monkeypatch, how):
-    monkeypatch.setenv("FAKE_UV", "hang")
-    job = install(home)
-    until(lambda: job.fraction > 0)
+def test_killed_in_the_middle(home, hanging, monkeypatch, how):
     if how == "Blender":  # the process notices the end of its input
-        job._process.stdin.close()
+        hanging._process.stdin.close()
     else:
-        job._process.send_signal(signal.SIGKILL)
-    state, line = ended(job)
+        hanging._process.send_signal(signal.SIGKILL)
+    state, line = ended(hanging)
     assert state == "failed" and "see its log" in line
     uv = calls(home)[-1]["pid"]
     if how == "Blender":
@@ -128,10 +127,7 @@ def test_killed_in_the_middle(home, monkeypatch, how):
 @pytest.mark.parametrize(
     "fate, line",
     [
-        (
-            "network",
-            "wheels.example cannot be reached: check the connection and the firewall, and resume",
-        ),
+        ("network", "wheels.example cannot be reached: check the connection and the firewall, and resume"),
         ("full", "the disk of {home} is full: free some space and resume"),
         ("mute", "the trainer is installed but does not start on this machine: see the log"),
     ],
@@ -144,11 +140,11 @@ def test_what_fails_is_said_in_one_line(home, monkeypatch, fate, line):
 
 
 def test_what_else_uv_may_say():
-    assert "does not exist for this machine" in installation.explain_uv_error(
-        "error: No solution found when resolving\n cause: torch", "/a"
-    )
-    assert installation.explain_uv_error("error: Access is denied. (os error 5)", "/a").startswith("cannot write to /a")
-    assert installation.explain_uv_error("error: something else", "/a") == ""
+    explain = installation.explain_uv_error
+    unsolved = "error: No solution found when resolving\n cause: torch"
+    assert "does not exist for this machine" in explain(unsolved, "/a")
+    assert explain("error: Access is denied. (os error 5)", "/a").startswith("cannot write to /a")
+    assert explain("error: something else", "/a") == ""
 
 
 def test_a_newer_release_goes_into_what_is_there(home, tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ import pytest
 
 from refgs_addon import jobs
 from refgs_addon.errors import InputError
-from tests.makers.waiting import until
+from tests.makers.waiting import final_state, until
 
 
 @pytest.fixture
@@ -25,8 +25,7 @@ def start(python, tmp_path):
 
 def test_a_training_to_its_end(start, tmp_path):
     job = start(preset="quick", minutes=2.0, settings={"train.seed": 3}, mesh=False)
-    until(lambda: job.ended)
-    assert job.state == "done" and job.results["train"]["psnr"] == 30
+    assert final_state(job) == "done" and job.results["train"]["psnr"] == 30
     assert job.progress["iteration"] == 1000 and len(job.curve) == 100 and job.curve[-1] == (10.0, 30.0)
     assert job.held_out == [(1.0, 20.0), (10.0, 29.0)]
     asked = json.loads((tmp_path / "run" / "started").read_text())
@@ -36,15 +35,14 @@ def test_a_training_to_its_end(start, tmp_path):
 
 
 def test_one_that_is_silent_is_not_waited_for(tmp_path):
-    """Check that polling a job whose process has closed its output, but still runs, does not block the window."""
+    """Check that `poll` returns at once for a job whose process still runs but has closed its output."""
     ends_with_its_input = "import os, sys; print('{}', flush=True); os.close(1); sys.stdin.read(); os._exit(3)"
     arguments, commands = ("-c", ends_with_its_input), [{"command": "rest"}]
     job = jobs._add(jobs.Job("slow", Path(sys.executable), commands, tmp_path / "log.txt", arguments=arguments))
     until(lambda: job._output_closed)
     assert not jobs.poll() and not job.ended and job._process.poll() is None
     job.close_input()
-    until(lambda: job.ended)
-    assert job.state == "failed" and "status 3" in job.line
+    assert final_state(job) == "failed" and "status 3" in job.line
 
 
 def test_it_rests_while_it_is_paused(start):
@@ -58,8 +56,7 @@ def test_it_rests_while_it_is_paused(start):
     job.tell("resume")
     until(lambda: job.progress["iteration"] > before)
     job.tell("stop")
-    until(lambda: job.ended)
-    assert job.state == "done"
+    assert final_state(job) == "done"
 
 
 def test_one_at_a_time_and_the_next_after_it(start):
@@ -70,21 +67,18 @@ def test_one_at_a_time_and_the_next_after_it(start):
     assert third.state == "cancelled"
     until(lambda: second.progress)
     assert first.state == "done"
-    until(lambda: second.ended)
-    assert third.state == "cancelled" and not third.progress
+    assert final_state(second) == "done" and third.state == "cancelled" and not third.progress
 
 
 def test_one_that_is_stopped_can_be_gone_on_with(start, tmp_path):
     job = start()
     until(lambda: job.progress)
     job.stop()
-    until(lambda: job.ended)
-    assert job.state == "cancelled" and jobs.run_state(job.run) == "stopped"
+    assert final_state(job) == "cancelled" and jobs.run_state(job.run) == "stopped"
     with pytest.raises(InputError, match="not empty"):
         start()
     again = start(resume=True, mesh=False)
-    until(lambda: again.ended)
-    assert again.state == "done" and json.loads((tmp_path / "run" / "started").read_text())["resume"]
+    assert final_state(again) == "done" and json.loads((tmp_path / "run" / "started").read_text())["resume"]
 
 
 def test_one_that_is_kept_goes_on_when_blender_closes(start, tmp_path):
@@ -106,8 +100,7 @@ def test_one_that_is_kept_no_longer(start):
     job.tell("pause")
     until(lambda: job.state == "paused")
     job.stop()
-    until(lambda: job.ended)
-    assert job.state == "cancelled" and job._process.wait(timeout=20) == 0
+    assert final_state(job) == "cancelled" and job._process.wait(timeout=20) == 0
     assert jobs.run_state(job.run) == "stopped"
 
 
@@ -130,7 +123,7 @@ time.sleep(600)
 
 @pytest.fixture
 def killed(python, tmp_path):
-    """Start a second Blender that trains, kill it, and return the run folder."""
+    """Return a function that starts a process like Blender, which trains, kills it, and returns the run folder."""
 
     def killed(kept: str) -> Path:
         capture, run = tmp_path / "slow photos", tmp_path / "run"
@@ -169,29 +162,25 @@ def test_the_same_folder_twice(start):
 
 def test_what_fails_is_said_and_what_was_done_before_it_stays(start):
     job = start(mesh=True)
-    until(lambda: job.ended)
-    assert job.state == "failed" and job.line == "the mesh is crumbs" and "train" in job.results
+    assert final_state(job) == "failed" and job.line == "the mesh is crumbs" and "train" in job.results
     assert job.progress["psnr"] == 30  # the mesh's progress does not replace it in the panel
 
 
 def test_a_trainer_that_dies(start):
     job, next_one = start("crash", out="a"), start(out="b", mesh=False)
-    until(lambda: job.ended)
-    assert job.state == "failed" and "status 3" in job.line and job.log.exists()
+    assert final_state(job) == "failed" and "status 3" in job.line and job.log.exists()
     until(lambda: next_one.state == "done")
 
 
 def test_a_trainer_that_is_newer(start, monkeypatch):
     monkeypatch.setenv("FAKE", "newer")
     job = start()
-    until(lambda: job.ended)
-    assert job.state == "failed" and "9.9, is newer than this add-on" in job.line
+    assert final_state(job) == "failed" and "9.9, is newer than this add-on" in job.line
 
 
 def test_a_line_that_is_no_event(start):
     job = start("noise", mesh=False)
-    until(lambda: job.ended)
-    assert job.state == "done" and job.warnings == [
+    assert final_state(job) == "done" and job.warnings == [
         "this is no JSON", "not an event: 5", "not an event: {'event': 'progress'}",
     ]  # fmt: skip
 
@@ -202,22 +191,17 @@ def test_a_python_that_is_not_there(start, tmp_path):
 
 
 def test_a_python_without_the_trainer(tmp_path):
-    import sys
-
     job = jobs.query_trainer(sys._base_executable, tmp_path / "log.txt")
-    until(lambda: job.ended)
-    assert job.state == "failed" and "log" in job.line
+    assert final_state(job) == "failed" and "log" in job.line
 
 
 def test_cameras_are_found_then_checked(python, tmp_path):
     capture = tmp_path / "bare photos"
     capture.mkdir()
     checked = jobs.check(python, capture, tmp_path / "found", tmp_path / "check.txt")
-    until(lambda: checked.ended)
-    assert checked.state == "failed" and checked.no_cameras
+    assert final_state(checked) == "failed" and checked.no_cameras
     found = jobs.find_cameras(python, capture, tmp_path / "found", tmp_path / "poses.txt")
-    until(lambda: found.ended)
-    assert found.state == "done" and found.progress["stage"] == "matching" and not found.curve
+    assert final_state(found) == "done" and found.progress["stage"] == "matching" and not found.curve
     assert found.results["poses"]["placed"] == 3 and found.results["check"]["lines"][0] == "Views: 3"
 
 
@@ -225,7 +209,6 @@ def test_asking_and_checking_run_beside_a_training(start, python, tmp_path):
     training = start()
     asked = jobs.query_trainer(python, tmp_path / "log.txt")
     checked = jobs.check(python, tmp_path, tmp_path / "found", tmp_path / "check.txt")
-    until(lambda: asked.ended and checked.ended)
-    assert asked.state == "done" and asked.ready["refgs"] == "9.9"
+    assert final_state(asked) == final_state(checked) == "done" and asked.ready["refgs"] == "9.9"
     assert checked.results["check"]["lines"] == ["Views: 3", "Warning: they are dark"]
     assert training.state != "waiting"

@@ -1,4 +1,4 @@
-"""Provide Blender, as a Python module, to the tests. A process has one file, so each test starts with an empty one."""
+"""Provide Blender, as a Python module, to the tests. A process has one Blender file, so each test opens an empty one."""
 
 import pytest
 
@@ -9,6 +9,7 @@ bpy = pytest.importorskip("bpy", reason="needs Blender's Python module")
 
 @pytest.fixture
 def run_folder(tmp_path):
+    """Write a run folder named pot; return its path."""
     return write_run(tmp_path / "pot")
 
 
@@ -17,3 +18,24 @@ def scene():
     """Open an empty file, and return its scene."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     return bpy.context.scene
+
+
+@pytest.fixture
+def run(run_folder, scene):
+    """Import the run folder into the scene, and return the imported run."""
+    from refgs_addon.scene.import_run import import_run
+
+    return import_run(run_folder, scene)
+
+
+@pytest.fixture
+def addon(scene):
+    """Enable the add-on during the test, and return the empty scene."""
+    from refgs_addon import preferences, ui
+
+    enabled = bpy.context.preferences.addons.new()
+    enabled.module = preferences.PACKAGE
+    ui.register()
+    yield scene
+    ui.unregister()
+    bpy.context.preferences.addons.remove(enabled)

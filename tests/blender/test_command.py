@@ -1,4 +1,4 @@
-"""Test `python -m refgs_addon.preview`, run by another program."""
+"""Test `python -m refgs_addon.preview`, which imports a run and renders it without a window."""
 
 import json
 import os
@@ -22,11 +22,9 @@ def command(*arguments, **environment):
 
 
 def test_previews_and_blend(run_folder, tmp_path):
-    write_panorama(tmp_path / "dusk.exr", np.full((16, 32, 3), [0.8, 0.4, 0.2]))
-    out, blend = tmp_path / "previews", tmp_path / "pot.blend"
-    done = command(
-        run_folder, "--hdri", tmp_path / "dusk.exr", "--out", out, "--blend", blend, "--views", "shifted", "--size", 32
-    )
+    dusk, out, blend = tmp_path / "dusk.exr", tmp_path / "previews", tmp_path / "pot.blend"
+    write_panorama(dusk, np.full((16, 32, 3), [0.8, 0.4, 0.2]))
+    done = command(run_folder, "--hdri", dusk, "--out", out, "--blend", blend, "--views", "shifted", "--size", 32)
     assert done.returncode == 0, done.stderr
     events = [json.loads(line) for line in done.stdout.splitlines()]
     assert [(e["done"], e["total"]) for e in events if e["event"] == "progress"] == [(0, 0), (0, 2), (1, 2), (2, 2)]
@@ -62,21 +60,13 @@ def test_bad_input_is_one_line(run_folder, tmp_path, capfd, monkeypatch, argumen
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names the shared libraries of Linux")
 def test_missing_libraries_are_named(run_folder, tmp_path):
-    """Check that the error names a missing system library. A fake `ldd`, first in the PATH, reports the library missing."""
+    """Check that the error names a missing system library. A fake of the system's tool `ldd` reports it as missing."""
     tool = tmp_path / "bin" / "ldd"
     tool.parent.mkdir()
     tool.write_text("#!/bin/sh\nprintf '\\tlibXfixes.so.3 => not found\\n\\tlibm.so.6 => /lib/libm.so.6 (0x1)\\n'\n")
     tool.chmod(0o755)
-    done = command(
-        run_folder,
-        "--hdri",
-        "a.exr",
-        "--out",
-        tmp_path,
-        "--blend",
-        "a.blend",
-        PATH=f"{tool.parent}:{os.environ['PATH']}",
-    )
+    path = f"{tool.parent}:{os.environ['PATH']}"
+    done = command(run_folder, "--hdri", "a.exr", "--out", tmp_path, "--blend", "a.blend", PATH=path)
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith("Blender cannot start without libXfixes.so.3: ")
     assert "apt-get install" in done.stderr and done.stderr.count("\n") == 1

@@ -1,4 +1,4 @@
-"""Test runs whose metallic, roughness or specular is constant: the file stores the value once, and no node reads it."""
+"""Test runs whose metallic, roughness or specular is the same for all splats: the file's header stores the value once."""
 
 import numpy as np
 import pytest
@@ -10,12 +10,13 @@ from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import edited_materials, export_splats
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.splat_cloud import read_constants
+from tests.makers.blender import principled
 
 MATTE = {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
 
 
 def say_once(folder, constants):
-    """Move columns of the run's splats.ply to constants in the file's header."""
+    """Replace columns of the run's splats.ply by constants, a value by name, in the file's header."""
     file = folder / "splats.ply"
     data = PlyData.read(str(file))["vertex"].data
     rows = data[[name for name in data.dtype.names if name not in constants]].copy()
@@ -27,11 +28,8 @@ def say_once(folder, constants):
 
 
 def attributes(material):
-    return {node.attribute_name for node in material.node_tree.nodes if node.type == "ATTRIBUTE"}
-
-
-def principled(material):
-    return next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+    """List the names that a material's Attribute nodes read."""
+    return [node.attribute_name for node in material.node_tree.nodes if node.type == "ATTRIBUTE"]
 
 
 @pytest.mark.parametrize("constants", [MATTE, {"metallic": 1.0}, {}])
@@ -39,7 +37,7 @@ def test_the_material_reads_what_varies_alone(constants, run_folder, scene):
     say_once(run_folder, constants)
     run = import_run(run_folder, scene)
     material = run.splats.data.materials[0]
-    assert {"metallic", "roughness"} & attributes(material) == {"metallic", "roughness"} - {*constants}
+    assert {"metallic", "roughness"} & {*attributes(material)} == {"metallic", "roughness"} - {*constants}
     inputs = principled(material).inputs
     for name, socket in (("metallic", "Metallic"), ("roughness", "Roughness"), ("specular", "Specular IOR Level")):
         if name in constants:
@@ -48,21 +46,20 @@ def test_the_material_reads_what_varies_alone(constants, run_folder, scene):
 
 
 def test_an_edit_has_it_read_all(run_folder, scene):
-    """Check that a matte run's material reads all attributes once an edit sets it to gold."""
+    """Check that a matte run's material has constants until an edit makes splats gold, and then reads all attributes."""
     say_once(run_folder, MATTE)
     run = import_run(run_folder, scene)
     add_edit(run.collection, "Everywhere", "Gold")
     add_edit(run.collection, "Box", "Gold")
     material = run.splats.data.materials[0]
-    assert {"metallic", "roughness", "edit_amount"} <= attributes(material)
-    assert principled(material).inputs["Specular IOR Level"].links
-    assert sum(node.type == "ATTRIBUTE" and node.attribute_name == "metallic" for node in material.node_tree.nodes) == 1
+    assert {"metallic", "roughness", "edit_amount"} <= {*attributes(material)}
+    assert principled(material).inputs["Specular IOR Level"].links and attributes(material).count("metallic") == 1
     new = edited_materials(run.splats)
     assert (new["metallic"] == 1).all() and (new["roughness"] < 1).all()
 
 
 def test_what_is_exported_says_it_as_the_run_did(run_folder, scene, tmp_path):
-    """Check that an export keeps the constants, and writes columns instead once an edit makes the splats differ."""
+    """Check that an export keeps the constants of the file's header, and writes columns once an edit changes the values."""
     say_once(run_folder, MATTE)
     run = import_run(run_folder, scene)
     export_splats(run.collection, tmp_path / "same.ply")

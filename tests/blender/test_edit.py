@@ -1,11 +1,11 @@
-"""Test material edits: what they change, where they apply, and that the learned values stay."""
+"""Test material edits: what they change, where they apply, and that the run's learned values are kept."""
 
 import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix
 
-from refgs_addon import compat, ui
+from refgs_addon import compat
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.edit_tree import AMOUNT, COLOR, SURFACE
 from refgs_addon.scene.edit import add_edit, edits, remove_edit
@@ -13,47 +13,30 @@ from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.material_presets import set_material
 from refgs_addon.scene.regions import crop
 from refgs_addon.scene.run_parts import show
+from tests.makers.blender import attribute, evaluated_mesh
 
 GOLD = (1.0, 0.766, 0.336), 1.0, 0.15  # base colour, metallic, roughness
 CHROME_ROUGHNESS = 0.02
 
 
-@pytest.fixture
-def run(run_folder, scene):
-    return import_run(run_folder, scene)
+def drawn(run, name):
+    """Read an attribute of the splats as drawn, with all edits: one value a splat, from the first corner of its quad."""
+    return attribute(evaluated_mesh(run.splats), name)[::4]
 
 
-def drawn(run, name, field="value", width=1):
-    """Read an attribute of the splats as drawn, at the first corner of each quad."""
-    bpy.context.view_layer.update()
-    graph = bpy.context.evaluated_depsgraph_get()
-    mesh = next(
-        i.object.data for i in graph.object_instances if i.object.original == run.splats and i.object.type == "MESH"
-    )
-    values = np.empty((len(mesh.attributes[name].data), width), np.float32)
-    mesh.attributes[name].data.foreach_get(field, values.ravel())
-    return values[::4, 0] if width == 1 else values[::4]
-
-
-def learned(run, name, field="value", width=1):
-    data = run.splats.data.attributes[name].data
-    values = np.empty((len(data), width), np.float32)
-    data.foreach_get(field, values.ravel())
-    return values[:, 0] if width == 1 else values
-
-
-def positions(run):
-    return learned(run, "position", "vector", 3)
+def learned(run, name):
+    """Read an attribute of the splats as imported, which edits do not change."""
+    return attribute(run.splats.data, name)
 
 
 def test_everything_becomes_gold_and_nothing_is_lost(run):
-    before = learned(run, "metallic").copy(), learned(run, "base_color", "color", 4).copy()
+    before = learned(run, "metallic"), learned(run, "base_color")
     edit = add_edit(run.collection, material="Gold")
     color, metallic, roughness = GOLD
     assert drawn(run, "metallic") == pytest.approx(metallic) and drawn(run, "roughness") == pytest.approx(roughness)
-    np.testing.assert_allclose(drawn(run, "base_color", "color", 4)[:, :3], np.tile(color, (40, 1)), rtol=1e-5)
+    np.testing.assert_allclose(drawn(run, "base_color")[:, :3], np.tile(color, (40, 1)), rtol=1e-5)
     np.testing.assert_array_equal(learned(run, "metallic"), before[0])
-    np.testing.assert_array_equal(learned(run, "base_color", "color", 4), before[1])
+    np.testing.assert_array_equal(learned(run, "base_color"), before[1])
     edit.show_viewport = False
     np.testing.assert_allclose(drawn(run, "metallic"), before[0])
     edit.show_viewport = True
@@ -63,9 +46,7 @@ def test_everything_becomes_gold_and_nothing_is_lost(run):
 
 def test_a_material_that_leaves_the_colour(run):
     add_edit(run.collection, material="Polished")
-    np.testing.assert_allclose(
-        drawn(run, "base_color", "color", 4)[:, :3], learned(run, "base_color", "color", 4)[:, :3], atol=1e-6
-    )
+    np.testing.assert_allclose(drawn(run, "base_color")[:, :3], learned(run, "base_color")[:, :3], atol=1e-6)
     assert drawn(run, "metallic") == pytest.approx(1)
 
 
@@ -79,12 +60,11 @@ def test_a_region_is_moved_turned_and_scaled(run, where, size):
     region.location, region.rotation_euler, region.scale = (0.3, -0.2, 0.1), (0.4, 0.5, 0.6), (0.9, 1.2, 0.7)
     bpy.context.view_layer.update()
     inverse = np.array(region.matrix_world.inverted())
-    inside = size(positions(run) @ inverse[:3, :3].T + inverse[:3, 3]) < 1
+    inside = size(learned(run, "position") @ inverse[:3, :3].T + inverse[:3, 3]) < 1
     assert 3 < inside.sum() < 37
     expected = np.where(inside, CHROME_ROUGHNESS, learned(run, "roughness"))
     np.testing.assert_allclose(drawn(run, "roughness"), expected, atol=1e-5)
     # Splats and region that move together keep the edit.
-    run.splats.location = region.location = (5, 0, 0)
     run.splats.location.x, region.location = 5.0, (5.3, -0.2, 0.1)
     np.testing.assert_allclose(drawn(run, "roughness"), expected, atol=1e-5)
 
@@ -94,7 +74,7 @@ def test_the_border_is_soft(run):
     compat.set_modifier_input(edit, "Falloff", 0.5)
     region = compat.get_modifier_input(edit, "Region")
     region.location, region.scale = (0, 0, 0), (2, 2, 2)
-    distance = np.linalg.norm(positions(run), axis=1) / 2
+    distance = np.linalg.norm(learned(run, "position"), axis=1) / 2
     t = np.clip((1 - distance) / 0.5, 0, 1)
     mask = t * t * (3 - 2 * t)
     assert ((mask > 0.1) & (mask < 0.9)).any()
@@ -106,19 +86,17 @@ def test_what_is_like_the_splat_at_the_region(run):
     edit = add_edit(run.collection, "Similar", "Rubber")
     compat.set_modifier_input(edit, "Falloff", 0.0)
     compat.set_modifier_input(edit, "Tolerance", 0.6)
-    compat.get_modifier_input(edit, "Region").location = positions(run)[7]
-    of = np.column_stack(
-        [learned(run, "base_color", "color", 4)[:, :3], learned(run, "metallic"), learned(run, "roughness")]
-    )
+    compat.get_modifier_input(edit, "Region").location = learned(run, "position")[7]
+    of = np.column_stack([learned(run, "base_color")[:, :3], learned(run, "metallic"), learned(run, "roughness")])
     alike = np.linalg.norm(of - of[7], axis=1) < 0.6
     assert 1 < alike.sum() < 39
     np.testing.assert_allclose(drawn(run, "metallic"), np.where(alike, 0, of[:, 3]), atol=1e-5)
 
 
 def test_the_mesh_follows_all_edits(run):
-    """Check that the splats' stored edits, composited over the learned material, give the edited material.
+    """Check that each splat's summed edits, over its learned material, give the drawn material.
 
-    The mesh must get the edits of the nearest splat.
+    Each corner of the mesh must get the edits of the nearest splat.
     """
     first = add_edit(run.collection, material="Gold")
     compat.set_modifier_input(first, "Color Amount", 0.7)
@@ -126,11 +104,9 @@ def test_the_mesh_follows_all_edits(run):
     compat.set_modifier_input(second, "Metallic Amount", 0.4)
     compat.get_modifier_input(second, "Region").location = (0.5, 0, 0)
     assert [m.name for m in edits(run.splats)] == [first.name, second.name]
-    amount, color, surface = (drawn(run, name, "vector", 3) for name in (AMOUNT, COLOR, SURFACE))
-    learned_color = learned(run, "base_color", "color", 4)[:, :3]
-    np.testing.assert_allclose(
-        learned_color * (1 - amount[:, :1]) + color, drawn(run, "base_color", "color", 4)[:, :3], atol=1e-5
-    )
+    amount, color, surface = (drawn(run, name) for name in (AMOUNT, COLOR, SURFACE))
+    made = learned(run, "base_color")[:, :3] * (1 - amount[:, :1]) + color
+    np.testing.assert_allclose(made, drawn(run, "base_color")[:, :3], atol=1e-5)
     for column, name in enumerate(("metallic", "roughness")):
         made = learned(run, name) * (1 - amount[:, column + 1]) + surface[:, column]
         np.testing.assert_allclose(made, drawn(run, name), atol=1e-5)
@@ -140,10 +116,8 @@ def test_the_mesh_follows_all_edits(run):
     bpy.context.view_layer.update()
     shown = box.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
     corners = np.array([v.co for v in shown.vertices])
-    nearest = np.linalg.norm(corners[:, None] - positions(run)[None], axis=2).argmin(axis=1)
-    found = np.empty((len(corners), 3), np.float32)
-    shown.attributes[AMOUNT].data.foreach_get("vector", found.ravel())
-    np.testing.assert_allclose(found, amount[nearest], atol=1e-5)
+    nearest = np.linalg.norm(corners[:, None] - learned(run, "position")[None], axis=2).argmin(axis=1)
+    np.testing.assert_allclose(attribute(shown, AMOUNT), amount[nearest], atol=1e-5)
 
 
 def test_what_is_removed_takes_its_region_along(run):
@@ -159,22 +133,18 @@ def test_what_is_removed_takes_its_region_along(run):
         add_edit(bpy.data.collections.new("empty"))
 
 
-def test_the_buttons(run):
-    ui.register()
-    try:
-        bpy.context.view_layer.objects.active = run.splats
-        assert bpy.ops.refgs.add_edit(where="Sphere", material="Chrome") == {"FINISHED"}
-        (edit,) = edits(run.splats)
-        region = compat.get_modifier_input(edit, "Region")
-        assert bpy.context.view_layer.objects.active == region  # selected, ready to be moved
-        bpy.ops.refgs.set_material(splats=run.splats.name, edit=edit.name, material="Rubber")
-        assert compat.get_modifier_input(edit, "Metallic") == 0
-        bpy.ops.refgs.remove_edit(splats=run.splats.name, edit=edit.name)
-        assert not edits(run.splats)
-        bpy.data.batch_remove([run.collection])
-        assert not bpy.ops.refgs.add_edit.poll()
-    finally:
-        ui.unregister()
+def test_the_buttons(addon, run):
+    bpy.context.view_layer.objects.active = run.splats
+    assert bpy.ops.refgs.add_edit(where="Sphere", material="Chrome") == {"FINISHED"}
+    (edit,) = edits(run.splats)
+    region = compat.get_modifier_input(edit, "Region")
+    assert bpy.context.view_layer.objects.active == region  # selected, ready to be moved
+    bpy.ops.refgs.set_material(splats=run.splats.name, edit=edit.name, material="Rubber")
+    assert compat.get_modifier_input(edit, "Metallic") == 0
+    bpy.ops.refgs.remove_edit(splats=run.splats.name, edit=edit.name)
+    assert not edits(run.splats)
+    bpy.data.batch_remove([run.collection])
+    assert not bpy.ops.refgs.add_edit.poll()
 
 
 def test_what_is_painted_on_the_mesh(run):
@@ -185,11 +155,9 @@ def test_what_is_painted_on_the_mesh(run):
     assert canvas.data == run.mesh[0].data and not canvas.modifiers and canvas.hide_render
     np.testing.assert_allclose(drawn(run, "metallic"), learned(run, "metallic"))  # nothing is painted yet
     height = np.array([v.co.z for v in canvas.data.vertices])
-    middle = float(height.mean())
-    canvas.vertex_groups.active.add([int(i) for i in np.flatnonzero(height > middle)], 1.0, "REPLACE")
-    metallic, before = drawn(run, "metallic"), learned(run, "metallic")
-    above = positions(run)[:, 2] > height.max()
-    below = positions(run)[:, 2] < height.min()
+    canvas.vertex_groups.active.add(np.flatnonzero(height > height.mean()).tolist(), 1.0, "REPLACE")
+    metallic, before, z = drawn(run, "metallic"), learned(run, "metallic"), learned(run, "position")[:, 2]
+    above, below = z > height.max(), z < height.min()
     assert above.any() and below.any()
     np.testing.assert_allclose(metallic[above], 1.0, atol=1e-5)
     np.testing.assert_allclose(metallic[below], before[below], atol=1e-5)
@@ -211,7 +179,7 @@ def test_painting_needs_a_mesh(run_folder, scene):
 
 def test_a_crop_hides_what_is_outside_of_its_box(run):
     box = crop(run.splats, run.collection, True)
-    places = positions(run)
+    places = learned(run, "position")
     assert len(drawn(run, "metallic")) > 0.8 * len(places)  # a new box contains nearly all splats
     box.location, box.scale = (0.5, 0, 0), (0.5, 2, 2)
     inside = (np.abs(places - [0.5, 0, 0]) <= [0.5, 2, 2]).all(axis=1)

@@ -10,11 +10,11 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from refgs.formats.gltf import write_glb
-from refgs_addon import ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import export_mesh, export_run
 from refgs_addon.scene.import_run import data_blocks, import_run
+from tests.makers.blender import principled
 from tests.makers.box import textured_box
 
 IMPORTERS = [
@@ -61,15 +61,13 @@ def test_it_comes_back_as_it_was(textured, scene, tmp_path, ending, read):
     assert distance.max() < 1e-3 and cKDTree(corners).query(expected)[0].max() < 1e-3
 
     (material,) = data.materials
-    shader = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
     for name in ("Base Color", "Metallic", "Roughness", "Normal"):
-        node = shader.inputs[name].links[0].from_node
+        node = principled(material).inputs[name].links[0].from_node
         if node.type != "TEX_IMAGE":
             assert node.type == {"Normal": "NORMAL_MAP"}.get(name, "SEPARATE_COLOR")
             node = node.inputs["Color"].links[0].from_node
         image, stem = node.image, name.lower().replace(" ", "_")
-        file = moved / "le pot été textures" / f"{stem}.png"
-        assert bpy.path.abspath(image.filepath) == str(file)
+        assert bpy.path.abspath(image.filepath) == str(moved / "le pot été textures" / f"{stem}.png")
         assert image.colorspace_settings.name == ("sRGB" if name == "Base Color" else "Non-Color")
         shown = np.array(image.pixels).reshape(64, 64, 4)[::-1, :, :3]
         truth = np.asarray(Image.open(folder / "textures" / f"{stem}.png").convert("RGB")) / 255
@@ -78,13 +76,12 @@ def test_it_comes_back_as_it_was(textured, scene, tmp_path, ending, read):
 
 def level(item):
     """Read the Specular IOR Level of an object's material."""
-    nodes = item.data.materials[0].node_tree.nodes
-    return next(node for node in nodes if node.type == "BSDF_PRINCIPLED").inputs["Specular IOR Level"].default_value
+    return principled(item.data.materials[0]).inputs["Specular IOR Level"].default_value
 
 
 @pytest.mark.parametrize("specular", [1.0, 0.0])
 def test_what_mirrors_nothing_is_not_given_gloss(run_folder, scene, tmp_path, specular):
-    """Check that specular 0 survives the export. Of the two FBX importers only the one in Python reads the value."""
+    """Check that an export to FBX keeps specular 0. Only Blender's importer in Python reads the value back."""
     ending, read = IMPORTERS[1]
     mesh, textures = textured_box()
     write_glb(run_folder / "mesh.glb", mesh, replace(textures, specular=specular))
@@ -101,21 +98,21 @@ def test_what_is_in_the_way_is_said_in_one_line(textured, scene, tmp_path, endin
     folder, _ = textured
     run = import_run(folder, scene)
     before = data_blocks()
-    with pytest.raises(InputError, match=r"cannot write .*not there"):
-        export_mesh(run.collection, tmp_path / "not there" / f"a{ending}")
+
+    def refused(name, says):
+        with pytest.raises(InputError, match=says):
+            export_mesh(run.collection, tmp_path / f"{name}{ending}")
+
+    refused("not there/a", r"cannot write .*not there")
     (tmp_path / f"b{ending}").mkdir()
-    with pytest.raises(InputError, match=r"cannot write .*b\."):
-        export_mesh(run.collection, tmp_path / f"b{ending}")
+    refused("b", r"cannot write .*b\.")
     (folder / "textures" / "metallic.png").unlink()
-    with pytest.raises(InputError, match=r"metallic\.png does not exist: make the run's mesh again"):
-        export_mesh(run.collection, tmp_path / f"a{ending}")
+    refused("a", r"metallic\.png does not exist: make the run's mesh again")
     (folder / "mesh.glb").unlink()
-    with pytest.raises(InputError, match="make the run's mesh first"):
-        export_mesh(run.collection, tmp_path / f"a{ending}")
+    refused("a", "make the run's mesh first")
     assert data_blocks() == before
     add_edit(run.collection)
-    with pytest.raises(InputError, match="lacks the edits"):
-        export_mesh(run.collection, tmp_path / f"a{ending}")
+    refused("a", "lacks the edits")
     assert not (tmp_path / f"a{ending}").exists()
 
 
@@ -129,13 +126,8 @@ def test_a_run_that_was_copied_has_its_pictures(textured, scene, tmp_path):
     assert all(file.read_bytes() == (source / file.name).read_bytes() for file in found.iterdir())
 
 
-def test_the_file_menu_has_them(textured, tmp_path):
-    ui.register()
-    try:
-        bpy.ops.wm.read_factory_settings(use_empty=True)
-        bpy.ops.refgs.import_run(directory=f"{textured[0]}/")
-        bpy.ops.refgs.export_mesh_usd(filepath=str(tmp_path / "a.usdc"))
-        bpy.ops.refgs.export_mesh_fbx(filepath=str(tmp_path / "a.fbx"))
-        assert (tmp_path / "a.usdc").stat().st_size and (tmp_path / "a.fbx").stat().st_size
-    finally:
-        ui.unregister()
+def test_the_file_menu_has_them(textured, addon, tmp_path):
+    bpy.ops.refgs.import_run(directory=f"{textured[0]}/")
+    bpy.ops.refgs.export_mesh_usd(filepath=str(tmp_path / "a.usdc"))
+    bpy.ops.refgs.export_mesh_fbx(filepath=str(tmp_path / "a.fbx"))
+    assert (tmp_path / "a.usdc").stat().st_size and (tmp_path / "a.fbx").stat().st_size

@@ -15,23 +15,24 @@ from tests.makers.runs import COUNT, write_panorama
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOL = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg", "cli", "blender_ext.py")
-
-
-@pytest.fixture
-def addon(scene):
-    ui.register()
-    yield scene
-    ui.unregister()
+# Files of a clone that do not belong into the extension's zip.
+LEFT = [
+    "refgs_addon/__pycache__/jobs.pyc", "refgs_addon/ui/__pycache__/a.pyc", "refgs_addon/jobs.pyc", "refgs_addon/.DS_Store",
+    "run/splats.ply", "refgs/a", "reference/a.jpg", "refgs_runs/a", "refgs_addon.zip", "_out/a", "LOG.txt", "white ball/a.jpg",
+    "r", "wood/b", ".venv/c",
+]  # fmt: skip
 
 
 def test_registers_and_unregisters_twice(scene):
-    before = {name for name in dir(bpy.types) if "refgs" in name.lower()} | set(dir(bpy.ops.refgs))
+    def ours():
+        return {name for name in dir(bpy.types) if "refgs" in name.lower()} | set(dir(bpy.ops.refgs))
+
+    before = ours()
     for _ in range(2):
         ui.register()
         assert bpy.types.REFGS_PT_run.bl_category == "RefGS" and "import_run" in dir(bpy.ops.refgs)
         ui.unregister()
-        after = {name for name in dir(bpy.types) if "refgs" in name.lower()} | set(dir(bpy.ops.refgs))
-        assert after == before
+        assert ours() == before
 
 
 def test_registers_and_draws_without_numpy():
@@ -57,34 +58,15 @@ def test_registers_and_draws_without_numpy():
 
 
 def test_builds_and_validates(tmp_path):
-    """Check that the extension builds from a copy of the repository that contains runs and captures."""
+    """Check that the built zip holds the extension only, though the repository's folder also holds runs and captures."""
     clone, archive = tmp_path / "refgs", tmp_path / "refgs.zip"
     shutil.copytree(ROOT / "refgs_addon", clone / "refgs_addon")
     for name in ("__init__.py", "blender_manifest.toml", "LICENSE", "README.md"):
         shutil.copy(ROOT / name, clone)
-    for left in (
-        "refgs_addon/__pycache__/jobs.pyc",
-        "refgs_addon/ui/__pycache__/a.pyc",
-        "run/splats.ply",
-        "refgs/a",
-        "reference/a.jpg",
-        "refgs_runs/a",
-        "refgs_addon.zip",
-        "_out/a",
-        "LOG.txt",
-        "white ball/a.jpg",
-        "r",
-        "refgs_addon/jobs.pyc",
-        "refgs_addon/.DS_Store",
-        "wood/b",
-        ".venv/c",
-    ):
+    for left in LEFT:
         (clone / left).parent.mkdir(parents=True, exist_ok=True)
         (clone / left).touch()
-    for arguments in (
-        ["build", "--source-dir", clone, "--output-filepath", archive],
-        ["validate", archive],
-    ):
+    for arguments in (["build", "--source-dir", clone, "--output-filepath", archive], ["validate", archive]):
         done = subprocess.run([sys.executable, TOOL, *arguments], capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr
     code = {str(path.relative_to(ROOT)) for path in (ROOT / "refgs_addon").rglob("*.py")}

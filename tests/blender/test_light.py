@@ -6,7 +6,6 @@ import bpy
 import numpy as np
 import pytest
 
-from refgs_addon import ui
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.panorama_world import IMAGE, ROTATION, STRENGTH
 from refgs_addon.scene.import_run import import_run
@@ -17,7 +16,7 @@ from tests.makers.runs import write_panorama
 
 
 def room(height=48, seed=0):
-    """Return a function that draws a panorama of lamps over a floor. It is smooth enough to rotate by fractions of a pixel."""
+    """Return a function that draws a panorama of lamps, rotated by an angle: (height, 2 × height, 3)."""
     rng = np.random.default_rng(seed)
     azimuth = math.pi * (1 - 2 * (np.arange(2 * height) + 0.5) / (2 * height))
     elevation = math.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
@@ -36,17 +35,13 @@ def room(height=48, seed=0):
 
 @pytest.mark.parametrize("turn", [0.0, 1.0, -2.5, 3.1])
 def test_the_turn_between_two_panoramas_is_found(turn, scene, tmp_path):
-    panorama = room()
-    write_panorama(tmp_path / "a.exr", panorama(0))
-    write_panorama(tmp_path / "b.exr", 2.5 * panorama(turn))
-    a, b = (load_panorama(tmp_path / f"{name}.exr") for name in "ab")
-    found, scale = best_rotation(a, b)
-    assert abs((found - turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(0.5)
-    assert scale == pytest.approx(2.5, rel=0.01)
-    write_panorama(tmp_path / "finer.exr", 2.5 * room(100)(turn))  # another size, not an integer multiple
-    found, scale = best_rotation(a, load_panorama(tmp_path / "finer.exr"))
-    assert abs((found - turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(1)
-    assert scale == pytest.approx(2.5, rel=0.02)
+    write_panorama(tmp_path / "a.exr", room()(0))
+    a = load_panorama(tmp_path / "a.exr")
+    for height, degrees, relative in ((48, 0.5, 0.01), (100, 1, 0.02)):  # the same size, and no integer multiple of it
+        write_panorama(tmp_path / f"{height}.exr", 2.5 * room(height)(turn))
+        found, scale = best_rotation(a, load_panorama(tmp_path / f"{height}.exr"))
+        assert abs((found - turn + math.pi) % (2 * math.pi) - math.pi) < math.radians(degrees)
+        assert scale == pytest.approx(2.5, rel=relative)
 
 
 def test_an_hdri_is_matched_to_the_recovered_light(run_folder, scene, tmp_path):
@@ -75,24 +70,20 @@ def test_blenders_own_and_the_artists_hdris_are_at_hand(scene, tmp_path):
     assert hdris(tmp_path / "not there") == hdris()
 
 
-def test_the_chooser_says_and_sets_what_lights_the_scene(run_folder, scene, monkeypatch, tmp_path):
+def test_the_chooser_says_and_sets_what_lights_the_scene(run_folder, addon, monkeypatch, tmp_path):
     write_panorama(tmp_path / "my room.exr", np.ones((8, 16, 3)))
     monkeypatch.setattr(light_panel, "hdri_folder", lambda: tmp_path)
-    ui.register()
-    try:
-        manager = bpy.context.window_manager
-        assert manager.refgs_light == "OTHER"
-        manager.refgs_light = str(hdris()[0])
-        assert scene.world.node_tree.nodes[IMAGE].image.name == hdris()[0].name  # in a new world
-        import_run(run_folder, scene)
-        assert manager.refgs_light == "RECOVERED"
-        nodes = scene.world.node_tree.nodes
-        nodes[STRENGTH].inputs["Strength"].default_value = 2.0
-        manager.refgs_light = str(tmp_path / "my room.exr")
-        assert nodes[IMAGE].image.name == "my room.exr" and manager.refgs_light == str(tmp_path / "my room.exr")
-        assert nodes[STRENGTH].inputs["Strength"].default_value == 2.0
-        manager.refgs_light = "RECOVERED"
-        assert nodes[IMAGE].image.name == "environment.exr"
-        assert nodes[STRENGTH].inputs["Strength"].default_value == 1.0
-    finally:
-        ui.unregister()
+    manager = bpy.context.window_manager
+    assert manager.refgs_light == "OTHER"
+    manager.refgs_light = str(hdris()[0])
+    assert addon.world.node_tree.nodes[IMAGE].image.name == hdris()[0].name  # in a new world
+    import_run(run_folder, addon)
+    assert manager.refgs_light == "RECOVERED"
+    nodes = addon.world.node_tree.nodes
+    strength = nodes[STRENGTH].inputs["Strength"]
+    strength.default_value = 2.0
+    manager.refgs_light = str(tmp_path / "my room.exr")
+    assert nodes[IMAGE].image.name == "my room.exr" and manager.refgs_light == str(tmp_path / "my room.exr")
+    assert strength.default_value == 2.0
+    manager.refgs_light = "RECOVERED"
+    assert nodes[IMAGE].image.name == "environment.exr" and strength.default_value == 1.0

@@ -1,7 +1,5 @@
 """Test that the 3D view shows a training's surfels while the training runs."""
 
-import time
-
 import bpy
 import pytest
 
@@ -9,6 +7,7 @@ from refgs_addon import jobs
 from refgs_addon.nodes.splats_tree import NAME
 from refgs_addon.scene import live_splats
 from tests.makers.runs import random_columns, write_ply
+from tests.makers.waiting import until
 
 
 @pytest.fixture
@@ -22,16 +21,15 @@ def preview(job, tmp_path, iteration, count):
     job.preview = {"iteration": iteration, "splats": str(tmp_path / f"{iteration}.ply")}
 
 
-def until(condition):
-    end = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < end
-        live_splats.update()
-        time.sleep(0.005)
-
-
 def clouds():
+    """Return the file's point clouds."""
     return [item for item in bpy.data.objects if item.type == "POINTCLOUD"]
+
+
+def shown():
+    """Update the view, and return the number of surfels that it shows."""
+    live_splats.update()
+    return len(clouds()[0].data.points)
 
 
 def test_the_surfels_come_change_and_go(job, scene, tmp_path):
@@ -40,14 +38,15 @@ def test_the_surfels_come_change_and_go(job, scene, tmp_path):
     (item,) = clouds()
     assert live_splats.is_watched(job) and len(item.data.points) == 0 and item.modifiers[NAME].node_group
     preview(job, tmp_path, 10, 30)
-    until(lambda: len(item.data.points) == 30)
+    until(lambda: shown() == 30)
     preview(job, tmp_path, 20, 50)
-    until(lambda: len(item.data.points) == 50)
+    until(lambda: shown() == 50)
     assert clouds() == [item] and len(bpy.data.pointclouds) == 1 and len(item.data.materials) == 1
+    preview(job, tmp_path, 30, 30)
     (tmp_path / "30.ply").write_bytes(b"half")  # an unreadable preview is skipped
-    job.preview = {"iteration": 30, "splats": str(tmp_path / "30.ply")}
+    live_splats.update()
     preview(job, tmp_path, 40, 20)
-    until(lambda: len(item.data.points) == 20)
+    until(lambda: shown() == 20)
     job.state = "done"
     live_splats.update()
     assert not clouds() and not bpy.data.pointclouds and not live_splats.is_watched(job)
@@ -56,7 +55,7 @@ def test_the_surfels_come_change_and_go(job, scene, tmp_path):
 def test_what_is_deleted_or_switched_off_stays_away(job, scene, tmp_path):
     preview(job, tmp_path, 10, 30)
     live_splats.watch(job, scene)
-    until(lambda: len(clouds()[0].data.points) == 30)
+    until(lambda: shown() == 30)
     live_splats.watch(job, scene, False)
     assert not clouds() and not live_splats.is_watched(job)
     live_splats.watch(job, scene)

@@ -6,7 +6,6 @@ import pytest
 from refgs_addon import compat, ui
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit, edits
-from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.material_presets import (
     INPUTS,
     materials,
@@ -21,15 +20,16 @@ OURS = ["Brushed Steel", "Chrome", "Clay", "Copper", "Glazed Ceramic", "Gold", "
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """Return the path of the artist's presets, which does not exist yet."""
+    """Return the folder of the artist's own presets, which does not exist yet."""
     (tmp_path / "scripts").mkdir()
     monkeypatch.setenv("BLENDER_USER_SCRIPTS", str(tmp_path / "scripts"))
     return tmp_path / "scripts" / "presets" / "refgs_material"
 
 
 @pytest.fixture
-def edit(run_folder, scene, own):
-    return add_edit(import_run(run_folder, scene).collection)
+def edit(run, own):
+    """Add an edit, with the preset Gold, to all of the run's splats."""
+    return add_edit(run.collection)
 
 
 def values(edit):
@@ -73,49 +73,41 @@ def test_what_cannot_be_is_said_and_leaves_all_as_it_was(edit, own):
     own.mkdir(parents=True)
     (own / "Broken.py").write_text("metallic = 'very'\n")
     count, before = len(edits(edit.id_data)), values(edit)["Metallic"]
-    for call in (
-        lambda: set_material(edit, "Broken"),
-        lambda: add_edit(edit.id_data.users_collection[0], "Box", "Broken"),
-    ):
-        with pytest.raises(InputError, match=r"Broken\.py cannot be read .*save it again"):
-            call()
+    with pytest.raises(InputError, match=r"Broken\.py cannot be read .*save it again"):
+        set_material(edit, "Broken")
+    with pytest.raises(InputError, match=r"Broken\.py cannot be read .*save it again"):
+        add_edit(edit.id_data.users_collection[0], "Box", "Broken")
     assert len(edits(edit.id_data)) == count and values(edit)["Metallic"] == before
     with pytest.raises(InputError, match="there is no material Marble: choose one of Broken"):
         set_material(edit, "Marble")
 
 
-def test_it_can_be_undone(edit, own):
-    splats, which = edit.id_data.name, {"splats": edit.id_data.name, "edit": edit.name}
-    ui.register()
-    try:
-        bpy.ops.ed.undo_push(message="before")
-        bpy.ops.refgs.set_material("EXEC_DEFAULT", True, **which, material="Rubber")
-        (edit,) = edits(bpy.data.objects[splats])
-        assert values(edit)["Roughness"] == pytest.approx(0.9)
-        bpy.ops.ed.undo()
-        (edit,) = edits(bpy.data.objects[splats])
-        assert values(edit)["Roughness"] == pytest.approx(0.15)
-    finally:
-        ui.unregister()
+def test_it_can_be_undone(addon, edit):
+    splats = edit.id_data.name
+    bpy.ops.ed.undo_push(message="before")
+    bpy.ops.refgs.set_material("EXEC_DEFAULT", True, splats=splats, edit=edit.name, material="Rubber")
+    (edit,) = edits(bpy.data.objects[splats])
+    assert values(edit)["Roughness"] == pytest.approx(0.9)
+    bpy.ops.ed.undo()
+    (edit,) = edits(bpy.data.objects[splats])
+    assert values(edit)["Roughness"] == pytest.approx(0.15)
 
 
-def test_the_buttons(edit, own):
-    ui.register()
-    try:
-        (folder,) = bpy.utils.preset_paths("refgs_material")
-        which = {"splats": edit.id_data.name, "edit": edit.name}
-        file = f"{folder}/Brushed_Steel.py"  # as Blender's list of presets passes it
-        bpy.ops.refgs.set_material(**which, material=file)
-        assert values(edit)["Roughness"] == pytest.approx(0.4)
+def test_the_buttons(addon, edit, own):
+    (folder,) = bpy.utils.preset_paths("refgs_material")
+    which = {"splats": edit.id_data.name, "edit": edit.name}
+    file = f"{folder}/Brushed_Steel.py"  # as Blender's list of presets passes it
+    bpy.ops.refgs.set_material(**which, material=file)
+    assert values(edit)["Roughness"] == pytest.approx(0.4)
+    bpy.ops.refgs.keep_material(**which, name="Steel of mine")
+    assert bpy.utils.preset_paths("refgs_material") == [str(own), folder]
+    assert bpy.ops.refgs.add_edit(where="Everywhere", material="Steel of mine") == {"FINISHED"}
+    with pytest.raises(RuntimeError, match="already"):
         bpy.ops.refgs.keep_material(**which, name="Steel of mine")
-        assert bpy.utils.preset_paths("refgs_material") == [str(own), folder]
-        assert bpy.ops.refgs.add_edit(where="Everywhere", material="Steel of mine") == {"FINISHED"}
-        with pytest.raises(RuntimeError, match="already"):
-            bpy.ops.refgs.keep_material(**which, name="Steel of mine")
-        bpy.ops.refgs.keep_material(name="Steel of mine", remove_name=True)
-        with pytest.raises(RuntimeError, match="only those can be removed"):
-            bpy.ops.refgs.keep_material(name="Gold", remove_name=True)
-        assert list(materials()) == OURS
-    finally:
-        ui.unregister()
+    bpy.ops.refgs.keep_material(name="Steel of mine", remove_name=True)
+    with pytest.raises(RuntimeError, match="only those can be removed"):
+        bpy.ops.refgs.keep_material(name="Gold", remove_name=True)
+    assert list(materials()) == OURS
+    ui.unregister()
     assert str(folder) not in bpy.utils.preset_paths("refgs_material")
+    ui.register()

@@ -1,4 +1,4 @@
-"""Test the preferences' buttons, which install, stop, resume, use and remove the trainer, with a fake uv."""
+"""Test the preferences' buttons: install, stop, resume, use and remove the trainer. A fake stands in for uv."""
 
 import sys
 
@@ -8,23 +8,27 @@ import pytest
 from refgs_addon import installation, jobs, preferences, ui
 from refgs_addon.errors import InputError
 from tests.makers.bring import bring
-from tests.makers.waiting import until
+from tests.makers.waiting import final_state, until
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is a script that Windows does not start")
 
 
 @pytest.fixture
-def online(scene, tmp_path, monkeypatch):
-    """Enable the add-on with a bundled trainer, a user folder for this test, and online access."""
+def online(addon, tmp_path, monkeypatch):
+    """Give the enabled add-on online access, the wheels of a fake trainer and an own user folder."""
     monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     monkeypatch.setattr(preferences, "_folder", lambda name: tmp_path / name)
-    enabled = bpy.context.preferences.addons.new()
-    enabled.module = preferences.PACKAGE
-    ui.register()
     bpy.context.preferences.system.use_online_access = True
-    yield
-    ui.unregister()
-    bpy.context.preferences.addons.remove(enabled)
+
+
+@pytest.fixture
+def hanging(online, monkeypatch):
+    """Start an installation that hangs while it fetches; return its job."""
+    monkeypatch.setenv("FAKE_UV", "hang")
+    bpy.ops.refgs.install_trainer()
+    job = preferences.installing()
+    until(lambda: job.fraction > 0)
+    return job
 
 
 def test_installed_used_and_removed(online):
@@ -32,8 +36,7 @@ def test_installed_used_and_removed(online):
     assert bpy.ops.refgs.install_trainer() == {"FINISHED"}
     assert preferences.status() == ("SORTTIME", "The trainer is being installed")
     assert not bpy.ops.refgs.install_trainer.poll()
-    job = preferences.installing()
-    until(lambda: job.ended)
+    assert final_state(preferences.installing()) == "done"
     assert preferences.status() == ("CHECKMARK", "RefGS 9.9, training on the processor: it is a fake")
     assert preferences.set_up() and preferences.python() == installation.python(preferences.home())
     bpy.ops.refgs.ask_trainer()
@@ -44,18 +47,10 @@ def test_installed_used_and_removed(online):
     assert "not set up" in preferences.status()[1] and not preferences.home().exists()
 
 
-def test_stopped_and_gone_on_with(online, monkeypatch):
-    monkeypatch.setenv("FAKE_UV", "hang")
-    bpy.ops.refgs.install_trainer()
-    job = preferences.installing()
-    until(lambda: job.fraction > 0)
+def test_stopped_and_gone_on_with(hanging, monkeypatch):
     bpy.ops.refgs.stop_installing()
-    until(lambda: job.ended)
-    assert (
-        job.state == "cancelled"
-        and installation.interrupted(preferences.home())
-        and "not set up" in preferences.status()[1]
-    )
+    assert final_state(hanging) == "cancelled" and installation.interrupted(preferences.home())
+    assert "not set up" in preferences.status()[1]
     monkeypatch.setenv("FAKE_UV", "network")
     bpy.ops.refgs.install_trainer()
     until(lambda: not preferences.installing())
@@ -67,16 +62,17 @@ def test_stopped_and_gone_on_with(online, monkeypatch):
 
 
 def test_why_it_cannot_be_installed(online, python, monkeypatch, tmp_path):
-    assert bpy.ops.refgs.install_trainer.poll() and not preferences.installation_problem()
+    poll = bpy.ops.refgs.install_trainer.poll
+    assert poll() and not preferences.installation_problem()
     bpy.context.preferences.system.use_online_access = False
-    assert not bpy.ops.refgs.install_trainer.poll() and "allow online access" in preferences.installation_problem()
+    assert not poll() and "allow online access" in preferences.installation_problem()
     bpy.context.preferences.system.use_online_access = True
     preferences.preferences().python = str(python)
-    assert not bpy.ops.refgs.install_trainer.poll() and "A Python is chosen" in preferences.installation_problem()
+    assert not poll() and "A Python is chosen" in preferences.installation_problem()
     preferences.preferences().python = ""
     (tmp_path / "photos").mkdir()
     jobs.train(python, tmp_path / "photos", tmp_path / "run", tmp_path / "log.txt")
-    assert not bpy.ops.refgs.install_trainer.poll() and "trainer is running" in preferences.installation_problem()
+    assert not poll() and "trainer is running" in preferences.installation_problem()
     with pytest.raises(InputError, match="trainer is running"):
         preferences.remove()
     jobs.stop_all()
@@ -84,14 +80,10 @@ def test_why_it_cannot_be_installed(online, python, monkeypatch, tmp_path):
     with pytest.raises(RuntimeError, match=r"too little space .*\(it needs about"):
         bpy.ops.refgs.install_trainer()
     monkeypatch.setattr(installation, "WHEELS", tmp_path)
-    assert not bpy.ops.refgs.install_trainer.poll() and "contains no trainer" in preferences.installation_problem()
+    assert not poll() and "contains no trainer" in preferences.installation_problem()
 
 
-def test_taken_away_while_it_installs(online, monkeypatch):
-    monkeypatch.setenv("FAKE_UV", "hang")
-    bpy.ops.refgs.install_trainer()
-    job = preferences.installing()
-    until(lambda: job.fraction > 0)
+def test_taken_away_while_it_installs(hanging):
     ui.unregister()
-    assert job._process.wait(timeout=20) == 1 and not installation.installed(preferences.home())
+    assert hanging._process.wait(timeout=20) == 1 and not installation.installed(preferences.home())
     ui.register()

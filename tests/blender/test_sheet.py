@@ -14,8 +14,7 @@ from refgs_addon.scene.world_light import relight
 from tests.makers.runs import write_panorama
 
 
-def test_a_view_under_each_light(run_folder, scene, tmp_path):
-    import_run(run_folder, scene)
+def test_a_view_under_each_light(run, scene, tmp_path):
     colors = {"red": (1, 0.05, 0.05), "green": (0.05, 1, 0.05), "blue": (0.05, 0.05, 1)}
     for name, color in colors.items():
         write_panorama(tmp_path / f"{name}.exr", np.broadcast_to(color, (8, 16, 3)))
@@ -26,13 +25,9 @@ def test_a_view_under_each_light(run_folder, scene, tmp_path):
     assert said[0] == (0, "the recovered light") and said[1] == (1, "red") and said[-1][0] == 4
     sheet = np.asarray(Image.open(tmp_path / "a.png"))
     assert sheet.shape == (2 * 24 + GAP, 2 * 24 + GAP, 4)
-    shown = {
-        "recovered": sheet[:24, :24],
-        "red": sheet[:24, 24 + GAP :],
-        "green": sheet[24 + GAP :, :24],
-        "blue": sheet[24 + GAP :, 24 + GAP :],
-    }
-    for name, channel in (("red", 0), ("green", 1), ("blue", 2)):
+    low, high = slice(24), slice(24 + GAP, None)
+    shown = {"red": sheet[low, high], "green": sheet[high, low], "blue": sheet[high, high]}
+    for channel, name in enumerate(colors):
         solid = shown[name][shown[name][..., 3] > 128]
         assert len(solid) and solid[:, :3].mean(axis=0).argmax() == channel
     nodes = scene.world.node_tree.nodes

@@ -1,14 +1,16 @@
-"""Test training from Blender with a fake worker: the scene's settings, the buttons, and the runs that a file lists."""
+"""Test training from Blender with a fake trainer: the scene's settings, the buttons, and the runs that the file lists."""
 
 import json
 import math
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import bpy
 import numpy as np
 import pytest
 from filelock import FileLock
+from scipy.spatial.transform import Rotation
 
 from refgs_addon import job_timers, jobs, preferences, ui
 from refgs_addon.errors import InputError
@@ -21,19 +23,15 @@ from refgs_addon.ui import checked_capture
 from refgs_addon.ui.closing import quit_question
 from refgs_addon.ui.icons import CURVE, DOTS, GRID, LINE, plot
 from refgs_addon.ui.train_panel import other_process_status
-from tests.makers.waiting import until
+from tests.makers.captures import edit
+from tests.makers.waiting import final_state, until
 
 
 @pytest.fixture
-def addon(scene, python):
-    """Enable the add-on with the fake trainer chosen in its preferences."""
-    enabled = bpy.context.preferences.addons.new()
-    enabled.module = preferences.PACKAGE
-    ui.register()
+def addon(addon, python):
+    """Choose the fake trainer in the preferences of the enabled add-on. Returns the scene."""
     preferences.preferences().python = str(python)
-    yield scene
-    ui.unregister()
-    bpy.context.preferences.addons.remove(enabled)
+    return addon
 
 
 @pytest.fixture
@@ -59,11 +57,9 @@ def test_the_trainer_is_asked_when_it_is_chosen(addon):
 def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
     addon.refgs.limited, addon.refgs.minutes, addon.refgs.mesh = True, 3.0, False
     assert bpy.ops.refgs.train() == {"FINISHED"}
-    job = jobs.JOBS[-1]
-    out = tmp_path / "good photos RefGS"
+    job, number, out = jobs.JOBS[-1], len(jobs.JOBS) - 1, tmp_path / "good photos RefGS"
     assert job.run == out and addon.refgs.runs[0].folder == str(out)
     until(lambda: job.progress)
-    number = len(jobs.JOBS) - 1
     bpy.ops.refgs.tell(number=number, command="pause")
     until(lambda: job.state == "paused")
     bpy.ops.refgs.tell(number=number, command="cancel")
@@ -79,8 +75,7 @@ def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
     scene = bpy.context.scene
     assert scene.refgs.runs[0].folder == str(out) and jobs.run_state(out) == "stopped"
     bpy.ops.refgs.resume(folder=str(out))
-    until(lambda: jobs.JOBS[-1].ended)
-    assert jobs.run_state(out) == "finished"
+    assert final_state(jobs.JOBS[-1]) == "done" and jobs.run_state(out) == "finished"
     with pytest.raises(InputError, match="no stopped training"):
         training.resume(scene, out)
     training.forget(scene, out)
@@ -94,7 +89,7 @@ def test_what_is_to_be_learned(addon, capture):
     job = training.train(addon)
     changes = {"surfels.budget": 5000, "light.frame": "camera", "light.exposure": "off", "needs.reflections": "off"}
     assert told(job.run) == changes
-    until(lambda: job.progress)
+    until(lambda: job.decided)
     assert job.decided == {"light": "the light stands still: it brightens so"}
 
 
@@ -128,17 +123,17 @@ def test_a_capture_that_is_not_there(addon):
 
 @pytest.fixture
 def checked(addon, capture):
-    """Check a capture with the fake trainer. Returns the job and its number in the list."""
+    """Let the fake trainer check the capture. Returns the check's job and the job's number in the add-on's list."""
     job = training.check(addon)
-    until(lambda: job.ended)
+    assert final_state(job) == "done"
     for number in range(2):
         shutil.copy(job.results["check"]["thumbnails"][number], capture / f"{number}.png")
     return job, len(jobs.JOBS) - 1
 
 
 def test_the_curve_in_the_panel():
-    """Check that a PSNR linear in log time is drawn as a straight line, and that held-out views are drawn as dots on the line."""
-    height, width = CURVE[1], CURVE[0]
+    """Check that the panel draws PSNR over log time: a line for training views, and dots for held-out views."""
+    width, height = CURVE
     seconds = np.geomspace(0.5, 200, 60)
     trained = [(s, 20 + 5 * np.log10(s)) for s in seconds]
     drawn = plot(trained, [(seconds[30], trained[30][1])])
@@ -156,34 +151,16 @@ def test_the_curve_in_the_panel():
     assert np.isfinite(flat).all() and (flat == np.float32(LINE)).all(axis=2).any()
 
 
-class Drawn:
-    """Record the icons and buttons that a panel draws, as a fake of Blender's layout."""
-
-    def __init__(self):
-        self.pictures, self.icons, self.pressed = [], [], []
-
-    def thumbnail(self, file, version):
-        self.pictures.append((file.name, version))
-        return len(self.pictures)
-
-    def grid_flow(self, **_):
-        return self
-
-    def template_icon(self, icon_value, scale):
-        self.icons.append(icon_value)
-
-    def operator(self, name, icon, depress):
-        self.pressed.append(depress)
-        return self
-
-
 def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
     job, number = checked
-    drawn = Drawn()
-    monkeypatch.setattr(checked_capture, "thumbnail", drawn.thumbnail)  # Blender has no icons without a window
-    checked_capture.draw_capture(drawn, addon, number, job)
-    assert drawn.icons == [1, 2] and drawn.pressed == [False]
-    assert drawn.pictures == [("0000.png", job.serial), ("0001.png", job.serial)]
+    layout, thumbnail = Mock(), Mock(side_effect=[1, 2, 1, 2])
+    monkeypatch.setattr(checked_capture, "thumbnail", thumbnail)  # Blender has no icons without a window
+    checked_capture.draw_capture(layout, addon, number, job)
+    drawn = layout.grid_flow.return_value.template_icon.call_args_list
+    assert [icon.kwargs["icon_value"] for icon in drawn] == [1, 2]
+    pictures = [(file.name, version) for (file, version), _ in thumbnail.call_args_list]
+    assert pictures == [("0000.png", job.serial), ("0001.png", job.serial)]
+    assert not layout.operator.call_args.kwargs["depress"]
     assert bpy.ops.refgs.show_cameras(number=number) == {"FINISHED"}
     cameras = cameras_of(addon, capture)
     assert cameras.name == "good photos cameras" and [item.name for item in cameras.objects] == ["0", "1"]
@@ -192,8 +169,8 @@ def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
     assert bpy.ops.refgs.next_camera() == {"FINISHED"}
     assert addon.camera == cameras.objects[1] and photo_shown(addon.camera) == 1
     assert addon.camera.data.background_images[0].image.filepath == str(capture / "1.png")
-    checked_capture.draw_capture(drawn, addon, number, job)
-    assert drawn.pressed == [False, True]
+    checked_capture.draw_capture(layout, addon, number, job)
+    assert layout.operator.call_args.kwargs["depress"]
     bpy.ops.refgs.show_cameras(number=number)
     assert cameras_of(addon, capture) is None and not bpy.data.cameras and addon.camera is None
     assert not bpy.ops.refgs.next_camera.poll()
@@ -202,11 +179,12 @@ def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
 def test_a_run_brings_its_own_cameras(addon, checked, capture, run_folder):
     """Check that a run's cameras replace the capture's, and that the scene's camera stays on the same photo."""
     _, number = checked
-    file = run_folder / "cameras.json"
-    content = json.loads(file.read_text())
-    for frame, name in zip(content["frames"], ("1", "0"), strict=True):
-        frame["file_path"], frame["photo"] = f"images/{name}", f"{name}.png"
-    file.write_text(json.dumps(content))
+
+    def rename(content):
+        for frame, name in zip(content["frames"], ("1", "0"), strict=True):
+            frame.update(file_path=f"images/{name}", photo=f"{name}.png")
+
+    edit(run_folder / "cameras.json", rename)
     bpy.ops.refgs.show_cameras(number=number)
     other = import_run(run_folder, addon)
     assert len(cameras_of(addon, capture).objects) == 2 and "1" not in [item.name for item in other.cameras.values()]
@@ -229,16 +207,13 @@ def test_what_else_is_among_the_cameras_stays(addon, checked):
 
 
 def test_photos_without_cameras(addon, tmp_path):
-    folder = tmp_path / "bare photos"
-    folder.mkdir()
-    addon.refgs.capture = str(folder)
+    (tmp_path / "bare photos").mkdir()
+    addon.refgs.capture = str(tmp_path / "bare photos")
     checked = training.check(addon)
-    until(lambda: checked.ended)
-    assert checked.no_cameras
+    assert final_state(checked) == "failed" and checked.no_cameras
     bpy.ops.refgs.find_cameras()
     assert checked not in jobs.JOBS
-    until(lambda: jobs.JOBS[-1].ended)
-    assert jobs.JOBS[-1].state == "done" and "check" in jobs.JOBS[-1].results
+    assert final_state(jobs.JOBS[-1]) == "done" and "check" in jobs.JOBS[-1].results
 
 
 def test_display_splats_are_made_by_the_trainer(addon, run_folder, tmp_path):
@@ -246,8 +221,7 @@ def test_display_splats_are_made_by_the_trainer(addon, run_folder, tmp_path):
     (tmp_path / "a.ply").write_text("of before")
     bpy.ops.refgs.export_display_splats(filepath=str(tmp_path / "a.ply"))
     job = jobs.JOBS[-1]
-    until(lambda: job.ended)
-    assert job.state == "done" and job.results["export"]["display_splats"] == str(tmp_path / "a.ply")
+    assert final_state(job) == "done" and job.results["export"]["display_splats"] == str(tmp_path / "a.ply")
     assert job.progress["stage"] == "colours" and (tmp_path / "a.ply").read_text() == str(run_folder)
     # The trainer gets the edits, and the run does not change.
     before = (run_folder / "splats.ply").read_bytes()
@@ -277,7 +251,7 @@ def test_taken_away_while_it_trains(addon, capture):
 
 
 def told(out):
-    """Read the settings, by name, that the fake trainer got."""
+    """Read the settings, by name, that the fake trainer got for the run folder `out`."""
     until(lambda: (out / "started").is_file() and (out / "started").read_text())
     words = dict(word.split("=", 1) for word in json.loads((out / "started").read_text())["settings"])
     return {key: value if value.isalpha() else json.loads(value) for key, value in words.items()}
@@ -298,13 +272,8 @@ def test_a_box_is_the_region_and_its_up_the_results(addon, capture):
     words = told(training.train(addon).run)
     assert words["region.centre"] == [1, 2, 3]
     assert words["region.size"] == pytest.approx([1, 2, 0.5])
-    x, y, z = np.radians(words["region.rotation"])
-    about = [
-        np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]]),
-        np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]]),
-        np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]]),
-    ]
-    np.testing.assert_allclose(np.abs(about[2] @ about[1] @ about[0]), matrix, atol=1e-6)  # axes, up to their signs
+    found = Rotation.from_euler("xyz", words["region.rotation"], degrees=True).as_matrix()
+    np.testing.assert_allclose(np.abs(found), matrix, atol=1e-6)  # axes, up to their signs
     assert words["region.up"] == pytest.approx([1, 0, 0], abs=1e-6)
 
     box.scale.x = 0
@@ -314,11 +283,14 @@ def test_a_box_is_the_region_and_its_up_the_results(addon, capture):
     assert addon.refgs.region is None and told(training.train(addon).run) == {}
 
 
-@pytest.mark.parametrize(
-    ("up", "hidden"), [((0, 0, 0), False), ((0, 0, 2), False), ((0, 0, -1), True), ((0, 0.1, 1), True)]
-)
-def test_a_box_is_not_shown_beside_a_run_that_stands_otherwise(addon, capture, run_folder, up, hidden):
-    of = f"[run]\ncapture = {json.dumps(str(capture))}\n"
+UP = [("", (0, 0, 0), False), ("", (0, 0, 2), False), ("", (0, 0, -1), True), ("", (0, 0.1, 1), True)]
+
+
+@pytest.mark.parametrize(("other", "up", "hidden"), [*UP, ("/another", (0, 1, 1), False)])
+def test_a_box_is_not_shown_beside_its_captures_run_that_stands_otherwise(
+    addon, capture, run_folder, other, up, hidden
+):
+    of = f"[run]\ncapture = {json.dumps(other or str(capture))}\n"
     (run_folder / "run.toml").write_text(f"{of}[settings.region]\nup = {list(up)}\n")
     bpy.ops.refgs.add_training_region()
     assert bpy.ops.refgs.import_run(directory=str(run_folder)) == {"FINISHED"}
@@ -338,13 +310,6 @@ def test_a_hidden_box_is_the_same_when_the_file_is_opened_again(addon, capture, 
     assert regions.region_settings(bpy.context.scene) == before
 
 
-def test_a_box_of_another_capture_stays(addon, capture, run_folder):
-    (run_folder / "run.toml").write_text('[run]\ncapture = "/another"\n[settings.region]\nup = [0, 1, 1]\n')
-    bpy.ops.refgs.add_training_region()
-    bpy.ops.refgs.import_run(directory=str(run_folder))
-    assert not addon.refgs.region.hide_viewport
-
-
 def test_a_box_that_is_deleted_or_cleared_is_no_region(addon, capture):
     bpy.ops.refgs.add_training_region()
     box = addon.refgs.region
@@ -356,10 +321,8 @@ def test_a_box_that_is_deleted_or_cleared_is_no_region(addon, capture):
     assert regions.region_settings(addon) == {}
 
 
-def test_the_box_holds_what_the_cameras_look_at(addon, capture):
-    checked = training.check(addon)
-    until(lambda: checked.ended)
-    checked.results["check"] |= {"capture": str(capture.resolve()), "centre": [1.0, 2.0, 3.0], "radius": 4.0}
+def test_the_box_holds_what_the_cameras_look_at(addon, checked, capture):
+    checked[0].results["check"] |= {"capture": str(capture.resolve()), "centre": [1.0, 2.0, 3.0], "radius": 4.0}
     box = regions.add_training_region(addon)
     assert list(box.location) == [1, 2, 3] and list(box.scale) == [4, 4, 4]
 
@@ -388,7 +351,7 @@ def test_a_run_that_another_process_trains(addon, capture, tmp_path):
     job = training.train(addon)
     until(lambda: job.progress)
     job.stop()
-    until(lambda: job.ended)
+    assert final_state(job) == "cancelled"
     run = job.run
     jobs.JOBS.clear()
     with FileLock(run / "run.lock"):

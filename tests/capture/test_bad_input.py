@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ import pytest
 from refgs.capture import load_view, published_normals, read_cameras, read_capture
 from refgs.errors import InputError
 from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, nero, ring, shiny_blender, write
+
+SMALL_MASK = np.full((24, 32), 255, np.uint8)
 
 
 def refused(read, *parts: str) -> None:
@@ -48,19 +51,32 @@ def test_transforms_that_are_not(tmp_path, text, says):
     refused(lambda: read_capture(tmp_path), says)
 
 
-def test_transforms_that_are_binary(tmp_path):
-    (tmp_path / "transforms.json").write_bytes(b"\xff\xd8\xff\x00")
-    refused(lambda: read_capture(tmp_path), "transforms.json", "text")
-
-
-def _number(path):
-    return int(path.stem.removeprefix("r_"))
+@pytest.mark.parametrize(
+    ("make", "name", "spoil", "says"),
+    [
+        (
+            nerfstudio,
+            "transforms.json",
+            lambda file: file.write_bytes(b"\xff\xd8\xff\x00"),
+            ["transforms.json", "text"],
+        ),
+        (nerfstudio, "images/0002.png", lambda file: file.write_text("not a picture"), ["0002.png", "not an image"]),
+        (nerfstudio, "masks/0004.png", lambda file: write(file, SMALL_MASK), ["0004.png", "32×24", "64×48"]),
+        (colmap, "sparse/0/cameras.bin", Path.unlink, ["cameras.bin", "missing"]),
+        (nero, "7.png", Path.unlink, ["1 of the 16", "7.png"]),
+    ],
+)
+def test_a_file_that_is_spoiled_or_missing(tmp_path, make, name, spoil, says):
+    folder = make(tmp_path / "capture")
+    spoil(folder / name)
+    refused(lambda: read_capture(folder), *says)
 
 
 @pytest.mark.parametrize("make", [nerf_blender, nerfstudio, colmap])
 def test_missing_images(tmp_path, make):
     folder = make(tmp_path)
-    paths = sorted((path for path in folder.rglob("*.png") if "test" not in path.parts), key=_number)
+    training = (path for path in folder.rglob("*.png") if "test" not in path.parts)
+    paths = sorted(training, key=lambda path: int(path.stem.removeprefix("r_")))
     for path in paths[3:6]:
         path.unlink()
     refused(lambda: read_capture(folder), "3 of the", "missing", paths[3].stem)
@@ -90,10 +106,8 @@ def test_cameras_in_one_place(tmp_path):
 
 
 def _pose(row, column, value):
-    def change(matrix):
-        matrix[row][column] = value
-
-    return change
+    """Return a function that changes one number of a pose."""
+    return lambda matrix: matrix[row].__setitem__(column, value)
 
 
 @pytest.mark.parametrize(
@@ -151,16 +165,9 @@ def test_frame_values(tmp_path, values, says):
 def test_colmap_files_cut_short(tmp_path, name, binary, kept):
     file = colmap(tmp_path, binary) / "sparse" / "0" / f"{name}.{'bin' if binary else 'txt'}"
     data = file.read_bytes()
-    header = data.rfind(b"# ") if not binary else 0
-    cut = max(int(kept * len(data)), data.index(b"\n", header) + 1 if not binary else 0)
-    file.write_bytes(data[:cut])
+    header = 0 if binary else data.index(b"\n", data.rfind(b"# ")) + 1
+    file.write_bytes(data[: max(int(kept * len(data)), header)])
     refused(lambda: read_capture(tmp_path), file.name, "truncated")
-
-
-def test_colmap_without_its_cameras(tmp_path):
-    folder = colmap(tmp_path)
-    (folder / "sparse" / "0" / "cameras.bin").unlink()
-    refused(lambda: read_capture(folder), "cameras.bin", "missing")
 
 
 @pytest.mark.parametrize("binary", [True, False])
@@ -185,15 +192,8 @@ def test_colmap_pose_nan(tmp_path):
 def test_photos_that_differ_in_their_endings_only(tmp_path):
     folder = nerfstudio(tmp_path)
     (folder / "images" / "0002.png").rename(folder / "images" / "0003.webp")
-    change = {"file_path": "images/0003.webp"}
-    edit(folder / "transforms.json", lambda data: data["frames"][2].update(change))
+    edit(folder / "transforms.json", lambda data: data["frames"][2].update(file_path="images/0003.webp"))
     refused(lambda: read_capture(folder), "2 photos are named 0003")
-
-
-def test_mask_of_another_size(tmp_path):
-    folder = nerfstudio(tmp_path)
-    write(folder / "masks" / "0004.png", np.full((24, 32), 255, np.uint8))
-    refused(lambda: read_capture(folder), "0004.png", "32×24", "64×48")
 
 
 def test_masks_all_empty(tmp_path):
@@ -208,12 +208,6 @@ def test_image_truncated_since(tmp_path):
     data = view.image_path.read_bytes()
     view.image_path.write_bytes(data[: len(data) // 2])
     refused(lambda: load_view(view, 32), view.image_path.name, "truncated")
-
-
-def test_image_that_is_text(tmp_path):
-    folder = nerfstudio(tmp_path)
-    (folder / "images" / "0002.png").write_text("not a picture")
-    refused(lambda: read_capture(folder), "0002.png", "not an image")
 
 
 def test_camera_file(tmp_path):
@@ -247,12 +241,6 @@ def test_cameras_of_nero(tmp_path, content, says):
     folder = nero(tmp_path / "bell")
     (folder / "5-camera.pkl").write_bytes(pickle.dumps(content))
     refused(lambda: read_capture(folder), "5-camera.pkl", says)
-
-
-def test_missing_photos_of_nero(tmp_path):
-    folder = nero(tmp_path / "bell")
-    (folder / "7.png").unlink()
-    refused(lambda: read_capture(folder), "1 of the 16", "7.png")
 
 
 @pytest.mark.parametrize(

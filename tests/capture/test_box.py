@@ -1,4 +1,4 @@
-"""Test the region and the up direction of settings: in every layout they are read in the capture's own frame."""
+"""Test the settings for the region, a box to reconstruct, and for the up direction. Both are in the capture's own frame."""
 
 import numpy as np
 import pytest
@@ -14,9 +14,9 @@ UP = np.array([0.6, 0.0, 0.8])
 
 
 def region(**numbers):
-    return load_settings(
-        "quick", [f"region.{key}={[float(x) for x in value]}" for key, value in numbers.items()]
-    ).region
+    """Make the settings of a region, such as `centre=(0, 0, 1)`; others keep their defaults."""
+    changes = [f"region.{key}={list(map(float, value))}" for key, value in numbers.items()]
+    return load_settings("quick", changes).region
 
 
 def test_a_box_is_turned_as_blender_turns():

@@ -1,4 +1,4 @@
-"""Test camera files: those of a run folder, written and read back, and the capture's own JSON."""
+"""Test camera files: write and read a run folder's cameras.json, and read cameras from a capture's transforms file."""
 
 import numpy as np
 import pytest

@@ -57,7 +57,7 @@ def test_warnings_name_the_first_view(tmp_path):
         "exposure varies: 0007.png",
         "1 of 32 views do not see the centre, first 0020.png: where",
     ):
-        assert f"{part}" in said, said
+        assert part in said, said
 
 
 def test_blurred_photos_are_named(tmp_path):
@@ -74,26 +74,19 @@ def test_blurred_photos_are_named(tmp_path):
 
 
 def test_what_is_shown_of_it(tmp_path):
-    """The written cameras equal the capture's cameras. Thumbnails are small, masked photos."""
+    """Check that the written cameras are the capture's, and that thumbnails are small, masked photos."""
     capture = read_capture(nerf_blender(tmp_path / "capture", {"train": 24, "test": 6}))
-    found = check(capture, tmp_path / "new" / "out")
-    assert found["capture"] == str(tmp_path / "capture") and any(
-        "30, 24 to train on" in line for line in found["lines"]
-    )
-    frames = json.loads(Path(found["cameras"]).read_text())["frames"]
-    assert [frame["photo"] for frame in frames[22:26]] == [
-        "train/r_22.png",
-        "train/r_23.png",
-        "test/r_0.png",
-        "test/r_1.png",
-    ]
+    out = tmp_path / "new" / "out"
+    found = check(capture, out)
+    assert found["capture"] == str(tmp_path / "capture")
+    assert any("30, 24 to train on" in line for line in found["lines"])
+    photos = [frame["photo"] for frame in json.loads(Path(found["cameras"]).read_text())["frames"]]
+    assert photos[22:26] == ["train/r_22.png", "train/r_23.png", "test/r_0.png", "test/r_1.png"]
     assert np.linalg.norm(np.subtract(found["centre"], CENTRE)) < 0.1 and 0.4 < found["radius"] < 0.7
     assert len(set(found["thumbnails"])) == 12
     picture = cv2.imread(found["thumbnails"][0], cv2.IMREAD_UNCHANGED)
     assert picture.shape == (48, 64, 4) and 0 < (picture[..., 3] > 0).mean() < 0.5
-    assert sorted(path.name for path in (tmp_path / "new" / "out").iterdir() if path.suffix != ".png") == [
-        "cameras.json"
-    ]
+    assert [path.name for path in out.iterdir() if path.suffix != ".png"] == ["cameras.json"]
     large = nerfstudio(tmp_path / "large", count=5)
     for photo in (large / "images").iterdir():
         write(photo, cv2.resize(cv2.imread(str(photo)), (640, 480)))

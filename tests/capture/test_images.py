@@ -1,4 +1,4 @@
-"""Test loading of photos: they are decoded completely or refused; masks, undistortion and reduction invent no colours."""
+"""Test the loading of photos: broken files are refused; masks, undistortion and resizing add no colours of their own."""
 
 from dataclasses import replace
 
@@ -73,7 +73,7 @@ def test_full_size_is_returned_as_stored(tmp_path):
 
 
 def distorted_dots(width, height, matrix, coefficients):
-    """Make a photo of dots through OpenCV's own distortion; return it with their rays (n, 3)."""
+    """Draw dots through OpenCV's lens distortion. Returns the photo (height, width, 3) and the dots' undistorted rays (n, 3)."""
     rays = np.stack([*np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.4, 0.4, 4)), np.ones((4, 5))], -1)
     rays = rays.reshape(-1, 3)
     pixels = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
@@ -85,7 +85,7 @@ def distorted_dots(width, height, matrix, coefficients):
 @pytest.mark.parametrize("k1", [-0.25, 0.2])
 @pytest.mark.parametrize("side", [None, 160])
 def test_undistortion_against_opencv(tmp_path, k1, side):
-    """Dots drawn through OpenCV's projectPoints lie where the pinhole camera expects them."""
+    """Check that undistortion moves dots, drawn by OpenCV's projectPoints, to where a pinhole camera sees them."""
     width, height, fx, fy, cx, cy = 320, 240, 290.0, 300.0, 155.0, 124.0
     coefficients = np.array([k1, 0.05, 0.004, -0.003, 0.02])  # k1 k2 p1 p2 k3
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -114,22 +114,22 @@ def test_undistortion_against_opencv(tmp_path, k1, side):
 
 @pytest.mark.parametrize("binary", [True, False])
 @pytest.mark.parametrize(
-    "model",
+    ("model", "opencv"),
     [
-        (0, "SIMPLE_PINHOLE", [60.0, 32.0, 24.0]),
-        (2, "SIMPLE_RADIAL", [60.0, 32.0, 24.0, -0.1]),
-        (3, "RADIAL", [60.0, 32.0, 24.0, 0.1, 0.02]),
-        OPENCV,
+        ((0, "SIMPLE_PINHOLE", [60.0, 32.0, 24.0]), None),
+        ((2, "SIMPLE_RADIAL", [60.0, 32.0, 24.0, -0.1]), [60.0, 60.0, 32.0, 24.0, -0.1, 0.0, 0.0, 0.0]),
+        ((3, "RADIAL", [60.0, 32.0, 24.0, 0.1, 0.02]), [60.0, 60.0, 32.0, 24.0, 0.1, 0.02, 0.0, 0.0]),
+        (OPENCV, OPENCV[2]),
     ],
 )
-def test_colmap_models_leave_no_invalid_pixels(tmp_path, model, binary):
-    """A white photo stays white to its corners for either sign of distortion, and the map follows the model."""
+def test_colmap_models_leave_no_invalid_pixels(tmp_path, model, opencv, binary):
+    """Check that an undistorted white photo is white to its corners, and that its pixels come from where OpenCV's model says."""
     folder = colmap(tmp_path, binary, model)
     for path in (folder / "images").iterdir():
         write(path, np.full((48, 64, 3), 255, np.uint8))
     view = read_capture(folder).views[0]
     assert load_view(view, None).image.min() == 255
-    if model[1] == "SIMPLE_PINHOLE":
+    if opencv is None:
         assert view.lens is None
         return
     across, down = view.lens.maps(view.camera)
@@ -137,15 +137,11 @@ def test_colmap_models_leave_no_invalid_pixels(tmp_path, model, binary):
     # As little as possible is lost: the map reaches the photo's border somewhere.
     slack = min(across.min() + 0.5, 63.5 - across.max(), down.min() + 0.5, 47.5 - down.max())
     assert slack < 1.0
-    fx, fy, cx, cy, k1, k2, p1, p2 = {
-        "SIMPLE_RADIAL": lambda f, cx, cy, k: (f, f, cx, cy, k, 0, 0, 0),
-        "RADIAL": lambda f, cx, cy, k1, k2: (f, f, cx, cy, k1, k2, 0, 0),
-        "OPENCV": lambda *p: p,
-    }[model[1]](*model[2])
+    fx, fy, cx, cy, *coefficients = opencv
     camera = view.camera
     ray = np.array([[(3.5 - camera.cx) / camera.fx, (40.5 - camera.cy) / camera.fy, 1.0]])
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    expected = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), matrix, np.array([k1, k2, p1, p2], float))[0][0, 0]
+    expected = cv2.projectPoints(ray, np.zeros(3), np.zeros(3), matrix, np.array(coefficients))[0][0, 0]
     np.testing.assert_allclose([across[40, 3] + 0.5, down[40, 3] + 0.5], expected, atol=1e-4)
 
 

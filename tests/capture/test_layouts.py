@@ -1,6 +1,8 @@
-"""Test all layouts of captures: projected points of the scene lie where the photos show them."""
+"""Test all layouts of captures: the cameras project points of the scene to where the photos show them."""
 
 import json
+from functools import partial
+from itertools import count
 
 import numpy as np
 import pytest
@@ -54,17 +56,14 @@ def assert_sees_the_ball(capture):
             assert tuple(shown) == expected
 
 
-@pytest.fixture(params=["nerf-blender", "nerfstudio", "colmap", "colmap-text", "nero"])
+MAKERS = {"nerf-blender": nerf_blender, "nerfstudio": nerfstudio, "colmap": colmap, "nero": nero}
+MAKERS["colmap-text"] = partial(colmap, binary=False)
+
+
+@pytest.fixture(params=MAKERS)
 def capture(request, tmp_path):
-    folder = tmp_path / "été dans le jardin"
-    make = {
-        "nerf-blender": nerf_blender,
-        "nerfstudio": nerfstudio,
-        "colmap": colmap,
-        "colmap-text": lambda path: colmap(path, binary=False),
-        "nero": nero,
-    }
-    capture = read_capture(make[request.param](folder))
+    """Write a capture of each layout, and return it as it is read."""
+    capture = read_capture(MAKERS[request.param](tmp_path / "été dans le jardin"))
     assert capture.layout == request.param.removesuffix("-text")
     return capture
 
@@ -99,10 +98,9 @@ def test_points_go_with_the_cameras(capture):
 
 
 def test_split(tmp_path):
-    capture = read_capture(nerf_blender(tmp_path / "a"))
-    assert (len(capture.train_views), len(capture.test_views)) == (12, 4)
-    capture = read_capture(nerf_blender(tmp_path / "b", {"train": 12, "val": 3}))
-    assert (len(capture.train_views), len(capture.test_views)) == (12, 3)
+    for folder, splits in (("a", {"train": 12, "test": 4}), ("b", {"train": 12, "val": 3})):
+        capture = read_capture(nerf_blender(tmp_path / folder, splits))
+        assert [len(capture.train_views), len(capture.test_views)] == list(splits.values())
     capture = read_capture(nerf_blender(tmp_path / "c", {"train": 12}))
     assert [view.camera.name for view in capture.test_views] == ["r_0", "r_6"]  # by name: r_0 r_1 r_10 r_11 r_2 … r_6
     folder = nerfstudio(tmp_path / "d")
@@ -122,11 +120,9 @@ def test_mixed_sizes_and_intrinsics_per_frame(tmp_path):
     folder = nerfstudio(tmp_path)
 
     def mix(data):
-        for i, frame in enumerate(data["frames"]):
-            if i % 2:
-                w, h, f = 40, 56, 75.0
-                write(folder / frame["file_path"], ball(np.array(frame["transform_matrix"]), w, h, f)[..., :3])
-                frame.update(fl_x=f, fl_y=f, cx=w / 2, cy=h / 2, w=w, h=h)
+        for frame in data["frames"][1::2]:
+            write(folder / frame["file_path"], ball(np.array(frame["transform_matrix"]), 40, 56, 75.0)[..., :3])
+            frame.update(fl_x=75.0, fl_y=75.0, cx=20.0, cy=28.0, w=40, h=56)
 
     edit(folder / "transforms.json", mix)
     capture = read_capture(folder)
@@ -243,10 +239,7 @@ def test_one_sided_cameras_are_not_taken_for_an_object(tmp_path):
 
 
 def test_cameras_that_look_outwards_are_a_room(tmp_path):
-    poses = []
-    for pose in ring(16, distance=0.5):
-        pose[:3, [0, 2]] *= -1  # rotated by 180°
-        poses.append(pose)
+    poses = [pose @ np.diag([-1, 1, -1, 1]) for pose in ring(16, distance=0.5)]  # rotated by 180°
     capture = read_capture(nerfstudio(tmp_path, poses=poses))
     assert not capture.bounded and "outwards" in capture.bounded_because
 
@@ -256,8 +249,8 @@ def test_up_is_found_though_cameras_look_down_from_one_side(tmp_path):
     tilt[1:3, 1:3] = [[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]]  # the capture's frame leans
     poses = [tilt @ pose for pose in ring(24)[1:12:2]]
     capture = read_capture(nerfstudio(tmp_path, poses=poses))
-    up = capture.to_capture[:3, 2] / np.linalg.norm(capture.to_capture[:3, 2])
-    assert np.degrees(np.arccos(up @ tilt[:3, 2])) < 8
+    up = capture.to_capture[:3, 2]
+    assert np.degrees(np.arccos(up @ tilt[:3, 2] / np.linalg.norm(up))) < 8
 
 
 def test_fingerprint(tmp_path):
@@ -266,8 +259,7 @@ def test_fingerprint(tmp_path):
     assert first == read_capture(folder).fingerprint()
     moved = tmp_path.rename(tmp_path.with_name("moved"))
     assert first == read_capture(moved).fingerprint()
-    file = moved / "transforms_train.json"
-    edit(file, lambda data: data["frames"][2]["transform_matrix"][0].__setitem__(3, 5.0))
+    edit(moved / "transforms_train.json", lambda data: data["frames"][2]["transform_matrix"][0].__setitem__(3, 5.0))
     changed = read_capture(moved).fingerprint()
     assert changed != first
     (moved / "train" / "r_1.png").write_bytes((moved / "train" / "r_1.png").read_bytes() + b"\0")
@@ -352,17 +344,19 @@ def test_glossy_synthetic_without_depth_takes_the_photos_alpha(tmp_path):
 
 
 def test_glossy_synthetic_converted_to_nerf_blender(tmp_path):
-    """A converted Glossy Synthetic scene is read: photos of both splits lie in `rgb`; the files give sizes and focal lengths."""
+    """Check a Glossy Synthetic scene in the NeRF-Blender layout: photos of both splits lie in `rgb`, and w, h, fl_x and fl_y are given."""
     folder = nerf_blender(tmp_path)
     (folder / "rgb").mkdir()
-    for split, first in (("train", 0), ("test", 20)):
+    numbers = count()
 
-        def convert(data, split=split, first=first):
-            data.update(w=64, h=48, fl_x=60.0, fl_y=60.0)
-            for i, frame in enumerate(data["frames"]):
-                (folder / split / f"r_{i}.png").rename(folder / "rgb" / f"{first + i}.png")
-                frame["file_path"] = f"rgb/{first + i}"
+    def convert(data):
+        data.update(w=64, h=48, fl_x=60.0, fl_y=60.0)
+        for frame in data["frames"]:
+            name = f"rgb/{next(numbers)}"
+            (folder / f"{frame['file_path']}.png").rename(folder / f"{name}.png")
+            frame["file_path"] = name
 
+    for split in ("train", "test"):
         edit(folder / f"transforms_{split}.json", convert)
     capture = read_capture(folder)
     assert capture.masked and len(capture.test_views) == 4
@@ -371,7 +365,7 @@ def test_glossy_synthetic_converted_to_nerf_blender(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".png", ".PNG", ".webp"])
 def test_reduced_photos_of_a_colmap_capture(tmp_path, suffix):
-    """A path to `images_4` of a Ref-NeRF scene selects these reduced photos. Every eighth photo is held out."""
+    """Check that a path to the folder `images_4` selects its reduced photos. Every eighth photo is held out."""
     folder = colmap(tmp_path / "sedan")
     for i, pose in enumerate(ring(16)):
         write(folder / "images_4" / f"{i:04d}.png", ball(pose, 16, 12, 15.0)[..., :3])

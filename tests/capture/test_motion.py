@@ -1,6 +1,7 @@
 """Test structure from motion: compare the poses found from photos alone with known poses."""
 
 import multiprocessing
+from itertools import product
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ def quiet(event: str, facts: dict) -> None:
 
 
 def speckled(pose: np.ndarray) -> np.ndarray:
-    """Ray-cast a block on a floor, both of speckled stone, to RGB (H, W, 3) uint8."""
+    """Ray-cast a block on a floor, both with random speckles, from a camera-to-world matrix: RGB (H, W, 3) uint8."""
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     rays = np.stack([u / FOCAL, -v / FOCAL, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
     eye, half, middle = pose[:3, 3], np.array([0.6, 0.5, 0.4]), np.array([0, 0, 0.4])
@@ -33,13 +34,10 @@ def speckled(pose: np.ndarray) -> np.ndarray:
     floor = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], 1e3)
     points = eye + rays * np.where(near < far, near, floor)[..., None]
     lattice = np.random.default_rng(0).random((32, 32, 32, 3))
-    grains = sum(
-        np.stack(
-            [map_coordinates(lattice[..., c], size * points.reshape(-1, 3).T, order=1, mode="wrap") for c in range(3)]
-        )
-        for size in (4.0, 13.0)
-    )
-    return (127 * grains.T.reshape(HEIGHT, WIDTH, 3)).astype(np.uint8)
+    grains = np.zeros((HEIGHT, WIDTH, 3))
+    for size, c in product((4.0, 13.0), range(3)):
+        grains[..., c] += map_coordinates(lattice[..., c], size * points.transpose(2, 0, 1), order=1, mode="wrap")
+    return (127 * grains).astype(np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +47,17 @@ def pictures():
 
 @pytest.fixture
 def photos(tmp_path, pictures):
-    """Write the photos alone, with a space in their names."""
+    """Write the photos, with a space in their names, but no cameras. Returns the folder."""
     for number, picture in enumerate(pictures):
         write(tmp_path / f"stone {number:02d}.png", picture)
     return tmp_path
 
 
 def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Align points (N, 3) with others by the best similarity (Umeyama 1991); return them and its rotation."""
+    """Align points `found` (N, 3) with `true` by the best similarity transform (Umeyama 1991).
+
+    Returns the aligned points and the rotation (3, 3).
+    """
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     u, stretch, vt = np.linalg.svd(b.T @ a)
     flip = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
@@ -93,7 +94,7 @@ def test_photos_become_a_capture(photos):
 
 
 def test_one_that_is_interrupted_goes_on(photos):
-    """An interrupted search for camera poses writes no capture. The next search reuses the saved features of unchanged photos."""
+    """Check that an interrupted search for camera poses writes no capture, and that the next search reuses its features."""
 
     def interrupt(event: str, facts: dict) -> None:
         if facts.get("stage") == "matching":
@@ -125,10 +126,7 @@ def test_no_photos(tmp_path):
 
 
 def test_what_stands_still_contradicts_what_turns():
-    """Poses that fit a turning object contradict the matches in the room behind it, and the other way round.
-
-    The object turns, the room stands still, and the camera moves a little.
-    """
+    """Check that matches on a turning object contradict the poses that fit the still room behind it, and the other way round."""
     rng, focal, count = np.random.default_rng(0), 1000, 36
     block, room = rng.uniform(-0.8, 0.8, (100, 3)), np.add(rng.uniform(-2, 2, (50, 3)), [0, 6, 0])
     places, around, inside = [], [], []
@@ -142,13 +140,12 @@ def test_what_stands_still_contradicts_what_turns():
         places.append(seen[:, :2] / seen[:, 2:])
 
     def contradicted(poses: list[np.ndarray], reach: int, features: slice) -> np.ndarray:
-        """Return the contradicted part of the matches between photos at most this far apart."""
-        near = [(a, b) for a, b in pairs(count) if min(b - a, count - b + a) <= reach]
-        ways = [(poses[b] @ np.linalg.inv(poses[a]))[:3] for a, b in near]
-        far = [
-            epipolar_distance(places[a][features], places[b][features], way)
-            for (a, b), way in zip(near, ways, strict=True)
-        ]
+        """Tell for each match of these features, between photos at most `reach` apart, if the poses contradict it: bool (N,)."""
+        far = []
+        for a, b in pairs(count):
+            if min(b - a, count - b + a) <= reach:
+                way = (poses[b] @ np.linalg.inv(poses[a]))[:3]
+                far.append(epipolar_distance(places[a][features], places[b][features], way))
         return np.concatenate(far) * focal > MATCH_TOLERANCE
 
     of_block, of_room = (6, slice(100)), (count, slice(100, None))  # six photos on, the block's features are hidden

@@ -22,7 +22,7 @@ def refused(file, data: bytes, says: str) -> None:
 
 
 class _Runs:
-    """Malicious object: unpickling it with `pickle.load` creates a file."""
+    """Create a file when it is unpickled by `pickle.load`, as malicious code would."""
 
     def __init__(self, path):
         self.path = path
@@ -75,7 +75,7 @@ def test_a_pickle_that_is_cut_short(tmp_path, kept):
 
 
 def test_lists_within_lists_are_not_followed(tmp_path):
-    """A few hundred bytes can describe more items than fit into memory."""
+    """Check that nested lists are refused: a few hundred bytes can describe more items than fit into memory."""
     value = [1] * 10
     for _ in range(30):
         value = [value] * 10

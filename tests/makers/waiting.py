@@ -13,3 +13,9 @@ def until(condition: Callable[[], object], seconds: float = 30) -> None:
         assert time.monotonic() < end, [(job.name, job.state, job.line) for job in jobs.JOBS]
         jobs.poll()
         time.sleep(0.005)
+
+
+def final_state(job: jobs.Job, seconds: float = 30) -> str:
+    """Wait until a job has ended, and return its state; fail after `seconds`."""
+    until(lambda: job.ended, seconds)
+    return job.state

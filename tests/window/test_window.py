@@ -47,16 +47,9 @@ def in_window(script, tmp_path, *words):
     tool = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg", "cli", "blender_ext.py")
     archive = tmp_path / "refgs.zip"
     subprocess.run([sys.executable, tool, "build", "--source-dir", ROOT, "--output-filepath", archive], check=True)
-    words = [
-        *command,
-        "--enable-event-simulate",
-        "--python",
-        Path(__file__).with_name(script),
-        "--",
-        archive,
-        *words,
-        tmp_path,
-    ]
+    folder = Path(__file__).parent
+    beside = ["--python-expr", f"import sys; sys.path.append({str(folder)!r})", "--python", folder / script]
+    words = [*command, "--enable-event-simulate", *beside, "--", archive, *words, tmp_path]
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
     done = subprocess.run(list(map(str, words)), env=environment, capture_output=True, text=True, timeout=1200)
     path = tmp_path / "report.json"

@@ -1,33 +1,18 @@
 """Act as an artist in a Blender window: train a capture with the real trainer, and take a screenshot of each step.
 
-blender --python train.py -- EXTENSION.zip PYTHON CAPTURE OUT
+stage.py has the command line; its words are the Python with the trainer and the capture.
 """
 
 import contextlib
 import importlib.util
-import json
-import shutil
-import subprocess
-import sys
 import time
 import traceback
-from pathlib import Path
 
 import bpy
+from stage import MODULE, OUT, PATIENCE, WORDS, area, choose_tab, install, jobs, photograph, quit_blender, report, view
 
-ARCHIVE, PYTHON, CAPTURE, OUT = map(Path, sys.argv[sys.argv.index("--") + 1 :])
-MODULE = "bl_ext.user_default.refgs"
-PATIENCE = 180  # seconds, for a machine that is busy
-bpy.context.preferences.view.show_splash = False
-report = {"steps": {}, "longest": {}, "ours": {}, "clicks": {}}
-
-
-def jobs():
-    return sys.modules[f"{MODULE}.refgs_addon.jobs"].JOBS
-
-
-def area():
-    return next(area for area in bpy.context.window_manager.windows[0].screen.areas if area.type == "VIEW_3D")
+PYTHON, CAPTURE = WORDS
+report |= {"steps": {}, "longest": {}, "ours": {}, "clicks": {}}
 
 
 def last(state):
@@ -40,17 +25,16 @@ def tell(command):
 
 def artist():
     """Press the buttons of a whole session. After each click, yield a condition to await and the screenshot's name."""
-    bpy.ops.extensions.package_install_files(filepath=str(ARCHIVE), repo="user_default", enable_on_install=True)
+    install()
     area().spaces.active.show_region_ui = True
     bpy.data.objects.remove(bpy.data.objects["Cube"])  # it is where the object will be
     yield lambda: True, None
-    next(region for region in area().regions if region.type == "UI").active_panel_category = "RefGS"
-    area().tag_redraw()
+    choose_tab()
     yield lambda: True, "empty"
     measure_ours()
-    bpy.context.preferences.addons[MODULE].preferences.python = str(PYTHON)
+    bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
     settings = bpy.context.scene.refgs
-    settings.capture, settings.preset, settings.limited, settings.minutes = str(CAPTURE), "quick", True, 2.0
+    settings.capture, settings.preset, settings.limited, settings.minutes = CAPTURE, "quick", True, 2.0
     yield last("done"), None
     bpy.ops.refgs.check_capture()
     yield last("done"), "checked"
@@ -153,24 +137,6 @@ def addon(name):
     return importlib.import_module(f"{MODULE}.refgs_addon.{name}")
 
 
-def view():
-    """Override the context with the 3D view, as Blender does for a button in the sidebar."""
-    region = next(region for region in area().regions if region.type == "WINDOW")
-    return bpy.context.temp_override(area=area(), region=region)
-
-
-def photograph(name):
-    if shutil.which("import"):
-        subprocess.run(["import", "-window", "root", str(OUT / f"{name}.png")], check=True)
-    else:
-        bpy.ops.screen.screenshot(filepath=str(OUT / f"{name}.png"))
-
-
-def finish():
-    (OUT / "report.json").write_text(json.dumps(report))
-    bpy.ops.wm.quit_blender()
-
-
 steps, waiting, due, longest = artist(), None, time.perf_counter() + 3.0, 0.0
 
 
@@ -189,7 +155,7 @@ def tick() -> float | None:
                 found = next(steps, None)
             click = time.perf_counter() - now
             if found is None:
-                return finish()
+                return quit_blender()
             waiting = (*found, now + PATIENCE)
             if found[1]:
                 report["clicks"][found[1]] = click
@@ -208,7 +174,7 @@ def tick() -> float | None:
             raise TimeoutError(f"{name}: {[(job.name, job.state, job.line) for job in jobs()]}")
     except Exception:
         report["error"] = traceback.format_exc()
-        return finish()
+        return quit_blender()
     return 0.1
 
 

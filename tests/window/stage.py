@@ -1,0 +1,99 @@
+"""Install the extension in a Blender window, take screenshots, and write a report, for the scripts beside this file.
+
+blender --python-expr "import sys; sys.path.append(FOLDER)" --python SCRIPT.py -- EXTENSION.zip [WORD ...] OUT
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+import traceback
+from pathlib import Path
+
+import bpy
+
+ARCHIVE, *WORDS, OUT = sys.argv[sys.argv.index("--") + 1 :]
+OUT = Path(OUT)
+MODULE = "bl_ext.user_default.refgs"
+PATIENCE = 180  # seconds, for a machine that is busy
+bpy.context.preferences.view.show_splash = False
+report = {}
+
+
+def install():
+    bpy.ops.extensions.package_install_files(filepath=ARCHIVE, repo="user_default", enable_on_install=True)
+
+
+def jobs():
+    """Return the add-on's list of jobs."""
+    return sys.modules[f"{MODULE}.refgs_addon.jobs"].JOBS
+
+
+def area():
+    """Return the window's 3D view."""
+    return next(area for area in bpy.context.window_manager.windows[0].screen.areas if area.type == "VIEW_3D")
+
+
+def region(kind):
+    """Return a region of the 3D view: "UI" is the sidebar, "WINDOW" the view itself."""
+    return next(region for region in area().regions if region.type == kind)
+
+
+def view():
+    """Override the context with the 3D view, as Blender does for a button in the sidebar."""
+    return bpy.context.temp_override(area=area(), region=region("WINDOW"))
+
+
+def choose_tab():
+    region("UI").active_panel_category = "RefGS"
+    area().tag_redraw()
+
+
+def photograph(name):
+    """Save a screenshot of the window as NAME.png."""
+    # Blender's own screenshot reads a front buffer, which is black on a virtual screen; ImageMagick reads the screen.
+    if shutil.which("import"):
+        subprocess.run(["import", "-window", "root", str(OUT / f"{name}.png")], check=True)
+    else:
+        bpy.ops.screen.screenshot(filepath=str(OUT / f"{name}.png"))
+
+
+def write_report():
+    (OUT / "report.json").write_text(json.dumps(report))
+
+
+def quit_blender():
+    write_report()
+    bpy.ops.wm.quit_blender()
+
+
+def after(seconds):
+    """Return a condition that holds once this time has passed."""
+    due = time.monotonic() + seconds
+    return lambda: time.monotonic() >= due
+
+
+def act(steps):
+    """Run a generator's steps in the window. Each step yields the condition to await before the next step.
+
+    Blender closes when the steps or the patience end, or a step fails.
+    """
+    waiting, begun = None, 0.0
+
+    def tick() -> float | None:
+        nonlocal waiting, begun
+        try:
+            if waiting is None or waiting():
+                with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+                    waiting, begun = next(steps), time.monotonic()
+                return 1.0  # until Blender has handled the key
+            assert time.monotonic() < begun + PATIENCE, "waited in vain"
+        except StopIteration:
+            return quit_blender()
+        except Exception:
+            report["error"] = traceback.format_exc()
+            return quit_blender()
+        return 0.2
+
+    bpy.app.timers.register(tick, first_interval=3.0)
