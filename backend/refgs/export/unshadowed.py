@@ -24,9 +24,9 @@ def unshadowed(splats: Splats, surfels: Surfels, mesh: Mesh, light: Environment)
     are in the colours if the training traced no mesh. `light` is that of the training; `surfels` are the splats as tensors.
     """
     shadowed, occluder = surfels.albedo, Occluder(mesh)
-    matt = 1 - surfels.metallic[:, None]
+    matte = 1 - surfels.metallic[:, None]
     for _ in range(PASSES):
         with torch.no_grad():
             part = received(surfels, occluder, light).clamp_min(LEAST)
-        surfels = surfels._replace(albedo=(shadowed * (1 - matt + matt / part)).clamp(0, 1))
+        surfels = surfels._replace(albedo=(shadowed * (1 - matte + matte / part)).clamp(0, 1))
     return replace(splats, albedo=surfels.albedo.numpy())
