@@ -25,7 +25,7 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def ring(count: int = 16, distance: float = 3.0, centre: np.ndarray = CENTRE) -> list[np.ndarray]:
-    """Return camera poses on a ring around the ball, at alternating heights."""
+    """Return camera-to-world matrices on a ring around the ball, at alternating heights."""
     poses = []
     for i in range(count):
         azimuth, elevation = 2 * np.pi * i / count, (0.2, 0.9)[i % 2]

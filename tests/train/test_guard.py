@@ -64,7 +64,7 @@ def test_a_loss_that_is_no_number_is_not_stepped_on():
 
 
 def test_no_kernel_hides_what_is_no_number(device):
-    """Check that NaN in the input gives NaN in colour by direction, in shading, and in the rasteriser's derivatives."""
+    """Check that NaN in the input gives NaN in colours of spherical harmonics, in shading, and in the rasteriser's derivatives."""
     camera, nan = scenes.camera(20, 16), math.nan
     constant, rest, position = torch.ones(3, 1, 3), torch.ones(3, 3, 3), torch.rand(3, 3)
     constant[1, 0, 2] = rest[2, 1, 0] = nan

@@ -22,7 +22,7 @@ CHANGES += ["indirect.every=200", "indirect.resolution=64", "residual.start=1"]
 def trained(tmp_path_factory):
     """Train with inter-reflection and without it. Return both trainers and a list of two PSNRs.
 
-    The PSNRs are those of the trainer with inter-reflection, just before and just after inter-reflection starts.
+    These are the PSNRs of the first trainer just before and just after inter-reflection starts.
     """
     folder = tmp_path_factory.mktemp("two")
     write_ball_capture(folder / "capture", 64, TWO)
@@ -81,7 +81,7 @@ def test_visibility_is_that_of_the_balls(trained):
 
 
 def test_the_run_folder_has_it_all(trained):
-    """Check that the run folder renders as the training did, and nearly the same when relit by its own environment."""
+    """Check that the run folder renders as the training did. Relit by its own environment, it must look nearly the same."""
     made = trained[0]
     run, view = open_run(made.state.folder), made.state.test[0]
     shown, asset = made.state.render(view.camera), run.render(view.camera)
