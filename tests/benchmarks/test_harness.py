@@ -28,6 +28,12 @@ def scenes(tmp_path):
 
 
 @pytest.fixture
+def words(scenes, tmp_path):
+    """Return the options of a benchmark of these scenes, as words of a command line."""
+    return ["--scenes", str(scenes), "--out", str(tmp_path / "out"), "--csv", str(tmp_path / "a.csv")]
+
+
+@pytest.fixture
 def called(monkeypatch):
     """Replace calls of refgs by a fake that writes finished runs; return the list of commands that are called."""
     found = []
@@ -38,9 +44,8 @@ def called(monkeypatch):
             run = Path(words[1])
             run.mkdir(parents=True, exist_ok=True)
             (run / "splats.ply").touch()
-            (run / "needs.json").write_text(
-                '[{"need": "specular", "needed": false}, {"need": "light", "needed": true}]'
-            )
+            rows = [{"need": "specular", "needed": False}, {"need": "light", "needed": True}]
+            (run / "needs.json").write_text(json.dumps(rows))
             (run / "history.jsonl").write_text('{"parts": {"deciding": 1.0}, "seconds": 50.0}\n')
         else:
             psnr = {"deferred": 31.0, "sh": 26.0}.get(folder.parent.name, 30.0)
@@ -65,17 +70,8 @@ def test_a_wrong_word_lists_the_benchmarks():
     assert set(benchmarks.BENCHMARKS) == {file.stem for file in files if "def main(arguments" in file.read_text()}
 
 
-def test_nothing_is_trained_twice_and_colour_by_direction_as_long(scenes, called, tmp_path, capsys):
-    words = [
-        "--scenes",
-        str(scenes),
-        "--out",
-        str(tmp_path / "out"),
-        "--csv",
-        str(tmp_path / "a.csv"),
-        "--only",
-        "ball",
-    ]
+def test_nothing_is_trained_twice_and_colour_by_direction_as_long(scenes, words, called, tmp_path, capsys):
+    words += ["--only", "ball"]
     truth.main(words)
     first, _, second, evaluated = called
     assert first[:2] == ("train", "ball") and "--minutes" not in first
@@ -101,17 +97,16 @@ def test_an_interrupted_run_is_resumed(scenes, called, tmp_path):
     assert harness.train(scenes / "ball", run, []) and [words[0] for words in called] == ["evaluate"]
 
 
-def test_what_fails_does_not_stop_the_others(scenes, monkeypatch, tmp_path, capsys):
+def test_what_fails_does_not_stop_the_others(words, monkeypatch, capsys):
     trained = []
     monkeypatch.setattr(harness, "call", lambda command, folder, *_: trained.append(folder.name) or 2)
     with pytest.raises(SystemExit) as left:
-        truth.main(["--scenes", str(scenes), "--out", str(tmp_path / "out")])
+        truth.main(words)
     assert left.value.code == 1 and trained == ["ball", "matte"]
     assert "not measured, see above" in capsys.readouterr().out
 
 
-def test_what_scenes_do_without(scenes, called, tmp_path, capsys):
-    words = ["--scenes", str(scenes), "--out", str(tmp_path / "out"), "--csv", str(tmp_path / "a.csv")]
+def test_what_scenes_do_without(words, called, tmp_path, capsys):
     needs.main([*words, "--ways", "all on", "auto"])
     found = {r[1:4]: r.value for r in harness.read(tmp_path / "a.csv")}
     assert found["ball", "auto", "times_as_fast"] == 1 and found["ball", "auto", "left_out"] == "specular"
@@ -132,16 +127,10 @@ def test_no_scene_is_said(scenes):
 
 
 def test_rows_become_a_table():
-    table = Table(
-        "", "truth", (Column("a", "a", ".1f", "x"), Column("b", "b", ".2f", "x"), Column("c", "c")), mean=("one", "two")
-    )
-    rows = [
-        row("one", "x", "a", 30.0),
-        row("two", "x", "a", 32.0),
-        row("two", "x", "b", 1.0),
-        row("matte", "x", "a", 10.0),
-    ]
-    rows += [row("other", "y", "a", 1.0)]
+    columns = Column("a", "a", ".1f", "x"), Column("b", "b", ".2f", "x"), Column("c", "c")
+    table = Table("", "truth", columns, mean=("one", "two"))
+    rows = [row("one", "x", "a", 30.0), row("two", "x", "a", 32.0), row("two", "x", "b", 1.0)]
+    rows += [row("matte", "x", "a", 10.0), row("other", "y", "a", 1.0)]
     kept = [row("one", "x", "a", 29.0)]
     assert table.lines(rows, kept) == [
         ["scene", "a", "b"],

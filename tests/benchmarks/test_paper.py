@@ -20,7 +20,7 @@ def finish(run: Path, **figures: float) -> None:
 
 
 def test_the_papers_figures_are_its_means():
-    """Means of the figures kept from the paper's Table 1 agree with its Tables 5 and 6.
+    """Check that means of the figures kept from the paper's Table 1 agree with its Tables 5 and 6.
 
     Only the mean PSNR of Glossy Synthetic, 30.33, differs from the mean of its scenes.
     """
@@ -41,12 +41,8 @@ def test_the_papers_figures_are_its_means():
 
 
 def test_scenes_are_found_where_they_are_put(tmp_path, capsys):
-    for scene in (
-        "shiny_blender/ball",
-        "shiny_blender/unknown",
-        "glossy_synthetic/bell_blender",
-        "nerf_synthetic/lego",
-    ):
+    given = ["shiny_blender/ball", "shiny_blender/unknown", "glossy_synthetic/bell_blender", "nerf_synthetic/lego"]
+    for scene in given:
         (tmp_path / scene).mkdir(parents=True)
     nero(tmp_path / "glossy_synthetic" / "cat", count=1)
     colmap(tmp_path / "ref_real" / "sedan", count=1)
@@ -76,39 +72,28 @@ def test_nothing_there_is_said_in_one_line(tmp_path):
 
 
 def test_tables_of_finished_runs(tmp_path, capsys):
-    """Tables are printed from finished runs without training. If a scene lacks LPIPS, its cell and the mean are empty."""
+    """Check that tables are printed from finished runs without training. If a scene lacks LPIPS, its cell and the mean are empty."""
     data, out = tmp_path / "data", tmp_path / "runs"
+    figures = "psnr", "ssim", "lpips", "normal_mae_degrees", "training_seconds"
     measured = {
-        "shiny_blender/coffee": {
-            "psnr": 36.0,
-            "ssim": 0.98,
-            "lpips": 0.1,
-            "normal_mae_degrees": 1.5,
-            "training_seconds": 1800,
-        },
-        "shiny_blender/toaster": {
-            "psnr": 32.0,
-            "ssim": 0.96,
-            "lpips": 0.03,
-            "normal_mae_degrees": 2.5,
-            "training_seconds": 1800,
-        },
-        "glossy_synthetic/cat": {"psnr": 33.5, "ssim": 0.97, "lpips": 0.04},
-        "nerf_synthetic/materials": {"psnr": 34.0, "ssim": 0.97, "lpips": 0.02},
-        "nerf_synthetic/ship": {"psnr": 30.0, "ssim": 0.9},
+        "shiny_blender/coffee": (36.0, 0.98, 0.1, 1.5, 1800),
+        "shiny_blender/toaster": (32.0, 0.96, 0.03, 2.5, 1800),
+        "glossy_synthetic/cat": (33.5, 0.97, 0.04),
+        "nerf_synthetic/materials": (34.0, 0.97, 0.02),
+        "nerf_synthetic/ship": (30.0, 0.9),
     }
-    for name, figures in measured.items():
+    for name, values in measured.items():
         (data / name).mkdir(parents=True)
-        finish(out / "standard" / name, **figures)
+        finish(out / "standard" / name, **dict(zip(figures, values, strict=False)))
     paper.main(["--data", str(data), "--out", str(out), "--preset", "standard"])
     said = capsys.readouterr().out
-    for title in (
-        "Table 1, Shiny Blender",
-        "Table 1, Glossy Synthetic",
-        "Table 8, NeRF-Synthetic",
-        "Table 2, Shiny Blender",
+    for number, data_set in (
+        (1, "Shiny Blender"),
+        (1, "Glossy Synthetic"),
+        (8, "NeRF-Synthetic"),
+        (2, "Shiny Blender"),
     ):
-        assert title in " ".join(said.split())
+        assert f"Table {number}, {data_set}" in " ".join(said.split())
     rows = [line.replace("│", " ").split() for line in said.splitlines()]
     assert ["coffee", "36.00", "34.63", "0.980", "0.976", "0.100", "0.076"] in rows
     assert ["mean", "34.00", "31.34", "0.970", "0.962", "0.065", "0.075"] in rows
@@ -127,15 +112,12 @@ def test_a_scene_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, caps
     with pytest.raises(SystemExit) as left:
         paper.main(["--data", str(tmp_path), "--out", str(tmp_path / "runs"), "--preset", "standard"])
     said = capsys.readouterr().out
-    assert (
-        left.value.code == 1
-        and "shiny_blender/ball" in said.partition("not measured, see above")[2]
-        and "31.00" in said
-    )
+    assert left.value.code == 1 and "31.00" in said
+    assert "shiny_blender/ball" in said.partition("not measured, see above")[2]
 
 
 def test_from_photos_to_the_tables(tmp_path, monkeypatch, capsys):
-    """A tiny version of Shiny Blender's ball is trained, evaluated and printed, all in this process."""
+    """Train, evaluate and print a tiny version of Shiny Blender's ball, all in this process."""
     shiny_blender(tmp_path / "shiny_blender" / "ball")
     preset = tmp_path / "tiny.toml"
     preset.write_text(

@@ -46,7 +46,7 @@ def read(path):
 
 @pytest.fixture(scope="module")
 def rings(tmp_path_factory):
-    """Run `all` where every scene's folder but that of `rings` exists; return the rings' folder and the process."""
+    """Render all scenes where only the folder of the scene `rings` is missing. Return that folder and the finished process."""
     pytest.importorskip("bpy")
     out = tmp_path_factory.mktemp("all")
     for name in set(NAMES) - {"rings"}:
@@ -70,6 +70,11 @@ def camera_rays(capture, per_side=1):
     x, y = np.meshgrid(pixel / focal, -pixel / focal)
     directions = np.stack([x, y, -np.ones_like(x)], -1) @ matrix[:3, :3].T
     return matrix[:3, 3], directions / np.linalg.norm(directions, axis=-1, keepdims=True), -matrix[:3, 2]
+
+
+def first_hits(mesh, origin, rays):
+    """Return where rays from one origin first hit a mesh: the points, and the indices of the rays and of the triangles."""
+    return mesh.ray.intersects_location(np.broadcast_to(origin, rays.shape), rays, multiple_hits=False)
 
 
 def test_the_folder_and_the_progress(capture):
@@ -99,7 +104,7 @@ def test_depth_and_normals_are_the_true_mesh_seen_by_the_camera(capture):
     mesh = trimesh.load(capture[0] / "ground_truth/mesh.ply", process=False)
     origin, directions, axis = camera_rays(capture)
     rays = directions.reshape(-1, 3)
-    points, ray, triangle = mesh.ray.intersects_location(np.broadcast_to(origin, rays.shape), rays, multiple_hits=False)
+    points, ray, triangle = first_hits(mesh, origin, rays)
     hit = np.zeros(SIZE * SIZE, bool)
     hit[ray] = True
     alpha = images["alpha"].ravel()
@@ -156,15 +161,12 @@ def test_the_mirror_shows_the_light_where_it_is(capture, light, picture):
     normal = origin + directions * distance[..., None]
     facing = -(normal * directions).sum(-1)
     mirrored = directions + 2 * facing[..., None] * normal
-
-    def mean(values):
-        return values.reshape(SIZE, per_side, SIZE, per_side, -1).mean((1, 3))
-
-    good = mean((discriminant > 0) & (facing > 0.7) & (np.abs(normal[..., 2]) > 0.25))[..., 0] == 1
+    clear = (discriminant > 0) & (facing > 0.7) & (np.abs(normal[..., 2]) > 0.25)
+    good = pixel_means(clear, per_side) == 1
     assert good.sum() > 100
 
     def error(turn):
-        expected = mean(lookup(np.roll(panorama, turn, axis=1), mirrored)) * (0.95, 0.93, 0.88)
+        expected = pixel_means(lookup(np.roll(panorama, turn, axis=1), mirrored), per_side) * (0.95, 0.93, 0.88)
         return np.median(np.abs(np.log(color[..., :3][good] / expected[good])))
 
     assert error(0) < 0.05
@@ -186,11 +188,12 @@ def test_photos_are_straight_alpha_and_srgb(capture):
 
 
 def pixel_means(values, per_side):
-    return values.reshape(SIZE, per_side, SIZE, per_side, -1).mean((1, 3)).squeeze(-1)
+    """Average values (SIZE·n, SIZE·n) or (SIZE·n, SIZE·n, C) over the n × n rays of each pixel."""
+    return values.reshape(SIZE, per_side, SIZE, per_side, *values.shape[2:]).mean((1, 3))
 
 
 def march(solid, origins, directions):
-    """March rays (n, 3) to the surface of a signed distance; return which rays hit it, and their end points."""
+    """March rays (n, 3) to the surface of the signed distance `solid`. Return which rays hit it, and the end points of all."""
     along = np.zeros(len(directions))
     for _ in range(200):
         distance = solid(origins + directions * along[:, None])
@@ -249,9 +252,7 @@ def test_the_albedo_pass_shows_the_textures(tmp_path):
     origin, directions, _ = camera_rays([out], per_side)
     rays = directions.reshape(-1, 3)
     solid = trimesh.Trimesh(scene.mesh.vertices, scene.mesh.triangles, process=False)
-    points, ray, triangle = solid.ray.intersects_location(
-        np.broadcast_to(origin, rays.shape), rays, multiple_hits=False
-    )
+    points, ray, triangle = first_hits(solid, origin, rays)
     colors = np.zeros((len(rays), 3))
     for index, material in enumerate(scene.materials):
         here = scene.mesh.material[triangle] == index

@@ -27,11 +27,7 @@ def test_a_case_can_fail():
 
 
 def test_the_command():
-    done = subprocess.run(
-        [sys.executable, "-m", "refgs.cli", "stability", "--only", "depth ties"],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    command = [sys.executable, "-m", "refgs.cli", "stability", "--only", "depth ties"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "depth ties" in done.stdout and "Adam" not in done.stdout

@@ -18,7 +18,7 @@ def bench():
 
 
 def test_the_cards_benchmark_runs(bench, capsys):
-    """The card's benchmark runs on the CPU, all but its trainings."""
+    """Run the card's benchmark on the CPU, except for its trainings."""
     gpu.measure_raster(bench, CPU, [(500, 60, 40)], rounds=2)
     gpu.measure_frames(bench, CPU, 500, 40, rounds=2)
     gpu.measure_iteration(bench, CPU, rounds=1)
@@ -35,22 +35,19 @@ def test_no_card_is_said(monkeypatch, capsys):
 
 
 def test_the_kernels_benchmark_runs(monkeypatch, bench):
-    """A small version of the kernels' benchmark records every step, on one instruction set."""
+    """Check that a small version of the kernels' benchmark records every step, on one instruction set."""
     for name, value in {"SPLATS": 300, "SIDE": 24, "ROUNDS": 1}.items():
         monkeypatch.setattr(kernels, name, value)
     monkeypatch.setattr(kernels.load, "supported", lambda: ["sse4"])
     monkeypatch.setattr(kernels, "ball", partial(kernels.ball, 300, 24))
     kernels.measure_all(bench)
     assert {row.scene for row in bench.rows} == set(kernels.STEPS.values())
-    assert all(row.value > 0 for row in bench.rows) and {row.figure for row in bench.rows} == {
-        "least",
-        "median",
-        "floor",
-    }
+    assert all(row.value > 0 for row in bench.rows)
+    assert {row.figure for row in bench.rows} == {"least", "median", "floor"}
 
 
 def test_covered_pairs_are_about_those_that_are_blended():
-    """The estimated pairs of surfel and pixel are within 15 % of the blended ones.
+    """Check that the estimated number of pairs of surfel and pixel is within 15 % of the number of blended pairs.
 
     Surfels are so transparent that none is occluded, so the sum of alpha gives the number of pairs.
     """

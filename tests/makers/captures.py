@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 CENTRE = np.array([1.0, 2.0, 3.0])
 RADIUS = 0.5
@@ -14,7 +15,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the camera-to-world matrix, with OpenGL axes, of a camera that looks at the origin; +Z is up."""
+    """Return the camera-to-world matrix, with OpenGL axes, of a camera that looks at `target`; +Z is up."""
     back = (position - target) / np.linalg.norm(position - target)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -24,7 +25,7 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def ring(count: int = 16, distance: float = 3.0, centre: np.ndarray = CENTRE) -> list[np.ndarray]:
-    """Return camera poses on a ring around the ball, at alternating heights."""
+    """Return camera-to-world matrices on a ring around the ball, at alternating heights."""
     poses = []
     for i in range(count):
         azimuth, elevation = 2 * np.pi * i / count, (0.2, 0.9)[i % 2]
@@ -109,7 +110,8 @@ def colmap(
     for i, pose in enumerate(ring(count)):
         write(folder / "images" / f"{i:04d}.png", ball(pose, 64, 48, 60.0)[..., :3])
         world_to_camera = np.linalg.inv(pose @ FLIP)
-        images.append((i + 1, *quaternion(world_to_camera[:3, :3]), *world_to_camera[:3, 3], 7, f"{i:04d}.png"))
+        turn = Rotation.from_matrix(world_to_camera[:3, :3])
+        images.append((i + 1, *turn.as_quat(scalar_first=True), *world_to_camera[:3, 3], 7, f"{i:04d}.png"))
     number, name, params = model
     if binary:
         data = struct.pack("<QiiQQ", 1, 7, number, 64, 48) + struct.pack(f"<{len(params)}d", *params)
@@ -171,15 +173,3 @@ def nero(folder: Path, count: int = 16, split: tuple[list, list] | None = None, 
     if split is not None:
         (folder.parent / "synthetic_split_128.pkl").write_bytes(pickle.dumps(split, protocol))
     return folder
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Return the quaternion wxyz of a rotation matrix, as the eigenvector of its symmetric 4×4 form."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    matrix = [
-        [a + e + i, h - f, c - g, d - b],
-        [h - f, a - e - i, b + d, c + g],
-        [c - g, b + d, e - a - i, f + h],
-        [d - b, c + g, f + h, i - a - e],
-    ]
-    return np.linalg.eigh(np.array(matrix))[1][:, -1]

@@ -60,12 +60,7 @@ def learn(command, asked, out):
             iteration += 10
             if "crash" in command["capture"] and iteration > 100:
                 os._exit(3)
-            facts = {
-                "iteration": iteration,
-                "total": 1000,
-                "seconds": iteration / 100,
-                "seconds_left": 10 - iteration / 100,
-            }
+            facts |= {"iteration": iteration, "seconds": iteration / 100, "seconds_left": 10 - iteration / 100}
             say("progress", **facts, loss=0.1, psnr=20 + iteration / 100, splats=10)
             if iteration in (100, 1000):
                 say("measured", iteration=iteration, seconds=iteration / 100, psnr_test=19 + iteration / 100)
@@ -95,16 +90,9 @@ def check(command):
         lens = {"fl_x": 90.0, "fl_y": 90.0, "cx": 32.0, "cy": 32.0, "w": 64, "h": 64}
         frames.append({"file_path": f"images/{number}", "photo": f"{number}.png", "transform_matrix": matrix} | lens)
     (out / "cameras.json").write_text(json.dumps({"frames": frames}))
-    say(
-        "done",
-        job="check",
-        capture=command["capture"],
-        cameras=str(out / "cameras.json"),
-        thumbnails=[str(out / "0000.png"), str(out / "0001.png")],
-        centre=[0.0, 0.0, 0.0],
-        radius=1.0,
-        lines=["Views: 3", "Warning: they are dark"],
-    )
+    files = {"cameras": str(out / "cameras.json"), "thumbnails": [str(out / "0000.png"), str(out / "0001.png")]}
+    facts = {"centre": [0.0, 0.0, 0.0], "radius": 1.0, "lines": ["Views: 3", "Warning: they are dark"]}
+    say("done", job="check", capture=command["capture"], **files, **facts)
 
 
 def main():
@@ -129,13 +117,8 @@ def main():
         return taken
 
     threading.Thread(target=listen, daemon=True).start()
-    say(
-        "ready",
-        protocol=2 if "newer" in os.environ.get("FAKE", "") else 1,
-        refgs="9.9",
-        card=None,
-        no_card="it is a fake",
-    )
+    protocol = 2 if "newer" in os.environ.get("FAKE", "") else 1
+    say("ready", protocol=protocol, refgs="9.9", card=None, no_card="it is a fake")
     while True:
         commands = waiting + asked()
         waiting.clear()

@@ -22,7 +22,7 @@ def quaternion_matrix(q):
 
 
 def look_at(eye, target=(0, 0, 0)):
-    """Return the camera-to-world matrix, with OpenGL axes, of a camera that looks at the origin; +Z is up."""
+    """Return the camera-to-world matrix, with OpenGL axes, of a camera that looks at `target`; +Z is up."""
     back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
     right = np.cross([0, 0, 1], back)
     right /= np.linalg.norm(right)

@@ -7,6 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from benchmarks.scenes.analytic import meet
 from refgs.camera import Camera
 
 NEAR = 0.1
@@ -33,6 +34,16 @@ def camera_rays(camera: Camera) -> Tensor:
     rotation = torch.from_numpy(camera.world_to_camera[:3, :3].copy())
     rays = rotation[2] + x[None, :, None] * rotation[0] + y[:, None, None] * rotation[1]
     return rays.float()
+
+
+def meetings(camera: Camera, balls: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Intersect the rays through pixel centres with balls, row by row.
+
+    Return unit rays (P, 3), which of them hit a ball (P,), the first points (P, 3) and the normals there (P, 3).
+    """
+    rays = camera_rays(camera).double().numpy().reshape(-1, 3)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return rays, *meet(np.broadcast_to(camera.position, rays.shape), rays, balls)
 
 
 def surfels(kind: str, channels: int, seed: int = 0) -> tuple[Tensor, ...]:

@@ -7,31 +7,21 @@ import trimesh
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake_temporarily
 
-from refgs.capture import read_capture
 from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.kernels import cuda
 from refgs.model import prefilter
 from refgs.render import raster_cuda, shade
-from refgs.settings import load_settings
-from refgs.train.trainer import Trainer
 from tests.makers.emulate import emulate
+from tests.makers.training import TINY, trainer
 
 CARD = torch.device("cuda:0")
+# At a metallic of 0.5, a metal and a dielectric are so equally bright that derivatives are only rounding.
+START = [*TINY, "surfels.metallic=0.8"]
 
 
-def make_trainer(capture, folder, *changes: str, device: str = "cpu") -> Trainer:
-    start = [
-        "surfels.start=600",
-        "surfels.budget=800",
-        "surfels.hull=48",
-        "train.light_first=0",
-        "environment.resolution=16",
-        "surfels.metallic=0.8",  # at 0.5, a metal and a dielectric are so equally bright that derivatives are only rounding
-    ]
-    settings = load_settings("quick", [*start, *changes])
-    (folder / "checkpoints").mkdir(parents=True)
-    return Trainer(read_capture(capture), settings, folder, lambda *_: None, device=device)
+def occluder(shape: trimesh.Trimesh) -> Occluder:
+    return Occluder(Mesh(shape.vertices, np.asarray(shape.faces)))
 
 
 @pytest.mark.parametrize(
@@ -39,23 +29,20 @@ def make_trainer(capture, folder, *changes: str, device: str = "cpu") -> Trainer
 )
 def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
     """Check that a training takes the same steps with the kernels for the CPU and for cards, with self-occlusion too."""
-    figures, learned = [], []
+    figures, values = [], []
     for name in ("cpu", "card"):
-        trainer = make_trainer(ball_capture, tmp_path / name, *changes)
+        made = trainer(ball_capture, tmp_path / name, *START, *changes, total=3000)
         if "indirect.start=0" in changes:
-            ring = trimesh.creation.torus(1.0, 0.3)
-            trainer.state.occluder = Occluder(
-                Mesh(ring.vertices * trainer.state.capture.radius, np.asarray(ring.faces))
-            )
+            made.state.occluder = occluder(trimesh.creation.torus(1.0, 0.3).apply_scale(made.state.capture.radius))
         if name == "card":
             emulate(monkeypatch)
-        steps = [trainer.step() for _ in range(3)]
+        steps = [made.step() for _ in range(3)]
         figures.append([[float(step[name]) for name in ("loss", "square")] for step in steps])
-        learned.append({name: value.detach().clone() for name, value in trainer.state.parameters.items()})
+        values.append(made.state.parameters)
     np.testing.assert_allclose(figures[0], figures[1], rtol=1e-3)
-    for name, value in learned[0].items():
+    for name, value in values[0].items():
         # Adam's first steps follow the sign of the gradient, which rounding may flip where gradients are tiny.
-        off = (value - learned[1][name]).abs() > 1e-3 * value.abs().max()
+        off = (value - values[1][name]).abs() > 1e-3 * value.abs().max()
         assert float(off.float().mean()) < 0.05, name
 
 
@@ -125,33 +112,23 @@ def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, ind
 
     With fake tensors, reading a value is an error. Making a tensor whose size depends on a value is an error too.
     """
-    ball = trimesh.creation.icosphere(2)
-    occluder = Occluder(Mesh(ball.vertices, np.asarray(ball.faces)))
-    tree = occluder.tree(torch.device("cpu"))
+    ball = occluder(trimesh.creation.icosphere(2))
+    tree = ball.tree(torch.device("cpu"))
     launched = follow_to_the_card(monkeypatch)
     with FakeTensorMode(allow_non_fake_inputs=True):
         changes = f"indirect.start={0 if indirect else 1}", "light.frame=world"  # "auto" would be decided on the CPU
-        trainer = make_trainer(ball_capture, tmp_path / "run", *changes, device="cuda")
+        made = trainer(ball_capture, tmp_path / "run", *START, *changes, total=3000, device="cuda")
         with unset_fake_temporarily():
-            trainer._next_view()  # shuffles the order of views on the CPU
+            made._next_view()  # shuffles the order of views on the CPU
         if indirect:
             tree._boxes, tree._triangles = (torch.empty(v.shape, device=CARD) for v in (tree._boxes, tree._triangles))
-            trainer.state.occluder = occluder
+            made.state.occluder = ball
         # The training computes at its start which texels of the light the object shows.
-        trainer.state.light_shown = torch.empty(len(trainer.state.light), device=CARD)
-        figures = trainer.step()
+        made.state.light_shown = torch.empty(len(made.state.light), device=CARD)
+        figures = made.step()
         assert all(figure.device == CARD for figure in figures.values())
-        assert all(value.grad is None and value.device == CARD for value in trainer.state.parameters.values())
-    stages = [
-        "activate",
-        "sparse",
-        "raster_project",
-        "raster_forward",
-        "shade_forward",
-        "losses",
-        "ssim",
-        "raster_backward",
-        "adam",
-    ]
+        assert all(value.grad is None and value.device == CARD for value in made.state.parameters.values())
+    stages = ["activate", "sparse", "raster_project", "raster_forward", "shade_forward"]
+    stages += ["losses", "ssim", "raster_backward", "adam"]
     for stage in stages + ["trace", "harmonics"] * indirect:
         assert any(stage in name for name in launched), stage

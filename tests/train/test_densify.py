@@ -11,12 +11,13 @@ from refgs.train.motion import ScreenGradient
 SETTINGS = load_settings("quick").densify
 
 
-def make(count=20):
+def make():
+    """Make the parameters of 20 random surfels, and an optimiser of them and a light that has done one step."""
     rng = np.random.default_rng(0)
-    normals = rng.normal(size=(count, 3))
+    normals = rng.normal(size=(20, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     parameters = initial_parameters(
-        rng.normal(size=(count, 3)), normals, np.full(count, 0.1), None,
+        rng.normal(size=(20, 3)), normals, np.full(20, 0.1), None,
         opacity=0.5, sh_degree=1, albedo=0.5, metallic=0.5, roughness=0.3,
     )  # fmt: skip
     groups = [{"params": [value], "name": name} for name, value in parameters.items()]
@@ -62,14 +63,11 @@ def test_a_division_keeps_the_variance():
 
 def test_faint_surfels_go_and_one_stays():
     parameters, optimizer = make()
-    with torch.no_grad():
-        parameters["opacity"][:5] = -20
-    densify(parameters, optimizer, torch.zeros(20), SETTINGS, budget=100, divide=False)
-    assert len(parameters["position"]) == 15
-    with torch.no_grad():
-        parameters["opacity"][:] = -20
-    densify(parameters, optimizer, torch.zeros(15), SETTINGS, budget=100, divide=False)
-    assert len(parameters["position"]) == 1
+    for count, faint, left in ((20, 5, 15), (15, 15, 1)):
+        with torch.no_grad():
+            parameters["opacity"][:faint] = -20
+        densify(parameters, optimizer, torch.zeros(count), SETTINGS, budget=100, divide=False)
+        assert len(parameters["position"]) == left
 
 
 def test_screen_gradient_is_by_pixels_of_motion():

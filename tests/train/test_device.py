@@ -6,11 +6,10 @@ import pytest
 import torch
 
 from refgs import train_job
-from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.kernels import cuda
-from refgs.settings import load_settings
 from refgs.train.trainer import Trainer
+from tests.makers.training import trainer
 
 
 def chosen(device: str) -> tuple[str, list[str]]:
@@ -43,8 +42,8 @@ def test_a_card_is_taken(monkeypatch):
 def test_no_card(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert chosen("auto") == ("cpu", [])
-    device, said = chosen("cuda")
-    assert device == "cpu" and len(said) == 1 and "no NVIDIA card, or no driver" in said[0]
+    device, (line,) = chosen("cuda")
+    assert device == "cpu" and "no NVIDIA card, or no driver" in line
 
 
 def test_a_driver_that_is_too_old_for_torch(monkeypatch):
@@ -54,64 +53,51 @@ def test_a_driver_that_is_too_old_for_torch(monkeypatch):
 
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", available)
-    device, said = chosen("auto")
-    assert device == "cpu" and len(said) == 1 and "driver is too old" in said[0]
+    device, (line,) = chosen("auto")
+    assert device == "cpu" and "driver is too old" in line
 
 
 @pytest.mark.parametrize("asked", ["auto", "cuda"])
 def test_a_card_that_is_too_old(monkeypatch, asked):
     card(monkeypatch, (6, 1))
-    device, said = chosen(asked)
-    assert device == "cpu" and len(said) == 1
-    assert "GeForce is too old: its compute capability is 6.1, 7.5" in said[0]
+    device, (line,) = chosen(asked)
+    assert device == "cpu" and "GeForce is too old: its compute capability is 6.1, 7.5" in line
 
 
 def test_a_driver_that_refuses(monkeypatch):
     card(monkeypatch, (8, 6), driver="adam.cpp: CUDA_ERROR_INVALID_IMAGE\nand more")
-    device, said = chosen("auto")
-    assert (
-        device == "cpu"
-        and len(said) == 1
-        and said[0].endswith("(adam.cpp: CUDA_ERROR_INVALID_IMAGE): a newer driver may do")
-    )
+    device, (line,) = chosen("auto")
+    assert device == "cpu" and line.endswith("(adam.cpp: CUDA_ERROR_INVALID_IMAGE): a newer driver may do")
 
 
-def small_trainer(ball_capture, folder, reports: list, start: int) -> Trainer:
-    changes = [
-        f"surfels.start={start}",
-        "train.iterations=12",
-        "surfels.hull=48",
-        "surfels.inside=0.0",
-        "surfels.opacity=0.73",
-    ]
-    settings = load_settings("quick", changes)
-    (folder / "checkpoints").mkdir(parents=True)
-    return Trainer(read_capture(ball_capture), settings, folder, lambda *event: reports.append(event))
+def of_many(capture, folder, start: int, report=lambda *event: None) -> Trainer:
+    """Make a trainer of `start` surfels, whose budget is far larger."""
+    changes = f"surfels.start={start}", "surfels.budget=24000", "surfels.inside=0.0", "surfels.opacity=0.73"
+    return trainer(capture, folder / "run", "surfels.hull=48", *changes, total=12, report=report)
 
 
 def test_full_memory_lowers_the_budget_and_goes_on(ball_capture, tmp_path, monkeypatch):
     reports = []
-    trainer = small_trainer(ball_capture, tmp_path, reports, start=2000)
-    whole, step = 1800, trainer.step
+    made = of_many(ball_capture, tmp_path, 2000, lambda *event: reports.append(event))
+    step = made.step
 
     def limited() -> dict:
-        if len(trainer.state.parameters["position"]) > whole:
+        if len(made.state.parameters["position"]) > 1800:
             raise torch.OutOfMemoryError
         return step()
 
-    faintest = trainer.state.parameters["opacity"][:400]
     with torch.no_grad():
-        faintest -= 1
-    monkeypatch.setattr(trainer, "step", limited)
-    assert trainer.run()
-    warnings = [facts["what"] for event, facts in reports if event == "warning"]
-    assert len(warnings) == 1 and "1,600 surfels" in warnings[0]
-    assert trainer.state.settings.surfels.budget == len(trainer.state.parameters["position"]) == 1600
-    assert trainer.state.parameters["opacity"].min() > 0
+        made.state.parameters["opacity"][:400] -= 1
+    monkeypatch.setattr(made, "step", limited)
+    assert made.run()
+    (warning,) = [facts["what"] for event, facts in reports if event == "warning"]
+    assert "1,600 surfels" in warning
+    assert made.state.settings.surfels.budget == len(made.state.parameters["position"]) == 1600
+    assert made.state.parameters["opacity"].min() > 0
 
 
 def test_memory_that_is_far_too_small(ball_capture, tmp_path, monkeypatch):
-    trainer = small_trainer(ball_capture, tmp_path, [], start=1200)
-    monkeypatch.setattr(trainer, "step", lambda: (_ for _ in ()).throw(torch.OutOfMemoryError()))
+    made = of_many(ball_capture, tmp_path, 1200)
+    monkeypatch.setattr(made, "step", lambda: (_ for _ in ()).throw(torch.OutOfMemoryError()))
     with pytest.raises(InputError, match="memory is too small"):
-        trainer.run()
+        made.run()

@@ -23,9 +23,7 @@ def test_a_change_keeps_what_was_asked():
     first = Effective.of(asked).changed("surfels.budget", 900, "memory", "the card is full")
     second = first.changed("surfels.budget", 700, "memory", "it is full again")
     assert second.asked is asked and second.settings.surfels.budget == 700 and first.settings.surfels.budget == 900
-    assert second.changes == {
-        "surfels.budget": Change(asked.surfels.budget, 700, "memory", "it is full again"),
-    }
+    assert second.changes == {"surfels.budget": Change(asked.surfels.budget, 700, "memory", "it is full again")}
     assert second.settings.model_copy(update={"surfels": asked.surfels}) == asked
 
 

@@ -37,8 +37,7 @@ def test_rates_change_only_beyond_the_presets(part, factor):
 def test_more_time_brings_more_of_all(ball_capture, tmp_path):
     """Check that a longer training has more surfels, more iterations and lower learning rates.
 
-    The durations range from less than `quick` takes to more than `standard` takes. The test only measures the time of an iteration;
-    it does not train to the end.
+    The shortest duration is less than the preset `quick` takes, the longest more than `standard` takes. No training is run to its end.
     """
     capture = read_capture(ball_capture)
     said, found = [], []

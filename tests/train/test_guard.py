@@ -1,6 +1,5 @@
 """Test the guard, which rejects steps of the optimiser that are not finite."""
 
-import json
 import math
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 import torch
 
 from benchmarks.stability.optimisation import nan_gradient, nan_value, resumed
-from benchmarks.stability.training import trainer
+from benchmarks.stability.training import ball, changed, trainer
 from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.model.adam import Adam
@@ -65,7 +64,7 @@ def test_a_loss_that_is_no_number_is_not_stepped_on():
 
 
 def test_no_kernel_hides_what_is_no_number(device):
-    """Check that NaN in the input gives NaN in colour by direction, in shading, and in the rasteriser's derivatives."""
+    """Check that NaN in the input gives NaN in colours of spherical harmonics, in shading, and in the rasteriser's derivatives."""
     camera, nan = scenes.camera(20, 16), math.nan
     constant, rest, position = torch.ones(3, 1, 3), torch.ones(3, 3, 3), torch.rand(3, 3)
     constant[1, 0, 2] = rest[2, 1, 0] = nan
@@ -90,14 +89,11 @@ def test_no_kernel_hides_what_is_no_number(device):
 def test_values_stay_within_limits(device):
     value = torch.zeros(40, device=device)
     optimizer = Adam([{"params": [value], "lr": 5.0, "limits": (-12.0, 3.0)}])
-    for _ in range(20):
-        value.grad = torch.linspace(-1, 1, 40, device=device)
-        optimizer.step()
-    assert value[[0, -1]].tolist() == [3, -12] == [float(value.max()), float(value.min())]
-    for _ in range(20):  # a value at a limit leaves it when its gradient points away
-        value.grad = -torch.linspace(-1, 1, 40, device=device)
-        optimizer.step()
-    assert value[[0, -1]].tolist() == [-12, 3]
+    for sign, ends in ((1, [3, -12]), (-1, [-12, 3])):  # a value at a limit leaves it when its gradient points away
+        for _ in range(20):
+            value.grad = sign * torch.linspace(-1, 1, 40, device=device)
+            optimizer.step()
+        assert value[[0, -1]].tolist() == ends and (float(value.max()), float(value.min())) == (3, -12)
 
 
 def test_limits_keep_to_the_scenes_size():
@@ -178,27 +174,18 @@ def test_resumed_in_every_stage_it_is_the_same_run():
     assert found.finite and found.error == 0
 
 
-def moved(folder, target, scale, offset):
-    """Copy the capture. Multiply its camera positions by `scale`, then add `offset`."""
-    target.mkdir()
-    for split in ("train", "test"):
-        (target / split).symlink_to(folder / split)
-        frames = json.loads((folder / f"transforms_{split}.json").read_text())
-        for frame in frames["frames"]:
-            matrix = np.array(frame["transform_matrix"])
-            matrix[:3, 3] = scale * matrix[:3, 3] + offset
-            frame["transform_matrix"] = matrix.tolist()
-        (target / f"transforms_{split}.json").write_text(json.dumps(frames))
-    return target
-
-
 @pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e-6, 1.0), (1e6, 0.0), (1.0, 1e5), (1e3, -1e7)])
-def test_a_capture_anywhere_is_learned_about_the_origin(ball_capture, tmp_path, scale, offset):
+def test_a_capture_anywhere_is_learned_about_the_origin(scale, offset):
     """Check that the scale and offset of a capture do not change its cameras in the run's frame, up to rounding.
 
     `to_capture` maps the cameras back to the capture's frame.
     """
-    usual, found = (read_capture(c) for c in (ball_capture, moved(ball_capture, tmp_path / "moved", scale, offset)))
+
+    def moved(pose: np.ndarray) -> np.ndarray:
+        pose[:3, 3] = scale * pose[:3, 3] + offset
+        return pose
+
+    usual, found = read_capture(ball()), read_capture(changed(moved))
     assert np.array_equal(usual.to_capture, np.eye(4))  # a NeRF-Blender frame is kept if it suits float32
     assert np.abs(found.centre).max() < 1e-9 and found.radius == pytest.approx(1)
     lost = 1e-15 * (abs(offset) / scale + 1) + 1e-9

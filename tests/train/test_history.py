@@ -7,32 +7,17 @@ import shutil
 import numpy as np
 import pytest
 
-from benchmarks.scenes.analytic import F0, ONE, meet, sky
+from benchmarks.scenes.analytic import F0, ONE, sky
 from refgs.capture import read_capture
 from refgs.formats.exr import write_exr
 from refgs.formats.panorama import directions
-from refgs.run import create_run
-from refgs.settings import load_settings
 from refgs.train import history
-from refgs.train.trainer import Trainer
 from tests.makers import scenes
-
-SMALL = [
-    "surfels.start=600",
-    "surfels.budget=800",
-    "surfels.hull=48",
-    "environment.resolution=16",
-    "train.light_first=0",
-]
+from tests.makers.training import TINY, put, trainer
 
 
-def make(capture, folder, *changes, total=40, report=lambda event, facts: None):
-    settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
-    read = read_capture(capture)
-    trainer = Trainer(read, settings, folder, report)
-    if not folder.exists():
-        create_run(folder, read, trainer.state.settings, "quick", "cpu")
-    return trainer
+def make(capture, folder, *changes, total=40, **options):
+    return trainer(capture, folder, *TINY, *changes, total=total, **options)
 
 
 def rows(folder):
@@ -80,30 +65,26 @@ def test_measuring_is_not_in_the_seconds(ball_capture, tmp_path, monkeypatch):
     time = Time()
     monkeypatch.setattr("refgs.train.trainer.time", time)
     monkeypatch.setattr("refgs.clock.time", time)
-    trainer = make(ball_capture, tmp_path / "run", total=20)
+    made = make(ball_capture, tmp_path / "run", total=20)
 
     def slow(_):
         time.now += 1000
         return {"psnr_test": 20.0}
 
-    trainer.measures.errors = slow
-    trainer.run()
+    made.measures.errors = slow
+    made.run()
     found = rows(tmp_path / "run")
     assert [row["iteration"] for row in found] == [10, 13, 16, 20]
-    assert ["psnr_test" in row for row in found] == [True, False, False, True], (
-        "the first and the last, whatever it costs"
-    )
-    assert found[-1]["seconds"] < 10 and trainer.state.seconds < 10
-    assert trainer.state.clock.seconds["measuring"] == pytest.approx(2000, abs=1)
+    measured = [row["iteration"] for row in found if "psnr_test" in row]
+    assert measured == [10, 20], "the first and the last, whatever it costs"
+    assert found[-1]["seconds"] < 10 and made.state.seconds < 10
+    assert made.state.clock.seconds["measuring"] == pytest.approx(2000, abs=1)
     assert found[-1]["parts"]["measuring"] == pytest.approx(1000, abs=1), "what was spent before that line"
 
 
 def test_parts_add_up_to_the_seconds(ball_capture, tmp_path):
     said = []
-    trainer = make(
-        ball_capture, tmp_path / "run", "densify.every=10", report=lambda event, facts: said.append((event, facts))
-    )
-    trainer.run()
+    make(ball_capture, tmp_path / "run", "densify.every=10", report=lambda *event: said.append(event)).run()
     last = rows(tmp_path / "run")[-1]
     parts = last["parts"]
     inside = {name: seconds for name, seconds in parts.items() if name not in history.BESIDE}
@@ -127,13 +108,9 @@ def test_a_resumed_run_records_the_same(ball_capture, tmp_path, monkeypatch):
     second.resume()
     assert rows(tmp_path / "cut")[-1]["iteration"] == 20 == second.state.iteration
     second.run()
-    # Loss and psnr_train are left out: their running means start anew.
+    others = {"seconds", "parts", "loss", "psnr_train"}  # the running means of loss and psnr_train start anew
     whole, cut = (
-        [
-            {name: value for name, value in row.items() if name not in ("seconds", "parts", "loss", "psnr_train")}
-            for row in found
-        ]
-        for found in map(rows, (tmp_path / "whole", tmp_path / "cut"))
+        [{name: row[name] for name in row.keys() - others} for row in rows(tmp_path / run)] for run in ("whole", "cut")
     )
     assert whole == cut and whole[-1]["iteration"] == 40 and "flip_test" in whole[3]
     before, after = (row["parts"] for row in rows(tmp_path / "cut")[3:5])
@@ -141,23 +118,16 @@ def test_a_resumed_run_records_the_same(ball_capture, tmp_path, monkeypatch):
 
 
 def test_a_training_that_is_ended_early_has_a_last_line(ball_capture, tmp_path):
-    trainer = make(ball_capture, tmp_path / "run")
+    made = make(ball_capture, tmp_path / "run")
 
     def finish():
-        if trainer.state.iteration == 14:
-            trainer.state.total = 14
-        return trainer.state.ended
+        if made.state.iteration == 14:
+            made.state.total = 14
+        return made.state.ended
 
-    trainer.run(stop=finish)
+    made.run(stop=finish)
     assert [row["iteration"] for row in rows(tmp_path / "run")] == [10, 13, 14]
     assert "flip_test" in rows(tmp_path / "run")[-1]
-
-
-def rays(camera):
-    """Return a camera's unit rays (P, 3), which of them hit the ball, the hit points, and the normals at these points."""
-    ray = scenes.camera_rays(camera).double().numpy().reshape(-1, 3)
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    return ray, *meet(np.broadcast_to(camera.position, ray.shape), ray, ONE)
 
 
 def dusk(direction):
@@ -173,21 +143,15 @@ def write_truth(capture):
     write_exr(truth / "relight" / "dusk.exr", dusk(directions(64, 128)))
     for view in read_capture(capture).test_views:
         camera, name = view.camera, f"{view.camera.name}.exr"
-        size = camera.height, camera.width
-        ray, hit, _, normal = rays(camera)
+        ray, hit, _, normal = scenes.meetings(camera, ONE)
         cosine = -(ray * normal).sum(-1, keepdims=True)
         fresnel = F0 + (1 - F0) * (1 - cosine.clip(0, 1)) ** 5
         radiance = np.where(hit[:, None], fresnel * dusk(ray + 2 * cosine * normal), 0)
-        images = {
-            "alpha": hit,
-            "normal": normal * hit[:, None],
-            "albedo": hit[:, None] * F0,
-            "metallic": hit,
-            "roughness": 0 * hit,
-        }
+        images = {"alpha": hit, "metallic": hit, "roughness": 0 * hit}
+        images |= {"normal": normal * hit[:, None], "albedo": hit[:, None] * F0}
         images["relight/dusk"] = np.concatenate([radiance, hit[:, None]], axis=1)
         for kind, pixels in images.items():
-            shape = size if pixels.ndim == 1 else (*size, pixels.shape[1])
+            shape = camera.height, camera.width, *pixels.shape[1:]
             write_exr(truth / kind / name, pixels.reshape(shape).astype(np.float32))
 
 
@@ -201,16 +165,15 @@ def known_capture(ball_capture, tmp_path_factory):
 
 def test_errors_against_the_truth(known_capture, tmp_path):
     """Check that the recorded errors agree with a second computation, and that training lowers them."""
-    trainer = make(
-        known_capture, tmp_path / "run", "surfels.metallic=0.9", "surfels.budget=1500", "surfels.start=1500", total=250
-    )
-    start = trainer.measures.errors(trainer.state)
-    trainer.run()
+    changes = "surfels.metallic=0.9", "surfels.budget=1500", "surfels.start=1500"
+    made = make(known_capture, tmp_path / "run", *changes, total=250)
+    start = made.measures.errors(made.state)
+    made.run()
     found = rows(tmp_path / "run")[-1]
     angles, roughness, metallic = [], [], []
-    for view in trainer.state.test:
-        _, hit, _, normal = rays(view.camera)
-        seen = trainer.state.render(view.camera)
+    for view in made.state.test:
+        _, hit, _, normal = scenes.meetings(view.camera, ONE)
+        seen = made.state.render(view.camera)
         shown = seen.normal.double().numpy().reshape(-1, 3)[hit]
         there = (seen.alpha.numpy().reshape(-1)[hit] >= 0.1) & (np.linalg.norm(shown, axis=1) > 1e-6)
         cosine = (shown * normal[hit]).sum(-1) / np.maximum(np.linalg.norm(shown, axis=1), 1e-6)
@@ -220,7 +183,7 @@ def test_errors_against_the_truth(known_capture, tmp_path):
     assert found["normal_mae_degrees"] == pytest.approx(np.mean(angles), rel=1e-4)
     assert found["roughness_mae"] == pytest.approx(np.mean(roughness), abs=1e-4)
     assert found["metallic_mae"] == pytest.approx(np.mean(metallic), abs=1e-4)
-    light, true = (x(64) for x in (trainer.state.environment().panorama, lambda rows: sky(directions(rows, 2 * rows))))
+    light, true = made.state.environment().panorama(64), sky(directions(64, 128))
     weight = np.cos(np.pi * (0.5 - (np.arange(64) + 0.5) / 64))[:, None, None]
     apart = np.log(light) - np.log(true)
     apart -= (apart * weight).sum() / (weight.sum() * 128 * 3)
@@ -236,14 +199,12 @@ def test_a_light_known_exactly_leaves_the_relit_picture_alone(known_capture, tmp
 
     The remaining error is at the outline. Surfels with another metal do not reach 20 dB.
     """
-    trainer = make(known_capture, tmp_path / "run", "surfels.start=3000", "surfels.budget=3000", "surfels.hull=96")
+    made = make(known_capture, tmp_path / "run", "surfels.start=3000", "surfels.budget=3000", "surfels.hull=96")
     logit = np.log(F0 / (1 - F0))
-    settings = {"albedo": logit, "metallic": 9.0, "roughness": -9.0}
-    for name, value in settings.items():
-        trainer.state.parameters[name].data[:] = trainer.state.parameters[name].new_tensor(value)
-    assert trainer.measures.errors(trainer.state)["relit_psnr"] > 20
-    trainer.state.parameters["albedo"].data[:] = trainer.state.parameters["albedo"].new_tensor(logit[::-1].copy())
-    assert trainer.measures.errors(trainer.state)["relit_psnr"] < 20, "of another metal"
+    put(made, albedo=logit, metallic=9.0, roughness=-9.0)
+    assert made.measures.errors(made.state)["relit_psnr"] > 20
+    put(made, albedo=logit[::-1].copy())
+    assert made.measures.errors(made.state)["relit_psnr"] < 20, "of another metal"
 
 
 def test_without_colour_that_is_material_there_is_none_to_compare(known_capture, tmp_path):
@@ -256,21 +217,19 @@ def test_without_colour_that_is_material_there_is_none_to_compare(known_capture,
 
 def test_a_truth_that_does_not_fit_is_left_out_with_a_line(known_capture, tmp_path):
     said = []
-    trainer = make(
-        known_capture, tmp_path / "run", "image.max_side=32", report=lambda event, facts: said.append((event, facts))
-    )
-    warnings = [facts["what"] for event, facts in said if event == "warning"]
-    assert len(warnings) == 1 and "its size is not the view's (32×32)" in warnings[0]
-    assert trainer.measures.errors(trainer.state).keys() == {"psnr_test"}
+    made = make(known_capture, tmp_path / "run", "image.max_side=32", report=lambda *event: said.append(event))
+    (warning,) = [facts["what"] for event, facts in said if event == "warning"]
+    assert "its size is not the view's (32×32)" in warning
+    assert made.measures.errors(made.state).keys() == {"psnr_test"}
 
 
 def test_psnr_is_that_of_encoded_pictures(ball_capture, tmp_path):
-    trainer = make(ball_capture, tmp_path / "run")
+    made = make(ball_capture, tmp_path / "run")
     square = []
-    for view in trainer.state.test:
+    for view in made.state.test:
         alpha = view.alpha[..., None] / 255
         photo = view.image / 255 * alpha + 1 - alpha
-        seen = trainer.state.render(view.camera)
+        seen = made.state.render(view.camera)
         square.append(((seen.color.double().numpy().clip(0, 1) - photo) ** 2).mean())
     expected = np.mean([-10 * np.log10(s) for s in square])
-    assert trainer.measures.errors(trainer.state)["psnr_test"] == pytest.approx(expected, abs=1e-4)
+    assert made.measures.errors(made.state)["psnr_test"] == pytest.approx(expected, abs=1e-4)

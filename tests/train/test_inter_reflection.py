@@ -7,31 +7,28 @@ import torch
 from benchmarks.scenes.analytic import TWO, meet, write_ball_capture
 from refgs.capture import read_capture
 from refgs.compare.pictures import composite
-from refgs.run import create_run, open_run
-from refgs.settings import load_settings
+from refgs.run import open_run
 from refgs.train.asset import write_asset
 from refgs.train.measures import held_out_psnr
-from refgs.train.trainer import Trainer
 from tests.makers import scenes
+from tests.makers.training import trainer
 
-SMALL = ["surfels.start=3000", "surfels.budget=4000", "environment.resolution=16", "train.light_first=20"]
-SMALL += ["surfels.metallic=0.9", "train.iterations=600", "indirect.every=200", "indirect.resolution=64"]
+CHANGES = ["surfels.start=3000", "surfels.budget=4000", "surfels.hull=144", "surfels.metallic=0.9"]
+# Without a residual, which could learn part of the missing inter-reflection.
+CHANGES += ["indirect.every=200", "indirect.resolution=64", "residual.start=1"]
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """Train with inter-reflection and without it. Return both trainers and a list of two PSNRs.
 
-    The PSNRs are those of the trainer with inter-reflection, just before and just after inter-reflection starts.
+    These are the PSNRs of the first trainer just before and just after inter-reflection starts.
     """
     folder = tmp_path_factory.mktemp("two")
     write_ball_capture(folder / "capture", 64, TWO)
     capture, made, heard = read_capture(folder / "capture"), [], []
     for start in (0.3, 1):
-        alone = "residual.start=1"  # no residual, which could learn part of the missing inter-reflection
-        settings = load_settings("quick", [*SMALL, f"indirect.start={start}", alone])
-        run = Trainer(capture, settings, folder / str(start), lambda *_: None)
-        create_run(run.state.folder, capture, settings, "quick", "cpu")
+        run = trainer(capture, folder / str(start), *CHANGES, f"indirect.start={start}", total=600)
         if start < 1:
             run.run(stop=lambda run=run: run.state.iteration == 199)
             heard.append(held_out_psnr(run.state))
@@ -68,27 +65,23 @@ def test_joining_loses_nothing(trained):
 
 def test_visibility_is_that_of_the_balls(trained):
     run = trained[0]
-    hidden, found, both, solid = 0, 0, 0, 0
+    counts = np.zeros(4)
     for view in run.state.test:
         rendering = run.state.render(view.camera)
-        ray = scenes.camera_rays(view.camera).double().numpy().reshape(-1, 3)
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        hit, point, normal = meet(np.broadcast_to(view.camera.position, ray.shape), ray, TWO)
+        ray, hit, point, normal = scenes.meetings(view.camera, TWO)
         mirrored = ray - 2 * (ray * normal).sum(-1, keepdims=True) * normal
         meets, _, _ = meet(point, mirrored, TWO)
         sure = hit & (rendering.alpha.numpy().reshape(-1) > 0.9)
         traced = (rendering.visibility.numpy().reshape(-1) < 0.5) & sure
-        hidden += int((meets & sure).sum())
-        found += int(traced.sum())
-        both += int((traced & meets).sum())
-        solid += int(sure.sum())
+        counts += [(meets & sure).sum(), traced.sum(), (traced & meets).sum(), sure.sum()]
+    hidden, found, both, solid = counts
     assert hidden > 0.02 * solid
     assert hidden + found - 2 * both < 0.03 * solid
     assert both > 0.6 * found
 
 
 def test_the_run_folder_has_it_all(trained):
-    """Check that the run folder renders as the training did, and nearly the same when relit by its own environment."""
+    """Check that the run folder renders as the training did. Relit by its own environment, it must look nearly the same."""
     made = trained[0]
     run, view = open_run(made.state.folder), made.state.test[0]
     shown, asset = made.state.render(view.camera), run.render(view.camera)

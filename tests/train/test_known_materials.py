@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.scenes.analytic import BANDS, ONE, meet, sunny, write_ball_capture
+from benchmarks.scenes.analytic import BANDS, ONE, sunny, write_ball_capture
 from refgs.capture import load_view, read_capture
 from refgs.compare.pictures import composite
 from refgs.formats.panorama import directions
@@ -31,10 +31,7 @@ def views(tmp_path_factory) -> list[tuple]:
     write_ball_capture(folder, 48, samples=2, bands=True)
     for view in read_capture(folder).train_views:
         loaded = load_view(view, 48)
-        ray = scenes.camera_rays(loaded.camera).double().numpy()
-        ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-        position = np.broadcast_to(loaded.camera.position, ray.shape).reshape(-1, 3)
-        hit, point, normal = (v.reshape(*ray.shape[:2], -1) for v in meet(position, ray.reshape(-1, 3), ONE))
+        _, hit, point, normal = (v.reshape(48, 48, -1) for v in scenes.meetings(loaded.camera, ONE))
         below = np.cumsum([normal[..., 2] < lowest for lowest, _ in BANDS[:2]], axis=0)[-1]
         band = torch.nn.functional.one_hot(torch.from_numpy(below), 3).float()
         alpha = torch.from_numpy(hit[..., 0] & (loaded.alpha == 255)).float()
@@ -87,7 +84,6 @@ def test_roughness_under_a_known_light(views, start):
 
     learn(views, 300, 0.1, [albedo, roughness], materials, lambda: light)
     found = roughness.detach().sigmoid().flatten().tolist()
-    print(found)
     assert found == pytest.approx([material.roughness for _, material in BANDS], abs=0.12)
 
 
@@ -97,8 +93,6 @@ def test_roughness_and_metallic(learned):
     The dielectric's roughness is not compared. The dielectric mirrors only 4 % of the light, too little to learn its roughness.
     """
     materials, _ = learned
-    for (_, material), found in zip(BANDS, materials.tolist(), strict=True):
-        print(material, np.round(found, 3))
     assert float(materials[1, 4]) == pytest.approx(0.5, abs=0.1)
     sharp, rough, matte = materials[:, 3].tolist()
     assert min(sharp, rough) > 0.65 and matte < 0.3
@@ -111,9 +105,7 @@ def test_light_and_albedo(learned):
     """
     materials, environment = learned
     panorama, truth = environment.panorama(32), sunny(directions(32, 64))
-    print("correlation", np.corrcoef(panorama.ravel(), truth.ravel())[0, 1])
     assert np.corrcoef(panorama.ravel(), truth.ravel())[0, 1] > 0.97
     scale = panorama.mean(axis=(0, 1)) / truth.mean(axis=(0, 1))
     for (_, material), found, error in zip(BANDS, materials.numpy(), (0.06, 0.06, 0.2), strict=True):
-        print(scale * found[:3] / material.base_color)
         np.testing.assert_allclose(scale * found[:3] / material.base_color, 1, atol=error)

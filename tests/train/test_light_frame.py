@@ -9,20 +9,15 @@ from PIL import Image
 
 from benchmarks.scenes.analytic import DISTANCE, F0, TWO, camera_matrix, sky, write_ball_capture
 from refgs.camera import Camera
-from refgs.capture import read_capture
 from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.formats.panorama import directions
 from refgs.model.environment import turn_between
-from refgs.run import create_run, open_run
-from refgs.settings import load_settings
-from refgs.train.asset import write_asset
+from refgs.run import open_run
 from refgs.train.measures import held_out_psnr
-from refgs.train.trainer import Trainer
+from tests.makers.training import asset_error, trained, trainer
 
-SMALL = ["surfels.start=1500", "surfels.budget=1800", "environment.resolution=16", "train.light_first=20"]
-SMALL += ["surfels.metallic=0.9", "surfels.hull=64"]
+METAL = "surfels.metallic=0.9"
 STOPS = (0.0, 0.7, 0.0, -0.7, 0.0)
-ITERATIONS = 600
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +25,6 @@ def turntable(tmp_path_factory):
     folder = tmp_path_factory.mktemp("turntable")
     write_ball_capture(folder, 48, turning=True)
     return folder
-
-
-def made(capture, folder, *changes, total=ITERATIONS, report=lambda *_: None):
-    settings = load_settings("quick", [*SMALL, f"train.iterations={total}", *changes])
-    folder.mkdir(exist_ok=True)
-    return Trainer(read_capture(capture), settings, folder, report)
 
 
 def camera(direction) -> Camera:
@@ -56,21 +45,17 @@ def test_heading_is_the_turn_about_the_vertical():
             np.testing.assert_allclose(turned, expected, atol=1e-9)
 
 
-def test_auto_tells_which_light_it_was(ball_capture, turntable, tmp_path):
-    for turning, capture in ((False, ball_capture), (True, turntable)):
-        found = made(capture, tmp_path / "one")
-        assert found.state.settings.light.frame == ("camera" if turning else "world"), found.state.effective.chosen()
-        assert "explains" in found.state.effective.chosen()["light.frame"]
-        write_ball_capture(tmp_path / f"two{turning}", 48, TWO, turning=turning)  # two balls that mirror each other
-        found = made(tmp_path / f"two{turning}", tmp_path / "two")
-        assert found.state.settings.light.frame == ("camera" if turning else "world"), found.state.effective.chosen()
+@pytest.mark.parametrize("turning", [False, True])
+@pytest.mark.parametrize("how", [{}, {"balls": TWO}, {"stops": STOPS}], ids=["one ball", "two balls", "exposures"])
+def test_auto_tells_which_light_it_was(tmp_path, how, turning):
+    """Check that the photos alone tell a light that turns with the camera from a fixed one.
 
-
-def test_auto_tells_it_whatever_the_exposures(tmp_path):
-    for turning in (False, True):
-        write_ball_capture(tmp_path / f"{turning}", 48, turning=turning, stops=STOPS)
-        found = made(tmp_path / f"{turning}", tmp_path / "run")
-        assert found.state.settings.light.frame == ("camera" if turning else "world"), found.state.effective.chosen()
+    Two balls that mirror each other, or different exposures, do not confuse it.
+    """
+    write_ball_capture(tmp_path / "capture", 48, turning=turning, **how)
+    found = trainer(tmp_path / "capture", tmp_path / "run", METAL, total=600).state
+    assert found.settings.light.frame == ("camera" if turning else "world"), found.effective.chosen()
+    assert "explains" in found.effective.chosen()["light.frame"]
 
 
 def test_without_masks_the_light_stands_still(turntable, tmp_path):
@@ -78,7 +63,8 @@ def test_without_masks_the_light_stands_still(turntable, tmp_path):
     for file in (tmp_path / "bare").glob("*/*.png"):
         Image.open(file).convert("RGB").save(file)
     said = []
-    found = made(tmp_path / "bare", tmp_path / "run", report=lambda event, facts: said.append((event, facts["what"])))
+    report = lambda event, facts: said.append((event, facts["what"]))  # noqa: E731
+    found = trainer(tmp_path / "bare", tmp_path / "run", METAL, report=report)
     assert found.state.settings.light.frame == "world"
     assert ("decided", "the light stands still: not every photo has a mask of the object") in said
     assert ("decided", "without inter-reflection: not every photo has a mask of the object") in said
@@ -90,25 +76,13 @@ def test_a_light_that_turns_is_recovered(turntable, tmp_path):
 
     Check also that the saved run renders as the training did, and that run.toml records which light was chosen.
     """
-    still = made(turntable, tmp_path / "still", "light.frame=world", "light.exposure=off", total=300)
+    still = trainer(turntable, tmp_path / "still", METAL, "light.frame=world", "light.exposure=off", total=300)
     still.run()
-    turning = made(turntable, tmp_path / "scratch", "light.exposure=off", total=300)
-    turning.state.folder = tmp_path / "run"
-    create_run(
-        turning.state.folder,
-        turning.state.capture,
-        turning.state.settings,
-        "quick",
-        "cpu",
-        turning.state.effective.chosen(),
-    )
-    turning.run()
-    write_asset(turning.state)
+    turning = trained(turntable, tmp_path / "run", METAL, "light.exposure=off", total=300)
     assert held_out_psnr(turning.state) > held_out_psnr(still.state) + 3
 
-    run, view = open_run(turning.state.folder), turning.state.test[0]
-    assert run.settings.light.frame == "camera"
-    assert float((turning.state.render(view.camera).color - run.render(view.camera).color).abs().mean()) < 2e-3
+    run = open_run(turning.state.folder)
+    assert run.settings.light.frame == "camera" and asset_error(turning) < 2e-3
     assert tomllib.loads((run.folder / "run.toml").read_text())["chosen"]["light.frame"].startswith("camera: ")
     left_out = {entry["what"]: entry["why"] for entry in json.loads((run.folder / "needs.json").read_text())}
     assert "turns with the camera" in left_out["inter-reflection"]
@@ -132,15 +106,14 @@ def test_a_light_that_turns_is_recovered(turntable, tmp_path):
 
 def test_exposures_are_learned_where_photos_differ(tmp_path):
     write_ball_capture(tmp_path / "capture", 48, stops=STOPS)
-    without, with_them = (made(tmp_path / "capture", tmp_path / e, f"light.exposure={e}") for e in ("off", "auto"))
-    without.run()
-    with_them.run()
+    without, with_them = (
+        trained(tmp_path / "capture", tmp_path / e, METAL, f"light.exposure={e}", total=600) for e in ("off", "auto")
+    )
     assert held_out_psnr(with_them.state) > held_out_psnr(without.state) + 1
     index = [int(view.camera.name.partition("_")[2].partition(".")[0]) for view in with_them.state.views]
     truth = np.array([STOPS[i % len(STOPS)] for i in index])
     found = with_them.state.exposures.detach().numpy() / np.log(2)
     assert np.abs(found - truth).max() < 0.2
-    write_asset(with_them.state)
     frames = json.loads((tmp_path / "auto" / "cameras.json").read_text())["frames"]
     factors = [frame.get("exposure") for frame in frames if frame["split"] == "train"]
     np.testing.assert_allclose(factors, 2**found, rtol=1e-5)
@@ -148,8 +121,8 @@ def test_exposures_are_learned_where_photos_differ(tmp_path):
 
 
 def test_exposures_cost_nothing_where_photos_agree(ball_capture, tmp_path):
-    without, asked = (made(ball_capture, tmp_path / e, f"light.exposure={e}", total=300) for e in ("off", "auto"))
-    without.run()
-    asked.run()
+    without, asked = (
+        trained(ball_capture, tmp_path / e, METAL, f"light.exposure={e}", total=300) for e in ("off", "auto")
+    )
     assert asked.state.exposures is None and "no exposures of their own" in asked.state.decided["exposures"]
     assert abs(held_out_psnr(asked.state) - held_out_psnr(without.state)) < 0.3

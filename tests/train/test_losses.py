@@ -23,6 +23,10 @@ BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
 MAPS = ("color", "normal", "blended_depth", "alpha", "material")
 
 
+def huber(difference: Tensor) -> Tensor:
+    return torch.nn.functional.huber_loss(difference, torch.zeros_like(difference), reduction="none", delta=FLAT) / FLAT
+
+
 def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress: float) -> dict[str, Tensor]:
     """Compute all terms of the objective in float64, each times its weight."""
     photo = view.image.double() / 255
@@ -52,10 +56,7 @@ def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress
         kept = torch.exp(-step(photo)) * both
         terms[f"smooth {axis}"] = weights.smooth * (step(rendering.normal) * kept).mean()
         if rendering.material is not None:
-            change = rendering.material[..., 3:].diff(dim=axis)
-            change = (
-                torch.nn.functional.huber_loss(change, torch.zeros_like(change), reduction="none", delta=FLAT) / FLAT
-            )
+            change = huber(rendering.material[..., 3:].diff(dim=axis))
             terms[f"even {axis}"] = weights.even * (change.sum(dim=-1) * kept).mean()
     if mask is not None:
         terms["alpha"] = weights.alpha * (rendering.alpha - mask).abs().mean()
@@ -63,9 +64,7 @@ def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress
         m, covered = rendering.metallic, (rendering.alpha.detach() > COVERED).sum().clamp_min(1)
         terms["metallic"] = weights.metallic * progress**2 * (m * (1 - m)).sum() / covered
         dark = (1 - rendering.albedo.detach().amax(dim=-1) / DARK).clamp(0, 1)
-        over = (rendering.roughness - 0.3).clamp_min(0)
-        over = torch.nn.functional.huber_loss(over, torch.zeros_like(over), reduction="sum", delta=FLAT) / FLAT
-        terms["matte"] = weights.matte * over / covered
+        terms["matte"] = weights.matte * huber((rendering.roughness - 0.3).clamp_min(0)).sum() / covered
         terms["dark metal"] = weights.metallic * (dark * m).sum() / covered
     return terms
 
@@ -186,11 +185,9 @@ def test_nothing_waits_for_a_card(monkeypatch):
 
 def test_other_photos_are_refused():
     rendering, view = pictures(30, 20, masked=True, material=True)
-    wrong = {"image": view.image[:, 1:]}, {"mask": view.mask[:10]}, {"mask": view.mask.float()}
-    for other in wrong:
-        with pytest.raises(
-            ValueError, match="test: the photo and its mask must be uint8 on cpu, of the rendering's size"
-        ):
+    said = "test: the photo and its mask must be uint8 on cpu, of the rendering's size"
+    for other in {"image": view.image[:, 1:]}, {"mask": view.mask[:10]}, {"mask": view.mask.float()}:
+        with pytest.raises(ValueError, match=said):
             objective(leaves(rendering, torch.float32), None, view._replace(**other), BACKGROUND, ALL, 1.0)
 
 

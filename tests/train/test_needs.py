@@ -14,7 +14,6 @@ import pytest
 import torch
 
 from benchmarks.scenes.analytic import write_ball_capture
-from refgs.capture import read_capture
 from refgs.formats.mesh import Mesh
 from refgs.formats.splats import read_splats
 from refgs.geometry.visibility import Occluder
@@ -28,30 +27,24 @@ from refgs.train.measures import held_out_psnr
 from refgs.train.needs import lighting, photos, schedule
 from refgs.train.plan import Plan
 from refgs.train.trace import why_not_traced
+from tests.makers.occluders import plate
+from tests.makers.training import asset_error, check_equal, put
 from tests.makers.training import trainer as small
 
-DULL = [
-    "surfels.metallic=0.01",
-    "surfels.roughness=0.8",
-]  # start with a matte material, because the trainings are short
+DULL = ["surfels.metallic=0.01", "surfels.roughness=0.8"]  # a matte start, because the trainings are short
 SMALL = ["environment.resolution=32", "indirect.every=100", "indirect.resolution=32"]
 
 
 def trainer(capture, folder, *changes, total=150):
-    return small(capture.folder, folder, *SMALL, *changes, total=total)
-
-
-@pytest.fixture(scope="module")
-def mirror(ball_capture):
-    return read_capture(ball_capture)
+    return small(capture, folder, *SMALL, *changes, total=total)
 
 
 @pytest.fixture(scope="module")
 def matte(tmp_path_factory):
-    """Read a capture of a matte ball. Its colour is the same from every direction."""
+    """Write a capture of a matte ball, whose colour is the same from every direction."""
     folder = tmp_path_factory.mktemp("matte")
     write_ball_capture(folder, 64, matte=True)
-    return read_capture(folder)
+    return folder
 
 
 @pytest.fixture(scope="module")
@@ -78,11 +71,8 @@ def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
     It keeps all iterations if needs.iterations is on, or if the user gave a duration.
     """
     found = chalk.state.needs["iterations"]
-    assert (
-        not found["needed"]
-        and found["statistic"] == chalk.state.needs["specular"]["statistic"]
-        and found["seconds"] > 0
-    )
+    assert not found["needed"] and found["seconds"] > 0
+    assert found["statistic"] == chalk.state.needs["specular"]["statistic"]
     assert chalk.state.iteration == chalk.state.total == found["total"] == 100 + round(schedule.Iterations.ENOUGH * 200)
     forced = trainer(matte, tmp_path / "off", "needs.specular=off", total=150)
     assert forced.state.total == forced.state.needs["iterations"]["total"] == round(schedule.Iterations.ENOUGH * 150)
@@ -93,18 +83,21 @@ def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
     assert "iterations" not in forced.state.needs
 
 
-def test_a_mirror_keeps_it(mirror, tmp_path):
-    made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
+def test_a_convex_mirror_keeps_specular_and_does_without_reflections(ball_capture, tmp_path):
+    made = trainer(ball_capture, tmp_path / "run", "surfels.metallic=0.9", total=150)
     made.run(stop=lambda: made.state.iteration == 110)
     found = made.state.needs["specular"]
     assert found["needed"] and found["statistic"] > 1 and "metallic" in made.state.parameters
     assert made.state.settings.render.reflection == "microfacet" and made.state.total == 150
+    found = made.state.needs["reflections"]
+    assert not found["needed"] and found["statistic"] < found["threshold"]
+    assert made.state.occluder is None and "received" not in made.state.parameters and why_not_traced(made.state)
 
 
 @pytest.mark.parametrize("word", ["on", "off"])
-def test_forced_either_way(word, matte, mirror, tmp_path):
+def test_forced_either_way(word, matte, ball_capture, tmp_path):
     """Check that the setting needs.specular, on or off, overrules the decision by the photos."""
-    made = trainer(matte if word == "on" else mirror, tmp_path / "run", f"needs.specular={word}", total=120)
+    made = trainer(matte if word == "on" else ball_capture, tmp_path / "run", f"needs.specular={word}", total=120)
     made.run()
     assert ("metallic" in made.state.parameters) == (word == "on")
     write_asset(made.state)
@@ -122,7 +115,7 @@ def test_the_asset_says_so_once(chalk):
     head = (chalk.state.folder / "splats.ply").read_bytes().partition(b"end_header")[0]
     assert b"property float metallic" not in head and b"property float albedo_r" in head
     camera = chalk.state.test[0].camera
-    assert float((run.render(camera).color - chalk.state.render(camera).color).abs().mean()) < 2e-3
+    assert asset_error(chalk) < 2e-3
     assert (run.render(camera).roughness[run.render(camera).alpha > 0.9] == 1).all()
 
 
@@ -150,10 +143,7 @@ def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
     second.resume()
     assert second.state.needs == first.state.needs and not second.state.needs["specular"]["needed"]
     second.run()
-    assert {*whole.state.parameters} == {*second.state.parameters} and whole.state.decided == second.state.decided
-    for name, value in whole.state.parameters.items():
-        assert torch.equal(value, second.state.parameters[name]), name
-    assert torch.equal(whole.state.light, second.state.light)
+    check_equal(whole, second)
 
 
 def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
@@ -174,41 +164,25 @@ def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
     made.step()
 
 
-def test_a_convex_mirror_does_without_reflections(mirror, tmp_path):
-    made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
-    made.run(stop=lambda: made.state.iteration == 101)
-    found = made.state.needs["reflections"]
-    assert not found["needed"] and found["statistic"] < found["threshold"]
-    assert made.state.occluder is None and "received" not in made.state.parameters and why_not_traced(made.state)
-
-
-def test_reflections_by_what_they_could_be_worth(mirror, tmp_path):
+def test_reflections_by_what_they_could_be_worth(ball_capture, tmp_path):
     """Check that a mirror keeps inter-reflection if a fifth of its reflections are occluded, and that a rough black dielectric does not.
 
     The dielectric reflects so little light that occlusion hardly changes the photos.
     """
-    made = trainer(mirror, tmp_path / "run", "surfels.metallic=0.9", total=150)
+    made = trainer(ball_capture, tmp_path / "run", "surfels.metallic=0.9", total=150)
     made.run(stop=lambda: made.state.iteration == 99)
-    x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-3, 3, 61)] * 2))
-    at = np.arange(60 * 61).reshape(60, 61)[:, :-1].ravel()
-    faces = np.concatenate([np.stack([at, at + 61, at + 1], axis=1), np.stack([at + 1, at + 61, at + 62], axis=1)])
-    # A plane above the ball that faces down.
-    made.state.occluder = Occluder(Mesh(np.stack([x, y, np.full_like(x, 1.5)], axis=1), faces))
+    above = plate(0.5, -1)  # faces down
+    made.state.occluder = Occluder(Mesh(3 * above.vertices, np.asarray(above.faces)))
     needs.evaluate_mesh(made.state, 0.2)
-    assert (
-        made.state.needs["reflections"]["needed"]
-        and made.state.needs["reflections"]["statistic"] > lighting.Reflections.threshold
-    )
-    del made.state.needs["reflections"]
-    with torch.no_grad():
-        made.state.parameters["metallic"][:], made.state.parameters["albedo"][:] = -10, 0
-        made.state.parameters["roughness"][:] = 5
+    found = made.state.needs.pop("reflections")
+    assert found["needed"] and found["statistic"] > lighting.Reflections.threshold
+    put(made, metallic=-10, albedo=0, roughness=5)
     needs.evaluate_mesh(made.state, 0.2)
     assert not made.state.needs["reflections"]["needed"]
 
 
-def test_views_that_show_the_same_from_the_same_place(mirror, tmp_path):
-    made = trainer(mirror, tmp_path / "run", total=10)
+def test_views_that_show_the_same_from_the_same_place(ball_capture, tmp_path):
+    made = trainer(ball_capture, tmp_path / "run", total=10)
     one = made.state.views[0]
     noise = np.random.default_rng(0).normal(0, 1, one.image.shape)
     again = replace(one, image=(one.image + noise.round()).clip(0, 255).astype(np.uint8))
@@ -223,12 +197,12 @@ def test_views_that_show_the_same_from_the_same_place(mirror, tmp_path):
     assert photos.duplicate_views(made.state.views, radius) == []
 
 
-def test_the_part_about_the_mask_is_all_that_counts(mirror, tmp_path):
+def test_the_part_about_the_mask_is_all_that_counts(ball_capture, tmp_path):
     """Check that a crop about the mask gives the same loss and gradients as the full photo.
 
     The rendering is empty outside the crop.
     """
-    made, generator = trainer(mirror, tmp_path / "run", total=10), torch.Generator().manual_seed(0)
+    made, generator = trainer(ball_capture, tmp_path / "run", total=10), torch.Generator().manual_seed(0)
     camera = made.state.photos[0].camera
     camera = replace(camera, fx=0.6 * camera.fx, fy=0.6 * camera.fy)
     mask = (made.state.render(camera).alpha > 0).byte() * 255
@@ -250,9 +224,9 @@ def test_the_part_about_the_mask_is_all_that_counts(mirror, tmp_path):
         assert float((value - by_other[name]).abs().max()) <= 1e-3 * float(value.abs().max()) + 1e-12, name
 
 
-def test_a_photo_that_its_object_fills_stays_whole(mirror, tmp_path, monkeypatch):
+def test_a_photo_that_its_object_fills_stays_whole(ball_capture, tmp_path, monkeypatch):
     monkeypatch.setattr(photos, "MARGIN", 5)  # the ball covers 45 of 64 pixels
-    made = trainer(mirror, tmp_path / "run", total=10)
+    made = trainer(ball_capture, tmp_path / "run", total=10)
     assert made.state.crops is not None
     for view in made.state.views:
         view.alpha[:] = 255
@@ -262,10 +236,10 @@ def test_a_photo_that_its_object_fills_stays_whole(mirror, tmp_path, monkeypatch
     assert made.state.crops is None
 
 
-def test_surfels_that_are_faint_decide_nothing_and_are_no_mesh(mirror, tmp_path):
+def test_surfels_that_are_faint_decide_nothing_and_are_no_mesh(ball_capture, tmp_path):
     changes = ["densify.reset_every=5", "densify.stop=0.1", "rates.opacity=1.0", "rates.decay=1.0"]
     changes += ["needs.specular=on", "needs.reflections=on", "indirect.start=0", "indirect.every=8"]
-    made = trainer(mirror, tmp_path / "run", *changes, total=60)
+    made = trainer(ball_capture, tmp_path / "run", *changes, total=60)
     way = 4 * math.log(SEEN / (1 - SEEN) * (1 - RESET) / RESET)  # iterations that surfels stay faint, at a rate of one
     made.run(stop=lambda: made.state.iteration >= 5 + math.floor(way))
     assert faint_now(made.state) and made.state.iteration > 60 * lighting.Light.SETTLED
@@ -274,10 +248,10 @@ def test_surfels_that_are_faint_decide_nothing_and_are_no_mesh(mirror, tmp_path)
     assert not faint_now(made.state) and "light" in made.state.needs and made.state.occluder is not None
 
 
-def test_what_the_part_about_the_mask_saves_is_timed(mirror, tmp_path, monkeypatch):
+def test_what_the_part_about_the_mask_saves_is_timed(ball_capture, tmp_path, monkeypatch):
     monkeypatch.setattr(photos, "MARGIN", 5)
     monkeypatch.setattr(photos, "TIMED", 3)
-    made = trainer(mirror, tmp_path / "run", "needs.specular=on", total=20)
+    made = trainer(ball_capture, tmp_path / "run", "needs.specular=on", total=20)
     asked = []
     monkeypatch.setattr(probe, "seconds_saved", lambda trainer, whole: asked.append(whole) or 8.0)
     made.run(stop=lambda: made.state.iteration == 6)
@@ -306,10 +280,10 @@ def test_weighted_quantiles():
     assert [probe.quantile(values, weight, part) for part in (0.1, 0.79, 0.85, 1.0)] == [1.0, 1.0, 2.0, 3.0]
 
 
-def test_degrees_by_what_they_are_worth(mirror, tmp_path):
+def test_degrees_by_what_they_are_worth(ball_capture, tmp_path):
     """Check that spherical harmonics are kept up to the highest degree that the photos show, from three down to zero."""
     changes = ["needs.specular=on", "needs.reflections=off", "needs.light=on", "residual.start=0.5"]
-    made = trainer(mirror, tmp_path / "run", *changes, total=10)
+    made = trainer(ball_capture, tmp_path / "run", *changes, total=10)
     made.run(stop=lambda: made.state.iteration == 6)
     for kept in (15, 8, 3, 0):
         rest = made.state.parameters["sh_rest"]
@@ -325,11 +299,10 @@ def test_degrees_by_what_they_are_worth(mirror, tmp_path):
     made.step()
 
 
-def test_what_all_have_alike_is_said_once(mirror, tmp_path):
-    made = trainer(mirror, tmp_path / "run", "needs.specular=on", total=10)
+def test_what_all_have_alike_is_said_once(ball_capture, tmp_path):
+    made = trainer(ball_capture, tmp_path / "run", "needs.specular=on", total=10)
     made.run()
-    with torch.no_grad():
-        made.state.parameters["metallic"][:] = -20
+    put(made, metallic=-20)
     write_asset(made.state)
     splats = read_splats(tmp_path / "run" / "splats.ply")
     assert {*splats.constants} == {"metallic"} and splats.roughness.std() > 0
@@ -344,40 +317,39 @@ def photographed(state, photo, noise=0.0):
     return photo._replace(image=(color.clamp(0, 1) * 255).round().byte(), mask=torch.full_like(photo.mask, 255))
 
 
-def test_specular_on_synthetic_surfels(mirror, tmp_path):
-    """Check that specular shading gains over 3 dB in photos of a mirror, and under 0.3 dB in photos of a matte ball.
+def test_specular_on_synthetic_surfels(ball_capture, tmp_path):
+    """Check that specular shading gains over 3 dB in photos of a ball_capture, and under 0.3 dB in photos of a matte ball.
 
     The photos are renderings of the model itself.
     """
-    made = trainer(mirror, tmp_path / "run", total=10)
+    made = trainer(ball_capture, tmp_path / "run", total=10)
     light = torch.randn(made.state.light.shape, generator=torch.Generator().manual_seed(1))
     for metallic, roughness, least, most in ((5.0, -3.0, 3.0, math.inf), (-20.0, 20.0, -math.inf, 0.3)):
+        put(made, metallic=metallic, roughness=roughness)
         with torch.no_grad():
             made.state.light.copy_(light)
-            made.state.parameters["metallic"][:], made.state.parameters["roughness"][:] = metallic, roughness
             for view, photo in enumerate(made.state.photos):
                 made.state.photos[view] = photographed(made.state, photo, noise=0.01)
         assert least < probe.specular_explains(made.state) < most
 
 
-def test_shares_are_weights(mirror, tmp_path):
+def test_shares_are_weights(ball_capture, tmp_path):
     """Check the blended shares: the weights by which each surfel contributes to the pixels, summed over the pixels.
 
     Over all surfels, the weights add up to the sum of alpha. The weighted mean of a constant map is the same constant.
     """
-    made = trainer(mirror, tmp_path / "run", total=10)
+    made = trainer(ball_capture, tmp_path / "run", total=10)
     photo, surfels = made.state.photo(0), made.state.surfels()
     alpha = made.state.render(photo.camera).alpha
-    torch.testing.assert_close(
-        probe.blended_shares(surfels, [photo], made.state.near).sum(), alpha.sum(), rtol=1e-3, atol=0
-    )
+    shares = probe.blended_shares(surfels, [photo], made.state.near)
+    torch.testing.assert_close(shares.sum(), alpha.sum(), rtol=1e-3, atol=0)
     even = torch.full((*alpha.shape, 2), 0.3)
     mean = probe.blended_shares(surfels, [photo], made.state.near, [even])
-    seen = probe.blended_shares(surfels, [photo], made.state.near)[0] > 1e-3
+    seen = shares[0] > 1e-3
     torch.testing.assert_close(mean[seen], torch.full_like(mean[seen], 0.3), rtol=1e-3, atol=0)
 
 
-def test_training_does_not_load_torchs_compiler(mirror, tmp_path):
+def test_training_does_not_load_torchs_compiler(ball_capture, tmp_path):
     """Check that training imports neither torch._dynamo (takes 2 s) nor sympy (0.5 s).
 
     torch imports sympy if `backward` is called with a gradient.
@@ -392,4 +364,4 @@ made.run()
 probe.specular_explains(made.state), probe.seconds_saved(made.state)
 assert not {"sympy", "torch._dynamo"} & {*sys.modules}
 """
-    subprocess.run([sys.executable, "-c", program, mirror.folder, tmp_path / "run"], check=True)
+    subprocess.run([sys.executable, "-c", program, ball_capture, tmp_path / "run"], check=True)

@@ -26,9 +26,9 @@ def clock(monkeypatch) -> _Time:
 def _train(
     clock: _Time, made: Plan, pace, paused: float = 0.0, start: float = 12.0, first: int = 0, growth: float = 1.5
 ) -> tuple[int, float]:
-    """Follow a plan as a trainer does. Return the number of iterations, and the seconds until the asset is written.
+    """Follow a plan as a trainer does; `pace` gives the seconds of an iteration. Return how many iterations ran, and their seconds.
 
-    The seconds do not include pauses.
+    The seconds include the time until the asset is written, but no pauses.
     """
     begun = clock.now
     clock.now += start

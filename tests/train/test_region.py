@@ -14,20 +14,11 @@ from refgs.errors import InputError
 from refgs.formats.gltf import read_glb
 from refgs.formats.splats import read_splats
 from refgs.run import open_run
-from refgs.settings import load_settings
 from refgs.train.live_view import write_preview
 from refgs.train.start import AROUND, start_parameters
-from refgs.train.trainer import Trainer
+from tests.makers.training import SMALL, trainer
 
-SMALL = [
-    "surfels.start=1500",
-    "surfels.budget=1800",
-    "surfels.hull=48",
-    "environment.resolution=16",
-    "train.light_first=20",
-    "train.iterations=150",
-    "mesh.resolution=48",
-]
+CHANGES = [*SMALL, "surfels.hull=48", "train.iterations=150", "mesh.resolution=48"]
 RIGHT = ["region.centre=[0.62, 0.0, 0.0]", "region.size=[1.2, 1.2, 1.2]"]
 
 
@@ -46,7 +37,7 @@ def balls(request, tmp_path_factory):
 
 def train(capture, out, *changes):
     return train_job.train(
-        capture, out, "quick", "cpu", None, [*SMALL, *changes], False, lambda *_: None, lambda state: False
+        capture, out, "quick", "cpu", None, [*CHANGES, *changes], False, lambda *_: None, lambda state: False
     )
 
 
@@ -88,14 +79,12 @@ def test_mesh_figures_and_preview_are_of_the_box(right, balls):
         assert np.linalg.norm(mesh.vertices - TWO[1, :3], axis=1).max() < 0.7
 
 
-def test_surfels_start_in_the_box_and_around_it(balls):
-    settings = load_settings("quick", [*SMALL, *RIGHT])
-    capture = read_capture(balls, settings.region)
-    made = Trainer(capture, settings, balls / "none", lambda *_: None)
-    inside = made.state.wanted()
+def test_surfels_start_in_the_box_and_around_it(balls, tmp_path):
+    state = trainer(balls, tmp_path / "run", *CHANGES, *RIGHT).state
+    inside = state.wanted()
     assert 0.5 <= inside.float().mean() < 1 and len(inside) <= 1500
-    if made.state.from_hull:
-        parameters, shown, _ = start_parameters(capture, made.state.views, settings)
+    if state.from_hull:
+        parameters, shown, _ = start_parameters(state.capture, state.views, state.settings)
         faint = parameters["opacity"].sigmoid() < 0.2
         assert faint[shown:].all() and not faint[:shown].any() and 0.3 < shown / len(faint) < 0.7
 
@@ -121,20 +110,18 @@ def test_up_turns_the_result_and_nothing_else(ball_capture, tmp_path):
     np.testing.assert_allclose(turned.to_capture[:3, :3] @ (0, 0, 1), up, atol=1e-12)
     assert np.array_equal(plain.to_capture, np.eye(4))
     turn = turned.to_capture[:3, :3]
+    back = torch.from_numpy(turn.T).float()
     for one, other in zip(plain.cameras[::9], turned.cameras[::9], strict=True):
         np.testing.assert_allclose(turn @ other.position, one.position, atol=1e-9)
         seen, again = plain.render(one.fitted(64)), turned.render(other.fitted(64))
         assert float((seen.color - again.color).abs().mean()) < 0.01
         assert float((seen.alpha - again.alpha).abs().mean()) < 0.01
         solid = (seen.alpha > 0.9) & (again.alpha > 0.9)
-        cosine = torch.cosine_similarity(
-            seen.normal[solid], again.normal[solid] @ torch.from_numpy(turn.T).float(), dim=-1
-        )
+        cosine = torch.cosine_similarity(seen.normal[solid], again.normal[solid] @ back, dim=-1)
         assert float(cosine.mean()) > 0.99
     directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
-    there = plain.environment.diffuse(directions @ torch.from_numpy(turn.T).float())
+    there = plain.environment.diffuse(directions @ back)
     here = turned.environment.diffuse(directions)
     assert float((there - here).abs().mean() / there.mean()) < 0.06
     commands.evaluate(folders[1], "test", None)
-    figures = json.loads((folders[1] / "metrics.json").read_text())
-    assert figures["psnr"] > 25
+    assert json.loads((folders[1] / "metrics.json").read_text())["psnr"] > 25

@@ -6,46 +6,25 @@ import numpy as np
 import pytest
 import torch
 
-from refgs.capture import read_capture
 from refgs.color import srgb_encode
 from refgs.model import harmonics
 from refgs.render.rasterize import rasterize
 from refgs.render.volume import discs
-from refgs.run import create_run, open_run
-from refgs.settings import load_settings
+from refgs.run import open_run
 from refgs.train.asset import write_asset
-from refgs.train.trainer import Trainer
+from tests.makers.training import asset_error, trained, trainer
 
-SMALL = [
-    "surfels.start=1500",
-    "surfels.budget=1800",
-    "surfels.hull=64",
-    "environment.resolution=16",
-    "train.light_first=0",
-    "residual.start=0.5",
-    "rates.residual=0.02",
-    "needs.specular=on",  # too few iterations to decide
-    "needs.degrees=on",
-]
-
-
-def trainer(capture_folder, folder, *changes):
-    capture = read_capture(capture_folder)
-    settings = load_settings("quick", [*SMALL, "train.iterations=60", *changes])
-    create_run(folder, capture, settings, "quick", "cpu")
-    return Trainer(capture, settings, folder, lambda event, facts: None)
+CHANGES = ["train.light_first=0", "residual.start=0.5", "rates.residual=0.02"]
+CHANGES += ["needs.specular=on", "needs.degrees=on"]  # there are too few iterations to decide these
 
 
 @pytest.fixture(scope="module")
 def learned(ball_capture, tmp_path_factory):
-    made = trainer(ball_capture, tmp_path_factory.mktemp("runs") / "ball")
-    made.run()
-    write_asset(made.state)
-    return made
+    return trained(ball_capture, tmp_path_factory.mktemp("runs") / "ball", *CHANGES, total=60)
 
 
 def test_it_learns_when_material_and_light_have(ball_capture, tmp_path):
-    made = trainer(ball_capture, tmp_path / "run")
+    made = trainer(ball_capture, tmp_path / "run", *CHANGES, total=60)
     rest = made.state.parameters["sh_rest"]
     for _ in range(30):
         made.step()
@@ -88,13 +67,11 @@ def test_another_light_is_without_it(learned):
 
 
 def test_a_run_shows_what_was_learned(learned):
-    camera = learned.state.test[0].camera
-    shown = open_run(learned.state.folder).render(camera)
-    assert float((shown.color - learned.state.render(camera).color).abs().mean()) < 1e-3
+    assert asset_error(learned) < 1e-3
 
 
 def test_one_that_ends_before_it_leaves_none(ball_capture, tmp_path):
-    made = trainer(ball_capture, tmp_path / "run")
+    made = trainer(ball_capture, tmp_path / "run", *CHANGES, total=60)
     for _ in range(3):
         made.step()
     made.state.total = made.state.iteration  # end here
@@ -103,10 +80,8 @@ def test_one_that_ends_before_it_leaves_none(ball_capture, tmp_path):
 
 
 def test_without_it_no_harmonics_are_left(ball_capture, tmp_path):
-    made = trainer(ball_capture, tmp_path / "run", "residual.start=1", "train.iterations=10")
+    made = trained(ball_capture, tmp_path / "run", *CHANGES, "residual.start=1", total=10)
     assert "sh_rest" not in made.state.parameters
-    made.run()
-    write_asset(made.state)
     assert open_run(tmp_path / "run").splats.sh.shape[1] == 1
     left = json.loads((tmp_path / "run" / "needs.json").read_text(encoding="utf-8"))
     assert "spherical harmonics" in [one["what"] for one in left]

@@ -3,50 +3,37 @@
 import pytest
 import torch
 
-from refgs.capture import read_capture
-from refgs.run import create_run, open_run
-from refgs.settings import load_settings
-from refgs.train.asset import write_asset
 from refgs.train.light import diffuse
 from refgs.train.measures import held_out_psnr
 from refgs.train.rates import set_rates
 from refgs.train.setup import start_deferred
 from refgs.train.start import GEOMETRY
-from refgs.train.trainer import Trainer
-
-SMALL = ["surfels.start=1500", "surfels.budget=1800", "surfels.hull=64", "environment.resolution=16"]
-
-
-def trainer(capture_folder, folder, preset, *changes):
-    capture, settings = read_capture(capture_folder), load_settings(preset, [*SMALL, "needs.initial=on", *changes])
-    create_run(folder, capture, settings, preset, "cpu")
-    return Trainer(capture, settings, folder, lambda event, facts: None)
+from tests.makers.training import asset_error, learned, trained, trainer
 
 
 def test_the_deferred_stage_keeps_the_geometry_alone(ball_capture, tmp_path):
-    made = trainer(ball_capture, tmp_path / "run", "quick", "train.iterations=60", "initial.until=0.5", "diffuse=sh")
-    start = {name: value.detach().clone() for name, value in made.state.parameters.items()}
-    light = made.state.light.detach().clone()
+    changes = "needs.initial=on", "initial.until=0.5", "diffuse=sh", "train.light_first=50"
+    made = trainer(ball_capture, tmp_path / "run", *changes, total=60)
+    start = learned(made)
     for _ in range(30):
         made.step()
-    learned = {name: value.detach().clone() for name, value in made.state.parameters.items()}
-    assert made.state.initial and all(
-        not torch.equal(learned[name], start[name]) for name in ("albedo", "sh_dc", "roughness")
-    )
+    before = learned(made)
+    assert made.state.initial
+    assert not any(torch.equal(before[name], start[name]) for name in ("albedo", "sh_dc", "roughness"))
     start_deferred(made.state)
     assert not made.state.initial
     for name, value in made.state.parameters.items():
         if name in GEOMETRY:
-            assert torch.equal(value, learned[name]), name
+            assert torch.equal(value, before[name]), name
         else:
             assert torch.equal(value, start[name][:1].expand_as(value)), name
             assert value not in made.state.optimizer.state
-    assert torch.equal(made.state.light, light) and made.state.light not in made.state.optimizer.state
+    assert torch.equal(made.state.light, start["light"]) and made.state.light not in made.state.optimizer.state
     assert made.state.parameters["position"] in made.state.optimizer.state
 
 
 def test_the_stage_ends_where_the_preset_says(ball_capture, tmp_path):
-    made = trainer(ball_capture, tmp_path / "run", "quick", "train.iterations=10", "initial.until=0.4")
+    made = trainer(ball_capture, tmp_path / "run", "needs.initial=on", "initial.until=0.4", total=10)
     stages = []
     for _ in range(10):
         made.step()
@@ -65,35 +52,33 @@ def test_the_stage_ends_where_the_preset_says(ball_capture, tmp_path):
     ],
 )
 def test_learns_and_renders_as_it_trained(ball_capture, tmp_path, changes):
-    made = trainer(ball_capture, tmp_path / "run", "quick", "train.iterations=300", "surfels.metallic=0.9", *changes)
-    made.run()
+    changes = ["needs.initial=on", "surfels.metallic=0.9", "train.light_first=50", *changes]
+    made = trained(ball_capture, tmp_path / "run", *changes, total=300)
     # The bound is lower for mirrors, which have no colour of their own.
     assert held_out_psnr(made.state) > (22 if "reflection=mirror" in changes else 25)
-    write_asset(made.state)
-    asset, view = open_run(made.state.folder), made.state.test[0]
-    assert float((made.state.render(view.camera).color - asset.render(view.camera).color).abs().mean()) < 3e-3
+    assert asset_error(made) < 3e-3
 
 
 def test_the_papers_schedule_runs_to_its_end(ball_capture, tmp_path):
     """Check that the preset `paper`, shortened to 300 iterations, runs all its stages and gains 4 dB."""
-    changes = ["train.iterations=300", "densify.every=20", "propagation.every=100", "rates.environment=0.05"]
-    changes += ["propagation.rest=10", "indirect.every=60", "indirect.resolution=32"]
-    made = trainer(ball_capture, tmp_path / "run", "paper", *changes)
+    changes = ["needs.initial=on", "train.light_first=0", "densify.every=20", "propagation.every=100"]
+    changes += ["rates.environment=0.05", "propagation.rest=10", "indirect.every=60", "indirect.resolution=32"]
+    made = trainer(ball_capture, tmp_path / "run", *changes, total=300, preset="paper")
     before = held_out_psnr(made.state)
     made.run()
     assert not made.state.initial and held_out_psnr(made.state) > before + 4
 
 
 def test_all_grow_faint_and_mirrors_grow(ball_capture, tmp_path):
-    changes = ["train.iterations=100", "densify.every=100", "densify.reset_every=6", "propagation.every=4"]
-    made = trainer(ball_capture, tmp_path / "run", "quick", *changes, "propagation.rest=2")
+    changes = ["needs.initial=on", "densify.every=100", "densify.reset_every=6", "propagation.every=4"]
+    made = trainer(ball_capture, tmp_path / "run", *changes, "propagation.rest=2", total=100)
     with torch.no_grad():  # make half of the surfels mirrors
         made.state.parameters["metallic"][::2], made.state.parameters["roughness"][::2] = 3.0, -5.0
         made.state.parameters["metallic"][1::2], made.state.parameters["roughness"][1::2] = 3.0, 5.0
 
     def step():
         made.step()
-        return {name: value.detach().clone() for name, value in made.state.parameters.items()}
+        return learned(made)
 
     for _ in range(3):
         before = step()
@@ -116,8 +101,8 @@ def test_the_light_diffuses_as_heat_does(ball_capture, tmp_path, waves):
     A cosine across a cubemap face is an eigenvector of the discrete Laplacian with insulated borders. So a step multiplies the cosine
     by 1 − 4 c sin²(θ / 2), with c = 0.5 · 6.4 · (16 / 64)². θ is the phase between neighbouring texels.
     """
-    changes = ["environment.diffusion=6.4", "rates.environment=0.5", "train.iterations=10"]
-    made = trainer(ball_capture, tmp_path / "run", "quick", *changes)
+    changes = "needs.initial=on", "environment.diffusion=6.4", "rates.environment=0.5"
+    made = trainer(ball_capture, tmp_path / "run", *changes, total=10)
     set_rates(made.state, 0.0)
     angle = torch.pi * waves / 16
     wave = torch.cos(angle * (torch.arange(16) + 0.5))
