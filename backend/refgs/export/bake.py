@@ -68,12 +68,12 @@ def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np
 
 
 def _row_blocks(size: int) -> list[slice]:
-    """Split all rows into blocks of _ROWS."""
+    """Split the rows of a picture, `size` in all, into blocks of _ROWS rows."""
     return [slice(start, min(start + _ROWS, size)) for start in range(0, size, _ROWS)]
 
 
 def _enlarged_rows(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
-    """Enlarge a square picture (C, C, 8) to `size` bilinearly, and return some of its rows."""
+    """Enlarge a square picture (C, C, 8) to (size, size, 8) bilinearly, and return only `rows` of the enlarged picture."""
     place = ((np.arange(rows.start, rows.stop) + 0.5) * len(picture) / size - 0.5).clip(0, len(picture) - 1)
     above = place.astype(int)
     below, part = np.minimum(above + 1, len(picture) - 1), (place - above).astype(np.float32)[:, None, None]
@@ -121,8 +121,8 @@ def _uv_scene(mesh: Mesh, size: int) -> EmbreeScene:
 def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the face (R, S) at each texel's centre, its barycentric weights (R, S, 3), and the point (R, S, 3) on the mesh.
 
-    A texel beside a face takes that face. Its point is then on the face's extended plane, its weights are those of the neighbour on the
-    face. Other texels have face −1.
+    If a texel is not on a face but next to one, it takes that face. Its point is then on the face's extended plane, and its weights are
+    those of the neighbouring texel on the face. All other texels have face −1.
     """
     first, last = max(rows.start - 1, 0), min(rows.stop + 1, size)
     y, x = np.mgrid[first:last, :size].astype(np.float32) + np.float32(0.5)
@@ -149,7 +149,10 @@ def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[
 
 
 def _barycentric(points: np.ndarray, corners: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """Compute barycentric weights (N, 3) of points (N, 2), also outside of triangles (N, 3, 2). Slivers have the weights `otherwise`."""
+    """Compute barycentric weights (N, 3) of points (N, 2) in triangles (N, 3, 2).
+
+    Points may lie outside. For very thin triangles the weights `otherwise` (N, 3) are returned.
+    """
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     c, area = points - corners[:, 0], _cross(a, b)
     good = np.abs(area) > 0.05 * ((a * a).sum(axis=1) + (b * b).sum(axis=1))

@@ -24,8 +24,8 @@ def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress:
 
     The ray of a point comes from outside, against the normal. Splats near the surface that face outwards are composited front to back.
     Alpha is the opacity times the Gaussian where the ray meets the splat's plane. The blend is divided by the sum of weights. The
-    blended normal is that of the splats' mean position: it is extrapolated to the point by the normals' slope, fitted by weighted least
-    squares. Where no splat reaches the ray, the nearest ones decide. `progress` is called with the points done and their total.
+    blended normal is that of the splats' mean position. It is extrapolated to the point by the normals' slope, fitted by weighted least
+    squares. If no splat reaches the ray, the nearest splats give the values. `progress` is called with the points done and their total.
     """
     table, values = _geometry(splats), _appearance(splats)
     spread = float(np.median(splats.scales[:, :2].mean(axis=1))) or 1.0

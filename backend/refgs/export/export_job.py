@@ -30,8 +30,8 @@ def export(
 ) -> list[Path]:
     """Export the textured mesh of a run, or its splats; return the files written.
 
-    Where a splats file is named, the mesh is written only if its file is named too. `folder` may be a PLY file of splats
-    instead of a run: it has no mesh.
+    If `splats_file` or `display_file` is given, the mesh is written only if `mesh_file` is given too. `folder` is a run folder, or a PLY
+    file of splats. A PLY file has no mesh to export.
     """
     splats = [file for file in (splats_file, display_file) if file is not None]
     is_run = folder.is_dir() or folder.suffix.lower() != ".ply"
@@ -81,7 +81,7 @@ def _check_absent(files: list[Path], overwrite: bool) -> None:
 
 
 def _read_source(folder: Path, is_run: bool, report: Report) -> "tuple[Run | None, Splats]":
-    """Open the run, or read the PLY file of splats. Reports rows that were left out as a warning."""
+    """Open the run, or read the PLY file of splats. If rows of the PLY file are left out, a warning is reported."""
     from refgs.formats.splats import read_splats
     from refgs.run import open_run
 
@@ -162,7 +162,10 @@ def _make_mesh(run: "Run", report: Report) -> Any:
 
 
 def _baked_splats(run: "Run", mesh: Any) -> "Splats":
-    """Return the splats to bake. Shadows are removed from base colours if the training did not model them, under a fixed light."""
+    """Return the splats to bake.
+
+    If the light stood still and the training modelled no shadows, the base colours contain shadows. These are removed.
+    """
     from refgs.export.unshadowed import unshadowed
     from refgs.render.baselines import method_of
 

@@ -12,9 +12,10 @@ _CHUNK = 1 << 14  # vertices at a time
 
 
 def openness(mesh: Mesh) -> np.ndarray:
-    """Measure the fraction (V,) of a uniform light that reaches each vertex, where the mesh does not block it.
+    """Measure the fraction (V,) of a uniform light that reaches each vertex, because the mesh does not block it.
 
-    This is glTF's occlusion: 1 where nothing occludes. Rays about the vertex's normal are distributed as the cosine.
+    This is glTF's occlusion: 1 means that nothing blocks the light. Rays are traced from each vertex, denser near its normal: their
+    density is the cosine to the normal.
     """
     middle = mesh.vertices.mean(axis=0)  # subtracted, because rays are traced in single precision
     vertices = (mesh.vertices - middle).astype(np.float32)

@@ -1,7 +1,7 @@
 """Fit a mesh to the outlines in renderings.
 
-A mesh fused from depth is too small, by half a voxel and more. Surfels are faint, so blended depth lies inside the shell that they form,
-while the outline against the background is that of the shell.
+A mesh fused from depth is too small, by half a voxel and more. Surfels are partly transparent, so their blended depth lies a little
+below the surface. Outlines against the background have no such error.
 """
 
 from collections.abc import Callable, Sequence
@@ -73,7 +73,7 @@ def _overshoot(vertices: np.ndarray, views: list[tuple[Camera, np.ndarray]]) -> 
 def _smoother(mesh: Mesh) -> Callable[[np.ndarray], np.ndarray]:
     """Make a function that smooths values (V,): it averages each vertex with its neighbours, SMOOTHING_STEPS times.
 
-    Outlines have an error of a part of a pixel, which smoothing reduces.
+    Outlines are wrong by a fraction of a pixel. Smoothing reduces this error.
     """
     a, b = np.concatenate([mesh.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]).T
     count = len(mesh.vertices)
@@ -96,15 +96,16 @@ def _signed_distance(alpha: np.ndarray) -> np.ndarray:
 
 
 def _look_up(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Look up an upsampled picture at pixel positions."""
+    """Look up a picture that is UPSAMPLING times as dense, at positions `x` and `y` in pixels of the original."""
     row, column = ((UPSAMPLING * v).astype(int) for v in (y, x))
     return picture[row.clip(0, len(picture) - 1), column.clip(0, picture.shape[1] - 1)]
 
 
 def _gaps(mesh: Mesh, camera: Camera, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Measure the gap at each pixel along the mesh's outline in a view: a vertex there, and the gap in world units.
+    """Measure how far the mesh's outline lies inside the rendering's outline, at each pixel along the mesh's outline.
 
-    The gap is positive where the mesh's outline lies inside the rendering's.
+    Returns a vertex for each of these pixels, and the gap there in world units, negative if the mesh's outline lies outside. `distance` is
+    the result of `_signed_distance`.
     """
     scene = EmbreeScene()  # rays are traced in single precision about the mesh's middle
     middle = mesh.vertices.mean(axis=0)

@@ -20,8 +20,9 @@ PASSES = 3
 def unshadowed(splats: Splats, surfels: Surfels, mesh: Mesh, light: Environment) -> Splats:
     """Divide the base colour of matte splats by the fraction of the irradiance that reaches them.
 
-    That fraction is the direct light that the `mesh` does not block, and the light that the mesh reflects. Metals are unchanged. Shadows
-    are in the colours if the training traced no mesh. `light` is that of the training; `surfels` are the splats as tensors.
+    The light that reaches a splat is the direct light that the `mesh` does not block, plus the light that the mesh reflects. Metals are
+    unchanged. Call this only if the training traced no mesh: only then do base colours contain shadows. `light` is the training's light,
+    and `surfels` are the splats as tensors.
     """
     shadowed, occluder = surfels.albedo, Occluder(mesh)
     matte = 1 - surfels.metallic[:, None]

@@ -30,7 +30,7 @@ class Quantity(NamedTuple):
         return 10 ** (-value / 20) if self.decibels else value
 
     def text(self, error: float) -> str:
-        """Format an error; in decibels if the quantity is a PSNR."""
+        """Format an error as text. If the quantity is a PSNR, the text is in decibels."""
         return f"{-20 * np.log10(error):.4g} dB" if self.decibels else f"{error:.3g}"
 
 
@@ -72,7 +72,7 @@ def curve(run: str, history: list[dict], quantity: Quantity) -> Curve:
 def front(curves: list[Curve]) -> list[np.ndarray]:
     """Mark the points of each curve (n,) that lie on the Pareto front of all curves.
 
-    No other point has a smaller error in at most the same time, or at most the same error in less time.
+    A point is on the front if no other point has a smaller error in at most the same time, or at most the same error in less time.
     """
     seconds, errors = (np.concatenate([getattr(c, name) for c in curves]) for name in ("seconds", "errors"))
     order = np.lexsort((errors, seconds))
@@ -99,9 +99,9 @@ def knee(found: Curve) -> int | None:
 
 
 def time_to(found: Curve, error: float) -> float | None:
-    """Return the seconds until an error was reached, or None if it was not reached.
+    """Return the seconds after which the curve `found` first has at most this error, or None if it never has.
 
-    The seconds are interpolated between logarithms.
+    Between two points of the curve, the logarithms of seconds and error are interpolated linearly.
     """
     reached = np.flatnonzero(found.errors <= error)
     if not len(reached):
@@ -114,7 +114,7 @@ def time_to(found: Curve, error: float) -> float | None:
 
 
 def levels(curves: list[Curve]) -> list[float]:
-    """Choose a few round errors that the curves pass, the largest first; round in decibels if the quantity is a PSNR."""
+    """Choose a few round errors that the curves pass, the largest first. If the quantity is a PSNR, they are round in decibels."""
     quantity = curves[0].quantity
     worst, best = max(c.errors[0] for c in curves), min(c.errors.min() for c in curves)
     if best >= worst:

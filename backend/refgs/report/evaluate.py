@@ -32,7 +32,10 @@ Step = Callable[[int, str, int], None]
 
 
 def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None, step: Step) -> dict[str, Any]:
-    """Measure a run on views of its capture and against ground truth. Writes pictures/ and returns the figures."""
+    """Measure a run on views of its capture and against ground truth. Writes pictures/ and returns the figures.
+
+    `split` names the views, such as "test". `step` is called after each rendering.
+    """
     pictures, lit = run.folder / "pictures", run.environment is not None
     hdris = truth.hdris if truth and lit else []
     total, done, cameras = len(views) * (1 + 2 * len(hdris)), 0, []
@@ -130,7 +133,7 @@ def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[
 def _measure_relit(
     run: Run, hdri: str, cameras: list[Camera], truth: GroundTruth, pictures: Path, next_step: Callable[[str], None]
 ) -> dict[str, float]:
-    """Measure views under another light, and write pictures of the renderings and of the truth."""
+    """Measure views under another light, `hdri`, and write pictures of the renderings and of the ground truth."""
     light = run.light(truth.panorama(f"relight/{hdri}"))
 
     # Each call renders again, because keeping all pictures takes too much memory.
@@ -146,7 +149,7 @@ def _measure_relit(
 
 
 def _measure_speed(run: Run, cameras: list[Camera]) -> dict[str, float | str]:
-    """Measure the renderer's frames a second, by the median frame; on the CUDA card if there is one."""
+    """Measure the renderer's frames per second from the median time of a frame. The CUDA card renders if there is one."""
     device = torch.device("cuda" if cuda.unusable() is None else "cpu")
     surfels = Surfels(*(value.to(device) for value in run.surfels()))
     light = run.environment and Environment(run.environment.radiance.to(device), run.environment.reference)

@@ -81,9 +81,9 @@ def in_words(metrics: dict, figures: list[Quantity]) -> list[str]:
 
 
 def relit_pair(figures: dict[str, float], prefix: str) -> str:
-    """Format PSNR and FLIP of relit pictures: as they are / after one scale aligns them.
+    """Format PSNR and FLIP of relit pictures, each as "raw / aligned". Aligned pictures are scaled by the factor that fits best.
 
-    `prefix` is the keys' beginning, such as "relight.studio.mesh".
+    `figures` maps dotted keys to numbers. `prefix` is the keys' beginning, such as "relight.studio.mesh".
     """
     parts = []
     for name, text in (("psnr", "{:.2f}"), ("flip", "{:.3f}")):

@@ -20,8 +20,8 @@ BY_NAME = {  # in this order; other settings follow, under their own names
 def labels(names: list[str], facts: list[dict]) -> list[str]:
     """Make a unique label for each run from its settings, `facts` (the tables of run.toml), or else from its folder's name.
 
-    A setting that only differs between presets is not named: the preset's name says it. A setting is named without its section if no
-    other section has a setting of that name.
+    If a setting differs only because the presets differ, the label has the preset's name instead. A setting is named without its section
+    if no other section has a setting of that name.
     """
     known = [_settings(tables) for tables in facts]
     groups = defaultdict(list)

@@ -163,7 +163,7 @@ def _ambiguities(metrics: dict) -> list[str]:
 
 
 def _lines(text: str) -> list[dict]:
-    """Parse the lines of history.jsonl that have seconds."""
+    """Parse history.jsonl. Lines without a number of seconds are skipped."""
     return [line for line in history.read(text) if is_number(line.get("seconds"))]
 
 
@@ -181,7 +181,7 @@ def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[
 
 
 def _embed(path: Path) -> str:
-    """Embed a picture as a data URL, scaled down to LARGEST_SIDE; "" if it is missing or broken."""
+    """Return a picture as a data URL, scaled down to LARGEST_SIDE pixels. Return "" if the picture is missing or broken."""
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.exists() else None
     if image is None:
         return ""
@@ -237,7 +237,7 @@ def _other_figures(pages: list[RunPage]) -> list[dict]:
 
 
 def _curves(pages: list[RunPage]) -> list[list[Curve]]:
-    """Group the runs' curves by quantity."""
+    """Make the curves of error against time: a list for each quantity, with the curve of each run that recorded it."""
     groups = []
     for quantity in QUANTITIES:
         curves = [curve(page.label, page.history, quantity) for page in pages]

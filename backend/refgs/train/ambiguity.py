@@ -29,7 +29,7 @@ def _redder(of: Explanation, size: float) -> Explanation:
 
 
 def _blurred(of: Explanation, size: float) -> Explanation:
-    """Blur the light: blend the mean of each texel's neighbours into the texel. `size` is the mean's weight.
+    """Blur the light of `of`: blend the mean of each texel's neighbours into the texel. `size` is the mean's weight.
 
     Neighbours lie on the same face, up to a sixteenth of the face's side away.
     """
@@ -60,7 +60,7 @@ def _more_metal(of: Explanation, size: float) -> Explanation:
 class Trade(NamedTuple):
     """Pair a change of a given size with another change that may cancel it in the pictures.
 
-    `words` name the change and `answer` names the other one, for the artist.
+    `change` is made by `size`, and `made_up` is the other change. `words` and `answer` name them for the artist.
     """
 
     words: str
@@ -81,7 +81,8 @@ TRADES = {
 def ambiguities(state: State) -> dict[str, dict]:
     """Measure at the end of the training how far the two changes of each trade (see `Trade`) cancel.
 
-    Returns figures for each of `TRADES`, and nothing where nothing is lit. All are root mean squares of encoded colours, except `answer`:
+    Returns these figures for each of `TRADES`; without light, an empty dictionary. `alone`, `left` and `error` are root mean squares of
+    encoded colours.
 
     `alone` is how far the first change alters the pictures. `answer` is the size of the other change that cancels it best. `left` is how
     far both changes together alter the pictures. `error` is the pictures' error against the photos. `what` is a line for the artist,

@@ -128,7 +128,7 @@ def _seen_side(surfels: Surfels, state: State) -> Tensor:
 
 
 def _left_out(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) -> list[dict[str, Any]]:
-    """List for needs.json the decisions of `refgs.train.needs`, and what else the run did without, why, and what that saved.
+    """List the rows of needs.json: decisions of `refgs.train.needs`, and what else the run left out, with the reason and the saving.
 
     `side` (N,) is the result of `_seen_side`. `wanted` (N,) are the surfels in the region to train.
     """

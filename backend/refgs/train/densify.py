@@ -22,7 +22,7 @@ LEAST_SURFELS = 1000
 def faint_now(state: State, opacity: float = SEEN) -> bool:
     """Tell whether surfels may still be faint because of the last opacity reset.
 
-    This ends once surfels that the picture needs have had time to reach `opacity` again.
+    The answer is no once the surfels that the picture needs have had time to reach `opacity` again.
     """
     return faint(state.settings.densify, state.settings.rates, state.iteration, state.total, opacity)
 
@@ -45,9 +45,9 @@ def densify_due(state: State, progress: float) -> None:
 
 
 def since_propagation(state: State) -> int | None:
-    """Count the iterations since normals were last propagated.
+    """Count the iterations since normals were last propagated (see `propagate_normals`).
 
-    Returns None before the first propagation and after the last.
+    Returns None before the first propagation, and once the training no longer propagates normals.
     """
     settings, iteration = state.settings.propagation, state.iteration
     if not settings.every or iteration < settings.every or not state.method.lit:
@@ -78,7 +78,8 @@ def densify(
     """Remove faint surfels, and divide those with the largest screen gradients, up to the budget.
 
     A surfel is divided in two along its longer axis. At least one surfel is kept. Parameters are replaced in the dictionary and in the
-    optimiser. Surviving surfels keep their moments, new ones start without. Returns how many surfels were divided.
+    optimiser. Surfels that were not divided keep Adam's moments; the halves of a divided one start with zero moments. Returns how many
+    surfels were divided.
     """
     opacity = parameters["opacity"].sigmoid()
     keep = ~(opacity < settings.prune_opacity)  # NaN is kept here: guard.py removes it, with a warning
@@ -105,7 +106,7 @@ def densify(
 def reset_opacity(parameters: Parameters, optimizer: Adam) -> None:
     """Lower all opacities to RESET at most (Kerbl et al. 2023).
 
-    The picture then raises the opacities of surfels that it needs. The others are removed later.
+    Training then raises the opacities of the surfels that the picture needs. The other surfels stay faint and are removed later.
     """
     parameters["opacity"].clamp_(max=math.log(RESET / (1 - RESET)))
     optimizer.state.pop(parameters["opacity"], None)
@@ -114,8 +115,8 @@ def reset_opacity(parameters: Parameters, optimizer: Adam) -> None:
 def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total: int, opacity: float) -> bool:
     """Tell whether surfels may still be faint because of the last opacity reset before `iteration`.
 
-    This ends once surfels that the picture needs have had time to reach `opacity` again. Adam moves a logit by about its rate in each
-    iteration that sees the surfel, and the rate decays. Surfels get four times as long as this takes.
+    The answer is no once the surfels that the picture needs have had time to reach `opacity` again. The time needed is estimated: Adam
+    moves the logit of an opacity by about the learning rate in each iteration, and the rate decays. Surfels get four times this estimate.
     """
     every = settings.reset_every
     last = min(iteration, math.ceil(settings.stop * total)) - 1  # a reset at the end of this iteration does not count
@@ -135,8 +136,8 @@ def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total:
 def propagate_normals(parameters: Parameters, optimizer: Adam, settings: PropagationSettings) -> None:
     """Propagate normals from mirrors to their surroundings (paper §3.3).
 
-    All surfels become opaque, and mirrors grow. The surfels in front then lend their normals to the pixels around. The surfels behind give
-    way or follow.
+    All surfels become opaque, and surfels that mirror become larger. The larger surfels then cover pixels around them, which are shaded
+    with their normals. Training adapts the covered surfels.
     """
     parameters["opacity"].clamp_(min=math.log(settings.opacity / (1 - settings.opacity)))
     optimizer.state.pop(parameters["opacity"], None)
@@ -172,8 +173,8 @@ def fewer_surfels(state: State) -> None:
 def take(parameters: Parameters, optimizer: Adam, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
     """Replace the surfels by those at `index`, with their Adam moments. Rows at `fresh` start with zero moments.
 
-    Adam then moves fresh rows by several times their rate for a while. The picture gets worse at first, but captures without masks end
-    better. If memory does not suffice, nothing is replaced.
+    At first, zero moments make Adam move fresh rows by several times the learning rate. The picture then gets worse for a while, but
+    captures without masks end better. If memory does not suffice, nothing is replaced.
     """
     groups = [group for group in optimizer.param_groups if group["name"] in parameters]  # without light and exposures
     made = []

@@ -42,9 +42,9 @@ class Effective:
         return self.moved_to(self.settings.model_copy(update={section: table}), by, why)
 
     def noted(self, key: str, value: Any, by: By, why: str) -> "Effective":
-        """Return a copy that records the change of a number, without changing `settings`.
+        """Return a copy that records the change of a number, but keep `settings` as they are.
 
-        The training's state holds this number itself, such as how many iterations there are.
+        This is for numbers that the training's state holds itself, such as the total of iterations.
         """
         return replace(self, changes=self.changes | {key: Change(_numbers(self.asked)[key], value, by, why)})
 

@@ -14,7 +14,7 @@ ALIKE = math.log(2) / 3
 
 @torch.no_grad()
 def leave_out_alike(state: State, progress: float) -> None:
-    """Stop learning exposures if they have converged to equal values, and the setting `light.exposure` is "auto"."""
+    """Stop learning exposures if the learned ones are nearly equal and the setting `light.exposure` is "auto"."""
     settings = state.settings
     if state.exposures is None or settings.light.exposure != "auto" or state.initial:
         return

@@ -78,7 +78,7 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
 
 
 def between(quick: Settings, standard: Settings, part: float) -> Settings:
-    """Interpolate two presets geometrically: `part` 0 is `quick`, 1 is `standard`, more extrapolates.
+    """Interpolate two presets geometrically: `part` 0 gives `quick`, 1 gives `standard`, and more than 1 extrapolates.
 
     The cubemap's side is rounded down to a power of two.
     """
@@ -93,10 +93,11 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
 
 
 def _scheduled(settings: Settings, iterations: float, quick: Settings, standard: Settings) -> Settings:
-    """Scale a schedule to `iterations`; with fewer than `quick` has, or more than `standard`, adapt the learning rates.
+    """Scale the schedule in `settings` to `iterations`, and adapt the learning rates where that is needed.
 
-    The rates were chosen for numbers between those two. Beyond, they are multiplied by √(nearest such number / iterations): each step has
-    the noise of one view, and with these rates the noise of all steps adds up to the same amount, however many steps there are.
+    The rates suit any number of iterations between those of `quick` and `standard`. With fewer or more iterations, the rates are multiplied
+    by √(nearest suitable number / iterations). Each step has the noise of one view. With these rates, the total noise of all steps does not
+    depend on how many steps there are.
     """
     tables, part = settings.model_dump(), iterations / settings.train.iterations
     usual = min(max(iterations, quick.train.iterations), standard.train.iterations)

@@ -26,9 +26,10 @@ SMALLEST, LARGEST = 1e-6, 1e2  # of a surfel, in scene radii
 
 
 def limits(name: str, radius: float, brightest: float) -> tuple[float, float]:
-    """Return the lowest and the highest raw value of a parameter. `brightest` is the highest raw light.
+    """Return the lowest and the highest raw value that a parameter may take.
 
-    Between them, gradients are large enough to lead back. `radius` is the scene's.
+    Beyond these limits, gradients would be too small to lead the parameter back. `radius` is the scene's radius, and `brightest` is the
+    limit for the light's raw texels.
     """
     if name == "scale":
         return math.log(SMALLEST * radius), math.log(LARGEST * radius)
@@ -38,9 +39,9 @@ def limits(name: str, radius: float, brightest: float) -> tuple[float, float]:
 
 
 class Guard:
-    """Count the steps that were skipped.
+    """Skip and count the steps whose loss or gradients are not finite.
 
-    The counts are kept on the training's device, so that the CPU need not wait for a card.
+    The counts are kept on the training's device, so that the CPU need not wait for the graphics card.
     """
 
     def __init__(self, device: torch.device):
@@ -104,7 +105,7 @@ class Guard:
 
 
 def warn(state: State, what: str) -> None:
-    """Report a warning with the iteration."""
+    """Report a warning that names the iteration."""
     state.report("warning", {"what": f"iteration {state.iteration}: {what}"})
 
 

@@ -18,17 +18,18 @@ BESIDE = ("reading", "start", "writing", "measuring", "FLIP")  # parts of the cl
 def due(iteration: int) -> bool:
     """Tell whether to record an iteration.
 
-    In each decade, A_DECADE iterations are recorded, evenly spaced by logarithm. The last iteration is recorded besides.
+    While the iteration grows tenfold, A_DECADE iterations are recorded, evenly spaced by logarithm. The trainer also records the last
+    iteration.
     """
     place, before = (math.floor(A_DECADE * math.log10(max(i, 1))) for i in (iteration, iteration - 1))
     return iteration >= FIRST and place > before
 
 
 def allowed(iteration: int, total: int, seconds: float) -> float:
-    """Return how many seconds measuring errors may have taken in total before this iteration, `seconds` after the start.
+    """Return how many seconds all measurements of errors before this iteration may have taken together. FLIP has the same limit again.
 
-    Measuring may take SHARE of the training's expected time. This time is spread evenly over the history's lines, which are evenly spaced
-    by the iteration's logarithm.
+    `seconds` is how long the training took so far. Measuring may take the fraction SHARE of the training's expected time. This time is
+    spread evenly over the history's lines, which are evenly spaced by the iteration's logarithm.
     """
     lines = math.log(max(total / FIRST, 1)) or 1.0
     passed = min(math.log(max(iteration / FIRST, 1)) / lines, 1.0)

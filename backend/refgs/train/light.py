@@ -32,14 +32,14 @@ SOLID = 0.5  # alpha
 
 
 def start_value(state: State) -> float:
-    """Return the raw value of a texel at the start."""
+    """Return the raw value that all of the light's texels start from."""
     return state.method.light.raw(state.settings.environment.radiance)
 
 
 def resolution(settings: Settings, progress: float) -> int:
-    """Return how many texels the cubemap has along a side.
+    """Return how many texels the cubemap has along a side, for a progress of 0..1.
 
-    At first it has half of them: each texel is then seen more often and learns sooner.
+    Early in the training, the cubemap has half its final resolution: each texel is then seen more often and learns sooner.
     """
     finest = settings.environment.resolution
     return finest if progress >= REFINED else max(finest // 2, LEAST)
@@ -74,8 +74,9 @@ def _replace(state: State, texels: Tensor) -> None:
 def diffuse(state: State) -> None:
     """Let texels flow into their neighbours on the face, in proportion to the light's learning rate.
 
-    Diffusion acts beside the optimiser's step, as decoupled weight decay does (Loshchilov and Hutter 2019). Texels that photos agree on
-    move by the whole rate and stay sharp. Texels that only noise moves even out. The mean stays.
+    Diffusion is a step apart from the optimiser's, like decoupled weight decay (Loshchilov and Hutter 2019). If the photos agree on a
+    texel, the optimiser moves it faster than diffusion, and details stay sharp. Texels that only noise moves become even. The mean over
+    all texels does not change.
     """
     side = math.isqrt(len(state.light) // 6)
     rate = state.group("environment")["lr"]
@@ -92,7 +93,7 @@ def diffuse(state: State) -> None:
 def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
     """Average the light's radiance (3,) over the directions that the object mirrors.
 
-    Returns None if the loss has no term on this mean. The term pulls the mean towards grey.
+    The loss may have a term that pulls this mean towards grey. Returns None if it has none, or if `light` is None.
     """
     if light is None or state.settings.loss.light == 0:
         return None
@@ -108,7 +109,7 @@ def mirrored(
 ) -> Tensor:
     """Return weights (6·R²,) of the light's texels: the solid angle if a camera sees the texel mirrored, else zero.
 
-    The weights sum to one. If no texel is seen, all texels count.
+    R is the cubemap's side in texels. The weights are scaled to sum to one. If no texel is seen, all texels count.
     """
     seen = torch.zeros(6 * PART * PART, dtype=torch.bool)
     settings = settings.model_copy(update={"reflection": "microfacet"})  # treat matte surfaces as reflective here

@@ -35,8 +35,8 @@ def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndar
     turns with the camera, the factor changes with the normal and the mirror direction, both in the camera's frame.
 
     The logarithm of the brightness is fitted in three quarters of the photos by harmonics of those directions, a number for each point,
-    and a number for each photo, its exposure. The light that better predicts the other photos is chosen; their exposures do not count.
-    "camera" has to predict them clearly better. This takes seconds and is deterministic.
+    and a number for each photo, its exposure. The frame whose fit better predicts the other photos, up to their exposures, is chosen.
+    "camera" is chosen only if it predicts them clearly better. The choice takes seconds and is deterministic.
     """
     points, photos, brightness, still, turning = _observations(views, positions, normals, radius)
     if len(np.unique(photos)) < 2 * FOLDS or len(points) < 100:
@@ -54,9 +54,10 @@ def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndar
 
 
 def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple:
-    """List what the photos show of the points, in M rows.
+    """List the brightness of points in the photos, a row for each of the M times that a photo shows a point.
 
-    A row is the point, the photo, the log radiance, and the fit's terms (M, K) under a still and under a turning light.
+    Returns the indices of the points and of the photos (M,), the log radiance (M,), and the harmonics (M, K) that explain it under a still
+    light and under a turning light.
     """
     some = np.arange(0, len(positions), max(1, len(positions) // POINTS))
     coarse = int(np.clip(0.75 * np.sqrt(len(positions)), 16, SIDE))  # coarse enough that points leave no holes
@@ -87,9 +88,9 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
 
 
 def _in_front(camera: Camera, positions: np.ndarray, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tell which of the points with indices `some` are in the picture.
+    """Tell which of the points with indices `some` are inside the picture.
 
-    Return also how far each point is behind the foremost point at its pixel.
+    Return also how far each of these points lies behind the foremost of all points at its pixel, in world units.
     """
     pixels, depth = project(camera, positions)
     ahead = inside(camera, pixels, depth)
@@ -108,7 +109,8 @@ def _harmonics(directions: np.ndarray) -> np.ndarray:
 def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray, photos: np.ndarray) -> float:
     """Return the mean squared error of a fit on photos that the fit has not seen (cross-validation).
 
-    The fit explains values (M,) by terms (M, K), a number for each point and a number for each photo.
+    The fit explains each of the `values` (M,) as a sum: a linear function of `terms` (M, K), a number for its point, and a number for its
+    photo. `points` and `photos` (M,) are the indices of these.
     """
     total = count = 0
     for fold in range(FOLDS):
@@ -130,6 +132,6 @@ def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray,
 
 
 def _means(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
-    """Average rows (M, K) by their group (M,). Returns (groups, K), zero for empty groups."""
+    """Average the rows of `values` (M, K) in each group: `group` (M,) is each row's group. Returns (groups, K), zero for empty groups."""
     sums = np.stack([np.bincount(group, column, groups) for column in values.T], axis=1)
     return sums / np.maximum(np.bincount(group, minlength=groups), 1)[:, None]

@@ -46,9 +46,10 @@ class Photo(NamedTuple):
 
 
 class Objective(NamedTuple):
-    """Hold the training loss of a view, a differentiable scalar, and the mean squared error of the picture, clipped to 0..1.
+    """Hold the training loss of a view and the picture's mean squared error.
 
-    Both are means over the full photo. Pixels outside the crop count as error-free.
+    `loss` is a differentiable scalar. `square` is the squared error of the picture clipped to 0..1. If the photo was cropped, the pixels
+    outside the crop count as error-free in both.
     """
 
     loss: Tensor
@@ -141,8 +142,8 @@ class _Objective(torch.autograd.Function):
 def departure(exposure: Tensor) -> Tensor:
     """Penalise an exposure other than one, given the exposure's natural logarithm.
 
-    The penalty is the logarithm's magnitude, rounded off below 2 %. Photos cannot tell a brighter light from longer exposures, so one of
-    the two must be held. Magnitudes, unlike squares, let a few photos differ without moving the rest.
+    The penalty is the logarithm's absolute value, smoothed near zero. Photos cannot tell a brighter light from longer exposures, so
+    exposures are held near one. Absolute values, unlike squares, let a few photos differ without moving the others.
     """
     return torch.sqrt(exposure * exposure + ROUND_OFF**2) - ROUND_OFF
 

@@ -31,7 +31,7 @@ def held_out_psnr(state: State, most: int = VIEWS) -> float | None:
 
 
 class _Look(NamedTuple):
-    """Hold a held-out view, its true maps with the object's coverage, and its true picture under another light."""
+    """Hold a held-out view and its ground truth: maps such as normals, the object's coverage, and a picture under another light."""
 
     view: LoadedView
     known: dict[str, np.ndarray]
@@ -87,9 +87,9 @@ class Measures:
     def errors(self, state: State) -> dict[str, float]:
         """Measure the mean errors of a training as it stands, where the truth is known.
 
-        Without ground truth there is `psnr_test`. With it there are `normal_mae_degrees`, `albedo_psnr` (linear, one scale a channel
-        aligned), `metallic_mae`, `roughness_mae`, `light_log_rmse` (natural logarithm, one scale aligned) and `relit_psnr` (one scale
-        aligned; without inter-reflection).
+        `psnr_test` needs held-out photos only. Ground truth adds `normal_mae_degrees`, `albedo_psnr` (linear, after a best factor for
+        each channel), `metallic_mae`, `roughness_mae`, `light_log_rmse` (natural logarithm, after one best factor) and `relit_psnr`
+        (after one best factor; without inter-reflection).
         """
         rows: dict[str, list] = {}
         for look in self._looks:
@@ -123,7 +123,7 @@ class Measures:
 
     @torch.no_grad()
     def _relit(self, state: State) -> float:
-        """Compute the PSNR of the first views under the held-out light, with one scale aligned."""
+        """Compute the PSNR of the first views under the held-out light, after one factor scales the renderings to fit the truth."""
         settings = self.settings.render.model_copy(update={"reflection": "microfacet"})
         surfels = state.surfels().without_directions()
         pairs = []

@@ -12,9 +12,9 @@ _Work = struct("Motion", "motion.cpp")
 
 
 class ScreenGradient:
-    """Average the gradient of the loss by each surfel's position on the screen.
+    """Average over views how strongly the loss depends on each surfel's position on the screen: the length of this gradient.
 
-    Positions are in half image widths, as in 3D Gaussian splatting.
+    Positions on the screen are in units of half the image's width, as in 3D Gaussian splatting.
     """
 
     def __init__(self, count: int, device: torch.device):
@@ -24,7 +24,7 @@ class ScreenGradient:
     @timed("densification")
     @torch.no_grad()
     def add(self, position: Tensor, gradient: Tensor, camera: Camera, accepted: Tensor | None = None) -> None:
-        """Add one view's gradient (N, 3) of the loss by the world `position` (N, 3).
+        """Add one view's gradient (N, 3) of the loss with respect to the world `position` (N, 3).
 
         If `accepted`, a float32 scalar, is zero, nothing is added.
         """
@@ -38,5 +38,5 @@ class ScreenGradient:
         run("refgs_motion", work, position, items=work.count)
 
     def mean(self) -> Tensor:
-        """Return the mean over the views (N,). It is zero for a surfel that was never seen."""
+        """Return the length of each surfel's gradient (N,), averaged over the views that saw the surfel; zero if none did."""
         return self.total / self.views.clamp_min(1)

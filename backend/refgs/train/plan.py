@@ -15,7 +15,8 @@ MIRRORED = 1.2  # factor of an iteration's time for inter-reflection: 1 without,
 def iterations_time(growth: float, progress: float) -> float:
     """Compute the relative time of all iterations up to a progress of 0..1.
 
-    The time of an iteration is 1 at first and grows to `growth` at the end. All iterations would take 1 if it did not grow.
+    An iteration takes `growth` times as long at the end as at the start. The unit is the time that all iterations would take if each took
+    as long as the first.
     """
     first, last = GROWS
     ramp = min(max(progress - first, 0.0), last - first)

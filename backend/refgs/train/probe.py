@@ -1,7 +1,7 @@
 """Measure what pictures lose without a part of the method, and how much time an iteration saves without it.
 
-`refgs.train.needs` decides by these figures. All are of training views, at the time of the call. Decibels are computed from the mean
-squared error over all views looked at.
+`refgs.train.needs` decides by these figures. All are measured on training views, with the surfels and the light as they are at the call.
+Decibels are computed from the mean squared error over all views measured.
 """
 
 import math
@@ -35,7 +35,7 @@ def pooled(environment: Environment, side: int) -> Environment:
 
 
 def without_specular(inputs: RenderInputs) -> RenderInputs:
-    """Make all surfaces matte."""
+    """Return inputs for rendering all surfaces as matte."""
     return inputs._replace(settings=inputs.settings.model_copy(update={"reflection": "none"}), occluder=None)
 
 
@@ -54,7 +54,7 @@ def squared_error(color: Tensor, photo: Photo, background: Tensor) -> float:
 
 
 def decibels_lost(errors: list[float], without: list[float]) -> float:
-    """Compute how many dB the PSNR falls from mean squared errors `errors` to mean squared errors `without`."""
+    """Compute by how many dB the PSNR falls if the views' mean squared errors rise from `errors` to `without`."""
     return 10 * math.log10(max(sum(without), 1e-12) / max(sum(errors), 1e-12))
 
 
@@ -74,17 +74,17 @@ def squared_errors(state: State, inputs: RenderInputs) -> list[float]:
 
 @torch.no_grad()
 def psnr_loss(state: State, change: Change) -> float:
-    """Compute how many dB of PSNR the training views lose by a change of what they are rendered from."""
+    """Compute how many dB of PSNR the training views lose if `change` is applied to the inputs of the rendering."""
     inputs = state.inputs()
     return decibels_lost(squared_errors(state, inputs), squared_errors(state, change(inputs)))
 
 
 @torch.enable_grad()
 def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: bool = False) -> float:
-    """Time an iteration without and with a change. Return the seconds that the change saves in all iterations that are left.
+    """Time an iteration without and with a change. Return the seconds that the change saves in all remaining iterations.
 
-    If `whole` is true, the first timing is of the whole photo, the second of the part that is trained on. The optimiser's step is left out
-    of both.
+    If `whole` is true, the iteration without the change renders the whole photo, the other one only the part that is trained on. The
+    optimiser's step is not timed.
     """
     fastest = [math.inf, math.inf]
     for _ in range(REPEATS):
@@ -104,8 +104,8 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
 def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: list[Tensor] | None = None) -> Tensor:
     """Compute each surfel's blending weight in each photo, summed over the photo's pixels (V, N).
 
-    If `maps`, a map (H, W, C) for each photo, are given, return each surfel's mean of the maps by that weight instead (N, C). The weights
-    are computed as the gradient of a blended constant feature.
+    `maps` may hold a map (H, W, C) for each photo. In this case, return instead the mean of the maps for each surfel (N, C), weighted by
+    its blending weights. The weights are computed as the gradient of a blended constant feature.
     """
     surfels, count, rows = Surfels(*(value.detach() for value in surfels)), len(surfels.positions), []
     width = 1 if maps is None else maps[0].shape[-1] + 1
@@ -125,10 +125,10 @@ def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: lis
 
 @torch.no_grad()
 def specular_explains(state: State) -> float:
-    """Compute how many dB of training views the specular part explains.
+    """Compute how many dB of the training views' PSNR are due to reflections that change with the view.
 
-    The pictures are compared with pictures in which each surfel's specular part is one colour, the same from everywhere. That colour is
-    the mean of the specular part, by the surfel's weight in the pixels: a matte surface learns as much by its albedo.
+    The pictures are compared with pictures in which each surfel's specular part is one colour, the same from all directions: a matte
+    surface could learn this colour as albedo. It is the mean of the specular part, weighted by the surfel's weight in the pixels.
     """
     inputs, some = state.inputs(), spread_views(state, SEVERAL)
     photos, dull = [state.photo(view) for view in some], without_specular(inputs)
@@ -150,10 +150,10 @@ def specular_explains(state: State) -> float:
 
 @torch.no_grad()
 def reflections_explain(state: State) -> float:
-    """Bound how many dB of training views inter-reflection can explain.
+    """Compute how many dB of the training views' PSNR inter-reflection can gain at most.
 
-    Where the object mirrors itself, mirroring black is compared with mirroring the environment's light. The object's real mirror image
-    lies between the two. The difference is relative to the pictures' errors.
+    Two renderings are compared: where the object mirrors itself, one mirrors black, the other the environment's light. The object's real
+    mirror image lies between the two. The mean squared difference is relative to the pictures' mean squared error.
     """
     inputs, wrong, apart = state.inputs(), 0.0, 0.0
     black = inputs.surfels._replace(
@@ -171,7 +171,7 @@ def reflections_explain(state: State) -> float:
 
 @torch.no_grad()
 def quantile(values: Tensor, weight: Tensor, part: float) -> float:
-    """Find the value below which `part` of the weight lies, for values (N,) with weights (N,)."""
+    """Find the weighted quantile of values (N,): the fraction `part` of the total weight belongs to smaller values."""
     order = values.argsort()
     share = weight[order].cumsum(dim=0) / weight.sum().clamp_min(1e-9)
     return float(values[order][int((share < part).sum().clamp_max(len(order) - 1))])

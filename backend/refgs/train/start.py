@@ -18,10 +18,10 @@ AROUND = 0.5  # part of the surfels, at the most, that lie outside the region
 
 
 def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings) -> tuple[Parameters, int, str]:
-    """Make the initial parameters.
+    """Make the surfels' initial parameters.
 
-    Returns also how many surfels lie on the known surface, and a line that says where all surfels came from. The surfels on the surface
-    are the first ones. Other surfels start inside the visual hull, for hollows that no mask shows.
+    Returns also how many surfels lie on the surface, and a line that says where the surfels start. The surfels on the surface come first.
+    If all photos have masks, the surface is the visual hull; the other surfels start inside, for hollows that no mask shows.
     """
     count, seed = min(settings.surfels.start, settings.surfels.budget), settings.train.seed
     colours, opacity, shown = None, settings.surfels.opacity, count
@@ -66,7 +66,7 @@ def _initial(positions, normals, spacing, colours, surfels: SurfelSettings, opac
 def _hull(capture: Capture, views: list[LoadedView], count: int, settings: Settings):
     """Place points on the masks' visual hull and inside it.
 
-    Returns positions, normals, spacing, and how many points are on the hull. These points are the first ones.
+    Returns positions, normals, spacing, and how many points are on the hull. The points on the hull come first.
     """
     alphas, cameras = [view.alpha for view in views], [view.camera for view in views]
     surfels, seed = settings.surfels, settings.train.seed
@@ -100,10 +100,10 @@ def _hull(capture: Capture, views: list[LoadedView], count: int, settings: Setti
 def _in_and_around(
     box: Box, near: np.ndarray, around: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose at random from the points `near` (N, 3) inside the box, and from the points `around` (M, 3) outside it.
+    """Choose at random those points of `near` (N, 3) that lie in the box, and those of `around` (M, 3) that lie outside the box.
 
-    Returns the indices of both, at most `count` in all. At most AROUND of `count` are outside. Raises InputError if no point is in the
-    box.
+    Returns the indices into `near` and into `around`, at most `count` in all. At most the fraction AROUND of `count` lies outside. Raises
+    InputError if no point of `near` is in the box.
     """
     rng = np.random.default_rng(seed)
     inner, outer = np.flatnonzero(box.contains(near)), np.flatnonzero(~box.contains(around))

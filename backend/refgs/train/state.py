@@ -42,7 +42,7 @@ class State:
     """Hold a training as it stands.
 
     The constructor reads the capture's photos, `train/setup.py` makes the state ready, and `train/trainer.py` moves it on. The second
-    block of attributes is what a checkpoint holds (`train/snapshot.py`). The first block is made anew when a run is resumed.
+    block of attributes in `__init__` is saved in checkpoints (`train/snapshot.py`). The first block is made anew when a run is resumed.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class State:
     def residual_start(self) -> float:
         """Return the progress at which the residual starts to learn, or 1 if it never does.
 
-        The residual is the colour by direction that material and light leave over.
+        The residual is a colour by direction: what material and light do not explain of the photos.
         """
         settings = self.settings
         return settings.residual.start if self.method.deferred and settings.render.diffuse == "irradiance" else 1.0
@@ -155,9 +155,9 @@ class State:
         return [view.camera for view in self.views[:: max(1, len(self.views) // least)]]
 
     def wanted(self) -> Tensor:
-        """Tell which surfels (N,) lie in the region to train. Without a region, all do.
+        """Tell which surfels (N,) lie in the region to train. If no region is set, all surfels do.
 
-        The other surfels show what photos show beside the region.
+        The surfels outside the region show what the photos show there.
         """
         position, box = self.parameters["position"], self.capture.box
         if box is None:
@@ -165,21 +165,21 @@ class State:
         return torch.from_numpy(box.contains(position.numpy(force=True))).to(self.device)
 
     def announce(self, about: str, what: str) -> None:
-        """Report a decision once, and again only if it changes."""
+        """Report a decision, unless the same text was reported before. `about` names the decision, and `what` is the text."""
         if self.decided.get(about) != what:
             self.decided[about] = what
             self.report("decided", {"about": about, "what": what})
 
     def change(self, key: str, value: Any, by: str, why: str) -> None:
-        """Change a setting from here on, given by its key `section.name`."""
+        """Change a setting, named by its `key` "section.name", for the rest of the training. `by` and `why` record the reason."""
         self.effective = self.effective.changed(key, value, by, why)
 
     def group(self, name: str) -> dict[str, Any]:
-        """Return the optimiser's group of a parameter."""
+        """Return the optimiser's parameter group of this name."""
         return next(group for group in self.optimizer.param_groups if group["name"] == name)
 
     def leave_out(self, *names: str) -> None:
-        """Stop learning these parameters. The first surfel's values then stand for all surfels."""
+        """Stop learning these parameters. From then on, all surfels have the values of the first surfel."""
         for name in names:
             if name in self.parameters:
                 value = self.parameters.pop(name)

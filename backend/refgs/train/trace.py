@@ -18,7 +18,7 @@ VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer
 
 
 def why_not_traced(state: State) -> str:
-    """Say why this run traces no inter-reflection. Return "" if it traces it."""
+    """Say why this run traces no inter-reflection. Return "" if the run traces inter-reflection."""
     settings = state.settings
     if not state.method.deferred:
         return f"shading = {settings.render.shading}"

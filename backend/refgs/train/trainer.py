@@ -46,7 +46,7 @@ class Trainer:
     def step(self) -> dict[str, Tensor]:
         """Do one iteration. Returns its loss and its mean squared error.
 
-        A card may still be computing the two tensors.
+        On a graphics card, the two tensors may not be computed yet: reading them waits.
         """
         state, view = self.state, self._next_view()
         progress = min(state.iteration / state.total, 1.0)
@@ -167,7 +167,7 @@ class Trainer:
     def _check(self, whole: bool) -> None:
         """Let the guard check the state. Go back to the last checkpoint if the guard says so.
 
-        The time spent since that checkpoint counts.
+        The time spent since that checkpoint still counts as time of the training.
         """
         state = self.state
         if why := self.guard.look(state, whole):

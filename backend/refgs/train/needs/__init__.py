@@ -45,9 +45,9 @@ __all__ = [
 
 
 def evaluate_due(state: State, moment: Moment, *given: Any, progress: float = 0.0) -> list[str]:
-    """Decide the needs that are due at a moment of the training (see `Moment`). Returns their names.
+    """Decide the needs (parts of the method that a scene may do without) that are due at a moment of the training (see `Moment`).
 
-    A need is a part of the method that a scene may do without. `progress` is 0..1.
+    Returns the names of the needs decided. `given` is passed on to `Need.measure`. `progress` is 0..1.
     """
     decided: list[str] = []
     for need in NEEDS:
@@ -69,16 +69,17 @@ def evaluate_iteration(state: State, progress: float) -> None:
 
 
 def evaluate_mesh(state: State, hidden: float) -> None:
-    """Decide whether inter-reflection is needed. If that is not decided now, only report how much the object mirrors itself.
+    """Decide, once there is a mesh, whether inter-reflection is needed.
 
-    `hidden` is the part of the object's pixels that mirror the object.
+    If it is decided already, only report how much the object mirrors itself. `hidden` is the fraction of the object's pixels that mirror
+    the object.
     """
     if not evaluate_due(state, "mesh", hidden):
         state.announce("reflections", f"with {Reflections.what}: {share_hidden(hidden)}")
 
 
 def _record(state: State, need: Need, decision: Decision) -> None:
-    """Record and announce a decision. If the need's part of the method is not needed, leave it out."""
+    """Record and announce the decision about a need. If this part of the method is not needed, leave it out."""
     found: dict[str, Any] = {"needed": decision.needed, "why": decision.why}
     if decision.statistic is not None:
         found["statistic"] = float(decision.statistic)
@@ -91,9 +92,9 @@ def _record(state: State, need: Need, decision: Decision) -> None:
 
 
 def restore(state: State, recorded: dict[str, dict[str, Any]]) -> None:
-    """Take over a checkpoint's decisions, and leave out again what is not needed.
+    """Take over the decisions `recorded` in a checkpoint, and leave out again the parts of the method that are not needed.
 
-    When the training goes back to a checkpoint, decisions made since then stay.
+    If the training goes back to an earlier checkpoint, decisions made after that checkpoint stay.
     """
     state.needs = recorded | state.needs
     for name, found in state.needs.items():
@@ -102,7 +103,7 @@ def restore(state: State, recorded: dict[str, dict[str, Any]]) -> None:
 
 
 def rows(state: State) -> list[dict[str, Any]]:
-    """List the decisions as the rows of needs.json."""
+    """List the decisions about needs as rows of needs.json."""
     listed = []
     for name, found in state.needs.items():
         row = {"need": name, "what": BY_NAME[name].what, **found}

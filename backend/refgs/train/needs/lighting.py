@@ -49,7 +49,7 @@ class Reflections(Need):
 
 
 def share_hidden(hidden: float) -> str:
-    """Describe in words on what part of its pixels the object mirrors itself."""
+    """Say in words on what fraction of its pixels, `hidden`, the object mirrors itself."""
     return f"the object mirrors itself on {hidden:.1%} of it"
 
 
@@ -105,9 +105,9 @@ class Light(Need):
 
 
 def resolvable(roughness: float, part: float, finest: int, coarsest: int) -> int:
-    """Choose the fewest texels along a side that resolve a roughness's lobe, between `coarsest` and `finest`.
+    """Choose the fewest texels along a cubemap's side, from `coarsest` to `finest`, that resolve reflections of this roughness.
 
-    A texel may take at most `part` of the lobe's width. This width, in radians, is the square of the roughness.
+    A texel may be at most `part` as wide as the reflection's lobe. The lobe's width, in radians, is the square of the roughness.
     """
     side = coarsest
     while side < finest and math.pi / 2 / side > part * roughness**2:
@@ -118,8 +118,8 @@ def resolvable(roughness: float, part: float, finest: int, coarsest: int) -> int
 class Degrees(Need):
     """Decide whether the scene needs all degrees of spherical harmonics.
 
-    Two colours by direction are learned as harmonics: the one that material and light leave over, and the object's light that it mirrors
-    itself.
+    Two colours that depend on direction are learned as harmonics: the colour that material and light do not explain, and the object's
+    mirror image in itself.
     """
 
     name, what = "degrees", "all degrees of harmonics"

@@ -76,9 +76,9 @@ class Constants(Need):
 
     @torch.no_grad()
     def common(self, state: State, surfels: Surfels, kept: Tensor) -> dict[str, tuple[float, float]]:
-        """Find which of metallic and roughness are about the same for all surfels in `kept` (N,).
+        """Find out whether metallic, and whether roughness, is about the same for all surfels in `kept` (N,).
 
-        Returns the common value and its spread, by name.
+        Returns those that are, by name: the common value, and how far the values spread.
         """
         if self.asked(state) == "on" or not state.method.lit:
             return {}

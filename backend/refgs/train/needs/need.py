@@ -17,8 +17,8 @@ MEGA = 1e6
 class Decision(NamedTuple):
     """Hold the decision about a need.
 
-    `statistic` was compared with `threshold`; None stands for the need's own threshold. `figures` say what was saved, in `seconds` and
-    `megabytes`, and what it cost, in `decibels` of the training views' PSNR. They also hold numbers that `Need.apply` reads.
+    `statistic` was compared with `threshold`, or with the need's own threshold if `threshold` is None. `figures` say what was saved, in
+    `seconds` and `megabytes`, and what it cost, in `decibels` of the training views' PSNR. They also hold numbers that `Need.apply` reads.
     """
 
     needed: bool
@@ -42,21 +42,24 @@ class Need:
     follows: ClassVar[str] = ""  # a need after whose decision this one is asked, too
 
     def due(self, state: State, moment: Moment, progress: float) -> bool:
-        """Tell whether to decide at this moment of the training.
+        """Tell whether to decide about this need at this moment of the training.
 
-        This is not called for a need whose setting is "on", or that is decided already.
+        This function is not called if the need's setting is "on", or if the need is decided already.
         """
         return True
 
     def measure(self, state: State, *given: Any) -> Decision | None:
-        """Measure and decide. `given` is what the moment gives besides the state.
+        """Measure whether the scene needs this part of the method, and decide.
 
-        Returns None where there is nothing to record.
+        `given` are further arguments, which depend on the moment of the training. Returns None if there is nothing to record.
         """
         raise NotImplementedError
 
     def apply(self, state: State, found: dict[str, Any]) -> None:
-        """Leave out this part of the method. This is called after the decision, and again when a run is resumed."""
+        """Leave out the part of the method that is not needed. Called after the decision, and again when a run is resumed.
+
+        `found` is the recorded decision.
+        """
 
     def asked(self, state: State) -> str:
         """Return the need's setting: "auto", "on" or "off"."""

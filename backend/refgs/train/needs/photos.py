@@ -64,16 +64,16 @@ class Outside(Need):
 def time_crops(state: State) -> None:
     """Measure the seconds that cropped photos save, once there are enough iterations to time.
 
-    The seconds are added to the decision `outside`, which has cropped the photos (see `Outside`).
+    The photos are cropped if the need `outside` was decided so (see `Outside`). The seconds are added to the record of that decision.
     """
     if state.crops is not None and state.iteration >= TIMED and "seconds" not in state.needs["outside"]:
         state.needs["outside"]["seconds"] = (1 - 1 / WHOLE_EVERY) * probe.seconds_saved(state, whole=True)
 
 
 def bounds(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
-    """Return the rows and columns that hold a mask (H, W), and `margin` pixels about them.
+    """Return the smallest ranges of rows and columns that contain a mask (H, W), enlarged by `margin` pixels on each side.
 
-    If the mask is empty, they are all rows and columns.
+    If the mask is empty, return all rows and columns.
     """
     shown = []
     for axis, size in ((1, mask.shape[0]), (0, mask.shape[1])):
@@ -85,7 +85,7 @@ def bounds(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
 def duplicate_views(views: list[LoadedView], radius: float) -> list[int]:
     """Find views that duplicate an earlier view.
 
-    From a view to its duplicate no point of the object moves, and the two photos show the same.
+    A view is a duplicate if points of the object move by less than ALIKE_PIXELS between the two photos, and the photos look the same.
     """
     found, kept = [], []
     for number, view in enumerate(views):
@@ -98,9 +98,9 @@ def duplicate_views(views: list[LoadedView], radius: float) -> list[int]:
 
 
 def motion(one: LoadedView, other: LoadedView, radius: float) -> float:
-    """Bound how far, in pixels, a point of the object moves from one photo to the other.
+    """Return an upper bound, in pixels, of how far a point of the object moves from one photo to the other.
 
-    The bound is infinite between photos of two sizes, or if only one of them has a mask.
+    The bound is infinite if the photos differ in size, or if only one of them has a mask.
     """
     a, b = one.camera, other.camera
     if (a.width, a.height) != (b.width, b.height) or (one.alpha is None) != (other.alpha is None):

@@ -28,7 +28,7 @@ class Initial(Need):
 class Iterations(Need):
     """Decide whether the training needs the last fifth of its iterations.
 
-    A scene without a specular part does not need them. A training that was given a time does all of its iterations.
+    A matte scene does not need them. A training that must end within a given time does all of its iterations.
     """
 
     name, what = "iterations", "all iterations"
