@@ -170,7 +170,7 @@ def _interrupt(*_) -> None:
 
 
 def _one_line(show):
-    """Return `show`, but print an InputWarning as one line."""
+    """Return a function for `warnings.showwarning` that prints an InputWarning as one line, and calls `show` for other warnings."""
 
     def shown(message, category, *where) -> None:
         if issubclass(category, InputWarning):

@@ -34,7 +34,7 @@ def write_text(file: Path, text: str) -> None:
 
 @contextmanager
 def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
-    """Raise InputError if the disk of these folders is full, read-only or gone."""
+    """In a `with`: raise InputError if the disk of a folder is full, read-only or gone. The message includes `again`: what to do then."""
     try:
         yield
     except InputError:

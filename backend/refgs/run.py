@@ -69,7 +69,8 @@ class Run:
     def relit(self, light: Environment, progress: Progress = lambda done, total: None) -> Surfels:
         """Relight the surfels, with inter-reflection where the run has a mesh to trace it on.
 
-        The first light takes seconds, the next ones less. The last light again takes no time. `progress` is called while rays are traced.
+        The first call takes seconds, later calls less. A call with the same light as the last one returns the same surfels. `progress` is
+        called while rays are traced.
         """
         if self.occluder is None:
             return self.surfels().without_directions()  # learned under the recovered light: wrong under this one
@@ -134,7 +135,7 @@ def create_run(
 
 
 def record_changes(folder: Path, rows: dict[str, dict]) -> None:
-    """Add changed settings to the table [changed] of run.toml. A key that is already there keeps its first `asked` value."""
+    """Add changed settings to the table [changed] of run.toml. A setting that is in the table already keeps its `asked` value."""
     if not rows:
         return
     tables = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))

@@ -37,10 +37,10 @@ def train(
 ) -> "tuple[State, float | None]":
     """Train a capture into a run folder, or resume the training in it. When it ends, write the asset and measure it.
 
-    `minutes` limits the whole job, pauses not counted; without a preset all settings are then planned for that time. Without
-    `minutes` the preset is `standard`. `attend` is called before each iteration: True stops the training with a checkpoint, which
-    `resume` starts from. Another process can stop it too (`refgs.lock`). Returns the state, whose `ended` tells a finished
-    training from a stopped one, and the mean PSNR of the held-out views if it has ended and there are any.
+    `minutes` limits the whole job, pauses not counted. If `minutes` is given without a preset, all settings are planned for that time. If
+    neither is given, the preset is `standard`. `attend` is called before each iteration: True stops the training with a checkpoint, which
+    `resume` starts from. Another process can stop it too (`refgs.lock`). Returns the state, whose `ended` tells a finished training from a
+    stopped one, and the mean PSNR of the held-out views if it has ended and there are any.
     """
     plan, lock = Plan(minutes), RunLock(out)
     _check_device(device)

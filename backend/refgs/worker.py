@@ -108,7 +108,7 @@ class Worker:
             _thread.interrupt_main()
 
     def close(self) -> None:
-        """Note that no more commands will come."""
+        """Record that no more commands will come."""
         self._closed = True
         self._commands.put(CLOSED)
 

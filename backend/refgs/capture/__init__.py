@@ -52,7 +52,7 @@ def find_layout(folder: Path) -> str | None:
 def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
     """Read the cameras of a capture and convert them to the run's frame, the coordinates of the training.
 
-    `wanted` may hold a box around the wanted part, and an up direction. Both are in the run's frame as it is when nothing is wanted.
+    `wanted` may hold a box around the wanted part, and an up direction. Both are given in the run's frame that results without `wanted`.
     Only the photos' headers and some masks are read; photos are not decoded. Raises InputError, one line for the artist.
     """
     folder = Path(folder)
@@ -197,7 +197,7 @@ def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray,
 
 
 def _narrow(whole: Region, box: Box, views: list[View], silhouettes: list) -> tuple[Region, float]:
-    """Return the region of interest inside a box. Also return the radius at which a ball about its centre holds the region `whole`."""
+    """Return the region of interest inside a box, and a radius: a ball of that radius about the new region's centre holds `whole`."""
     region = region_in(box, views, silhouettes)
     return region, whole.radius + float(np.linalg.norm(whole.centre - region.centre))
 

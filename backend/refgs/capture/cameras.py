@@ -41,8 +41,8 @@ def write_cameras(
 ) -> None:
     """Write the run folder's cameras.json: undistorted cameras in the run's frame, with OpenGL axes.
 
-    The key `photo` is the photo's file, relative to the capture's folder. `light` says what the light is fixed to, "world" or "camera".
-    For "camera", the key `light_of` names a photo: environment.exr is in the frame of its camera. `exposures` maps names of training
+    The key `photo` is the photo's file, relative to the capture's folder. `light` says what the light is fixed to, "world" or "camera". For
+    "camera", the key `light_of` names a photo: environment.exr is the light as it was for that photo. `exposures` maps names of training
     photos to factors: radiance times this factor is as bright as the photo.
     """
     frames = []

@@ -45,8 +45,8 @@ def report_missing(source: Path, missing: list[str], total: int) -> None:
 class Masks:
     """Masks of a capture: for NAME.jpg, the file NAME.png or NAME.jpg.png in the folder `masks`, with any image suffix.
 
-    If photos are in subfolders, `masks` has the same subfolders. Without such a mask NAME_alpha.png beside the photo is used, as in the
-    scene `ball` of Shiny Blender.
+    If photos are in subfolders, `masks` has the same subfolders. If that mask is missing, NAME_alpha.png beside the photo is used, as in
+    the scene `ball` of Shiny Blender.
     """
 
     def __init__(self, folder: Path):
@@ -85,10 +85,10 @@ def photo_view(
     where: str,
     mask_below: float | None = None,
 ) -> View:
-    """Make the view of a photo. `as_given` is the camera and lens from the capture's file; `where` is the place in it, for errors.
+    """Make the view of a photo. `as_given` is the camera and lens from the capture's file. Error messages name the camera by `where`.
 
-    `mask_below` is as in `View`. Intrinsics are scaled to the photo's resolution if they were given for another one. Raises InputError if
-    the camera has another aspect ratio than the photo, or the mask another size.
+    `mask_below` has the meaning of `View.mask_below`. Intrinsics are scaled if they were given for another resolution than the photo's.
+    Raises InputError if the camera's aspect ratio or the mask's size differs from the photo's.
     """
     width, height, has_alpha = read_header(image)
     camera, lens = as_given

@@ -145,9 +145,10 @@ def _place_in_child(photos: list[Path], database: Path, model: Path, report: Cal
 
 
 def _place(photos: list[Path], database: Path, model: Path, events: Connection) -> None:
-    """Find the photos' cameras, and send progress to `events`. At the end send the result of three values.
+    """Find the photos' cameras, and send progress to `events`. At the end send the result.
 
-    They are the names of the photos that got a camera, the mean reprojection error in pixels, and the result of `_contradicted`.
+    The result is a tuple: the names of the photos that got a camera, the mean reprojection error in pixels, and the fraction of matches
+    that contradict the cameras.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     import pycolmap

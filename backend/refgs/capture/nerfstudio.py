@@ -39,8 +39,8 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.nda
 def _without_deleted(shared: dict, frames: list[Frame], file: Path) -> tuple[list[Frame], list[str]]:
     """Drop frames whose photos are missing, and warn, in instant-ngp's files only.
 
-    instant-ngp (its files have an `aabb_scale`) ignores frames of photos that were deleted as blurred, and its sample captures rely
-    on it. If more than half of the photos are missing, or in any other file, missing photos are an error.
+    instant-ngp (its files have an `aabb_scale`) ignores frames of photos that were deleted as blurred, and its sample captures rely on it.
+    All frames are kept, for the caller to report as an error, if more than half of the photos are missing or the file is not instant-ngp's.
     """
     missing = [frame.path for frame in frames if find_image(file.parent / frame.path) is None]
     if "aabb_scale" not in shared or not missing or 2 * len(missing) > len(frames):

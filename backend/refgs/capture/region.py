@@ -102,7 +102,7 @@ def up_direction(views: list[View]) -> np.ndarray:
 
 
 def run_frame(up: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    """Return run → capture, the 4×4 similarity under which the ball is at the run's origin with radius 1, and `up` is +Z."""
+    """Return the similarity (4, 4) from the run's frame to the capture's. In the run's frame the ball is the unit ball, and `up` is +Z."""
     # The run's x is as close to the capture's x as possible.
     x = np.eye(3)[np.argmin(np.abs(up))] if abs(up[0]) > 0.9 else np.array([1.0, 0.0, 0.0])
     x = x - up * (up @ x)
@@ -145,7 +145,10 @@ def _half_view(view: View) -> float:
 
 
 def _one_sided(views: list[View], centre: np.ndarray, up: np.ndarray) -> float:
-    """Return the length of the mean horizontal direction from the centre to the cameras: 0 all round, 1 on one side."""
+    """Measure how one-sided the cameras stand about the centre: 0 if they stand all round, 1 if all stand in one direction.
+
+    This is the length of the mean horizontal unit direction from the centre to the cameras.
+    """
     away = np.array([view.camera.position for view in views]) - centre
     away -= np.outer(away @ up, up)
     return float(np.linalg.norm((away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)).mean(axis=0)))
@@ -156,7 +159,8 @@ def _carve(
 ) -> tuple | None:
     """Return centre and radius of a coarse visual hull in the cube centre ± half, and in the box if given; None if nothing is left.
 
-    Carves twice: the cube, then the bounds of what was left. A cell may lie outside a tenth of the masks that see it.
+    Carves twice: first the cube, then the bounding box of the cells left. A cell is kept if at least half of the views see it, and if it
+    is inside nine tenths of these views' masks.
     """
     low, high = centre - half, centre + half
     for _ in range(2):

@@ -35,7 +35,7 @@ class View:
 
     @property
     def masked(self) -> bool:
-        """Tell whether the view has a mask, of either kind."""
+        """Tell whether the view has a mask: a mask file, or the photo's alpha channel."""
         return self.mask_path is not None or self.has_alpha
 
 
@@ -44,10 +44,10 @@ class Capture:
     """Photos with cameras, in the run's frame: the coordinates of the training, with Z up.
 
     `to_capture` is a 4×4 float64 similarity, p_capture = to_capture @ p_run. For most NeRF-Blender captures it is the identity. For others
-    the region of interest has radius 1 about the run's origin. If the user sets an up direction, the run's frame is rotated to it.
-    `points` (M, 3) are structure-from-motion points with `point_colors` (M, 3), sRGB-encoded in 0..1; None if the layout has none.
-    `centre` (3,) and `radius` are the region of interest: the object, or a room's foreground. `bounded` is a guess: the photos surround
-    one object, or look at a place; `bounded_because` says why. If the user sets a `box` (in the run's frame), it narrows the region of
+    the region of interest has radius 1 about the run's origin. If the user sets an up direction, the run's frame is rotated to it. `points`
+    (M, 3) are structure-from-motion points with `point_colors` (M, 3), sRGB-encoded in 0..1; None if the layout has none. `centre` (3,) and
+    `radius` are the region of interest: the object, or a room's foreground. `bounded` is a guess: True if the photos surround one object,
+    False if they look at a place; `bounded_because` says why. If the user sets a `box` (in the run's frame), it narrows the region of
     interest, but changes no frame. A ball of radius `reach` about `centre` then holds the region of interest without the box; if there is
     no box, `reach` is `radius`. `warnings` are lines about what was left out or looks wrong.
     """

@@ -148,7 +148,7 @@ def relit(
     pairs: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]],
     measures: tuple[Callable[[np.ndarray, np.ndarray], float], ...] = (psnr, flip),
 ) -> dict[str, float]:
-    """Measure pictures under another light, over white. Returns psnr_raw, psnr_aligned, flip_raw, flip_aligned (by `measures`) and scale.
+    """Measure pictures under another light, over white, by each of `measures`. Returns scale, and psnr_raw, psnr_aligned and so on.
 
     Each call of `pairs()` yields every view's picture and truth, premultiplied linear RGBA. Photos do not tell the overall brightness of
     the base colours, so "aligned" errors are measured after radiance is multiplied by the least-squares `scale`, the same for all views.
@@ -178,7 +178,7 @@ def _elevations(height: int) -> np.ndarray:
 
 
 def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
-    """RMS error of a recovered panorama's log radiance after one scale is taken out; returns the error and that scale.
+    """RMS error of a recovered panorama's log radiance, after it is multiplied by the best scale. Returns the error and the scale.
 
     Both are equirectangular (h, w, 3) and linear; the larger is averaged down to the smaller. Pixels are weighted by solid angle. The scale
     makes the mean difference zero. The logarithm is natural: 0.1 is about 10 %. A thousandth of the mean radiance is added to both, since
@@ -234,10 +234,10 @@ def find_lights(panorama: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def lights_error(environment: np.ndarray, reference: np.ndarray) -> tuple[float, int] | None:
     """Measure the mean angular error of the brightest lights in degrees. Returns it and the number of lights; None if there are none.
 
-    True lights (`find_lights`, in at most 128 rows) are at least twice as bright as the mean and a quarter as bright as the brightest. The
-    brightest MOST_LIGHTS of them count. They are matched one to one with lights of the recovered panorama, of which the brightest twice as
-    many are candidates, so that the sum of angles is least. A light without a match within LOST_LIGHT counts as LOST_LIGHT. The mean is
-    weighted by the true brightness. A scale of the radiance has no effect.
+    True lights are found by `find_lights` in at most 128 rows. Lights below twice the mean brightness, or below a quarter of the brightest
+    light, are left out. At most MOST_LIGHTS count, the brightest. They are matched one to one with lights of the recovered panorama, so
+    that the sum of angles is least. The recovered panorama offers twice as many lights, its brightest. A true light without a match within
+    LOST_LIGHT counts as LOST_LIGHT. The mean is weighted by the true brightness. A scale of the radiance has no effect.
     """
     recovered, truth = (resized(x, min(128, len(environment), len(reference))) for x in (environment, reference))
     lights, bright = find_lights(truth)

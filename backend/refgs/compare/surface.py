@@ -27,7 +27,8 @@ def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
 
     Each of POINTS samples on one mesh is matched to the nearest point of the other, in both directions. `chamfer` is the mean distance,
     `normal_consistency` the mean absolute cosine between the two faces' normals. A sample counts only if some camera sees it, not occluded
-    by its own mesh, because photos do not show the rest. The nearest point may be unseen. Returns {} if no sample of a mesh is seen.
+    by its own mesh, because photos do not show the rest. The point nearest to it may be unseen. Returns {} if a mesh has no seen
+    sample.
     """
     unit = radius(truth)
     samples = []

@@ -36,13 +36,13 @@ class GroundTruth:
             raise InputError(f"{folder}: there is no ground truth in it; known are {known}")
 
     def maps(self, camera: Camera) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Read all passes of a view, and its alpha (h, w); without passes, {} and an alpha of 0."""
+        """Read the true maps of a view by pass, and its alpha (h, w). If the folder has no passes, return {} and an alpha of 0."""
         if not self.passes:
             return {}, np.zeros((camera.height, camera.width), np.float32)
         return {name: self.view(name, camera) for name in self.passes}, self.view("alpha", camera)
 
     def view(self, name: str, camera: Camera) -> np.ndarray:
-        """Read the pass `name` of the view that `camera` names, float32 (h, w) or (h, w, 3)."""
+        """Read the pass `name` of the view with the camera's name, float32 (h, w) or (h, w, 3)."""
         file = self.folder / name / f"{camera.name}.exr"
         pixels = read_exr(file)
         if pixels.shape[:2] != (camera.height, camera.width):
@@ -64,13 +64,13 @@ class GroundTruth:
         return Mesh(mesh.vertices @ self._to_run[:3, :3].T + self._to_run[:3, 3], mesh.faces)
 
     def relit(self, hdri: str, camera: Camera) -> np.ndarray:
-        """Read a view under another light, premultiplied linear RGBA."""
+        """Read the true picture of a view under the light `hdri`, a name: premultiplied linear RGBA."""
         file = self.folder / "relight" / hdri / f"{camera.name}.exr"
         return read_relit(file, (camera.height, camera.width))
 
 
 def read_relit(file: Path, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Read a premultiplied linear RGBA picture. Raises InputError if it has no alpha or another (height, width) than `size`."""
+    """Read a premultiplied linear RGBA picture. Raises InputError if it has no alpha, or if its (height, width) is not `size`."""
     pixels = read_exr(file)
     if pixels.ndim != 3 or pixels.shape[2] != 4:
         raise InputError(f"{file} has no alpha: an RGBA picture is needed to put it over a background")

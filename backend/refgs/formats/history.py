@@ -6,7 +6,7 @@ FILE = "history.jsonl"  # in the run folder
 
 
 def read(text: str) -> list[dict]:
-    """Parse the complete lines. A killed training can leave a truncated one."""
+    """Parse the lines; skip a line that is truncated, which a killed training can leave."""
     found = []
     for line in text.splitlines():
         try:

@@ -185,7 +185,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
         return structured_to_unstructured(repack_fields(part) if rows.dtype.hasobject else part, np.float32, copy=True)
 
     def harmonics(prefix: str, *degrees: int) -> np.ndarray:
-        """Return the channel-major values of a prefix as (N, K, 3). Raises InputError where no degree has so many."""
+        """Return the harmonics in the columns PREFIX0, PREFIX1 … as (N, K, 3). Raises InputError if no degree has that many columns."""
         found = sum(re.fullmatch(rf"{prefix}\d+", name) is not None for name in names)
         wanted = [f"{prefix}{i}" for i in range(found)]
         if found not in degrees or not {*wanted} <= {*names}:
@@ -273,7 +273,7 @@ def _other_elements(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[
 def _without_nonfinite(splats: Splats, path: Path) -> Splats:
     """Remove the splats with a value that is not finite, with an InputWarning.
 
-    If any splat is removed, drop all elements other than `vertex`, because they may refer to its rows by index.
+    If any splat is removed, drop all elements other than `vertex`: they may refer to the rows of `vertex` by index.
     """
     values = {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
     wrong = [name for name, value in values.items() if not np.isfinite(value).all()]

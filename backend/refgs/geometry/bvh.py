@@ -52,7 +52,7 @@ class Tree:
     def visible(self, mirrored: Tensor, alpha: Tensor, depth: Tensor, camera: Camera) -> Tensor:
         """Trace each pixel's mirrored ray: 1 where it is free, 0 where the mesh occludes it, 1 in empty pixels; (H, W).
 
-        `mirrored` (H, W, 3) are unit directions. `depth` (H, W) is the sum of depths weighted as `alpha` (H, W), not divided by it.
+        `mirrored` (H, W, 3) are unit directions. `depth` (H, W) is the blended depth before it is divided by `alpha` (H, W).
         """
         mirrored, alpha, depth = (v.detach().contiguous() for v in (mirrored, alpha, depth))
         visible, work = torch.empty_like(alpha), _Work(width=camera.width, height=camera.height, leaves=self.leaves)

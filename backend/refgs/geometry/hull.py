@@ -159,7 +159,10 @@ def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int, rng: 
 
 
 def _choose_evenly(dense: np.ndarray, count: int) -> np.ndarray:
-    """Choose `count` evenly spaced points by a few Lloyd iterations. Each moves a cell's centre to the point nearest to its mean."""
+    """Choose `count` evenly spaced ones of the points `dense` by a few Lloyd iterations.
+
+    Each iteration assigns every point to the nearest chosen one. Then the point nearest to each group's mean becomes the chosen one.
+    """
     chosen = dense[:: len(dense) // count][:count]
     for _ in range(5):
         cell = cKDTree(chosen).query(dense)[1]

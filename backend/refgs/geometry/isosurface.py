@@ -34,9 +34,9 @@ def isosurface(block: np.ndarray, signed: np.ndarray) -> Mesh:
 
 
 def _assign_to_chunks(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Assign blocks to chunks: rows (K,) of blocks, and the chunk (K, 3) of each.
+    """Assign blocks to chunks. Returns K pairs: indices (K,) of blocks, and the chunk (K, 3) that each is assigned to.
 
-    A block on the lower side of a chunk is also in the chunk before, whose last cells need its voxels.
+    A block on the lower side of a chunk is also assigned to the chunk before, whose last cells need its voxels.
     """
     rows, chunks = [], []
     for back in np.ndindex(2, 2, 2):

@@ -62,7 +62,7 @@ def fuse(
 
 
 def _with_neighbours(block: Tensor, blocks: int) -> Tensor:
-    """Add the neighbours of blocks (M, 3) inside a cube of `blocks`³; unique and sorted."""
+    """Return blocks (M, 3) and their neighbours, unique and sorted. Neighbours outside the grid of `blocks`³ are left out."""
     step = torch.arange(-1, 2, device=block.device)
     around = (_unique(block, blocks)[:, None] + torch.cartesian_prod(step, step, step)).view(-1, 3)
     return _unique(around[((around >= 0) & (around < blocks)).all(dim=-1)], blocks)

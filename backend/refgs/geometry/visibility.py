@@ -15,8 +15,8 @@ _PASSES = 3  # faces tested by a ray: it passes through two back faces at most
 class Occluder:
     """Mesh that occludes light.
 
-    Its scale and position are arbitrary: rays are traced in single precision relative to its centre and size. `lift` is the height of
-    their start above the mesh, in its units.
+    Its scale and position are arbitrary: rays are traced in single precision relative to its centre and size. Rays start at the height
+    `lift` above the mesh, in the mesh's units.
     """
 
     def __init__(self, mesh: Mesh):
@@ -38,7 +38,7 @@ class Occluder:
         return self._tree
 
     def visible(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Trace rays as `meet` does: true (P,) where nothing occludes."""
+        """Trace the rays of `meet`. Return bool (P,): true where the mesh does not occlude the ray."""
         return self.meet(points, normals, directions)[0] < 0
 
     def meet(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -81,7 +81,7 @@ def unwritable(cache: Path, error: OSError) -> InputError:
 def build(target: Target, cache: Path) -> Path:
     """Compile the library for a target into `cache`, unless it is already there. Returns its path.
 
-    Several processes may call this at once. Raises InputError where `cache` can't be written.
+    Several processes may call this at the same time. Raises InputError where `cache` can't be written.
     """
     library = cache / f"refgs-{_fingerprint(target)}.{target.extension}"
     if library.exists():

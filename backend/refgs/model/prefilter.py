@@ -56,14 +56,14 @@ def _pyramid_sides(resolution: int) -> list[int]:
 
 
 def ggx_lobe(cosine: np.ndarray, roughness: float) -> np.ndarray:
-    """Evaluate K(θ) (see the module's docstring) by cos θ, up to a factor. It is zero below the horizon."""
+    """Evaluate K(θ) of the module's docstring from cos θ, up to a constant factor. It is zero below the horizon."""
     a2 = roughness**4  # α² with α = roughness²
     half = (1 + cosine) / 2  # cos²(θ/2)
     return np.maximum(cosine, 0) / (half * (a2 - 1) + 1) ** 2
 
 
 def cosine_lobe(cosine: np.ndarray) -> np.ndarray:
-    """Evaluate the weight of radiance in irradiance by cos θ, up to a factor."""
+    """Evaluate the weight of radiance in irradiance from cos θ, up to a constant factor. It is zero below the horizon."""
     return np.maximum(cosine, 0)
 
 
@@ -72,7 +72,9 @@ LOBES = (*(partial(ggx_lobe, roughness=roughness) for roughness in ROUGHNESS[1:]
 
 
 def _level(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute a level's matrix for the pyramid's texels in the quarter s, t > 0 of face +x. Symmetry gives the rest.
+    """Compute the numbers of a level's matrix that weight the pyramid's texels in the quarter s, t > 0 of face +x.
+
+    Symmetry gives the other numbers.
 
     Returns three arrays, which describe each number of the matrix: the pyramid's texel, the level's texel in orbit order
     (`cubemap.orbit_order`), and the weight. The weights of each texel of the level sum to one. Pooled mips whose side is below `coarsest`
@@ -141,9 +143,9 @@ class Matrix(NamedTuple):
 def _pair(
     shape: tuple[int, int], orbit: np.ndarray, column: np.ndarray, number: np.ndarray, device: torch.device
 ) -> tuple[Matrix, Matrix]:
-    """Make a matrix from the numbers in the first rows of its orbits, and its transpose.
+    """Make a matrix from the numbers in the first row of each orbit (see `cubemap.orbits`). Return it and its transpose.
 
-    `shape` counts orbits (see `cubemap.orbits`).
+    `shape` is the matrix's numbers of rows and columns, counted in orbits.
     """
     # A number at row 24 i, column 24 j + h is also at row 24 i + g, column 24 j, where g is the inverse of h.
     inverse = (cubemap.compositions() == 0).int().argmax(dim=1).numpy()
@@ -198,7 +200,7 @@ _Work = struct("Product", "sparse.cpp")
 def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tensor:
     """Multiply a matrix by `dense`.
 
-    Input and output are in orbit order (`cubemap.orbit_order`), unless `rows` gives each output its row.
+    `dense` and the product are in orbit order (`cubemap.orbit_order`). If `rows` is given, row i of the product is stored at `rows[i]`.
     """
     work = _Work(orbits=len(matrix.starts) - 1)
     out = dense.new_empty(SYMMETRIES * work.orbits, 3)

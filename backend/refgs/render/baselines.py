@@ -91,8 +91,8 @@ class Method:
     """Method of rendering surfels under a light. The defaults are RefGS's own method.
 
     `draw`, if given, replaces the deferred shading of `render` and takes the same arguments. `unread` names parameters that do not affect
-    pictures. `constants` maps parameters that are equal for all surfels to their raw values. Neither kind is trained. `left_out` are the
-    rows that needs.json gets for what the method does without.
+    pictures. `constants` maps parameters that are equal for all surfels to their raw values. Neither kind is trained. `left_out` are rows
+    for needs.json: each names something that the method does without.
     """
 
     lit: bool = True
@@ -135,7 +135,7 @@ def initial_stage(settings: RenderSettings) -> RenderSettings:
 
 
 def axes_of(settings: SurfelSettings) -> int:
-    """Return the number of a surfel's axes that have a scale."""
+    """Return the number of scales of a primitive: 3 for 3D Gaussians, 2 for surfels."""
     return 3 if settings.primitive == "3dgs" else 2
 
 

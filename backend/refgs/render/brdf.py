@@ -41,9 +41,10 @@ def _gauss(nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def one_bounce(n_v: np.ndarray, roughness: float, nodes: int) -> np.ndarray:
-    """Integrate ∫ D G2 F / (4 N·L N·V) N·L dL at N·V (P,), for F = 1 − (1 − V·H)⁵, (1 − V·H)⁵ and a dielectric's: (3, P).
+    """Integrate ∫ D G2 F / (4 N·L N·V) N·L dL at N·V (P,) for three Fresnel terms F. Returns (3, P).
 
-    The variables are the half vector's tangent, α tan ψ, in which D is smooth, and its azimuth, as far as L is above the horizon.
+    The terms are 1 − (1 − V·H)⁵, (1 − V·H)⁵ and a dielectric's Fresnel reflectance. The integral is over half vectors H with L above the
+    horizon: over the azimuth, and over ψ, where the tangent of the angle from N to H is α tan ψ. D is smooth in ψ.
     """
     at, weight = _gauss(nodes)
     alpha, s_v = roughness**2, np.sqrt(1 - n_v**2)

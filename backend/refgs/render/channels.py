@@ -13,7 +13,7 @@ from refgs.settings import RenderSettings
 def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirect: bool) -> list[Tensor]:
     """Collect the features (N, C) of surfels, as a camera sees them, in the order that `shade` reads.
 
-    First come normals and albedo. Unless the settings reflect nothing, these follow: metallic and roughness; colour by direction (`diffuse
+    First come normals and albedo. Unless `reflection` is "none", these follow: metallic and roughness; colour by direction (`diffuse
     = "sh"`) or irradiance divided by that of an unoccluded surface (with `indirect`); radiance from the object itself (with `indirect`);
     positions.
     """

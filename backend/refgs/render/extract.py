@@ -1,4 +1,4 @@
-"""The surface of surfels as a mesh: depth maps of the cameras that saw them, fused."""
+"""Extract the surface of surfels as a mesh: render depth maps for the cameras, and fuse them."""
 
 from collections.abc import Sequence
 

@@ -17,7 +17,7 @@ SHORT = 1 << 15  # tiles that an int16 can number: such keys sort in half the ti
 
 
 def how_many(ends: torch.Tensor) -> int:
-    """Read the last of the running sums `ends`, their total. The CPU waits for the card here, because it allocates by this number."""
+    """Read the total, the last of the running sums `ends`. The CPU waits for the card here: it allocates memory by the total."""
     return int(ends[-1]) if len(ends) else 0
 
 

@@ -169,9 +169,9 @@ def radiance_towards(
     mirror: bool = False,
     matte: bool = False,
 ) -> Tensor:
-    """Compute radiance by the split sum (paper Eq. 5–10), from normals, albedo, metallic and roughness (P, 8 or more).
+    """Compute the radiance (P, 3) that leaves surface points in unit directions `towards` (P, 3), by the split sum (paper Eq. 5–10).
 
-    It leaves in the directions `towards` (P, 3), unit vectors.
+    `maps` (P, 8 or more) are normals, albedo, metallic and roughness.
     """
     normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
     if turn is not None:

@@ -1,8 +1,8 @@
 """Relight surfels: compute shadows on the object, and the light that it reflects onto itself, under another environment.
 
-All surfels trace rays in the same directions. Each direction stands for its cell of the sphere, so that a small sun falls into one
-of them, whole. Rays are traced once; each light then takes a few matrix products. A point that a ray hits reflects two kinds of light, by
-the split sum: the environment's, where the point's mirror direction is not occluded, and that of the previous bounce.
+All surfels trace rays in the same directions. Each direction stands for a cell of the sphere, so that a small sun falls wholly into one
+cell. Rays are traced once; each light then takes a few matrix products. A point that a ray hits reflects two kinds of light, by the split
+sum: the environment's, where the point's mirror direction is not occluded, and that of the previous bounce.
 """
 
 import math
@@ -146,7 +146,7 @@ def _blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: n
 
 
 def relit(t: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
-    """Compute the surfels' `sh` and `indirect` under `light`.
+    """Return the surfels with the `sh` and `indirect` that they have under `light`. `t` holds their traced rays.
 
     Render the result with diffuse = "sh" and the occluder that `t` was traced with.
     """
@@ -185,7 +185,10 @@ def _gather(t: Transport, light: Environment, bounces: int) -> tuple[Tensor, Ten
     basis, count = harmonics.basis(t.directions, DEGREE), (t.starts[1:] - t.starts[:-1]).clamp_min(1)[:, None]
 
     def sums(received: Tensor, mean: Tensor, most: float) -> Tensor:
-        """Sum radiance, clamped at `most`, times harmonics over each surfel's rays: (N, 16, 3)."""
+        """Sum radiance times harmonics over each surfel's rays: (N, 16, 3). The radiance of a ray is clamped at `most`.
+
+        Of the last bounce, `received` (N, 3) is the surfels' irradiance / π, and `mean` (N, 3) the mean radiance over their rays.
+        """
         there = t.at_vertices(torch.cat([received, mean], dim=1))
         of_surfels = []
         for (surfels, rays, surfel), (first, share, matte) in zip(t.chunks(), firsts, strict=True):
@@ -208,10 +211,10 @@ def _gather(t: Transport, light: Environment, bounces: int) -> tuple[Tensor, Ten
 
 
 def _first(t: Transport, rays: slice, levels: Tensor, sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Shade the hits of rays.
+    """Shade the hits of rays by the environment's light alone.
 
-    Returns three (P, 3): the environment's light that a hit mirrors to the surfel; the hit's reflectance for other mirrored light; and its
-    reflectance for irradiance / π.
+    Returns three arrays (P, 3): the radiance that the hit mirrors from the environment to the surfel; its reflectance for light
+    from the object in its mirror direction, zero where that direction is free; and its reflectance for irradiance / π.
     """
     vertex, ray, free = t.vertex[rays], t.directions[t.direction[rays]], t.free[rays]
     albedo, metallic, roughness = t.material[vertex].split((3, 1, 1), dim=1)
