@@ -37,7 +37,7 @@ def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
 
 
 def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
-    """Clear the node tree of a material or a world, and return it."""
+    """Return the node tree of a material or a world, without nodes: the old nodes are removed."""
     if data.node_tree is None:  # from 5.0 a tree always exists, and `use_nodes` is deprecated
         data.use_nodes = True
     data.node_tree.nodes.clear()
@@ -45,7 +45,7 @@ def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
 
 
 def modifier_input(modifier: bpy.types.NodesModifier, name: str) -> tuple[bpy.types.bpy_struct, str]:
-    """Return the struct and the property name of a geometry-nodes modifier's input, as `layout.prop` takes them."""
+    """Find the property that holds an input of a geometry-nodes modifier. Returns its struct and its name, for `layout.prop`."""
     identifier = modifier.node_group.interface.items_tree[name].identifier
     if hasattr(modifier, "properties"):  # from 5.2
         return getattr(modifier.properties.inputs, identifier), "value"

@@ -63,7 +63,7 @@ def python(home: Path) -> Path:
 
 
 def needed_bytes() -> float:
-    """Estimate the bytes of an installation. It needs more where nvidia-smi exists: uv may then choose torch's CUDA build."""
+    """Estimate the bytes of an installation. If nvidia-smi exists, the estimate is larger, because uv may choose torch's CUDA build."""
     return NEEDED_WITH_CARD if shutil.which("nvidia-smi") else NEEDED
 
 
@@ -149,7 +149,10 @@ def exit_with_stdin() -> None:
 
 @contextlib.contextmanager
 def _locked(home: Path) -> Iterator[None]:
-    """Hold the installation's lock. The system frees it when this process ends."""
+    """Hold the installation's lock, which keeps other processes out. Raises _Failed if another process holds it.
+
+    The system frees the lock when this process ends, even by a crash.
+    """
     home.parent.mkdir(parents=True, exist_ok=True)
     with open(home.with_name(f"{home.name}.lock"), "ab") as file:
         try:
@@ -255,7 +258,10 @@ def _uv(program: Path, variables: dict[str, str], home: Path, *words: str) -> No
 
 
 def _report_download(home: Path, fetching: dict[str, str], ended: threading.Event) -> None:
-    """Report downloads every other second. uv itself is silent while it downloads torch, which takes minutes."""
+    """Report uv's downloads every two seconds until `ended` is set. uv itself is silent while it downloads torch, which takes minutes.
+
+    `fetching` maps the packages being downloaded to their sizes.
+    """
     while not ended.wait(2):
         now = list(fetching.items())
         if now:

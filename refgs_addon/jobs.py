@@ -222,7 +222,7 @@ JOBS: list[Job] = []
 
 
 def check(python: Path, capture: Path, out: Path, log: Path) -> Job:
-    """Check a capture at once, even while other jobs run. The worker writes cameras.json and thumbnails into `out`.
+    """Check a capture without waiting for other jobs. The worker writes cameras.json and thumbnails into `out`.
 
     `results["check"]` has `lines`, `cameras`, `thumbnails` and more: docs/job-protocol.md.
     """
@@ -230,7 +230,7 @@ def check(python: Path, capture: Path, out: Path, log: Path) -> Job:
 
 
 def find_cameras(python: Path, capture: Path, out: Path, log: Path) -> Job:
-    """Find the cameras of a folder's photos at once, then check the capture as `check` does."""
+    """Find the cameras of a folder's photos, without waiting for other jobs. Then check the capture as `check` does."""
     return _add(Job(capture.name, python, [{"command": "poses", "capture": str(capture)}, _check(capture, out)], log))
 
 
@@ -239,7 +239,7 @@ def _check(capture: Path, out: Path) -> dict:
 
 
 def query_trainer(python: Path, log: Path) -> Job:
-    """Ask a Python for its trainer. The job's `ready` then has the trainer's release and device."""
+    """Ask a Python which trainer it has. The job's `ready` then has the trainer's release and device."""
     return _add(Job("trainer", python, [], log))
 
 
@@ -275,11 +275,11 @@ def train(
     mesh: bool = True,
     resume: bool = False,
 ) -> Job:
-    """Train a capture into a run folder and make its mesh. The job waits until earlier trainings have ended.
+    """Train a capture, write the run into the folder `out`, and make its mesh. The job waits until earlier trainings have ended.
 
-    `preset` names the settings. With `minutes` and no preset, the minutes choose all settings. With neither, the preset is "standard".
-    `settings` override a preset's values by name: `{"train.iterations": 2000}`. Raises InputError where there is no capture, or the run
-    folder is not empty.
+    `preset` names the settings. With `minutes` and no preset, the settings are chosen to fit that time. With neither, the preset is
+    "standard". `settings` override a preset's values by name: `{"train.iterations": 2000}`. `resume` continues a stopped run. Raises
+    InputError if there is no capture, if `out` is being trained already, or if a new run's `out` is not empty.
     """
     if not capture.is_dir():
         raise InputError(f"{capture} is not a folder: choose the folder of a capture")
@@ -302,13 +302,19 @@ def export(python: Path, run: Path, log: Path) -> Job:
 
 
 def display_splats(python: Path, run: Path, file: Path, log: Path) -> Job:
-    """Write a run at once as display splats: splats with fixed colours, for viewers without lights. Replaces the file."""
+    """Write a run as display splats: splats with fixed colours, for viewers without lights.
+
+    The job does not wait for other jobs. An existing file is replaced.
+    """
     command = {"command": "export", "run": str(run), "display_splats": str(file)}
     return _add(Job(file.name, python, [command], log))
 
 
 def render(blender: Path, arguments: tuple[str, ...], command: Mapping[str, object], log: Path) -> Job:
-    """Render at once in another Blender, which runs `render_worker`. `results["render"]["png"]` is the picture's file."""
+    """Render in another Blender, which runs `render_worker`, without waiting for other jobs.
+
+    `results["render"]["png"]` is the picture's file.
+    """
     return _add(Job(Path(command["png"]).name, blender, [dict(command)], log, arguments=arguments, program=BLENDER))
 
 
@@ -353,7 +359,7 @@ def stop_all() -> None:
 def run_state(folder: Path) -> str:
     """Return a run folder's state.
 
-    "training": a process works in the folder. "stopped": the training can be resumed. "finished". "": the folder holds no run.
+    The state is "training" (a process works in the folder), "stopped" (the training can be resumed), "finished", or "" (no run).
     """
     if _locked(folder / LOCK):
         return "training"
@@ -363,7 +369,7 @@ def run_state(folder: Path) -> str:
 
 
 def run_progress(folder: Path) -> dict:
-    """Read the progress of the training in a folder: `iteration`, `total`, `seconds_left`. Any process may run the training.
+    """Read the progress of the training in a folder, whichever process runs it: `iteration` of `total` iterations, and `seconds_left`.
 
     The result is empty before the first iteration and while the mesh is made.
     """
@@ -389,7 +395,7 @@ def stop_requested(folder: Path) -> bool:
 
 
 def _locked(file: Path) -> bool:
-    """Check whether a process locks the first byte of a file. The system frees the lock when the process ends."""
+    """Check whether a process holds a lock on a file. The system frees the lock when that process ends."""
     try:
         descriptor = os.open(file, os.O_RDONLY)
     except OSError:  # usually there is no such file

@@ -108,7 +108,7 @@ def _folder(name: str) -> Path:
 
 
 def query_trainer() -> None:
-    """Ask the chosen Python for its trainer. `status` then shows the trainer's answer."""
+    """Ask the chosen Python which trainer it has. `status` then shows the answer."""
     forget_queries()
     if set_up():
         _own_jobs.append(jobs.query_trainer(python(), log_file("trainer")))
@@ -141,7 +141,7 @@ def stop() -> None:
 
 
 def forget_queries() -> None:
-    """Stop the newest query or installation, and drop its result."""
+    """Stop the job that the preferences started, if any, and drop its result."""
     for job in _own_jobs:
         job.stop()
         if job in jobs.JOBS:

@@ -2,8 +2,8 @@
 
     python -m refgs_addon.preview RUN --hdri A.exr --hdri B.exr --out DIR --blend FILE.blend [--views NAME …] [--size N]
 
-renders each view of {splats, mesh} under each HDRI into DIR/HDRI_{splats,mesh}_VIEW.png and .exr. It prints one JSON object
-a line: {"event": "progress", "done": 1, "total": 8, "what": "…"}, and at the end {"event": "done", "files": […]}.
+This command renders the splats and the mesh from each view under each HDRI, into DIR/HDRI_{splats,mesh}_VIEW.png and .exr. It prints one
+JSON object a line: {"event": "progress", "done": 1, "total": 8, "what": "…"}, and at the end {"event": "done", "files": […]}.
 If the input or a system library is missing, it prints one line to stderr and exits with status 2.
 """
 
@@ -103,7 +103,7 @@ def preview(options: argparse.Namespace) -> None:
 def check_libraries() -> None:
     """Raise InputError if this machine lacks a system library that Blender needs. The error names all missing libraries.
 
-    Blender's module links against X. Eevee loads EGL at its first picture, and without EGL it ends the process.
+    Blender's Python module needs the X libraries to load. Eevee loads EGL for its first picture, and without EGL the process dies.
     """
     spec = importlib.util.find_spec("bpy")
     if spec is None:

@@ -1,4 +1,4 @@
-"""Build the extension for release: a zip for each platform, with the trainer's wheel and uv's, which installs it.
+"""Build the extension for release: a zip for each platform. It contains the trainer's wheel, and that of uv, which installs the trainer.
 
     python scripts/build_extension.py [FOLDER]      # into dist/
 
@@ -46,7 +46,7 @@ def build_trainer(source: Path, wheels: Path) -> None:
 
 
 def stage(folder: Path, wheels: Path) -> None:
-    """Make the extension's folder: the clone's files and the wheels, with a manifest that lists them."""
+    """Make the extension's folder: the repository's files, the wheels, and a manifest that lists uv's wheels."""
     shutil.copytree(ROOT / "refgs_addon", folder / "refgs_addon", ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("__init__.py", "LICENSE"):
         shutil.copy(ROOT / name, folder)

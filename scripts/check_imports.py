@@ -1,7 +1,7 @@
 """Check the imports of the trainer and of the extension.
 
-The trainer's packages stand on floors: a module imports its own floor and those below. No modules import each other in a circle. The
-trainer never imports bpy, the extension never torch.
+The trainer's packages are ordered in layers, called floors. A module imports only from its own floor and from those below. No modules
+import each other in a circle. The trainer never imports bpy, the extension never torch.
 
     python scripts/check_imports.py [FOLDER]      # this repository, or a folder that is laid out like it
 
@@ -37,7 +37,7 @@ FORBIDDEN = {"backend": ("bpy", "refgs_addon"), "refgs_addon": ("torch", "refgs"
 
 
 class Import(NamedTuple):
-    """Import of the module `target` by the module `source`, at `place`: file and line."""
+    """Hold one import: the module `source` imports the module `target`. `place` is the file and the line."""
 
     source: str
     target: str
@@ -51,7 +51,7 @@ def modules(root: Path, package: str) -> dict[str, Path]:
 
 
 def imports(files: dict[str, Path], root: Path) -> Iterator[Import]:
-    """Find all imports in files. `from module import name` counts as an import of that module."""
+    """Find all imports in files. `from package import name` counts as an import of the module `package.name`, else of `package`."""
     for source, file in files.items():
         package = source if file.name == "__init__.py" else source.rpartition(".")[0]
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), str(file))):
@@ -68,7 +68,10 @@ def imports(files: dict[str, Path], root: Path) -> Iterator[Import]:
 
 
 def circles(found: list[Import]) -> Iterator[list[Import]]:
-    """Find circles, each as a list of imports. After finding one, remove one of its imports and search again."""
+    """Find modules that import each other in a circle. Yields each circle as a list of its imports.
+
+    After finding a circle, ignore one of its imports and search again.
+    """
     places = {(i.source, i.target): i for i in found if i.source != i.target}
     while True:
         graph: dict[str, list[str]] = {}
@@ -85,7 +88,7 @@ def circles(found: list[Import]) -> Iterator[list[Import]]:
 
 
 def floor(module: str) -> int | None:
-    """Return the floor of a module of `refgs`, counted from below; None if FLOORS does not list it."""
+    """Return the number of the floor of a module of `refgs`; 0 is the lowest. Returns None if FLOORS does not list the module."""
     part = [*module.split("."), ""][1]
     return next((height for height, names in enumerate(FLOORS) if part in names), None)
 

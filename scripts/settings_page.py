@@ -53,7 +53,10 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def _allowed(key: str, info: FieldInfo) -> str | None:
-    """Describe a setting's allowed values. Return None if all values but one only serve comparison with papers."""
+    """Describe the values that a setting may have. Values that only serve comparison with papers are left out.
+
+    Returns None if a single value is left.
+    """
     if get_origin(info.annotation) is Literal:
         values = [value for value in get_args(info.annotation) if value not in COMPARISON.get(key, ())]
         return ", ".join(map(str, values)) if len(values) > 1 else None

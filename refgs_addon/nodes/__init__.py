@@ -69,7 +69,10 @@ def store_attribute(tree: bpy.types.NodeTree, geometry, name: str, kind: str, va
 
 
 def object_frame(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[bpy.types.Node, bpy.types.NodeSocket]:
-    """Add an Object Info node, and transform the points' positions into that object's frame. Returns the positions' output."""
+    """Add nodes that transform the points' positions into the frame of the object `item`.
+
+    Returns the object's Object Info node, and the output with the positions.
+    """
     info = add(tree, "GeometryNodeObjectInfo", {"Object": item}, transform_space="RELATIVE")
     inverse = add(tree, "FunctionNodeInvertMatrix", {"Matrix": info.outputs["Transform"]}).outputs["Matrix"]
     position = out(add(tree, "GeometryNodeInputPosition"))
@@ -77,6 +80,6 @@ def object_frame(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[
 
 
 def max_component(tree: bpy.types.NodeTree, vector: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """Add nodes that compute a vector's largest absolute component. It is at most 1 inside the cube from -1 to 1."""
+    """Add nodes that compute a vector's largest absolute component, which is at most 1 in the cube from -1 to 1. Returns their output."""
     x, y, z = add(tree, "ShaderNodeSeparateXYZ", {0: vector_math(tree, "ABSOLUTE", vector)}).outputs
     return math(tree, "MAXIMUM", math(tree, "MAXIMUM", x, y), z)

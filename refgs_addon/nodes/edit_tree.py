@@ -1,4 +1,4 @@
-"""Build the node trees of edits. One edits the splats' materials and keeps the learned values; one shows the edits on the mesh."""
+"""Build two node trees: one edits the splats' materials and keeps the learned values, the other shows the edits on the mesh."""
 
 import bpy
 
@@ -28,10 +28,11 @@ _MIXED = "RefGS Edited"  # node that marks a mesh's material as showing the edit
 def edit_tree() -> bpy.types.NodeTree:
     """Make the tree `RefGS Edit`, or return the existing one, which all edits in the file share.
 
-    The tree blends the splats' base_color, metallic and roughness with the edit's values. Each has an amount, which is multiplied by a
-    mask:
+    The tree blends the splats' base_color, metallic and roughness with the edit's values. The weight of each new value is its amount,
+    an input of the tree, times a mask. The input Where chooses the mask:
     - "Everywhere": 1;
-    - "Box" or "Sphere": 1 inside the object Region (an Empty of size 1), falling to 0 at its border over the fraction Falloff;
+    - "Box" or "Sphere": 1 inside the object Region (an Empty of size 1). Falloff is the part of the region over which the mask falls
+      to 0 at the border;
     - "Similar": 1 for the material of the splat nearest to Region, 0 for a material that differs by more than Tolerance;
     - "Painted": the weight of the vertex group Painted at the nearest point of Region, which is a mesh.
     """
@@ -137,9 +138,9 @@ def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.N
 
 
 def mesh_edits_tree() -> bpy.types.NodeTree:
-    """Make the tree `RefGS Follow`, or return the existing one. It gives each corner of a mesh the edits of the nearest splat.
+    """Make the tree `RefGS Follow`, or return the existing one. The tree copies the edits of the nearest splat to each vertex of a mesh.
 
-    Distances are measured in the run's frame.
+    Distances to the splats are measured in the run's frame.
     """
     if MESH_EDITS in bpy.data.node_groups:
         return bpy.data.node_groups[MESH_EDITS]

@@ -15,8 +15,8 @@ _SURFACE = {"metallic": "Metallic", "roughness": "Roughness", "specular": SPECUL
 def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material:
     """Make a Principled material for the quads of `nodes.splats_tree`. It reads each splat's base colour, metallic and roughness.
 
-    `constants` (of metallic, roughness and specular) are set as values on the BSDF, without a node. The back of a splat is black, like
-    the inside of a solid. A lit back would shine through where the front splats leave a few per cent uncovered.
+    `constants` are values that all splats share, of metallic, roughness or specular. They replace the splats' own. The back of a splat is
+    black, like the inside of a solid. A lit back would shine through where the front splats leave a few per cent uncovered.
     """
     material = bpy.data.materials.new(name)
     tree = node_tree(material)
@@ -47,7 +47,7 @@ def principled(material: bpy.types.Material) -> bpy.types.ShaderNode:
 def connect_edits(material: bpy.types.Material) -> None:
     """Make a material of `splat_material` read all attributes that edits change.
 
-    A material with specular 0 gets its specular reflection back where an edit changes the roughness.
+    If the material's specular is 0, splats whose roughness is edited get specular reflection again.
     """
     tree = material.node_tree
     shader = principled(material)

@@ -35,9 +35,9 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
 
 
 def light_of(path: Path) -> str:
-    """Read from cameras.json the name of the view for which the recovered light is right, or "" if the light stood still.
+    """Read from a cameras.json the view that the recovered light belongs to. Returns the view's name.
 
-    A light that turned with the camera is different in each view.
+    Only a light that turned with the camera differs from view to view. For a light that stood still the result is "".
     """
     return Path(json.loads(path.read_text(encoding="utf-8")).get("light_of", "")).stem
 
@@ -67,9 +67,9 @@ def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Objec
 
 
 def frame_camera(scene: bpy.types.Scene, camera: bpy.types.Object, size: int | None = None) -> None:
-    """Make a camera the active one of the scene, and set the resolution to that of its photo.
+    """Make a camera the scene's camera, and set the render resolution to the size of the camera's photo.
 
-    `size` sets another longer side, in pixels.
+    With `size`, the resolution is scaled so that its longer side is `size` pixels.
     """
     scene.camera = camera
     render = scene.render
@@ -111,9 +111,10 @@ def photo_shown(camera: bpy.types.Object | None) -> float:
 
 
 def next_camera(scene: bpy.types.Scene, collection: bpy.types.Collection, steps: int = 1) -> bpy.types.Object:
-    """Make another camera of a run or a capture the scene's camera: the one `steps` further in the order of the photos.
+    """Switch the scene to the camera that comes `steps` photos after its present one, and return that camera.
 
-    If the old camera shows its photo, the new camera shows its own. Raises InputError where there are no cameras.
+    `collection` holds the cameras of a run or a capture. If the old camera shows its photo, the new camera then shows its own photo.
+    Raises InputError if the collection has no cameras.
     """
     cameras = [item for item in collection.all_objects if item.type == "CAMERA"]
     if not cameras:

@@ -63,10 +63,9 @@ def replace_cameras(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bp
 
 
 def active_cameras(context: bpy.types.Context) -> bpy.types.Collection | None:
-    """Find the collection of cameras to step through.
+    """Find the collection of cameras to step through, which belongs to a run or a capture.
 
-    The first that exists is taken: the run or capture of the active object, that of the scene's camera, the newest run, the newest
-    capture.
+    That is the collection of the active object, else that of the scene's camera, else the newest run, else the newest capture.
     """
     captures = _captures(context.scene)
     for item in (context.view_layer.objects.active, context.scene.camera):

@@ -73,7 +73,7 @@ def splats_of(collection: bpy.types.Collection) -> bpy.types.Object:
 def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: str) -> bpy.types.Object:
     """Make an Empty that marks an edit's region, in the middle of the splats.
 
-    Its size is a third of the splats' extent, and a sixth for "Similar", where it marks one splat.
+    The Empty is a third as large as the splats' extent. For "Similar" it marks a single splat, and is a sixth as large.
     """
     shape = {"Box": "CUBE", "Sphere": "SPHERE", "Similar": "ARROWS"}[where]
     region = add_region(splats, collection, f"{where} of {splats.name}", shape)
@@ -82,7 +82,7 @@ def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: s
 
 
 def _paint_target(mesh: bpy.types.Object, collection: bpy.types.Collection) -> tuple[bpy.types.Object, str]:
-    """Make the object to paint on, or find the existing one, and add a vertex group to it.
+    """Make the object that the artist paints weights on, or find the existing one, and add a vertex group. Returns object and group name.
 
     The object shares the mesh's data but has no modifiers. The mesh's own modifiers depend on the splats, and so on the painted weights.
     """

@@ -86,7 +86,7 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
 def export_run(collection: bpy.types.Collection, folder: Path) -> None:
     """Write a run with its edits as a new run folder, which must not exist. The run itself does not change.
 
-    The mesh is copied only without edits, because the edits are not in its textures. `refgs export` or the trainer makes a new mesh.
+    If the run has edits, its mesh is not copied, because the textures do not contain them. `refgs export` or the trainer makes a new mesh.
     Raises InputError where the run's files are missing or have changed, or the folder exists or cannot be written.
     """
     original = run_folder(collection)

@@ -45,7 +45,7 @@ def is_watched(job: jobs.Job) -> bool:
 
 
 def update() -> None:
-    """Put the previews that a background thread has read into the scene, and let the thread read the next ones."""
+    """Renew the surfels in the scene from the newest previews, which a background thread reads. Remove those of ended trainings."""
     for live in list(_shown):
         deleted = live.item not in bpy.data.objects
         if live.job.ended or deleted or live.scene not in bpy.data.scenes:
@@ -60,7 +60,10 @@ def update() -> None:
 
 
 def _read(path: Path) -> dict | None:
-    """Read a preview's splats with flat normals. Bent normals take longer to compute than everything else."""
+    """Read a preview's splats as attributes for a point cloud, or return None if the file cannot be read.
+
+    The normal is constant over each splat, because its change across the splat would take longer to compute than everything else.
+    """
     import numpy as np
 
     from .splat_cloud import cloud_attributes, read_splats

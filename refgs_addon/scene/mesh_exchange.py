@@ -56,7 +56,7 @@ def _specular(item: bpy.types.Object) -> float:
 def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:
     """Make a Principled BSDF with one texture for each input.
 
-    FBX cannot pick one channel of a texture, and the exporters read no other nodes.
+    Two inputs cannot share a texture: FBX cannot pick one of its channels, and the exporters read no other nodes.
     """
     material = bpy.data.materials.new(name)
     tree, inputs = node_tree(material), {SPECULAR: specular}

@@ -11,10 +11,10 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec.709
 
 
 def best_rotation(image: bpy.types.Image, other: bpy.types.Image) -> tuple[float, float]:
-    """Find the rotation about z that makes an equirectangular panorama most like another, and the ratio of their mean radiances.
+    """Find the rotation about z and the factor that make the panorama `image` most like `other`. Both are equirectangular.
 
-    The rotation is in radians, counter-clockwise seen from above, -π..π. It maximises the correlation of log luminance, weighted by solid
-    angle. The mean radiance is over the sphere.
+    The rotation is in radians, -π..π, counter-clockwise seen from above. It maximises the correlation of the log luminances, weighted by
+    solid angle. The factor is the mean luminance of `other` over the sphere, divided by that of `image`.
     """
     area = np.cos(np.pi * ((np.arange(ROWS) + 0.5) / ROWS - 0.5))[:, None]
     small = [_luminance(picture) for picture in (image, other)]
@@ -32,7 +32,7 @@ def best_rotation(image: bpy.types.Image, other: bpy.types.Image) -> tuple[float
 
 
 def _luminance(image: bpy.types.Image) -> np.ndarray:
-    """Compute a panorama's luminance (ROWS, 2 · ROWS), bottom row first, by area averaging."""
+    """Compute a panorama's luminance, resampled to (ROWS, 2 · ROWS) pixels by area averaging. The bottom row comes first."""
     width, height = image.size
     pixels = np.empty(width * height * image.channels, np.float32)
     image.pixels.foreach_get(pixels)

@@ -14,7 +14,7 @@ REGION = "refgs_region"  # custom property of an object that marks a region
 
 
 def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name: str, shape: str) -> bpy.types.Object:
-    """Add an Empty, drawn as "CUBE", "SPHERE" or "ARROWS", whose unit box contains nearly all splats."""
+    """Add an Empty, scaled so that the cube from -1 to 1 in its frame holds nearly all splats. `shape` is "CUBE", "SPHERE" or "ARROWS"."""
     region = bpy.data.objects.new(name, None)
     region[REGION] = True
     region.empty_display_type = shape
@@ -31,7 +31,10 @@ def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name:
 
 
 def crop(splats: bpy.types.Object, collection: bpy.types.Collection, on: bool) -> bpy.types.Object | None:
-    """Draw only the splats in a crop box, or all splats. The first call makes the box; switching the crop off keeps the box."""
+    """Switch cropping on or off, and return the crop box, if any. With `on`, only the splats in the box are drawn.
+
+    The box is made when it is first needed, and is kept when cropping is switched off.
+    """
     modifier = splats.modifiers[NAME]
     box = compat.get_modifier_input(modifier, "Crop Box")
     if on and box is None:
@@ -52,9 +55,9 @@ def training_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
 def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
     """Show the box that limits the training. Make the box if there is none.
 
-    A new box surrounds the ball that the cameras look at, as found by the capture's last check. Without a check the box is 2 m wide around
-    the origin, because the trainer moves that ball there and scales it to a radius of 1 m. Only captures in NeRF-Blender's layout are not
-    moved.
+    A new box surrounds the ball that the cameras look at, which the capture's last check found. If the capture was not checked, the box
+    is 2 m wide around the origin: the trainer moves the ball to the origin and scales it to a radius of 1 m. (The trainer does not move
+    captures in NeRF-Blender's layout.)
     """
     box = training_region(scene)
     if box is None:
@@ -78,9 +81,9 @@ def _looked_at(scene: bpy.types.Scene) -> tuple[Vector, float]:
 
 
 def region_settings(scene: bpy.types.Scene) -> dict[str, list[float]]:
-    """Return the trainer's settings from the scene's region: the box's extent, and its Z axis as the result's up. Empty without a region.
+    """Return the trainer's settings that describe the scene's training box, or {} if there is no box.
 
-    Raises InputError for a box without volume.
+    The box limits what is trained, and its Z axis becomes the result's up direction. Raises InputError for a box without volume.
     """
     box = training_region(scene)
     if box is None:

@@ -20,11 +20,11 @@ def render_preview(
     samples: int = 64,
     exr: Path | None = None,
 ) -> None:
-    """Render a camera's view in Eevee over a transparent background. The default is the scene's camera.
+    """Render a camera's view in Eevee over a transparent background. The default camera is the scene's.
 
-    `size` is the longer side in pixels; the default is the photo's. `png` gets 8-bit sRGB with straight alpha, through the Standard view
-    transform. `exr` gets linear Rec.709 radiance in 32 bits, premultiplied. The scene's own settings are restored. Raises InputError
-    where there is no camera or a file cannot be written.
+    `size` is the picture's longer side in pixels; by default the picture is as large as the camera's photo. `png` gets 8-bit sRGB with
+    straight alpha, through the Standard view transform. `exr` gets linear Rec.709 radiance in 32 bits, premultiplied. The scene's own
+    settings are restored. Raises InputError where there is no camera or a file cannot be written.
     """
     camera = camera or scene.camera
     if camera is None:

@@ -1,4 +1,4 @@
-"""Find the parts of an imported run, which are splats and mesh, and show one of them."""
+"""Find the parts of an imported run, the splats and the mesh, and show one part."""
 
 import bpy
 
@@ -7,7 +7,7 @@ FOLDER = "refgs_folder"  # custom property of a run's collection: its run folder
 
 
 def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]:
-    """Group the objects of a run's collection by part. Returns {} for any other collection."""
+    """List the objects of a run's collection by part: "splats" and "mesh". Returns {} for any other collection."""
     found: dict[str, list[bpy.types.Object]] = {}
     for item in collection.objects:
         if KEY in item:

@@ -58,8 +58,8 @@ def cloud_attributes(
 ) -> dict[str, np.ndarray]:
     """Return the attributes for a cloud's points: the arrays of `read_splats`, and the slopes of the normal.
 
-    scale gets a third component 1, and base_color a fourth, as Blender's types need. normal_u and normal_v (N, 3) are the changes of the
-    normal along the splat's axes, per standard deviation.
+    `normal_u` and `normal_v` (N, 3) are these slopes: the changes of the normal along the splat's two axes, per standard deviation.
+    Blender's types need more components: scale gets a third one, and base_color a fourth, both 1.
     """
     one = np.ones((len(splats["position"]), 1), np.float32)
     return splats | {
@@ -158,7 +158,7 @@ def _flatten_gaussians(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndar
 def finite_rows(rows: np.ndarray) -> np.ndarray:
     """Select the rows of a PLY whose values are all finite, as the trainer does.
 
-    The opacity is a logit and may be infinite: that is an opacity of 0 or 1.
+    Only the opacity, which is stored as a logit, may be infinite: such a splat is fully transparent or opaque.
     """
     fine = np.ones(len(rows), bool)
     floats = [name for name in rows.dtype.names if rows.dtype[name].kind == "f"]
@@ -190,9 +190,10 @@ def read_rows(path: Path) -> np.ndarray:
 
 
 def read_constants(path: Path) -> dict[str, float]:
-    """Read constants from the header comments of a run's splats.ply: one metallic, roughness or specular for all splats.
+    """Read from the header of a run's splats.ply the values that all splats share: of metallic, roughness or specular.
 
-    Specular is the Principled BSDF's Specular IOR Level. A column of the same name takes precedence over the constant.
+    The header stores them as comments. Specular is the Principled BSDF's Specular IOR Level. A constant is ignored if the file also has a
+    column of that name.
     """
     try:
         with open(path, "rb") as file:
@@ -232,9 +233,9 @@ def _parse_header(head: bytes, found: bytes, path: Path) -> tuple[np.dtype, int]
 def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the change of the normal across each splat: dn/du and dn/dv (N, 3) per standard deviation.
 
-    A flat splat mirrors only one direction, and a curved mirror of flat splats looks faceted. The slopes are a weighted least-squares
-    plane through the normals of neighbours that face the same way, fixed at the splat's own normal. The neighbours are close along
-    space-filling curves. They are not always the nearest ones, but take only a second for a million splats.
+    With a constant normal on each splat, a curved mirror would look faceted. A weighted least-squares fit finds how the normals of the
+    neighbours that face the same way differ from the splat's own. Neighbours are splats that are close along space-filling curves. These
+    are not always the nearest splats, but finding them takes only a second for a million splats.
     """
     position, normal = (splats[key].astype(np.float32) for key in ("position", "normal"))
     count = len(position)
@@ -252,9 +253,10 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
     reach = np.maximum(np.where(np.isfinite(beside), 64 * beside, 1), 1e-24)
 
     def gather(order: np.ndarray) -> np.ndarray:
-        """Sum products over each splat's neighbours: w·u·u, w·u·v, w·v·v, w·u·dn, w·v·dn.
+        """Sum products over each splat's neighbours along one curve: (7, N), for the least-squares fit.
 
-        u and v are a neighbour's offset in the splat's tangent plane, dn is the difference of the normals along u and v, w is the weight.
+        The products are w·u·u, w·u·v, w·v·v, w·u·du, w·u·dv, w·v·du, w·v·dv. (u, v) is the offset to the neighbour and (du, dv) the
+        difference of the normals, both along the splat's axes; w is the neighbour's weight.
         """
         place, facing_way, *axes, width = (values[order] for values in (position, normal, *tangents, reach))
         found = np.zeros((7, count), np.float32)
@@ -284,7 +286,7 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
 def _morton_order(position: np.ndarray, shift: float) -> np.ndarray:
     """Order points (N, 3) along a Morton curve through their bounding cube. `shift` moves the curve by a fraction of the cube's side.
 
-    Two curves with different shifts jump at different points, so that neighbours missed by one are found by the other.
+    Points that lie close together can be far apart along one curve. A curve with another shift is then likely to join them.
     """
     low = position.min(axis=0)
     cells = (position - low) / max((position - low).max(), 1e-30) / 2 + np.float32(shift)

@@ -21,7 +21,7 @@ def check(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
-    """Find the cameras of the scene's photos, then check the capture. Earlier jobs that failed for lack of cameras leave the list."""
+    """Find the cameras of the scene's photos, then check the capture. Earlier jobs that failed for lack of cameras are removed."""
     capture = _capture(scene)
     job = jobs.find_cameras(python(), capture, capture_folder(capture), log_file(f"cameras {capture.name}"))
     jobs.JOBS[:] = [known for known in jobs.JOBS if not known.no_cameras]
@@ -51,7 +51,8 @@ def train(scene: bpy.types.Scene) -> jobs.Job:
 def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: Path) -> jobs.Job | None:
     """Write a run with its edits as a new run folder, and add the folder to the scene's list.
 
-    If a trainer is set up, it makes the mesh and textures. Returns that job, or None. Raises InputError where the run cannot be exported.
+    If the new folder has no mesh and a trainer is set up, a job makes the mesh and textures. Returns that job, or None. Raises InputError
+    where the run cannot be exported.
     """
     from .export_run import export_run
 
@@ -109,7 +110,7 @@ def forget(scene: bpy.types.Scene, folder: Path) -> None:
 
 
 def _choices(settings: bpy.types.PropertyGroup) -> dict[str, object]:
-    """Return the trainer's settings that the scene overrides in the preset."""
+    """Return the trainer's settings that the artist chose in the scene. They override the preset's."""
     chosen = {
         "surfels.budget": settings.splats or "auto",
         "light.frame": settings.light,

@@ -11,7 +11,7 @@ ENDINGS = (".exr", ".hdr")
 
 
 def hdris(folder: Path | None = None) -> list[Path]:
-    """List the panoramas that come with Blender, and those in a folder."""
+    """List the files of the panoramas that come with Blender, and of those in `folder`."""
     own = bpy.utils.system_resource("DATAFILES", path="studiolights/world")
     folders = [Path(path) for path in (own, folder) if path]
     files = [file for path in folders if path.is_dir() for file in sorted(path.iterdir())]

@@ -29,9 +29,9 @@ class ShowCameras(OnJob, bpy.types.Operator):
 
 
 def draw_capture(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job) -> None:
-    """Draw some of the photos of a checked capture, and a button that shows its cameras.
+    """Draw some photos of a checked capture, and a button that shows its cameras.
 
-    `job` is the check, `number` its index in the list of jobs.
+    `job` is the job that checked the capture, and `number` is the job's index in the list of jobs.
     """
     checked = job.results.get("check", {})
     if "cameras" not in checked:

@@ -47,7 +47,7 @@ def thumbnail(file: Path, version: int = 0) -> int:
 
 
 def curve_icon(job: jobs.Job) -> int:
-    """Return the icon of a job's `plot`, or 0 for fewer than two points. Also 0 without numpy, which Debian's Blender may lack."""
+    """Return an icon with the curve of a job's PSNR. Returns 0 before the second point, or if Blender has no window or no numpy."""
     if len(job.curve) < 2 or _pictures is None:
         return 0
     key = f"{job.serial} curve"
@@ -65,9 +65,10 @@ def curve_icon(job: jobs.Job) -> int:
 
 
 def plot(trained: list[tuple[float, float]], held_out: list[tuple[float, float]]) -> "np.ndarray":
-    """Plot PSNR over log time as RGBA (height, width, 4), bottom row first. Training views make a line, held-out views dots.
+    """Plot PSNR over log time as RGBA (height, width, 4), bottom row first.
 
-    Points are (seconds, PSNR). The grid is at 1, 10, 100 … seconds and every 5 dB.
+    `trained` and `held_out` are points (seconds, PSNR). Those of the training views are joined by a line, those of the held-out views
+    are dots. The grid is at 1, 10, 100 … seconds and every 5 dB.
     """
     import numpy as np
 

@@ -38,7 +38,7 @@ def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, 
 
 
 def _number(file: Path) -> int:
-    """Hash a file's path to a number above OTHER. The number does not change when the folder's other files do."""
+    """Return a number for a file's menu item, above OTHER. It is a hash of the path, so other files in the folder do not change it."""
     return 2 + crc32(str(file).encode()) % (1 << 30)
 
 

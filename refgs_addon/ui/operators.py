@@ -179,7 +179,7 @@ class Photo(ReportsErrors, bpy.types.Operator):
 
 
 def view_through_camera(context: bpy.types.Context) -> None:
-    """Switch the button's 3D view to the scene's camera."""
+    """Make the 3D view in which the button was pressed look through the scene's camera."""
     if context.region_data is not None:
         context.region_data.view_perspective = "CAMERA"
 
@@ -196,7 +196,7 @@ class Turntable(OnRun, bpy.types.Operator):
 
 
 class _Render(ReportsErrors, ExportHelper):
-    """Render in another Blender process. A Blender without a window renders in its own process."""
+    """Render in another Blender process, or in this process if Blender has no window. Base of the operators that render."""
 
     bl_options: ClassVar = {"REGISTER"}
     filename_ext = ".png"

@@ -252,7 +252,7 @@ def draw_status(self, context: bpy.types.Context) -> None:
 
 
 def _fraction(job: jobs.Job) -> float:
-    """Return the fraction of a training, or of another job's stage, that is done."""
+    """Return how much of a training is done, 0..1. For other jobs, return how much of the present stage is done."""
     facts = job.progress
     return facts["done" if "stage" in facts else "iteration"] / max(facts["total"], 1) if facts else 0.0
 
@@ -305,7 +305,7 @@ def _draw_run(box: bpy.types.UILayout, folder: Path) -> None:
 
 
 def other_process_status(folder: Path) -> tuple[float, str]:
-    """Return the fraction done, and a few words on the progress, of a run that another process trains."""
+    """Return the progress of a run that another process trains: the fraction done, 0..1, and a few words."""
     facts = jobs.run_progress(folder)
     if not facts:
         return (1.0, "Making the mesh") if (folder / "splats.ply").exists() else (0.0, "Starting")

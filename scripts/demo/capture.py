@@ -44,7 +44,7 @@ def write_capture(
     All but the photos are float32. In a partly covered pixel, albedo, roughness, metallic, depth, visibility and normal (normalised
     again) are means over the covered part. They are zero where alpha is zero.
 
-    `progress(done, total, what)` is called after every view. InputError: `out` exists; an HDRI is unknown.
+    `progress(done, total, what)` is called after every view. Raises InputError if `out` exists or an HDRI is unknown.
     """
     if out.exists():
         raise InputError(f"{out} exists: choose another folder, or remove it")
@@ -97,9 +97,11 @@ def write_capture(
 
 
 def sphere_cameras(count: int, distance: float, lowest: float, turn: float) -> np.ndarray:
-    """Place cameras on a Fibonacci spiral over the sphere above z = `lowest`·distance, turned by `turn`.
+    """Place cameras evenly on a sphere around the origin, where z > `lowest`·`distance`, along a Fibonacci spiral.
 
-    Returns (count, 4, 4) camera-to-world matrices with OpenGL's axes, looking at the origin, +z up.
+    `distance` is the sphere's radius. `turn` rotates the spiral about z, in radians.
+
+    Returns (count, 4, 4) camera-to-world matrices with OpenGL's axes. The cameras look at the origin, with +z up.
     """
     steps = np.arange(count) + 0.5
     z = lowest + (1 - lowest) * steps / count

@@ -74,7 +74,7 @@ class Renderer:
         self._panorama.image = bpy.data.images.load(str(path))
 
     def render(self, camera_to_world: np.ndarray, seed: int) -> dict[str, np.ndarray]:
-        """Render one view from a camera-to-world matrix with OpenGL's axes.
+        """Render one view from a camera-to-world matrix with OpenGL's axes. Returns arrays by name:
 
         color (h, w, 4): linear, premultiplied; alpha (h, w); normal (h, w, 3): world space, unit length; albedo
         (h, w, 3): base colour; roughness, metallic, depth (h, w): depth along the camera's axis. All are zero where
@@ -83,9 +83,10 @@ class Renderer:
         return _passes(self._channels(camera_to_world, seed))
 
     def visibility(self, camera_to_world: np.ndarray, seed: int) -> np.ndarray:
-        """Render visibility (h, w): the share of a pixel's covered part whose mirrored rays miss the object.
+        """Render visibility (h, w): the fraction of the mirrored rays that miss the object, over the covered part of each pixel.
 
-        The object becomes a perfect mirror in a white world, in which it reflects itself as black. Visibility is zero where alpha is zero.
+        For this the object becomes a perfect mirror in a white world, in which it reflects itself as black. Visibility is zero where alpha
+        is zero.
         """
         scene, layer, world = self.scene, self.scene.view_layers[0], self.scene.world
         layer.material_override, scene.world = self._mirror, self._white
@@ -128,7 +129,7 @@ class Renderer:
 
 
 def _material(values: Material, attribute: str) -> bpy.types.Material:
-    """Make a Principled BSDF whose inputs, shading normal and depth are also written to the passes.
+    """Make a Principled BSDF. Its inputs, the shading normal and the depth are also written to render passes.
 
     A textured base colour is read from a colour attribute of the mesh.
     """
@@ -173,7 +174,7 @@ def _mirror() -> bpy.types.Material:
 
 
 def _passes(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Read the passes of a multilayer EXR, each divided by alpha: Cycles counts a ray that misses as zero."""
+    """Read the passes of a multilayer EXR. All except color and alpha are divided by alpha: Cycles counts a ray that misses as zero."""
 
     def pick(name: str, letters: str) -> np.ndarray:
         return np.stack([channels[f"ViewLayer.{name}.{letter}"] for letter in letters], -1).astype(np.float32)

@@ -31,7 +31,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Scene:
-    """Object about the origin, Z up, and how it is photographed.
+    """Hold an object, which lies about the origin with Z up, and how it is photographed.
 
     `light` names one of Blender's HDRIs; `lowest` is the smallest z of a camera's direction from the origin.
     """
@@ -48,13 +48,13 @@ def moved(mesh: Mesh, by: tuple[float, float, float]) -> Mesh:
 
 
 def step(start: float, end: float, values: np.ndarray) -> np.ndarray:
-    """Smoothstep from 0 at `start` to 1 at `end`; for textures."""
+    """Compute a smooth step that rises from 0 at `start` to 1 at `end`, for textures."""
     t = ((values - start) / (end - start)).clip(0, 1)
     return t * t * (3 - 2 * t)
 
 
 def mix(one, other, share: np.ndarray) -> np.ndarray:
-    """Mix colours (n, 3): `one` where share (n,) is 0, `other` where it is 1."""
+    """Mix two colours (n, 3): `share` (n,) is the weight of `other`, 0..1."""
     return np.asarray(one) + share[:, None] * (np.asarray(other) - np.asarray(one))
 
 
@@ -69,10 +69,10 @@ def join(*meshes: Mesh) -> Mesh:
 
 
 def lathe(segments: list[tuple[int, list[tuple[float, float]]]], rows: int, columns: int, flutes=None) -> Mesh:
-    """Turn a profile about z into a closed surface.
+    """Rotate a profile about z, which makes a closed surface.
 
-    `segments`: (material, [(radius, z), …]) from the lowest point on the axis to the highest, each starting where the last ended. The
-    whole profile is one monotone cubic, which does not overshoot at a moulding. `flutes(angle, z)` multiplies the radius.
+    `segments`: (material, [(radius, z), …]) from the lowest point on the axis to the highest. Each segment starts where the one before
+    ended. A monotone cubic joins all points without overshooting. `flutes(angle, z)` returns factors of the radius.
     """
     points = np.array([point for _, segment in segments for point in segment])
     ends = np.cumsum([len(segment) for _, segment in segments])[:-1] - 1
@@ -102,7 +102,7 @@ def lathe(segments: list[tuple[int, list[tuple[float, float]]]], rows: int, colu
 
 
 def tube(path: np.ndarray, radius: float, material: int, closed: bool, rows: int = 128, columns: int = 32) -> Mesh:
-    """Sweep a round tube along a cubic spline through the planar `path` (n, 3); open ends are not capped."""
+    """Make a round tube along a cubic spline through the points `path` (n, 3), which lie in a plane. Open ends are not capped."""
     path = np.asarray(path, float)
     if closed:
         path = np.concatenate([path, path[:1]])
@@ -122,7 +122,7 @@ def tube(path: np.ndarray, radius: float, material: int, closed: bool, rows: int
 
 
 def _grid_triangles(bands: int, columns: int) -> np.ndarray:
-    """Triangulate a grid that is closed along its columns, two triangles a cell: (2·bands·columns, 3)."""
+    """Triangulate a grid whose last column joins its first, with two triangles for each cell. Returns indices (2·bands·columns, 3)."""
     row, column = np.meshgrid(np.arange(bands), np.arange(columns), indexing="ij")
     a, b = row * columns + column, row * columns + (column + 1) % columns
     c, d = b + columns, a + columns
