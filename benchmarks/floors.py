@@ -39,7 +39,7 @@ class Machine(NamedTuple):
 
     @classmethod
     def measured(cls, device: torch.device = torch.device("cpu")) -> "Machine":  # noqa: B008  it never changes
-        """Measure this machine."""
+        """Measure how many operations and bytes a second this machine can do at most."""
         return cls(arithmetic(device=device), bandwidth(device=device))
 
     def floor(self, need: Need) -> float:
@@ -48,9 +48,9 @@ class Machine(NamedTuple):
 
 
 def covered_pairs(surfels: list[torch.Tensor], camera: Camera) -> float:
-    """Estimate how many pairs of a surfel and a pixel that it covers there are, for surfels on the unit ball.
+    """Estimate how many pixels each surfel covers, summed over the surfels of a unit ball.
 
-    The estimate adds up the projected areas of the surfels that face the camera.
+    The sum is the projected area, in pixels, of the surfels that face the camera.
     """
     positions, _, scales, opacities, _ = (v.detach().double() for v in surfels)
     towards = torch.from_numpy(camera.position).to(positions) - positions
@@ -63,7 +63,7 @@ def covered_pairs(surfels: list[torch.Tensor], camera: Camera) -> float:
 
 
 def raster(surfels: list[torch.Tensor], camera: Camera) -> tuple[Need, Need]:
-    """Count the rasteriser's operations and bytes for surfels on the unit ball: of the forward pass, and of the backward pass."""
+    """Count the rasteriser's operations and bytes for surfels of a unit ball, for the forward pass and for the backward pass."""
     pixels, channels = camera.width * camera.height, surfels[-1].shape[1]
     given, maps, pairs = sum(v.nbytes for v in surfels), 4 * pixels * (channels + 2), covered_pairs(surfels, camera)
     forward = Need(pairs * (FORWARD_OPERATIONS + CHANNEL_OPERATIONS[0] * channels), given + maps)
@@ -78,8 +78,8 @@ def ssim(pixels: int) -> Need:
 def shading(covered: int, pixels: int) -> Need:
     """Count the operations and bytes of deferred shading, forward and backward.
 
-    It reads eleven channels and alpha twice, writes their derivatives, writes fourteen numbers and reads eleven derivatives. Only
-    `covered` of the `pixels` need operations.
+    For each of the `pixels`, shading reads eleven channels and alpha twice, writes their derivatives, writes fourteen numbers and reads
+    eleven derivatives. Operations are only needed for the `covered` pixels.
     """
     return Need(covered * SHADING_OPERATIONS, 4 * pixels * (3 * 12 + 14 + 11))
 
@@ -87,7 +87,7 @@ def shading(covered: int, pixels: int) -> Need:
 def prefiltering(side: int) -> Need:
     """Count the operations and bytes of prefiltering a cubemap of 6·side² texels, forward and backward.
 
-    Each pass reads the filter's matrix once. A number of the matrix serves all symmetries of the cubemap.
+    Each pass reads the filter's matrix once, and uses each of its numbers for all symmetries of the cubemap.
     """
     numbers = matrices(side, torch.device("cpu"))[0].numbers.numel()
     texels = 6 * sum(s * s for s in level_sides(side))

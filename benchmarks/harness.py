@@ -1,7 +1,7 @@
 """Run benchmarks: find scenes, train on them, record measured figures as rows, print tables of the rows.
 
-A benchmark trains only runs that do not exist yet. Its tables show the figures kept in docs/measurements.csv in brackets. `--csv FILE`
-writes the rows. `refgs bench page` makes docs/measurements.md from docs/measurements.csv.
+A benchmark trains only runs that do not exist yet. Beside each new figure, its tables show in brackets the earlier figure from
+docs/measurements.csv. `--csv FILE` writes the rows. `refgs bench page` makes docs/measurements.md from docs/measurements.csv.
 """
 
 import argparse
@@ -47,7 +47,7 @@ class Row(NamedTuple):
 class Column(NamedTuple):
     """Describe a column of a table: its heading, its figure and the number's format.
 
-    It shows the figure of `variant`. If that is None, it shows the variant of each line.
+    If `variant` is given, the column shows that variant's figure. If `variant` is None, each line shows the figure of its own variant.
     """
 
     heading: str
@@ -107,7 +107,7 @@ def mean(values: Sequence[float | str | None]) -> float | None:
 class Way(NamedTuple):
     """Describe one way to train: `words` are options of `refgs train`.
 
-    `minutes` limits the time: a number, or the name of another way, whose measured time is taken.
+    `minutes`, if given, limits the time. It is a number, or the name of another way: the limit is then the time that the other way took.
     """
 
     words: tuple[object, ...]
@@ -193,7 +193,7 @@ def scene_options(parser: argparse.ArgumentParser, preset: str | None = None) ->
 
 
 def find_scenes(folder: Path, only: list[str] | None = None) -> list[Path]:
-    """Find the captures in a folder, or those of the given names. Raise InputError if there are none."""
+    """Find the captures in a folder; if `only` is given, only the captures with these names. Raise InputError if none is found."""
     found = [folder / name for name in NAMES if (folder / name / "ground_truth").is_dir()]
     if not found:
         raise InputError(f"{folder}: no scene is here: render them with python -m benchmarks.scenes all --out {folder}")

@@ -1,7 +1,7 @@
 """Time a training iteration with deferred shading, part by part.
 
-The scene is made without Blender: 256×256 photos of a metal ball that fills most of the frame, 20,000 surfels on its visual hull. Each
-part is timed by running the iteration's own functions up to it.
+The scene is made without Blender: 256×256 photos of a metal ball that fills most of the frame, 20,000 surfels on its visual hull. The
+parts are the functions that a training iteration calls.
 """
 
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
@@ -23,7 +23,7 @@ SIZE, SURFELS, REPEATS = 256, 20_000, 30
 
 
 def make_trainer(folder: Path, device: str = "cpu") -> Trainer:
-    """Start a training and take its first steps."""
+    """Start a training on photos of a ball, and run its first five iterations."""
     write_ball_capture(folder / "ball", SIZE, samples=2)
     changes = [f"surfels.start={SURFELS}", f"surfels.budget={SURFELS}", "train.light_first=0"]
     settings = load_settings("quick", changes)

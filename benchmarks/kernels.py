@@ -1,8 +1,8 @@
 """Time the CPU kernels and a training iteration: `refgs bench kernels`.
 
-The kernels' scene is a ball that fills most of the picture, as training starts on a visual hull: 20,000 discs, uniformly random and
-tangent to the surface, both scales the mean distance to the three nearest neighbours, opacity 0.73. Half of the discs face away and
-are mostly hidden.
+The kernels' scene resembles the start of a training on a visual hull: a ball of 20,000 discs fills most of the picture. The discs lie at
+random places and are tangent to the ball. Both scales of a disc are the mean distance to its three nearest neighbours; its opacity is
+0.73. Half of the discs face away from the camera and are mostly hidden.
 """
 
 import argparse
@@ -80,7 +80,7 @@ def ball(splats: int = SPLATS, side: int = SIDE, channels: int = CHANNELS) -> tu
 
 
 def _time(*steps: Callable[[], None]) -> list[list[float]]:
-    """Run the steps in turn, several rounds; return the milliseconds of each step in each round."""
+    """Run all steps one after the other, in several rounds. Return the milliseconds of each step in each round."""
     rounds = []
     for _ in range(ROUNDS + 3):
         stamps = [time.perf_counter()]
@@ -92,7 +92,7 @@ def _time(*steps: Callable[[], None]) -> list[list[float]]:
 
 
 def measure() -> dict[str, list[float]]:
-    """Time each step with the instruction set in REFGS_ISA; return the milliseconds in each round."""
+    """Time each kernel with the instruction set that REFGS_ISA names. Return each kernel's milliseconds, one number for each round."""
     surfels, camera = ball()
     detached = [v.clone() for v in surfels]
     inputs = [v.requires_grad_() for v in surfels]
@@ -123,7 +123,7 @@ def measure() -> dict[str, list[float]]:
 
 
 def _shading() -> Callable[[], None]:
-    """Shade the ball as a rough metal under a random light, forward and backward."""
+    """Return a function that shades the ball as a rough metal under a random light, forward and backward."""
     (positions, *geometry, _), camera = ball()
     material = torch.tensor([0.9, 0.7, 0.5, 1.0, 0.3]).expand(SPLATS, 5)
     raster = rasterize(positions, *geometry, torch.cat([positions, material, positions], dim=1), camera, near=0.1)
@@ -139,14 +139,14 @@ def _shading() -> Callable[[], None]:
 
 
 def _prefilter(side: int) -> Callable[[], None]:
-    """Prefilter a cubemap of 6·side² texels, forward and backward."""
+    """Return a function that prefilters a cubemap of 6·side² texels, forward and backward."""
     radiance = torch.rand(6 * side**2, 3, requires_grad=True)
     upstream = torch.rand_like(prefilter(radiance, side))
     return lambda: torch.autograd.grad(prefilter(radiance, side), radiance, upstream)
 
 
 def _needs() -> dict[str, floors.Need]:
-    """Count the operations and bytes of the steps that have a floor (a least possible time)."""
+    """Count the operations and bytes of each kernel that has a floor (a least possible time)."""
     surfels, camera = ball()
     forward, backward = floors.raster(surfels, camera)
     covered = int((rasterize(*surfels, camera, near=0.1).alpha > 1 / 255).sum())
@@ -157,7 +157,7 @@ def _needs() -> dict[str, floors.Need]:
 
 
 def measure_all(bench: Bench, threads: int = THREADS) -> None:
-    """Record the times of each step on each instruction set, and its floor (the least possible time)."""
+    """Record each kernel's times with each instruction set, and its floor (the least possible time)."""
     before, chosen = torch.get_num_threads(), os.environ.get("REFGS_ISA")
     torch.set_num_threads(threads)
     try:

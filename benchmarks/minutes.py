@@ -1,7 +1,8 @@
 """Measure the PSNR that a training reaches in a given time: `refgs bench minutes --scenes DIR`.
 
 Each scene is trained by the presets `quick` and `standard`, and with a time limit and no preset. The held-out PSNR of a time-limited run
-is compared with the best PSNR that a preset's run had reached by that time. Seconds count from the command to the written asset.
+is compared with the best PSNR that a preset's run had reached by that time. Seconds are counted from
+the start of the command until the asset is written.
 """
 
 import argparse
@@ -41,9 +42,9 @@ def course(run: Path) -> list[tuple[float, float]]:
 
 
 def best(presets: dict[str, Path], seconds: float) -> tuple[float, str] | None:
-    """Return the best PSNR that a preset's run had reached after these seconds, and the preset's name.
+    """Find the best PSNR that any preset's run had reached within `seconds`. Return this PSNR and the preset's name.
 
-    Returns None if no run had been measured by then.
+    `presets` maps the names of presets to run folders. The result is None if no run had been measured by then.
     """
     reached = [(psnr, name) for name, run in presets.items() for at, psnr in course(run) if at <= seconds]
     return max(reached, default=None)

@@ -2,8 +2,8 @@
 
 A need is a part of the method that a scene may do without.
 
-Each scene is trained with every need "auto" (decided by the photos), with every need on, and without inter-reflection. Seconds are
-processor time, so that other programs hardly disturb them.
+Each scene is trained three times: with every need "auto" (decided by the photos), with every need on, and without inter-reflection.
+Seconds are processor time, which other programs hardly change.
 """
 
 import argparse

@@ -1,9 +1,11 @@
 """Measure the scenes of the paper's tables with today's program: `refgs bench paper --data DIR`.
 
-DIR holds the published data sets as they are downloaded, any part of them: `shiny_blender/SCENE`, `ref_real/SCENE`,
-`nerf_synthetic/SCENE`, and `glossy_synthetic/SCENE` (NeRO's with `synthetic_split_128.pkl` beside the scenes, or converted to
-NeRF-Blender and then perhaps named SCENE_blender). Each scene is trained on its training views at the photos' size and evaluated on its
-test views; real scenes use the usual reduced photos (`images_4`, of the sedan `images_8`). Runs lie in OUT/PRESET/DATA SET/SCENE.
+DIR holds the published data sets as they are downloaded; some may be missing. The scenes' folders are `shiny_blender/SCENE`,
+`ref_real/SCENE`, `nerf_synthetic/SCENE` and `glossy_synthetic/SCENE`. Glossy Synthetic may be in NeRO's format, with
+`synthetic_split_128.pkl` beside the scenes, or in NeRF-Blender's format, where folders may be named SCENE_blender.
+
+Each scene is trained on its training views at the photos' size, and evaluated on its test views. Real scenes use the usual reduced
+photos: `images_8` for the sedan, `images_4` for the others. Runs lie in OUT/PRESET/DATA SET/SCENE.
 """
 
 import argparse
@@ -24,7 +26,7 @@ FORMS = {"psnr": ("PSNR", ".2f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".
 
 
 class Scene(NamedTuple):
-    """Scene of the paper that was found on this disk: the data set's key, its name, and the folder to train on."""
+    """Hold a scene of the paper that was found on this disk: the data set's key, the scene's name, and the folder to train on."""
 
     data_set: str
     name: str
@@ -53,7 +55,7 @@ def find_scenes(data: Path) -> list[Scene]:
 
 
 def tables() -> list[Table]:
-    """Lay out Tables 1, 8 and 2, with the paper's figures beside ours."""
+    """Lay out the paper's Tables 1, 8 and 2, with the paper's figures beside ours."""
     result = []
     for key, data_set in PAPER.items():
         columns = [

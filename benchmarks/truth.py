@@ -1,7 +1,7 @@
 """Measure the method on scenes with ground truth: `refgs bench truth --scenes DIR`.
 
-Each scene is trained by a preset and compared with all its ground truth. To compare novel views, plain view-dependent colour
-(`shading=sh`) is trained for the same time.
+Each scene is trained by a preset and compared with all its ground truth. It is also trained for the same time with plain view-dependent
+colour (`shading=sh`), to compare the quality of novel views.
 """
 
 import argparse
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def record(bench: Bench, scene: str, way: str, found: dict) -> None:
     """Add a run's figures to the rows. `found` is its metrics.json.
 
-    Figures of materials and light are missing for plain view-dependent colour.
+    A run with plain view-dependent colour has no figures of materials and light.
     """
     bench.record(scene, way, "dB", psnr=found["psnr"], albedo=found.get("albedo", {}).get("psnr_aligned"))
     bench.record(scene, way, "dB", relit=relit(found, "psnr_raw"), relit_aligned=relit(found, "psnr_aligned"))

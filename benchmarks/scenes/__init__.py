@@ -1,7 +1,7 @@
 """Render captures with ground truth by Cycles: `python -m benchmarks.scenes NAME --out DIR`.
 
-Each scene is a module with a function `build()`. `solids` sculpts the meshes. `scripts.demo` photographs the scenes, and has one more: the
-jar. `analytic` makes captures without Blender.
+Each scene is a module with a function `build()`. `solids` sculpts the meshes. `scripts.demo` photographs the scenes, and builds one more
+scene, the jar. `analytic` makes captures without Blender.
 """
 
 import importlib

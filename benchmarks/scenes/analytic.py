@@ -27,7 +27,10 @@ def sky(direction: np.ndarray) -> np.ndarray:
 
 
 def meet(origin: np.ndarray, ray: np.ndarray, balls: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Intersect unit rays (P, 3) with balls (B, 4); return hits (P,), the first points (P, 3) and their normals (P, 3)."""
+    """Find where unit rays (P, 3) first hit balls (B, 4), given by centre and radius.
+
+    Return whether each ray hits a ball (P,), the points (P, 3) and the normals there (P, 3).
+    """
     apart = origin[:, None] - balls[:, :3]
     b = (apart * ray[:, None]).sum(-1)
     inside = b * b - ((apart**2).sum(-1) - balls[:, 3] ** 2)
@@ -125,8 +128,8 @@ def photo(
     A ball is a mirror with Schlick's Fresnel. With `bands` it has three horizontal bands of materials (BANDS); with `matte` it is matte
     with a pattern.
 
-    Alpha is the mean over `samples`² rays a pixel. The mirrors' sky stands still, or with `turning` rotates with the camera about z.
-    `stops` is the exposure in powers of two, `angle` the field of view in radians.
+    `matrix` is the camera-to-world matrix, `angle` the field of view in radians, `stops` the exposure in powers of two. Each pixel has
+    `samples`² rays; alpha is their mean. The sky in the mirrors stands still; with `turning`, it rotates about z with the camera.
     """
     focal = 0.5 * size / np.tan(angle / 2)
     grid = (np.arange(size * samples) + 0.5) / samples
@@ -163,7 +166,10 @@ def photo(
 
 
 def camera_matrix(direction: np.ndarray, distance: float = DISTANCE) -> np.ndarray:
-    """Return the camera-to-world matrix, with OpenGL's axes, of a camera along a direction that looks at the origin, +z up."""
+    """Return the camera-to-world matrix, with OpenGL's axes, of a camera that looks at the origin; +z is up.
+
+    `direction` points from the origin to the camera.
+    """
     back = direction / np.linalg.norm(direction)
     right = np.cross([0, 0, 1], back)
     right /= np.linalg.norm(right)
@@ -185,7 +191,7 @@ def write_ball_capture(
 ) -> None:
     """Write a NeRF-Blender capture of balls with 24 training and 4 test views.
 
-    `stops` are the exposures of the training views, in powers of two, repeated in turn. Other arguments: see `photo`.
+    `stops` are exposures in powers of two, which the training views take in turn. The other arguments are explained at `photo`.
     """
     angle = ANGLE if distance == DISTANCE else 2 * np.arctan(np.tan(ANGLE / 2) * DISTANCE / distance)
     steps = np.arange(VIEWS + 4) + 0.5

@@ -1,7 +1,7 @@
 """Blend and carve solids, and mesh them by `sculpt`.
 
-A solid is a function from points (n, 3) to n signed distances, negative inside. They need not be exact, but must be smooth near the
-surface and must not grow by much more than one a unit.
+A solid is a function from points (n, 3) to n signed distances, negative inside. The distances need not be exact. They must be smooth near
+the surface, and between two points they must not differ by much more than the points' distance.
 """
 
 from collections.abc import Callable
@@ -100,7 +100,7 @@ def sweep(path, radii) -> Solid:
 
 
 def blend(width: float, *parts: Solid) -> Solid:
-    """Unite solids; surfaces closer than `width` run into each other (a cubic smooth minimum)."""
+    """Unite solids; surfaces closer than `width` merge smoothly (a cubic smooth minimum)."""
 
     def distance(points):
         result = parts[0](points)
@@ -114,7 +114,7 @@ def blend(width: float, *parts: Solid) -> Solid:
 
 
 def carve(width: float, solid: Solid, *tools: Solid) -> Solid:
-    """Subtract tools from a solid, with edges rounded over about `width`."""
+    """Subtract other solids, the `tools`, from a solid. Edges of the cuts are rounded over about `width`."""
     rest = blend(width, lambda points: -solid(points), *tools)
     return lambda points: -rest(points)
 
@@ -127,8 +127,8 @@ def mirrored(solid: Solid) -> Solid:
 def sculpt(solid: Solid, low, high, cell: float, material: int) -> Mesh:
     """Mesh the surface of a solid within `low` to `high` (3,), in triangles of about `cell`.
 
-    Marching cubes find the triangles. Then vertices slide along the surface until the triangles are even, because mirrors show uneven
-    ones. `material` is the index of all faces' material.
+    Marching cubes find the triangles. Then vertices slide along the surface until all triangles are about as large: uneven triangles would
+    show in reflections. `material` is the index of all faces' material.
     """
     block = 4
     low = np.asarray(low, float) - 2 * cell

@@ -19,10 +19,10 @@ class Found(NamedTuple):
 
 
 class Case(NamedTuple):
-    """Describe a stiff or extreme case. It passes if all values are finite and its error is at most `most`.
+    """Describe an ill-conditioned or extreme case. It passes if all values are finite and its error is at most `most`.
 
-    `run` computes the error, compared with what `against` names. `because` says why an error of that size is allowed; `guard` says what
-    the program does in such a case.
+    `run` computes the outcome; `against` names what results are compared with. `because` says why an error of `most` is allowed; `guard`
+    says what the program does in such a case.
     """
 
     name: str

@@ -1,6 +1,6 @@
 """Compare float32 kernels with the float64 reference.
 
-The error of a tensor, of values or of gradients, is its largest error divided by its largest value.
+Errors are relative: the largest error in a tensor of values or gradients is divided by the largest exact number in it.
 """
 
 from collections.abc import Sequence
@@ -26,10 +26,10 @@ class Undecided(Exception):
 
 
 def worst(found: Sequence[Tensor], expected: Sequence[Tensor], terms: Sequence[Tensor] | None = None) -> float:
-    """Return the largest error over pairs of tensors, each error relative to the largest expected value of its tensor.
+    """Return the largest relative error of tensors: a tensor's largest error is divided by its largest expected number.
 
-    `terms` are the magnitudes that cancel in the values. Where these are larger, the error is relative to them. If all of them are zero,
-    the error is absolute.
+    If numbers are sums of larger terms that cancel, `terms` has the size of these terms. Errors are then divided by the largest term. If
+    all expected numbers and terms are zero, errors are not divided.
     """
     errors = [0.0]
     for value, exact, summed in zip(found, expected, terms or expected, strict=True):
@@ -46,10 +46,10 @@ def outcome(
     exact_by: Sequence[Tensor],
     terms: Sequence[Tensor] | None = None,
 ) -> Found:
-    """Check that all values are finite, and return the larger of two errors: that of the values, and a tenth of that of the gradients.
+    """Check that values and gradients are finite, and compute the error: the values' error, or a tenth of the gradients' if that is larger.
 
-    `found` are the float32 values and `by` their gradients; `expected` and `exact_by` are the same in float64. `terms` are the magnitudes
-    that cancel in the gradients, if known.
+    `found` are the float32 values and `by` their gradients; `expected` and `exact_by` are the same in float64. `terms`, if given, has the
+    size of the terms that cancel in the gradients.
     """
     finite = all(bool(v.isfinite().all()) for v in (*found, *by))
     return Found(finite, max(worst(found, expected), 0.1 * worst(by, exact_by, terms)))
@@ -58,8 +58,8 @@ def outcome(
 def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest: int | None = None) -> Found:
     """Compare the rasteriser with the float64 reference, forward and backward.
 
-    `inputs` are the surfels' tensors. With `nearest`, the reference draws only that many surfels, those nearest to the camera; they must
-    occlude all others.
+    `inputs` are the surfels' tensors. If the number `nearest` is given, the reference draws only the surfels nearest to the camera, so many
+    of them. They must occlude all others.
     """
     order = None if nearest is None else _order(inputs, camera)
     few = inputs if order is None else [v[order[:nearest]] for v in inputs]
@@ -86,7 +86,7 @@ def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest:
 
 
 def _learned(by: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
-    """Convert derivatives by quaternion and scale to derivatives by rotation angle and log scale; keep the others."""
+    """Convert derivatives by quaternion and by scale to derivatives by rotation angle and by the scale's logarithm; keep the others."""
     position, rotation, scale, *rest = by
     return [position, rotation * inputs[1].double().norm(dim=-1, keepdim=True), scale * inputs[2].double(), *rest]
 
@@ -98,13 +98,13 @@ def _terms(
     exact_by: Sequence[Tensor],
     generator: torch.Generator,
 ) -> list[Tensor]:
-    """Bound the terms that cancel in each derivative. Where a gradient cancels larger terms, its error is relative to them.
+    """Estimate the size of the terms that cancel in each derivative: the derivative's error is compared with this size.
 
-    - By alpha: a derivative is what the surfel adds, less what it occludes. What it occludes is computed from the pixel's total, divided
-      by 1 - alpha. So it has the rounding error of the total, however small it is itself. The derivative of the transmittance is divided
-      by 1 - alpha, too. So totals of random sign are propagated back.
-    - By rotation and scale: the same pixels move, turn and stretch a disc. A derivative by rotation is a difference of derivatives by
-      position, times the radius. A derivative by scale is a difference of derivatives by rotation.
+    - The derivative by a surfel's alpha is the colour that the surfel adds, minus the colour that it occludes. The kernel computes the
+      occluded colour from the pixel's total colour, so both have the same rounding error. To estimate this error in all derivatives, each
+      pixel's total is divided by 1 - alpha, multiplied by a random number, and propagated back.
+    - The derivative by rotation is a difference of derivatives by position, times the radius. The derivative by scale is a difference of
+      derivatives by rotation.
     """
     features, depth, alpha = (m.detach() for m in maps)
     by_features, by_depth, by_alpha = upstream
@@ -126,8 +126,8 @@ def _order(inputs: Sequence[Tensor], camera: Camera) -> Tensor:
 def shading(features: Tensor, alpha: Tensor, radiance: Tensor, camera: Camera, kink: bool = False) -> Found:
     """Compare deferred shading with the float64 reference, forward and backward.
 
-    `features` and `alpha` are the maps that `shade` takes; `radiance` (6·R², 3) is the light. Set `kink` where the derivative jumps in all
-    of the picture: gradients then only have to be finite.
+    `features` and `alpha` are the maps that `shade` takes; `radiance` (6·R², 3) is the light. Set `kink` if derivatives jump in every
+    pixel: gradients are then not compared, but must be finite.
     """
     light = Environment(radiance)
     light.levels = light.levels.requires_grad_()

@@ -40,7 +40,7 @@ def surfels(
     """Make `count` surfels at random places in a camera's picture. Returns the rasteriser's input tensors.
 
     `pixels` is the range of standard deviations in pixels, `depth` the range of depths, `aspect` the largest ratio of the two scales.
-    Normals are random, or with `edge_on`, discs are seen edge-on to within that many radians.
+    Normals are random. If `edge_on` is given, discs are seen edge-on instead, to within `edge_on` radians.
     """
     rng = np.random.default_rng(0)
     z = rng.uniform(*depth, count)
@@ -139,8 +139,8 @@ def ties() -> Found:
 def one_pixel(count: int = 1_000_000) -> Found:
     """Compare the rasteriser with float64 where all surfels lie in one pixel and are smaller than it.
 
-    They lie around the pixel's centre, not on it. There the surfel's distance and the low-pass filter's distance are both zero, and
-    rounding would choose between them.
+    They lie around the pixel's centre, not on it. At the centre, the distance to the surfel and the low-pass filter's distance would both
+    be zero, and rounding would decide which one is less.
     """
     view = camera(size=(3, 3))
     _, rotation, scale, opacity, features = surfels(view, count, pixels=(0.01, 0.38), depth=(1.0, 1.0))

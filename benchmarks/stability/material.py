@@ -24,9 +24,9 @@ SIDE, RESOLUTION = 32, 16
 
 
 def ball(grazing: float | None = None) -> tuple[Tensor, Tensor, Camera]:
-    """Make the normals and positions (H, W, 3), float64, and the camera of a ball that fills the image from far away.
+    """Make the picture of a ball that is seen from far away and fills it: normals and positions (H, W, 3), float64, and the camera.
 
-    With `grazing`, all normals have this cosine with the view direction instead.
+    If `grazing` is given, all normals are changed to have this cosine with the view direction.
     """
     view = Camera("far", SIDE, SIDE, 1e3, 1e3, SIDE / 2 + 0.13, SIDE / 2 - 0.17, np.eye(4))
     y, x = torch.meshgrid(*[(torch.arange(SIDE, dtype=torch.float64) + 0.5) / SIDE * 1.2 - 0.6] * 2, indexing="ij")
@@ -45,7 +45,7 @@ def ball(grazing: float | None = None) -> tuple[Tensor, Tensor, Camera]:
 
 
 def light(sun: float = 0.0, scale: float = 1.0) -> Tensor:
-    """Make smooth radiance (6·R², 3) times `scale`, and add `sun` to one texel that the ball mirrors."""
+    """Make a cubemap (6·R², 3) of smooth radiance times `scale`, and add the radiance `sun` to one texel, which the ball mirrors."""
     way = cubemap.texel_directions(RESOLUTION)
     radiance = scale * torch.exp(0.7 * way + 0.2 * torch.sin(5 * way[:, [1, 2, 0]]))
     radiance[int((way @ torch.tensor([0.3, 0.4, -0.87], dtype=torch.float64)).argmax())] += sun
@@ -79,7 +79,7 @@ def lit(
 def one_sun(radiance: float) -> Found:
     """Check that the prefilter is linear, forward and backward.
 
-    Smooth light with a sun of this radiance must give the sum of the results for the smooth light and for the sun alone.
+    The result for a smooth light with a sun of this radiance must be the sum of two results: for the smooth light, and for the sun alone.
     """
     smooth, texel = light(), light(sun=1.0) - light()
     both = (smooth + radiance * texel).requires_grad_()
@@ -119,7 +119,7 @@ def likeness(kind: str) -> Found:
 
 
 def activations() -> Found:
-    """Compare activations of raw values 0 … ±1e4 with float64. Check that no slope is zero within the limits of training."""
+    """Compare activations of raw values 0 … ±1e4 with float64. Check that no derivative is zero in the range that training allows."""
     raw = torch.tensor([-1e4, -87, -12, -6, -1, 0, 1, 6, 12, 87, 1e4])
     names = ("scale", "opacity", "albedo", "metallic", "roughness")
     empty = {
@@ -161,7 +161,7 @@ def steps(size: float) -> Found:
 
 
 def rays(scale: float, offset: float) -> Found:
-    """Trace rays in random directions inside a ball with an opening. Return the share of rays whose visibility is wrong.
+    """Trace random rays inside a hollow ball with an opening. Return the share of rays whose visibility is wrong.
 
     `scale` and `offset` scale and move the ball and the rays.
     """

@@ -28,7 +28,7 @@ AT, UNTIL, LONG = 50, 90, 300  # iterations: start and end of a disturbance, len
 def disturbed(
     start: Callable[[Trainer], None], end: Callable[[Trainer], None] | None = None, total: int = TOTAL
 ) -> Found:
-    """Train with and without a disturbance. Return the dB lost at the end, and when the disturbed training recovered.
+    """Train with and without a disturbance. Return the PSNR in dB that is lost at the end, and when the disturbed training recovered.
 
     `start` makes the disturbance at iteration AT; `end`, if given, undoes it at iteration UNTIL.
     """

@@ -1,7 +1,7 @@
 """Measure in float64 how well photos tell light from material.
 
-A change of the light and a change of the material may cancel in the pictures. For each such pair, compute the singular values of the
-pictures' Jacobian, and the effect of each loss weight on the pair.
+A change of the light and a change of the material may cancel in the pictures. For each such pair of changes, tables show the singular
+values of the pictures' Jacobian, and the effect of each loss weight.
 """
 
 from collections.abc import Callable
@@ -42,7 +42,7 @@ TRADES = {
 class Scene(NamedTuple):
     """Describe a ball under a light. `light` maps directions to radiance.
 
-    `materials` are (base colour, metallic, roughness) of the left half and of the right half, or one for both.
+    `materials` has one material for the whole ball, or two for its left and right half. A material is base colour, metallic and roughness.
     """
 
     light: Callable
@@ -61,7 +61,10 @@ class Scene(NamedTuple):
         return base, base * torch.tensor([1.0, 0.0, -1.0]), mean - base
 
     def pictures(self, change: Tensor) -> Tensor:
-        """Render all views after the eight changes `change` (8,), as sRGB values in one vector (P,)."""
+        """Render all views, and return their sRGB values as one vector (P,).
+
+        `change` (8,) has the amounts by which light, materials and exposure are changed first (LIGHT, ALBEDO … EXPOSURE).
+        """
         normal, position, view = ball()
         base, tint, blur = (prefilter.prefilter(radiance, RESOLUTION).double() for radiance in self.radiance())
         levels = (1 + change[LIGHT]) * base + change[LIGHT_TINT] * tint + change[BLUR] * blur
@@ -88,12 +91,12 @@ class Scene(NamedTuple):
         return torch.cat(found)
 
     def jacobian(self) -> Tensor:
-        """Compute the Jacobian (P, 8) of the pictures by the eight changes, by central differences, divided by √P."""
+        """Compute the pictures' derivatives (P, 8) by each of the eight changes, divided by √P. Central differences are used."""
         columns = [self.pictures(STEP * e) - self.pictures(-STEP * e) for e in torch.eye(8).double()]
         return torch.stack(columns, dim=1) / (2 * STEP) / len(columns[0]) ** 0.5
 
     def weights(self, change: Tensor) -> dict[str, Tensor]:
-        """Compute each weighted loss term after the eight changes `change` (8,).
+        """Compute each weighted loss term for the light, materials and exposure changed by `change` (8,), see `pictures`.
 
         The weights are those of the preset `standard` at the end of a training.
         """
@@ -144,7 +147,7 @@ def condition(hessian: Tensor) -> str:
 
 
 def tables() -> list[tuple[str, list[str], list[list[str]]]]:
-    """Make the table of how well each scene tells the changes of each pair apart: title, headings, rows."""
+    """Make a table that shows how well each scene's photos distinguish the two changes of each pair: title, headings, rows."""
     weights, rows = ("loss.light", "loss.metallic", "loss.matte", "loss.exposure"), []
     for name, scene in SCENES.items():
         jacobian = scene.jacobian()

@@ -92,9 +92,9 @@ class Course(NamedTuple):
         return self.trainer.state.render(view.camera)
 
     def back_after(self, start: int, undisturbed: "Course") -> int:
-        """Count the iterations from `start` until PSNR stays no more than BACK dB below an undisturbed training's.
+        """Count the iterations from `start` until the PSNR has recovered: it then stays within BACK dB of an undisturbed training's.
 
-        Returns NEVER if that is not reached by the end.
+        Return NEVER if the PSNR has not recovered at the end.
         """
         late = [i for i in self.psnr if i > start and self.psnr[i] < undisturbed.psnr.get(i, undisturbed.end) - BACK]
         return NEVER if late and max(late) == max(self.psnr) else max(late, default=start - LOOK) + LOOK - start
