@@ -1,4 +1,4 @@
-"""Test finding the best PSNR that a preset had reached after so many seconds, with start and end of the run counted."""
+"""Test finding the best PSNR that a preset had reached by a given time; the whole command's seconds count."""
 
 import json
 

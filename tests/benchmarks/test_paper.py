@@ -12,7 +12,7 @@ from tests.makers.captures import colmap, nero, shiny_blender
 
 
 def finish(run: Path, **figures: float) -> None:
-    """Write a run folder as `refgs evaluate` leaves it."""
+    """Write the files that a run has after `refgs evaluate`, with the given figures."""
     run.mkdir(parents=True)
     (run / "run.toml").touch()
     (run / "splats.ply").touch()

@@ -61,7 +61,7 @@ def passes(capture):
 
 
 def camera_rays(capture, per_side=1):
-    """Compute a test view's origin (3,), unit rays (SIZE·n, SIZE·n, 3) and camera axis from transforms_test.json alone."""
+    """Compute a test view's origin (3,), unit rays (SIZE·n, SIZE·n, 3), n × n a pixel, and camera axis from transforms_test.json alone."""
     transforms = json.loads((capture[0] / "transforms_test.json").read_text())
     matrix = np.array(transforms["frames"][0]["transform_matrix"])
     focal = SIZE * per_side / 2 / np.tan(transforms["camera_angle_x"] / 2)

@@ -47,9 +47,9 @@ def test_the_kernels_benchmark_runs(monkeypatch, bench):
 
 
 def test_covered_pairs_are_about_those_that_are_blended():
-    """Check that the estimated number of pairs of surfel and pixel is within 15 % of the number of blended pairs.
+    """Check that the estimate of the pixels that surfels cover, summed over surfels, is within 15 % of the pixels that are blended.
 
-    Surfels are so transparent that none is occluded, so the sum of alpha gives the number of pairs.
+    Surfels are so transparent that none is occluded, so the sum of alpha gives the number of blended pixels.
     """
     (positions, rotations, scales, _, _), camera = gpu.make_ball(2000, 200, 150, CPU)
     opacities = torch.full((2000,), 0.02)

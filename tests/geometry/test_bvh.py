@@ -24,7 +24,7 @@ SHAPES = {"rings": rings(), "half open": inside(0.3, 4), "five faces": trimesh.c
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(("scale", "moved"), [(1.0, 0.0), (1e3, 2e4)])
 def test_as_embree(shape, scale, moved, card, monkeypatch):
-    """Along views that are mirrored at random normals, visibility is the same as Embree's in all but 0.2 % of the pixels."""
+    """Check that rays mirrored at random normals have the same visibility as by Embree, in all but 0.2 % of the pixels."""
     occluder = as_occluder(SHAPES[shape], scale=scale, moved=moved)
     matrix = scenes.camera().world_to_camera.copy()
     matrix[:3, 3] = [0, 0, 3.0 * scale] - matrix[:3, :3] @ np.full(3, moved)

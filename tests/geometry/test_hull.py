@@ -22,7 +22,7 @@ def degrees(a, b):
 
 
 def expected(masks, cameras, low, high, resolution):
-    """Carve in float64 with every view.
+    """Compute in float64, from all views, the values that carving must find.
 
     Return for each voxel: the smallest mask value, the second smallest, the values of all views, and the distance in pixels to the
     nearest picture border.

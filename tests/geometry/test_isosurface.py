@@ -8,7 +8,7 @@ CORNERS = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), axis=-1)
 
 
 def blocks_about(sdf, blocks, band=6.0):
-    """Cut a cube into blocks. Return those near the surface (B, 3), within `band` voxels, and the signed distances of their voxels."""
+    """Cut a cube into `blocks`³ blocks. Return the indices (B, 3) of blocks near the surface, and the signed distances of their voxels."""
     block = np.stack(np.meshgrid(*[np.arange(blocks)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     block = block[np.abs(sdf(BLOCK * block + BLOCK / 2)) < band]
     return block, sdf(BLOCK * block[:, None] + CORNERS).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Compare the kernel for colour by direction with spherical harmonics in float64."""
+"""Compare the kernel for view-dependent colour with spherical harmonics in float64."""
 
 import dataclasses
 import math
@@ -59,7 +59,7 @@ def test_same_bits_for_any_number_of_threads():
 
 
 def turned(values, turn):
-    """Rotate harmonics (N, K, 3) by a matrix (3, 3): what they were along a direction, they become along the rotated direction."""
+    """Rotate harmonics (N, K, 3) by a matrix (3, 3): the colour of each direction becomes that of the rotated direction."""
     directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(2)).double())
     degree = math.isqrt(values.shape[1]) - 1
     before, after = (harmonics.basis(d, degree) for d in (directions, directions @ turn.T))

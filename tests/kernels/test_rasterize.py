@@ -29,7 +29,7 @@ FORWARD, GRADIENT = 1e-5, 1e-4
 def case(kind: str, channels: int, size: tuple[int, int] = (45, 30), centre: tuple[float, float] | None = None):
     """Make inputs, a camera and upstream gradients; return them with the reference's maps, safe pixels and gradients.
 
-    A pixel is safe if all numbers that are compared with thresholds for it are far from them, so that rounding cannot change it.
+    A pixel is safe if none of its numbers is near a threshold with which it is compared, so that rounding cannot change the pixel.
     """
     camera, inputs = scenes.camera(*size, centre), scenes.surfels(kind, channels)
     exact = [v.double().requires_grad_() for v in inputs]
@@ -99,7 +99,7 @@ def test_trimmed_depth_matches_reference(kind, trim, device):
 def test_trimmed_depth_is_that_of_the_surface(device):
     """Trimmed depth is the surface's depth, in spite of fog in front and a disc 1000 times as far behind.
 
-    Both move the mean depth.
+    The fog and the disc both change the mean depth.
     """
     camera = replace(scenes.camera(9, 9, (4.5, 4.5)), world_to_camera=np.eye(4))
     depths, opacities = torch.tensor([0.5, 0.7, 2.0, 2000.0]), torch.tensor([0.1, 0.1, 0.9, 0.9])

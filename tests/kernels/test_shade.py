@@ -24,7 +24,7 @@ TURN = reference.rotation_matrices(torch.tensor([[0.8, 0.3, -0.4, 0.5]], dtype=t
 
 
 class Light:
-    """Stand-in for an Environment: its roughness levels and its exposure are leaves that get gradients."""
+    """Stand in for an Environment, with roughness levels and an exposure that get gradients."""
 
     def __init__(self, dtype: torch.dtype, device: torch.device | str = "cpu", resolution: int = 16):
         generator = torch.Generator().manual_seed(2)
@@ -40,7 +40,7 @@ class Light:
 def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
     """Make smooth random maps of features (H, W, C) and alpha (H, W). A third of the pixels is empty.
 
-    The features are normal, material, `colours` RGB colours, and position. Positions lie up to ten pixels beside their pixel.
+    The features are the normal, the material, `colours` RGB colours and the position, which lies up to ten pixels beside its pixel.
     """
     generator = torch.Generator().manual_seed(1)
 
@@ -63,7 +63,7 @@ def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
 def case(appearance: bool, indirect: bool, size: tuple[int, int]):
     """Make a camera, inputs and upstream gradients; return them with the reference's maps, safe pixels and gradients.
 
-    Safe pixels are not near a kink. With `indirect` light there is a visibility map of free, occluded and partly occluded pixels.
+    Safe pixels are not near a kink, where derivatives jump. If `indirect`, a visibility map has free, occluded and partly occluded pixels.
     """
     camera = scenes.camera(*size)
     mean, alpha = means(camera, 2 if indirect else int(appearance))

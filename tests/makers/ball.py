@@ -19,7 +19,7 @@ BOX = trimesh.creation.box((1.0, 1.4, 0.8)).subdivide().subdivide()
 
 
 def write_run(folder, capture):
-    """Write the run folder of a metal ball; its upper half is rough, its lower half smooth, its mesh a box."""
+    """Write the run folder of a metal ball, whose upper half is rough and lower half smooth. The run's mesh is a box."""
     create_run(folder, capture, load_settings("quick", ["environment.resolution=16"]), "quick", "cpu")
     steps = np.arange(3000) + 0.5
     z, azimuth = 1 - 2 * steps / len(steps), steps * np.pi * (3 - np.sqrt(5))

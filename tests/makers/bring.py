@@ -1,4 +1,4 @@
-"""Make the wheels that the extension carries; its uv is a fake."""
+"""Make the wheels that the extension carries: an empty trainer and a fake uv."""
 
 import sys
 import zipfile

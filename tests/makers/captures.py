@@ -158,7 +158,7 @@ def shiny_blender(folder: Path) -> Path:
 def nero(folder: Path, count: int = 16, split: tuple[list, list] | None = None, protocol: int = 4) -> Path:
     """Write a capture like a scene of NeRO's Glossy Synthetic: opaque photos, 16-bit depth, pickled cameras.
 
-    The file with the split lies beside the scene's folder.
+    If `split` is given, it is written into a file beside the scene's folder.
     """
     folder.mkdir(parents=True)
     for i, pose in enumerate(ring(count)):

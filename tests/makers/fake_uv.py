@@ -1,4 +1,4 @@
-"""Stand in for uv and print its lines.
+"""Stand in for uv, and print the lines that uv prints.
 
 The variable FAKE_UV names a failure: "hang" (while fetching), "network", "full" (disk), "mute" (the trainer never answers).
 """

@@ -1,4 +1,4 @@
-"""Speak the job protocol without training.
+"""Stand in for the trainer's worker: speak the job protocol without training.
 
 The capture's name chooses the behaviour: "good", "crash", "noise" (lines that are no events), "bare" (photos without cameras), "slow".
 The variable FAKE chooses "newer": a newer protocol.

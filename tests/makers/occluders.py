@@ -25,7 +25,7 @@ def plate(z: float, up: int) -> trimesh.Trimesh:
 
 
 def inside(height: float, level: int = 5) -> trimesh.Trimesh:
-    """Make the inside of the unit sphere up to a height; its faces face the middle."""
+    """Make the part of the unit sphere below a height; its faces face the centre."""
     ball = trimesh.creation.icosphere(level)
     return trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < height][:, ::-1], process=False)
 

@@ -35,7 +35,7 @@ METAL, DIELECTRIC = Material(1.0, 0.7), Material(0.0, 0.5)
 
 
 class View(NamedTuple):
-    """Direction to the camera, seen from a surface with the normal +z, and the mirror direction."""
+    """Hold the direction from a surface with the normal +z to the camera, and the mirror direction."""
 
     way: np.ndarray
     mirrored: np.ndarray
@@ -49,7 +49,7 @@ class View(NamedTuple):
 def light_and_view(kind: str, angle: float) -> tuple[Radiance, View]:
     """Return a light as a function from directions (P, 3) to radiance (P,), and the view at an angle to the normal.
 
-    The sun is in the mirror direction.
+    `kind` is "constant", "gradient" or "sun"; the sun is in the mirror direction.
     """
     view, slope = View.at(angle), np.array([-0.48, 0.48, 0.424])
     lights = {
@@ -61,7 +61,7 @@ def light_and_view(kind: str, angle: float) -> tuple[Radiance, View]:
 
 
 class Reflected(NamedTuple):
-    """Exact reflection of a constant light: the factor for multiple bounces, the specular part, and the base's diffuse part."""
+    """Hold the exact reflection of a constant light: the factor for multiple bounces, the specular part, and the base's diffuse part."""
 
     bounces: float
     specular: float

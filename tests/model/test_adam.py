@@ -32,7 +32,7 @@ def train(optimizer: torch.optim.Optimizer | Adam, values: list[Tensor], gradien
 
 
 class Held(torch.optim.Adam):
-    """Torch's Adam, except that a number whose gradient is zero keeps its value and moments."""
+    """Change torch's Adam: a number whose gradient is zero keeps its value and moments."""
 
     @torch.no_grad()
     def step(self) -> None:

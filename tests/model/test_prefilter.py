@@ -9,9 +9,9 @@ from refgs.model.environment import Environment
 
 
 def errors(radiance: torch.Tensor, fine: torch.Tensor, rows: int) -> list[float]:
-    """Compare `rows` random texels of each level with the lobe summed over a finer cubemap.
+    """Return the relative RMS error of each prefiltered level of `radiance`, on `rows` random texels.
 
-    Return the relative RMS error of each level.
+    Exact values are sums over the finer cubemap `fine`, weighted by the level's lobe.
     """
     side, fine_side = (math.isqrt(len(v) // 6) for v in (radiance, fine))
     levels = prefilter.prefilter(radiance, side).cpu()
@@ -38,7 +38,7 @@ def light(side: int) -> torch.Tensor:
 
 
 def test_levels_match_direct_integration(device):
-    """Each level matches the lobe summed over a cubemap four times as fine, to 0.5 %."""
+    """Check that each prefiltered level is within 0.5 % of sums over a cubemap four times as fine."""
     assert max(errors(light(32).to(device), light(128), rows=40)) < 0.005
 
 

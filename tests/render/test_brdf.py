@@ -89,7 +89,8 @@ def test_the_integral_converges():
 def test_table_everywhere():
     """All values of the table are exact to 0.001, also between its entries.
 
-    They are FG0, FG1, their mean over the row, the dielectric's reflectance with bounces, and the reflectance for F0 of 0.04 and of 1.
+    They are FG0, FG1, the mean of FG0 + FG1 over all angles, and the dielectric's reflectance with bounces. The reflectances for F0 = 0.04
+    and F0 = 1 are compared, too.
     """
     n_v, roughness = grid(np.linspace(0.02, 1 - 1e-9, 59), np.linspace(0.03, 1, 61))
     exact = integrate(n_v, roughness, 32)

@@ -68,9 +68,9 @@ def test_inside_a_matte_bowl(albedo, monkeypatch):
 
 
 def test_what_training_takes_of_it(monkeypatch):
-    """Surfels receive 2/3 of an unoccluded surface's light in a bowl, and all of it on a convex ball. Training reads this share.
+    """Check the share of an unoccluded surface's light that surfels receive: 2/3 in a bowl, all on a convex ball. Training uses it.
 
-    The share does not depend on the side to which normals point, and is nearly the same if only some surfels are probed.
+    The share does not depend on the side to which normals point, and is nearly the same if only some surfels trace rays.
     """
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
@@ -101,7 +101,7 @@ def test_a_white_bowl_under_an_even_sky_cannot_be_seen(part, monkeypatch):
 
 
 def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
-    """A point under a mirror that faces down sees the light from below in it, exact to 0.05 in every direction."""
+    """Check that a point under a mirror sees in it the light from below, exact to 0.05 in every direction."""
     light = colourful()
     mirrors(monkeypatch, 1.0)
     below = surfels(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))._replace(roughness=torch.tensor([0.05]))
