@@ -43,10 +43,7 @@ def test_what_is_hardly_there_has_no_surface():
 
 
 def test_voxels_are_no_finer_than_pixels():
-    """Above 104 voxels a side the mesh gets no finer: the grid's 2.6 units are at most 104 pixels wide.
-
-    96 pixels show 3.3 units at the depth of the ball's centre and 2.5 at its nearest point.
-    """
+    """Check that voxels are at least as wide as a typical pixel at the surface: above 104 a side, the mesh gets no finer."""
     layer = ball(0.95, 0.0)
     fine, finer, coarse = (len(radii(layer, resolution)) for resolution in (120, 240, 75))
     assert coarse < fine == finer == len(radii(layer, 104))
