@@ -134,12 +134,11 @@ class Bench:
     def runs(self, ways: dict[str, Way]) -> Iterator[tuple[str, dict[str, Path]]]:
         """Train and evaluate each scene in each way, in OUT/[PRESET/]WAY/SCENE.
 
-        Yields the scene's name, and the folders of its successful runs by way. Raises InputError if
-        `--ways` names an unknown way.
+        Yields the scene's name, and the folders of its successful runs by way. Raises InputError if `--ways` has a name
+        that no way has.
         """
         options = self.options
-        chosen = options.ways or [*ways]
-        if unknown := [name for name in chosen if name not in ways]:
+        if unknown := [name for name in options.ways if name not in ways]:
             raise InputError(f"--ways: no way is called {', '.join(unknown)}: there are {', '.join(ways)}")
         preset = getattr(options, "preset", "")
         if preset:
@@ -147,8 +146,9 @@ class Bench:
         out = (options.out or clone_root() / "demo" / self.name) / Path(preset).stem
         for capture in find_scenes(options.scenes, options.only):
             done: dict[str, Path] = {}
-            for name in chosen:
-                words, minutes = ways[name]
+            for name, (words, minutes) in ways.items():
+                if options.ways and name not in options.ways:
+                    continue
                 if isinstance(minutes, str):
                     if minutes not in done:
                         continue
@@ -186,7 +186,7 @@ def scene_options(parser: argparse.ArgumentParser, preset: str | None = None) ->
     parser.add_argument("--scenes", type=Path, required=True, help="folder of captures by benchmarks.scenes")
     parser.add_argument("--out", type=Path, help="folder for the runs (default: demo/BENCHMARK)")
     parser.add_argument("--only", nargs="+", metavar="SCENE", help="measure these scenes")
-    parser.add_argument("--ways", nargs="+", metavar="WAY", help="train in these ways, in this order")
+    parser.add_argument("--ways", nargs="+", default=[], metavar="WAY", help="train in these ways")
     if preset:
         parser.add_argument("--preset", default=preset, help=f"a preset's name or a TOML file ({preset})")
     return parser

@@ -170,7 +170,7 @@ def measure_all(bench: Bench, threads: int = THREADS) -> None:
                 bench.record(name, isa, "ms", least=least, median=median, floor=floor)
     finally:
         torch.set_num_threads(before)
-        os.environ.pop("REFGS_ISA", None)
+        os.environ.pop("REFGS_ISA")
         if chosen:
             os.environ["REFGS_ISA"] = chosen
 

@@ -119,6 +119,12 @@ def test_ways_are_valid_settings(way):
     assert changed == (way != needs.AUTO)
 
 
+def test_an_unknown_way_is_said(words, called):
+    with pytest.raises(InputError, match="no way is called sideways: there are deferred, sh"):
+        truth.main([*words, "--ways", "deferred", "sideways"])
+    assert not called
+
+
 def test_no_scene_is_said(scenes):
     with pytest.raises(InputError, match=r"benchmarks\.scenes all"):
         harness.find_scenes(scenes / "ball")
