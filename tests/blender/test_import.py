@@ -25,6 +25,7 @@ from refgs_addon.scene.run_parts import parts, show
 from refgs_addon.scene.run_toml import newer_release
 from refgs_addon.scene.splat_cloud import MATERIALS, normal_slopes, read_splats
 from tests.makers.blender import attribute, evaluated_mesh
+from tests.makers.distances import spread
 from tests.makers.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_columns, write_ply
 
 
@@ -109,9 +110,7 @@ def test_size_opacity_cut_and_display(run):
 def test_normals_bend_as_a_sphere_does(tmp_path):
     count, radius = 600, 2.0
     columns = random_columns(count)
-    steps = np.arange(count) + 0.5
-    z, azimuth = 1 - 2 * steps / count, steps * np.pi * (3 - np.sqrt(5))
-    normal = np.stack([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z], axis=1)
+    normal = spread(count)
     # The shortest rotation from z to the normal: (1 + z, z × n), normalised.
     quaternion = np.stack([1 + normal[:, 2], -normal[:, 1], normal[:, 0], np.zeros(count)], axis=1)
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)

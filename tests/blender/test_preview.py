@@ -17,7 +17,8 @@ from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.render_eevee import render_preview
 from refgs_addon.scene.run_parts import show
 from refgs_addon.scene.world_light import relight
-from tests.makers.runs import COLUMNS, look_at, read_exr, write_panorama, write_ply
+from tests.makers.captures import look_at
+from tests.makers.runs import COLUMNS, read_exr, write_panorama, write_ply
 
 SIZE = 64
 

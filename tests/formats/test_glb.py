@@ -11,7 +11,7 @@ from refgs.color import srgb_encode
 from refgs.formats.exr import read_exr
 from refgs.formats.gltf import write_glb
 from refgs.formats.tangents import vertex_tangents
-from tests.makers.box import read_glb, textured_box
+from tests.makers.box import glb_chunks, textured_box
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def written(tmp_path_factory):
 def test_what_mirrors_nothing_is_written_so(written, tmp_path):
     _, mesh, textures = written
     write_glb(tmp_path / "mesh.glb", mesh, replace(textures, specular=0.0))
-    gltf, _ = read_glb(tmp_path / "mesh.glb")
+    gltf, _ = glb_chunks(tmp_path / "mesh.glb")
     assert gltf["materials"][0]["extensions"] == {"KHR_materials_specular": {"specularFactor": 0.0}}
     assert gltf["extensionsUsed"] == ["KHR_materials_specular"] and "extensionsRequired" not in gltf
 
@@ -44,7 +44,7 @@ def test_the_folder_holds_what_it_should(written):
 
 def test_gltf_is_y_up_and_routes_its_channels(written):
     folder, mesh, textures = written
-    gltf, binary = read_glb(folder / "mesh.glb")
+    gltf, binary = glb_chunks(folder / "mesh.glb")
     material = gltf["materials"][0]
     assert material["doubleSided"] and material["name"] == "RefGS"
     surface = material["pbrMetallicRoughness"]
@@ -69,6 +69,8 @@ def test_gltf_is_y_up_and_routes_its_channels(written):
 
 def test_blender_imports_it_upright_with_the_right_material(written):
     bpy = pytest.importorskip("bpy")
+    from tests.makers.blender import principled
+
     folder, mesh, _ = written
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.import_scene.gltf(filepath=str(folder / "mesh.glb"))
@@ -76,8 +78,7 @@ def test_blender_imports_it_upright_with_the_right_material(written):
     world = np.array([found.matrix_world @ v.co for v in found.data.vertices])
     np.testing.assert_allclose([world.min(0), world.max(0)], [[-1, -2, 0], [1, 2, 6]], atol=1e-5)
 
-    nodes = found.data.materials[0].node_tree.nodes
-    shader = next(n for n in nodes if n.type == "BSDF_PRINCIPLED")
+    shader = principled(found.data.materials[0])
 
     def source(socket):
         link = socket.links[0]

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from refgs.formats.gltf import write_glb
 from refgs.formats.splats import Splats, read_splats, write_display_splats
-from tests.makers.box import read_glb, textured_box
+from tests.makers.box import glb_chunks, textured_box
 
 TOOLS = Path(__file__).parents[1] / "tools"
 NODE = shutil.which("node")
@@ -114,7 +114,7 @@ def test_gltf_of_splats(tmp_path):
     splats = discs()
     write_display_splats(tmp_path / "a.ply", splats)
     transform(tmp_path / "a.ply", tmp_path / "a.glb", "-r", "-90,0,0")
-    gltf, binary = read_glb(tmp_path / "a.glb")
+    gltf, binary = glb_chunks(tmp_path / "a.glb")
     assert "KHR_gaussian_splatting" in gltf["extensionsUsed"]
     (primitive,) = gltf["meshes"][0]["primitives"]
     rows = PlyData.read(str(tmp_path / "a.ply"))["vertex"]

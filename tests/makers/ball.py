@@ -12,6 +12,7 @@ from refgs.formats.splats import write_splats
 from refgs.model.surfels import activate, initial_parameters, to_splats
 from refgs.run import create_run
 from refgs.settings import load_settings
+from tests.makers.distances import spread
 
 TURN = Rotation.from_euler("zyx", [40, 25, -70], degrees=True).as_matrix()
 SCALE, MOVE = 3.0, np.array([5.0, -2.0, 1.0])
@@ -21,12 +22,10 @@ BOX = trimesh.creation.box((1.0, 1.4, 0.8)).subdivide().subdivide()
 def write_run(folder, capture):
     """Write the run folder of a metal ball, whose upper half is rough and lower half smooth. The run's mesh is a box."""
     create_run(folder, capture, load_settings("quick", ["environment.resolution=16"]), "quick", "cpu")
-    steps = np.arange(3000) + 0.5
-    z, azimuth = 1 - 2 * steps / len(steps), steps * np.pi * (3 - np.sqrt(5))
-    points = np.stack([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z], axis=1)
+    points = spread(3000)
     look = {"opacity": 0.95, "sh_degree": 0, "albedo": 0.7, "metallic": 0.9, "roughness": 0.3}
     surfels = activate(initial_parameters(points, points, np.full(3000, 0.04), None, **look))
-    roughness = torch.where(torch.from_numpy(z) > 0, 0.6, 0.2).float()
+    roughness = torch.where(torch.from_numpy(points[:, 2]) > 0, 0.6, 0.2).float()
     splats = to_splats(surfels._replace(roughness=roughness, indirect_dc=surfels.indirect_dc[:, :0]))
     write_splats(folder / "splats.ply", splats)
     write_exr(folder / "environment.exr", sky(directions(64, 128)))

@@ -25,7 +25,7 @@ def textured_box():
     return mesh, Textures(colour, full(0.75), full(0.3), full(0.9), full(0.6, 0, 0.8), np.ones((SIZE, SIZE), bool))
 
 
-def read_glb(file):
+def glb_chunks(file):
     """Read a binary glTF file: its JSON as a mapping, and the bytes of its buffer."""
     data = file.read_bytes()
     length = int.from_bytes(data[12:16], "little")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 CENTRE = np.array([1.0, 2.0, 3.0])
@@ -14,9 +15,9 @@ RADIUS = 0.5
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
+def look_at(position: ArrayLike, target: ArrayLike = (0, 0, 0)) -> np.ndarray:
     """Return the camera-to-world matrix, with OpenGL axes, of a camera that looks at `target`; +Z is up."""
-    back = (position - target) / np.linalg.norm(position - target)
+    back = np.subtract(position, target) / np.linalg.norm(np.subtract(position, target))
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     pose = np.eye(4)

@@ -7,6 +7,8 @@ import OpenEXR
 import trimesh
 from plyfile import PlyData, PlyElement
 
+from tests.makers.captures import look_at
+
 COUNT, SIZE = 40, 64
 COLUMNS = [
     "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1",
@@ -19,16 +21,6 @@ def quaternion_matrix(q):
     w, xyz = q[:, :1, None], q[:, None, 1:]
     axes = np.eye(3)[None]
     return np.swapaxes(axes + 2 * np.cross(xyz, np.cross(xyz, axes) + w * axes), 1, 2)
-
-
-def look_at(eye, target=(0, 0, 0)):
-    """Return the camera-to-world matrix, with OpenGL axes, of a camera that looks at `target`; +Z is up."""
-    back = np.subtract(eye, target) / np.linalg.norm(np.subtract(eye, target))
-    right = np.cross([0, 0, 1], back)
-    right /= np.linalg.norm(right)
-    matrix = np.eye(4)
-    matrix[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)
-    return matrix
 
 
 def write_ply(path, columns):

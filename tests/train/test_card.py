@@ -7,21 +7,16 @@ import trimesh
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake_temporarily
 
-from refgs.formats.mesh import Mesh
-from refgs.geometry.visibility import Occluder
 from refgs.kernels import cuda
 from refgs.model import prefilter
 from refgs.render import raster_cuda, shade
 from tests.makers.emulate import emulate
+from tests.makers.occluders import as_occluder
 from tests.makers.training import TINY, trainer
 
 CARD = torch.device("cuda:0")
 # At a metallic of 0.5, a metal and a dielectric are so equally bright that derivatives are only rounding.
 START = [*TINY, "surfels.metallic=0.8"]
-
-
-def occluder(shape: trimesh.Trimesh) -> Occluder:
-    return Occluder(Mesh(shape.vertices, np.asarray(shape.faces)))
 
 
 @pytest.mark.parametrize(
@@ -33,7 +28,7 @@ def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
     for name in ("cpu", "card"):
         made = trainer(ball_capture, tmp_path / name, *START, *changes, total=3000)
         if "indirect.start=0" in changes:
-            made.state.occluder = occluder(trimesh.creation.torus(1.0, 0.3).apply_scale(made.state.capture.radius))
+            made.state.occluder = as_occluder(trimesh.creation.torus(1.0, 0.3), scale=made.state.capture.radius)
         if name == "card":
             emulate(monkeypatch)
         steps = [made.step() for _ in range(3)]
@@ -112,7 +107,7 @@ def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, ind
 
     With fake tensors, reading a value is an error. Making a tensor whose size depends on a value is an error too.
     """
-    ball = occluder(trimesh.creation.icosphere(2))
+    ball = as_occluder(trimesh.creation.icosphere(2))
     tree = ball.tree(torch.device("cpu"))
     launched = follow_to_the_card(monkeypatch)
     with FakeTensorMode(allow_non_fake_inputs=True):

@@ -14,9 +14,7 @@ import pytest
 import torch
 
 from benchmarks.scenes.analytic import write_ball_capture
-from refgs.formats.mesh import Mesh
 from refgs.formats.splats import read_splats
-from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.run import open_run
 from refgs.train import needs, probe
@@ -27,7 +25,7 @@ from refgs.train.measures import held_out_psnr
 from refgs.train.needs import lighting, photos, schedule
 from refgs.train.plan import Plan
 from refgs.train.trace import why_not_traced
-from tests.makers.occluders import plate
+from tests.makers.occluders import as_occluder, plate
 from tests.makers.training import asset_error, check_equal, put
 from tests.makers.training import trainer as small
 
@@ -171,8 +169,7 @@ def test_reflections_by_what_they_could_be_worth(ball_capture, tmp_path):
     """
     made = trainer(ball_capture, tmp_path / "run", "surfels.metallic=0.9", total=150)
     made.run(stop=lambda: made.state.iteration == 99)
-    above = plate(0.5, -1)  # faces down
-    made.state.occluder = Occluder(Mesh(3 * above.vertices, np.asarray(above.faces)))
+    made.state.occluder = as_occluder(plate(0.5, -1), scale=3.0)  # faces down, above the ball
     needs.evaluate_mesh(made.state, 0.2)
     found = made.state.needs.pop("reflections")
     assert found["needed"] and found["statistic"] > lighting.Reflections.threshold
@@ -318,7 +315,7 @@ def photographed(state, photo, noise=0.0):
 
 
 def test_specular_on_synthetic_surfels(ball_capture, tmp_path):
-    """Check that specular shading gains over 3 dB in photos of a ball_capture, and under 0.3 dB in photos of a matte ball.
+    """Check that specular shading gains over 3 dB in photos of a mirror, and under 0.3 dB in photos of a matte ball.
 
     The photos are renderings of the model itself.
     """
