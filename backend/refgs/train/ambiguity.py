@@ -20,47 +20,50 @@ Explanation = tuple[Surfels, Tensor]
 Change = Callable[[Explanation, float], Explanation]
 
 
-def _brighter(of: Explanation, size: float) -> Explanation:
-    return of[0], of[1] * (1 + size)
+def _brighter(old: Explanation, size: float) -> Explanation:
+    return old[0], old[1] * (1 + size)
 
 
-def _redder(of: Explanation, size: float) -> Explanation:
-    return of[0], of[1] * (1 + size * torch.tensor([1.0, 0.0, -1.0]).to(of[1]))
+def _redder(old: Explanation, size: float) -> Explanation:
+    return old[0], old[1] * (1 + size * torch.tensor([1.0, 0.0, -1.0]).to(old[1]))
 
 
-def _blurred(of: Explanation, size: float) -> Explanation:
-    """Blur the light of `of`: blend the mean of each texel's neighbours into the texel. `size` is the mean's weight.
+def _blurred(old: Explanation, size: float) -> Explanation:
+    """Blur the environment's light: blend each texel with the mean of its neighbours, which gets the weight `size`.
 
-    Neighbours lie on the same face, up to a sixteenth of the face's side away.
+    Neighbours lie on the same face of the cubemap, at most a sixteenth of the face's side away.
     """
-    side = round((len(of[1]) // 6) ** 0.5)
-    faces = of[1].view(6, side, side, 3).permute(0, 3, 1, 2)
+    side = round((len(old[1]) // 6) ** 0.5)
+    faces = old[1].view(6, side, side, 3).permute(0, 3, 1, 2)
     reach = max(1, side // 16)
     padded = torch.nn.functional.pad(faces, (reach,) * 4, mode="replicate")
     mean = torch.nn.functional.avg_pool2d(padded, 2 * reach + 1, stride=1).permute(0, 2, 3, 1).reshape(-1, 3)
-    return of[0], (of[1] + size * (mean - of[1])).clamp_min(0)
+    return old[0], (old[1] + size * (mean - old[1])).clamp_min(0)
 
 
-def _lighter(of: Explanation, size: float) -> Explanation:
-    return of[0]._replace(albedo=of[0].albedo * (1 + size)), of[1]
+def _lighter(old: Explanation, size: float) -> Explanation:
+    return old[0]._replace(albedo=old[0].albedo * (1 + size)), old[1]
 
 
-def _warmer(of: Explanation, size: float) -> Explanation:
-    return of[0]._replace(albedo=of[0].albedo * (1 + size * torch.tensor([1.0, 0.0, -1.0]).to(of[1]))), of[1]
+def _warmer(old: Explanation, size: float) -> Explanation:
+    return old[0]._replace(albedo=old[0].albedo * (1 + size * torch.tensor([1.0, 0.0, -1.0]).to(old[1]))), old[1]
 
 
-def _rougher(of: Explanation, size: float) -> Explanation:
-    return of[0]._replace(roughness=(of[0].roughness + size).clamp(0, 1)), of[1]
+def _rougher(old: Explanation, size: float) -> Explanation:
+    return old[0]._replace(roughness=(old[0].roughness + size).clamp(0, 1)), old[1]
 
 
-def _more_metal(of: Explanation, size: float) -> Explanation:
-    return of[0]._replace(metallic=of[0].metallic + size * (1 - 2 * of[0].metallic)), of[1]  # towards the other kind
+def _more_metal(old: Explanation, size: float) -> Explanation:
+    return old[0]._replace(metallic=old[0].metallic + size * (1 - 2 * old[0].metallic)), old[
+        1
+    ]  # towards the other kind
 
 
 class Trade(NamedTuple):
-    """Pair a change of a given size with another change that may cancel it in the pictures.
+    """Hold two changes of the scene that may cancel in the pictures, such as a brighter light and a darker base colour.
 
-    `change` is made by `size`, and `made_up` is the other change. `words` and `answer` name them for the artist.
+    `change` is the first one, and `size` is how strong it is. `made_up` is the second one, which may make up for the first. `words` names
+    the first change for the user, and `answer` names the second.
     """
 
     words: str
@@ -79,14 +82,17 @@ TRADES = {
 
 
 def ambiguities(state: State) -> dict[str, dict]:
-    """Measure at the end of the training how far the two changes of each trade (see `Trade`) cancel.
+    """Measure how well the two changes of each pair in `TRADES` cancel in the pictures of a finished training.
 
-    Returns these figures for each of `TRADES`; without light, an empty dictionary. `alone`, `left` and `error` are root mean squares of
-    encoded colours.
+    Returns a dictionary for each pair, or nothing if the scene has no light:
 
-    `alone` is how far the first change alters the pictures. `answer` is the size of the other change that cancels it best. `left` is how
-    far both changes together alter the pictures. `error` is the pictures' error against the photos. `what` is a line for the artist,
-    present only if `left` is less than UNSEEN of `error`. Derivatives are finite differences.
+    - `alone`: how much the first change alters the pictures.
+    - `answer`: the strength of the second change that cancels the first one best.
+    - `left`: how much the pictures still change with both changes.
+    - `error`: how much the pictures differ from the photos.
+    - `what`: a message for the user. It is present only if `left` is less than UNSEEN times `error`.
+
+    Differences are root mean squares of encoded colours. They are linear estimates, from a small step of each change.
     """
     light = state.environment()
     if light is None:
@@ -110,9 +116,9 @@ def ambiguities(state: State) -> dict[str, dict]:
     return found
 
 
-def _pictures(state: State, of: Explanation, chosen: range) -> Tensor:
-    """Render the training views `chosen` from surfels and radiance, flattened into one vector."""
-    light = Environment(of[1].contiguous(), state.environment().reference)
-    inputs = RenderInputs(of[0], light, state.settings.render, state.occluder)
+def _pictures(state: State, old: Explanation, chosen: range) -> Tensor:
+    """Render the training views with the indices `chosen`. Return the colours of all pixels as one vector."""
+    light = Environment(old[1].contiguous(), state.environment().reference)
+    inputs = RenderInputs(old[0], light, state.settings.render, state.occluder)
     pictures = (state.picture(inputs, state.views[i].camera, state.exposure(i)) for i in chosen)
     return torch.cat([picture.color.clamp(0, 1).flatten() for picture in pictures])

@@ -24,9 +24,10 @@ from refgs.train.trace import why_not_traced
 
 
 def write_asset(state: State) -> None:
-    """Write splats.ply, environment.exr and needs.json.
+    """Write the results of a training into its run folder.
 
-    Also write occluder.ply and the exposures in cameras.json, where the training has them.
+    These are the surfels (splats.ply), the light (environment.exr), and what the training left out (needs.json). With inter-reflection, the
+    object's mesh is written to occluder.ply. With learned exposures, cameras.json is written again to include them.
     """
     folder, settings = state.folder, state.settings
     with torch.no_grad():
@@ -59,13 +60,13 @@ def write_asset(state: State) -> None:
         factors = state.exposures.detach().exp().tolist()
         exposures = {view.camera.name: factor for view, factor in zip(state.views, factors, strict=True)}
         write_cameras(folder / "cameras.json", state.capture, settings.light.frame, exposures)
-    write_text(folder / "needs.json", json.dumps(_left_out(state, surfels, side, wanted), indent=1))
+    write_text(folder / "needs.json", json.dumps(_needs_rows(state, surfels, side, wanted), indent=1))
 
 
 def _constant_columns(state: State, surfels: Surfels, kept: Tensor) -> dict[str, float]:
-    """Find the columns of splats.ply that have one value for all surfels: metallic, roughness, specular.
+    """Find out which of metallic, roughness and specular have about the same value for all surfels. Return these values by name.
 
-    Only the surfels in `kept` (N,) count.
+    splats.ply then needs no column for them. Only surfels whose entry in `kept` (N,) is true are compared.
     """
     if state.settings.render.reflection == "none" and state.method.lit:
         return {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
@@ -75,12 +76,12 @@ def _constant_columns(state: State, surfels: Surfels, kept: Tensor) -> dict[str,
 
 
 def _with_relightable_albedo(surfels: Surfels, environment: Environment, state: State) -> Surfels:
-    """Recover the albedo under the recovered light, and the SH that a viewer without lights shows.
+    """Return surfels that have both an albedo, for viewers that light them, and SH colours, for viewers without lights.
 
-    If the diffuse part was learned as SH, a dielectric's albedo is the SH's colour divided by the surfel's irradiance. A metal's albedo is
-    its reflectance. If the diffuse part was learned as albedo, the SH are set to the matte colour under that irradiance.
+    If the training learned diffuse colour as SH, compute the albedo: the mean SH colour divided by the irradiance, or for metals the
+    learned reflectance. If the training learned the albedo, compute the SH colour: the albedo times the irradiance.
     """
-    received = _received(surfels, environment, state)
+    received = _irradiance(surfels, environment, state)
     metallic = surfels.metallic[:, None]
     if state.settings.render.diffuse == "sh":
         sent = (0.5 + harmonics.DC * surfels.sh_dc[:, 0]).clamp_min(0)  # the mean over all directions
@@ -90,11 +91,11 @@ def _with_relightable_albedo(surfels: Surfels, environment: Environment, state: 
     return surfels._replace(sh_dc=((look - 0.5) / harmonics.DC)[:, None])
 
 
-def _received(surfels: Surfels, environment: Environment, state: State) -> Tensor:
-    """Compute irradiance / π of each surfel (N, 3).
+def _irradiance(surfels: Surfels, environment: Environment, state: State) -> Tensor:
+    """Compute the irradiance of each surfel, divided by π (N, 3).
 
-    If the light turned with the camera, this is a mean over the photos. In each photo the irradiance is that of the surfel's side towards
-    the camera, weighted by the cosine to the camera.
+    If the light turned with the camera, average over the photos. In each photo the surfel is lit on the side that faces the camera, and
+    photos that show the surfel at a grazing angle count less.
     """
     normals = surfels.normals()
     if environment.reference is None:
@@ -110,10 +111,10 @@ def _received(surfels: Surfels, environment: Environment, state: State) -> Tenso
 
 
 def _seen_side(surfels: Surfels, state: State) -> Tensor:
-    """Find the side of each surfel (N,) that training views see.
+    """Find out which side of each surfel (N,) the training views see.
 
-    1 is the side that the normal points to, −1 the other side. 0 means that no view sees the surfel. If no view sees any surfel, all
-    surfels count as seen.
+    1 is the side that the normal points to, −1 is the other side, and 0 means that no view sees the surfel. If no view sees any surfel, all
+    count as seen.
     """
     surfels = Surfels(*(value.detach() for value in surfels))
     normals = surfels.normals()
@@ -127,10 +128,10 @@ def _seen_side(surfels: Surfels, state: State) -> Tensor:
     return torch.where(side < 0, -1.0, 1.0) * known
 
 
-def _left_out(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) -> list[dict[str, Any]]:
-    """List the rows of needs.json: decisions of `refgs.train.needs`, and what else the run left out, with the reason and the saving.
+def _needs_rows(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) -> list[dict[str, Any]]:
+    """Make the rows of needs.json: what the run decided it needs or leaves out, each with the reason and what was saved.
 
-    `side` (N,) is the result of `_seen_side`. `wanted` (N,) are the surfels in the region to train.
+    `side` (N,) is the result of `_seen_side`. `wanted` (N,) is true for surfels in the region to train.
     """
     settings, method, left = state.settings, state.method, needs.rows(state)
 
@@ -158,7 +159,7 @@ def _left_out(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) -> l
 
 
 def _why_no_mesh(state: State) -> str:
-    """Say why a run that may trace inter-reflection has no mesh to trace it on."""
+    """Explain why a run that has inter-reflection switched on never made a mesh to trace it on."""
     indirect = state.settings.indirect
     first = max(indirect.every, max(indirect.start, state.settings.initial.until) * state.total)
     over = state.total * state.residual_start <= first

@@ -19,9 +19,10 @@ KEPT = 2
 
 
 def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
-    """Write a checkpoint of an iteration. The checkpoint is complete once its TOML file is there.
+    """Write the tensors of an iteration to a safetensors file, and its other values, `facts`, to a TOML file.
 
-    Raises InputError when the disk is full. Earlier checkpoints then stay complete.
+    The checkpoint is complete once its TOML file is there. Older checkpoints than the last two are removed. Raises InputError when the disk
+    is full; earlier checkpoints then stay complete.
     """
     folder.mkdir(exist_ok=True)
     data, note = folder / f"{iteration:08d}.safetensors", folder / f"{iteration:08d}.toml"
@@ -53,7 +54,7 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
 
 
 def complete(folder: Path) -> list[int]:
-    """List the iterations of the complete checkpoints, ascending."""
+    """List the iterations that have a complete checkpoint, in ascending order."""
     return sorted(
         int(file.stem)
         for file in folder.glob("*.toml")
@@ -62,7 +63,7 @@ def complete(folder: Path) -> list[int]:
 
 
 def load(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the last complete checkpoint's tensors and facts. Raises InputError where there is none."""
+    """Read the tensors, and the other values as a dictionary, from the last complete checkpoint. Raises InputError if there is none."""
     iterations = complete(folder)
     if not iterations:
         raise InputError(f"{folder} holds no complete checkpoint: train without --resume into a new folder")

@@ -20,9 +20,10 @@ LEAST_SURFELS = 1000
 
 
 def faint_now(state: State, opacity: float = SEEN) -> bool:
-    """Tell whether surfels may still be faint because of the last opacity reset.
+    """Tell whether the last opacity reset was so recent that useful surfels may still be too transparent.
 
-    The answer is no once the surfels that the picture needs have had time to reach `opacity` again.
+    An opacity reset makes all surfels nearly transparent. Useful surfels become opaque again as they learn, and this function estimates
+    whether they have had enough iterations to reach `opacity`.
     """
     return faint(state.settings.densify, state.settings.rates, state.iteration, state.total, opacity)
 
@@ -75,11 +76,11 @@ def densify(
     budget: int,
     divide: bool,
 ) -> int:
-    """Remove faint surfels, and divide those with the largest screen gradients, up to the budget.
+    """Remove faint surfels. If `divide` is true, also divide the surfels with the largest screen gradients, up to the budget.
 
-    A surfel is divided in two along its longer axis. At least one surfel is kept. Parameters are replaced in the dictionary and in the
-    optimiser. Surfels that were not divided keep Adam's moments; the halves of a divided one start with zero moments. Returns how many
-    surfels were divided.
+    `gradient` (N,) is each surfel's screen gradient. A surfel is divided into two halves along its longer axis. Parameters are replaced in
+    the dictionary and in the optimiser. The halves start with zero Adam moments; other surfels keep theirs. At least one surfel is kept.
+    Returns how many surfels were divided.
     """
     opacity = parameters["opacity"].sigmoid()
     keep = ~(opacity < settings.prune_opacity)  # NaN is kept here: guard.py removes it, with a warning
@@ -113,10 +114,11 @@ def reset_opacity(parameters: Parameters, optimizer: Adam) -> None:
 
 
 def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total: int, opacity: float) -> bool:
-    """Tell whether surfels may still be faint because of the last opacity reset before `iteration`.
+    """Tell whether the last opacity reset before `iteration` was so recent that useful surfels may still be too transparent.
 
-    The answer is no once the surfels that the picture needs have had time to reach `opacity` again. The time needed is estimated: Adam
-    moves the logit of an opacity by about the learning rate in each iteration, and the rate decays. Surfels get four times this estimate.
+    An opacity reset makes all surfels nearly transparent. Useful surfels become opaque again as they learn. The time until they reach
+    `opacity` is estimated: in each iteration, Adam moves an opacity's logit by about the learning rate, which decays. The function returns
+    true until four times this estimate has passed. `total` is the number of iterations of the training.
     """
     every = settings.reset_every
     last = min(iteration, math.ceil(settings.stop * total)) - 1  # a reset at the end of this iteration does not count
@@ -134,10 +136,10 @@ def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total:
 
 @torch.no_grad()
 def propagate_normals(parameters: Parameters, optimizer: Adam, settings: PropagationSettings) -> None:
-    """Propagate normals from mirrors to their surroundings (paper §3.3).
+    """Propagate normals from mirror-like surfels to the surfels around them (paper §3.3).
 
-    All surfels become opaque, and surfels that mirror become larger. The larger surfels then cover pixels around them, which are shaded
-    with their normals. Training adapts the covered surfels.
+    Smooth, metallic surfels are enlarged, and all opacities are raised to at least `settings.opacity`. The enlarged surfels then cover
+    their neighbours' pixels, which are shaded with the enlarged surfels' normals. Further training adapts the neighbours to them.
     """
     parameters["opacity"].clamp_(min=math.log(settings.opacity / (1 - settings.opacity)))
     optimizer.state.pop(parameters["opacity"], None)
@@ -153,12 +155,15 @@ def thin(parameters: Parameters, optimizer: Adam, count: int) -> None:
 
 
 def full_card() -> InputError:
-    """Make the error for a card whose memory is too small. Its message says what helps."""
+    """Return the InputError to raise if the graphics card has too little memory. Its message tells the user what to do."""
     return InputError("the card's memory is too small: close what else uses it, or take --device cpu")
 
 
 def fewer_surfels(state: State) -> None:
-    """Lower the budget and keep the most opaque surfels. Raises InputError where too few would be left."""
+    """Keep only the most opaque surfels, the fraction FEWER of all, because the graphics card's memory is full.
+
+    The surfel budget is lowered to the same number. Raises InputError if fewer than LEAST_SURFELS would be left.
+    """
     budget = int(FEWER * len(state.parameters["position"]))
     if budget < LEAST_SURFELS:
         raise full_card()
@@ -171,10 +176,11 @@ def fewer_surfels(state: State) -> None:
 
 
 def take(parameters: Parameters, optimizer: Adam, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
-    """Replace the surfels by those at `index`, with their Adam moments. Rows at `fresh` start with zero moments.
+    """Replace all surfels by the rows `index` of their parameters. A row may be taken more than once.
 
-    At first, zero moments make Adam move fresh rows by several times the learning rate. The picture then gets worse for a while, but
-    captures without masks end better. If memory does not suffice, nothing is replaced.
+    Adam's moments are taken along, but the rows of the result that `fresh` lists start with zero moments. Adam then moves these rows faster
+    than others at first: pictures get worse for a while, but captures without masks end better. If memory runs out, nothing has changed
+    yet.
     """
     groups = [group for group in optimizer.param_groups if group["name"] in parameters]  # without light and exposures
     made = []
@@ -194,9 +200,10 @@ def take(parameters: Parameters, optimizer: Adam, index: Tensor, fresh: Sequence
 
 
 def _divide(parameters: Parameters, first: Tensor, second: Tensor) -> None:
-    """Move the two copies of a divided surfel apart along its longer axis.
+    """Make two halves of each divided surfel, so that together they cover what it covered.
 
-    Together the copies cover what the surfel covered.
+    The rows `first` and `second` of the parameters hold two equal copies of each surfel. Move the copies apart along the longer axis, and
+    shorten them along it.
     """
     scale = parameters["scale"][first]
     longer = scale.argmax(dim=1)

@@ -1,4 +1,4 @@
-"""Track a training's settings in effect: the settings that were asked for, and each change with its cause."""
+"""Keep track of the settings that a training uses: the user's settings, and every later change with its reason."""
 
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
@@ -11,7 +11,10 @@ By = Literal["plan", "photos", "needs", "memory"]
 
 @dataclass(frozen=True)
 class Change:
-    """Record the change of one setting: the value asked for, the new value, the cause and the reason."""
+    """Record that the training changed a setting.
+
+    `asked` is the user's value, and `became` is the new value. `by` says what caused the change (see `By`), and `why` explains it in words.
+    """
 
     asked: Any
     became: Any
@@ -21,9 +24,9 @@ class Change:
 
 @dataclass(frozen=True)
 class Effective:
-    """Hold a training's settings in effect, and how each came to differ from the setting that was asked for.
+    """Hold the settings that a training uses now, and a record of each change that the training made to the user's settings.
 
-    The user's own settings are in `asked` and never change.
+    `asked` holds the user's own settings, which never change. `settings` holds those in use.
     """
 
     asked: Settings
@@ -32,38 +35,44 @@ class Effective:
 
     @classmethod
     def of(cls, asked: Settings) -> "Effective":
-        """Start from the settings that were asked for."""
+        """Start from the user's settings `asked`, without any changes."""
         return cls(asked, asked)
 
     def changed(self, key: str, value: Any, by: By, why: str) -> "Effective":
-        """Return a copy in which one setting, given by its key `section.name`, is changed. The copy records the cause and the reason."""
+        """Return a copy in which one setting has a new value. Its `key` is "section.name".
+
+        The copy records what caused the change, `by`, and the reason in words, `why`.
+        """
         section, name = key.split(".")
         table = getattr(self.settings, section).model_copy(update={name: value})
         return self.moved_to(self.settings.model_copy(update={section: table}), by, why)
 
     def noted(self, key: str, value: Any, by: By, why: str) -> "Effective":
-        """Return a copy that records the change of a number, but keep `settings` as they are.
+        """Return a copy that only records a change of the setting `key`. The value in `settings` stays the same.
 
-        This is for numbers that the training's state holds itself, such as the total of iterations.
+        Use this for values that the training keeps outside its settings, such as its total of iterations.
         """
-        return replace(self, changes=self.changes | {key: Change(_numbers(self.asked)[key], value, by, why)})
+        return replace(self, changes=self.changes | {key: Change(_by_key(self.asked)[key], value, by, why)})
 
     def moved_to(self, settings: Settings, by: By, why: str) -> "Effective":
-        """Return a copy with other settings. The copy records each setting that differs as a change."""
-        asked, before, after = (_numbers(s) for s in (self.asked, self.settings, settings))
+        """Return a copy that uses other settings, and records a change for each setting that differs.
+
+        `by` says what caused the changes, and `why` explains them in words.
+        """
+        asked, before, after = (_by_key(s) for s in (self.asked, self.settings, settings))
         changes = {key: Change(asked[key], value, by, why) for key, value in after.items() if value != before[key]}
         return replace(self, settings=settings, changes=self.changes | changes)
 
     def chosen(self) -> dict[str, str]:
-        """List the settings that the photos chose, with the reasons: the table [chosen] of run.toml."""
+        """Return the settings whose values were chosen from the photos, as "value: reason" by key: the table [chosen] of run.toml."""
         return {key: f"{change.became}: {change.why}" for key, change in self.changes.items() if change.by == "photos"}
 
     def rows(self) -> dict[str, dict[str, Any]]:
-        """List the settings that were changed, with the value asked for and the new value: the table [changed] of run.toml."""
+        """Return all changed settings by key, each with the user's value, the new value and the reason: the table [changed] of run.toml."""
         return {key: asdict(change) for key, change in self.changes.items()}
 
 
-def _numbers(settings: Settings) -> dict[str, Any]:
-    """List the values of all settings by their dotted keys."""
+def _by_key(settings: Settings) -> dict[str, Any]:
+    """Flatten settings to a dictionary with keys such as "train.iterations"."""
     tables = settings.model_dump(mode="json")
     return {f"{section}.{name}": value for section, table in tables.items() for name, value in table.items()}

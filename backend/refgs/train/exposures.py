@@ -1,4 +1,4 @@
-"""Stop learning an exposure for each photo, if the photos turn out to have equal exposures."""
+"""Stop learning one exposure for each photo, if all photos turn out to have about the same exposure."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Fit settings to a given time: between the presets `quick` and `standard`, or beyond `standard`."""
+"""Choose the settings of a training that must end within a given time. They range from the preset `quick` to beyond `standard`."""
 
 import math
 from pathlib import Path
@@ -18,13 +18,14 @@ STEPS, MOST = 64, 2.0  # steps in which settings richer than quick are tried, an
 
 
 def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, device: str, report: Report) -> Trainer:
-    """Make a trainer for a capture. Its settings are chosen to fit into the time of `plan`.
+    """Make a trainer whose settings let the training end within `plan.minutes`.
 
-    All numbers are interpolated geometrically between the presets `quick` and `standard`, and extrapolated as far again beyond `standard`.
-    If the time is too short for `quick`, or longer than the richest settings take, the number of iterations changes instead.
+    A few iterations with the preset `quick` measure how long an iteration takes. Then the richest settings that fit into the time are
+    chosen from those that `between` makes, from `quick` to beyond `standard`. If even `quick` takes too long, or the richest settings leave
+    time to spare, the number of iterations is changed instead.
 
-    Some iterations with `quick`, the rehearsal, measure the pace. If the trainer keeps the settings of `quick`, the rehearsal's iterations
-    are the training's first.
+    If the settings stay those of `quick`, the measured iterations are kept as the first of the training. `changes` are the user's settings,
+    such as "train.seed=1".
     """
     quick, standard = (load_settings(preset, changes) for preset in ("quick", "standard"))
     begun, said = plan.spent, []
@@ -39,7 +40,7 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
     pixels = _pixels(capture, quick)
 
     def iterations(settings: Settings) -> float:
-        """Estimate how many iterations with these settings fit into the time."""
+        """Estimate how many iterations with these settings fit into the time that is left."""
         larger = _pixels(capture, settings) / pixels
         # There may be fewer points to start from than the settings ask for.
         start = settings.surfels.start if first == quick.surfels.start else first
@@ -78,9 +79,9 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
 
 
 def between(quick: Settings, standard: Settings, part: float) -> Settings:
-    """Interpolate two presets geometrically: `part` 0 gives `quick`, 1 gives `standard`, and more than 1 extrapolates.
+    """Interpolate geometrically between two presets: `part` 0 gives `quick`, 1 gives `standard`, and more than 1 extrapolates.
 
-    The cubemap's side is rounded down to a power of two.
+    The side of the light's cubemap is rounded down to a power of two.
     """
     tables, ends = quick.model_dump(), standard.model_dump()
     for section, values in tables.items():
@@ -93,11 +94,11 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
 
 
 def _scheduled(settings: Settings, iterations: float, quick: Settings, standard: Settings) -> Settings:
-    """Scale the schedule in `settings` to `iterations`, and adapt the learning rates where that is needed.
+    """Set the number of iterations, and adapt the schedule and the learning rates to it.
 
-    The rates suit any number of iterations between those of `quick` and `standard`. With fewer or more iterations, the rates are multiplied
-    by √(nearest suitable number / iterations). Each step has the noise of one view. With these rates, the total noise of all steps does not
-    depend on how many steps there are.
+    The learning rates suit every number of iterations from that of `quick` to that of `standard`. Outside this range, they are multiplied
+    by √(nearest number in the range / iterations), at most by FASTEST. This keeps the total noise of the training constant, because each
+    step adds the noise of one view.
     """
     tables, part = settings.model_dump(), iterations / settings.train.iterations
     usual = min(max(iterations, quick.train.iterations), standard.train.iterations)

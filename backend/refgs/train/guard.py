@@ -1,4 +1,4 @@
-"""Guard a training against numbers that are not finite: skip and count such steps, remove such surfels."""
+"""Guard a training against NaN and infinity: skip and count the steps that have them, and remove the surfels that have them."""
 
 import math
 
@@ -26,10 +26,10 @@ SMALLEST, LARGEST = 1e-6, 1e2  # of a surfel, in scene radii
 
 
 def limits(name: str, radius: float, brightest: float) -> tuple[float, float]:
-    """Return the lowest and the highest raw value that a parameter may take.
+    """Return the lowest and the highest value that the raw parameter `name` may take, before its activation function.
 
-    Beyond these limits, gradients would be too small to lead the parameter back. `radius` is the scene's radius, and `brightest` is the
-    limit for the light's raw texels.
+    Beyond these limits, gradients would be too small for the parameter to return. `radius` is the scene's radius. `brightest` is the
+    highest raw value of the light's texels.
     """
     if name == "scale":
         return math.log(SMALLEST * radius), math.log(LARGEST * radius)
@@ -50,9 +50,9 @@ class Guard:
 
     @torch.no_grad()
     def judge(self, loss: Tensor, optimizer: Adam) -> Tensor:
-        """Return 1 if a step may be taken, else 0, as a float32 scalar.
+        """Return 1 if the optimiser may take this step, else 0, as a float32 scalar tensor.
 
-        A step may be taken if the loss and the sum of the gradients' squares, which Adam needs, are finite.
+        The step may be taken if the loss and the sum of all squared gradients are finite. Steps that may not be taken are counted.
         """
         gradients = [
             value.grad for group in optimizer.param_groups for value in group["params"] if value.grad is not None
@@ -70,10 +70,11 @@ class Guard:
         return int(self._counts[0])
 
     def look(self, state: State, whole: bool) -> str:
-        """Warn of skipped steps, and remove surfels that are not finite.
+        """Look for numbers that are not finite: warn of skipped steps, and remove surfels that have such numbers.
 
-        Surfels are checked if steps were skipped since the last call, or if `whole` is true. Returns why the training must go back to its
-        last checkpoint, or "" if it need not. Raises InputError if there is no checkpoint, or if going back to it did not help before.
+        Surfels are only checked if steps were skipped since the last call, or if `whole` is true. If the light is broken, or too many steps
+        in a row were skipped, the training must go back to its last checkpoint, and the reason is returned. Otherwise "" is returned.
+        Raises InputError if there is no checkpoint, or if the training failed again after it went back.
         """
         total, in_a_row, taken = (int(count) for count in self._counts.tolist())
         worse, self._seen = total > self._seen, total
@@ -124,6 +125,6 @@ def remove_broken(parameters: Parameters, optimizer: Adam) -> int:
 
 
 def running(mean: Tensor, figure: Tensor) -> Tensor:
-    """Update a running mean with one more figure, unless the figure is not finite."""
+    """Return the running mean after a new value, `figure`. If the value is not finite, return the mean unchanged."""
     known = torch.where(mean.isfinite(), figure + 0.95 * (mean - figure), figure)
     return torch.where(figure.isfinite(), known, mean)

@@ -1,4 +1,4 @@
-"""Record the history of a training in RUN/history.jsonl, one object a line (docs/run-folder.md)."""
+"""Record the history of a training in RUN/history.jsonl: one JSON object per line (see docs/run-folder.md)."""
 
 import json
 import math
@@ -16,20 +16,20 @@ BESIDE = ("reading", "start", "writing", "measuring", "FLIP")  # parts of the cl
 
 
 def due(iteration: int) -> bool:
-    """Tell whether to record an iteration.
+    """Tell whether the history should have a line for this iteration.
 
-    While the iteration grows tenfold, A_DECADE iterations are recorded, evenly spaced by logarithm. The trainer also records the last
-    iteration.
+    Lines are evenly spaced on a logarithmic axis: A_DECADE lines from iteration 10 to 100, as many from 100 to 1000, and so on.
     """
     place, before = (math.floor(A_DECADE * math.log10(max(i, 1))) for i in (iteration, iteration - 1))
     return iteration >= FIRST and place > before
 
 
 def allowed(iteration: int, total: int, seconds: float) -> float:
-    """Return how many seconds all measurements of errors before this iteration may have taken together. FLIP has the same limit again.
+    """Return how many seconds may have been spent on measuring errors before this iteration.
 
-    `seconds` is how long the training took so far. Measuring may take the fraction SHARE of the training's expected time. This time is
-    spread evenly over the history's lines, which are evenly spaced by the iteration's logarithm.
+    If more were spent, errors are not measured now. `total` is the training's number of iterations, and `seconds` is how long it has taken
+    so far. By the end, measuring may have taken the fraction SHARE of the training's expected time. The limit grows to this with the
+    logarithm of the iteration, as the history's lines do. FLIP has a limit of its own, of the same size.
     """
     lines = math.log(max(total / FIRST, 1)) or 1.0
     passed = min(math.log(max(iteration / FIRST, 1)) / lines, 1.0)
@@ -37,9 +37,10 @@ def allowed(iteration: int, total: int, seconds: float) -> float:
 
 
 def record(state: State, measures: Measures, loss: float, quality: float) -> None:
-    """Add a line that describes the training as it stands.
+    """Add a line to the history that describes the training now.
 
-    `loss` is the running mean of its loss, `quality` that of its PSNR on training views.
+    `loss` is the running mean of the training loss, and `quality` is that of the PSNR on training views. Errors against held-out photos and
+    ground truth are measured if there is time for it (see `allowed`).
     """
     limit = math.inf if state.ended else allowed(state.iteration, state.total, state.seconds)
     parts = dict(state.clock.seconds)
@@ -62,7 +63,7 @@ def record(state: State, measures: Measures, loss: float, quality: float) -> Non
 
 
 def trim(folder: Path, iteration: int) -> None:
-    """Remove the lines of iterations after `iteration`, which will be recorded again."""
+    """Remove from the history the lines of iterations after `iteration`, because the training will do these iterations again."""
     file = folder / FILE
     if file.exists():
         kept = [line for line in read(file.read_text(encoding="utf-8")) if line.get("iteration", math.inf) <= iteration]

@@ -1,6 +1,6 @@
-"""Learn the environment's light: refine its resolution, diffuse between texels, measure its mean radiance.
+"""Learn the environment's light, a cubemap: raise its resolution, smooth it by diffusion, and compute its mean radiance.
 
-A term of the loss keeps this mean grey, so that the light does not take on the colours of the object.
+A term of the loss pulls this mean towards grey, so that the light does not take on the colours of the object.
 """
 
 import math
@@ -72,11 +72,11 @@ def _replace(state: State, texels: Tensor) -> None:
 @timed("optimiser")
 @torch.no_grad()
 def diffuse(state: State) -> None:
-    """Let texels flow into their neighbours on the face, in proportion to the light's learning rate.
+    """Smooth the light a little: let neighbouring texels of a cubemap face flow into each other.
 
-    Diffusion is a step apart from the optimiser's, like decoupled weight decay (Loshchilov and Hutter 2019). If the photos agree on a
-    texel, the optimiser moves it faster than diffusion, and details stay sharp. Texels that only noise moves become even. The mean over
-    all texels does not change.
+    How much they flow is proportional to the light's learning rate. This is a step of its own beside the optimiser's, like decoupled weight
+    decay (Loshchilov and Hutter 2019). Where the photos agree on a texel, the optimiser moves it faster than diffusion, and details stay
+    sharp. Where only noise moves the texels, they become alike. The mean over all texels does not change.
     """
     side = math.isqrt(len(state.light) // 6)
     rate = state.group("environment")["lr"]
@@ -91,9 +91,9 @@ def diffuse(state: State) -> None:
 
 
 def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
-    """Average the light's radiance (3,) over the directions that the object mirrors.
+    """Average the light's radiance (3,) over the directions that the object mirrors towards the cameras.
 
-    The loss may have a term that pulls this mean towards grey. Returns None if it has none, or if `light` is None.
+    Returns None if the scene has no light, or if no term of the loss uses this mean.
     """
     if light is None or state.settings.loss.light == 0:
         return None
@@ -107,9 +107,10 @@ def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
 def mirrored(
     surfels: Surfels, cameras: list[Camera], light: Environment, settings: RenderSettings, near: float
 ) -> Tensor:
-    """Return weights (6·R²,) of the light's texels: the solid angle if a camera sees the texel mirrored, else zero.
+    """Return a weight for each texel of the light (6·R²,), where R is the cubemap's side. The weights sum to one.
 
-    R is the cubemap's side in texels. The weights are scaled to sum to one. If no texel is seen, all texels count.
+    The weight is proportional to the texel's solid angle if a camera sees the texel mirrored in the object, else zero. If no texel is
+    mirrored, all texels are weighted by their solid angles. Surfels nearer to a camera than `near` are not drawn.
     """
     seen = torch.zeros(6 * PART * PART, dtype=torch.bool)
     settings = settings.model_copy(update={"reflection": "microfacet"})  # treat matte surfaces as reflective here
@@ -117,15 +118,15 @@ def mirrored(
         lit = stack(channels(surfels, camera, settings, indirect=True))
         features, _, alpha = rasterize(*discs(surfels, camera), lit, camera, near=near)
         turn = torch.from_numpy(light.turn(camera)).float().T
-        seen[_cells(mirror_directions(features, alpha, camera)[alpha > SOLID].cpu() @ turn)] = True
+        seen[_texels_at(mirror_directions(features, alpha, camera)[alpha > SOLID].cpu() @ turn)] = True
     weights = cubemap.texel_solid_angles(light.resolution).float()
-    part = seen[_cells(cubemap.texel_directions(light.resolution).float())]
+    part = seen[_texels_at(cubemap.texel_directions(light.resolution).float())]
     weights = weights * part if part.any() else weights
     return (weights / weights.sum()).to(light.radiance.device)
 
 
-def _cells(directions: Tensor) -> Tensor:
-    """Find the texels in which directions (P, 3) lie, on a cubemap with PART texels along a side."""
+def _texels_at(directions: Tensor) -> Tensor:
+    """Return the indices of the texels that lie in the directions (P, 3), on a coarse cubemap with PART texels along a side."""
     face, s, t = cubemap.face_coordinates(directions)
     column, row = (((x + 1) / 2 * PART).long().clamp(0, PART - 1) for x in (s, t))
     return (face * PART + row) * PART + column

@@ -28,15 +28,16 @@ LESS = 0.95  # of the error under a still light: the light turns only where it e
 
 
 def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple[str, str]:
-    """Choose "world" or "camera" from the photos. Returns the choice and the reason.
+    """Find out from the photos whether the light stands still ("world") or turns with the camera ("camera").
 
-    `positions` (N, 3) are points on the object's visual hull, with their `normals`. A point's brightness is a number of its own, times a
-    factor of the light. Under a still light, this factor changes from photo to photo with the mirror direction alone. Under a light that
-    turns with the camera, the factor changes with the normal and the mirror direction, both in the camera's frame.
+    Returns this answer, and the reason in words. `positions` (N, 3) and `normals` (N, 3) are points on the object's visual hull. `radius`
+    is the scene's radius.
 
-    The logarithm of the brightness is fitted in three quarters of the photos by harmonics of those directions, a number for each point,
-    and a number for each photo, its exposure. The frame whose fit better predicts the other photos, up to their exposures, is chosen.
-    "camera" is chosen only if it predicts them clearly better. The choice takes seconds and is deterministic.
+    Each possibility is tried as a model of how bright the points look. Both models are fitted to three quarters of the photos, and must
+    then predict the others. A model explains the logarithm of the brightness by a constant for each point, a constant for each photo (its
+    exposure), and spherical harmonics of directions. If the light stands still, this is the mirror direction in the world. If the light
+    turns, these are the normal and the mirror direction in the camera's frame. "camera" is chosen only if its predictions are clearly
+    better. The choice takes seconds and is deterministic.
     """
     points, photos, brightness, still, turning = _observations(views, positions, normals, radius)
     if len(np.unique(photos)) < 2 * FOLDS or len(points) < 100:
@@ -54,10 +55,10 @@ def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndar
 
 
 def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.ndarray, radius: float) -> tuple:
-    """List the brightness of points in the photos, a row for each of the M times that a photo shows a point.
+    """Sample the photos at the points that they show. Returns one row for each of the M pairs of a photo and a visible point.
 
-    Returns the indices of the points and of the photos (M,), the log radiance (M,), and the harmonics (M, K) that explain it under a still
-    light and under a turning light.
+    The results are the points' indices (M,), the photos' indices (M,), the log radiance (M,), and two tables (M, K) of spherical harmonics,
+    which model the radiance: the first under a light that stands still, the second under a light that turns with the camera.
     """
     some = np.arange(0, len(positions), max(1, len(positions) // POINTS))
     coarse = int(np.clip(0.75 * np.sqrt(len(positions)), 16, SIDE))  # coarse enough that points leave no holes
@@ -66,7 +67,7 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
         camera = view.camera.fitted(SIDE)
         shown = cv2.resize(view.image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         radiance = srgb_decode(shown.astype(np.float32) / 255).mean(axis=-1)
-        ahead, behind = _in_front(camera.fitted(coarse), positions, some)
+        ahead, behind = _visibility(camera.fitted(coarse), positions, some)
         towards = camera.position - positions[some]
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         cosine = (normals[some] * towards).sum(axis=1)
@@ -87,10 +88,10 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
     return tuple(np.concatenate(column) for column in zip(*rows, strict=True))
 
 
-def _in_front(camera: Camera, positions: np.ndarray, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tell which of the points with indices `some` are inside the picture.
+def _visibility(camera: Camera, positions: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two arrays for the points whose `indices` are given: whether the point is inside the picture, and how far it is hidden.
 
-    Return also how far each of these points lies behind the foremost of all points at its pixel, in world units.
+    The latter is its distance in world units behind the nearest of all `positions` (N, 3) at the same pixel.
     """
     pixels, depth = project(camera, positions)
     ahead = inside(camera, pixels, depth)
@@ -99,7 +100,7 @@ def _in_front(camera: Camera, positions: np.ndarray, some: np.ndarray) -> tuple[
     foremost = np.full((camera.height, camera.width), np.inf, np.float32)
     np.minimum.at(foremost, (row[ahead], column[ahead]), depth[ahead])
     foremost = cv2.erode(foremost, np.ones((3, 3)))
-    return ahead[some], (depth - foremost[row, column])[some]
+    return ahead[indices], (depth - foremost[row, column])[indices]
 
 
 def _harmonics(directions: np.ndarray) -> np.ndarray:
@@ -107,10 +108,10 @@ def _harmonics(directions: np.ndarray) -> np.ndarray:
 
 
 def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray, photos: np.ndarray) -> float:
-    """Return the mean squared error of a fit on photos that the fit has not seen (cross-validation).
+    """Return the mean squared error with which a linear model predicts photos that it was not fitted to (cross-validation).
 
-    The fit explains each of the `values` (M,) as a sum: a linear function of `terms` (M, K), a number for its point, and a number for its
-    photo. `points` and `photos` (M,) are the indices of these.
+    The model explains each of the `values` (M,) as a linear function of `terms` (M, K), plus a constant for its point, plus a constant for
+    its photo. `points` (M,) and `photos` (M,) hold the index of each value's point and photo.
     """
     total = count = 0
     for fold in range(FOLDS):
@@ -132,6 +133,9 @@ def _prediction_error(values: np.ndarray, terms: np.ndarray, points: np.ndarray,
 
 
 def _means(values: np.ndarray, group: np.ndarray, groups: int) -> np.ndarray:
-    """Average the rows of `values` (M, K) in each group: `group` (M,) is each row's group. Returns (groups, K), zero for empty groups."""
+    """Average the rows of `values` (M, K) that belong to the same group. Returns (groups, K).
+
+    `group` (M,) is the group's index of each row, and `groups` is the number of groups. Empty groups get zero.
+    """
     sums = np.stack([np.bincount(group, column, groups) for column in values.T], axis=1)
     return sums / np.maximum(np.bincount(group, minlength=groups), 1)[:, None]
