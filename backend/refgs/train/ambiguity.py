@@ -54,9 +54,8 @@ def _rougher(old: Explanation, size: float) -> Explanation:
 
 
 def _more_metal(old: Explanation, size: float) -> Explanation:
-    return old[0]._replace(metallic=old[0].metallic + size * (1 - 2 * old[0].metallic)), old[
-        1
-    ]  # towards the other kind
+    # Towards the other kind.
+    return old[0]._replace(metallic=old[0].metallic + size * (1 - 2 * old[0].metallic)), old[1]
 
 
 class Trade(NamedTuple):
@@ -116,9 +115,9 @@ def ambiguities(state: State) -> dict[str, dict]:
     return found
 
 
-def _pictures(state: State, old: Explanation, chosen: range) -> Tensor:
-    """Render the training views with the indices `chosen`. Return the colours of all pixels as one vector."""
-    light = Environment(old[1].contiguous(), state.environment().reference)
-    inputs = RenderInputs(old[0], light, state.settings.render, state.occluder)
+def _pictures(state: State, scene: Explanation, chosen: range) -> Tensor:
+    """Render `scene` in the training views with the indices `chosen`. Return the colours of all pixels as one vector."""
+    light = Environment(scene[1].contiguous(), state.environment().reference)
+    inputs = RenderInputs(scene[0], light, state.settings.render, state.occluder)
     pictures = (state.picture(inputs, state.views[i].camera, state.exposure(i)) for i in chosen)
     return torch.cat([picture.color.clamp(0, 1).flatten() for picture in pictures])

@@ -66,7 +66,7 @@ class Guard:
 
     @property
     def left_out(self) -> int:
-        """Return how many steps this process has skipped."""
+        """Return how many steps were skipped since this process started."""
         return int(self._counts[0])
 
     def look(self, state: State, whole: bool) -> str:
@@ -106,7 +106,7 @@ class Guard:
 
 
 def warn(state: State, what: str) -> None:
-    """Report a warning that names the iteration."""
+    """Report `what` as a warning, together with the current iteration."""
     state.report("warning", {"what": f"iteration {state.iteration}: {what}"})
 
 

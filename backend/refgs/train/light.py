@@ -32,7 +32,7 @@ SOLID = 0.5  # alpha
 
 
 def start_value(state: State) -> float:
-    """Return the raw value that all of the light's texels start from."""
+    """Return the raw value, before activation, at which all texels of the light start."""
     return state.method.light.raw(state.settings.environment.radiance)
 
 

@@ -1,4 +1,4 @@
-"""Compute the objective (paper §3.3): colour, normal consistency, edge-aware smoothness, and further terms such as the mask."""
+"""Compute the training loss (paper §3.3): colour, normal consistency, edge-aware smoothness, and further terms such as the mask."""
 
 from typing import NamedTuple
 
@@ -38,7 +38,7 @@ class Photo(NamedTuple):
         return cls(torch.from_numpy(view.image).to(device), mask, view.camera)
 
     def part(self, rows: slice, columns: slice) -> "Photo":
-        """Crop to these rows and columns."""
+        """Return this photo cropped to ranges of rows and columns."""
         image = self.image[rows, columns].contiguous()
         mask = None if self.mask is None else self.mask[rows, columns].contiguous()
         camera = self.camera.cropped(columns.start, rows.start, image.shape[1], image.shape[0])
@@ -46,10 +46,10 @@ class Photo(NamedTuple):
 
 
 class Objective(NamedTuple):
-    """Hold the training loss of a view and the picture's mean squared error.
+    """Hold the training loss of one view, and the mean squared error of its picture.
 
-    `loss` is a differentiable scalar. `square` is the squared error of the picture clipped to 0..1. If the photo was cropped, the pixels
-    outside the crop count as error-free in both.
+    `loss` is a differentiable scalar. `square` is the mean squared error, of the picture clipped to 0..1. If the photo is a crop, pixels
+    outside the crop count in both, as free of error.
     """
 
     loss: Tensor
@@ -61,7 +61,7 @@ _Work = struct("Losses", "losses.cpp")
 
 @timed("loss")
 class _Objective(torch.autograd.Function):
-    """Compute the objective as an autograd function. Its derivatives are computed together with its value."""
+    """Compute the training loss as an autograd function. Its derivatives are computed together with its value."""
 
     DIFFERENTIABLE = "color", "normal", "depth", "alpha", "material", "light"
 
@@ -140,10 +140,10 @@ class _Objective(torch.autograd.Function):
 
 
 def departure(exposure: Tensor) -> Tensor:
-    """Penalise an exposure other than one, given the exposure's natural logarithm.
+    """Compute a loss that keeps a photo's exposure near one. `exposure` is the exposure's natural logarithm.
 
-    The penalty is the logarithm's absolute value, smoothed near zero. Photos cannot tell a brighter light from longer exposures, so
-    exposures are held near one. Absolute values, unlike squares, let a few photos differ without moving the others.
+    Without this loss, a brighter light with shorter exposures would fit the photos as well. The loss is the absolute value of the
+    logarithm, smoothed near zero. Unlike a square, it lets a few photos differ strongly without moving the others.
     """
     return torch.sqrt(exposure * exposure + ROUND_OFF**2) - ROUND_OFF
 
@@ -156,23 +156,23 @@ def objective(
     weights: LossSettings,
     progress: float,
 ) -> Objective:
-    """Compute the objective of one view, at a progress of 0..1. Its terms, each with a weight in `weights`:
+    """Compute the training loss of one view. `progress` is 0 at the start of the training and 1 at its end.
 
-    - Colour: (1 − λ) L1 + λ D-SSIM on sRGB, against the photo over the background. The rendering is clipped only where the photo is
-      clipped: elsewhere an over-bright pixel must feel its gradient.
-    - Normals: 1 − ÑᵀN, Ñ from the depth by central differences, where the surface is opaque around the pixel.
-    - Smoothness: ‖∇N‖ exp(−‖∇C_gt‖), forward differences, where the surface is opaque. Metallic and roughness have a weight of their
-      own: where everything mirrored is even, no photo tells them.
+    The loss is the sum of these terms, each with a weight in `weights`:
+
+    - Colour: (1 − λ) L1 + λ D-SSIM of sRGB pictures. The photo is composited over `background`. The rendering is clipped only where the
+      photo is clipped, so that other pixels that are too bright still have a gradient.
+    - Normals: 1 − ÑᵀN where the surface is opaque around the pixel. Ñ is the normal of the depth map, by central differences.
+    - Smoothness: ‖∇N‖ exp(−‖∇C‖) where the surface is opaque, with the photo's colour C and forward differences. Metallic and roughness are
+      smoothed with a weight of their own, because photos do not determine them where the mirrored light is uniform.
     - Mask: |α − mask|.
-    - Light: squared departure from grey of the mean radiance `light` (3,), where it is given. Warm metal under neutral light looks almost
-      like neutral metal under warm light: without this term white balance drifts. Only the mean is held, so that colours may differ by
-      direction. The mean is over texels that are seen mirrored: unseen texels would take on the colour that the mean lacks.
-    - Metallic m: m (1 − m) over the object, for nothing real is half a metal. Dielectrics' highlights, 4 % of the light and colourless,
-      then fix the light's scale and white balance, which metals cannot. The weight grows with the square of the progress, for at first
-      it is not known which is which.
-    - Dark metals: m times how much darker the surfel is than any metal, from the start. A metal of 4 % would mirror as dark glass does.
-    - Roughness: by how much it exceeds 0.3, over the object. Where photos are clipped, or show nothing bright, a broad lobe explains as
-      much as a sharp one, and forgives wrong normals.
+    - Light: the squared difference between `light` (3,), the mean radiance that the object mirrors, and grey. Without this term, white
+      balance drifts, because warm metal under neutral light looks almost like neutral metal under warm light.
+    - Metallic m: m (1 − m), because real surfaces are either metal or not. The weight grows with the square of `progress`, because early in
+      the training it is unknown which surfaces are metal.
+    - Dark metals: m times how much darker the surfel is than real metals. A dark metal would look like dark glass.
+    - Roughness: how much it exceeds 0.3. Where photos are clipped or show nothing bright, a blurred reflection fits as well as a sharp one,
+      even if normals are wrong.
     """
     material = rendering.material if max(weights.metallic, weights.even, weights.matte) > 0 else None
     maps = rendering.color, rendering.normal, rendering.blended_depth, rendering.alpha, material

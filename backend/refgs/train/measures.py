@@ -1,4 +1,4 @@
-"""Measure a training's errors against held-out photos, and against the ground truth that a capture brings."""
+"""Measure a training's errors against held-out photos, and against the capture's ground truth if it has any."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -30,8 +30,11 @@ def held_out_psnr(state: State, most: int = VIEWS) -> float | None:
     return float(np.mean([metrics.psnr(*(image.numpy(force=True) for image in pair)) for pair in pairs]))
 
 
-class _Look(NamedTuple):
-    """Hold a held-out view and its ground truth: maps such as normals, the object's coverage, and a picture under another light."""
+class _TestView(NamedTuple):
+    """Hold a held-out view and its ground truth.
+
+    `known` are true maps by name, such as normals. `alpha` is the object's true coverage. `relit` is a true picture under another light.
+    """
 
     view: LoadedView
     known: dict[str, np.ndarray]
@@ -55,14 +58,16 @@ class Measures:
         self._light = self._panorama = None
         try:
             truth = GroundTruth(folder, capture.to_capture) if folder.is_dir() else None
-            self._looks = [self._look(*pair, truth, capture.to_capture) for pair in chosen]
+            self._test_views = [self._test_view(*pair, truth, capture.to_capture) for pair in chosen]
             if truth:
                 self._read_lights(truth, state.device)
         except InputError as error:
             state.report("warning", {"what": f"errors against the ground truth are not recorded: {error}"})
-            self._looks = [self._look(*pair, None, None) for pair in chosen]
+            self._test_views = [self._test_view(*pair, None, None) for pair in chosen]
 
-    def _look(self, view: View, loaded: LoadedView, truth: GroundTruth | None, to_capture: np.ndarray | None) -> _Look:
+    def _test_view(
+        self, view: View, loaded: LoadedView, truth: GroundTruth | None, to_capture: np.ndarray | None
+    ) -> _TestView:
         camera, known, alpha, relit = loaded.camera, {}, np.zeros(0), None
         if to_capture is not None:
             known, alpha = known_maps(truth, view, camera, to_capture)
@@ -72,30 +77,31 @@ class Measures:
         elif truth and truth.hdris and self._method.lit:
             relit = truth.relit(truth.hdris[0], camera)
         known = {name: known[name] for name in PASSES if name in known and name not in left}
-        return _Look(loaded, known, alpha, relit)
+        return _TestView(loaded, known, alpha, relit)
 
     def _read_lights(self, truth: GroundTruth, device: torch.device) -> None:
-        """Read the true light, and the first of the other lights that the capture has relit pictures for."""
+        """Read two lights from the ground truth: the light of the photos, and another light that true pictures exist for."""
         if not self._method.lit:
             return
         if truth.has_light and self.settings.light.frame != "camera":  # the true light stands still
             self._panorama = metrics.resized(truth.panorama("light"), ROWS)
-        if any(look.relit is not None for look in self._looks):
+        if any(test.relit is not None for test in self._test_views):
             light = light_of(truth.panorama(f"relight/{truth.hdris[0]}"), self.settings)
             self._light = Environment(light.radiance.to(device))
 
     def errors(self, state: State) -> dict[str, float]:
-        """Measure the mean errors of a training as it stands, where the truth is known.
+        """Measure the errors of the training now, averaged over the held-out views. Returns them by name.
 
-        `psnr_test` needs held-out photos only. Ground truth adds `normal_mae_degrees`, `albedo_psnr` (linear, after a best factor for
-        each channel), `metallic_mae`, `roughness_mae`, `light_log_rmse` (natural logarithm, after one best factor) and `relit_psnr`
-        (after one best factor; without inter-reflection).
+        `psnr_test` is measured against the held-out photos. The others need ground truth: `normal_mae_degrees`, `albedo_psnr`,
+        `metallic_mae`, `roughness_mae`, `light_log_rmse` (natural logarithm) and `relit_psnr` (without inter-reflection). Albedo is
+        compared in linear colours, after each channel is scaled to fit the truth best. The light and relit pictures are compared after one
+        such scaling of all channels.
         """
         rows: dict[str, list] = {}
-        for look in self._looks:
-            rendering = state.render(look.view.camera)
-            figures = {"psnr_test": self._against_photo(metrics.psnr, rendering, look)}
-            figures |= errors(maps(rendering), look.known, look.alpha)
+        for test in self._test_views:
+            rendering = state.render(test.view.camera)
+            figures = {"psnr_test": self._against_photo(metrics.psnr, rendering, test)}
+            figures |= errors(maps(rendering), test.known, test.alpha)
             for name, value in figures.items():
                 rows.setdefault(name, []).append(value)
         found = {}
@@ -110,25 +116,28 @@ class Measures:
         return found
 
     def flip(self, state: State) -> dict[str, float]:
-        """Average FLIP over the first held-out views. Returns it as `flip_test`."""
-        looks = self._looks[:FEWER]
-        values = [self._against_photo(metrics.flip, state.render(look.view.camera), look) for look in looks]
+        """Average the image error FLIP over the first FEWER held-out views. Returns it under the name `flip_test`."""
+        chosen = self._test_views[:FEWER]
+        values = [self._against_photo(metrics.flip, state.render(test.view.camera), test) for test in chosen]
         return {"flip_test": float(np.mean(values))} if values else {}
 
     def _against_photo(
-        self, measure: Callable[[np.ndarray, np.ndarray], float], rendering: Rendering, look: _Look
+        self, measure: Callable[[np.ndarray, np.ndarray], float], rendering: Rendering, test: _TestView
     ) -> float:
-        photo = composite(look.view, self._background).numpy()
+        photo = composite(test.view, self._background).numpy()
         return measure(rendering.color.clamp(0, 1).numpy(force=True), photo)
 
     @torch.no_grad()
     def _relit(self, state: State) -> float:
-        """Compute the PSNR of the first views under the held-out light, after one factor scales the renderings to fit the truth."""
+        """Render the first FEWER held-out views under another light, and return the PSNR against their true pictures.
+
+        One factor first scales all renderings to fit the truth best.
+        """
         settings = self.settings.render.model_copy(update={"reflection": "microfacet"})
         surfels = state.surfels().without_directions()
         pairs = []
-        for look in self._looks[:FEWER]:
-            given = look.view.camera, state.background, settings, state.near
+        for test in self._test_views[:FEWER]:
+            given = test.view.camera, state.background, settings, state.near
             image = render(surfels, self._light, *given)
-            pairs.append((maps(image)["color"], look.relit))
+            pairs.append((maps(image)["color"], test.relit))
         return metrics.relit(lambda: pairs, (metrics.psnr,))["psnr_aligned"]

@@ -12,7 +12,7 @@ _Work = struct("Motion", "motion.cpp")
 
 
 class ScreenGradient:
-    """Average over views how strongly the loss depends on each surfel's position on the screen: the length of this gradient.
+    """Average each surfel's screen gradient over views: how strongly the loss depends on the surfel's position on the screen.
 
     Positions on the screen are in units of half the image's width, as in 3D Gaussian splatting.
     """

@@ -13,10 +13,10 @@ MIRRORED = 1.2  # factor of an iteration's time for inter-reflection: 1 without,
 
 
 def iterations_time(growth: float, progress: float) -> float:
-    """Compute the relative time of all iterations up to a progress of 0..1.
+    """Compute how long all iterations up to a progress of 0..1 take together, relative to the whole training.
 
-    An iteration takes `growth` times as long at the end as at the start. The unit is the time that all iterations would take if each took
-    as long as the first.
+    The unit is the time of the whole training if every iteration took as long as the first. In fact iterations slow down: at the end, one
+    takes `growth` times as long as at the start.
     """
     first, last = GROWS
     ramp = min(max(progress - first, 0.0), last - first)
@@ -25,15 +25,15 @@ def iterations_time(growth: float, progress: float) -> float:
 
 
 def growth(first: int, last: int) -> float:
-    """Estimate how many times longer an iteration takes at the end than at the start.
+    """Estimate how many times longer an iteration takes at the end of the training than at the start.
 
-    There are `first` surfels at the start and `last` at the end.
+    The training starts with `first` surfels and ends with `last`.
     """
     return MIRRORED * (OTHERS + max(last, first)) / (OTHERS + first)
 
 
 class Plan:
-    """Plan a training that must end within a given time, its asset included. Pauses do not count."""
+    """Plan a training that must end within a given time, including the writing of its asset. Pauses do not count."""
 
     def __init__(self, minutes: float | None):
         """Start the clock. Without `minutes` there is no limit."""
@@ -43,7 +43,7 @@ class Plan:
 
     @property
     def spent(self) -> float:
-        """Return the seconds since the command was given, plus those spent before the run was resumed."""
+        """Return the seconds since the command was started, plus those spent before the run was resumed."""
         return self.before + time.perf_counter() - self._begun
 
     def wait(self, seconds: float) -> None:
@@ -58,9 +58,10 @@ class Plan:
         self._growth, self._marks = growth, [(iteration, self.spent)]
 
     def total(self, iteration: int, views: int) -> int | None:
-        """Plan the total number of iterations from the pace until now. Return None at iterations where no plan is due.
+        """Choose the total number of iterations so that the training ends in time.
 
-        `views` is the number of photos, all of which are rendered for the asset.
+        Returns None at iterations at which the choice is not made anew. The choice depends on how long iterations have taken so far.
+        `views` is the number of photos, because writing the asset renders all of them.
         """
         done = iteration - self._marks[0][0]
         if self.minutes is None or not (done == FIRST or (done > 0 and iteration % EVERY == 0)):
@@ -71,8 +72,8 @@ class Plan:
         self._marks.append((iteration, now))
         pace, left = (now - then) / (iteration - half), 60 * self.minutes - now
 
-        def ahead(total: int) -> float:
-            """Estimate the seconds left in a training of `total` iterations, its asset included."""
+        def seconds_left(total: int) -> float:
+            """Estimate the seconds from now to the end, including the asset, if the training has `total` iterations."""
             whole, by_now, by_half = (
                 iterations_time(self._growth, k / total) * total for k in (total, iteration, half)
             )
@@ -82,5 +83,5 @@ class Plan:
         low, high = iteration, 2 * iteration + int(2 * max(left, 0.0) / pace)
         while high - low > 1:
             middle = (low + high) // 2
-            low, high = (middle, high) if ahead(middle) <= left else (low, middle)
+            low, high = (middle, high) if seconds_left(middle) <= left else (low, middle)
         return low

@@ -1,7 +1,7 @@
-"""Measure what pictures lose without a part of the method, and how much time an iteration saves without it.
+"""Measure how much worse pictures get, and how much faster an iteration gets, if a part of the training is left out.
 
-`refgs.train.needs` decides by these figures. All are measured on training views, with the surfels and the light as they are at the call.
-Decibels are computed from the mean squared error over all views measured.
+`refgs.train.needs` uses these measurements for its decisions. They are made on training views, with the surfels and the light as they are
+now. PSNR is computed from the mean squared error over all measured views.
 """
 
 import math
@@ -40,12 +40,12 @@ def without_specular(inputs: RenderInputs) -> RenderInputs:
 
 
 def picture(state: State, view: int, inputs: RenderInputs, whole: bool = False) -> Rendering:
-    """Render the part of a view that is trained on, or the whole view if `whole` is true."""
+    """Render a training view. Render only the crop that the training uses, or the whole view if `whole` is true."""
     return state.picture(inputs, state.photo(view, whole).camera, state.exposure(view))
 
 
 def squared_error(color: Tensor, photo: Photo, background: Tensor) -> float:
-    """Compute the mean squared error of an encoded picture (H, W, 3) against a photo over the background."""
+    """Compute the mean squared error of an encoded picture (H, W, 3) against a photo that is composited over the background."""
     image = photo.image.float() / 255
     if photo.mask is not None:
         opaque = photo.mask.float()[..., None] / 255
@@ -65,7 +65,7 @@ def spread_views(state: State, most: int = VIEWS) -> list[int]:
 
 @torch.no_grad()
 def squared_errors(state: State, inputs: RenderInputs) -> list[float]:
-    """Compute the mean squared error of each of a few training views."""
+    """Compute the mean squared error against the photo in each of a few training views."""
     found = []
     for view in spread_views(state):
         found.append(squared_error(picture(state, view, inputs).color, state.photo(view), state.background))
@@ -74,17 +74,20 @@ def squared_errors(state: State, inputs: RenderInputs) -> list[float]:
 
 @torch.no_grad()
 def psnr_loss(state: State, change: Change) -> float:
-    """Compute how many dB of PSNR the training views lose if `change` is applied to the inputs of the rendering."""
+    """Compute how many dB of PSNR the training views lose by a change of what is rendered.
+
+    `change` is a function that takes the inputs of a rendering and returns the changed inputs.
+    """
     inputs = state.inputs()
     return decibels_lost(squared_errors(state, inputs), squared_errors(state, change(inputs)))
 
 
 @torch.enable_grad()
 def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: bool = False) -> float:
-    """Time an iteration without and with a change. Return the seconds that the change saves in all remaining iterations.
+    """Measure how many seconds a change of what is rendered would save in all remaining iterations.
 
-    If `whole` is true, the iteration without the change renders the whole photo, the other one only the part that is trained on. The
-    optimiser's step is not timed.
+    An iteration is timed without the change and with it, except for the optimiser's step. If `whole` is true, the iteration without the
+    change renders the whole photo, and the one with it renders only the crop that the training uses.
     """
     fastest = [math.inf, math.inf]
     for _ in range(REPEATS):
@@ -102,10 +105,11 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
 
 @torch.no_grad()
 def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: list[Tensor] | None = None) -> Tensor:
-    """Compute each surfel's blending weight in each photo, summed over the photo's pixels (V, N).
+    """Compute how much each surfel contributes to each of V photos (V, N): the sum of its blending weights over all pixels.
 
-    `maps` may hold a map (H, W, C) for each photo. In this case, return instead the mean of the maps for each surfel (N, C), weighted by
-    its blending weights. The weights are computed as the gradient of a blended constant feature.
+    If `maps` holds an image (H, W, C) for each photo, return instead the mean of these images for each surfel (N, C), weighted by its
+    blending weights. The weights are computed as gradients: all surfels are rendered with a feature of 1, whose gradient is the sum of the
+    weights. Surfels nearer to a camera than `near` are not drawn.
     """
     surfels, count, rows = Surfels(*(value.detach() for value in surfels)), len(surfels.positions), []
     width = 1 if maps is None else maps[0].shape[-1] + 1
@@ -125,10 +129,10 @@ def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: lis
 
 @torch.no_grad()
 def specular_explains(state: State) -> float:
-    """Compute how many dB of the training views' PSNR are due to reflections that change with the view.
+    """Compute how many dB of PSNR the training views lose if reflections no longer change with the view.
 
-    The pictures are compared with pictures in which each surfel's specular part is one colour, the same from all directions: a matte
-    surface could learn this colour as albedo. It is the mean of the specular part, weighted by the surfel's weight in the pixels.
+    For the comparison, each surfel's specular colour is replaced by its mean over the photos. A matte surface could learn this mean as
+    albedo, so that the loss shows what only specular shading can explain.
     """
     inputs, some = state.inputs(), spread_views(state, SEVERAL)
     photos, dull = [state.photo(view) for view in some], without_specular(inputs)
@@ -150,10 +154,11 @@ def specular_explains(state: State) -> float:
 
 @torch.no_grad()
 def reflections_explain(state: State) -> float:
-    """Compute how many dB of the training views' PSNR inter-reflection can gain at most.
+    """Estimate how many dB of PSNR the training views can gain from inter-reflection at most.
 
-    Two renderings are compared: where the object mirrors itself, one mirrors black, the other the environment's light. The object's real
-    mirror image lies between the two. The mean squared difference is relative to the pictures' mean squared error.
+    Two pictures are compared. Where the object mirrors itself, one picture shows black there, and the other shows the environment's light.
+    The correct picture lies between the two, so that their difference limits the gain. The result is how many dB the PSNR falls if this
+    difference is added to the error against the photos.
     """
     inputs, wrong, apart = state.inputs(), 0.0, 0.0
     black = inputs.surfels._replace(
@@ -171,7 +176,7 @@ def reflections_explain(state: State) -> float:
 
 @torch.no_grad()
 def quantile(values: Tensor, weight: Tensor, part: float) -> float:
-    """Find the weighted quantile of values (N,): the fraction `part` of the total weight belongs to smaller values."""
+    """Return the weighted quantile of `values` (N,): the value below which the fraction `part` of the total weight lies."""
     order = values.argsort()
     share = weight[order].cumsum(dim=0) / weight.sum().clamp_min(1e-9)
     return float(values[order][int((share < part).sum().clamp_max(len(order) - 1))])

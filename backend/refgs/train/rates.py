@@ -8,7 +8,7 @@ REFLECTING = ("albedo", "metallic", "roughness", "indirect_dc", "indirect_rest",
 
 
 def set_rates(state: State, progress: float) -> None:
-    """Set the learning rate of each of the optimiser's groups, for a progress of 0..1."""
+    """Set the learning rate of each parameter group of the optimiser, at a progress of 0..1."""
     rates, late = state.settings.rates, state.residual_start
     frozen = _frozen(state, progress)
     for group in state.optimizer.param_groups:
@@ -30,7 +30,7 @@ def _start_rate(state: State, name: str) -> float:
 
 
 def _frozen(state: State, progress: float) -> set[str]:
-    """List the parameters that do not learn at this iteration."""
+    """Return the names of the parameters that do not learn in this iteration."""
     settings, frozen = state.settings, set()
     if state.from_hull and state.iteration < settings.train.light_first and state.method.deferred:
         frozen |= {*GEOMETRY}

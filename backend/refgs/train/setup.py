@@ -1,6 +1,6 @@
-"""Set up a training: photos, the light's frame, surfels, the optimiser.
+"""Set up a training: load the photos, choose the light's frame, and make the surfels and the optimiser.
 
-Reset colour, material and light when the training begins to shade pixels instead of surfels.
+Also start the second stage of a training, in which pixels are shaded instead of surfels.
 """
 
 from pathlib import Path
@@ -23,13 +23,13 @@ from refgs.train.trace import why_not_traced
 
 
 def set_up(capture: Capture, effective: Effective, folder: Path, report: Report, plan: Plan, device: str) -> State:
-    """Read a capture's photos and make everything that learns, ready for the first iteration."""
+    """Read a capture's photos, and make all parameters and the optimiser, so that the first iteration can start."""
     state = State(capture, effective, folder, report, plan, device)
     needs.evaluate_due(state, "photos")
     state.photos = [Photo.of(view, state.device) for view in state.views]
     with state.clock.part("start"):
-        start, shown, source = start_parameters(capture, state.views, state.settings)
-    _choose_light_frame(state, start, shown)
+        start, on_hull, source = start_parameters(capture, state.views, state.settings)
+    _choose_light_frame(state, start, on_hull)
     state.parameters = {name: value.detach().to(state.device).requires_grad_() for name, value in start.items()}
     report("stage", {"what": source})
     _start_learning(state)
@@ -37,10 +37,10 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     return state
 
 
-def _choose_light_frame(state: State, start: Parameters, shown: int) -> None:
-    """Choose the light's frame, the world's or the camera's, from the photos, if the settings leave it to them.
+def _choose_light_frame(state: State, start: Parameters, on_hull: int) -> None:
+    """Choose from the photos whether the light stands still in the world or turns with the camera. Do so only if the setting is "auto".
 
-    The first `shown` of the initial surfels lie on the visual hull.
+    `start` are the surfels' initial parameters. The first `on_hull` of these surfels lie on the visual hull.
     """
     lit = state.method.lit
     if state.settings.light.frame != "auto":
@@ -49,7 +49,7 @@ def _choose_light_frame(state: State, start: Parameters, shown: int) -> None:
     if lit and state.from_hull:
         with torch.no_grad():
             points = activate(start)
-            found = points.positions[:shown].numpy(), points.normals()[:shown].numpy()
+            found = points.positions[:on_hull].numpy(), points.normals()[:on_hull].numpy()
         frame, why = light_frame(state.views, *found, state.capture.radius)
     state.change("light.frame", frame, "photos", why)
     if lit:
@@ -58,14 +58,14 @@ def _choose_light_frame(state: State, start: Parameters, shown: int) -> None:
 
 
 def _start_learning(state: State) -> None:
-    """Make light, exposures and the optimiser.
+    """Make the initial light and exposures, and an optimiser for them and the surfels.
 
-    Parameters that this run's shading never reads are set aside.
+    Parameters that do not affect this run's pictures are excluded.
     """
     settings, method = state.settings, state.method
     texels = torch.empty(6 * light.resolution(settings, 0) ** 2, 3, device=state.device)
     state.light = texels.fill_(light.start_value(state)).requires_grad_()
-    _set_constants_aside(state)
+    _stop_learning_unused(state)
     learned = dict(state.parameters)
     if method.lit:
         learned["environment"] = state.light
@@ -77,8 +77,11 @@ def _start_learning(state: State) -> None:
     state.reset_motion()
 
 
-def _set_constants_aside(state: State) -> None:
-    """Move parameters that the shading never reads to the constants. A constant has one row for all surfels."""
+def _stop_learning_unused(state: State) -> None:
+    """Exclude parameters from training if they do not affect this run's pictures, or if the rendering method fixes their values.
+
+    They move from `state.parameters`, with a row for each surfel, to `state.constant`, with one row for all surfels.
+    """
     method, diffuse = state.method, state.settings.render.diffuse
     unused = [*method.unread]
     if method.lit and diffuse == "irradiance":
@@ -96,9 +99,9 @@ def _set_constants_aside(state: State) -> None:
 
 @torch.no_grad()
 def start_deferred(state: State) -> None:
-    """Start the deferred stage, in which pixels are shaded after blending. The first stage shades each surfel by itself.
+    """Start the second stage of a training, deferred shading: pixels are shaded after blending. The first stage shades each surfel.
 
-    Colour, material and light are learned anew on the first stage's geometry (paper §3.3).
+    The surfels' geometry is kept. Colours, materials and light are reset and learned anew (paper §3.3).
     """
     state.initial = False
     for name, row in start_appearance(state.settings).items():

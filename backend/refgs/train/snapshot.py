@@ -1,4 +1,4 @@
-"""Save and restore a training's state: everything that the next iteration depends on."""
+"""Save and restore the state of a training: everything that the next iteration depends on."""
 
 import numpy as np
 import torch
@@ -38,7 +38,7 @@ def save(state: State) -> None:
 
 
 def restore(state: State) -> None:
-    """Resume from the last complete checkpoint. Raises InputError where there is none, or another release wrote it."""
+    """Resume from the last complete checkpoint. Raises InputError if there is none, or if another release of RefGS wrote it."""
     tensors, facts = checkpoint.load(state.folder / "checkpoints")
     state.total = facts["total"]
     needs.restore(state, facts.get("needs", {}))

@@ -18,15 +18,16 @@ AROUND = 0.5  # part of the surfels, at the most, that lie outside the region
 
 
 def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings) -> tuple[Parameters, int, str]:
-    """Make the surfels' initial parameters.
+    """Make the initial parameters of the surfels.
 
-    Returns also how many surfels lie on the surface, and a line that says where the surfels start. The surfels on the surface come first.
-    If all photos have masks, the surface is the visual hull; the other surfels start inside, for hollows that no mask shows.
+    Returns the parameters, the number of surfels on the visual hull, and a message for the user that says where the surfels start. If all
+    photos have masks, these surfels come first, and the others start inside the hull, because masks do not show hollows. Without masks,
+    surfels start at structure-from-motion points or at random, and the number means nothing.
     """
     count, seed = min(settings.surfels.start, settings.surfels.budget), settings.train.seed
     colours, opacity, shown = None, settings.surfels.opacity, count
     if all(view.alpha is not None for view in views):
-        positions, normals, spacing, shown = _hull(capture, views, count, settings)
+        positions, normals, spacing, shown = _hull_points(capture, views, count, settings)
         source = "the visual hull of the masks"
     else:
         opacity = min(opacity, FAINT)
@@ -34,7 +35,7 @@ def start_parameters(capture: Capture, views: list[LoadedView], settings: Settin
             positions, colours = _thinned(capture, count, seed)
             source = f"{len(positions)} structure-from-motion points"
         else:
-            positions = _random(capture, count, seed)
+            positions = _random_points(capture, count, seed)
             source = "random points (no masks and no structure-from-motion points)"
         normals, spacing = _towards_cameras(positions, views), _spacing(positions)
     parameters = _initial(positions, normals, spacing, colours, settings.surfels, opacity)
@@ -43,7 +44,7 @@ def start_parameters(capture: Capture, views: list[LoadedView], settings: Settin
 
 
 def start_appearance(settings: Settings) -> Parameters:
-    """Make the initial colour and material, one row for all surfels, without gradients."""
+    """Make the initial colour and material parameters that all surfels share. Each has one row and no gradient."""
     one = _initial(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.ones(1), None, settings.surfels, 0.5)
     return {name: value.detach() for name, value in one.items() if name not in GEOMETRY}
 
@@ -63,10 +64,10 @@ def _initial(positions, normals, spacing, colours, surfels: SurfelSettings, opac
     )
 
 
-def _hull(capture: Capture, views: list[LoadedView], count: int, settings: Settings):
-    """Place points on the masks' visual hull and inside it.
+def _hull_points(capture: Capture, views: list[LoadedView], count: int, settings: Settings):
+    """Place `count` points: most on the visual hull of the masks, the others inside it.
 
-    Returns positions, normals, spacing, and how many points are on the hull. The points on the hull come first.
+    Returns positions, normals, the spacing of the points, and how many are on the hull. These come first.
     """
     alphas, cameras = [view.alpha for view in views], [view.camera for view in views]
     surfels, seed = settings.surfels, settings.train.seed
@@ -100,10 +101,10 @@ def _hull(capture: Capture, views: list[LoadedView], count: int, settings: Setti
 def _in_and_around(
     box: Box, near: np.ndarray, around: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose at random those points of `near` (N, 3) that lie in the box, and those of `around` (M, 3) that lie outside the box.
+    """Choose at random some points of `near` (N, 3) that lie inside the box, and some of `around` (M, 3) that lie outside.
 
-    Returns the indices into `near` and into `around`, at most `count` in all. At most the fraction AROUND of `count` lies outside. Raises
-    InputError if no point of `near` is in the box.
+    Returns their indices in `near` and in `around`, at most `count` together. At most the fraction AROUND of `count` lies outside. Raises
+    InputError if no point of `near` is inside the box.
     """
     rng = np.random.default_rng(seed)
     inner, outer = np.flatnonzero(box.contains(near)), np.flatnonzero(~box.contains(around))
@@ -114,7 +115,7 @@ def _in_and_around(
 
 
 def _has_points(capture: Capture) -> bool:
-    """Tell whether structure from motion found enough points to start from in the region to train."""
+    """Tell whether structure from motion found at least 100 points in the region to train, enough for surfels to start at."""
     if capture.points is None:
         return False
     return len(capture.points if capture.box is None else capture.points[capture.box.contains(capture.points)]) >= 100
@@ -129,10 +130,11 @@ def _thinned(capture: Capture, count: int, seed: int):
     return points[chosen], None if colours is None else colours[chosen]
 
 
-def _random(capture: Capture, count: int, seed: int) -> np.ndarray:
-    """Place points at random, uniform in the ball that the cameras look at, or in the region to train if there is one.
+def _random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
+    """Place `count` points at random, evenly in the ball that the cameras look at, or in the region to train if there is one.
 
-    In a room, or around a region, some points lie farther out, uniform in inverse distance.
+    In a room, or if there is a region to train, up to half of the points are placed farther out, for the surroundings. They are uniform in
+    inverse distance.
     """
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))

@@ -1,4 +1,4 @@
-"""Hold the state of a training: what it works on, what it learns, and what was decided about it."""
+"""Hold the state of a training: the capture, the parameters that it learns, and the decisions that it has made."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,10 +39,10 @@ class RenderInputs(NamedTuple):
 
 
 class State:
-    """Hold a training as it stands.
+    """Hold the state of a training: the capture, the parameters that it learns, and the decisions that it has made.
 
-    The constructor reads the capture's photos, `train/setup.py` makes the state ready, and `train/trainer.py` moves it on. The second
-    block of attributes in `__init__` is saved in checkpoints (`train/snapshot.py`). The first block is made anew when a run is resumed.
+    The constructor only reads the photos; `train/setup.py` makes the parameters, and `train/trainer.py` trains them. Attributes in the
+    second block of `__init__` are saved in checkpoints (`train/snapshot.py`). Those in the first block are made anew when a run is resumed.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class State:
 
     @property
     def method(self) -> Method:
-        """Return the method by which surfels and light become pictures."""
+        """Return the method that renders pictures from surfels and light, as the settings select it."""
         return method_of(self.settings.render)
 
     @property
@@ -94,9 +94,9 @@ class State:
 
     @property
     def residual_start(self) -> float:
-        """Return the progress at which the residual starts to learn, or 1 if it never does.
+        """Return the progress (0..1) from which on the residual learns, or 1 if it never learns.
 
-        The residual is a colour by direction: what material and light do not explain of the photos.
+        The residual is a colour that changes with the direction. It is added for what material and light do not explain of the photos.
         """
         settings = self.settings
         return settings.residual.start if self.method.deferred and settings.render.diffuse == "irradiance" else 1.0
@@ -119,20 +119,20 @@ class State:
         return Surfels(*(v if len(v) == count else v.expand(count, *v.shape[1:]) for v in values))
 
     def environment(self) -> Environment | None:
-        """Make the light from its raw texels. Return None where nothing is lit."""
+        """Make the light from its raw texels. Return None if the rendering method uses no light."""
         if not self.method.lit:
             return None
         reference = self.views[0].camera if self.settings.light.frame == "camera" else None
         return Environment(self.method.light.radiance(self.light), reference)
 
     def inputs(self) -> RenderInputs:
-        """Gather everything that pictures are rendered from at this stage."""
+        """Gather the inputs of a rendering: the surfels, the light, the render settings and the mesh for inter-reflection."""
         settings = self.settings.render
         settings = initial_stage(settings) if self.initial else settings
         return RenderInputs(self.surfels(), self.environment(), settings, self.occluder)
 
     def picture(self, inputs: RenderInputs, camera: Camera, exposure: Tensor | None = None) -> Rendering:
-        """Render a camera's picture, with gradients."""
+        """Render the picture of a camera from these inputs, with gradients."""
         surfels, environment, settings, occluder = inputs
         return render(surfels, environment, camera, self.background, settings, self.near, occluder, exposure)
 
@@ -143,11 +143,11 @@ class State:
         return self.picture(inputs if surfels is None else inputs._replace(surfels=surfels), camera)
 
     def photo(self, view: int, whole: bool = False) -> Photo:
-        """Return the part of a view's photo that is trained on, or the whole photo if `whole` is true."""
+        """Return the crop of a view's photo that the training uses, or the whole photo if `whole` is true."""
         return self.photos[view] if whole or self.crops is None else self.photos[view].part(*self.crops[view])
 
     def exposure(self, view: int) -> Tensor | None:
-        """Return a photo's exposure, a factor of its radiance. Return None where exposures are not learned."""
+        """Return a view's exposure, by which its rendered radiance is multiplied. Return None if exposures are not learned."""
         return None if self.exposures is None else self.exposures[view].exp()
 
     def spread_cameras(self, least: int) -> list[Camera]:
@@ -155,9 +155,9 @@ class State:
         return [view.camera for view in self.views[:: max(1, len(self.views) // least)]]
 
     def wanted(self) -> Tensor:
-        """Tell which surfels (N,) lie in the region to train. If no region is set, all surfels do.
+        """Tell for each surfel (N,) whether it lies in the region to train. If the user set no region, all surfels do.
 
-        The surfels outside the region show what the photos show there.
+        Surfels outside the region only exist to reproduce the background of the photos.
         """
         position, box = self.parameters["position"], self.capture.box
         if box is None:
@@ -165,13 +165,16 @@ class State:
         return torch.from_numpy(box.contains(position.numpy(force=True))).to(self.device)
 
     def announce(self, about: str, what: str) -> None:
-        """Report a decision, unless the same text was reported before. `about` names the decision, and `what` is the text."""
+        """Report a decision to the user, unless the same text was reported before. `about` names the decision, and `what` is the text."""
         if self.decided.get(about) != what:
             self.decided[about] = what
             self.report("decided", {"about": about, "what": what})
 
     def change(self, key: str, value: Any, by: str, why: str) -> None:
-        """Change a setting, named by its `key` "section.name", for the rest of the training. `by` and `why` record the reason."""
+        """Change a setting for the rest of the training. Its `key` is "section.name".
+
+        `by` says what caused the change, and `why` explains it in words.
+        """
         self.effective = self.effective.changed(key, value, by, why)
 
     def group(self, name: str) -> dict[str, Any]:
@@ -188,7 +191,7 @@ class State:
         self.optimizer.param_groups = [g for g in self.optimizer.param_groups if g["name"] not in names]
 
     def shorten(self, name: str, count: int) -> None:
-        """Keep only the first `count` of a parameter's harmonic coefficients."""
+        """Keep only the first `count` spherical harmonic coefficients of the parameter `name`. Adam's moments are shortened, too."""
         old, new = self.parameters[name], self.parameters[name].detach()[:, :count].contiguous().requires_grad_()
         state = self.optimizer.state.pop(old, {})
         self.group(name)["params"][0] = self.parameters[name] = new
@@ -203,7 +206,7 @@ class State:
         self.exposures = None
 
     def reset_motion(self) -> None:
-        """Forget the screen gradients by which surfels are divided, because the surfels have been replaced."""
+        """Restart the mean of the screen gradients, which says which surfels to divide. Call this after surfels have been replaced."""
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
 
     def forget_gradients(self) -> None:

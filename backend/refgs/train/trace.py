@@ -1,4 +1,4 @@
-"""Trace inter-reflection on a mesh of the surfels, and say whether a training has inter-reflection at all."""
+"""Trace inter-reflection on a mesh made from the surfels. Explain why a training does not trace it."""
 
 import torch
 
@@ -18,7 +18,7 @@ VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer
 
 
 def why_not_traced(state: State) -> str:
-    """Say why this run traces no inter-reflection. Return "" if the run traces inter-reflection."""
+    """Return the reason why this run does not trace inter-reflection, or "" if it does."""
     settings = state.settings
     if not state.method.deferred:
         return f"shading = {settings.render.shading}"
@@ -49,7 +49,10 @@ def trace_due(state: State, progress: float) -> None:
 
 @torch.no_grad()
 def _trace(state: State) -> None:
-    """Extract the mesh, decide whether inter-reflection is needed, and trace the irradiance that surfels receive."""
+    """Make a new mesh from the surfels, and decide whether inter-reflection is needed.
+
+    If it is, trace rays to find out how much the mesh shadows and lights each surfel.
+    """
     capture, cameras = state.capture, state.spread_cameras(VIEWS)
     state.occluder = None
     inputs = state.inputs()

@@ -1,4 +1,4 @@
-"""Train by iterations of one view and one step. At some iterations also refine the light, decide needs, divide surfels, record errors."""
+"""Train surfels, one view per iteration. Some iterations also change the light's resolution, trace a mesh, or divide surfels."""
 
 import time
 from collections.abc import Callable
@@ -25,7 +25,7 @@ REPORT_EVERY = 10  # iterations
 
 
 class Trainer:
-    """Train on a capture. After each checkpoint the run folder holds the whole state."""
+    """Train surfels, materials and light on a capture. Checkpoints in the run folder allow a run to be resumed."""
 
     def __init__(
         self,
@@ -44,9 +44,9 @@ class Trainer:
         self._order: tuple[int, list[int]] = (-1, [])
 
     def step(self) -> dict[str, Tensor]:
-        """Do one iteration. Returns its loss and its mean squared error.
+        """Do one iteration on one view. Returns its `loss` and its mean squared error, `square`, as scalar tensors.
 
-        On a graphics card, the two tensors may not be computed yet: reading them waits.
+        On a graphics card, this returns before the tensors are computed. Reading their values waits for the card.
         """
         state, view = self.state, self._next_view()
         progress = min(state.iteration / state.total, 1.0)
@@ -80,9 +80,9 @@ class Trainer:
         return {"loss": loss.detach(), "square": square}
 
     def _next_view(self) -> int:
-        """Choose the next view. An epoch takes every view once.
+        """Choose the next view. Each epoch takes every view once, in a random order.
 
-        The order depends on the seed and the epoch alone, so that a resumed run takes the same order.
+        The order depends only on the seed and the epoch, so that a resumed run takes the same one.
         """
         epoch, place = divmod(self.state.iteration, len(self.state.views))
         if self._order[0] != epoch:
@@ -98,7 +98,7 @@ class Trainer:
         state, means = self.state, {}
         before, first = state.seconds, state.iteration
         state.plan.begin(state.iteration, growth(len(state.parameters["position"]), state.settings.surfels.budget))
-        while not state.ended and not self._waited(stop):
+        while not state.ended and not self._should_stop(stop):
             figures = self.iterate()
             state.total = state.plan.total(state.iteration, len(state.views) + len(state.test)) or state.total
             # Running means, read now and then: a card need not wait.
@@ -126,32 +126,29 @@ class Trainer:
     def _record(self, means: dict[str, Tensor]) -> None:
         history.record(self.state, self.measures, float(means["loss"]), decibels(float(means["square"])))
 
-    def _waited(self, stop: Callable[[], bool]) -> bool:
-        """Call `stop` and return its answer.
-
-        `stop` may pause the training. The plan does not count that time.
-        """
+    def _should_stop(self, stop: Callable[[], bool]) -> bool:
+        """Call `stop` and return its answer. `stop` may pause the training by returning late; the plan does not count this time."""
         begun = time.perf_counter()
         stopped = stop()
         self.state.plan.wait(time.perf_counter() - begun)
         return stopped
 
     def iterate(self) -> dict[str, Tensor]:
-        """Do a `step` and count its seconds.
+        """Do one iteration, and add its time to `state.seconds`. Returns what `step` returns.
 
-        If the card's memory is full, train with fewer surfels from here on.
+        If the graphics card runs out of memory, the number of surfels is reduced and the iteration is tried again.
         """
         begun, used = time.perf_counter(), time.process_time()
-        figures = self._attempt()
+        figures = self._try_step()
         while figures is None:  # out of the attempt, whose traceback held its tensors
             densify.fewer_surfels(self.state)
-            figures = self._attempt()
+            figures = self._try_step()
         self.state.seconds += time.perf_counter() - begun
         self.state.processor_seconds += time.process_time() - used
         return figures
 
-    def _attempt(self) -> dict[str, Tensor] | None:
-        """Try a step. Return None if the card's memory is full."""
+    def _try_step(self) -> dict[str, Tensor] | None:
+        """Do one iteration. Returns what `step` returns, or None if the graphics card has run out of memory."""
         try:
             with self.state.clock.iteration(self.state.iteration):
                 return self.step()
@@ -159,15 +156,15 @@ class Trainer:
             return None
 
     def save(self) -> None:
-        """Write a checkpoint, after making sure that all of the state is finite."""
+        """Write a checkpoint, after a check that all numbers in it are finite (see `Guard.look`)."""
         self._check(whole=True)
         with self.state.clock.part("writing"):
             snapshot.save(self.state)
 
     def _check(self, whole: bool) -> None:
-        """Let the guard check the state. Go back to the last checkpoint if the guard says so.
+        """Check that the training's numbers are finite. If the guard says so, go back to the last checkpoint.
 
-        The time spent since that checkpoint still counts as time of the training.
+        `whole` is passed on to `Guard.look`. The lost time still counts as training time.
         """
         state = self.state
         if why := self.guard.look(state, whole):

@@ -1,8 +1,8 @@
-"""Decide which needs a scene has. A need is a part of the method that a scene may do without.
+"""Decide which optional parts of the training a scene needs. Such a part, for example inter-reflection, is called a need.
 
-Each decision compares a figure of the training with a threshold, and is recorded in needs.json. If a part is not needed, settings,
-parameters and photos are changed accordingly. The decision's cost is the PSNR that training views lose without the part. Its saving is the
-seconds that an iteration saves, times the iterations that were left.
+A decision compares a measured value with a threshold, and is recorded in needs.json. A part that is not needed is left out: settings,
+parameters or photos are changed. The record says what this costs, the PSNR lost on training views, and what it saves, the seconds for all
+remaining iterations.
 """
 
 from typing import Any
@@ -45,9 +45,10 @@ __all__ = [
 
 
 def evaluate_due(state: State, moment: Moment, *given: Any, progress: float = 0.0) -> list[str]:
-    """Decide the needs (parts of the method that a scene may do without) that are due at a moment of the training (see `Moment`).
+    """Decide about the optional parts of the training (needs) that are due at a `moment`, such as "start" or "mesh".
 
-    Returns the names of the needs decided. `given` is passed on to `Need.measure`. `progress` is 0..1.
+    Returns the names of the needs decided. `given` are measured values, passed on to `Need.measure`. `progress` is 0 at the start of the
+    training and 1 at its end.
     """
     decided: list[str] = []
     for need in NEEDS:
@@ -61,7 +62,7 @@ def evaluate_due(state: State, moment: Moment, *given: Any, progress: float = 0.
 
 
 def evaluate_iteration(state: State, progress: float) -> None:
-    """Decide the needs (parts of the method that a scene may do without) that are due after an iteration."""
+    """After an iteration, decide about the optional parts of the training (needs) that are due."""
     if state.initial or not state.method.deferred or state.settings.render.diffuse != "irradiance" or faint_now(state):
         return
     time_crops(state)
@@ -69,17 +70,17 @@ def evaluate_iteration(state: State, progress: float) -> None:
 
 
 def evaluate_mesh(state: State, hidden: float) -> None:
-    """Decide, once there is a mesh, whether inter-reflection is needed.
+    """Decide whether the scene needs inter-reflection. Called each time that the training has extracted a mesh.
 
-    If it is decided already, only report how much the object mirrors itself. `hidden` is the fraction of the object's pixels that mirror
-    the object.
+    `hidden` is the fraction of the object's pixels that mirror the object itself. Once the decision has been made, this fraction is only
+    reported.
     """
     if not evaluate_due(state, "mesh", hidden):
         state.announce("reflections", f"with {Reflections.what}: {share_hidden(hidden)}")
 
 
 def _record(state: State, need: Need, decision: Decision) -> None:
-    """Record and announce the decision about a need. If this part of the method is not needed, leave it out."""
+    """Record a decision about an optional part of the training, and report it. Leave the part out if it is not needed."""
     found: dict[str, Any] = {"needed": decision.needed, "why": decision.why}
     if decision.statistic is not None:
         found["statistic"] = float(decision.statistic)
@@ -92,9 +93,9 @@ def _record(state: State, need: Need, decision: Decision) -> None:
 
 
 def restore(state: State, recorded: dict[str, dict[str, Any]]) -> None:
-    """Take over the decisions `recorded` in a checkpoint, and leave out again the parts of the method that are not needed.
+    """Take over the decisions of a checkpoint, and leave out again the parts of the training that were not needed.
 
-    If the training goes back to an earlier checkpoint, decisions made after that checkpoint stay.
+    `recorded` are the checkpoint's decisions by name. If the training goes back to an earlier checkpoint, later decisions stay.
     """
     state.needs = recorded | state.needs
     for name, found in state.needs.items():
@@ -103,7 +104,7 @@ def restore(state: State, recorded: dict[str, dict[str, Any]]) -> None:
 
 
 def rows(state: State) -> list[dict[str, Any]]:
-    """List the decisions about needs as rows of needs.json."""
+    """Return the decisions about optional parts of the training, as rows for needs.json."""
     listed = []
     for name, found in state.needs.items():
         row = {"need": name, "what": BY_NAME[name].what, **found}

@@ -1,4 +1,4 @@
-"""Decide whether a scene needs inter-reflection, all texels of the environment's light, and all degrees of harmonics."""
+"""Decide whether a scene needs inter-reflection, the light's full resolution, and all degrees of spherical harmonics."""
 
 import math
 from typing import Any
@@ -13,7 +13,7 @@ from refgs.train.state import RenderInputs, State
 
 
 class Reflections(Need):
-    """Decide whether the scene needs inter-reflection: the object's mirror image in itself."""
+    """Decide whether the scene needs inter-reflection: whether the object visibly mirrors itself."""
 
     name, what = "reflections", "inter-reflection"
     threshold = 0.1  # dB
@@ -25,7 +25,11 @@ class Reflections(Need):
 
     @torch.no_grad()
     def measure(self, state: State, hidden: float = 0.0) -> Decision:
-        """Decide by `hidden`, the part of the object's pixels whose mirror direction hits the object itself."""
+        """Decide by two measurements whether inter-reflection is needed.
+
+        The first is `hidden`, the fraction of the object's pixels that mirror the object itself. The second is how many dB inter-reflection
+        can gain. Both must reach a threshold.
+        """
         if self.asked(state) == "off":
             return Decision(False, ASKED)
         why, least = share_hidden(hidden), state.settings.indirect.least
@@ -49,14 +53,14 @@ class Reflections(Need):
 
 
 def share_hidden(hidden: float) -> str:
-    """Say in words on what fraction of its pixels, `hidden`, the object mirrors itself."""
+    """Return a sentence for the user that gives `hidden`, the fraction of the object's pixels that mirror the object itself, in percent."""
     return f"the object mirrors itself on {hidden:.1%} of it"
 
 
 class Light(Need):
-    """Decide whether the scene needs all texels of the environment's light.
+    """Decide whether the scene needs the full resolution of the environment's light.
 
-    If not, the light keeps the fewest texels that resolve the object's sharpest reflections.
+    If not, the cubemap is reduced to the lowest resolution that still shows the object's sharpest reflections.
     """
 
     name, what = "light", "all of the light's texels"
@@ -105,9 +109,10 @@ class Light(Need):
 
 
 def resolvable(roughness: float, part: float, finest: int, coarsest: int) -> int:
-    """Choose the fewest texels along a cubemap's side, from `coarsest` to `finest`, that resolve reflections of this roughness.
+    """Return the lowest cubemap resolution, in texels along a side, that still shows reflections of a surface with this roughness.
 
-    A texel may be at most `part` as wide as the reflection's lobe. The lobe's width, in radians, is the square of the roughness.
+    The result lies between `coarsest` and `finest`. A texel may take at most the fraction `part` of the width of the reflection's lobe,
+    which is roughness² radians.
     """
     side = coarsest
     while side < finest and math.pi / 2 / side > part * roughness**2:
@@ -118,8 +123,8 @@ def resolvable(roughness: float, part: float, finest: int, coarsest: int) -> int
 class Degrees(Need):
     """Decide whether the scene needs all degrees of spherical harmonics.
 
-    Two colours that depend on direction are learned as harmonics: the colour that material and light do not explain, and the object's
-    mirror image in itself.
+    Harmonics are learned for two colours that change with the direction: the residual, which is what material and light do not explain, and
+    the reflection of the object in itself.
     """
 
     name, what = "degrees", "all degrees of harmonics"
@@ -164,6 +169,6 @@ class Degrees(Need):
 
 
 def _shortened(inputs: RenderInputs, field: str, count: int) -> RenderInputs:
-    """Keep only the first `count` harmonic coefficients of a field of the surfels, such as `sh_rest`."""
+    """Return rendering inputs in which a field of the surfels, such as `sh_rest`, has only its first `count` harmonic coefficients."""
     values = {field: getattr(inputs.surfels, field)[:, :count]}
     return inputs._replace(surfels=inputs.surfels._replace(**values))

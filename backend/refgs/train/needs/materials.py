@@ -17,7 +17,7 @@ INDIRECT = "indirect_dc", "indirect_rest", "received"
 
 
 class Specular(Need):
-    """Decide whether the scene needs specular shading: metallic, roughness and inter-reflection."""
+    """Decide whether the scene needs specular shading, with metallic, roughness and inter-reflection. A matte scene does not."""
 
     name, what = "specular", "specular shading"
     threshold = 0.3  # dB
@@ -76,9 +76,10 @@ class Constants(Need):
 
     @torch.no_grad()
     def common(self, state: State, surfels: Surfels, kept: Tensor) -> dict[str, tuple[float, float]]:
-        """Find out whether metallic, and whether roughness, is about the same for all surfels in `kept` (N,).
+        """Find out which of metallic and roughness has about the same value for all surfels.
 
-        Returns those that are, by name: the common value, and how far the values spread.
+        Returns a dictionary with this value, and the width of the range of values, for each of the two that does. Only surfels whose entry
+        in `kept` (N,) is true are compared.
         """
         if self.asked(state) == "on" or not state.method.lit:
             return {}

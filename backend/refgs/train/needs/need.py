@@ -1,4 +1,4 @@
-"""Define a need, a part of the method that a scene may do without, and the decision about it."""
+"""Define `Need`, an optional part of the training such as inter-reflection, and `Decision`, whether a scene needs it."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -15,10 +15,11 @@ MEGA = 1e6
 
 
 class Decision(NamedTuple):
-    """Hold the decision about a need.
+    """Hold the decision whether a scene needs an optional part of the training.
 
-    `statistic` was compared with `threshold`, or with the need's own threshold if `threshold` is None. `figures` say what was saved, in
-    `seconds` and `megabytes`, and what it cost, in `decibels` of the training views' PSNR. They also hold numbers that `Need.apply` reads.
+    `statistic` is the measured value that was compared with `threshold`. If `threshold` is None, it was compared with `Need.threshold`.
+    `figures` holds what leaving the part out saves (`seconds`, `megabytes`) and costs (`decibels`, the PSNR lost on training views). It
+    also holds the values that `Need.apply` uses.
     """
 
     needed: bool
@@ -32,7 +33,10 @@ class Decision(NamedTuple):
 
 
 class Need:
-    """Describe a part of the method that a scene may do without. `refgs.train.needs` lists all of them."""
+    """Describe an optional part of the training, such as inter-reflection, and how to decide whether a scene needs it.
+
+    `refgs.train.needs` lists all of them.
+    """
 
     name: ClassVar[str]  # also in the settings' `needs`
     what: ClassVar[str]  # words for the artist
@@ -42,30 +46,30 @@ class Need:
     follows: ClassVar[str] = ""  # a need after whose decision this one is asked, too
 
     def due(self, state: State, moment: Moment, progress: float) -> bool:
-        """Tell whether to decide about this need at this moment of the training.
+        """Tell whether to decide about this optional part now, at this moment of the training.
 
-        This function is not called if the need's setting is "on", or if the need is decided already.
+        It is not called if the user's setting is "on", or after the decision has been made.
         """
         return True
 
     def measure(self, state: State, *given: Any) -> Decision | None:
-        """Measure whether the scene needs this part of the method, and decide.
+        """Decide whether the scene needs this optional part of the training. Returns None to make no decision.
 
-        `given` are further arguments, which depend on the moment of the training. Returns None if there is nothing to record.
+        `given` are values that the caller has measured, such as the fraction of pixels that mirror the object.
         """
         raise NotImplementedError
 
     def apply(self, state: State, found: dict[str, Any]) -> None:
-        """Leave out the part of the method that is not needed. Called after the decision, and again when a run is resumed.
+        """Leave out this optional part of the training, after it was found not to be needed.
 
-        `found` is the recorded decision.
+        It is called once after the decision, and again when a run is resumed. `found` is the recorded decision.
         """
 
     def asked(self, state: State) -> str:
-        """Return the need's setting: "auto", "on" or "off"."""
+        """Return the user's setting for this optional part of the training: "auto", "on" or "off"."""
         return getattr(state.settings.needs, self.name)
 
 
 def megabytes(state: State, names: tuple[str, ...]) -> float:
-    """Compute how much memory these parameters take while they learn, in MB."""
+    """Compute how much memory training these parameters takes, in MB: their values, gradients and Adam's moments."""
     return sum(state.parameters[name].numel() for name in names if name in state.parameters) * NUMBER / MEGA

@@ -62,9 +62,9 @@ class Outside(Need):
 
 
 def time_crops(state: State) -> None:
-    """Measure the seconds that cropped photos save, once there are enough iterations to time.
+    """Measure how many seconds training on cropped photos saves. Add the result to the recorded decision to crop them (see `Outside`).
 
-    The photos are cropped if the need `outside` was decided so (see `Outside`). The seconds are added to the record of that decision.
+    This is done once, as soon as there are enough iterations to measure.
     """
     if state.crops is not None and state.iteration >= TIMED and "seconds" not in state.needs["outside"]:
         state.needs["outside"]["seconds"] = (1 - 1 / WHOLE_EVERY) * probe.seconds_saved(state, whole=True)

@@ -1,4 +1,4 @@
-"""Decide whether a training needs its first stage, and all of its iterations."""
+"""Decide whether a training needs its first stage, which shades each surfel instead of each pixel, and all of its iterations."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from refgs.train.state import State
 
 
 class Initial(Need):
-    """Decide whether the training needs a first stage, in which each surfel is shaded by itself."""
+    """Decide whether the training needs a first stage that shades each surfel. The later stage shades each pixel, after blending."""
 
     name, what = "initial", "a first stage of surfels shaded one by one"
     moments = ("start",)
