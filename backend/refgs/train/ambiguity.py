@@ -83,15 +83,15 @@ TRADES = {
 def ambiguities(state: State) -> dict[str, dict]:
     """Measure how well the two changes of each pair in `TRADES` cancel in the pictures of a finished training.
 
-    Returns a dictionary for each pair, or nothing if the scene has no light:
+    Returns a dictionary of values for each pair, by the pair's name. If the scene has no light, nothing is measured. The values are:
 
     - `alone`: how much the first change alters the pictures.
     - `answer`: the strength of the second change that cancels the first one best.
-    - `left`: how much the pictures still change with both changes.
+    - `left`: how much both changes together still alter the pictures.
     - `error`: how much the pictures differ from the photos.
     - `what`: a message for the user. It is present only if `left` is less than UNSEEN times `error`.
 
-    Differences are root mean squares of encoded colours. They are linear estimates, from a small step of each change.
+    `alone`, `left` and `error` are root mean squares of encoded colours. Changes are linear estimates, from a small step of each change.
     """
     light = state.environment()
     if light is None:

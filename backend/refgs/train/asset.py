@@ -129,7 +129,7 @@ def _seen_side(surfels: Surfels, state: State) -> Tensor:
 
 
 def _needs_rows(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) -> list[dict[str, Any]]:
-    """Make the rows of needs.json: what the run decided it needs or leaves out, each with the reason and what was saved.
+    """Make the rows of needs.json: which parts of the training were used or left out, each with the reason and what leaving it out saved.
 
     `side` (N,) is the result of `_seen_side`. `wanted` (N,) is true for surfels in the region to train.
     """

@@ -76,7 +76,7 @@ def densify(
     budget: int,
     divide: bool,
 ) -> int:
-    """Remove faint surfels. If `divide` is true, also divide the surfels with the largest screen gradients, up to the budget.
+    """Remove faint surfels. If `divide` is true, also divide the surfels with the largest screen gradients, up to `budget` surfels in all.
 
     `gradient` (N,) is each surfel's screen gradient. A surfel is divided into two halves along its longer axis. Parameters are replaced in
     the dictionary and in the optimiser. The halves start with zero Adam moments; other surfels keep theirs. At least one surfel is kept.
@@ -139,7 +139,7 @@ def propagate_normals(parameters: Parameters, optimizer: Adam, settings: Propaga
     """Propagate normals from mirror-like surfels to the surfels around them (paper §3.3).
 
     Smooth, metallic surfels are enlarged, and all opacities are raised to at least `settings.opacity`. The enlarged surfels then cover
-    their neighbours' pixels, which are shaded with the enlarged surfels' normals. Further training adapts the neighbours to them.
+    their neighbours' pixels, which are shaded with the enlarged surfels' normals. Further training adapts the neighbours to these normals.
     """
     parameters["opacity"].clamp_(min=math.log(settings.opacity / (1 - settings.opacity)))
     optimizer.state.pop(parameters["opacity"], None)
@@ -178,9 +178,9 @@ def fewer_surfels(state: State) -> None:
 def take(parameters: Parameters, optimizer: Adam, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
     """Replace all surfels by the rows `index` of their parameters. A row may be taken more than once.
 
-    Adam's moments are taken along, but the rows of the result that `fresh` lists start with zero moments. Adam then moves these rows faster
-    than others at first: pictures get worse for a while, but captures without masks end better. If memory runs out, nothing has changed
-    yet.
+    Adam's moments move with their rows. Only the rows of the result that `fresh` lists start with zero moments. Adam then moves these rows
+    faster than others at first: pictures get worse for a while, but captures without masks end better. If memory runs out, all surfels stay
+    as they were.
     """
     groups = [group for group in optimizer.param_groups if group["name"] in parameters]  # without light and exposures
     made = []

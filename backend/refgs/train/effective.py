@@ -35,7 +35,7 @@ class Effective:
 
     @classmethod
     def of(cls, asked: Settings) -> "Effective":
-        """Start from the user's settings `asked`, without any changes."""
+        """Make an `Effective` from the user's settings `asked`, without any changes."""
         return cls(asked, asked)
 
     def changed(self, key: str, value: Any, by: By, why: str) -> "Effective":

@@ -1,4 +1,4 @@
-"""Stop learning one exposure for each photo, if all photos turn out to have about the same exposure."""
+"""Stop learning the photos' exposures, if all of them turn out to be about the same."""
 
 import math
 

@@ -26,10 +26,10 @@ SMALLEST, LARGEST = 1e-6, 1e2  # of a surfel, in scene radii
 
 
 def limits(name: str, radius: float, brightest: float) -> tuple[float, float]:
-    """Return the lowest and the highest value that the raw parameter `name` may take, before its activation function.
+    """Return the lowest and the highest raw value, before activation, that the parameter `name` may take.
 
-    Beyond these limits, gradients would be too small for the parameter to return. `radius` is the scene's radius. `brightest` is the
-    highest raw value of the light's texels.
+    Beyond these limits, gradients would be too small to move the parameter back. `radius` is the scene's radius. `brightest` is the highest
+    raw value of the light's texels.
     """
     if name == "scale":
         return math.log(SMALLEST * radius), math.log(LARGEST * radius)
@@ -112,7 +112,7 @@ def warn(state: State, what: str) -> None:
 
 @torch.no_grad()
 def remove_broken(parameters: Parameters, optimizer: Adam) -> int:
-    """Remove surfels with a number that is not finite. Returns how many. Raises InputError where none would be left."""
+    """Remove surfels that have a number that is not finite. Returns how many. Raises InputError if none would be left."""
     whole = torch.stack(
         [value.flatten(1).isfinite().all(dim=1) for value in (v[:, None] for v in parameters.values())]
     ).all(dim=0)

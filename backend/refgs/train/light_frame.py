@@ -1,7 +1,4 @@
-"""Choose the light's frame before training: the world's or the camera's.
-
-The photos tell whether the light stood still or turned with the camera.
-"""
+"""Find out from the photos, before training, whether the light stands still in the world or turns with the camera."""
 
 import cv2
 import numpy as np
@@ -35,8 +32,8 @@ def light_frame(views: list[LoadedView], positions: np.ndarray, normals: np.ndar
 
     Each possibility is tried as a model of how bright the points look. Both models are fitted to three quarters of the photos, and must
     then predict the others. A model explains the logarithm of the brightness by a constant for each point, a constant for each photo (its
-    exposure), and spherical harmonics of directions. If the light stands still, this is the mirror direction in the world. If the light
-    turns, these are the normal and the mirror direction in the camera's frame. "camera" is chosen only if its predictions are clearly
+    exposure), and spherical harmonics of some directions. For a still light, this is the mirror direction in the world. For a turning
+    light, these are the normal and the mirror direction in the camera's frame. "camera" is chosen only if its predictions are clearly
     better. The choice takes seconds and is deterministic.
     """
     points, photos, brightness, still, turning = _observations(views, positions, normals, radius)

@@ -13,7 +13,7 @@ FOLDER = "preview"  # in the run folder
 
 
 def write_preview(state: State) -> dict[str, str | int]:
-    """Write RUN/preview/view.png, a view as it is rendered now, and RUN/preview/splats.ply.
+    """Write a preview: RUN/preview/view.png, a view rendered now, and RUN/preview/splats.ply, the surfels now.
 
     Each file is written whole or not at all. Returns the two paths and the iteration.
     """

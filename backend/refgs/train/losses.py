@@ -48,8 +48,8 @@ class Photo(NamedTuple):
 class Objective(NamedTuple):
     """Hold the training loss of one view, and the mean squared error of its picture.
 
-    `loss` is a differentiable scalar. `square` is the mean squared error, of the picture clipped to 0..1. If the photo is a crop, pixels
-    outside the crop count in both, as free of error.
+    `loss` is a differentiable scalar. `square` is the mean squared error, of the picture clipped to 0..1. If the photo is a crop, both are
+    averaged over the whole photo, as if pixels outside the crop had no error.
     """
 
     loss: Tensor

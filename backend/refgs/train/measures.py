@@ -45,8 +45,8 @@ class _TestView(NamedTuple):
 class Measures:
     """Measure a few fixed held-out views against their photos and their ground truth.
 
-    Ground truth is the capture's folder `ground_truth`, as `compare.truth.GroundTruth` reads it, or the normals of its data set. If its
-    size is not the photos' size, a warning is reported and ground truth is left out.
+    Ground truth is the capture's folder `ground_truth` (see `compare.truth.GroundTruth`), or the true normals of the capture's data set. If
+    its pictures differ in size from the photos, a warning is reported and ground truth is not used.
     """
 
     def __init__(self, state: State) -> None:
@@ -80,7 +80,7 @@ class Measures:
         return _TestView(loaded, known, alpha, relit)
 
     def _read_lights(self, truth: GroundTruth, device: torch.device) -> None:
-        """Read two lights from the ground truth: the light of the photos, and another light that true pictures exist for."""
+        """Read two lights from the ground truth: the light of the photos, and another light under which the capture has true pictures."""
         if not self._method.lit:
             return
         if truth.has_light and self.settings.light.frame != "camera":  # the true light stands still

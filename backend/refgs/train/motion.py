@@ -38,5 +38,5 @@ class ScreenGradient:
         run("refgs_motion", work, position, items=work.count)
 
     def mean(self) -> Tensor:
-        """Return the length of each surfel's gradient (N,), averaged over the views that saw the surfel; zero if none did."""
+        """Return the length of each surfel's screen gradient (N,), averaged over the views that saw the surfel; zero if none did."""
         return self.total / self.views.clamp_min(1)

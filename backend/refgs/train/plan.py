@@ -1,4 +1,4 @@
-"""Plan how many iterations fit into a given time, with the training's start and end."""
+"""Plan how many iterations fit into a given time, which includes setting up the training and writing its asset."""
 
 import time
 

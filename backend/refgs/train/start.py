@@ -155,7 +155,7 @@ def _random_points(capture: Capture, count: int, seed: int) -> np.ndarray:
 def _towards_cameras(positions: np.ndarray, views: list[LoadedView]) -> np.ndarray:
     """Compute the unit vectors (N, 3) from each point to the nearest camera.
 
-    They stand for normals: a surface that was seen faces a camera.
+    They are used as normals, because a surface that a photo shows faces a camera.
     """
     cameras = np.stack([view.camera.position for view in views])
     towards = cameras[cKDTree(cameras).query(positions)[1]] - positions

@@ -80,7 +80,7 @@ class State:
 
     @property
     def settings(self) -> Settings:
-        """Return the settings in effect."""
+        """Return the settings that the training uses now (see `Effective`)."""
         return self.effective.settings
 
     @property
@@ -155,7 +155,7 @@ class State:
         return [view.camera for view in self.views[:: max(1, len(self.views) // least)]]
 
     def wanted(self) -> Tensor:
-        """Tell for each surfel (N,) whether it lies in the region to train. If the user set no region, all surfels do.
+        """Tell for each surfel (N,) whether it lies in the region to train, a box that the user may set. Without a box, all surfels do.
 
         Surfels outside the region only exist to reproduce the background of the photos.
         """
@@ -182,7 +182,7 @@ class State:
         return next(group for group in self.optimizer.param_groups if group["name"] == name)
 
     def leave_out(self, *names: str) -> None:
-        """Stop learning these parameters. From then on, all surfels have the values of the first surfel."""
+        """Stop learning the parameters with these `names`. From then on, all surfels have the values of the first surfel."""
         for name in names:
             if name in self.parameters:
                 value = self.parameters.pop(name)

@@ -1,8 +1,8 @@
 """Decide which optional parts of the training a scene needs. Such a part, for example inter-reflection, is called a need.
 
 A decision compares a measured value with a threshold, and is recorded in needs.json. A part that is not needed is left out: settings,
-parameters or photos are changed. The record says what this costs, the PSNR lost on training views, and what it saves, the seconds for all
-remaining iterations.
+parameters or photos are changed. The record says how much PSNR on training views this costs, and how many seconds it saves in the remaining
+iterations.
 """
 
 from typing import Any

@@ -28,7 +28,7 @@ class Reflections(Need):
         """Decide by two measurements whether inter-reflection is needed.
 
         The first is `hidden`, the fraction of the object's pixels that mirror the object itself. The second is how many dB inter-reflection
-        can gain. Both must reach a threshold.
+        can gain. Both must reach a threshold. Nothing is measured if the user's setting is "off".
         """
         if self.asked(state) == "off":
             return Decision(False, ASKED)

@@ -76,10 +76,10 @@ class Constants(Need):
 
     @torch.no_grad()
     def common(self, state: State, surfels: Surfels, kept: Tensor) -> dict[str, tuple[float, float]]:
-        """Find out which of metallic and roughness has about the same value for all surfels.
+        """Find out which of metallic and roughness have about the same value for all surfels.
 
-        Returns a dictionary with this value, and the width of the range of values, for each of the two that does. Only surfels whose entry
-        in `kept` (N,) is true are compared.
+        Returns these, by name, with the common value and the width of the range of values. Only surfels whose entry in `kept` (N,) is true
+        are compared.
         """
         if self.asked(state) == "on" or not state.method.lit:
             return {}
