@@ -50,10 +50,10 @@ def find_layout(folder: Path) -> str | None:
 
 
 def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
-    """Read the cameras of a capture and convert them to the run's frame, the coordinates of the training.
+    """Read the photos' cameras from a capture's folder, and convert them to the run's frame, the world coordinates used in training.
 
-    `wanted` may hold a box around the wanted part, and an up direction. Both are given in the run's frame that results without `wanted`.
-    Only the photos' headers and some masks are read; photos are not decoded. Raises InputError, one line for the artist.
+    `wanted` may set a box around the part to reconstruct, and an up direction. Both are given in the coordinates of a run that has neither.
+    Only the photos' headers and some masks are read; photos are not decoded. Raises InputError with a message of one line.
     """
     folder = Path(folder)
     layout = _check_layout(folder)
@@ -93,7 +93,7 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
 
 
 def _check_layout(folder: Path) -> str:
-    """Return the layout of a capture. Raise InputError if the folder holds none."""
+    """Return the file layout of a capture's folder, such as "colmap". Raise InputError if the folder holds no capture."""
     check_folder(folder)
     layout = find_layout(folder)
     if layout is not None:
@@ -108,7 +108,11 @@ def _check_layout(folder: Path) -> str:
 
 
 def _read(folder: Path, layout: str) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
-    """Return the views, the points, their colours, and warnings. Points and colours are None if the layout has none."""
+    """Read a capture with the reader for its layout.
+
+    Return the views (photos with cameras), the structure-from-motion points and their colours, and warnings. Points and colours are None if
+    this layout has none.
+    """
     match layout:
         case "nerf-blender":
             return read_nerf_blender(folder), None, None, []
@@ -127,7 +131,7 @@ def _check_photos(views: list[View]) -> None:
 
 
 def _shared_photos(views: list[View]) -> list[str]:
-    """Return a warning if a photo is in both the training and the test split."""
+    """Return a warning if a photo is both a training view and a test view, otherwise an empty list."""
     tested, trained = ({view.image_path for view in views if view.split == split} for split in ("test", "train"))
     shared = tested & trained
     if not shared:
@@ -137,7 +141,7 @@ def _shared_photos(views: list[View]) -> list[str]:
 
 
 def _hold_out(views: list[View]) -> list[View]:
-    """Keep the capture's own split into training and test views. Without a split, hold out every eighth view by name."""
+    """Make every eighth view, sorted by file name, a test view. If the capture has test views already, change nothing."""
     if any(view.split == "test" for view in views):
         return views
     views = sorted(views, key=lambda view: view.image_path.as_posix())
@@ -157,7 +161,7 @@ def _check_cameras(folder: Path, views: list[View]) -> None:
 
 
 def _unique_names(views: list[View]) -> list[View]:
-    """Make camera names unique in each split. If photos in two folders have the same name, prefix it with the folder."""
+    """Rename cameras that have the same name as another one of the same split: put the names of the photo's folders in front."""
     names = Counter((view.split, view.camera.name) for view in views)
     top = os.path.commonpath([view.image_path.parent for view in views])
 
@@ -174,7 +178,11 @@ def _unique_names(views: list[View]) -> list[View]:
 
 
 def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.ndarray]], list[str]]:
-    """Return the views, small masks of some of them, and warnings. If all masks are opaque everywhere, return the views without masks."""
+    """Sample small masks from the views.
+
+    Return the views, the pairs (view, mask), and warnings. If all masks are white everywhere they are useless: the views are then returned
+    without masks, the pairs are empty, and there is a warning.
+    """
     silhouettes = sample_silhouettes(views)
     if silhouettes or not any(view.masked for view in views):
         return views, silhouettes, []
@@ -184,10 +192,10 @@ def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.nda
 
 
 def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the similarity (4, 4) from the run's frame to the capture's, and its scale.
+    """Choose the run's frame: +Z is up, and the region of interest is a ball of radius 1 about the origin.
 
-    In the run's frame the region of interest is a ball of radius 1 about the origin, and up is +Z. A NeRF-Blender capture keeps its own
-    frame if float32 is exact enough at the region's size and place.
+    Return the similarity transform (4, 4) from the run's frame to the capture's, and its scale. A NeRF-Blender capture keeps its own
+    coordinates, unless its region of interest is so far away, so large or so small that float32 is too inexact.
     """
     if layout == "nerf-blender":
         if is_near(region):
@@ -197,13 +205,16 @@ def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray,
 
 
 def _narrow(whole: Region, box: Box, views: list[View], silhouettes: list) -> tuple[Region, float]:
-    """Return the region of interest inside a box, and a radius: a ball of that radius about the new region's centre holds `whole`."""
+    """Reduce the region of interest to the part inside a box.
+
+    Return the new region, and the radius of a ball about its centre that contains the old region `whole`.
+    """
     region = region_in(box, views, silhouettes)
     return region, whole.radius + float(np.linalg.norm(whole.centre - region.centre))
 
 
 def _in_run_frame(capture: Capture, unit: float) -> Capture:
-    """Convert a capture to the run's coordinates: move and rotate it, and divide all lengths by `unit`."""
+    """Convert a capture's cameras, points and box to the run's coordinates. One unit of the run is `unit` units of the capture."""
     to_run = np.linalg.inv(capture.to_capture)
     points = capture.points
     return replace(

@@ -1,4 +1,4 @@
-"""Describe the wanted part of a capture by a box."""
+"""Define a rotated box, which marks the part of a capture that the user wants to reconstruct."""
 
 from dataclasses import dataclass
 
@@ -9,13 +9,16 @@ from refgs.settings import RegionSettings
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """Box with any rotation. `matrix` (4, 4) maps the cube −1..1 onto the box: its columns are the three half edges and the centre."""
+    """Box with any position, size and rotation.
+
+    `matrix` (4, 4) maps the cube from −1 to 1 onto the box. Its columns are the three half edges and the centre.
+    """
 
     matrix: np.ndarray
 
     @classmethod
     def of(cls, region: RegionSettings) -> "Box":
-        """Make the box that the settings `region` describe."""
+        """Make a box with the centre, edge lengths and rotation of the settings [region]."""
         from scipy.spatial.transform import Rotation  # slow to import, and few captures have a region
 
         turn = Rotation.from_euler("xyz", region.rotation, degrees=True).as_matrix()
@@ -33,7 +36,7 @@ class Box:
 
     @property
     def radius(self) -> float:
-        """Return half the length of the box's diagonal."""
+        """Return half the length of the box's diagonal: the radius of the ball about the box."""
         return float(np.linalg.norm(self.matrix[:3, :3]))
 
     def contains(self, points: np.ndarray) -> np.ndarray:

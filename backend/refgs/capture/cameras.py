@@ -16,10 +16,11 @@ from refgs.paths import write_text
 
 
 def read_cameras(file: Path) -> list[Camera]:
-    """Read the cameras of a NeRF-Blender or nerfstudio JSON, in the capture's frame, named after their `file_path`.
+    """Read cameras from a NeRF-Blender or nerfstudio JSON file, in the capture's world coordinates.
 
-    A photo is opened only if the file does not name its size. A camera with a distorted lens is replaced by the pinhole camera of the
-    undistorted photo. Cameras of a run's cameras.json are transformed to the capture's frame. Raises InputError.
+    Each camera gets the name of its photo (`file_path`). If the file does not give the photo's size, it is read from the photo. A distorted
+    camera is replaced by the pinhole camera of the undistorted photo. The file may also be cameras.json of a run folder: its cameras are
+    transformed to the capture's coordinates. Raises InputError.
     """
     file = Path(file)
     shared, frames = read_frames(file)
@@ -39,11 +40,11 @@ def read_cameras(file: Path) -> list[Camera]:
 def write_cameras(
     file: Path, capture: Capture, light: str = "world", exposures: dict[str, float] | None = None
 ) -> None:
-    """Write the run folder's cameras.json: undistorted cameras in the run's frame, with OpenGL axes.
+    """Write the run folder's cameras.json: the undistorted cameras in the run's frame, with OpenGL axes.
 
-    The key `photo` is the photo's file, relative to the capture's folder. `light` says what the light is fixed to, "world" or "camera". For
-    "camera", the key `light_of` names a photo: environment.exr is the light as it was for that photo. `exposures` maps names of training
-    photos to factors: radiance times this factor is as bright as the photo.
+    `light` is "world" if the light stands still, or "camera" if it turns with the camera, as on a turntable. In the second case
+    environment.exr shows the light at the first training photo, and the key `light_of` names that photo. `exposures` maps names of training
+    photos to exposure factors: the scene's radiance times this factor gives the photo's brightness.
     """
     frames = []
     for view in capture.views:
@@ -78,8 +79,8 @@ def _from(folder: Path, file: Path) -> Path:
 def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float]]:
     """Read a run folder's cameras.json.
 
-    Return the cameras in the run's frame, their splits, the similarity (4, 4) from the run's frame to the capture's, and exposures
-    (default 1).
+    Return the cameras in the run's frame, the split of each ("train" or "test"), the similarity transform (4, 4) from the run's frame to
+    the capture's, and the exposure factor of each (1 if the file has none).
     """
     file = Path(file)
     shared, frames = read_frames(file)

@@ -27,11 +27,11 @@ LAYOUTS = {
 
 
 def check(capture: Capture, out: Path) -> dict[str, Any]:
-    """Check a capture. Write cameras.json and masked thumbnails of some photos, so that another program can show the capture.
+    """Check a capture. Write cameras.json, and thumbnails of up to 12 photos, so that another program can display the capture.
 
-    Files of an earlier check in the folder `out` are replaced. Returns the paths `capture`, `cameras` and `thumbnails`; `centre` and
-    `radius` of the region of interest, in the frame of cameras.json; and `lines`, the result of `describe`. Raises InputError for a
-    photo or mask that cannot be read.
+    They are written to the folder `out`, and replace files of an earlier check. Returns a dict: the paths `capture`, `cameras` and
+    `thumbnails`; `centre` and `radius` of the region of interest, in the coordinates of cameras.json; and `lines`, the text from
+    `describe`. Raises InputError if a photo or mask cannot be read.
     """
     out.mkdir(parents=True, exist_ok=True)
     lines = describe(capture, out)
@@ -39,7 +39,7 @@ def check(capture: Capture, out: Path) -> dict[str, Any]:
     return {
         "capture": str(capture.folder.resolve()),
         "cameras": str((out / "cameras.json").resolve()),
-        "thumbnails": [str(_thumbnail(out, number).resolve()) for number in _spread(len(capture.views))],
+        "thumbnails": [str(_thumbnail(out, number).resolve()) for number in _thumbnail_indices(len(capture.views))],
         "centre": capture.centre.tolist(),
         "radius": float(capture.radius),
         "lines": lines,
@@ -47,10 +47,10 @@ def check(capture: Capture, out: Path) -> dict[str, Any]:
 
 
 def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
-    """Return lines that describe the contents of the capture, followed by a line `Warning: …` for each likely mistake.
+    """Describe a capture in lines of text. At the end there is a line `Warning: …` for each likely mistake.
 
-    Decodes every photo and mask, and writes thumbnails of some photos to the folder `thumbnails`, if given. Raises InputError if files
-    cannot be read: the message has their number and the name of the first.
+    Decodes every photo and mask. If the folder `thumbnails` is given, thumbnails of up to 12 photos are written to it. Raises InputError if
+    photos or masks cannot be read: the message gives their number and the name of the first.
     """
     statistics = _decode_all(capture, thumbnails)
     return [
@@ -67,9 +67,10 @@ def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
 
 
 class _Statistics:
-    """Statistics of a photo. `coverage` is the fraction inside its mask (None without one); the rest is measured inside the mask.
+    """Statistics of one photo. If it has a mask, only pixels inside the mask are measured.
 
-    `clipped` is the fraction of white pixels, `brightness` the mean 8-bit value, and `grey` is True for a photo without colour.
+    `coverage` is the fraction of pixels inside the mask, None without a mask. `clipped` is the fraction of white pixels. `brightness` is
+    the mean 8-bit value. `grey` is True if the photo has no colour. `sharpness` comes from `_sharpness`.
     """
 
     def __init__(self, loaded: LoadedView):
@@ -83,9 +84,9 @@ class _Statistics:
 
 
 def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
-    """Measure the sharpness inside the mask, away from its edge: energy of the Laplacian divided by energy of the gradient.
+    """Measure how sharp an image is: the sum of its squared Laplacian divided by the sum of its squared gradient.
 
-    The quotient does not depend on contrast. It is 0 for a uniform picture.
+    Only pixels inside the mask and away from its edge count. The result does not depend on contrast. It is 0 for a uniform image.
     """
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     inside = cv2.erode(inside.astype(np.uint8), np.ones((7, 7), np.uint8), borderValue=0) > 0
@@ -94,8 +95,8 @@ def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
     return float((cv2.Laplacian(grey, cv2.CV_32F)[inside] ** 2).sum()) / gradient if gradient > 0 else 0.0
 
 
-def _spread(count: int) -> list[int]:
-    """Choose the views that get thumbnails, evenly: return their indices."""
+def _thumbnail_indices(count: int) -> list[int]:
+    """Return up to 12 evenly spaced indices of `count` views: these views get thumbnails."""
     return sorted({round(number) for number in np.linspace(0, count - 1, THUMBNAILS)})
 
 
@@ -113,7 +114,7 @@ def _write_thumbnail(file: Path, loaded: LoadedView) -> None:
 
 def _decode_all(capture: Capture, thumbnails: Path | None) -> list[_Statistics]:
     statistics, broken = [], []
-    shown = _spread(len(capture.views)) if thumbnails else []
+    shown = _thumbnail_indices(len(capture.views)) if thumbnails else []
     for number, view in enumerate(capture.views):
         try:
             loaded = load_view(view, 512)

@@ -1,7 +1,7 @@
 """Read COLMAP captures: a sparse model in `sparse/0` or `sparse`, binary or text, with photos in `images` or in the capture's folder.
 
-The real scenes of Ref-NeRF and those of mip-NeRF 360 also have reduced photos in `images_2`, `images_4` and `images_8`. If such a folder
-is named as the capture, its photos are used. Their file suffix may differ from the suffix in the model.
+Some data sets, such as the real scenes of Ref-NeRF and mip-NeRF 360, also have reduced photos in `images_2`, `images_4` and `images_8`. To
+use them, name such a folder as the capture. Reduced photos may have another file suffix than the photos that the model names.
 """
 
 import re
@@ -20,9 +20,9 @@ from refgs.formats.colmap import SUPPORTED, Image, Intrinsics, model_files, read
 
 
 def find_model(folder: Path) -> tuple[Path, Path] | None:
-    """Return the folder of a capture's photos and the folder of its sparse model. Return None if there is no model.
+    """Return two folders of a capture: that of its photos and that of its sparse model. Return None if there is no model.
 
-    `folder` is the capture's folder, or its subfolder with reduced photos.
+    `folder` is the capture's folder, or its subfolder `images_N` with reduced photos.
     """
     reduced = re.fullmatch(r"images_\d+", folder.name)
     root, photos = (folder.parent, folder) if reduced else (folder, folder / "images")
@@ -35,9 +35,10 @@ def find_model(folder: Path) -> tuple[Path, Path] | None:
 
 
 def read_colmap(photos: Path, model: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None]:
-    """Read the views, the points (M, 3) and their colours (M, 3) in 0..1, in the model's frame. Raises InputError.
+    """Read a COLMAP model. Return its views (photos with cameras), its points (M, 3), and their colours (M, 3) in 0..1.
 
-    `photos` and `model` are folders, as from `find_model`. Points and colours are None if the model has no file of points.
+    Everything is in the model's coordinates. `photos` and `model` are the folders that `find_model` returns. Points and colours are None if
+    the model has no file of points. Raises InputError.
     """
     cameras_file, images_file, points_file = model_files(model)
     for file in (cameras_file, images_file):
@@ -91,7 +92,7 @@ def _camera(image: Image, intrinsics: Intrinsics, where: str) -> tuple[Camera, L
 
 
 def _rotation(q: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix of a quaternion wxyz of any length. A zero quaternion gives NaN."""
+    """Convert a quaternion (w, x, y, z) of any length to a rotation matrix. A zero quaternion gives NaN."""
     with np.errstate(invalid="ignore"):
         w, x, y, z = q / np.linalg.norm(q)
     return np.array(

@@ -13,9 +13,9 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 
 
 def find_image(path: Path, any_suffix: bool = False) -> Path | None:
-    """Return the file at `path`, or else at `path` with an image suffix added. Return None if both are absent.
+    """Return the image file at `path`. If it is absent, try `path` with an image suffix added. Return None if no file is found.
 
-    With `any_suffix` also try other image suffixes in place of the suffix of `path`.
+    With `any_suffix`, an image suffix of `path` may also be replaced by another one.
     """
     if path.is_file():
         return path
@@ -26,7 +26,10 @@ def find_image(path: Path, any_suffix: bool = False) -> Path | None:
 
 
 def find_photos(folder: Path) -> list[Path]:
-    """Return the photos in the subfolder `images`, or else in the folder itself, sorted by name. NAME_alpha.png is a mask, not a photo."""
+    """List the photos in the subfolder `images`, or in the folder itself if it has no such subfolder. They are sorted by name.
+
+    A file NAME_alpha.png beside a photo NAME is its mask and is not listed.
+    """
     top = folder / "images" if (folder / "images").is_dir() else folder
     found = {path.name: path for path in sorted(top.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES}
     masks = {f"{path.stem}_alpha.png" for path in found.values()}
@@ -34,7 +37,10 @@ def find_photos(folder: Path) -> list[Path]:
 
 
 def report_missing(source: Path, missing: list[str], total: int) -> None:
-    """Raise InputError if photos that the file `source` names are missing."""
+    """Raise InputError if any photos are missing.
+
+    `source` is the file or folder that names the photos, `missing` are the names of the missing ones, and `total` is the number of all.
+    """
     if missing:
         raise InputError(
             f"{source}: {len(missing)} of the {total} images it names are missing, the first is {missing[0]}. "
@@ -43,10 +49,11 @@ def report_missing(source: Path, missing: list[str], total: int) -> None:
 
 
 class Masks:
-    """Masks of a capture: for NAME.jpg, the file NAME.png or NAME.jpg.png in the folder `masks`, with any image suffix.
+    """Find the mask file of each photo of a capture.
 
-    If photos are in subfolders, `masks` has the same subfolders. If that mask is missing, NAME_alpha.png beside the photo is used, as in
-    the scene `ball` of Shiny Blender.
+    The mask of NAME.jpg is NAME.png or NAME.jpg.png in the folder `masks`, or the same with another image suffix. If photos are in
+    subfolders, their masks are in subfolders of `masks` with the same names. If there is no such mask, NAME_alpha.png beside the photo is
+    used, as in the scene `ball` of Shiny Blender.
     """
 
     def __init__(self, folder: Path):
@@ -59,9 +66,10 @@ class Masks:
         }
 
     def find(self, image: Path, named: object, where: str) -> Path | None:
-        """Return the mask of a photo: the file `named`, relative to the folder, or else a mask with the photo's name. None if absent.
+        """Return the mask file of the photo `image`, None if it has none.
 
-        Raises InputError, which begins with `where`, if the file `named` is missing.
+        `named` is the mask's path in the capture's file, relative to the folder; without it, the mask is found by the photo's name. Raises
+        InputError if the mask `named` is missing. The message begins with `where`, which tells the user which camera it is about.
         """
         if named:
             path = find_image(self.folder / str(named).replace("\\", "/"))
@@ -85,10 +93,11 @@ def photo_view(
     where: str,
     mask_below: float | None = None,
 ) -> View:
-    """Make the view of a photo. `as_given` is the camera and lens from the capture's file. Error messages name the camera by `where`.
+    """Make a view from a photo and its camera.
 
-    `mask_below` has the meaning of `View.mask_below`. Intrinsics are scaled if they were given for another resolution than the photo's.
-    Raises InputError if the camera's aspect ratio or the mask's size differs from the photo's.
+    `as_given` is the camera and lens as the capture's file gives them. If they are for another resolution than the photo's, they are
+    scaled. `mask_below` is given if the mask is a depth map (see `View`). Raises InputError if the photo's aspect ratio differs from the
+    camera's, or the mask's size from the photo's. `where` tells in the message which camera it is about.
     """
     width, height, has_alpha = read_header(image)
     camera, lens = as_given

@@ -1,4 +1,4 @@
-"""Load photos and masks for training: undistort and reduce them to 8-bit sRGB with straight alpha."""
+"""Load photos and masks for training: decode, undistort and reduce them. The results are 8-bit sRGB with straight alpha."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -16,9 +16,10 @@ from refgs.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class LoadedView:
-    """Pixels of a view: `image` (H, W, 3) uint8 sRGB-encoded, and straight `alpha` (H, W) uint8, None without a mask.
+    """Pixels of a photo as loaded for training: `image` (H, W, 3) uint8, sRGB-encoded, and `alpha` (H, W) uint8, None without a mask.
 
-    `camera` has the loaded size. In a resampled photo fully transparent pixels are black.
+    Colours are not premultiplied by alpha. `camera` is the pinhole camera for this image size. If the photo was reduced or undistorted, its
+    fully transparent pixels are black.
     """
 
     image: np.ndarray
@@ -27,15 +28,16 @@ class LoadedView:
 
 
 def read_header(path: Path) -> tuple[int, int, bool]:
-    """Return a picture's width, height, and True if it has an alpha channel. Decodes no pixels. Raises InputError naming the file."""
+    """Return an image file's width, its height, and whether it has alpha. No pixels are decoded. Raises InputError naming the file."""
     with _open(path) as picture:
         return *picture.size, picture.has_transparency_data
 
 
 def read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Decode a photo to RGB (H, W, 3) and alpha (H, W) uint8. EXIF rotation is ignored, as in COLMAP and nerfstudio.
+    """Decode an image file to RGB (H, W, 3) uint8 and alpha (H, W) uint8, None without alpha.
 
-    16-bit and greyscale files are converted to 8-bit RGB. Raises InputError naming a file that is truncated or unreadable.
+    16-bit and greyscale files are converted to 8-bit RGB. The EXIF rotation is ignored, as in COLMAP and nerfstudio. Raises InputError
+    naming the file if it is truncated or unreadable.
     """
     with _open(path) as picture:
         pixels = np.asarray(_decode(picture, path))
@@ -43,10 +45,11 @@ def read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def read_mask(path: Path, below: float | None = None) -> np.ndarray:
-    """Read a mask file as alpha (H, W) uint8: white is the object.
+    """Read a mask file as (H, W) uint8: 255 is the object, 0 the background.
 
-    An alpha channel, if the file has one, is the mask. A mask of the values 0 and 1 is scaled to 255. If `below` is given, the file is a
-    depth map instead: the object is where depth is less than `below` times the largest value that a pixel can have.
+    If the file has an alpha channel that is not opaque everywhere, the alpha channel is the mask. Otherwise the brightness is the mask. A
+    mask with the values 0 and 1 is scaled to 255. If `below` is given, the file is a depth map instead: the object is where depth is less
+    than `below` times the largest possible value.
     """
     image, alpha = read_image(path)
     if below is not None:
@@ -57,17 +60,17 @@ def read_mask(path: Path, below: float | None = None) -> np.ndarray:
 
 
 def read_alpha(view: View) -> np.ndarray | None:
-    """Read a view's mask as stored, before undistortion: (H, W) uint8, None without a mask."""
+    """Return a photo's mask (H, W) uint8, None if it has none. It is not undistorted and has the size of the file."""
     if view.mask_path is not None:
         return read_mask(view.mask_path, view.mask_below)
     return read_image(view.image_path)[1] if view.has_alpha else None
 
 
 def load_view(view: View, max_side: int | None = None) -> LoadedView:
-    """Load a view: decode, mask and undistort it, and reduce its longer side to `max_side` pixels (None: keep its size).
+    """Load a photo for training: decode it, apply its mask, undistort it, reduce its longer side to `max_side` pixels (None: full size).
 
-    Linear radiance is averaged over the area of each reduced pixel, as by a coarser sensor. Pixels are weighted by alpha, so that
-    colours outside the mask do not bleed into its edge. Raises InputError naming the file.
+    When a photo is reduced, linear radiance is averaged over each new pixel's area, as a coarser sensor would do. The average is weighted
+    by alpha, so that colours outside the mask do not bleed into its edge. Raises InputError naming the file.
     """
     image, own_alpha = read_image(view.image_path)
     alpha = own_alpha if view.has_alpha else None
@@ -132,7 +135,7 @@ def _reason(error: Exception) -> str:
 
 @cache
 def _decoding_table() -> np.ndarray:
-    """Return the linear radiance of each 8-bit sRGB code, float32 (256,)."""
+    """Return a table from 8-bit sRGB values to linear radiance, float32 (256,)."""
     return srgb_decode(np.arange(256) / 255).astype(np.float32)
 
 

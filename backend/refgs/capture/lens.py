@@ -5,8 +5,8 @@ With (x, y) = (X/Z, Y/Z) and r² = x² + y²,
     y' = y·(1 + k1·r² + k2·r⁴ + k3·r⁶ + k4·r⁸) + p1·(r² + 2y²) + 2·p2·x·y
 and the pixel is (fx·x' + cx, fy·y' + cy).
 
-The undistorted photo is that of a pinhole camera with the same size in pixels. Its focal lengths are scaled by the smallest factor at
-which every pixel samples the inside of the photo. So there are no black pixels to mask, and a thin strip at the photo's edges is lost.
+The undistorted photo has the same size in pixels. Its focal length is chosen so that it shows as much as possible of the distorted photo
+without black borders. A thin strip at the edges of the distorted photo is lost.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +20,10 @@ from refgs.errors import InputError
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of a distorted photo in pixels (centres at half-integers), with radial k1..k4 and tangential p1, p2."""
+    """Intrinsics and distortion coefficients of a photo: `radial` is k1..k4, `tangential` is p1, p2.
+
+    Focal lengths and principal point are in pixels; pixel centres are at half-integers.
+    """
 
     fx: float
     fy: float
@@ -30,7 +33,7 @@ class Lens:
     tangential: tuple[float, float]
 
     def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the distorted position (x', y') of the undistorted position (x, y) on the image plane at unit distance."""
+        """Return the distorted image position (x', y') of an undistorted one (x, y). Both are on the image plane at depth 1."""
         k1, k2, k3, k4 = self.radial
         p1, p2 = self.tangential
         r2 = x * x + y * y
@@ -42,9 +45,9 @@ class Lens:
         )
 
     def pinhole(self, camera: Camera, where: str) -> Camera:
-        """Return the pinhole camera of the undistorted photo, with the pose and size of `camera`.
+        """Return the pinhole camera of the undistorted photo. It has the pose and the size of `camera`.
 
-        Raises InputError naming `where` if the distortion is too strong.
+        Raises InputError if the distortion is too strong. The message begins with `where`, a name for the camera.
         """
         factor = _focal_factor(self, camera.width, camera.height)
         if factor is None:
@@ -52,15 +55,18 @@ class Lens:
         return replace(camera, fx=self.fx * factor, fy=self.fy * factor, cx=self.cx, cy=self.cy)
 
     def maps(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return where to sample the distorted photo for each pixel of the pinhole `camera`: columns and rows, two float32 (H, W)."""
+        """Return the maps that `cv2.remap` needs to undistort the photo: columns and rows, each (H, W) float32.
+
+        They say, for each pixel of the pinhole `camera`, where it lies in the distorted photo.
+        """
         return _maps(self, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 @lru_cache(maxsize=64)
 def _focal_factor(lens: Lens, width: int, height: int) -> float | None:
-    """Find the smallest factor on the focal lengths at which every pixel of the pinhole lies inside the photo.
+    """Find the smallest factor for the focal lengths with which the undistorted photo has no black borders.
 
-    Return None if the factor would be above 2.
+    A larger factor zooms in, so that every pixel lies inside the distorted photo. Return None if the factor would be above 2.
     """
     u, v = np.meshgrid(np.linspace(0, width, 65), np.linspace(0, height, 65))
 

@@ -1,14 +1,16 @@
-"""Find the cameras of photos from the photos alone: structure from motion by COLMAP, through pycolmap.
+"""Find the cameras of photos by structure from motion, with COLMAP (pycolmap).
 
-COLMAP runs in its own process: its OpenMP conflicts with torch's on some systems, COLMAP cannot be interrupted, and when it aborts, its
-process ends.
+COLMAP runs in a child process, for three reasons: its OpenMP conflicts with torch's on some systems, it cannot be interrupted, and it ends
+its process when it aborts.
 
-Masks are not used, because surroundings fixed to the object determine the cameras best. A shiny object alone determines them poorly: from
-the pixels inside the masks, only 5 of 66 photos of a polished head got a camera. With a turntable, the surroundings are fixed to the
-camera and mislead. Therefore matches at the same pixel in both photos are dropped. This is not enough if the camera also moved a little:
-then some cameras fit the turntable and others the surroundings (all 66 photos of the head got cameras, 19° wrong on average). Such cameras
-contradict many of the matches that they were found from, so the artist is warned. Dropping features that hardly move over many photos was
-tried: only 8 of the 66 photos then got cameras, though correct ones.
+Masks are not used. If the camera moves around an object that stands still, the surroundings help to find the cameras. A shiny object alone
+gives poor cameras: with only the pixels inside the masks, 5 of 66 photos of a polished head got a camera.
+
+If the object stands on a turntable instead, the surroundings do not turn with it and lead to wrong cameras. Therefore matches at the same
+pixel in both photos are dropped. This does not help if the camera also moved a little: some cameras then follow the turntable and others
+the surroundings (all 66 photos of the head got cameras, 19° wrong on average). Such cameras disagree with many feature matches, and the
+user gets a warning. Dropping features that hardly move over many photos was tried: only 8 of the 66 photos then got cameras, though correct
+ones.
 """
 
 import hashlib
@@ -42,12 +44,15 @@ DOUBTED = (
 
 
 def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) -> dict[str, Any]:
-    """Find the cameras of the photos in a folder or in its subfolder `images`. Write them to the folder's `sparse/0`, a COLMAP model.
+    """Find the cameras of the photos in a folder, or in its subfolder `images`. Write them to the subfolder `sparse/0` as a COLMAP model.
 
-    `report` is called with "progress" and a dict of `stage` ("features", "matching" or "mapping"), `done` and `total`, or with "warning"
-    and a dict of the text `what`. Returns the counts `placed` (photos that got a camera) and `photos`, and `error`, the mean reprojection
-    error in pixels. An interrupted call leaves `sparse.tmp`, from which the next call for the same photos resumes. Raises InputError if
-    there are fewer than three photos, if there are cameras already, or if fewer than half of the photos got a camera.
+    Returns a dict: `photos` is their number, `placed` is how many got a camera, and `error` is the mean reprojection error in pixels.
+
+    `report(event, facts)` is called with "progress" and a dict of `stage` ("features", "matching" or "mapping"), `done` and `total`, or
+    with "warning" and a dict with the text `what`.
+
+    An interrupted call leaves `sparse.tmp`. The next call for the same photos resumes from it. Raises InputError if there are fewer than
+    three photos, if there are cameras already, or if fewer than half of the photos got a camera.
     """
     folder = Path(folder)
     photos = find_photos(folder)
@@ -59,12 +64,12 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
         read_header(photo)
     work = folder / "sparse.tmp"
     work.mkdir(exist_ok=True)
-    database = work / f"{_digest(photos)}.db"
+    database = work / f"{_hash_of_photos(photos)}.db"
     for path in list(work.iterdir()):  # from other photos, or half written
         if not path.name.startswith(database.name):
             _remove(path)
     model = work / "0"
-    placed, error, contradicted = _place_in_child(photos, database, model, report)
+    placed, error, contradicted = _run_colmap_in_child(photos, database, model, report)
     if len(placed) < max(3, len(photos) / 2):
         shutil.rmtree(work)
         raise InputError(
@@ -85,11 +90,11 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
 
 
 def pairs(count: int) -> list[tuple[int, int]]:
-    """Choose the pairs of photos to match, as indices into the photos sorted by name.
+    """Choose which pairs of photos to match. Return pairs of indices; photos are sorted by name.
 
-    Up to ALL_PAIRS photos, match every pair. With more, match each photo with the next ten, and with those 16, 32, 64 … places further on.
-    Indices wrap around, because photographers walk around an object. Also match the photos 0, 10, 20 … with one another, to link several
-    rounds about the object.
+    With up to ALL_PAIRS photos, this is every pair. With more, each photo is matched with the next ten, and with those 16, 32, 64 … places
+    further on. The last photos are matched with the first, because photographers walk around an object. To link several rounds around the
+    object, the photos 0, 10, 20 … are also matched with one another.
     """
     if count <= ALL_PAIRS:
         return list(combinations(range(count), 2))
@@ -99,10 +104,10 @@ def pairs(count: int) -> list[tuple[int, int]]:
 
 
 def epipolar_distance(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return the Sampson distance (M,) of matches from their epipolar lines, on the image plane at depth 1.
+    """Return the Sampson distance (M,) of each match: how far two matched points are from each other's epipolar lines.
 
-    `ours` and `theirs` (M, 2) are the matched points of two photos on that plane. `pose` (3, 4) maps points from the first camera's frame
-    to the second's.
+    `ours` and `theirs` (M, 2) are the matched points in the two photos, on the image plane at depth 1. `pose` (3, 4) maps points from the
+    first camera's coordinates to the second's.
     """
     turn, shift = pose[:, :3], pose[:, 3]
     x, y = (np.column_stack([rays, np.ones(len(rays))]) for rays in (ours, theirs))
@@ -116,17 +121,19 @@ def _remove(path: Path) -> None:
     shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def _digest(photos: list[Path]) -> str:
-    """Identify these photos by names, sizes and dates, so that edited photos differ."""
+def _hash_of_photos(photos: list[Path]) -> str:
+    """Return a hash of the photos' names, sizes and dates. It changes if a photo is edited."""
     facts = [(photo.name, photo.stat().st_size, photo.stat().st_mtime_ns) for photo in photos]
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
 
 
-def _place_in_child(photos: list[Path], database: Path, model: Path, report: Callable) -> tuple[set[str], float, float]:
-    """Run `_place` in its own process, and return its result. The process is killed when this call returns or raises."""
+def _run_colmap_in_child(
+    photos: list[Path], database: Path, model: Path, report: Callable
+) -> tuple[set[str], float, float]:
+    """Run `_run_colmap` in a child process and return its result. The process is ended even if this call is interrupted."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_place, args=(photos, database, model, theirs), daemon=True)
+    process = context.Process(target=_run_colmap, args=(photos, database, model, theirs), daemon=True)
     process.start()
     theirs.close()
     try:
@@ -144,11 +151,11 @@ def _place_in_child(photos: list[Path], database: Path, model: Path, report: Cal
         process.join()
 
 
-def _place(photos: list[Path], database: Path, model: Path, events: Connection) -> None:
-    """Find the photos' cameras, and send progress to `events`. At the end send the result.
+def _run_colmap(photos: list[Path], database: Path, model: Path, events: Connection) -> None:
+    """Run COLMAP on the photos and write its model to the folder `model`. Send progress, and at the end the result, to the pipe `events`.
 
-    The result is a tuple: the names of the photos that got a camera, the mean reprojection error in pixels, and the fraction of matches
-    that contradict the cameras.
+    The result is a tuple: the names of the photos that got a camera, the mean reprojection error in pixels, and the fraction of feature
+    matches that disagree with the cameras.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     import pycolmap
@@ -178,9 +185,10 @@ def _place(photos: list[Path], database: Path, model: Path, events: Connection) 
 
 
 def _extract(photos: list[Path], database: Path, progress: Callable) -> None:
-    """Extract the features of all photos into the database. Photos of the same size and focal length (EXIF) share their intrinsics.
+    """Extract image features of all photos into COLMAP's database.
 
-    Then rename the photos in the database to their indices, because a file of pairs cannot hold names with spaces.
+    Photos with the same size and focal length (EXIF) share their intrinsics. At the end the photos in the database are renamed to their
+    indices, because names in COLMAP's file of pairs cannot have spaces.
     """
     import pycolmap
 
@@ -218,7 +226,7 @@ def _lens(camera) -> tuple[int, int, float]:
 
 
 def _match(count: int, database: Path, progress: Callable) -> None:
-    """Match the features of `pairs` of photos, and store the matches in the database."""
+    """Match the features of `count` photos, in the pairs that `pairs(count)` chooses. Store the matches in COLMAP's database."""
     import pycolmap
 
     verification = pycolmap.TwoViewGeometryOptions()
@@ -236,23 +244,23 @@ def _match(count: int, database: Path, progress: Callable) -> None:
         pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
 
 
-def _contradicted(found: Any, database: Path) -> float:
-    """Return the fraction of matches that contradict the cameras `found` (a pycolmap.Reconstruction).
+def _contradicted(model: Any, database: Path) -> float:
+    """Return the fraction of feature matches that disagree with the cameras of a model (a pycolmap.Reconstruction).
 
-    Such a match is more than MATCH_TOLERANCE pixels from its epipolar line.
+    A match disagrees if its points are more than MATCH_TOLERANCE pixels from their epipolar lines.
     """
     import pycolmap
 
-    placed = set(found.reg_image_ids())
+    placed = set(model.reg_image_ids())
     with pycolmap.Database.open(database) as known:
         places = {number: known.read_keypoints(number)[:, :2].astype(float) for number in placed}
         verified = list(zip(*known.read_two_view_geometries(), strict=True))
-    rays = {number: found.image(number).camera.cam_from_img(places[number]) for number in placed}
+    rays = {number: model.image(number).camera.cam_from_img(places[number]) for number in placed}
     wrong, total = 0, 0
     for pair, geometry in verified:
         (a, b), matches = pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches
         if {a, b} <= placed:
-            ours, theirs = found.image(a), found.image(b)
+            ours, theirs = model.image(a), model.image(b)
             pose = (theirs.cam_from_world() * ours.cam_from_world().inverse()).matrix()
             far = (
                 epipolar_distance(rays[a][matches[:, 0]], rays[b][matches[:, 1]], pose)
@@ -263,7 +271,10 @@ def _contradicted(found: Any, database: Path) -> float:
 
 
 def _map(photos: list[Path], database: Path, progress: Callable) -> Any:
-    """Find cameras from the matches. Return the model (a pycolmap.Reconstruction) with the most photos; None if there is none."""
+    """Compute cameras from the feature matches.
+
+    COLMAP may return several separate models. Return the one with the most photos (a pycolmap.Reconstruction), None if there is none.
+    """
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions()

@@ -1,8 +1,9 @@
 """Read NeRF-Blender captures: `transforms_train.json` and `transforms_test.json` beside folders of RGBA PNGs.
 
-NeRF-Synthetic (see its README) and Shiny Blender have this layout. Shiny Blender adds NAME_normal.png, read as by the class `Blender` in
-`internal/datasets.py` of multinerf, Ref-NeRF's code, and NAME_alpha.png, the mask of its scene `ball`. If the test file is missing, the
-validation file is used for testing. Pictures that no frame names are ignored: depth, disparity, and NeRF-Synthetic's
+NeRF-Synthetic and Shiny Blender have this layout. If the test file is missing, `transforms_val.json` is used for testing.
+
+Shiny Blender also has true normals, NAME_normal.png. They have the encoding that Ref-NeRF's code reads (class `Blender` in multinerf's
+`internal/datasets.py`). Its scene `ball` has masks, NAME_alpha.png. Other images are ignored: depth, disparity, and NeRF-Synthetic's
 NAME_normal_0000.png, whose encoding is undocumented.
 """
 
@@ -19,7 +20,7 @@ from refgs.errors import InputError
 
 
 def read_nerf_blender(folder: Path) -> list[View]:
-    """Read the views, in the capture's frame. Raises InputError."""
+    """Read the training and test views (photos with cameras) of a NeRF-Blender capture, in the capture's coordinates. Raises InputError."""
     views = _read(folder / "transforms_train.json", "train")
     for name in ("transforms_test.json", "transforms_val.json"):
         if (folder / name).is_file():
@@ -28,10 +29,10 @@ def read_nerf_blender(folder: Path) -> list[View]:
 
 
 def published_normals(view: View, max_side: int | None = None) -> tuple[np.ndarray, np.ndarray] | None:
-    """Read a view's true normals and alpha, where the data set publishes them; None otherwise.
+    """Read the true normals of a view and its alpha. Return None if the data set has no normals.
 
-    Unit normals (H, W, 3) float32 in the capture's frame, zero off the surface; alpha (H, W) float32 in 0..1. Both have the size
-    that `load_view` returns. Raises InputError naming the file.
+    Normals (H, W, 3) are float32 unit vectors in the capture's world coordinates, zero outside the object. Alpha (H, W) is float32 in 0..1.
+    Both have the size that `load_view` returns. Raises InputError naming the file.
     """
     if view.normal_path is None:
         return None

@@ -1,7 +1,7 @@
-"""Read nerfstudio and instant-ngp captures: one `transforms.json` with intrinsics, shared or per frame, and optional masks.
+"""Read nerfstudio and instant-ngp captures: one `transforms.json`, with intrinsics for all frames or for each frame, and optional masks.
 
-`train_filenames`, `test_filenames` and `val_filenames` are nerfstudio's split. If the test list is missing, the validation list is used for
-testing. `ply_file_path` names the file of structure-from-motion points.
+`train_filenames` and `test_filenames` list the training and test photos. If the test list is missing, `val_filenames` is used.
+`ply_file_path` names the file of structure-from-motion points.
 """
 
 from pathlib import Path
@@ -16,7 +16,10 @@ from refgs.errors import InputError
 
 
 def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
-    """Read the views, points (M, 3) and their colours (M, 3) in 0..1, in the capture's frame, and warnings. Raises InputError."""
+    """Read a nerfstudio or instant-ngp capture. Return its views, its points (M, 3), their colours (M, 3) in 0..1, and warnings.
+
+    Everything is in the capture's coordinates. Points and colours are None if the capture names no file of points. Raises InputError.
+    """
     file = folder / "transforms.json"
     shared, frames = read_frames(file)
     train = shared.get("train_filenames")
@@ -37,10 +40,10 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.nda
 
 
 def _without_deleted(shared: dict, frames: list[Frame], file: Path) -> tuple[list[Frame], list[str]]:
-    """Drop frames whose photos are missing, and warn, in instant-ngp's files only.
+    """Drop frames whose photos are missing, but only from instant-ngp's files. Return the frames that are left, and warnings.
 
-    instant-ngp (its files have an `aabb_scale`) ignores frames of photos that were deleted as blurred, and its sample captures rely on it.
-    All frames are kept, for the caller to report as an error, if more than half of the photos are missing or the file is not instant-ngp's.
+    Users of instant-ngp delete blurred photos and leave their frames in the file; instant-ngp ignores these frames. Its files have the key
+    `aabb_scale`. Nothing is dropped from other files, nor if more than half of the photos are missing: the caller then raises an error.
     """
     missing = [frame.path for frame in frames if find_image(file.parent / frame.path) is None]
     if "aabb_scale" not in shared or not missing or 2 * len(missing) > len(frames):

@@ -1,9 +1,9 @@
-"""Read captures of NeRO's Glossy Synthetic: `0.png`, `0-depth.png`, `0-camera.pkl` and so on in one folder.
+"""Read captures of NeRO's data set Glossy Synthetic: `0.png`, `0-depth.png`, `0-camera.pkl` and so on in one folder.
 
-`GlossySyntheticDatabase` in `dataset/database.py` of NeRO (Liu et al. 2023) reads this layout. A camera is a pickle of two arrays:
-world to camera (3, 4) with OpenCV's axes, and the intrinsic matrix (3, 3). A depth map has 16 bits for 0 to 15 units; depth beyond
-14.5 is background, the rest is the mask. `synthetic_split_128.pkl`, from NeRO's folder `configs`, holds the numbers of the test
-views and then of the training views. It may lie in the scene's folder or in its parent.
+The layout is that of `GlossySyntheticDatabase` in NeRO's `dataset/database.py` (Liu et al. 2023). A camera is a pickle of two arrays: world
+to camera (3, 4) with OpenCV's axes, and the intrinsic matrix (3, 3). A depth map stores 0 to 15 units in 16 bits. Depth beyond 14.5 is
+background, smaller depth is the object; this makes the mask. `synthetic_split_128.pkl`, from NeRO's folder `configs`, lists first the
+numbers of the test views, then those of the training views. It may be in the scene's folder or in the folder above.
 """
 
 from pathlib import Path
@@ -23,12 +23,12 @@ FAR = 14.5 / 15  # part of a depth map's range at which the background begins
 
 
 def read_nero(folder: Path) -> tuple[list[View], list[str]]:
-    """Read the views, in NeRO's frame, and warnings. Raises InputError."""
+    """Read a NeRO capture. Return its views (photos with cameras) in NeRO's coordinates, and warnings. Raises InputError."""
     names = (file.name.removesuffix("-camera.pkl") for file in folder.glob("*-camera.pkl"))
     numbers = sorted(int(name) for name in names if name.isdecimal())
     photos = [folder / f"{number}.png" for number in numbers]
     report_missing(folder, [photo.name for photo in photos if not photo.is_file()], len(photos))
-    tested, warnings = _tested(folder, numbers)
+    tested, warnings = _test_numbers(folder, numbers)
     views = []
     for number, photo in zip(numbers, photos, strict=True):
         file = folder / f"{number}-camera.pkl"
@@ -54,8 +54,11 @@ def _camera(file: Path, name: str, width: int, height: int) -> Camera:
     return Camera(name, width, height, fx, fy, cx, cy, world_to_camera(inverse, str(file)))
 
 
-def _tested(folder: Path, numbers: list[int]) -> tuple[set[int], list[str]]:
-    """Return the test views by NeRO's split. Without it, return every eighth view, and a warning."""
+def _test_numbers(folder: Path, numbers: list[int]) -> tuple[set[int], list[str]]:
+    """Return the numbers of the test views, and warnings.
+
+    They are read from NeRO's split file. If it is missing, every eighth view is a test view, and there is a warning.
+    """
     file = next((path for path in (folder / SPLIT, folder.parent / SPLIT) if path.is_file()), None)
     if file is None:
         warning = f"{SPLIT} of NeRO is neither in the scene's folder nor beside it: every eighth view is tested on"

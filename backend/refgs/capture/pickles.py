@@ -1,7 +1,7 @@
 """Read pickled NumPy arrays safely.
 
-`pickle.load` calls any function that a file names, and captures come from untrusted sources. This reader knows only the few names that a
-pickled array needs, and replaces them by plain containers; any other name is refused. The arrays are then made from the containers' bytes.
+`pickle.load` can run any code that a file names, and captures come from untrusted sources. This reader accepts only the few names that
+pickled arrays need, and loads them into plain containers. It refuses any other name. The arrays are then made from the containers' bytes.
 """
 
 import pickle
@@ -16,7 +16,7 @@ KINDS = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 
 
 def read_pair(file: Path) -> tuple[np.ndarray | list[int | str], np.ndarray | list[int | str]]:
-    """Read the two arrays or lists of a pickle. Raise InputError, one line, for anything else."""
+    """Read a pickle that holds two arrays or lists, and return both. Raise InputError with a message of one line for anything else."""
     try:
         with file.open("rb") as source:
             data = source.read(LARGEST + 1)
@@ -41,7 +41,7 @@ class _Refused(Exception):
 
 
 class _Dtype:
-    """Stand in for numpy.dtype. `kind` is a code such as "f8"; `order` is the byte order, from the pickled state."""
+    """Replace numpy.dtype while a pickle is read. `kind` is a type code such as "f8"; `order` is the byte order."""
 
     def __init__(self, kind: str, *_):
         self.kind, self.order = kind, "="
@@ -51,7 +51,7 @@ class _Dtype:
 
 
 class _Array:
-    """Stand in for numpy.ndarray: shape, type and bytes, made into an array when all are read."""
+    """Replace numpy.ndarray while a pickle is read: keep shape, type and bytes. `numpy()` makes the array later."""
 
     def __setstate__(self, state: tuple):
         _, self.shape, self.dtype, fortran, self.data = state

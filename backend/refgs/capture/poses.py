@@ -1,4 +1,4 @@
-"""Check poses, and move cameras between frames."""
+"""Check camera poses, and move cameras to other world coordinates."""
 
 from dataclasses import replace
 
@@ -12,10 +12,11 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def world_to_camera(camera_to_world: object, where: str) -> np.ndarray:
-    """Invert a camera-to-world matrix from a file (4×4 or 3×4 numbers, same axes) to a rigid pose, (4, 4) float64.
+    """Check a camera-to-world matrix (4×4 or 3×4) from a file, and return its inverse: a rigid world-to-camera matrix, (4, 4) float64.
 
-    A uniform scale does not change what a camera sees and is dropped; rounding is removed by orthonormalising. Raises InputError
-    naming `where` for NaN, and for a matrix that is singular, mirrors, or stretches by more than 1 %.
+    The axis convention stays that of the input. A uniform scale is dropped, because the camera sees the same without it. The rotation is
+    made orthonormal. Raises InputError for NaN, for a singular matrix, for a reflection, and for a stretch of more than 1 %. The message
+    begins with `where`, a name for the camera.
     """
     advice = "Export the cameras again, or remove this frame."
     try:
@@ -47,7 +48,7 @@ def split_similarity(matrix: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]
 
 
 def in_frame(camera: Camera, to_frame: np.ndarray) -> Camera:
-    """Move a camera to another world frame: p_new = to_frame @ p_old, a 4×4 similarity. Its image stays the same."""
+    """Move a camera to other world coordinates, p_new = to_frame @ p_old (a 4×4 similarity). The camera's image stays the same."""
     scale, rotation, translation = split_similarity(to_frame)
     old = camera.world_to_camera
     pose = np.eye(4)

@@ -1,4 +1,4 @@
-"""Find the region of interest that the cameras look at, an object or a room, and the run's frame."""
+"""Find a capture's region of interest: a ball around the object or place that the cameras look at. Also define the run's frame."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,10 @@ NEAR = 100.0  # largest distance from the origin in radii; largest radius, and i
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Region of interest: a ball in the cameras' frame. `bounded` is True if it holds one object; `because` gives the reason in words."""
+    """Region of interest: a ball, in the coordinates of the cameras.
+
+    `bounded` is True if the photos show one object, False if they show a room or an open scene. `because` gives the reason in words.
+    """
 
     centre: np.ndarray
     radius: float
@@ -27,7 +30,11 @@ class Region:
 def find_region(
     views: list[View], up: np.ndarray, points: np.ndarray | None, silhouettes: list[tuple[View, np.ndarray]]
 ) -> Region:
-    """Find the region of interest from the poses. Then narrow it by masks, or without masks by structure-from-motion points."""
+    """Find the ball that the cameras look at. Use the poses first, then make it tighter by masks, or without masks by the points.
+
+    `up` is the world's up direction. `points` are from structure from motion, or None. `silhouettes` are pairs of a view and its small
+    mask.
+    """
     centre, distances, miss = look_at_centre(views)
     ahead = float((distances > 0).mean())
     if ahead < 0.75:
@@ -53,14 +60,17 @@ def find_region(
 
 
 def is_near(region: Region) -> bool:
-    """Tell whether float32 is as exact in the region as in a unit ball about the origin, up to a factor of 100."""
+    """Tell whether float32 coordinates are exact enough in a region.
+
+    This holds if its radius is between 0.01 and 100, and if its centre is at most 100 radii from the origin.
+    """
     return 1 / NEAR <= region.radius <= NEAR and float(np.linalg.norm(region.centre)) <= NEAR * region.radius
 
 
 def region_in(box: Box, views: list[View], silhouettes: list[tuple[View, np.ndarray]]) -> Region:
-    """Find the region of interest inside a box: what the masks show in it, or without masks all of it.
+    """Find the region of interest inside a box. With masks it is a ball about the masked object; without masks it is a ball about the box.
 
-    Raises InputError if no photo shows the box.
+    `silhouettes` are pairs of a view and its small mask. Raises InputError if no photo shows the box.
     """
     if not any(inside(view.camera, *project(view.camera, box.grid(5))).any() for view in views):
         raise InputError("no photo shows the region: put its box where the cameras look")
@@ -69,10 +79,10 @@ def region_in(box: Box, views: list[View], silhouettes: list[tuple[View, np.ndar
 
 
 def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the point nearest to all optical axes (least squares), its depth from each camera, and how far the axes miss it.
+    """Find the point that the cameras look at: the point nearest to all optical axes, by least squares.
 
-    How far they miss is the median distance of the axes from the point, divided by the median depth. A small weight on the cameras' mean
-    position keeps the point finite if the axes are parallel.
+    Return the point (3,), its depth in each camera (N,), and a measure of how badly the axes meet: their median distance from the point,
+    divided by the median depth. If the axes are parallel, the point stays finite, because it is pulled slightly towards the cameras.
     """
     positions = np.array([view.camera.position for view in views])
     forward = np.array([view.camera.world_to_camera[2, :3] for view in views])
@@ -87,9 +97,10 @@ def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def up_direction(views: list[View]) -> np.ndarray:
-    """Find the world's up direction (3,), in the frame of the poses: perpendicular to the cameras' right axes, close to their mean up axis.
+    """Estimate the world's up direction (3,), in the coordinates of the cameras.
 
-    The mean up axis alone is tilted if all cameras look down. A camera's right axis stays horizontal however the camera is pitched.
+    It is perpendicular to the cameras' right axes, which stay horizontal when a camera looks up or down. The mean of their up axes would be
+    tilted if all cameras look down from one side; it only decides what the right axes leave open.
     """
     axes = np.array([view.camera.world_to_camera[:3, :3] for view in views])
     right, up = axes[:, 0], -axes[:, 1]
@@ -102,7 +113,10 @@ def up_direction(views: list[View]) -> np.ndarray:
 
 
 def run_frame(up: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    """Return the similarity (4, 4) from the run's frame to the capture's. In the run's frame the ball is the unit ball, and `up` is +Z."""
+    """Return the similarity transform (4, 4) from the run's frame to the capture's coordinates.
+
+    In the run's frame, the ball given by `centre` and `radius` has radius 1 about the origin, and `up` is +Z.
+    """
     # The run's x is as close to the capture's x as possible.
     x = np.eye(3)[np.argmin(np.abs(up))] if abs(up[0]) > 0.9 else np.array([1.0, 0.0, 0.0])
     x = x - up * (up @ x)
@@ -114,9 +128,9 @@ def run_frame(up: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
 
 
 def sample_silhouettes(views: list[View], count: int = 24) -> list[tuple[View, np.ndarray]]:
-    """Return small masks of some views, spread over the capture; none if masks are absent or fully opaque.
+    """Return pairs of a view and its small mask, for about `count` views spread over the capture.
 
-    Raises InputError if all masks are empty.
+    Return an empty list if there are no masks, or if they are white everywhere. Raises InputError if all masks are empty.
     """
     masked = [view for view in views if view.masked]
     chosen = masked[:: max(1, len(masked) // count)]
@@ -132,22 +146,25 @@ def sample_silhouettes(views: list[View], count: int = 24) -> list[tuple[View, n
 
 
 def _small(alpha: np.ndarray) -> np.ndarray:
-    """Reduce a mask to about 128 pixels; a cell is true if any of its pixels is more than half opaque."""
+    """Reduce a mask to about 128 pixels on its longer side, as bool.
+
+    A pixel is True if any of the original pixels in it is more than half opaque.
+    """
     step = max(1, max(alpha.shape) // 128)
     mask = (alpha > 127).astype(np.uint8)
     return cv2.dilate(mask, np.ones((step, step), np.uint8))[step // 2 :: step, step // 2 :: step] > 0
 
 
 def _half_view(view: View) -> float:
-    """Return the tangent of half the narrower field of view."""
+    """Return tan(fov / 2) of a camera, for the smaller of its horizontal and vertical fields of view."""
     camera = view.camera
     return min(camera.width / camera.fx, camera.height / camera.fy) / 2
 
 
 def _one_sided(views: list[View], centre: np.ndarray, up: np.ndarray) -> float:
-    """Measure how one-sided the cameras stand about the centre: 0 if they stand all round, 1 if all stand in one direction.
+    """Measure whether the cameras stand all around a point (0) or all on one side of it (1).
 
-    This is the length of the mean horizontal unit direction from the centre to the cameras.
+    The measure is the length of the mean of the unit vectors from the point to the cameras. Heights are ignored.
     """
     away = np.array([view.camera.position for view in views]) - centre
     away -= np.outer(away @ up, up)
@@ -157,10 +174,11 @@ def _one_sided(views: list[View], centre: np.ndarray, up: np.ndarray) -> float:
 def _carve(
     silhouettes: list[tuple[View, np.ndarray]], centre: np.ndarray, half: float, box: Box | None = None
 ) -> tuple | None:
-    """Return centre and radius of a coarse visual hull in the cube centre ± half, and in the box if given; None if nothing is left.
+    """Return a ball (centre, radius) about the visual hull: the space that lies inside the masks of the photos. None if it is empty.
 
-    Carves twice: first the cube, then the bounding box of the cells left. A cell is kept if at least half of the views see it, and if it
-    is inside nine tenths of these views' masks.
+    The search covers the cube centre ± half, and only the inside of `box` if given. It tests a grid of 49³ points, twice: the second grid
+    covers what the first has left. A point is kept if at least half of the views see it, and if it is inside the mask in nine tenths of
+    these.
     """
     low, high = centre - half, centre + half
     for _ in range(2):
@@ -186,7 +204,10 @@ def _carve(
 
 
 def _foreground(views: list[View], points: np.ndarray, centre: np.ndarray, radius: float) -> tuple[np.ndarray, float]:
-    """Return centre and radius of the points near the centre that at least half of the views show."""
+    """Return a ball (centre, radius) about most of the structure-from-motion points near the given ball.
+
+    Only points that at least half of the views see are used. If they are too few or too close together, the given ball is returned.
+    """
     seen = np.zeros(len(points))
     for view in views:
         camera = view.camera

@@ -1,9 +1,9 @@
-"""Read the JSON that NeRF-Blender, instant-ngp and nerfstudio share: cameras as `frames` with a `transform_matrix`.
+"""Read the JSON format that NeRF-Blender, instant-ngp and nerfstudio share: a list `frames`, each with a `transform_matrix`.
 
-Poses are camera-to-world with OpenGL's axes. Intrinsics (`fl_x fl_y cx cy w h`, or `camera_angle_x` and `camera_angle_y` in radians)
-and distortion (`k1 k2 k3 k4 p1 p2`) are given at the top or in a frame; the frame's value wins. The format is documented in
-nerfstudio's "Data conventions" and instant-ngp's "Tips for training NeRF models". instant-ngp's `aabb_scale`, `scale` and `offset`
-place the scene in its own cube and are not needed here.
+Poses are camera-to-world with OpenGL's axes. Intrinsics (`fl_x fl_y cx cy w h`, or `camera_angle_x` and `camera_angle_y` in radians) and
+distortion (`k1 k2 k3 k4 p1 p2`) are given for all frames at the file's top level, or in a frame. If both are given, the frame's value is
+used. The format is documented in nerfstudio's "Data conventions" and instant-ngp's "Tips for training NeRF models". instant-ngp's keys
+`aabb_scale`, `scale` and `offset` are ignored: they only place the scene in its unit cube.
 """
 
 import json
@@ -24,14 +24,17 @@ from refgs.errors import InputError
 
 @dataclass(frozen=True)
 class Frame:
-    """Entry of `frames` in the JSON `file`: its `values`, with those at the file's top level filled in."""
+    """One camera of a transforms JSON: an entry of its list `frames`.
+
+    `values` are the entry's keys and values. Keys that the entry lacks are taken from the file's top level.
+    """
 
     values: dict
     file: Path
 
     @property
     def path(self) -> str:
-        """Photo's path as written, relative to the file, with forward slashes."""
+        """Return the photo's path as the file gives it, with forward slashes. It is relative to the file's folder."""
         return str(self.values["file_path"]).replace("\\", "/")
 
     @property
@@ -39,7 +42,7 @@ class Frame:
         return f"{self.file}, frame {self.path}"
 
     def number(self, key: str) -> float | None:
-        """Return the value of a key, None if absent. Raises InputError if it is not a number."""
+        """Return the number stored under a key, None if it is absent. Raises InputError if the value is not a number."""
         value = self.values.get(key)
         if value is None:
             return None
@@ -49,7 +52,7 @@ class Frame:
 
 
 def read_frames(file: Path) -> tuple[dict, list[Frame]]:
-    """Read the values at the file's top level, and its frames. Raises InputError for JSON of another format."""
+    """Read a transforms JSON. Return its top-level keys and values as a dict, and its frames. Raises InputError for another format."""
     try:
         data = json.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
@@ -69,9 +72,9 @@ def read_frames(file: Path) -> tuple[dict, list[Frame]]:
 
 
 def frame_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> tuple[Camera, Lens | None]:
-    """Return the camera of a frame in the file's world, and its lens if it distorts.
+    """Return the camera of a frame in the file's coordinates, and its lens model. The lens is None if the frame has no distortion.
 
-    `image_size` (width, height) is used if the frame names no size. Raises InputError naming the frame.
+    `image_size` (width, height) is used if the frame gives no size. Raises InputError naming the frame.
     """
     if frame.values.get("is_fisheye") or str(frame.values.get("camera_model", "")).upper() in _NOT_PERSPECTIVE:
         raise InputError(f"{frame.where}: the camera is not a perspective one. Undistort the photos to pinholes first.")
@@ -100,7 +103,10 @@ def frame_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> tup
 
 
 def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> list[View]:
-    """Convert the file's frames to views, in the file's world coordinates. Photo paths are relative to `file`. Raises InputError."""
+    """Make a view (a photo with its camera) of each frame. Cameras are in the file's coordinates; photo paths are relative to its folder.
+
+    `frames` are pairs of a frame and its split, "train" or "test". Raises InputError.
+    """
     folder = file.parent
     found = [(frame, split, find_image(folder / frame.path)) for frame, split in frames]
     report_missing(file, [frame.path for frame, _, path in found if path is None], len(found))
@@ -114,7 +120,7 @@ def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> list[View]:
 
 
 def camera_name(path: str) -> str:
-    """Return the last part of a frame's `file_path`, without an image suffix."""
+    """Return the name of a frame's camera: the last part of its `file_path`, without an image suffix."""
     name = path.replace("\\", "/").rsplit("/", 1)[-1]
     stem, dot, suffix = name.rpartition(".")
     return stem if dot and suffix.lower() in _IMAGE_SUFFIXES else name

@@ -1,4 +1,4 @@
-"""Captures as read, independent of their layout on disk."""
+"""Define captures and views: photos with their cameras, in the same form for every file layout."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +15,14 @@ Split = Literal["train", "test"]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Photo and its pinhole camera.
+    """Photo and its camera.
 
-    `camera` is the pinhole camera of the full-size photo after `load_view` has undistorted it. Its name is the last part of the photo's
-    path without suffix, unique within a split. `lens` is the lens model that distorted the photo file; None without distortion.
-    `has_alpha` tells that the photo's own alpha channel is its mask; `mask_path` names a mask file instead. With `mask_below`, the mask
-    file is a depth map: the object is where depth is below this fraction of the map's range. `normal_path` is a picture of the true
-    normals, if the data set publishes them (`published_normals`).
+    - `camera` is the pinhole camera of the undistorted photo at full size. Its name is the photo's file name without suffix; it is unique
+      within a split.
+    - `lens` is the lens model of the distorted photo file; None without distortion. `load_view` undistorts the photo.
+    - `mask_path` is a mask file. Without one, `has_alpha` tells that the photo's own alpha channel is the mask.
+    - `mask_below` is set if the mask file is a depth map. The object is where depth is below this fraction of the largest possible value.
+    - `normal_path` is an image of the true normals, if the data set has them (see `published_normals`).
     """
 
     camera: Camera
@@ -41,15 +42,17 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Photos with cameras, in the run's frame: the coordinates of the training, with Z up.
+    """Photos with cameras, in the run's frame: the world coordinates used in training, with Z up.
 
-    `to_capture` is a 4×4 float64 similarity, p_capture = to_capture @ p_run. For most NeRF-Blender captures it is the identity. For others
-    the region of interest has radius 1 about the run's origin. If the user sets an up direction, the run's frame is rotated to it. `points`
-    (M, 3) are structure-from-motion points with `point_colors` (M, 3), sRGB-encoded in 0..1; None if the layout has none. `centre` (3,) and
-    `radius` are the region of interest: the object, or a room's foreground. `bounded` is a guess: True if the photos surround one object,
-    False if they look at a place; `bounded_because` says why. If the user sets a `box` (in the run's frame), it narrows the region of
-    interest, but changes no frame. A ball of radius `reach` about `centre` then holds the region of interest without the box; if there is
-    no box, `reach` is `radius`. `warnings` are lines about what was left out or looks wrong.
+    - `to_capture` is the 4×4 float64 similarity p_capture = to_capture @ p_run. It is the identity for most NeRF-Blender captures without
+      an up direction set by the user.
+    - `points` (M, 3) are from structure from motion, `point_colors` (M, 3) their sRGB colours in 0..1. Both are None if the capture has
+      none.
+    - `centre` (3,) and `radius` are a ball about the object, or about a room's foreground: the region of interest.
+    - `bounded` is a guess: True if the photos surround one object, False if they show a room or an open scene. `bounded_because` says why.
+    - `box` is the user's box around the part to reconstruct, or None. It makes the region of interest smaller.
+    - `reach` is the radius of a ball about `centre` that also contains the region of interest as it is without the box.
+    - `warnings` are lines of text about what was left out or looks wrong.
     """
 
     folder: Path
@@ -81,5 +84,5 @@ class Capture:
         return all(view.masked for view in self.train_views)
 
     def fingerprint(self) -> str:
-        """Return the SHA-256 of the files' names and sizes, and of the poses and intrinsics as read."""
+        """Return a SHA-256 hash of file names, file sizes, camera poses and intrinsics. It changes if the capture is changed."""
         return self.digest
