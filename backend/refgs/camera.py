@@ -8,10 +8,10 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Pinhole camera without distortion: x right, y down, z forward; pixel centres at half-integers.
+    """Pinhole camera without distortion, in OpenCV's convention: x right, y down, z forward.
 
-    A world point p is seen at pixel (fx·x/z + cx, fy·y/z + cy), where (x, y, z, 1) = world_to_camera @ (p, 1).
-    `world_to_camera` is a rigid 4×4 float64 matrix; focal lengths and principal point are in pixels.
+    A world point p is seen at pixel (fx·x/z + cx, fy·y/z + cy), where (x, y, z, 1) = world_to_camera @ (p, 1). `world_to_camera` is a rigid
+    4×4 float64 matrix. Focal lengths and principal point are in pixels, and pixel centres are at half-integers.
     """
 
     name: str
@@ -25,7 +25,7 @@ class Camera:
 
     @cached_property
     def camera_to_world(self) -> np.ndarray:
-        """Rigid 4×4 matrix; its columns are the camera's right, down and forward axes and its position."""
+        """Return the rigid 4×4 matrix from camera to world. Its columns are the camera's right, down and forward axes, and its position."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         matrix = np.eye(4)
         matrix[:3, :3] = rotation.T
@@ -34,26 +34,30 @@ class Camera:
 
     @cached_property
     def position(self) -> np.ndarray:
-        """Camera centre in the world, (3,)."""
+        """Return the camera's position in the world, (3,)."""
         return self.camera_to_world[:3, 3]
 
     @cached_property
     def projection(self) -> np.ndarray:
-        """Matrix (3, 4) from a world point (x, y, z, 1) to (column · depth, row · depth, depth)."""
+        """Return the projection matrix (3, 4).
+
+        It maps a homogeneous world point (x, y, z, 1) to (u·d, v·d, d), where (u, v) is the pixel and d the depth.
+        """
         intrinsics = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
         return intrinsics @ self.world_to_camera[:3]
 
     @cached_property
     def heading(self) -> float:
-        """Rotation about the world's z in radians: the twist of the rotation's swing-twist decomposition.
+        """Return the compass direction that the camera looks in: an angle about the world's z axis, in radians.
 
-        Zero for a level camera that looks along +y. Tilting, rolling or raising the camera does not change it.
+        It is 0 for a level camera that looks along +y, and grows counter-clockwise seen from above. Tilting or rolling the camera does not
+        change it. Unlike an angle from the viewing direction alone, it is also defined for a camera that looks straight down.
         """
         right, _, forward = self.camera_to_world[:3, :3].T
         return float(np.arctan2(right[1] - forward[0], right[0] + forward[1]))
 
     def resized(self, width: int, height: int) -> "Camera":
-        """Return the camera for an image of another size in pixels."""
+        """Return the camera for its image scaled to `width` × `height` pixels."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
@@ -64,7 +68,7 @@ class Camera:
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
     def fitted(self, max_side: int) -> "Camera":
-        """Return the camera with its longer side reduced to `max_side` pixels; unchanged if it is not longer."""
+        """Return the camera for its image scaled down to at most `max_side` pixels on the longer side. A smaller image is left as it is."""
         scale = max_side / max(self.width, self.height)
         if scale >= 1:
             return self

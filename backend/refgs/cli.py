@@ -141,7 +141,7 @@ def bench(
         typer.Argument(help="kernels, truth, paper, needs, minutes, gpu or page; another word lists them"),
     ] = "kernels",
 ) -> None:
-    """Measure the parts in milliseconds, or whole trainings by their errors; `--csv FILE` writes the figures."""
+    """Run a benchmark: time the program's parts in milliseconds, or train on scenes and measure errors. `--csv FILE` writes the results."""
     from refgs import commands
 
     commands.bench(what, context.args)
@@ -151,7 +151,7 @@ def bench(
 def stability(
     only: Annotated[str, typer.Option(help="run only cases whose name holds this word, or this group")] = "",
 ) -> None:
-    """Run stiff and extreme cases through every kernel and through training, and print a table. Exit status 1 if a case fails."""
+    """Test extreme inputs in every kernel and in training, and print a table. Exit status 1 if a test fails."""
     from refgs import commands
 
     commands.stability(only)
@@ -170,7 +170,7 @@ def _interrupt(*_) -> None:
 
 
 def _one_line(show):
-    """Return a function for `warnings.showwarning` that prints an InputWarning as one line, and calls `show` for other warnings."""
+    """Make a replacement for `warnings.showwarning`. It prints an InputWarning as one line and passes other warnings to `show`."""
 
     def shown(message, category, *where) -> None:
         if issubclass(category, InputWarning):
@@ -182,7 +182,7 @@ def _one_line(show):
 
 
 def main() -> None:
-    """Run a command. Exit status: 0 done, 2 wrong input (one line), 1 our fault (a traceback), 130 interrupted."""
+    """Run a command. Exit status: 0 success, 1 internal error (prints a traceback), 2 wrong input (prints one line), 130 interrupted."""
     warnings.showwarning = _one_line(warnings.showwarning)
     signal.signal(signal.SIGTERM, _interrupt)
     try:

@@ -1,8 +1,10 @@
-"""Time the parts of a training: forward and backward passes, and work at intervals.
+"""Measure how much time each part of a training takes.
 
-`timed` marks a function or an autograd Function as a part; it is timed while a clock watches an iteration. A part called within
-another part counts as the outer one. On the CPU every iteration is watched, which costs about 25 µs. A card runs asynchronously: one of
-`SAMPLED` iterations is watched, by events on the card's stream, and stands for the others.
+The decorator `timed` names a function, or an autograd Function, as a part. While `Clock.iteration` is active, the run time of its calls is
+added to that part. A part that is called inside another part counts for the outer one only.
+
+On the CPU every iteration is measured, which costs about 25 µs. A GPU runs asynchronously. There only one in `SAMPLED` iterations is
+measured, by CUDA events, and its times are multiplied by `SAMPLED`.
 """
 
 import functools
@@ -18,7 +20,7 @@ _watching: "Clock | None" = None
 
 
 class Clock:
-    """Count seconds of work on a device, by part."""
+    """Add up the seconds that a device spends in each part of a training. `seconds` maps a part's name to its total."""
 
     def __init__(self, device: torch.device):
         self.seconds: dict[str, float] = {}
@@ -26,13 +28,13 @@ class Clock:
         self._events: list[tuple[str, torch.cuda.Event, torch.cuda.Event]] = []
 
     def resume(self, seconds: dict[str, float]) -> None:
-        """Add the seconds that were counted before the training was interrupted."""
+        """Add the seconds of each part from a checkpoint, when an interrupted training is resumed."""
         for name, value in seconds.items():
             self._add(name, value)
 
     @contextmanager
     def iteration(self, number: int) -> Iterator[None]:
-        """Watch an iteration. On a card, watch only one of `SAMPLED`."""
+        """Measure the parts in this `with` block, which is one iteration. On a GPU, only one in `SAMPLED` iterations is measured."""
         global _watching
         if self._on_card and number % SAMPLED != SAMPLED // 2:
             yield
@@ -50,9 +52,10 @@ class Clock:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Count the work in this `with` as one part, less the time of the parts nested in it. Use it for work done only at intervals.
+        """Time a `with` block as the part `name`. It is meant for work that is done only at intervals and is always measured.
 
-        The results of the work must be on the CPU, because the clock does not wait for a card.
+        The time of other `part` blocks inside it is subtracted. The clock does not wait for the GPU. So the block must end with its results
+        on the CPU.
         """
         begun, known = time.perf_counter(), sum(self.seconds.values())
         before, self._within = self._within, True
@@ -64,7 +67,7 @@ class Clock:
             self._add(name, time.perf_counter() - begun - others)
 
     def call(self, name: str, function: Callable, *arguments, **words):
-        """Call a function and count it as a part."""
+        """Call function(*arguments, **words), count its time for the part `name`, and return its result."""
         if self._within:
             return function(*arguments, **words)
         self._within, begun = True, self._now()
@@ -89,7 +92,7 @@ class Clock:
 
 
 def timed(name: str) -> Callable:
-    """Mark a function, or an autograd Function's forward and backward, as a part."""
+    """Return a decorator that times a function, or the forward and backward of an autograd Function, as the part `name`."""
 
     def decorate(what):
         if isinstance(what, type):

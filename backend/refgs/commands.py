@@ -1,4 +1,4 @@
-"""Run the commands of the command line, one function each."""
+"""Run the commands of the command line. There is one function for each command."""
 
 import runpy
 import signal
@@ -21,7 +21,10 @@ PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha"
 
 @contextmanager
 def progress_bar(what: str, total: int):
-    """Show a progress bar with the time left; yield a function that takes the count done and a note."""
+    """Show a progress bar with the estimated time left, for a `with` block.
+
+    Yields a function update(done, note, total) that moves the bar and shows the text `note`.
+    """
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -35,13 +38,16 @@ def progress_bar(what: str, total: int):
 
 
 def print_event(event: str, facts: dict) -> None:
-    """Print an event of a job as a line."""
+    """Print an event of a long-running job as one line. The text is facts["what"]; warnings are marked."""
     console.print(("warning: " if event == "warning" else "") + facts["what"])
 
 
 @contextmanager
 def job_report(what: str):
-    """Yield a function that takes a job's events and shows them: progress as a bar, the rest as lines."""
+    """Show the events of a long-running job: progress as a bar with the label `what`, other events as lines.
+
+    Yields the function report(event, facts) that the job must call.
+    """
     with progress_bar(what, 1) as bar:
 
         def report(event: str, facts: dict) -> None:
@@ -54,7 +60,7 @@ def job_report(what: str):
 
 
 def poses(folder: Path) -> None:
-    """Find the cameras of photos. An interrupted search resumes when the command is run again."""
+    """Find the cameras of the photos in a folder. If the search is interrupted, running the command again resumes it."""
     from refgs.capture.motion import find_cameras
 
     with job_report("finding cameras") as report:
@@ -73,7 +79,10 @@ def train(
     changes: list[str],
     resume: bool,
 ) -> None:
-    """Train a capture into a run folder. Ctrl-C stops it with a checkpoint for `--resume`; a second one ends it at once."""
+    """Train on a capture and write a run folder.
+
+    Ctrl-C ends the training with a checkpoint, from which `resume` continues. A second Ctrl-C ends it at once.
+    """
     stopped = []
     with progress_bar("training", 1) as bar:
 
@@ -106,7 +115,7 @@ def train(
 
 
 def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path | None, format: str) -> None:
-    """Write OUT/PASS/NAME.png or .exr for each camera."""
+    """Render images of a trained run: for each camera and each pass, write OUT/PASS/NAME.png or .exr."""
     for name in passes:
         if name not in PASSES:
             raise InputError(f"--passes {name}: take some of {', '.join(PASSES)}")
@@ -145,7 +154,7 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
 
 
 def _check_passes(run, passes: list[str], format: str) -> None:
-    """Raise InputError for a pass that the run does not have."""
+    """Raise InputError if a requested pass, such as "albedo", does not exist in the run."""
     without = {"albedo", "roughness", "metallic"} if run.environment is None else set()
     without |= {"visibility"} if run.occluder is None else set()
     if missing := [name for name in passes if name in without]:
@@ -155,7 +164,10 @@ def _check_passes(run, passes: list[str], format: str) -> None:
 
 
 def _relight(run, hdri: Path):
-    """Make the light of a panorama, and trace the run's inter-reflection under it, if the run has any."""
+    """Load a panorama and return it as a light for the run.
+
+    If the run has inter-reflection (the object reflects itself), its rays are traced under this light first, with a progress bar.
+    """
     from refgs.formats.panorama import read_environment
 
     if run.environment is None:
@@ -168,7 +180,7 @@ def _relight(run, hdri: Path):
 
 
 def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
-    """Compare renderings with held-out photos, and with ground truth if given. Write metrics.json and pictures/."""
+    """Compare renderings with held-out photos, and with ground truth if it is given. Write metrics.json and the folder pictures."""
     if split not in ("test", "train"):
         raise InputError(f"--split {split}: take test or train")
     check_finished(folder)  # before torch is imported
@@ -202,7 +214,7 @@ def export(
     display_file: Path | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write the mesh with its textures, or splats."""
+    """Export a run as a textured mesh or as splats, and print the files written."""
     with job_report("exporting") as report:
         files = export_run(folder, mesh_file, texture, splats_file, display_file, overwrite, report)
     for file in files:
@@ -210,17 +222,17 @@ def export(
 
 
 def bench(what: str, options: list[str]) -> None:
-    """Run a benchmark of the repository with its own options."""
+    """Run the benchmark `what` from the repository. `options` are its own command-line options."""
     _run_module("benchmarks", [what, *options])
 
 
 def stability(only: str) -> None:
-    """Run the repository's stiff and extreme cases."""
+    """Run the repository's tests of extreme inputs. `only` selects tests by name or group."""
     _run_module("benchmarks.stability", ["--only", only])
 
 
 def _run_module(name: str, options: list[str]) -> None:
-    """Run a module of the repository as a program with these options."""
+    """Run a Python module of the repository as a program, as `python -m NAME OPTIONS` does."""
     sys.path.insert(0, str(clone_root()))
     sys.argv[1:] = options
     runpy.run_module(name, run_name="__main__")

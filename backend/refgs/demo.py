@@ -1,4 +1,4 @@
-"""Run every step of RefGS on a rendered capture, up to relit pictures in Blender."""
+"""Demonstrate RefGS: render a capture of a test scene, train on it, export a mesh, and relight it in Blender."""
 
 import json
 import os
@@ -23,7 +23,10 @@ VIEWS = ("test_002", "test_004")
 
 
 def run(out: Path) -> None:
-    """Make capture, run, mesh, .blend, previews and report under `out`. Steps that are done already are skipped."""
+    """Run the demo. Write the capture, the trained run, the mesh, a .blend file, preview images and a report to the folder `out`.
+
+    Steps that were done by an earlier call are skipped.
+    """
     started = time.perf_counter()
     root, out = clone_root(), out.resolve()
     capture, folder = out / "capture", out / "run"
@@ -66,7 +69,7 @@ def run(out: Path) -> None:
 
 
 def _check_blender(root: Path) -> None:
-    """Raise InputError if Blender cannot be loaded."""
+    """Raise InputError if Blender's Python module cannot be loaded."""
     check = "from refgs_addon.preview import check_libraries; check_libraries()"
     done = subprocess.run([sys.executable, "-c", check], cwd=root, capture_output=True, text=True)
     if done.returncode:
@@ -74,7 +77,11 @@ def _check_blender(root: Path) -> None:
 
 
 def _child(root: Path, what: str, module: str, *arguments: object) -> None:
-    """Run a module that needs Blender in its own process. Show the progress that it prints as JSON lines."""
+    """Run a Python module that needs Blender in a child process.
+
+    The module prints its progress as JSON lines, and a progress bar with the label `what` shows it. Raises InputError with the module's
+    last line if it exits with status 2.
+    """
     command = [sys.executable, "-m", module, *map(str, arguments)]
     with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
         with (
@@ -95,7 +102,10 @@ def _child(root: Path, what: str, module: str, *arguments: object) -> None:
 
 
 def _compare(folder: Path, truth: Path, previews: Path) -> None:
-    """Compare the Eevee previews with Cycles' pictures under the same light. Copy the previews for the report."""
+    """Compare the preview images from Eevee with the images that Cycles rendered under the same light. Write the results to metrics.json.
+
+    Also copy the previews to the run's folder `pictures`, for the report.
+    """
     result: dict[str, dict[str, dict[str, float]]] = {}
     pictures = folder / "pictures" / "relight"
     for hdri in HDRIS:
@@ -112,7 +122,7 @@ def _compare(folder: Path, truth: Path, previews: Path) -> None:
 
 
 def _record(folder: Path, seconds: float) -> None:
-    """Add the demo's time and the peak memory of its processes to metrics.json."""
+    """Write the demo's run time and peak memory to metrics.json."""
     facts, largest = {"seconds": seconds}, [train_job.peak_memory(children) for children in (False, True)]
     if None not in largest:
         facts["peak_memory_bytes"] = max(largest)

@@ -2,16 +2,16 @@
 
 
 class InputError(Exception):
-    """Wrong input by the user.
+    """Error in the user's input.
 
-    The message is one line for the artist: what is wrong, where, what to do. The command line prints it alone and ends
-    with exit status 2. Any other exception is our fault: it ends with status 1 and a traceback in log.txt.
+    The message is one line for the user: what is wrong, where, and what to do. The command line prints only this line and exits with status
+    2. Any other exception is a bug of the program: it exits with status 1, and the traceback is written to log.txt.
     """
 
 
 class NoCameras(InputError):
-    """Folder with photos but without cameras. `refgs.capture.motion` can find them."""
+    """Error for a folder that has photos but no cameras. `refgs.capture.motion` can find the cameras."""
 
 
 class InputWarning(UserWarning):
-    """Partly wrong input: the right part was used. The message is one line, as in an InputError."""
+    """Warning that part of the user's input was wrong and was ignored. The message is one line, as for InputError."""

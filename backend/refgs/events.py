@@ -1,4 +1,4 @@
-"""Define the type of functions that receive a job's events."""
+"""Define the type of the functions that receive the events of a long-running job, such as progress and warnings."""
 
 from collections.abc import Callable
 from typing import Any

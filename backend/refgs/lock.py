@@ -1,7 +1,7 @@
-"""Lock a run folder while a process works in it. Other processes see the lock, read the training's progress, and can stop it.
+"""Lock a run folder while a process works in it. Other processes see the lock, can read the training's progress, and can stop it.
 
-The operating system holds the lock, and frees it when the process ends, even if it is killed. The Blender extension looks at the same
-files on its own; it imports nothing from here.
+The operating system holds the lock. It releases the lock when the process ends, even if it is killed. The Blender extension reads the same
+files with its own code, without importing this module.
 """
 
 import json
@@ -19,7 +19,7 @@ EVERY = 1.0  # seconds between looks
 
 
 class RunLock:
-    """Hold a run folder for this process, in a `with`. Raises InputError if another process holds it."""
+    """Lock a run folder for this process during a `with` block. Raises InputError if another process has locked it."""
 
     def __init__(self, folder: Path):
         self._folder, self._lock, self._next = folder, FileLock(folder / LOCK), 0.0
@@ -42,7 +42,11 @@ class RunLock:
         self._lock.release()
 
     def attend(self, iteration: int, total: int, seconds: float) -> bool:
-        """Write progress.json, once a second at most; return whether another process asked to stop. Call this often."""
+        """Write the training's progress to progress.json. Return True if another process has asked this one to stop.
+
+        Call this in every iteration: it does its work once a second and otherwise returns False. `seconds` is the time spent so far,
+        `total` the number of all iterations.
+        """
         now = time.monotonic()
         if now < self._next:
             return False

@@ -1,4 +1,4 @@
-"""Find the program's own files; write files whole or not at all."""
+"""Find the program's own files. Write files so that a failed write leaves no half-written file."""
 
 import errno
 import os
@@ -16,7 +16,10 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES)
 
 @contextmanager
 def whole(path: str | os.PathLike) -> Iterator[Path]:
-    """Yield a temporary name to write to; rename it to `path` at the end, or delete it if that fails."""
+    """Write a file completely or not at all.
+
+    Yields a temporary path to write to. It is renamed to `path` at the end of the `with` block, or deleted if the block raises an error.
+    """
     path = Path(path)
     temporary = path.with_name(path.name + ".tmp")
     try:
@@ -27,14 +30,17 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def write_text(file: Path, text: str) -> None:
-    """Write a text file whole or not at all."""
+    """Write a text file completely or not at all."""
     with whole(file) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 @contextmanager
 def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
-    """In a `with`: raise InputError if the disk of a folder is full, read-only or gone. The message includes `again`: what to do then."""
+    """Turn disk errors in a `with` block into InputErrors that name the folder: the disk is full, read-only or gone.
+
+    `again` is added to the message: it tells the user how to continue when the disk works again.
+    """
     try:
         yield
     except InputError:
@@ -49,13 +55,16 @@ def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
 
 
 def check_folder(folder: Path) -> None:
-    """Raise InputError unless the folder of a capture exists."""
+    """Raise InputError if the folder of a capture does not exist."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
 
 
 def clone_root() -> Path:
-    """Return the repository's root, which holds the benchmark scenes and the Blender extension; neither is in the package."""
+    """Return the root of the repository. Raise InputError if the program was installed without it.
+
+    The benchmark scenes and the Blender extension are in the repository, but not in the installed package.
+    """
     if not (ROOT / "blender_manifest.toml").exists():
         raise InputError("this needs the whole repository: clone it and install with `pip install -e .` from there")
     return ROOT

@@ -1,6 +1,6 @@
-"""Create a run folder, and open a finished run to render it.
+"""Create run folders, and open a finished run to render it. A run folder holds all results of one training.
 
-Rendering, evaluation, export and Blender read a run folder and nothing else.
+Rendering, evaluation, export and Blender read only the run folder.
 """
 
 import platform
@@ -34,7 +34,10 @@ OCCLUDER = "occluder.ply"  # the mesh that inter-reflection was traced on; absen
 
 @dataclass(frozen=True)
 class Run:
-    """Finished run, ready to render. Cameras are in the run's frame and have the photos' full size."""
+    """Results of a finished training, ready to render: surfels, light and cameras.
+
+    Cameras are in the run's frame, the world coordinates used in training, and have the full size of the photos.
+    """
 
     folder: Path
     settings: Settings
@@ -54,23 +57,24 @@ class Run:
     _traced: dict = field(default_factory=dict, repr=False, compare=False)
 
     def surfels(self) -> Surfels:
-        """Return the asset's surfels as tensors."""
+        """Return the trained surfels as tensors."""
         return from_splats(self.splats)
 
     def training_cameras(self) -> list[Camera]:
-        """Return the cameras of the training photos, at the size they were trained at."""
+        """Return the cameras of the training photos, at the image size used in training."""
         side = self.settings.image.max_side
         return [c.fitted(side) for c, split in zip(self.cameras, self.splits, strict=True) if split == "train"]
 
     def light(self, panorama: np.ndarray) -> Environment:
-        """Make a light for `render` from an equirectangular picture (see `light_of`)."""
+        """Make a light to pass to `render` from an equirectangular image (H, W, 3) of linear radiance."""
         return light_of(panorama, self.settings)
 
     def relit(self, light: Environment, progress: Progress = lambda done, total: None) -> Surfels:
-        """Relight the surfels, with inter-reflection where the run has a mesh to trace it on.
+        """Return the surfels as they are lit by another light.
 
-        The first call takes seconds, later calls less. A call with the same light as the last one returns the same surfels. `progress` is
-        called while rays are traced.
+        If the run has a mesh for it, inter-reflection (the object's reflection in itself) is traced under that light. The first call takes
+        seconds, because rays are traced; later calls are faster. The last light's result is cached. progress(done, total) is called during
+        the tracing.
         """
         if self.occluder is None:
             return self.surfels().without_directions()  # learned under the recovered light: wrong under this one
@@ -86,7 +90,10 @@ class Run:
         return self._traced["surfels"]
 
     def render(self, camera: Camera, environment: Environment | None = None, exposure: float = 1.0) -> Rendering:
-        """Render a camera of the run's frame, under `environment` if given; radiance is multiplied by `exposure`."""
+        """Render an image from a camera in the run's frame. Radiance is multiplied by `exposure`.
+
+        If `environment` is given, the surfels are relit by it; otherwise the light recovered in training is used.
+        """
         surfels, settings = self.surfels(), self.settings.render
         if environment is not None:
             surfels = self.relit(environment)
@@ -103,9 +110,10 @@ class Run:
 def create_run(
     folder: Path, capture: Capture, settings: Settings, preset: str, device: str, chosen: dict[str, str] | None = None
 ) -> None:
-    """Create a run folder with its run.toml and cameras.json. Raise InputError if the folder is not empty.
+    """Create a run folder with run.toml and cameras.json. Raise InputError if the folder exists and is not empty.
 
-    `chosen` names what was chosen for each setting that was "auto", and why; `settings` already hold these values.
+    `settings` are the values in use. `chosen` is written to run.toml for the user: for each setting that was "auto", the value that was
+    chosen and why.
     """
     check_free(folder)
     try:
@@ -135,7 +143,11 @@ def create_run(
 
 
 def record_changes(folder: Path, rows: dict[str, dict]) -> None:
-    """Add changed settings to the table [changed] of run.toml. A setting that is in the table already keeps its `asked` value."""
+    """Add changed settings to the table [changed] of run.toml.
+
+    `rows` maps a setting's key to a dict: `asked` is the value that the user asked for, `became` the new value. If a setting is changed
+    again, its first `asked` is kept.
+    """
     if not rows:
         return
     tables = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
@@ -145,7 +157,7 @@ def record_changes(folder: Path, rows: dict[str, dict]) -> None:
 
 
 def open_run(folder: Path) -> Run:
-    """Open a finished run. Raise InputError naming what is missing."""
+    """Open the run folder of a finished training. Raise InputError naming what is missing."""
     facts, settings = check_finished(folder)
     cameras, splits, to_capture, exposures = read_run_cameras(folder / "cameras.json")
     splats, environment = read_splats(folder / "splats.ply"), None
@@ -177,6 +189,10 @@ def open_run(folder: Path) -> Run:
 
 
 def light_of(panorama: np.ndarray, settings: Settings, reference: Camera | None = None) -> Environment:
-    """Make a run's light from an equirectangular picture (H, W, 3) of linear radiance, in Blender's orientation."""
+    """Make a light from an equirectangular image (H, W, 3) of linear radiance, in Blender's orientation.
+
+    Without `reference`, the light stands still in the world. With it, the light turns with the camera, and the image shows it as it is for
+    the camera `reference`.
+    """
     panorama = method_of(settings.render).light.from_linear(panorama)
     return Environment.from_panorama(panorama, settings.environment.resolution, reference)

@@ -1,4 +1,4 @@
-"""Check a run folder, read its run.toml and add to its metrics.json, without torch."""
+"""Check run folders, read run.toml and update metrics.json. This module does not import torch."""
 
 import json
 import tomllib
@@ -12,14 +12,17 @@ from refgs.settings import Settings, recorded_settings
 
 
 def check_free(folder: Path) -> None:
-    """Raise InputError unless a new run can go into the folder."""
+    """Raise InputError if a new run cannot be created in the folder, because it is not empty or is a file."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         what = "holds another run" if (folder / "run.toml").exists() else "is not empty"
         raise InputError(f"{folder} {what}: choose another folder with --out, or resume that run with --resume")
 
 
 def check_finished(folder: Path) -> tuple[dict, Settings]:
-    """Raise InputError unless the folder holds a run whose training has ended. Returns the result of `read_run_facts`."""
+    """Raise InputError if the folder is no run folder, or if its training has not ended.
+
+    Otherwise return what `read_run_facts` returns: the table [run] and the settings.
+    """
     facts, settings = read_run_facts(folder)
     if not (folder / "splats.ply").exists():
         raise InputError(
@@ -29,7 +32,10 @@ def check_finished(folder: Path) -> tuple[dict, Settings]:
 
 
 def read_run_facts(folder: Path) -> tuple[dict, Settings]:
-    """Read the [run] table and the settings of run.toml. Raise InputError without a run.toml, and for one by a newer release."""
+    """Read run.toml. Return its table [run] as a dict, and the settings of the training.
+
+    Raises InputError if there is no run.toml, or if a newer release has written it.
+    """
     file = folder / "run.toml"
     try:
         facts = tomllib.loads(file.read_text(encoding="utf-8"))
@@ -50,7 +56,7 @@ def _release(version: str) -> tuple[int, ...]:
 
 
 def update_metrics(folder: Path, facts: dict[str, Any]) -> None:
-    """Merge figures into a run's metrics.json. New figures replace those of the same name, at any depth."""
+    """Merge results into a run's metrics.json. A new value replaces the old value of the same name, also in nested dicts."""
 
     def merged(known: dict, new: dict) -> dict:
         both = {key: merged(known[key], new[key]) for key in new if isinstance(known.get(key), dict)}

@@ -1,6 +1,6 @@
-"""Train a capture and report progress, for the command line (`commands`) and the job protocol (`worker`).
+"""Train on a capture, for the command line (`commands`) and for the Blender extension (`worker`).
 
-Importing torch takes seconds. So everything that does not need torch is checked first.
+Importing torch takes seconds. So the arguments are checked before it is imported, where possible.
 """
 
 import sys
@@ -35,12 +35,17 @@ def train(
     report: Report,
     attend: "Callable[[State], bool]",
 ) -> "tuple[State, float | None]":
-    """Train a capture into a run folder, or resume the training in it. When it ends, write the asset and measure it.
+    """Train on a capture and write a run folder, or resume the training in it. At the end write the results and measure their quality.
 
-    `minutes` limits the whole job, pauses not counted. If `minutes` is given without a preset, all settings are planned for that time. If
-    neither is given, the preset is `standard`. `attend` is called before each iteration: True stops the training with a checkpoint, which
-    `resume` starts from. Another process can stop it too (`refgs.lock`). Returns the state, whose `ended` tells a finished training from a
-    stopped one, and the mean PSNR of the held-out views if it has ended and there are any.
+    - `minutes` limits the whole job; pauses do not count. Without a preset, all settings are chosen to fit into that time. Without both,
+      the preset is `standard`.
+    - `changes` are settings to change, `section.key=value`.
+    - `report(event, facts)` is called for progress and warnings.
+    - `attend(state)` is called before each iteration. If it returns True, the training stops with a checkpoint; `resume` continues it.
+      Another process can stop it too (`refgs.lock`).
+
+    Returns the training's state and the mean PSNR of the held-out views. `state.ended` is False if the training was stopped. The PSNR is
+    None then, or if there are no held-out views.
     """
     plan, lock = Plan(minutes), RunLock(out)
     _check_device(device)
@@ -65,7 +70,10 @@ def train(
 
 
 def choose_device(device: str, report: Report) -> str:
-    """Choose "cpu" or "cuda". Warn if a card was asked for, or is there, and cannot be used."""
+    """Return the device to train on: "cpu" or "cuda". `device` may also be "auto".
+
+    If a GPU was asked for or found but cannot be used, report a warning and return "cpu".
+    """
     _check_device(device)
     if device == "cpu":
         return "cpu"
@@ -122,7 +130,7 @@ def _start(
     device: str,
     report: Report,
 ) -> "Trainer":
-    """Make the trainer of a new run, and the run's folder."""
+    """Make the trainer of a new training, create its run folder, and return the trainer."""
     from refgs.run import create_run, record_changes
     from refgs.train.fit import fitting
     from refgs.train.trainer import Trainer
@@ -139,7 +147,7 @@ def _start(
 
 
 def _resume(capture: "Capture", settings: Settings, out: Path, plan: Plan, device: str, report: Report) -> "Trainer":
-    """Make the trainer of a run and load its last checkpoint."""
+    """Return the trainer of an interrupted training, with its last checkpoint loaded."""
     from refgs.train.trainer import Trainer
 
     trainer = Trainer(capture, settings, out, report, plan, device)
@@ -149,7 +157,7 @@ def _resume(capture: "Capture", settings: Settings, out: Path, plan: Plan, devic
 
 
 def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float | None:
-    """Write the asset and metrics.json; return the mean PSNR of the held-out views."""
+    """Write the results and metrics.json. Return the mean PSNR of the held-out views, None without such views."""
     from refgs.run import record_changes
     from refgs.train.ambiguity import ambiguities
     from refgs.train.asset import write_asset
@@ -185,7 +193,7 @@ def _costs(trainer: "Trainer") -> dict[str, Any]:
 
 @contextmanager
 def _card_memory(what: str | None = None) -> Iterator[None]:
-    """Raise InputError with the message `what` if the card runs out of memory."""
+    """Raise InputError if a `with` block runs out of GPU memory. `what` is the message; None is the usual message."""
     import torch
 
     from refgs.train.densify import full_card
@@ -198,7 +206,7 @@ def _card_memory(what: str | None = None) -> Iterator[None]:
 
 @contextmanager
 def _logged(out: Path) -> Iterator[None]:
-    """Write the traceback of an internal error to log.txt. Errors of the user's input pass through."""
+    """Write the traceback of an unexpected error in a `with` block to log.txt. InputErrors are not logged."""
     try:
         yield
     except InputError:
@@ -210,7 +218,10 @@ def _logged(out: Path) -> Iterator[None]:
 
 
 def peak_memory(children: bool = False) -> int | None:
-    """Return the peak memory of this process, or of its children that have ended, in bytes; None on Windows, which keeps no such count."""
+    """Return the peak memory of this process in bytes. With `children`, return the peak memory of its largest ended child process.
+
+    Return None on Windows, where this cannot be read.
+    """
     try:
         import resource
     except ModuleNotFoundError:

@@ -62,13 +62,19 @@ class Export(_Command):
 
 
 class During(_Command):
-    """Command to a running job. "stop" ends a training and writes its asset; "cancel" ends it with a checkpoint, to be resumed."""
+    """Command to the job that is running.
+
+    Two commands end a training: "stop" writes its results, "cancel" writes only a checkpoint, from which it can be resumed.
+    """
 
     command: Literal["preview", "pause", "resume", "stop", "cancel"]
 
 
 class Keep(_Command):
-    """Command that says whether jobs still run to their end after the input has closed. It takes effect at once, also during a job."""
+    """Command that sets whether jobs continue when the input is closed (`on` = True) or are ended.
+
+    It takes effect at once, even while a job is running.
+    """
 
     command: Literal["keep"]
     on: bool
@@ -79,7 +85,10 @@ CLOSED = None  # queued in place of a command: the input has ended
 
 
 class Worker:
-    """Run one job after another. Each sends `started`, then `done`, `cancelled` or `failed`."""
+    """Run jobs (check, poses, train, export) one after another, as commands ask for them.
+
+    Each job sends the event `started`, and at its end `done`, `cancelled` or `failed`.
+    """
 
     def __init__(self, events: IO[str]):
         self._events = events
@@ -92,7 +101,7 @@ class Worker:
         self._closed = False  # the input has ended; commands may still be queued
 
     def listen(self, commands: IO[str]) -> None:
-        """Read commands until the input ends. Runs in its own thread."""
+        """Read commands from the input and queue them, until the input ends. Runs in its own thread."""
         for line in commands:
             try:
                 command = COMMANDS.validate_json(line)
@@ -108,19 +117,25 @@ class Worker:
             _thread.interrupt_main()
 
     def close(self) -> None:
-        """Record that no more commands will come."""
+        """Note that the input has ended and no more commands will come."""
         self._closed = True
         self._commands.put(CLOSED)
 
     def interrupt(self, *_) -> None:
-        """Handle a signal. A training ends after its iteration, with a checkpoint; other jobs end at once and leave nothing half done."""
+        """Handle SIGTERM and SIGINT. A training stops after the current iteration, with a checkpoint. Other jobs stop at once.
+
+        No half-written results are left.
+        """
         self._keep = False
         self.close()
         if not self._attentive:
             raise KeyboardInterrupt
 
     def send(self, event: str, facts: dict[str, Any]) -> None:
-        """Write an event. If nobody reads the events any more, take no more commands, unless a `Keep` command said to go on."""
+        """Write an event to the output as a JSON line.
+
+        If the reader is gone, act as if the input had ended. Ignore this if a `Keep` command has told jobs to go on.
+        """
         try:
             self._events.write(json.dumps({"event": event} | facts) + "\n")
             self._events.flush()
@@ -129,7 +144,7 @@ class Worker:
                 self.close()
 
     def run(self) -> None:
-        """Run jobs until there are no more commands."""
+        """Send the event `ready`, then run jobs until no more commands can come."""
         why = cuda.unusable()
         card = torch.cuda.get_device_name() if why is None else None
         self.send("ready", {"protocol": PROTOCOL, "refgs": __version__, "card": card, "no_card": why})
@@ -189,7 +204,10 @@ class Worker:
         return "done", facts | {"psnr": quality, "left_out": left_out}
 
     def _attend(self, state: State) -> bool:
-        """Handle the commands since the last iteration. Return True to stop the training here."""
+        """Handle commands that came during a training; called before each iteration. Return True if the training must stop.
+
+        While the training is paused, this call waits.
+        """
         paused = False
         while paused or not self._commands.empty():
             command = self._commands.get()
@@ -222,7 +240,7 @@ class Worker:
 
 
 def work() -> None:
-    """Speak the protocol on stdin and stdout. All other output goes to stderr."""
+    """Run the job protocol on stdin and stdout until the input ends. Other output of the program goes to stderr."""
     events = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     sys.stdin.reconfigure(encoding="utf-8")
