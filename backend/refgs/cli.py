@@ -18,7 +18,7 @@ RunFolder = Annotated[Path, typer.Argument(help="run folder, made by `refgs trai
 
 @app.command()
 def check(capture: Annotated[Path, typer.Argument(help="folder with photos and cameras")]) -> None:
-    """Check a capture: read all of it, list its contents and its faults."""
+    """Check a capture: read all of its files, list what it contains, and warn of likely mistakes."""
     from refgs.capture import read_capture
     from refgs.capture.check import describe
 
@@ -28,7 +28,7 @@ def check(capture: Annotated[Path, typer.Argument(help="folder with photos and c
 
 @app.command()
 def poses(photos: Annotated[Path, typer.Argument(help="folder with photos, in it or in its folder images")]) -> None:
-    """Find the cameras of photos and write them to PHOTOS/sparse/0, which makes the folder a capture."""
+    """Find the cameras of the photos in a folder, and write them to PHOTOS/sparse/0. Then the folder is a capture."""
     from refgs import commands
 
     commands.poses(photos)
@@ -69,7 +69,7 @@ def render(
     hdri: Annotated[Path | None, typer.Option(help="panorama to relight with")] = None,
     format: Annotated[str, typer.Option(help="png or exr")] = "png",
 ) -> None:
-    """Render a run from any cameras."""
+    """Render images of a trained run, from the cameras in a JSON file."""
     from refgs import commands
 
     commands.render(run, cameras, out, passes.split(","), hdri, format)
@@ -115,7 +115,7 @@ def report(
     runs: Annotated[list[Path], typer.Argument(help="run folders; several are shown side by side")],
     out: Annotated[Path | None, typer.Option(help="file of the page (default: RUN/report.html)")] = None,
 ) -> None:
-    """Write one self-contained page: pictures, figures, error against run time."""
+    """Write one self-contained HTML page about runs: pictures, error measures, and charts of error against run time."""
     from refgs.report.page import write_report
 
     target = out or runs[0] / "report.html"
@@ -127,7 +127,7 @@ def report(
 def demo(
     out: Annotated[Path, typer.Option(help="folder for all results")] = Path("demo"),
 ) -> None:
-    """Run every step on a small capture that it renders itself, up to relit Eevee previews and a report."""
+    """Demonstrate all steps: render a small capture, train on it, export a mesh, relight it in Blender's Eevee, and write a report."""
     from refgs import demo
 
     demo.run(out)

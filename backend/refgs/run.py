@@ -70,11 +70,11 @@ class Run:
         return light_of(panorama, self.settings)
 
     def relit(self, light: Environment, progress: Progress = lambda done, total: None) -> Surfels:
-        """Return the surfels as they are lit by another light.
+        """Return the surfels as they look under another light.
 
-        If the run has a mesh for it, inter-reflection (the object's reflection in itself) is traced under that light. The first call takes
-        seconds, because rays are traced; later calls are faster. The last light's result is cached. progress(done, total) is called during
-        the tracing.
+        If the run has a mesh for it, the object's reflections in itself are traced under that light too. The first call takes seconds,
+        because rays are traced; later calls are faster. The result for the last light is cached. progress(done, total) is called while rays
+        are traced.
         """
         if self.occluder is None:
             return self.surfels().without_directions()  # learned under the recovered light: wrong under this one
@@ -191,8 +191,8 @@ def open_run(folder: Path) -> Run:
 def light_of(panorama: np.ndarray, settings: Settings, reference: Camera | None = None) -> Environment:
     """Make a light from an equirectangular image (H, W, 3) of linear radiance, in Blender's orientation.
 
-    Without `reference`, the light stands still in the world. With it, the light turns with the camera, and the image shows it as it is for
-    the camera `reference`.
+    Without `reference`, the light stands still in the world. With `reference`, it turns with the camera, and the image shows it in the
+    orientation that it has for the camera `reference`.
     """
     panorama = method_of(settings.render).light.from_linear(panorama)
     return Environment.from_panorama(panorama, settings.environment.resolution, reference)

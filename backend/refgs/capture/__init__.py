@@ -52,7 +52,7 @@ def find_layout(folder: Path) -> str | None:
 def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
     """Read the photos' cameras from a capture's folder, and convert them to the run's frame, the world coordinates used in training.
 
-    `wanted` may set a box around the part to reconstruct, and an up direction. Both are given in the coordinates of a run that has neither.
+    `wanted` may set a box around the part to reconstruct, and an up direction. Both are given in the run's frame as it is without them.
     Only the photos' headers and some masks are read; photos are not decoded. Raises InputError with a message of one line.
     """
     folder = Path(folder)
@@ -141,7 +141,7 @@ def _shared_photos(views: list[View]) -> list[str]:
 
 
 def _hold_out(views: list[View]) -> list[View]:
-    """Make every eighth view, sorted by file name, a test view. If the capture has test views already, change nothing."""
+    """Choose test views for a capture that has none: every eighth view, sorted by path. They are held out from training."""
     if any(view.split == "test" for view in views):
         return views
     views = sorted(views, key=lambda view: view.image_path.as_posix())
@@ -161,7 +161,10 @@ def _check_cameras(folder: Path, views: list[View]) -> None:
 
 
 def _unique_names(views: list[View]) -> list[View]:
-    """Rename cameras that have the same name as another one of the same split: put the names of the photo's folders in front."""
+    """Make the cameras' names unique within each split ("train", "test").
+
+    If several photos have the same file name, their cameras' names get the folder's path in front. Raises InputError if that does not help.
+    """
     names = Counter((view.split, view.camera.name) for view in views)
     top = os.path.commonpath([view.image_path.parent for view in views])
 

@@ -27,7 +27,7 @@ class Box:
         return cls(matrix)
 
     def moved(self, to_frame: np.ndarray) -> "Box":
-        """Return the box in another frame: p_new = to_frame @ p_old."""
+        """Return the box in other world coordinates: p_new = to_frame @ p_old."""
         return Box(to_frame @ self.matrix)
 
     @property

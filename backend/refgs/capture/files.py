@@ -1,4 +1,4 @@
-"""Find the photos and masks of a capture on disk, and make a view of each photo."""
+"""Find the photos and masks of a capture on disk, and combine each photo with its camera in a View."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -68,8 +68,8 @@ class Masks:
     def find(self, image: Path, named: object, where: str) -> Path | None:
         """Return the mask file of the photo `image`, None if it has none.
 
-        `named` is the mask's path in the capture's file, relative to the folder; without it, the mask is found by the photo's name. Raises
-        InputError if the mask `named` is missing. The message begins with `where`, which tells the user which camera it is about.
+        `named` is the mask's path if the capture's file gives one, relative to the folder. Otherwise the mask is found by the photo's name.
+        Raises InputError if the mask `named` is missing. `where` is a name for the camera in the error message.
         """
         if named:
             path = find_image(self.folder / str(named).replace("\\", "/"))
@@ -93,11 +93,11 @@ def photo_view(
     where: str,
     mask_below: float | None = None,
 ) -> View:
-    """Make a view from a photo and its camera.
+    """Combine a photo, its camera and its mask in a View.
 
-    `as_given` is the camera and lens as the capture's file gives them. If they are for another resolution than the photo's, they are
-    scaled. `mask_below` is given if the mask is a depth map (see `View`). Raises InputError if the photo's aspect ratio differs from the
-    camera's, or the mask's size from the photo's. `where` tells in the message which camera it is about.
+    `as_given` is the camera and lens from the capture's file. They are scaled if they are for another resolution than the photo's.
+    `mask_below` is given if the mask is a depth map (see `View`). Raises InputError if the photo's aspect ratio differs from the camera's,
+    or the mask's size from the photo's. `where` is a name for the camera in error messages.
     """
     width, height, has_alpha = read_header(image)
     camera, lens = as_given

@@ -130,7 +130,10 @@ def _hash_of_photos(photos: list[Path]) -> str:
 def _run_colmap_in_child(
     photos: list[Path], database: Path, model: Path, report: Callable
 ) -> tuple[set[str], float, float]:
-    """Run `_run_colmap` in a child process and return its result. The process is ended even if this call is interrupted."""
+    """Run `_run_colmap` in a child process and return its result. The process is ended even if this call is interrupted.
+
+    `report("progress", facts)` is called with the progress that the process sends.
+    """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_run_colmap, args=(photos, database, model, theirs), daemon=True)

@@ -99,8 +99,8 @@ def look_at_centre(views: list[View]) -> tuple[np.ndarray, np.ndarray, float]:
 def up_direction(views: list[View]) -> np.ndarray:
     """Estimate the world's up direction (3,), in the coordinates of the cameras.
 
-    It is perpendicular to the cameras' right axes, which stay horizontal when a camera looks up or down. The mean of their up axes would be
-    tilted if all cameras look down from one side; it only decides what the right axes leave open.
+    It is perpendicular to the cameras' right axes, which stay horizontal when a camera looks up or down. If several directions are
+    perpendicular to them, the mean of the cameras' up axes decides. That mean alone would be tilted if all cameras look down from one side.
     """
     axes = np.array([view.camera.world_to_camera[:3, :3] for view in views])
     right, up = axes[:, 0], -axes[:, 1]

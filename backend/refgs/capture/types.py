@@ -44,11 +44,12 @@ class View:
 class Capture:
     """Photos with cameras, in the run's frame: the world coordinates used in training, with Z up.
 
-    - `to_capture` is the 4×4 float64 similarity p_capture = to_capture @ p_run. It is the identity for most NeRF-Blender captures without
-      an up direction set by the user.
+    - `to_capture` is the 4×4 float64 similarity p_capture = to_capture @ p_run. It is the identity for most NeRF-Blender captures. Others
+      are moved and scaled so that their region of interest has radius 1 about the origin. An up direction from the user rotates the run's
+      frame.
     - `points` (M, 3) are from structure from motion, `point_colors` (M, 3) their sRGB colours in 0..1. Both are None if the capture has
       none.
-    - `centre` (3,) and `radius` are a ball about the object, or about a room's foreground: the region of interest.
+    - `centre` (3,) and `radius` are the region of interest: a ball about the object, or about a room's foreground.
     - `bounded` is a guess: True if the photos surround one object, False if they show a room or an open scene. `bounded_because` says why.
     - `box` is the user's box around the part to reconstruct, or None. It makes the region of interest smaller.
     - `reach` is the radius of a ball about `centre` that also contains the region of interest as it is without the box.
