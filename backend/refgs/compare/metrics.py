@@ -1,7 +1,7 @@
-"""Measure the errors of pictures and lights.
+"""Measure the errors of rendered pictures and of recovered lights.
 
-Pictures are (height, width, 3) float arrays; "encoded" means sRGB in 0..1, "linear" means radiance. Errors of several views are averaged
-over the views.
+Pictures are float arrays (height, width, 3). "Encoded" means sRGB values in 0..1, "linear" means radiance. The error of several views is
+the mean of their errors.
 """
 
 import importlib.util
@@ -32,19 +32,22 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec.709
 
 
 def decibels(square: float) -> float:
-    """Peak signal-to-noise ratio in dB of a mean squared error, for a peak of 1. At most 100, so that means stay finite."""
+    """Convert a mean squared error, `square`, to a peak signal-to-noise ratio (PSNR) in dB. The peak is 1.
+
+    The result is at most 100. Without this limit, one error of 0 would make a mean over views infinite.
+    """
     return -10 * math.log10(max(square, 1e-10))
 
 
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of encoded pictures."""
+    """Compute the peak signal-to-noise ratio (PSNR) in dB of a picture, compared with the reference. Both are sRGB-encoded."""
     return decibels(float(((np.asarray(image, np.float64) - reference) ** 2).mean()))
 
 
 def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) -> float:
-    """Fit the factor by which linear radiance (h, w, 3) matches an encoded photo, by least squares.
+    """Compute the exposure: the factor on the linear `radiance` (h, w, 3) that best matches the sRGB-encoded `photo`, by least squares.
 
-    Only pixels count that are opaque by alpha (h, w) and not clipped in the photo. Returns 1 if there are none.
+    Pixels are used if `alpha` (h, w) is above 0.5 and the photo is not overexposed there. If no pixel can be used, the factor is 1.
     """
     seen = (alpha > 0.5) & (photo.max(axis=-1) < 0.98)
     rendered, taken = radiance[seen].astype(np.float64), srgb_decode(photo[seen].astype(np.float64))
@@ -53,7 +56,7 @@ def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) 
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:
-    """Structural similarity of encoded pictures, with the Gaussian window of Wang et al. 2004, σ 1.5."""
+    """Compute the structural similarity (SSIM) of two sRGB-encoded pictures, with a Gaussian window of σ 1.5 pixels (Wang et al. 2004)."""
     return float(
         structural_similarity(
             np.asarray(image, np.float64),
@@ -68,14 +71,20 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def flip(image: np.ndarray, reference: np.ndarray) -> float:
-    """Mean FLIP (Andersson et al. 2020) of encoded pictures, 0 (equal) to 1, at the authors' 67 pixels a degree."""
+    """Compute the mean FLIP error (Andersson et al. 2020) between two sRGB-encoded pictures: 0 if they are equal, 1 at most.
+
+    The viewing distance is the authors' default: one degree of the field of view spans 67 pixels.
+    """
     pair = (np.ascontiguousarray(x, np.float32) for x in (reference, image))
     error, *_ = flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=False)
     return float(error.mean(dtype=np.float64))
 
 
 def lpips_missing() -> str | None:
-    """Say why LPIPS cannot be measured here; None if it can. The network's weights are never downloaded."""
+    """Return None if LPIPS can be measured here. Otherwise name the missing package or file in one line.
+
+    The weights of LPIPS's network are never downloaded.
+    """
     missing = [name for name in ("lpips", "torchvision") if importlib.util.find_spec(name) is None]
     if missing:
         return f"the package {missing[0]} is not installed"
@@ -91,7 +100,7 @@ def _lpips_network():
 
 
 def lpips(image: np.ndarray, reference: np.ndarray) -> float:
-    """LPIPS (Zhang et al. 2018) of encoded pictures with VGG-16 and its linear layers, version 0.1."""
+    """Compute the LPIPS error (Zhang et al. 2018) between two sRGB-encoded pictures, with VGG-16 and the linear layers of version 0.1."""
     pair = (torch.from_numpy(np.asarray(x, np.float32)).permute(2, 0, 1)[None] for x in (image, reference))
     with torch.no_grad():
         return float(_lpips_network()(*pair, normalize=True))
@@ -100,10 +109,11 @@ def lpips(image: np.ndarray, reference: np.ndarray) -> float:
 def normal_mae_degrees(
     normals: np.ndarray, reference: np.ndarray, alpha: np.ndarray, reference_alpha: np.ndarray
 ) -> float:
-    """Mean angle in degrees between normals (h, w, 3), over the pixels that the object covers at least by half.
+    """Compute the mean angle in degrees between rendered and true normals (h, w, 3), over the pixels of the object.
 
-    Each pixel counts the same, and both normals are normalised first. Where the rendering is almost empty (alpha below 0.1) or its normal
-    has no length, the error is 90°, so that leaving a part out does not pay.
+    A pixel belongs to the object if `reference_alpha` is at least 0.5. All these pixels have the same weight. Normals are normalised first.
+    The error is 90° where the rendering is almost empty (`alpha` below 0.1) or its normal has length 0. So a rendering cannot lower its
+    error by leaving out a part of the object.
     """
     seen = reference_alpha >= COVERED
     a, b = normals[seen].astype(np.float64), reference[seen].astype(np.float64)
@@ -114,7 +124,10 @@ def normal_mae_degrees(
 
 
 def normal_ssim(normals: np.ndarray, reference: np.ndarray, alpha: np.ndarray, reference_alpha: np.ndarray) -> float:
-    """Structural similarity of unit normals, encoded as (n + 1)/2, each over white by its own alpha. All pixels count."""
+    """Compute the structural similarity (SSIM) of two pictures of unit normals (h, w, 3), over all pixels.
+
+    Normals n are turned into colours (n + 1)/2. Each picture is then composited over white, with its own alpha.
+    """
 
     def encoded(n: np.ndarray, alpha: np.ndarray) -> np.ndarray:
         return np.nan_to_num((n * 0.5 + 0.5) * alpha[..., None]) + 1 - alpha[..., None]
@@ -123,16 +136,24 @@ def normal_ssim(normals: np.ndarray, reference: np.ndarray, alpha: np.ndarray, r
 
 
 def channel_products(image: np.ndarray, reference: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Means over a mask (h, w) of image², image · reference and reference² (rows), for each channel (columns): input of `aligned_psnr`."""
+    """Compute three means for each colour channel, over the pixels in `mask` (h, w): of image², image · reference and reference².
+
+    Returns (3, channels), one row for each mean. `aligned_psnr` needs them from every view.
+    """
     a, b = image[mask].astype(np.float64), reference[mask].astype(np.float64)
     return np.stack([(a * a).mean(0), (a * b).mean(0), (b * b).mean(0)])
 
 
 def aligned_psnr(views: list[np.ndarray]) -> dict[str, float | list[float]]:
-    """Compute the PSNR of linear base colours, averaged over views. `views` are the results of `channel_products`.
+    """Compute the PSNR in dB of linear base colours, as they are and after a correction of their tint. Both are means over the views.
 
-    Returns psnr_raw, psnr_aligned and scale. Photos cannot tell a tinted light from tinted base colours, so psnr_aligned is measured after
-    each channel is multiplied by its least-squares `scale`, the same for all views.
+    `views` has the result of `channel_products` for each view. Returns a dictionary:
+
+    - psnr_raw: the PSNR of the base colours as they are
+    - scale: the correction, one least-squares factor a channel, the same for all views
+    - psnr_aligned: the PSNR after each channel is multiplied by its factor
+
+    The correction is made because photos cannot tell a tinted light from tinted base colours.
     """
     aa, ab, bb = np.moveaxis(np.array(views), 1, 0)
     power = aa.sum(0)
@@ -148,11 +169,16 @@ def relit(
     pairs: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]],
     measures: tuple[Callable[[np.ndarray, np.ndarray], float], ...] = (psnr, flip),
 ) -> dict[str, float]:
-    """Measure pictures under another light, over white, by each of `measures`. Returns scale, and psnr_raw, psnr_aligned and so on.
+    """Measure the errors of an object's renderings under another light. Returns means over the views, by name.
 
-    Each call of `pairs()` yields every view's picture and truth, premultiplied linear RGBA. Photos do not tell the overall brightness of
-    the base colours, so "aligned" errors are measured after radiance is multiplied by the least-squares `scale`, the same for all views.
-    Pixels of 1 or brighter in either picture, such as a sun in a mirror, are left out of the fit: a few of them would dominate it.
+    Each call of `pairs()` yields the rendered and the true picture of every view, in premultiplied linear RGBA. Both are composited over
+    white and then compared by each function in `measures`. Results of `psnr`, for example, are named `psnr_raw` and `psnr_aligned`.
+
+    - raw: the renderings as they are
+    - aligned: after the renderings' radiance is multiplied by `scale`, because photos do not tell how bright the base colours are
+    - scale: the least-squares factor, the same for all views; it is returned too
+
+    The fit of `scale` leaves out pixels of 1 or brighter in either picture, such as a sun in a mirror. A few of them would dominate it.
     """
     product = power = 0.0
     for image, reference in pairs():
@@ -169,7 +195,7 @@ def relit(
 
 
 def resized(panorama: np.ndarray, height: int) -> np.ndarray:
-    """Reduce a panorama to `height` rows, by averaging."""
+    """Reduce an equirectangular panorama to `height` rows and twice as many columns. Pixels are averaged."""
     return cv2.resize(panorama.astype(np.float32), (2 * height, height), interpolation=cv2.INTER_AREA)
 
 
@@ -178,11 +204,12 @@ def _elevations(height: int) -> np.ndarray:
 
 
 def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
-    """RMS error of a recovered panorama's log radiance, after it is multiplied by the best scale. Returns the error and the scale.
+    """Compute the RMS error of a recovered panorama's log radiance. Returns the error, and the factor that brightness was corrected by.
 
-    Both are equirectangular (h, w, 3) and linear; the larger is averaged down to the smaller. Pixels are weighted by solid angle. The scale
-    makes the mean difference zero. The logarithm is natural: 0.1 is about 10 %. A thousandth of the mean radiance is added to both, since
-    darker light cannot be seen.
+    The recovered panorama is first multiplied by the factor that makes the mean difference of the logarithms zero. Both panoramas are
+    equirectangular (h, w, 3) and linear. The larger one is averaged down to the size of the smaller one. Pixels are weighted by solid
+    angle. The logarithm is natural: an error of 0.1 is about 10 %. A thousandth of a panorama's mean radiance is added before the
+    logarithm, because darker light cannot be seen.
     """
     a, b = (resized(x, min(len(environment), len(reference))) for x in (environment, reference))
     weight = np.cos(_elevations(len(a)))
@@ -193,7 +220,10 @@ def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tupl
 
 
 def _blur(values: np.ndarray, degrees: float) -> np.ndarray:
-    """Blur a panorama (h, 2h) on the sphere, with weights exp((cos angle − 1) / σ²), the sphere's Gaussian."""
+    """Blur one channel of a panorama (h, 2h) on the sphere. `degrees` is the standard deviation σ.
+
+    A pixel at the angle a has the weight exp((cos a − 1) / σ²): a Gaussian on the sphere.
+    """
     elevation, turn = _elevations(len(values)), 2 * np.pi / values.shape[1] * np.arange(values.shape[1])
     up, out = np.sin(elevation), np.cos(elevation)
     cosine = up[:, None, None] * up[:, None] + out[:, None, None] * out[:, None] * np.cos(turn)
@@ -206,10 +236,10 @@ def _blur(values: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def find_lights(panorama: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find a panorama's lights: unit directions (K, 3) and luminance (K,) relative to the mean, the brightest first.
+    """Find the light sources in a panorama. Returns unit directions (K, 3) and luminances (K,), the brightest first.
 
-    A light is a peak of the luminance blurred by LIGHT_BLUR that is brighter than the mean over the sphere and has no brighter peak within
-    LIGHTS_APART.
+    The luminance is blurred by LIGHT_BLUR degrees and divided by its mean over the sphere. A light source is a peak above the mean. A peak
+    is ignored if a brighter one lies within LIGHTS_APART degrees.
     """
     luminance = panorama.astype(np.float64) @ _LUMINANCE
     area = np.broadcast_to(np.cos(_elevations(len(luminance)))[:, None], luminance.shape)
@@ -232,12 +262,16 @@ def find_lights(panorama: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lights_error(environment: np.ndarray, reference: np.ndarray) -> tuple[float, int] | None:
-    """Measure the mean angular error of the brightest lights in degrees. Returns it and the number of lights; None if there are none.
+    """Measure how many degrees the brightest light sources of a recovered panorama are away from the true ones, on average.
 
-    True lights are found by `find_lights` in at most 128 rows. Lights below twice the mean brightness, or below a quarter of the brightest
-    light, are left out. At most MOST_LIGHTS count, the brightest. They are matched one to one with lights of the recovered panorama, so
-    that the sum of angles is least. The recovered panorama offers twice as many lights, its brightest. A true light without a match within
-    LOST_LIGHT counts as LOST_LIGHT. The mean is weighted by the true brightness. A scale of the radiance has no effect.
+    Returns the mean angle and the number of true lights. Returns None if `reference`, the true panorama, has no bright light.
+
+    - Both panoramas are reduced to at most 128 rows. `find_lights` searches them.
+    - True lights: the brightest MOST_LIGHTS at most. Each has at least twice the mean brightness and a quarter of the brightest light's.
+    - Recovered lights: the brightest ones, twice as many as there are true lights.
+    - Each true light is matched to another recovered light, so that the sum of the angles is least.
+    - A true light without a match within LOST_LIGHT degrees has the error LOST_LIGHT.
+    - The mean is weighted by the true lights' brightness. It does not depend on the overall brightness of the panoramas.
     """
     recovered, truth = (resized(x, min(128, len(environment), len(reference))) for x in (environment, reference))
     lights, bright = find_lights(truth)

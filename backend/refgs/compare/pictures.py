@@ -1,4 +1,4 @@
-"""Convert renderings to arrays to compare, and to pictures to look at."""
+"""Convert renderings to arrays for measurements, and to pictures for people."""
 
 from pathlib import Path
 
@@ -14,7 +14,10 @@ from refgs.render.renderer import Rendering
 
 
 def composite(view: LoadedView, background: Tensor) -> Tensor:
-    """Composite a photo over the background (3,): sRGB-encoded float (H, W, 3) in 0..1."""
+    """Composite a photo over a background colour (3,). Return sRGB-encoded floats (H, W, 3) in 0..1.
+
+    A photo without alpha is returned unchanged.
+    """
     image = torch.from_numpy(view.image).to(background.device).float() / 255
     if view.alpha is None:
         return image
@@ -23,7 +26,10 @@ def composite(view: LoadedView, background: Tensor) -> Tensor:
 
 
 def maps(rendering: Rendering) -> dict[str, np.ndarray]:
-    """Collect a rendering's passes as float arrays: colour (H, W, 4), linear and premultiplied; the others (H, W, 3) or (H, W)."""
+    """Collect the passes of a rendering, such as depth and base colour, as float arrays by name.
+
+    `color` is premultiplied linear RGBA (H, W, 4). The others are (H, W, 3) or (H, W). Passes that the rendering lacks are left out.
+    """
     alpha = rendering.alpha.numpy(force=True)
     normal = torch.nn.functional.normalize(rendering.normal, dim=-1).numpy(force=True)
     images = {"normal": normal, "depth": rendering.depth.numpy(force=True), "alpha": alpha}
@@ -36,16 +42,20 @@ def maps(rendering: Rendering) -> dict[str, np.ndarray]:
 
 
 def color_picture(rendering: Rendering, background: np.ndarray) -> np.ndarray:
-    """Convert a rendering's colour to 8-bit RGBA, sRGB-encoded, with straight alpha."""
+    """Convert a rendering's colour to 8-bit sRGB-encoded RGBA with straight alpha. The `background` colour is removed."""
     alpha = rendering.alpha.numpy(force=True)[..., None]
     over = rendering.color.numpy(force=True) - background * (1 - alpha)
     return as_bytes(np.dstack([over / np.maximum(alpha, 1e-6), alpha]))
 
 
 def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Convert a pass of `maps` to 8-bit RGB or grey.
+    """Convert one pass of a rendering to an 8-bit RGB or grey picture. `name` and `value` are an item of `maps`.
 
-    Colour is over white, base colour is sRGB-encoded, normals are n/2 + 1/2, depth is divided by its maximum.
+    - color: composited over white
+    - albedo: sRGB-encoded
+    - normal: n/2 + 1/2; black where `alpha` is 0.5 or less
+    - depth: divided by its maximum
+    - others: unchanged
     """
     if name == "color":
         value = over_white(value)
@@ -59,17 +69,20 @@ def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 
 
 def over_white(pixels: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """Composite premultiplied linear RGBA over white, radiance times `scale`: sRGB-encoded (H, W, 3), 0..1."""
+    """Composite premultiplied linear RGBA over white. Return sRGB-encoded floats (H, W, 3) in 0..1.
+
+    Radiance, but not alpha, is multiplied by `scale` first.
+    """
     return np.clip(srgb_encode(pixels[..., :3] * scale + 1 - pixels[..., 3:]), 0, 1)
 
 
 def as_bytes(value: np.ndarray) -> np.ndarray:
-    """Convert 0..1 to 0..255; NaN becomes 0."""
+    """Convert floats in 0..1 to 8-bit integers in 0..255. Values outside 0..1 are clipped; NaN becomes 0."""
     return np.rint(np.clip(np.nan_to_num(value), 0, 1) * 255).astype(np.uint8)
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write (H, W), (H, W, 3) or (H, W, 4) uint8 as PNG, whole or not at all."""
+    """Write a uint8 picture (H, W), (H, W, 3) or (H, W, 4) as a PNG file. A failed write leaves no partial file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR if pixels.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)

@@ -17,18 +17,21 @@ _OFFSET = 1e-3  # distance of a ray's start from its point, in radii, so that it
 
 
 def radius(mesh: Mesh) -> float:
-    """Largest distance of a vertex from the centre of the mesh's bounding box."""
+    """Return the largest distance of a vertex from the centre of the mesh's bounding box."""
     middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
     return float(np.linalg.norm(mesh.vertices - middle, axis=1).max())
 
 
 def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
-    """Measure two meshes in one frame: `chamfer`, in radii of the true mesh, and `normal_consistency`.
+    """Measure how much a mesh differs from the true mesh. Both are in the same coordinates.
 
-    Each of POINTS samples on one mesh is matched to the nearest point of the other, in both directions. `chamfer` is the mean distance,
-    `normal_consistency` the mean absolute cosine between the two faces' normals. A sample counts only if some camera sees it, not occluded
-    by its own mesh, because photos do not show the rest. The point nearest to it may be unseen. Returns {} if a mesh has no seen
-    sample.
+    Returns a dictionary, which is empty if no camera sees a mesh at all:
+
+    - chamfer: the mean distance from one surface to the other, in both directions, divided by the true mesh's `radius`
+    - normal_consistency: the mean absolute cosine between the normals of the two surfaces
+
+    POINTS samples are taken on each mesh, and each is compared with the nearest point on the other mesh. A sample is left out if no camera
+    sees it because its own mesh hides it: photos do not show that part. The nearest point on the other mesh may be hidden.
     """
     unit = radius(truth)
     samples = []
@@ -44,7 +47,10 @@ def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
 
 
 def seen(mesh: Mesh, points: np.ndarray, cameras: list[Camera], offset: float) -> np.ndarray:
-    """Mark the points (P, 3) on a mesh that some camera sees, not occluded by the mesh: bool (P,). Rays start `offset` off the points."""
+    """Test which points (P, 3) on a mesh at least one camera sees, without the mesh in between. Returns bool (P,).
+
+    Rays run from the points to the cameras. They start at the distance `offset` from the point, so that they do not hit the surface there.
+    """
     middle = mesh.vertices.mean(axis=0)  # Embree traces in float32: centre the mesh
     scene = EmbreeScene()
     TriangleMesh(scene, (mesh.vertices[mesh.faces] - middle).astype(np.float32))
@@ -64,7 +70,11 @@ def seen(mesh: Mesh, points: np.ndarray, cameras: list[Camera], offset: float) -
 
 
 def _to_nearest(sample: tuple, other: tuple) -> tuple[float, float]:
-    """Mean distance and mean absolute cosine from the seen samples of a mesh to the nearest points of another."""
+    """Compare the visible samples of one mesh with the nearest points on another mesh.
+
+    Returns the mean distance, and the mean absolute cosine between the faces' normals. Each argument is a tuple of a mesh, points on it,
+    the points' faces, and a mask of the visible points.
+    """
     solid, points, face, visible = sample
     points, normals = points[visible], solid.face_normals[face[visible]]
     target, targets, target_face, _ = other

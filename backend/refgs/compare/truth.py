@@ -1,4 +1,4 @@
-"""Read the ground truth of a capture, and measure the errors of renderings against it."""
+"""Read the ground truth of a capture (normals, light and so on), and measure the errors of renderings against it."""
 
 from pathlib import Path
 
@@ -18,10 +18,15 @@ PASSES = ("normal", "albedo", "roughness", "metallic", "visibility")
 
 
 class GroundTruth:
-    """Read a folder of ground truth, converted to the run's frame (the coordinates of the training). Every file is optional.
+    """Read a folder of ground truth: true pictures, lights and mesh of a captured object. Every file is optional.
 
-    The files are light.exr; mesh.ply; PASS/VIEW.exr for each of PASSES, with alpha/VIEW.exr; and relight/HDRI.exr, another light, with
-    relight/HDRI/VIEW.exr, the views under it (see `scripts.demo.capture`).
+    - light.exr: the light, as a panorama
+    - mesh.ply: the mesh
+    - PASS/VIEW.exr: a map of each view, such as its normals, for each name in PASSES; alpha/VIEW.exr: its alpha
+    - relight/HDRI.exr: another light; relight/HDRI/VIEW.exr: each view under this light
+
+    `scripts.demo.capture` writes these files. Normals, lights and the mesh are converted to the coordinates of the training. `to_capture`
+    is the matrix (4, 4) from these coordinates to the capture's.
     """
 
     def __init__(self, folder: Path, to_capture: np.ndarray):
@@ -36,13 +41,19 @@ class GroundTruth:
             raise InputError(f"{folder}: there is no ground truth in it; known are {known}")
 
     def maps(self, camera: Camera) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Read the true maps of a view by pass, and its alpha (h, w). If the folder has no passes, return {} and an alpha of 0."""
+        """Read the true maps of the camera's view by name, and the object's alpha (h, w).
+
+        If the folder has no maps, return {} and an alpha of 0.
+        """
         if not self.passes:
             return {}, np.zeros((camera.height, camera.width), np.float32)
         return {name: self.view(name, camera) for name in self.passes}, self.view("alpha", camera)
 
     def view(self, name: str, camera: Camera) -> np.ndarray:
-        """Read the pass `name` of the view with the camera's name, float32 (h, w) or (h, w, 3)."""
+        """Read one true map of the camera's view, float32 (h, w) or (h, w, 3). `name` is "alpha" or one of PASSES.
+
+        Raises InputError if the file is missing, or has another size or too few channels.
+        """
         file = self.folder / name / f"{camera.name}.exr"
         pixels = read_exr(file)
         if pixels.shape[:2] != (camera.height, camera.width):
@@ -55,7 +66,10 @@ class GroundTruth:
         return pixels[..., :3] @ self._turn.T.astype(np.float32) if name == "normal" else pixels[..., :3]
 
     def panorama(self, name: str) -> np.ndarray:
-        """Read the light NAME.exr and turn it to the run's frame: equirectangular (H, W, 3), in Blender's orientation."""
+        """Read the light in the file NAME.exr. Return a panorama (H, W, 3), rotated to the coordinates of the training.
+
+        The panorama is equirectangular, in Blender's orientation.
+        """
         panorama = read_environment(self.folder / f"{name}.exr")
         return sample(panorama, directions(*panorama.shape[:2]) @ self._turn.astype(np.float32))
 
@@ -64,13 +78,16 @@ class GroundTruth:
         return Mesh(mesh.vertices @ self._to_run[:3, :3].T + self._to_run[:3, 3], mesh.faces)
 
     def relit(self, hdri: str, camera: Camera) -> np.ndarray:
-        """Read the true picture of a view under the light `hdri`, a name: premultiplied linear RGBA."""
+        """Read the true picture of the camera's view under the light with the name `hdri`, as premultiplied linear RGBA (h, w, 4)."""
         file = self.folder / "relight" / hdri / f"{camera.name}.exr"
         return read_relit(file, (camera.height, camera.width))
 
 
 def read_relit(file: Path, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Read a premultiplied linear RGBA picture. Raises InputError if it has no alpha, or if its (height, width) is not `size`."""
+    """Read a picture with alpha, as premultiplied linear RGBA (H, W, 4).
+
+    Raises InputError if it has no alpha, or if its (height, width) is not `size`.
+    """
     pixels = read_exr(file)
     if pixels.ndim != 3 or pixels.shape[2] != 4:
         raise InputError(f"{file} has no alpha: an RGBA picture is needed to put it over a background")
@@ -82,9 +99,10 @@ def read_relit(file: Path, size: tuple[int, int] | None = None) -> np.ndarray:
 def known_maps(
     truth: GroundTruth | None, view: View, camera: Camera, to_capture: np.ndarray
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Read the true maps of a view and its alpha, as `GroundTruth.maps` does. Without such maps, read the data set's published normals.
+    """Read one view's true maps, such as normals and base colour, by name. Returns them, and the object's alpha (h, w).
 
-    `camera` is the view's camera, resized to the rendering.
+    If `truth` has no maps, read the normals that the data set publishes, if any. `camera` is the view's camera, resized to the
+    rendering. `to_capture` is the matrix (4, 4) from the training's coordinates to the capture's.
     """
     known, alpha = truth.maps(camera) if truth else ({}, np.zeros((camera.height, camera.width), np.float32))
     if not known and (published := published_normals(view, max(camera.width, camera.height))):
@@ -94,9 +112,10 @@ def known_maps(
 
 
 def errors(images: dict[str, np.ndarray], known: dict[str, np.ndarray], true_alpha: np.ndarray) -> dict:
-    """Measure the errors of a view's maps (`pictures.maps`) against the true ones, by name; {} if the object covers no pixel.
+    """Measure the errors of one view's rendered maps against the true maps. Returns them by name; {} if the object covers no pixel.
 
-    For base colour, return the view's `metrics.channel_products` instead: `metrics.aligned_psnr` later compares all views at once.
+    `images` are the rendered maps (see `pictures.maps`), `known` the true ones (see `known_maps`). The error of base colour is not computed
+    here, because `metrics.aligned_psnr` compares all views at once. Its input, `metrics.channel_products`, is returned as `albedo`.
     """
     figures, covered, alpha = {}, true_alpha >= metrics.COVERED, images["alpha"]
     for name, true in known.items() if covered.any() else ():
