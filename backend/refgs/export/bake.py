@@ -20,10 +20,11 @@ _NEIGHBOURS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, 
 
 
 def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:
-    """Bake base colour, materials and normals (`composite`) and occlusion (`openness`) at the point of each texel on the mesh.
+    """Bake the textures of a mesh, `size` texels on each side, from the splats around it.
 
-    `mesh` has normals and uv (`unwrap`). If a texel's centre lies just beyond a chart's edge, its point is on the extended plane of the
-    face. `progress` is called with the points done and their total.
+    Each texel has a point on the mesh. Base colour, metallic, roughness and normal at this point come from `composite`, occlusion from
+    `openness`. A texel just outside a chart (a connected piece of the uv layout) has a point on the plane of the nearest face. `mesh` must
+    have normals and uv, as made by `unwrap`. `progress` is called with the number of points done and their total.
     """
     coarse = _composited(mesh, splats, size, progress)
     tangents, signs = vertex_tangents(mesh)
@@ -46,7 +47,10 @@ def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done
 
 
 def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
-    """Composite base colour, metallic, roughness and normal (C, C, 8). C is the resolution that the splats need, `size` at most."""
+    """Composite the splats' base colour, metallic, roughness and normal at the texels of a texture. Returns (C, C, 8).
+
+    C is smaller than `size` if the splats are large: FINE texels per standard deviation of a splat are enough.
+    """
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     covered = np.abs(_cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0])).sum()
@@ -68,12 +72,12 @@ def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np
 
 
 def _row_blocks(size: int) -> list[slice]:
-    """Split the rows of a picture, `size` in all, into blocks of _ROWS rows."""
+    """Split the rows 0..`size` of a picture into slices of _ROWS rows."""
     return [slice(start, min(start + _ROWS, size)) for start in range(0, size, _ROWS)]
 
 
 def _enlarged_rows(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
-    """Enlarge a square picture (C, C, 8) to (size, size, 8) bilinearly, and return only `rows` of the enlarged picture."""
+    """Enlarge a square picture (C, C, 8) to (size, size, 8), bilinearly. Compute and return only its rows in `rows`."""
     place = ((np.arange(rows.start, rows.stop) + 0.5) * len(picture) / size - 0.5).clip(0, len(picture) - 1)
     above = place.astype(int)
     below, part = np.minimum(above + 1, len(picture) - 1), (place - above).astype(np.float32)[:, None, None]
@@ -94,10 +98,10 @@ def _interpolate(weights: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
-    """Solve for unit vectors' coordinates (N, 3) in the basis of tangents, bitangents and normals (N, 3).
+    """Convert vectors (N, 3) to tangent space. `basis` is three arrays (N, 3): tangents, bitangents and normals. Returns unit vectors.
 
-    A shader forms x·tangent + y·bitangent + z·normal from interpolated vectors that are neither of unit length nor orthogonal. So the
-    coordinates are the solution of a linear system, not three dot products.
+    A shader adds x·tangent + y·bitangent + z·normal. Its three interpolated vectors are neither orthogonal nor of unit length. So x, y and
+    z are found by solving a linear system. Dot products would be wrong.
     """
     a, b, c = basis
     across = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
@@ -111,7 +115,7 @@ def _in_tangent_space(vectors: np.ndarray, *basis: np.ndarray) -> np.ndarray:
 
 
 def _uv_scene(mesh: Mesh, size: int) -> EmbreeScene:
-    """Lay the mesh's charts flat, in units of texels, for ray tracing."""
+    """Make a ray-tracing scene of the mesh's uv layout: a flat mesh, in units of texels."""
     flat = np.concatenate([mesh.uv * size, np.zeros((len(mesh.uv), 1))], axis=1).astype(np.float32)
     scene = EmbreeScene()
     TriangleMesh(scene, flat, mesh.faces.astype(np.int32))
@@ -119,10 +123,11 @@ def _uv_scene(mesh: Mesh, size: int) -> EmbreeScene:
 
 
 def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the face (R, S) at each texel's centre, its barycentric weights (R, S, 3), and the point (R, S, 3) on the mesh.
+    """Find the point on the mesh that each texel in `rows` of a texture belongs to. R is the number of rows, S is `size`.
 
-    If a texel is not on a face but next to one, it takes that face. Its point is then on the face's extended plane, and its weights are
-    those of the neighbouring texel on the face. All other texels have face −1.
+    Returns the face (R, S), the barycentric weights in it (R, S, 3), and the point (R, S, 3). `scene` is the result of `_uv_scene`. Texels
+    without a face have −1. A texel just outside a face gets that face and the weights of its neighbour inside. Its point lies on the face's
+    plane, outside the face.
     """
     first, last = max(rows.start - 1, 0), min(rows.stop + 1, size)
     y, x = np.mgrid[first:last, :size].astype(np.float32) + np.float32(0.5)
@@ -148,19 +153,19 @@ def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[
     return face, weights, points
 
 
-def _barycentric(points: np.ndarray, corners: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
-    """Compute barycentric weights (N, 3) of points (N, 2) in triangles (N, 3, 2).
+def _barycentric(points: np.ndarray, corners: np.ndarray, fallback: np.ndarray) -> np.ndarray:
+    """Compute barycentric weights (N, 3) of points (N, 2) in triangles `corners` (N, 3, 2). Points may lie outside.
 
-    Points may lie outside. For very thin triangles the weights `otherwise` (N, 3) are returned.
+    For very thin triangles, return the weights in `fallback` (N, 3) instead.
     """
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     c, area = points - corners[:, 0], _cross(a, b)
     good = np.abs(area) > 0.05 * ((a * a).sum(axis=1) + (b * b).sum(axis=1))
     area = np.where(good, area, 1)
     s, t = _cross(c, b) / area, _cross(a, c) / area
-    return np.where(good[:, None], np.stack([1 - s - t, s, t], axis=1), otherwise)
+    return np.where(good[:, None], np.stack([1 - s - t, s, t], axis=1), fallback)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Compute signed areas (N,) of parallelograms of plane vectors (N, 2): the 2D cross product."""
+    """Compute the 2D cross products (N,) of vectors (N, 2)."""
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -1,4 +1,4 @@
-"""Blend splats at points of a surface, as a renderer does that looks straight at each point."""
+"""Blend splats at points on a surface, as if a camera looked straight at each point."""
 
 from collections.abc import Callable
 
@@ -20,12 +20,16 @@ Progress = Callable[[int, int], None]
 
 
 def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress: Progress) -> np.ndarray:
-    """Composite splats at points (N, 3) of a surface with unit normals (N, 3): base colour, metallic, roughness, unit normal (N, 8).
+    """Composite the splats at points (N, 3) on a surface with unit normals (N, 3).
 
-    The ray of a point comes from outside, against the normal. Splats near the surface that face outwards are composited front to back.
-    Alpha is the opacity times the Gaussian where the ray meets the splat's plane. The blend is divided by the sum of weights. The
-    blended normal is that of the splats' mean position. It is extrapolated to the point by the normals' slope, fitted by weighted least
-    squares. If no splat reaches the ray, the nearest splats give the values. `progress` is called with the points done and their total.
+    Returns (N, 8): base colour, metallic, roughness, unit normal.
+
+    At each point a ray looks at the surface from outside, along the reversed normal. Splats are composited front to back if they are near
+    the surface and face outwards. A splat's alpha is its opacity times its Gaussian where the ray meets the splat's plane. The result is
+    divided by the sum of the weights. If no splat meets the ray, the nearest splats give the values.
+
+    The blended normal is right at the mean position of the splats, not at the point. So it is extrapolated to the point, by a slope from
+    weighted least squares. `progress` is called with the number of points done and their total.
     """
     table, values = _geometry(splats), _appearance(splats)
     spread = float(np.median(splats.scales[:, :2].mean(axis=1))) or 1.0
@@ -50,7 +54,11 @@ def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress:
 
 
 def _geometry(splats: Splats) -> Tensor:
-    """Return (N, 17): position, axes divided by their standard deviations, plane's normal, outward normal, opacity, mean deviation."""
+    """Collect the geometry of N splats in a table (N, 17).
+
+    The columns are the position, the two axes divided by their standard deviations, the normal of the splat's plane, the outward normal,
+    the opacity, and the mean standard deviation.
+    """
     u, v, normal = (axis.numpy() for axis in axes(torch.from_numpy(splats.rotations)))
     scales = np.maximum(splats.scales[:, :2], 1e-12)
     columns = [splats.positions, u / scales[:, :1], v / scales[:, 1:], normal, splats.normals]

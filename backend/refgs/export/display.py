@@ -1,4 +1,4 @@
-"""Make splats for viewers without lights: learn the run's renderings as colour by direction."""
+"""Make splats for viewers without lights: fit spherical harmonics of the view direction to the run's renderings."""
 
 from collections.abc import Callable
 
@@ -19,11 +19,12 @@ DEGREE = 3
 
 
 def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Splats:
-    """Learn spherical harmonics of degree 3 that reproduce the run's renderings, and put them into its splats.
+    """Return the run's splats with spherical harmonics that reproduce its renderings, for viewers without lights.
 
-    The harmonics are sRGB-encoded colours by direction. Geometry is unchanged. Adam minimises the squared error to renderings of the
-    training cameras under the run's light. Harmonics of degree 3 show mirror images blurred. `progress` is called with the iterations done
-    and their total. A run that learned colour by direction has such harmonics already: its splats are returned.
+    The harmonics have degree 3 and give sRGB-encoded colours by view direction. Adam fits them to renderings from the training cameras
+    under the run's light, by squared error. Mirror images become blurred, because degree 3 is low. Positions and shapes of splats stay. A
+    run without a light has harmonics from its training: its splats are returned unchanged. `progress` is called with the number of
+    iterations done and their total.
     """
     splats = run.splats
     if run.environment is None:

@@ -1,6 +1,6 @@
 """Export a run's textured mesh or its splats.
 
-Importing torch takes seconds. So everything that does not need torch is checked first.
+Importing torch takes seconds. So all checks that do not need torch come first.
 """
 
 import warnings
@@ -28,10 +28,14 @@ def export(
     overwrite: bool,
     report: Report,
 ) -> list[Path]:
-    """Export the textured mesh of a run, or its splats; return the files written.
+    """Export the textured mesh of a run, its splats, or both. Returns the files written.
 
-    If `splats_file` or `display_file` is given, the mesh is written only if `mesh_file` is given too. `folder` is a run folder, or a PLY
-    file of splats. A PLY file has no mesh to export.
+    - folder: a run folder, or a PLY file of splats, which has no mesh to export
+    - mesh_file: a .glb or .obj file. If all three files are None, the mesh is written to mesh.glb in the run folder.
+    - texture: the side of the textures in texels; None means the side in the run's settings
+    - splats_file: a .ply file for the splats with their materials
+    - display_file: a .ply file for splats with spherical harmonics, for viewers without lights
+    - overwrite: replace files that exist. Without it, InputError is raised.
     """
     splats = [file for file in (splats_file, display_file) if file is not None]
     is_run = folder.is_dir() or folder.suffix.lower() != ".ply"
@@ -65,7 +69,7 @@ def _check_names(target: Path | None, splats: list[Path]) -> None:
 
 
 def _mesh_files(target: Path | None) -> list[Path]:
-    """Return the mesh's file and its companions: the folder of textures and, for OBJ, the MTL file."""
+    """List what is written for the mesh file `target`: the file, the folder of textures and, for OBJ, the MTL file."""
     from refgs.formats.textures import FOLDER
 
     if target is None:
@@ -81,7 +85,10 @@ def _check_absent(files: list[Path], overwrite: bool) -> None:
 
 
 def _read_source(folder: Path, is_run: bool, report: Report) -> "tuple[Run | None, Splats]":
-    """Open the run, or read the PLY file of splats. If rows of the PLY file are left out, a warning is reported."""
+    """Open the run folder, or read the PLY file of splats. Returns the run (None for a PLY file) and the splats.
+
+    If rows of the PLY file are skipped, the warning about it is sent to `report`.
+    """
     from refgs.formats.splats import read_splats
     from refgs.run import open_run
 
@@ -120,7 +127,7 @@ def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, displa
 
 
 def _write_mesh(run: "Run", target: Path, texture: int | None, report: Report) -> None:
-    """Fuse, simplify, unwrap and bake the mesh, and write it with its textures."""
+    """Make the run's mesh, bake its textures, and write both."""
     from refgs.export.bake import bake
     from refgs.formats.gltf import write_glb
     from refgs.formats.obj import write_obj
@@ -137,7 +144,7 @@ def _write_mesh(run: "Run", target: Path, texture: int | None, report: Report) -
 
 
 def _make_mesh(run: "Run", report: Report) -> Any:
-    """Return the simplified mesh with texture coordinates."""
+    """Make the run's mesh: fuse depth maps, simplify, fit the mesh to the outlines in renderings, and compute its uv."""
     from refgs.export.outline import fit_to_outlines
     from refgs.export.unwrap import layout, unwrap
     from refgs.geometry.mesh import clean, is_crumbs
@@ -162,9 +169,9 @@ def _make_mesh(run: "Run", report: Report) -> Any:
 
 
 def _baked_splats(run: "Run", mesh: Any) -> "Splats":
-    """Return the splats to bake.
+    """Return the run's splats for baking. If their base colours contain shadows, the shadows are removed.
 
-    If the light stood still and the training modelled no shadows, the base colours contain shadows. These are removed.
+    Base colours contain shadows if the light was fixed to the object and the training computed no shadows.
     """
     from refgs.export.unshadowed import unshadowed
     from refgs.render.baselines import method_of

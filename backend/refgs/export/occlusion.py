@@ -12,10 +12,10 @@ _CHUNK = 1 << 14  # vertices at a time
 
 
 def openness(mesh: Mesh) -> np.ndarray:
-    """Measure the fraction (V,) of a uniform light that reaches each vertex, because the mesh does not block it.
+    """Compute ambient occlusion at each vertex (V,): the fraction of a uniform light that the mesh does not block.
 
-    This is glTF's occlusion: 1 means that nothing blocks the light. Rays are traced from each vertex, denser near its normal: their
-    density is the cosine to the normal.
+    The value 1 means that nothing blocks the light, as in glTF. RAYS rays start at each vertex. Their density is proportional to the cosine
+    of the angle to the normal.
     """
     middle = mesh.vertices.mean(axis=0)  # subtracted, because rays are traced in single precision
     vertices = (mesh.vertices - middle).astype(np.float32)

@@ -1,7 +1,7 @@
-"""Fit a mesh to the outlines in renderings.
+"""Fit a mesh to the outlines of the object in renderings.
 
-A mesh fused from depth is too small, by half a voxel and more. Surfels are partly transparent, so their blended depth lies a little
-below the surface. Outlines against the background have no such error.
+A mesh fused from depth maps is too small, by at least half a voxel. The reason is that surfels are partly transparent, so their blended
+depth lies a little below the surface. Outlines against the background have no such error.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,11 +26,12 @@ PRIOR = 0.05  # weight of a zero displacement, in outline pixels: vertices off t
 
 
 def fit_to_outlines(mesh: Mesh, render: Callable[[Camera], Rendering], cameras: Sequence[Camera], voxel: float) -> Mesh:
-    """Move vertices along their normals until the mesh's outlines match those in renderings.
+    """Move a mesh's vertices along their normals until its outlines match the object's outlines in renderings.
 
-    First all vertices move by the median gap between the outlines; then vertices along outlines move by the gap there. Vertices outside
-    of an outline move back inside. No vertex moves by more than LARGEST_MOVE times `voxel`, the size in world units of the voxels that the
-    mesh was fused from. The mesh is returned unchanged if renderings do not show the object before a background.
+    `render` makes the rendering for a camera. First all vertices move by the same distance, the median gap between the two outlines. Then
+    vertices on the mesh's outlines move by the gap at their place. Vertices outside the object's outline move back inside. No vertex moves
+    by more than LARGEST_MOVE times `voxel`. `voxel` is the size in world units of the voxels that the mesh was made from. The mesh is
+    returned unchanged if the renderings show no background around the object.
     """
     chosen = [cameras[i] for i in np.linspace(0, len(cameras) - 1, min(VIEWS, len(cameras))).astype(int)]
     views = [(camera, _signed_distance(render(camera).alpha.numpy())) for camera in chosen]
@@ -60,7 +61,10 @@ def fit_to_outlines(mesh: Mesh, render: Callable[[Camera], Rendering], cameras: 
 
 
 def _overshoot(vertices: np.ndarray, views: list[tuple[Camera, np.ndarray]]) -> np.ndarray:
-    """Measure how far (V,) vertices lie outside of the outlines, in world units: the maximum over views."""
+    """Measure how far vertices lie outside the object's outlines, in world units (V,). The largest distance over the views counts.
+
+    `views` are pairs of a camera and the result of `_signed_distance` for its rendering.
+    """
     overshoot = np.zeros(len(vertices))
     for camera, distance in views:
         x, y, z = camera.world_to_camera[:3, :3] @ vertices.T + camera.world_to_camera[:3, 3:]
@@ -71,9 +75,9 @@ def _overshoot(vertices: np.ndarray, views: list[tuple[Camera, np.ndarray]]) -> 
 
 
 def _smoother(mesh: Mesh) -> Callable[[np.ndarray], np.ndarray]:
-    """Make a function that smooths values (V,): it averages each vertex with its neighbours, SMOOTHING_STEPS times.
+    """Make a function that smooths values (V,) by averaging each vertex with its neighbours, SMOOTHING_STEPS times.
 
-    Outlines are wrong by a fraction of a pixel. Smoothing reduces this error.
+    Measured outlines are off by a fraction of a pixel. Smoothing reduces this error.
     """
     a, b = np.concatenate([mesh.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]).T
     count = len(mesh.vertices)
@@ -89,23 +93,26 @@ def _smoother(mesh: Mesh) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _signed_distance(alpha: np.ndarray) -> np.ndarray:
-    """Compute the signed distance to the outline in pixels, negative outside, on a grid UPSAMPLING times as dense each way."""
+    """Compute the distance in pixels from each place in a picture to the object's outline, negative outside the object.
+
+    The result has UPSAMPLING times as many rows and columns as the object's `alpha`.
+    """
     fine = cv2.resize(alpha, None, fx=UPSAMPLING, fy=UPSAMPLING, interpolation=cv2.INTER_LINEAR) >= 0.5
     inner, outer = (cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) for mask in (fine, ~fine))
     return np.where(fine, inner - 0.5, 0.5 - outer) / UPSAMPLING
 
 
 def _look_up(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Look up a picture that is UPSAMPLING times as dense, at positions `x` and `y` in pixels of the original."""
+    """Read the values of a picture that was enlarged UPSAMPLING times. The positions `x` and `y` are in pixels of the original."""
     row, column = ((UPSAMPLING * v).astype(int) for v in (y, x))
     return picture[row.clip(0, len(picture) - 1), column.clip(0, picture.shape[1] - 1)]
 
 
 def _gaps(mesh: Mesh, camera: Camera, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Measure how far the mesh's outline lies inside the rendering's outline, at each pixel along the mesh's outline.
+    """Measure the gap between two outlines: the mesh's, and the object's in a rendering.
 
-    Returns a vertex for each of these pixels, and the gap there in world units, negative if the mesh's outline lies outside. `distance` is
-    the result of `_signed_distance`.
+    Returns, for each pixel on the mesh's outline, the index of a vertex there, and the gap in world units. A gap is positive if the mesh's
+    outline lies inside the object's, and negative if outside. `distance` is the result of `_signed_distance` for the rendering.
     """
     scene = EmbreeScene()  # rays are traced in single precision about the mesh's middle
     middle = mesh.vertices.mean(axis=0)

@@ -1,4 +1,4 @@
-"""Remove the object's shadows from base colours: renderers cast shadows on the exported mesh again."""
+"""Remove the object's shadows from its base colours. Renderers add the shadows themselves when they light the exported mesh."""
 
 from dataclasses import replace
 
@@ -18,11 +18,11 @@ PASSES = 3
 
 
 def unshadowed(splats: Splats, surfels: Surfels, mesh: Mesh, light: Environment) -> Splats:
-    """Divide the base colour of matte splats by the fraction of the irradiance that reaches them.
+    """Return splats whose base colours have no shadows and no inter-reflection.
 
-    The light that reaches a splat is the direct light that the `mesh` does not block, plus the light that the mesh reflects. Metals are
-    unchanged. Call this only if the training traced no mesh: only then do base colours contain shadows. `light` is the training's light,
-    and `surfels` are the splats as tensors.
+    The base colour of a matte splat is divided by the fraction of the irradiance that reaches it. This light is the direct light that
+    `mesh` does not block, and the light that `mesh` reflects. Metals are unchanged. Base colours contain shadows only if the training
+    computed none: do not call this function otherwise. `surfels` are the splats as tensors; `light` is the light of the training.
     """
     shadowed, occluder = surfels.albedo, Occluder(mesh)
     matte = 1 - surfels.metallic[:, None]

@@ -1,4 +1,4 @@
-"""Unwrap a mesh into charts in the unit square, for textures."""
+"""Unwrap a mesh for textures: cut it into charts (flat pieces), and place the charts in the unit square."""
 
 from dataclasses import dataclass
 
@@ -13,10 +13,11 @@ PART = 800
 
 @dataclass(frozen=True)
 class Layout:
-    """Quality of a layout of charts.
+    """Tell how good a mesh's uv layout is.
 
-    `used` is the filled part of the square. `density` is the texel density relative to the mean, at the 5th and 95th percentile of the
-    surface. `bend` is the area-weighted mean distortion of the triangles' angles, in degrees.
+    - used: the fraction of the unit square that is filled
+    - density: texels per surface area, divided by the mean. Two values: the 5th and the 95th percentile over the surface.
+    - bend: how much the uv layout changes the angles of triangles, in degrees. The mean is weighted by area.
     """
 
     used: float
@@ -25,10 +26,10 @@ class Layout:
 
 
 def unwrap(mesh: Mesh) -> Mesh:
-    """Cut the mesh into charts with uv, by xatlas. Charts are at least 1/128 of the texture's side apart.
+    """Compute uv for a mesh with xatlas, which cuts it into charts (flat pieces). Returns a new mesh.
 
-    Vertices on seams are doubled, with the normals of `mesh`. First the mesh is halved across its longest axis until no part has more
-    than PART triangles. Each part has its own charts; all charts are packed together.
+    Charts are at least 1/128 of the unit square's side apart. Vertices on seams are doubled and keep their normals. xatlas is slow for
+    large meshes. So the mesh is first split into parts of at most PART triangles; no chart crosses from one part to another.
     """
     atlas, parts = xatlas.Atlas(), []
     for part in _parts(mesh):
@@ -53,7 +54,7 @@ def unwrap(mesh: Mesh) -> Mesh:
 
 
 def _parts(mesh: Mesh) -> list[np.ndarray]:
-    """Split the mesh into parts of at most PART triangles. Return the face indices of each part."""
+    """Halve the mesh across its longest axis until all parts have at most PART triangles. Returns the face indices of each part."""
     middle, done, left = mesh.vertices[mesh.faces].mean(axis=1), [], [np.arange(len(mesh.faces))]
     while left:
         part = left.pop()
@@ -67,7 +68,7 @@ def _parts(mesh: Mesh) -> list[np.ndarray]:
 
 
 def layout(mesh: Mesh) -> Layout:
-    """Measure the layout of a mesh with uv."""
+    """Measure how good the uv layout of a mesh is."""
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
