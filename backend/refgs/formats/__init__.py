@@ -1,1 +1,1 @@
-"""Read and write files and the plain arrays they hold: PLY, EXR, glTF, OBJ, COLMAP's models, history.jsonl. No torch."""
+"""Read and write files: PLY, EXR, glTF, OBJ, COLMAP's models, history.jsonl. Nothing here imports torch."""

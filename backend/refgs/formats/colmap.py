@@ -1,7 +1,7 @@
 """Read COLMAP's sparse models, binary or text (COLMAP's documentation, "Output Format").
 
-COLMAP's own reader is not used: for a truncated file it prints an unrelated message, or asks for terabytes of memory. This reader's
-errors name the file.
+COLMAP's own reader is not used. For a truncated file it prints an unrelated message, or asks for terabytes of memory. This reader raises
+errors that name the file.
 """
 
 import re
@@ -50,24 +50,30 @@ class Image:
 
 
 def model_files(folder: Path) -> tuple[Path, Path, Path]:
-    """Name the files of a model's cameras, images and points: binary if images.bin exists, else text. They may be missing."""
+    """Return the paths of a COLMAP model's cameras, images and points. The files may be missing.
+
+    The names end in .bin if images.bin exists, otherwise in .txt.
+    """
     suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
     cameras, images, points = (folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D"))
     return cameras, images, points
 
 
 def read_cameras(file: Path) -> dict[int, Intrinsics]:
-    """Read the cameras, keyed by number. Raises InputError for a broken file."""
+    """Read a COLMAP model's cameras, keyed by camera id. Raises InputError for a broken file."""
     return _parse(file, _binary_cameras, _text_cameras)
 
 
 def read_images(file: Path) -> list[Image]:
-    """Read the images' names, cameras and poses. Raises InputError for a broken file."""
+    """Read the names, camera ids and poses of a COLMAP model's images. Raises InputError for a broken file."""
     return _parse(file, _binary_images, _text_images)
 
 
 def read_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the finite points (M, 3) and their colours (M, 3), sRGB-encoded 0..1. Raises InputError for a broken file."""
+    """Read the points (M, 3) of a COLMAP model and their colours (M, 3), sRGB-encoded in 0..1. Raises InputError for a broken file.
+
+    Points with a NaN or infinite value are left out.
+    """
     return _parse(file, _binary_points, _text_points)
 
 
@@ -79,7 +85,7 @@ def _parse(file: Path, binary: Callable[[Path], T], text: Callable[[Path], T]) -
 
 
 class _Reader:
-    """Binary file, read from front to back. Raises struct.error or ValueError where it is truncated."""
+    """Read values from a binary file one after the other. Raises struct.error or ValueError if the file is truncated."""
 
     def __init__(self, file: Path):
         self.data, self.at = file.read_bytes(), 0
@@ -137,7 +143,10 @@ def _points(rows: list) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _entries(file: Path, lines_each: int = 1) -> list[str]:
-    """Return the first line of each entry. Raises ValueError where the header counts more entries than there are."""
+    """Split a COLMAP text file into entries of `lines_each` lines. Return the first line of each entry.
+
+    Raises ValueError if the file has fewer entries than its header says.
+    """
     lines = file.read_text(encoding="utf-8").splitlines()
     entries = [line for line in lines if not line.startswith("#") and (lines_each > 1 or line.strip())]
     while entries and not entries[-1].strip():  # the line of keypoints may be empty

@@ -15,9 +15,9 @@ _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 
 def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
-    """Write float32 linear Rec.709: (H, W, 4) as premultiplied RGBA, (H, W, 3) as RGB, (H, W) as Y; ZIP, scan lines.
+    """Write float pixels (linear Rec.709) as an EXR file: (H, W, 4) as premultiplied RGBA, (H, W, 3) as RGB, (H, W) as Y.
 
-    Raises OSError where the disk is full or refuses the file.
+    The file has ZIP compression and scan lines. Raises OSError if the disk is full or the file cannot be written.
     """
     pixels = np.ascontiguousarray(pixels, np.float32)
     name = "Y" if pixels.ndim == 2 else {3: "RGB", 4: "RGBA"}[pixels.shape[2]]
@@ -37,10 +37,10 @@ def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
 
 
 def read_exr(path: str | os.PathLike) -> np.ndarray:
-    """Read an EXR as float32: (H, W, 4) RGBA, (H, W, 3) RGB, or (H, W) for a single channel.
+    """Read an EXR file as float32: (H, W, 4) for RGBA, (H, W, 3) for RGB, or (H, W) for a single channel.
 
-    If the file has several parts, read the first one with R, G and B, or else the first. Raises InputError for a file that is missing or
-    broken, or has other channels.
+    If the file has several parts, the first part with R, G and B is read; without one, the first part. Raises InputError if the file is
+    missing or broken, or has other channels.
     """
     path = Path(path)
     if not path.is_file():

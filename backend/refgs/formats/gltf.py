@@ -18,11 +18,16 @@ SPECULAR = "KHR_materials_specular"
 
 
 def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
-    """Write the mesh (Z up; with normals and uv) as Y-up binary glTF with a metallic-roughness material.
+    """Write a textured mesh as a binary glTF file. The mesh is turned from Z up to glTF's Y up.
 
-    Embedded are: base colour (sRGB); occlusion, roughness and metallic as R, G and B (linear); the tangent-space normal map; the
-    MikkTSpace tangents of `bake`, because not every reader computes them. A material without specular reflection has
-    KHR_materials_specular. `write_textures` writes the maps beside the file.
+    The file has one metallic-roughness material. These are stored in the file:
+
+    - base colour, sRGB-encoded
+    - occlusion, roughness and metallic, linear, as R, G and B of one picture
+    - the normal map, and the MikkTSpace tangents that it was made with, because not every program computes them
+    - the extension KHR_materials_specular, if the material has no specular reflection
+
+    The maps are also written as files beside the mesh, by `write_textures`. `mesh` must have normals and uv.
     """
     path = Path(path)
     pictures = write_textures(path.parent / FOLDER, textures)
@@ -62,7 +67,7 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
 
 
 def read_glb(path: str | os.PathLike) -> Mesh:
-    """Read the vertices and faces, Z up, of a file by `write_glb`. Raises InputError for a broken file."""
+    """Read the vertices and faces of a file that `write_glb` wrote. They are turned back to Z up. Raises InputError for a broken file."""
     try:
         model = trimesh.load_mesh(path, file_type="glb", process=False, skip_materials=True)
         vertices, faces = np.asarray(model.vertices, np.float64), np.asarray(model.faces)

@@ -1,4 +1,4 @@
-"""Read history.jsonl: the errors during a training, one JSON object a line (docs/run-folder.md)."""
+"""Read history.jsonl: the errors measured during a training, one JSON object a line (docs/run-folder.md)."""
 
 import json
 
@@ -6,7 +6,10 @@ FILE = "history.jsonl"  # in the run folder
 
 
 def read(text: str) -> list[dict]:
-    """Parse the lines; skip a line that is truncated, which a killed training can leave."""
+    """Parse the text of a history.jsonl file to one dictionary a line.
+
+    A truncated line is skipped. A training that is killed can leave one.
+    """
     found = []
     for line in text.splitlines():
         try:

@@ -14,10 +14,12 @@ Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # rotation from Z up to the
 
 @dataclass
 class Mesh:
-    """Triangle mesh.
+    """Hold a triangle mesh.
 
-    vertices (V, 3) are float64 in world units; faces (F, 3) are integers, counter-clockwise seen from outside. Optional are smooth unit
-    normals (V, 3) and uv (V, 2) in 0..1 with v upward.
+    - vertices (V, 3): float64, in world units
+    - faces (F, 3): vertex indices, counter-clockwise as seen from outside
+    - normals (V, 3), optional: smooth unit normals
+    - uv (V, 2), optional: in 0..1, with v upward
     """
 
     vertices: np.ndarray
@@ -31,13 +33,13 @@ class Mesh:
 
 
 def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
-    """Write vertices and faces as a binary PLY, whole or not at all."""
+    """Write a mesh's vertices and faces as a binary PLY file. A failed write leaves no partial file."""
     with whole(path) as temporary:
         temporary.write_bytes(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type="ply"))
 
 
 def read_mesh(path: str | os.PathLike) -> Mesh:
-    """Read a file by `write_mesh`. Raises InputError for a broken file."""
+    """Read a mesh that `write_mesh` wrote. Raises InputError for a broken file."""
     try:
         mesh = trimesh.load_mesh(path, file_type="ply", process=False)
         return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces))

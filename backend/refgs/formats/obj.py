@@ -11,9 +11,10 @@ from refgs.paths import whole
 
 
 def write_obj(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
-    """Write the mesh (Z up; with normals and uv) as Y-up Wavefront OBJ, and its material beside it as MTL.
+    """Write a textured mesh as a Wavefront OBJ file, with its material in an MTL file. The mesh is turned from Z up to Y up.
 
-    The material names the pictures of `write_textures`, by the customary PBR keys map_Pm (metallic), map_Pr (roughness) and norm.
+    The material names the pictures that `write_textures` writes beside it. Its keys are the usual ones for PBR: map_Kd (base colour),
+    map_Pm (metallic), map_Pr (roughness) and norm. `mesh` must have normals and uv.
     """
     path = Path(path)
     write_textures(path.parent / FOLDER, textures)

@@ -10,10 +10,10 @@ from refgs.formats.exr import read_exr
 
 
 def read_environment(path: str | os.PathLike) -> np.ndarray:
-    """Read a panorama (H, W, 3) of linear radiance, float32. Raises InputError where `path` does not hold one.
+    """Read a panorama of linear radiance as float32 (H, W, 3). Raises InputError if the file is not a panorama.
 
-    Infinite pixels (a sun that overflowed half floats) become the largest half float. Negative radiance becomes 0. NaN becomes 0 too,
-    with an InputWarning.
+    Infinite pixels (a sun that overflowed half floats) become the largest half float. Negative radiance becomes 0. NaN becomes 0 too, with
+    an InputWarning.
     """
     pixels = read_exr(path)
     if pixels.ndim == 2:
@@ -27,9 +27,9 @@ def read_environment(path: str | os.PathLike) -> np.ndarray:
 
 
 def directions(height: int, width: int) -> np.ndarray:
-    """Compute the unit directions (height, width, 3), float32, of a panorama's pixel centres, Z up.
+    """Compute the unit direction of each pixel of a panorama: float32 (height, width, 3), Z up. The first row is the top.
 
-    Blender's orientation is u = 0.5 − atan2(y, x)/2π from the left and v = asin(z)/π + 0.5 from the bottom. The first row is the top.
+    As in Blender, the direction (x, y, z) is at u = 0.5 − atan2(y, x)/2π from the left and v = asin(z)/π + 0.5 from the bottom.
     """
     azimuth = 2 * np.pi * (0.5 - (np.arange(width) + 0.5) / width)
     elevation = np.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
@@ -38,7 +38,10 @@ def directions(height: int, width: int) -> np.ndarray:
 
 
 def sample(panorama: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Look up a panorama (H, W, C) in directions (..., 3) of any length: radiance (..., C), bilinear, wrapped horizontally."""
+    """Look up a panorama (H, W, C) in directions (..., 3) of any length. Returns the radiance (..., C).
+
+    The look-up is bilinear. The left and right edges are joined.
+    """
     height, width = panorama.shape[:2]
     x, y, z = np.moveaxis(np.asarray(directions, np.float32), -1, 0)
     column = (0.5 - np.arctan2(y, x) / (2 * np.pi)) * width - 0.5

@@ -36,13 +36,13 @@ def read_ply(path: str | os.PathLike) -> PlyData:
 
 
 def write_ply(path: str | os.PathLike, elements: list[PlyElement], comments: list[str] = ()) -> None:
-    """Write a binary little-endian PLY file, whole or not at all."""
+    """Write a binary little-endian PLY file. A failed write leaves no partial file."""
     with whole(path) as temporary:
         PlyData(elements, byte_order="<", comments=list(comments)).write(str(temporary))
 
 
 def _check_header(file, path: Path) -> None:
-    """Check that the file has as many rows as its header says. Raises InputError."""
+    """Check that a PLY file is as long as its header says. Raises InputError if it is not a PLY file, truncated, or too long."""
     header = file.read(LONGEST_HEADER)
     end = _END.search(header)
     if not header.startswith(b"ply") or end is None:
@@ -73,7 +73,7 @@ def _check_header(file, path: Path) -> None:
 
 
 def _elements(lines: list[list[str]], path: Path) -> list[tuple[int, list[int]]]:
-    """Parse a header's elements. Return, for each, the number of rows, and the smallest size of each property in bytes."""
+    """Parse the header of a PLY file. Returns, for each element, the number of rows and the minimum bytes of each property."""
     elements: list[tuple[int, list[int]]] = []
     for line in lines:
         match line:

@@ -1,4 +1,7 @@
-"""Read and write splats.ply: one row a splat, with materials, in the property names of 3D Gaussian splatting (3DGS)."""
+"""Read and write splats.ply: one row for each splat, with its material.
+
+Properties have the same names as in the files of 3D Gaussian splatting (3DGS).
+"""
 
 import math
 import os
@@ -20,20 +23,20 @@ DC = 0.5 / math.sqrt(math.pi)  # Y00: a constant harmonic f_dc has the colour 0.
 
 @dataclass
 class Splats:
-    """Table of N splats with appearance and materials; float32 numpy arrays.
+    """Hold N splats with their appearance and materials, as float32 numpy arrays.
 
-    - positions (N, 3), world units
-    - normals (N, 3), unit, outward where that is known
-    - sh (N, K, 3): spherical harmonics, K = (degree + 1)², colour = 0.5 + SH as in 3DGS
+    - positions (N, 3), in world units
+    - normals (N, 3), unit vectors. They point outwards where that is known.
+    - sh (N, K, 3): spherical harmonics, K = (degree + 1)². The colour is 0.5 + SH, as in 3DGS.
     - opacities (N,) in 0..1
-    - scales: standard deviations in world units, (N, 2) of surfels, (N, 3) of 3D Gaussians with the normal's last
+    - scales: standard deviations in world units; (N, 2) for surfels, (N, 3) for 3D Gaussians. The last of three is along the normal.
     - rotations (N, 4): unit quaternions wxyz
     - albedo (N, 3), linear Rec.709; metallic (N,) and perceptual roughness (N,) in 0..1
-    - received (N, 3): irradiance, with light from the object itself, divided by that of an unoccluded surface
-    - indirect (N, K', 3): spherical harmonics of the linear radiance from the object itself. Scenes without inter-reflection have
-      K' = 0 and `received` 1.
-    - constants: values, by the names of CONSTANTS, that all splats share. Files have no columns for them.
-    - others: elements of a file that are not in this table. Its `vertex` has the unknown properties.
+    - received (N, 3): the irradiance, divided by the irradiance without occlusion. It includes light that the object reflects to itself.
+    - indirect (N, K', 3): spherical harmonics of the linear radiance that other parts of the object reflect to the splat. Without
+      inter-reflection, K' is 0 and `received` is 1.
+    - constants: material values that are the same for all splats, by name (see CONSTANTS). Files store them in the header.
+    - others: what a PLY file has besides these properties. It is kept in order to be written again.
     """
 
     positions: np.ndarray
@@ -71,10 +74,10 @@ _TO_THIRD = np.array([(0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1, 0, 0, 0
 
 
 def write_splats(path: str | os.PathLike, splats: Splats) -> None:
-    """Write a binary little-endian PLY: the table as `vertex`, then the elements of `splats.others` (docs/formats.md).
+    """Write splats as a binary little-endian PLY file (docs/formats.md). Elements in `splats.others` are written too.
 
-    As 3DGS viewers expect, opacities are logits, scales are logarithms, and spherical harmonics of degree 1 and above are
-    channel-major. Materials are stored unchanged. Opacities are clipped to 1e-6 .. 1 - 1e-6.
+    Values are encoded as 3DGS viewers expect: opacities as logits, scales as logarithms, and spherical harmonics of degree 1 and above in
+    channel-major order. Materials are stored unchanged. Opacities are clipped to 1e-6 .. 1 - 1e-6.
     """
     names, columns = _common_columns(splats, splats.scales)
     names += _MATERIAL[:3]
@@ -92,9 +95,9 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
 
 
 def write_display_splats(path: str | os.PathLike, splats: Splats) -> None:
-    """Write a binary little-endian PLY for 3DGS viewers: harmonics, opacity, three scales, rotation; no materials.
+    """Write splats as a binary little-endian PLY file for 3DGS viewers: colours and shapes, but no materials.
 
-    A surfel's third scale is THIN times its smaller one, because viewers hide a splat with scale 0.
+    These viewers need three scales and hide a splat with scale 0. So a surfel's third scale is THIN times its smaller one.
     """
     scales = splats.scales
     if scales.shape[1] == 2:
@@ -103,7 +106,7 @@ def write_display_splats(path: str | os.PathLike, splats: Splats) -> None:
 
 
 def _common_columns(splats: Splats, scales: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
-    """Return the names and columns of the properties in all files of splats."""
+    """List the columns that every PLY file of splats has. Returns their names, and their values as 3DGS encodes them."""
     opacity = np.clip(splats.opacities.astype(np.float64), 1e-6, 1 - 1e-6)
     rest = splats.sh[:, 1:].transpose(0, 2, 1)
     columns = [
@@ -153,11 +156,14 @@ def _write(
 
 
 def read_splats(path: str | os.PathLike) -> Splats:
-    """Read the PLY files of `write_splats`, 3DGS (three scales), 2DGS (two scales) and Ref-Gaussian.
+    """Read a PLY file of splats: from `write_splats`, 3DGS (three scales), 2DGS (two scales) or Ref-Gaussian.
 
-    Missing materials become MATTE, with the colour of the constant harmonic as base colour. Missing normals become the rotation's third
-    axis, of unknown sign. Three scales are reordered so that the smallest is the last. Rows with values that are not finite are left
-    out, with an InputWarning. Raises InputError for a file that is missing, broken, or not of splats.
+    - Splats without a material become matte (MATTE). The constant harmonic gives their base colour.
+    - Splats without a normal get the third axis of their rotation, which may point inwards.
+    - Three scales are reordered so that the smallest is the last.
+    - Splats with a NaN or infinite value are left out, with an InputWarning.
+
+    Raises InputError if the file is missing, broken, or not a file of splats.
     """
     data = read_ply(path)
     if "vertex" not in data:
@@ -184,12 +190,12 @@ def read_splats(path: str | os.PathLike) -> Splats:
         part = rows[[*wanted]]  # a view; numpy cannot convert it directly where the row also has lists
         return structured_to_unstructured(repack_fields(part) if rows.dtype.hasobject else part, np.float32, copy=True)
 
-    def harmonics(prefix: str, *degrees: int) -> np.ndarray:
-        """Return the harmonics in the columns PREFIX0, PREFIX1 … as (N, K, 3). Raises InputError if no degree has that many columns."""
+    def harmonics(prefix: str, *counts: int) -> np.ndarray:
+        """Read the columns PREFIX0, PREFIX1 … as harmonics (N, K, 3). Raises InputError if their number is not in `counts`."""
         found = sum(re.fullmatch(rf"{prefix}\d+", name) is not None for name in names)
         wanted = [f"{prefix}{i}" for i in range(found)]
-        if found not in degrees or not {*wanted} <= {*names}:
-            numbers = ", ".join(map(str, degrees))
+        if found not in counts or not {*wanted} <= {*names}:
+            numbers = ", ".join(map(str, counts))
             raise InputError(f"{path} has {found} {prefix} values a splat: spherical harmonics have {numbers}")
         return columns(*wanted).reshape(vertex.count, 3, found // 3).transpose(0, 2, 1)
 
@@ -245,7 +251,7 @@ def _third_axis(rotations: np.ndarray) -> np.ndarray:
 
 
 def _shortest_last(rotations: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate Gaussians' axes so that the shortest, which is the normal, is the third."""
+    """Reorder the axes of 3D Gaussians so that the shortest, which is the normal, is the third. Returns new rotations and scales."""
     shortest = np.where(scales[:, 2] <= scales.min(axis=1), 2, scales.argmin(axis=1))
     w, x, y, z = rotations.T
     a, b, c, d = _TO_THIRD[shortest].T
@@ -259,7 +265,7 @@ def _shortest_last(rotations: np.ndarray, scales: np.ndarray) -> tuple[np.ndarra
 
 
 def _other_elements(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[PlyElement, ...]:
-    """Copy a file's elements, without the known properties of `vertex`."""
+    """Copy the elements of a PLY file. Leave out the properties of `vertex` that are named in `known`."""
     kept = []
     for element in elements:
         more = [p for p in element.properties if element.name != "vertex" or p.name not in known]
@@ -271,9 +277,9 @@ def _other_elements(elements: tuple[PlyElement, ...], known: set[str]) -> tuple[
 
 
 def _without_nonfinite(splats: Splats, path: Path) -> Splats:
-    """Remove the splats with a value that is not finite, with an InputWarning.
+    """Remove splats with a NaN or infinite value, and warn with an InputWarning.
 
-    If any splat is removed, drop all elements other than `vertex`: they may refer to the rows of `vertex` by index.
+    If a splat is removed, the PLY elements other than `vertex` are dropped. They may refer to splats by row number, which has changed.
     """
     values = {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
     wrong = [name for name, value in values.items() if not np.isfinite(value).all()]

@@ -1,4 +1,4 @@
-"""Compute MikkTSpace tangents, which glTF demands and Blender computes, too."""
+"""Compute tangents by the MikkTSpace method, as glTF demands and Blender does."""
 
 import numpy as np
 
@@ -6,10 +6,11 @@ from refgs.formats.mesh import Mesh
 
 
 def vertex_tangents(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Compute unit tangents (V, 3) along increasing u, and signs (V,): bitangent = sign · normal × tangent.
+    """Compute a unit tangent (V, 3) and a sign (V,) for each vertex, such that bitangent = sign · normal × tangent.
 
-    Project the faces' tangents to the plane of the vertex's normal; weight them by the face's angle at the vertex (Mikkelsen 2008,
-    "Simulation of Wrinkled Surfaces Revisited"). Vertices on a seam must be doubled, as `unwrap` does.
+    Tangents point along increasing u. A vertex's tangent is the mean of its faces' tangents. Each is projected to the plane of the vertex's
+    normal and weighted by the face's angle at the vertex (Mikkelsen 2008, "Simulation of Wrinkled Surfaces Revisited"). Vertices on a seam
+    must be doubled, as `unwrap` does.
     """
     corners, uv = mesh.vertices[mesh.faces], mesh.uv[mesh.faces]
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

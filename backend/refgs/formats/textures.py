@@ -16,13 +16,13 @@ FOLDER = "textures"  # beside the mesh
 
 @dataclass
 class Textures:
-    """Square maps of S×S texels, float32, the first row at v = 1.
+    """Hold the square texture maps of a mesh, S×S texels, float32. The first row is at v = 1.
 
     - base_color (S, S, 3), linear Rec.709
     - metallic, roughness and occlusion (S, S)
     - normal (S, S, 3): unit vectors in MikkTSpace tangent space, y along v (OpenGL, glTF and Blender)
-    - mask (S, S): true where the centre of a texel or of one of its neighbours lies on the mesh. Bilinear look-ups on the mesh read only
-      these; the others are padding, copied from the nearest one.
+    - mask (S, S): true for a texel if its centre, or a neighbour's centre, lies on the mesh. A bilinear look-up on the mesh reads only
+      these texels. The other texels are padding: copies of the nearest texel in the mask.
     - specular: 1, or 0 for a material without specular reflection
     """
 
@@ -36,9 +36,10 @@ class Textures:
 
 
 def write_textures(folder: Path, textures: Textures) -> dict[str, np.ndarray]:
-    """Write each map as 8-bit PNG and as linear float EXR, each file whole or not at all. 8 bits alone are coarse for a mirror.
+    """Write each texture map twice: as 8-bit PNG, and as linear float EXR. Returns the 8-bit pictures by name.
 
-    Normals are mapped to 0..1 in both. Returns the 8-bit pictures by name, base colour sRGB-encoded.
+    The EXR files are for mirrors, where the steps of 8-bit normals are visible. Normals are mapped to 0..1 in both. Base colour is
+    sRGB-encoded in the PNG. A failed write leaves no partial file.
     """
     maps = {
         "base_color": textures.base_color,
