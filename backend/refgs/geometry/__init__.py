@@ -1,1 +1,1 @@
-"""Carve visual hulls, fuse depth maps, clean meshes, trace visibility."""
+"""Carve visual hulls, fuse depth maps to meshes, clean meshes, and trace which light a mesh blocks."""

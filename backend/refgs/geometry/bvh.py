@@ -17,16 +17,17 @@ _Work = struct("Trace", "trace.cu")
 
 
 def _spread_bits(v: Tensor) -> Tensor:
-    """Insert two zero bits between any two bits of integers below 2^10."""
+    """Insert two zero bits between neighbouring bits of integers below 2^10. A Morton code is made of three of these."""
     for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
         v = (v | v << shift) & mask
     return v
 
 
 class Tree:
-    """Bounding volume hierarchy of a mesh: a complete binary tree over its triangles in Morton order (Lauterbach et al. 2009).
+    """Hold a mesh's bounding volume hierarchy on a CUDA card. Triangles are in Morton order (Lauterbach et al. 2009).
 
-    Vertices are stored as (vertex − `centre`) / `size`. `lift` is the height above the surface at which rays start, in units of `size`.
+    The tree is a complete binary tree. Vertices are stored as (vertex − `centre`) / `size`. `lift` is the height above the surface at which
+    rays start, in units of `size`.
     """
 
     def __init__(self, mesh: Mesh, centre: np.ndarray, size: float, lift: float, device: torch.device):
@@ -50,9 +51,10 @@ class Tree:
         self._triangles = torch.cat([corners[:, :1], edges], dim=1).contiguous()
 
     def visible(self, mirrored: Tensor, alpha: Tensor, depth: Tensor, camera: Camera) -> Tensor:
-        """Trace each pixel's mirrored ray: 1 where it is free, 0 where the mesh occludes it, 1 in empty pixels; (H, W).
+        """Trace a ray from each pixel's surface point in its mirror direction. Returns (H, W): 0 if the mesh blocks the ray, otherwise 1.
 
-        `mirrored` (H, W, 3) are unit directions. `depth` (H, W) is the blended depth before it is divided by `alpha` (H, W).
+        Empty pixels have 1. `mirrored` (H, W, 3) are the rays' unit directions. `depth` (H, W) is the blended depth, not yet divided by
+        `alpha` (H, W).
         """
         mirrored, alpha, depth = (v.detach().contiguous() for v in (mirrored, alpha, depth))
         visible, work = torch.empty_like(alpha), _Work(width=camera.width, height=camera.height, leaves=self.leaves)

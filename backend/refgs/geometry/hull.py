@@ -1,4 +1,4 @@
-"""Carve the visual hull, the largest shape inside all masks, and spread points on it and in it."""
+"""Carve the visual hull, the largest shape that fits into all masks. Spread points on it and inside it."""
 
 import ctypes
 import logging
@@ -30,15 +30,17 @@ def visual_hull_points(
     seed: int = 0,
     on_hull: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spread points on the visual hull of an object.
+    """Spread `count` points on the visual hull of an object: the largest shape that fits into all masks.
 
-    Returns positions (count, 3), outward unit normals (count, 3), and the spacing (count,), which is the mean distance to the three
-    nearest neighbours; float32, world units. The first `on_hull` points, by default all, lie evenly on the hull. The others are random
-    points inside it, with the normals of the nearest point on it.
+    Returns float32 arrays in world units:
 
-    `alphas` are masks (H, W), one a camera, as floats in 0..1 or unsigned integers. The hull is carved twice on a grid of `resolution`³:
-    first in the cube of half-side `radius` about `centre`, then in the bounds of what remains. A view is left out, with a warning, if
-    its mask is empty or contradicts all the others. Raises InputError where no hull is left.
+    - positions (count, 3). The first `on_hull` points (None: all) lie evenly on the hull. The others are random points inside.
+    - outward unit normals (count, 3). A point inside has the normal of the nearest point on the hull.
+    - spacing (count,): the mean distance to the three nearest other points
+
+    `alphas` are the masks (H, W), one for each camera, floats in 0..1 or unsigned integers. The hull is carved twice, on a grid of
+    `resolution`³ voxels: first in the cube of half-side `radius` about `centre`, then in the bounding box of the result. A view is left
+    out, with a warning, if its mask is empty or contradicts all other masks. Raises InputError if no hull is left.
     """
     masks, views = [], []
     for alpha, camera in zip(alphas, cameras, strict=True):
@@ -105,7 +107,7 @@ def visual_hull_points(
 
 
 def _as_float(alpha: np.ndarray) -> np.ndarray:
-    """Convert a mask to float32 in 0..1."""
+    """Convert a mask of floats or integers to float32 in 0..1."""
     alpha = np.asarray(alpha)
     if np.issubdtype(alpha.dtype, np.integer):
         return alpha.astype(np.float32) / np.iinfo(alpha.dtype).max
@@ -127,10 +129,10 @@ def _silhouette(mask: np.ndarray, camera: Camera, low: np.ndarray, voxel: np.nda
 
 
 def _carve(masks, cameras, low, high, resolution):
-    """Compute each voxel's smallest and second smallest alpha over the views that see it, and the view with the smallest.
+    """Compare the voxels of the box from `low` to `high` with all masks, to carve the visual hull.
 
-    Each has the shape (resolution,)³. Voxels that fewer than an eighth of the views see count as empty, because hardly any mask
-    confirms them.
+    Returns three arrays (resolution, resolution, resolution): the smallest alpha of each voxel in any view, the second smallest, and the
+    view with the smallest. A voxel that fewer than an eighth of the views see counts as empty, because hardly any mask confirms it.
     """
     masks, voxel = [np.ascontiguousarray(mask, np.float32) for mask in masks], (high - low) / resolution
     views = [_silhouette(mask, camera, low, voxel) for mask, camera in zip(masks, cameras, strict=True)]
@@ -147,7 +149,7 @@ def _carve(masks, cameras, low, high, resolution):
 
 
 def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw random points (count, 3) on triangles, uniform by area."""
+    """Draw `count` random points on triangles, with uniform density on the surface. Returns (count, 3)."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     # Stratified, one stratum a point: the gaps are smaller than with independent draws.
@@ -159,9 +161,9 @@ def _sample_triangles(vertices: np.ndarray, faces: np.ndarray, count: int, rng: 
 
 
 def _choose_evenly(dense: np.ndarray, count: int) -> np.ndarray:
-    """Choose `count` evenly spaced ones of the points `dense` by a few Lloyd iterations.
+    """Choose `count` points that are evenly spaced from the many points `dense`, by a few Lloyd iterations.
 
-    Each iteration assigns every point to the nearest chosen one. Then the point nearest to each group's mean becomes the chosen one.
+    Each iteration groups all points by the nearest chosen point. Then the point nearest to a group's mean is chosen for the group.
     """
     chosen = dense[:: len(dense) // count][:count]
     for _ in range(5):

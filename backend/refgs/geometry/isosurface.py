@@ -1,4 +1,4 @@
-"""Mesh the zero level of signed distances on sparse blocks of voxels."""
+"""Mesh a surface by marching cubes. The surface is given by signed distances in sparse blocks of voxels."""
 
 import numpy as np
 from skimage.measure import marching_cubes
@@ -10,11 +10,14 @@ _CHUNK = 16  # blocks along the side of a chunk, which marching cubes meshes at 
 
 
 def isosurface(block: np.ndarray, signed: np.ndarray) -> Mesh:
-    """Run marching cubes (Lewiner et al. 2003) over unique blocks (M, 3) of BLOCK³ voxels with signed distances (M, BLOCK³).
+    """Mesh the surface where signed distances are zero, by marching cubes (Lewiner et al. 2003).
 
-    Unknown distances are NaN or infinite; only cells with eight known corners have faces. Vertices are in voxels; the origin is the
-    centre of the first voxel of block (0, 0, 0). Chunks are meshed one by one, each with one layer of its neighbours' voxels, and their
-    common vertices are merged. So memory grows with the blocks, not with the volume that they span.
+    Distances are given in M blocks of BLOCK³ voxels. `block` (M, 3) are the blocks' integer positions, without duplicates. `signed` (M,
+    BLOCK³) are the distances; NaN or infinite means unknown. A cube gets faces only if the distances at its eight corners are known. The
+    mesh's unit is the voxel, and its origin is the centre of the first voxel of block (0, 0, 0).
+
+    Blocks are meshed in chunks. Each chunk includes one layer of voxels of the next chunks, so that the meshes join. Memory grows with the
+    number of blocks, not with the volume around them.
     """
     rows, chunks = _assign_to_chunks(block)
     order = np.lexsort(chunks.T)
@@ -34,9 +37,9 @@ def isosurface(block: np.ndarray, signed: np.ndarray) -> Mesh:
 
 
 def _assign_to_chunks(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Assign blocks to chunks. Returns K pairs: indices (K,) of blocks, and the chunk (K, 3) that each is assigned to.
+    """List which blocks each chunk needs. Returns K pairs: the index of a block (K,), and the position of a chunk that needs it (K, 3).
 
-    A block on the lower side of a chunk is also assigned to the chunk before, whose last cells need its voxels.
+    A block lies in one chunk. If it is the first block there along an axis, the previous chunk needs it too, because the meshes must join.
     """
     rows, chunks = [], []
     for back in np.ndindex(2, 2, 2):
@@ -47,7 +50,10 @@ def _assign_to_chunks(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mesh_chunk(block: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Mesh one chunk: vertices, exact in the chunk's frame, and faces. `block` counts from the chunk's corner."""
+    """Mesh one chunk by marching cubes. Returns vertices and faces, or None if the chunk contains no surface.
+
+    The blocks' positions in `block` and the vertices are relative to the chunk's lower corner.
+    """
     side = _CHUNK + 1
     grid = np.full((side * BLOCK,) * 3, np.nan, np.float32)
     grid.reshape((side, BLOCK) * 3).transpose(0, 2, 4, 1, 3, 5)[tuple(block.T)] = signed.reshape(
@@ -71,9 +77,9 @@ def _mesh_chunk(block: np.ndarray, signed: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """Merge the vertices that chunks share.
+    """Merge the vertices that neighbouring chunks have in common.
 
-    Shared vertices have equal coordinates, bit for bit: on the plane between chunks both are interpolated from the same two voxels.
+    Common vertices have equal coordinates, bit for bit, because both chunks interpolate them between the same two voxels.
     """
     shared = np.flatnonzero((vertices % (BLOCK * _CHUNK) == 0).any(axis=1))
     _, kept, which = np.unique(vertices[shared], axis=0, return_index=True, return_inverse=True)

@@ -9,11 +9,10 @@ from refgs.formats.mesh import Mesh
 
 
 def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
-    """Remove floaters, simplify to about `triangles` faces at most, and compute smooth normals.
+    """Remove small loose parts, simplify the mesh to about `triangles` faces at most, and compute smooth normals.
 
-    Connected parts with less than `keep` of the largest part's area are floaters; so the rings of a chain stay. Faces keep their
-    winding. An edge has two faces at most. Simplification is by quadric error (Garland and Heckbert 1997). Raises InputError where
-    nothing is left.
+    A part is removed if its area is less than `keep` times the largest part's area. Faces keep their winding. After this, an edge has at
+    most two faces. Simplification is by quadric error (Garland and Heckbert 1997). Raises InputError if the mesh has no valid face.
     """
     work = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     work.update_faces(np.isfinite(work.triangles).all((1, 2)))
@@ -46,7 +45,10 @@ def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
 
 
 def _manifold(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Select the faces (F,) to keep so that no edge has three: the two largest at each edge. Simplification folds a few thin parts."""
+    """Mark the faces (F,) to keep so that no edge has more than two faces. At each edge, the two largest faces are kept.
+
+    Edges with three faces arise when simplification folds a thin part of the mesh.
+    """
     _, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
     edge, face = edge.reshape(-1), mesh.edges_face
     order = np.lexsort((-mesh.area_faces[face], edge))
@@ -58,19 +60,22 @@ def _manifold(mesh: trimesh.Trimesh) -> np.ndarray:
 
 
 def is_crumbs(mesh: Mesh, many: int = 5) -> bool:
-    """Return true for a mesh that is hardly a surface: more than `many` connected parts, none with half of the area."""
+    """Tell whether a mesh is in pieces: more than `many` connected parts, and none has half of the area."""
     _, areas = _parts(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
     return len(areas) > many and areas.max() < areas.sum() / 2
 
 
 def _parts(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """Label each face's connected part (F,), and measure the parts' areas."""
+    """Find the connected parts of a mesh. Returns each face's part number (F,), and each part's area."""
     part = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
     return part, np.bincount(part, mesh.area_faces)
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Compute unit normals (V, 3): faces' normals, weighted by their angle at the vertex (Thürmer and Wüthrich 1998)."""
+    """Compute a smooth unit normal at each vertex (V, 3), from the normals of its faces.
+
+    A face's normal is weighted by the face's angle at the vertex (Thürmer and Wüthrich 1998).
+    """
     corners = vertices[faces]
     edges = np.roll(corners, -1, axis=1) - corners
     length = np.maximum(np.linalg.norm(edges, axis=-1, keepdims=True), 1e-30)

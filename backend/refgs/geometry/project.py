@@ -1,4 +1,4 @@
-"""Project world points into a camera's image, and look up its values there."""
+"""Project world points into a camera's image, and interpolate the image at pixel positions."""
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ _ROW = 4096  # points a row: cv2.remap takes pictures, not lists
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project world points (N, 3): pixel positions (N, 2) and depths (N,) along the camera's axis, float32.
+    """Project world points (N, 3). Returns float32 pixel positions (N, 2), and depths along the camera's axis (N,).
 
     Pixel positions of points with depth ≤ 0 are meaningless.
     """
@@ -20,10 +20,10 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def sample(image: np.ndarray, pixels: np.ndarray, clamp: bool = False) -> np.ndarray:
-    """Look up a float32 image (H, W) or (H, W, C) at pixel positions (N, 2), bilinear: values (N,) or (N, C).
+    """Interpolate a float32 image (H, W) or (H, W, C) at pixel positions (N, 2), bilinearly. Returns (N,) or (N, C).
 
-    Outside the image the value is 0, or with `clamp` that of the nearest pixel. Pixel centres are at half-integers. OpenCV rounds
-    positions to 1/32 of a pixel.
+    The centre of the first pixel is at (0.5, 0.5). Outside the image the result is 0; with `clamp`, it is the nearest pixel's value. OpenCV
+    rounds positions to 1/32 of a pixel.
     """
     count = len(pixels)
     rows = max(1, -(-count // _ROW))
@@ -36,6 +36,9 @@ def sample(image: np.ndarray, pixels: np.ndarray, clamp: bool = False) -> np.nda
 
 
 def inside(camera: Camera, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Mark the points (N,) that are in front of the camera and inside its image."""
+    """Test which points are in front of the camera and inside its image. Returns bool (N,).
+
+    `pixels` and `depth` are results of `project`.
+    """
     x, y = pixels[:, 0], pixels[:, 1]
     return (depth > 0) & (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)

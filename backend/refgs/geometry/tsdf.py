@@ -30,16 +30,18 @@ def fuse(
     radius: float,
     resolution: int,
 ) -> Mesh:
-    """Fuse depth maps into a surface inside the cube of half-side `radius` about `centre`.
+    """Fuse depth maps into a mesh, inside the cube of half-side `radius` about `centre`, on a grid of `resolution`³ voxels.
 
     `depths` (H, W) are distances along the camera's axis in world units, already divided by alpha. `alphas` (H, W) are in 0..1. All are
-    float32 and on one device, which fuses them. A pixel with alpha below 0.5 is background: space along its whole ray is empty. So the
-    silhouettes of a masked object carve the surface; without masks alpha is 1, and nothing is carved. Pixels beside a jump in depth or
-    alpha have little weight. They vote for the surface but not for empty space before it, where the ray may have missed a neighbour by half
-    a pixel.
+    float32 on the same device, where most of the work is done.
 
-    Only voxels near a pixel's depth, in its block or the blocks around it, are kept. So time and memory grow with the surface, not with
-    the cube. Faces point outwards. The mesh is open where nothing was seen, and empty where there is no surface.
+    - A pixel with alpha below 0.5 is background: space along its whole ray is empty. So the silhouettes carve the mesh. For photos without
+      masks, alpha is 1 and nothing is carved.
+    - A pixel beside a jump in depth or alpha has a small weight. It counts near the surface, but not as empty space in front: its ray may
+      have missed another surface by half a pixel.
+    - Voxels are stored only in blocks near the depth of some pixel. So time and memory grow with the surface, not with the cube.
+
+    The mesh's faces point outwards. The mesh has holes where no camera saw the surface, and it is empty if there is no surface.
     """
     voxel = 2 * radius / resolution
     low = np.asarray(centre, np.float64) - radius
@@ -62,14 +64,14 @@ def fuse(
 
 
 def _with_neighbours(block: Tensor, blocks: int) -> Tensor:
-    """Return blocks (M, 3) and their neighbours, unique and sorted. Neighbours outside the grid of `blocks`³ are left out."""
+    """Add to blocks (M, 3) all their neighbours in a grid of `blocks`³ blocks. The result is sorted and has no duplicates."""
     step = torch.arange(-1, 2, device=block.device)
     around = (_unique(block, blocks)[:, None] + torch.cartesian_prod(step, step, step)).view(-1, 3)
     return _unique(around[((around >= 0) & (around < blocks)).all(dim=-1)], blocks)
 
 
 def _unique(block: Tensor, blocks: int) -> Tensor:
-    """Sort blocks (M, 3) and remove duplicates."""
+    """Sort blocks (M, 3) and remove duplicates. The grid has `blocks`³ blocks."""
     number = ((block[:, 0] * blocks + block[:, 1]) * blocks + block[:, 2]).unique()
     return torch.stack([number // blocks**2, number // blocks % blocks, number % blocks], dim=-1)
 
@@ -79,7 +81,7 @@ def _tensor_like(like: Tensor, numbers: np.ndarray) -> Tensor:
 
 
 def _rays(camera: Camera, like: Tensor) -> Tensor:
-    """Return rays (H, W, 3) through the pixels' centres, of depth 1 in the camera's frame."""
+    """Compute a ray (H, W, 3) through each pixel's centre, in camera coordinates with z = 1. `like` is a depth map (H, W) of the camera."""
     x = (torch.arange(camera.width, device=like.device) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, device=like.device) + 0.5 - camera.cy) / camera.fy
     return torch.stack([x.expand_as(like), y[:, None].expand_as(like), torch.ones_like(like)], dim=-1)
@@ -92,7 +94,10 @@ def _solid(depth: Tensor, alpha: Tensor) -> Tensor:
 def _blocks_of_pixels(
     depth: Tensor, alpha: Tensor, camera: Camera, low: np.ndarray, side: float, blocks: int
 ) -> Tensor:
-    """Find the blocks (M, 3) of the pixels' points; unique and sorted."""
+    """Find the blocks (M, 3) of voxels in which the surface points of a depth map lie. They are sorted, without duplicates.
+
+    The grid starts at the corner `low` and has `blocks`³ blocks with the side `side`, in world units.
+    """
     camera, solid = camera.resized(*depth.shape[::-1]), _solid(depth, alpha)
     local = _rays(camera, depth)[solid] * depth[solid][:, None]
     to_block = _tensor_like(depth, camera.world_to_camera[:3, :3] / side)
@@ -101,7 +106,7 @@ def _blocks_of_pixels(
 
 
 class _View:
-    """Votes of one depth map for voxels' signed distances."""
+    """Compute signed distances of voxels from one depth map, with weights."""
 
     def __init__(self, depth: Tensor, alpha: Tensor, camera: Camera, low: np.ndarray, voxel: float):
         self.camera = camera = camera.resized(*depth.shape[::-1])
@@ -138,9 +143,9 @@ class _View:
         self.maps = torch.stack([filled, solid, edge, empty, facing.clamp_min(0.1), cosine])
 
     def vote(self, block: Tensor, total: Tensor, weight: Tensor) -> None:
-        """Add this view's weighted signed distances and weights to `total` and `weight` (M, BLOCK³) of blocks (M, 3).
+        """Add this depth map's signed distances, times their weights, to `total`. Add the weights to `weight`.
 
-        Signed distances are divided by the truncation distance.
+        Both tensors are (M, BLOCK³), for the voxels of blocks (M, 3). Distances are divided by the truncation distance.
         """
         x, y, z = self._project(block)
         inverse = 1 / torch.where(z.abs() > 1e-12, z, 1e-12)
@@ -165,7 +170,10 @@ class _View:
         total += vote * torch.where(carve, 1, signed.clamp_max(1))
 
     def _project(self, block: Tensor) -> Tensor:
-        """Project the voxels of blocks: pixel positions times depth, and depths (3, M, BLOCK³)."""
+        """Project the voxels of blocks (M, 3) into the depth map. Returns (3, M, BLOCK³).
+
+        The three rows are x · depth, y · depth and depth, with the position (x, y) in pixels.
+        """
         index = torch.arange(_BLOCK, device=block.device, dtype=torch.float32)
         offset = torch.cartesian_prod(index, index, index) @ self.step.T
         corner = (_BLOCK * block).float() @ self.step.T + self.first

@@ -1,4 +1,4 @@
-"""Find the directions that the object itself occludes, by rays against its mesh (paper §3.2)."""
+"""Find which light directions the object blocks itself, by tracing rays against its mesh (Ref-Gaussian paper, §3.2)."""
 
 import numpy as np
 import torch
@@ -13,10 +13,10 @@ _PASSES = 3  # faces tested by a ray: it passes through two back faces at most
 
 
 class Occluder:
-    """Mesh that occludes light.
+    """Trace rays against a mesh that blocks light.
 
-    Its scale and position are arbitrary: rays are traced in single precision relative to its centre and size. Rays start at the height
-    `lift` above the mesh, in the mesh's units.
+    Rays start at the height `lift` above the mesh, in the mesh's units. The mesh may have any size and position, because single-precision
+    rays are traced relative to its centre and size.
     """
 
     def __init__(self, mesh: Mesh):
@@ -32,21 +32,24 @@ class Occluder:
         TriangleMesh(self._scene, ((corners - self._centre) / self._size).astype(np.float32))
 
     def tree(self, device: torch.device) -> Tree:
-        """Return the tree that a CUDA card traces in place of Embree. The first call builds it."""
+        """Return the tree for tracing on a CUDA card. On the CPU, Embree traces. The tree is built at the first call."""
         if self._tree is None:
             self._tree = Tree(self.mesh, self._centre, self._size, self.lift / self._size, device)
         return self._tree
 
     def visible(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Trace the rays of `meet`. Return bool (P,): true where the mesh does not occlude the ray."""
+        """Trace a ray from each of the surface `points` (P, 3). Return bool (P,): true if the mesh does not block the ray.
+
+        `normals` (P, 3) and `directions` (P, 3) are unit vectors, as in `meet`.
+        """
         return self.meet(points, normals, directions)[0] < 0
 
     def meet(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Trace rays from surface `points` (P, 3), in the mesh's frame, along unit `directions` (P, 3).
+        """Trace a ray from each of the surface `points` (P, 3) along its unit direction in `directions` (P, 3).
 
-        Returns the first face hit (P,), −1 for none, and the weights of its corners (P, 3). Rays start `lift` above the surface, along
-        its `normals` (P, 3). Only fronts of faces occlude. A ray passes through a back face, because it started below the mesh or meets
-        the mesh's open side.
+        Returns the first face that each ray hits (P,), −1 if none, and the barycentric weights of the hit (P, 3). Rays start `lift` above
+        the surface, along the unit `normals` (P, 3). Points and `lift` are in the mesh's units. Rays are blocked only by the front of a
+        face. They pass through the back of a face, because then the ray started below the mesh or came in through a hole of the mesh.
         """
         lift = self.lift / self._size
         directions = np.ascontiguousarray(directions, np.float32)
