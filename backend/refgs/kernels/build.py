@@ -1,6 +1,6 @@
-"""Compile the C++ kernels with the compiler in the `ziglang` wheel.
+"""Compile the C++ kernels to a shared library, with the compiler in the `ziglang` wheel.
 
-Each platform and instruction set has its own shared library.
+Each platform and instruction set has its own library.
 """
 
 import hashlib
@@ -26,7 +26,7 @@ FLAGS += ["-fno-builtin", "-ffp-contract=on", "-fno-math-errno", "-mprefer-vecto
 
 @dataclass(frozen=True)
 class Target:
-    """Describe what a library is compiled for: platform and processor by Zig's names, and the library's file extension."""
+    """Say what a library is compiled for: platform and processor, by Zig's names for them, and the library's file extension."""
 
     platform: str
     processor: str
@@ -44,7 +44,7 @@ TARGETS = {
 
 
 def target(system: str, machine: str, isa: str) -> Target:
-    """Choose the target for a platform, a machine and an instruction set.
+    """Return the compiler's target for a platform, a machine and an instruction set.
 
     `system` is `sys.platform`, `machine` is "x86_64" or "aarch64", `isa` is "sse4", "avx2", "avx512" or "neon".
     """
@@ -53,7 +53,7 @@ def target(system: str, machine: str, isa: str) -> Target:
 
 
 def cache_folder() -> Path:
-    """Return the folder of compiled kernels: the environment variable REFGS_CACHE if it is set, else a folder in the user's cache."""
+    """Return the folder for compiled kernels: the environment variable REFGS_CACHE, or else a folder in the user's cache."""
     return Path(os.environ.get("REFGS_CACHE") or platformdirs.user_cache_dir("refgs", appauthor=False))
 
 
@@ -65,23 +65,23 @@ def _fingerprint(target: Target) -> str:
 
 
 def sizes() -> dict[str, int]:
-    """Map each kernel function that returns a size to the number of integers that it takes."""
+    """Find the library's functions that return a size. Returns their names, and how many integers each takes as arguments."""
     text = "".join((HERE / source).read_text(encoding="utf-8") for source in SOURCES)
     found = re.findall(r"^EXPORT int64_t (\w+)\((.*?)\)", text, re.MULTILINE)
     return {name: parameters.count("int64_t") for name, parameters in found}
 
 
 def unwritable(cache: Path, error: OSError) -> InputError:
-    """Make the error for a cache that cannot be written."""
+    """Return an InputError that says why the folder `cache` cannot be written, and what to do."""
     return InputError(
         f"cannot write compiled kernels to {cache}: {error.strerror}; set REFGS_CACHE to a folder that can be written"
     )
 
 
 def build(target: Target, cache: Path) -> Path:
-    """Compile the library for a target into `cache`, unless it is already there. Returns its path.
+    """Compile the kernels for a target to a library in `cache`, unless it is already there. Returns the library's path.
 
-    Several processes may call this at the same time. Raises InputError where `cache` can't be written.
+    Several processes may call this at the same time. Raises InputError if `cache` cannot be written.
     """
     library = cache / f"refgs-{_fingerprint(target)}.{target.extension}"
     if library.exists():

@@ -1,6 +1,7 @@
 """Compile the kernels for CUDA cards, and launch them.
 
-NVRTC, NVIDIA's compiler as a library, comes with torch. Compiling needs no toolkit, no host compiler and no card.
+The compiler is NVRTC, a library that comes with torch. So users need neither NVIDIA's toolkit nor a C++ compiler. Compiling works without a
+card, too.
 """
 
 import ctypes
@@ -36,7 +37,10 @@ NO_CARD = "no NVIDIA card, or no driver for it, was found"
 
 
 def unusable() -> str | None:
-    """Return in one line why no CUDA card can be used here, NO_CARD if there is none. Return None if a card can be used."""
+    """Return None if a CUDA card can be used. Otherwise return one line that says why not.
+
+    This is the constant NO_CARD if no card or no driver is found.
+    """
     if torch.version.cuda is None:
         return NO_CARD
     with warnings.catch_warnings(record=True) as said:  # torch warns if the driver is too old
@@ -56,7 +60,7 @@ def unusable() -> str | None:
 
 
 def _check(result: tuple, what: str):
-    """Return the values of a CUDA call, without its status. Raise an error if the status says that the call failed."""
+    """Raise an error if a CUDA call failed; the message begins with `what`. Return the call's results without the status."""
     status, *values = result
     if status.name == "CUDA_ERROR_OUT_OF_MEMORY":
         raise torch.OutOfMemoryError(what)
@@ -66,7 +70,7 @@ def _check(result: tuple, what: str):
 
 
 def compile_source(source: str, architecture: str) -> bytes:
-    """Compile a source to machine code (cubin) for an architecture such as "sm_86". Needs no card."""
+    """Compile a kernel source file to machine code (cubin) for an architecture such as "sm_86". No card is needed."""
     from cuda.bindings import nvrtc
 
     headers = [(HERE / name).read_bytes() for name in HEADERS]
@@ -86,9 +90,9 @@ def compile_source(source: str, architecture: str) -> bytes:
 
 
 def cubin(source: str, architecture: str, cache: Path) -> bytes:
-    """Return a source's machine code from `cache`. Compile the source first if its machine code is not there.
+    """Return the machine code of a kernel source file from the folder `cache`. If it is not there, compile it first.
 
-    The file's name has a hash of everything that the machine code depends on.
+    The name of the cached file has a hash of everything that the machine code depends on.
     """
     from cuda.bindings import nvrtc
 
@@ -108,7 +112,7 @@ def cubin(source: str, architecture: str, cache: Path) -> bytes:
 
 @functools.cache
 def _module(source: str, device: int):
-    """Load a source's kernels on a card, in torch's own context."""
+    """Load all kernels of a source file on a card, in the CUDA context that torch uses."""
     from cuda.bindings import driver
 
     major, minor = torch.cuda.get_device_capability(device)
@@ -124,9 +128,9 @@ def _function(name: str, device: int):
 
 
 def launch(name: str, work: ctypes.Structure, device: torch.device, blocks: int, threads: int = BLOCK) -> None:
-    """Run a kernel on torch's current stream of a device.
+    """Run the kernel `name` on a CUDA card, in torch's current stream. `threads` is the number of threads a block.
 
-    The tensors that `work` points at must live until the kernel is done.
+    `work` holds the kernel's arguments. The tensors that it points at must exist until the kernel is done.
     """
     from cuda.bindings import driver
 

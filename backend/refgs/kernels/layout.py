@@ -1,6 +1,6 @@
-"""Read the layout of the kernels' argument structures from their C++ declarations.
+"""Read the kernels' argument structs from their C++ declarations, and make the same structs in Python.
 
-So no layout is written down twice.
+Each struct is declared in one place only.
 """
 
 import ctypes
@@ -21,20 +21,23 @@ NUMBERS = {
 
 
 class Work(ctypes.Structure):
-    """Hold the arguments of a kernel: numbers, and pointers to tensors."""
+    """Hold the arguments of a kernel: numbers, and pointers to tensors. `struct` makes subclasses with fields."""
 
     def attach(self, **tensors: torch.Tensor) -> None:
-        """Point fields at tensors. The tensors must be contiguous and outlive the calls that use them."""
+        """Set pointer fields, by name, to the memory of tensors.
+
+        The tensors must be contiguous. They must exist as long as kernels use the pointers.
+        """
         for name, tensor in tensors.items():
             assert tensor.is_contiguous()
             setattr(self, name, tensor.data_ptr())
 
 
 def struct(name: str, source: str) -> type[Work]:
-    """Make the ctypes class of `struct name`, which a source of the kernels declares or includes.
+    """Make a ctypes class like the C++ `struct name` that is declared in the file `source` or in a header that it includes.
 
-    Only fields before the first empty line count. A field may be a number, another such structure, a pointer, or an array. An array's
-    length is an integer or an integer constant of the same file. Raises ValueError for any other field.
+    The fields after the first empty line are ignored. The others must be numbers, structs, pointers or arrays. An array's length is an
+    integer, or an integer constant of the same file. Raises ValueError for any other field.
     """
     if made := _made(name, source):
         return made

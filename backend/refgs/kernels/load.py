@@ -30,10 +30,10 @@ def supported() -> list[str]:
 
 
 def _keep_memory() -> None:
-    """Have GNU's malloc keep freed memory.
+    """Tell GNU's malloc to keep freed memory in the process.
 
-    By default the buffers of an iteration go back to the system at its end. The next iteration then faults the same memory in again, page
-    by page. This takes 4 % of an iteration's time for small pictures, half for large ones.
+    By default, freed buffers go back to the system at the end of each iteration. The next iteration then gets new pages, and a page fault
+    for each. This takes 4 % of an iteration's time for small pictures, and half for large ones.
     """
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
         libc.mallopt(-4, 0)  # M_MMAP_MAX: no allocation has a mapping of its own, however large
@@ -53,10 +53,10 @@ def _load(isa: str) -> ctypes.CDLL:
 
 
 def kernels() -> ctypes.CDLL:
-    """Load the library for this processor. Compile it on first use, which takes seconds.
+    """Load the library of kernels for this processor. The first use compiles it, which takes seconds.
 
-    The environment variable REFGS_ISA picks another instruction set. Raises InputError if this processor can't run that instruction set,
-    or the cache can't be written.
+    The environment variable REFGS_ISA picks another instruction set. Raises InputError if this processor can't run that instruction set, or
+    the cache can't be written.
     """
     sets = supported()
     isa = os.environ.get("REFGS_ISA") or sets[0]
@@ -67,9 +67,10 @@ def kernels() -> ctypes.CDLL:
 
 @functools.cache
 def _openmp() -> Callable | None:
-    """Find GOMP_parallel of the OpenMP library that torch itself runs on. Return None if that library is not GNU's.
+    """Find the function GOMP_parallel of torch's OpenMP library. Return None if that library is not GNU's.
 
-    The library's worker threads spin for a while after torch's own work. A second pool of threads would compete with them for the cores.
+    With this function, kernels run on torch's own threads. These keep spinning for a while after torch's work, so other threads would
+    compete with them for the cores.
     """
     torch_folder = Path(torch.__file__).parent
     for path in (*torch_folder.glob("lib/libgomp*"), *torch_folder.parent.glob("torch.libs/libgomp*")):
@@ -89,12 +90,15 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def on_gpu(tensor: torch.Tensor) -> bool:
-    """Tell whether kernels that work on this tensor run on a CUDA card."""
+    """Tell whether a tensor is on a CUDA card. Its kernels then run there too."""
     return tensor.device.type == "cuda"
 
 
 def check(**expected: tuple[torch.Tensor, tuple[int, ...]]) -> None:
-    """Raise ValueError unless each tensor is float32, has its shape, and is on the first tensor's device: the CPU or a CUDA card."""
+    """Check tensors before kernels use them. Each argument is a pair: a tensor, and the shape that it must have.
+
+    Raises ValueError if a tensor has another shape, is not float32, or is not on the same device as the first: the CPU or a CUDA card.
+    """
     home = next(iter(expected.values()))[0].device
     for name, (tensor, shape) in expected.items():
         known = tensor.device == home and home.type in ("cpu", "cuda")
@@ -107,9 +111,10 @@ _kept = threading.local()
 
 
 def borrow(name: str, count: int) -> torch.Tensor:
-    """Lend memory for `count` 32-bit numbers. The next call with the same name lends the same memory again.
+    """Return a buffer for at least `count` 32-bit numbers. In one thread, calls with the same name return the same memory.
 
-    Memory is kept because temporary buffers of another size for each view would leave gaps in malloc's memory.
+    Buffers are kept for the next call, because their sizes change from view to view. If they were freed, they would leave gaps in malloc's
+    memory.
     """
     memory = _kept.__dict__.get(name)
     if memory is None or len(memory) < count:
@@ -119,10 +124,10 @@ def borrow(name: str, count: int) -> torch.Tensor:
 
 
 def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most: int = CORES) -> None:
-    """Call `function(&work)` on several threads at once.
+    """Run a C++ function on several CPU threads at once. Each thread calls `function(&work)`.
 
-    There are as many threads as torch has, but no more than cores, and no more than `most`. They divide the work among them by
-    `work.shared`. If `scratch` is given, each thread gets so many floats of temporary memory in `work.scratch`.
+    The number of threads is torch's, but at most the number of cores, and at most `most`. The threads divide the work among them by
+    counters in `work.shared`. Each thread has temporary memory for `scratch` floats, at `work.scratch`.
     """
     threads = max(1, min(torch.get_num_threads(), CORES, most))
     if scratch:
@@ -137,9 +142,10 @@ def parallel(function: Callable, work: ctypes.Structure, scratch: int = 0, most:
 
 
 def run(name: str, work: ctypes.Structure, like: torch.Tensor, items: int, scratch: int = 0) -> None:
-    """Run a kernel on a number of `items`, on the device of the tensor `like`.
+    """Run the kernel `name` with the arguments in `work`, on the device of the tensor `like`.
 
-    On the CPU, torch's threads run it, each with `scratch` floats of temporary memory. On a card, there is one thread an item.
+    `items` is how many parts the work has. On a card, each item has a thread. On the CPU, torch's threads share the items, and each thread
+    has temporary memory for `scratch` floats.
     """
     if on_gpu(like):
         cuda.launch(name, work, like.device, max(1, -(-items // cuda.BLOCK)))
