@@ -1,1 +1,1 @@
-"""Measure the errors of renderings, light and meshes, and draw them as pictures."""
+"""Measure the errors of renderings, lights and meshes. Convert renderings to pictures."""

@@ -45,9 +45,10 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
 
 
 def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) -> float:
-    """Compute the exposure: the factor on the linear `radiance` (h, w, 3) that best matches the sRGB-encoded `photo`, by least squares.
+    """Compute a photo's exposure: the factor that brings linear `radiance` (h, w, 3) closest to the sRGB-encoded `photo`.
 
-    Pixels are used if `alpha` (h, w) is above 0.5 and the photo is not overexposed there. If no pixel can be used, the factor is 1.
+    It is fitted by least squares, in linear colours. Pixels are used if `alpha` (h, w) is above 0.5 and the photo is not overexposed there.
+    If no pixel can be used, the factor is 1.
     """
     seen = (alpha > 0.5) & (photo.max(axis=-1) < 0.98)
     rendered, taken = radiance[seen].astype(np.float64), srgb_decode(photo[seen].astype(np.float64))
@@ -172,11 +173,11 @@ def relit(
     """Measure the errors of an object's renderings under another light. Returns means over the views, by name.
 
     Each call of `pairs()` yields the rendered and the true picture of every view, in premultiplied linear RGBA. Both are composited over
-    white and then compared by each function in `measures`. Results of `psnr`, for example, are named `psnr_raw` and `psnr_aligned`.
+    white and then compared by each function in `measures`. For `psnr`, for example, the results are:
 
-    - raw: the renderings as they are
-    - aligned: after the renderings' radiance is multiplied by `scale`, because photos do not tell how bright the base colours are
-    - scale: the least-squares factor, the same for all views; it is returned too
+    - psnr_raw: the PSNR of the renderings as they are
+    - psnr_aligned: the PSNR after the renderings' radiance is multiplied by `scale`
+    - scale: the least-squares factor, the same for all views. It is needed because photos do not tell how bright the base colours are.
 
     The fit of `scale` leaves out pixels of 1 or brighter in either picture, such as a sun in a mirror. A few of them would dominate it.
     """
@@ -204,9 +205,9 @@ def _elevations(height: int) -> np.ndarray:
 
 
 def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
-    """Compute the RMS error of a recovered panorama's log radiance. Returns the error, and the factor that brightness was corrected by.
+    """Compute the RMS error of a recovered panorama's log radiance. Returns the error and a factor, the brightness correction.
 
-    The recovered panorama is first multiplied by the factor that makes the mean difference of the logarithms zero. Both panoramas are
+    The recovered panorama is first multiplied by this factor, which makes the mean difference of the logarithms zero. Both panoramas are
     equirectangular (h, w, 3) and linear. The larger one is averaged down to the size of the smaller one. Pixels are weighted by solid
     angle. The logarithm is natural: an error of 0.1 is about 10 %. A thousandth of a panorama's mean radiance is added before the
     logarithm, because darker light cannot be seen.
@@ -262,16 +263,16 @@ def find_lights(panorama: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lights_error(environment: np.ndarray, reference: np.ndarray) -> tuple[float, int] | None:
-    """Measure how many degrees the brightest light sources of a recovered panorama are away from the true ones, on average.
+    """Measure the mean angle in degrees between the brightest lights of the true panorama (`reference`) and the recovered lights.
 
-    Returns the mean angle and the number of true lights. Returns None if `reference`, the true panorama, has no bright light.
+    Returns the mean angle and the number of true lights; None if there is no bright light.
 
-    - Both panoramas are reduced to at most 128 rows. `find_lights` searches them.
-    - True lights: the brightest MOST_LIGHTS at most. Each has at least twice the mean brightness and a quarter of the brightest light's.
-    - Recovered lights: the brightest ones, twice as many as there are true lights.
-    - Each true light is matched to another recovered light, so that the sum of the angles is least.
+    - Lights are found by `find_lights` in both panoramas, reduced to at most 128 rows.
+    - The MOST_LIGHTS brightest true lights count, if they have at least twice the mean brightness and a quarter of the brightest light's.
+    - Each true light is matched to a recovered light of its own, so that the sum of the angles is least. Of the recovered lights, the
+      brightest are used, twice as many as true ones.
     - A true light without a match within LOST_LIGHT degrees has the error LOST_LIGHT.
-    - The mean is weighted by the true lights' brightness. It does not depend on the overall brightness of the panoramas.
+    - The mean is weighted by the true lights' brightness. It does not depend on the overall brightness of a panorama.
     """
     recovered, truth = (resized(x, min(128, len(environment), len(reference))) for x in (environment, reference))
     lights, bright = find_lights(truth)

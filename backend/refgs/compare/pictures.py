@@ -42,20 +42,20 @@ def maps(rendering: Rendering) -> dict[str, np.ndarray]:
 
 
 def color_picture(rendering: Rendering, background: np.ndarray) -> np.ndarray:
-    """Convert a rendering's colour to 8-bit sRGB-encoded RGBA with straight alpha. The `background` colour is removed."""
+    """Convert a rendering's colour to 8-bit sRGB-encoded RGBA with straight alpha. The `background` colour is subtracted first."""
     alpha = rendering.alpha.numpy(force=True)[..., None]
     over = rendering.color.numpy(force=True) - background * (1 - alpha)
     return as_bytes(np.dstack([over / np.maximum(alpha, 1e-6), alpha]))
 
 
 def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Convert one pass of a rendering to an 8-bit RGB or grey picture. `name` and `value` are an item of `maps`.
+    """Convert one pass of a rendering to an 8-bit RGB or grey picture. `maps` returns the names and values.
 
     - color: composited over white
     - albedo: sRGB-encoded
     - normal: n/2 + 1/2; black where `alpha` is 0.5 or less
     - depth: divided by its maximum
-    - others: unchanged
+    - others: only converted from 0..1 to 8 bits
     """
     if name == "color":
         value = over_white(value)

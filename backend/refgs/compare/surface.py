@@ -25,13 +25,14 @@ def radius(mesh: Mesh) -> float:
 def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
     """Measure how much a mesh differs from the true mesh. Both are in the same coordinates.
 
-    Returns a dictionary, which is empty if no camera sees a mesh at all:
+    Returns a dictionary:
 
     - chamfer: the mean distance from one surface to the other, in both directions, divided by the true mesh's `radius`
     - normal_consistency: the mean absolute cosine between the normals of the two surfaces
 
-    POINTS samples are taken on each mesh, and each is compared with the nearest point on the other mesh. A sample is left out if no camera
-    sees it because its own mesh hides it: photos do not show that part. The nearest point on the other mesh may be hidden.
+    POINTS samples are taken on each mesh. Each is compared with the nearest point on the other mesh. Only samples count that a camera sees
+    and that their own mesh does not hide, because photos show nothing else. The nearest point on the other mesh may be hidden. If no sample
+    of a mesh counts, the dictionary is empty.
     """
     unit = radius(truth)
     samples = []

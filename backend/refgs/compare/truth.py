@@ -84,7 +84,7 @@ class GroundTruth:
 
 
 def read_relit(file: Path, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Read a picture with alpha, as premultiplied linear RGBA (H, W, 4).
+    """Read a picture of an object under another light, as premultiplied linear RGBA (H, W, 4).
 
     Raises InputError if it has no alpha, or if its (height, width) is not `size`.
     """

@@ -1,4 +1,4 @@
-"""Make splats for viewers without lights: fit spherical harmonics of the view direction to the run's renderings."""
+"""Make splats for viewers that compute no lighting: fit spherical harmonics of the view direction to the run's renderings."""
 
 from collections.abc import Callable
 
@@ -19,7 +19,7 @@ DEGREE = 3
 
 
 def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, total: None) -> Splats:
-    """Return the run's splats with spherical harmonics that reproduce its renderings, for viewers without lights.
+    """Return the run's splats with spherical harmonics that reproduce its renderings, for viewers that compute no lighting.
 
     The harmonics have degree 3 and give sRGB-encoded colours by view direction. Adam fits them to renderings from the training cameras
     under the run's light, by squared error. Mirror images become blurred, because degree 3 is low. Positions and shapes of splats stay. A

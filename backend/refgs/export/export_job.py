@@ -30,12 +30,13 @@ def export(
 ) -> list[Path]:
     """Export the textured mesh of a run, its splats, or both. Returns the files written.
 
-    - folder: a run folder, or a PLY file of splats, which has no mesh to export
+    - folder: a run folder (the result of a training), or a PLY file of splats, which has no mesh to export
     - mesh_file: a .glb or .obj file. If all three files are None, the mesh is written to mesh.glb in the run folder.
     - texture: the side of the textures in texels; None means the side in the run's settings
     - splats_file: a .ply file for the splats with their materials
-    - display_file: a .ply file for splats with spherical harmonics, for viewers without lights
+    - display_file: a .ply file for splats without materials, for viewers that compute no lighting
     - overwrite: replace files that exist. Without it, InputError is raised.
+    - report: a function that is told each step, the progress and warnings
     """
     splats = [file for file in (splats_file, display_file) if file is not None]
     is_run = folder.is_dir() or folder.suffix.lower() != ".ply"

@@ -20,9 +20,9 @@ PASSES = 3
 def unshadowed(splats: Splats, surfels: Surfels, mesh: Mesh, light: Environment) -> Splats:
     """Return splats whose base colours have no shadows and no inter-reflection.
 
-    The base colour of a matte splat is divided by the fraction of the irradiance that reaches it. This light is the direct light that
-    `mesh` does not block, and the light that `mesh` reflects. Metals are unchanged. Base colours contain shadows only if the training
-    computed none: do not call this function otherwise. `surfels` are the splats as tensors; `light` is the light of the training.
+    Use this only if the training did not compute shadows: then the learned base colours contain them. The base colour of a matte splat is
+    divided by the fraction of the irradiance that reaches the splat. That is direct light that `mesh` does not block, and light that `mesh`
+    reflects. Metals are unchanged. `surfels` are the splats as tensors; `light` is the light of the training.
     """
     shadowed, occluder = surfels.albedo, Occluder(mesh)
     matte = 1 - surfels.metallic[:, None]

@@ -13,7 +13,7 @@ PART = 800
 
 @dataclass(frozen=True)
 class Layout:
-    """Tell how good a mesh's uv layout is.
+    """Hold measures of how good a mesh's uv layout is.
 
     - used: the fraction of the unit square that is filled
     - density: texels per surface area, divided by the mean. Two values: the 5th and the 95th percentile over the surface.

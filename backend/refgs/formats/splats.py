@@ -36,7 +36,7 @@ class Splats:
     - indirect (N, K', 3): spherical harmonics of the linear radiance that other parts of the object reflect to the splat. Without
       inter-reflection, K' is 0 and `received` is 1.
     - constants: material values that are the same for all splats, by name (see CONSTANTS). Files store them in the header.
-    - others: what a PLY file has besides these properties. It is kept in order to be written again.
+    - others: what a PLY file has besides these properties. `write_splats` writes it again.
     """
 
     positions: np.ndarray

@@ -81,7 +81,7 @@ def _tensor_like(like: Tensor, numbers: np.ndarray) -> Tensor:
 
 
 def _rays(camera: Camera, like: Tensor) -> Tensor:
-    """Compute a ray (H, W, 3) through each pixel's centre, in camera coordinates with z = 1. `like` is a depth map (H, W) of the camera."""
+    """Compute a ray (H, W, 3) through each pixel's centre, in camera coordinates with z = 1. `like` is a depth map (H, W)."""
     x = (torch.arange(camera.width, device=like.device) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, device=like.device) + 0.5 - camera.cy) / camera.fy
     return torch.stack([x.expand_as(like), y[:, None].expand_as(like), torch.ones_like(like)], dim=-1)

@@ -39,7 +39,7 @@ NO_CARD = "no NVIDIA card, or no driver for it, was found"
 def unusable() -> str | None:
     """Return None if a CUDA card can be used. Otherwise return one line that says why not.
 
-    This is the constant NO_CARD if no card or no driver is found.
+    Without a card or a driver, the line is NO_CARD.
     """
     if torch.version.cuda is None:
         return NO_CARD

@@ -21,7 +21,7 @@ NUMBERS = {
 
 
 class Work(ctypes.Structure):
-    """Hold the arguments of a kernel: numbers, and pointers to tensors. `struct` makes subclasses with fields."""
+    """Hold the arguments of a kernel: numbers, and pointers to tensors. `struct` makes a subclass for each kernel."""
 
     def attach(self, **tensors: torch.Tensor) -> None:
         """Set pointer fields, by name, to the memory of tensors.

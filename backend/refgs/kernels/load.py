@@ -22,7 +22,7 @@ MACHINES = {"AMD64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64"
 
 @functools.cache
 def supported() -> list[str]:
-    """List the instruction sets that this processor has kernels for, best first."""
+    """List the instruction sets that the kernels can use on this processor, the best first."""
     if MACHINES.get(platform.machine()) == "aarch64":
         return ["neon"]
     sets = ["avx512", "avx2", "sse4"]
