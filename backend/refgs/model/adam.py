@@ -15,17 +15,16 @@ _Work = struct("Adam", "adam.cpp")
 
 
 class Adam:
-    """Optimise float32 tensors on one device by Adam (Kingma and Ba 2015).
+    """Optimise float32 tensors on one device with Adam (Kingma and Ba 2015). One kernel updates all tensors.
 
-    All tensors are updated in one go; torch's own Adam takes them one by one.
+    Elements whose gradient is zero keep their value and their moments. So a surfel that is not visible does not move. In the original Adam
+    it would still move, because its moments decay slowly. Tensors without a gradient do not change either.
 
-    A number whose gradient is zero keeps its value and its moments. So a surfel that the view does not see stays as it is; in the original
-    Adam its moments would fade and still move it. A parameter without a gradient stays as it is, too.
+    The attributes `param_groups` and `state` are as in `torch.optim.Adam`, with three differences. A group may have `limits` (lowest,
+    highest), to which its values are clamped. Its `params` must be a list. The "step" of the state is a Python number, not a tensor.
 
-    A group's values are kept within its `limits` (lowest, highest). Groups and state are otherwise as in `torch.optim.Adam`, but `params`
-    is always a list and the step a plain number.
-
-    The class does not derive from torch's optimisers: the first of them loads torch's compiler, which takes two seconds.
+    The class does not derive from `torch.optim.Optimizer`, because creating the first optimiser imports torch's compiler, which takes two
+    seconds.
     """
 
     BETAS, EPSILON = (0.9, 0.999), 1e-15
@@ -37,9 +36,9 @@ class Adam:
     @timed("optimiser")
     @torch.no_grad()
     def step(self, accepted: Tensor | None = None) -> None:
-        """Move every parameter by its group's rate `lr`.
+        """Update all parameters once, with the learning rate `lr` of their group.
 
-        If `accepted`, a float32 scalar, is zero, parameters and moments stay as they are.
+        `accepted` is a float32 scalar on the tensors' device. If it is zero, parameters and moments do not change.
         """
         (beta1, beta2), learned, kept = self.BETAS, [], []
         for group in self.param_groups:

@@ -1,8 +1,8 @@
-"""Look up cubemaps, stored as flat lists of texels: directions, solid angles, seamless bilinear look-up.
+"""Look up values in cubemaps that are stored as flat lists of texels.
 
-A cubemap of side R has 6·R² texels in the order face, row, column. Faces are +x, −x, +y, −y, +z, −z of the world. A face's (s, t)
-coordinates in [−1, 1] run along the two world axes that follow the face's own axis in the cycle x, y, z. Cubemaps never leave the program
-(environment.exr is equirectangular), so they follow no image convention.
+A cubemap with R×R texels a face is a list of 6·R² texels, ordered by face, then row, then column. The faces are +x, −x, +y, −y, +z, −z in
+world space. A point on a face has coordinates (s, t) in [−1, 1]. On the x faces they are (y, z), on the y faces (z, x), on the z faces (x,
+y). Only this program reads these cubemaps, so they need not follow the convention of a file format.
 """
 
 import itertools
@@ -15,7 +15,7 @@ SYMMETRIES = 24  # of the cube: all changes of the axes' signs, times all cyclic
 
 
 def _face_direction(face: Tensor, s: Tensor, t: Tensor) -> Tensor:
-    """Return the direction, not normalised, of (s, t) on a face (see the module's docstring)."""
+    """Return the direction from the cube's centre to the point (s, t) of a face, not normalised."""
     face, s, t = torch.broadcast_tensors(face, s, t)
     axis, sign = face // 2, (1 - 2 * (face % 2)).to(s.dtype)
     direction = torch.stack([sign, s, t], dim=-1)  # along the face's axis and the two that follow it
@@ -62,13 +62,14 @@ def texel_solid_angles(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=32)
 def orbits(resolution: int) -> Tensor:
-    """List the orbits of texels under the cube's symmetries (R²/4, 24), R even.
+    """List groups of 24 texels that symmetries of the cube map onto each other: texel indices (R²/4, 24). R must be even.
 
-    An orbit is the set of texels that the cube's 24 symmetries map onto each other. Each row lists one orbit: a texel of the quarter s, t
-    > 0 of face +x, then its images under the other symmetries. Rows are in the order of that first texel's row and column.
+    A symmetry changes the signs of some axes (8 ways), then permutes the axes cyclically (3 ways). Each row of the result lists such a
+    group, called an orbit. Its first texel lies on face +x where s, t > 0. Rows follow the row and column of that texel. Each texel occurs
+    once.
 
-    Column 8·turn + signs has the image under the symmetry P^turn D. D changes the signs of x, y, z where `signs` has the bits 1, 2, 4.
-    Then P takes +x to +y, +y to +z, +z to +x. Only the first symmetry maps a texel to itself, so each texel occurs once.
+    Column 8·p + b holds the image of the first texel under symmetry number 8·p + b. This symmetry flips the signs of x, y and z where b has
+    the bits 1, 2 and 4. Then it applies p times the permutation +x → +y → +z → +x.
     """
     texel = torch.arange(6 * resolution**2).reshape(3, 2, resolution, resolution)  # axis, its sign, t, s
     for dim in (2, 4):  # count each half from the face's middle outwards; its sign is a dimension before it
@@ -80,25 +81,25 @@ def orbits(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def orbit_order(sides: tuple[int, ...]) -> Tensor:
-    """Return the indices (Σ 6·side²,) that put the texels of stacked cubemaps in orbit order.
+    """Return the indices (Σ 6·side²,) that sort the texels of stacked cubemaps by orbits.
 
-    An orbit is the set of texels that the cube's symmetries map onto each other. In orbit order, the texels of a cubemap follow the rows
-    of `orbits`. The cubemaps keep their place in the stack.
+    An orbit is a group of 24 texels that symmetries of the cube map onto each other; each row of `orbits` lists one. Use the indices as
+    `levels[orbit_order(sides)]`. Afterwards the 24 texels of an orbit are adjacent. The order of the cubemaps in the stack does not change.
     """
     starts = itertools.accumulate((6 * side * side for side in sides), initial=0)
     return torch.cat([orbits(side).flatten() + start for side, start in zip(sides, starts, strict=False)])
 
 
 def in_texel_order(levels: Tensor, sides: tuple[int, ...]) -> Tensor:
-    """Reorder stacked cubemaps (Σ 6·side², C) from orbit order (see `orbit_order`) to texel order, as `sample` takes them."""
+    """Reorder stacked cubemaps (Σ 6·side², C) from orbit order (see `orbit_order`) to the order face, row, column, which `sample` reads."""
     return levels[orbit_order(sides).argsort()]
 
 
 @lru_cache(maxsize=1)
 def compositions() -> Tensor:
-    """Tabulate the compositions of the cube's symmetries (24, 24).
+    """Tabulate the products of the cube's 24 symmetries: (24, 24), numbered as the columns of `orbits`.
 
-    An entry is the symmetry that applies its row's symmetry, then its column's.
+    Entry [a, b] is the number of the symmetry that applies a first, then b.
     """
     first, then = torch.arange(SYMMETRIES)[:, None], torch.arange(SYMMETRIES)
     turn, signs = first // 8, then % 8
@@ -108,9 +109,9 @@ def compositions() -> Tensor:
 
 @lru_cache(maxsize=32)
 def _padded_texels(resolution: int) -> Tensor:
-    """Find the texel index of every cell of the faces padded by one cell, (6, R+2, R+2).
+    """Return a table (6, R + 2, R + 2) of texel indices: the faces, with a border one texel wide.
 
-    A cell of the padding holds the neighbour across the edge, so that bilinear look-up has no seams.
+    The border holds the neighbouring faces' texels, so that bilinear look-up has no seams.
     """
     centres = (torch.arange(-1, resolution + 1, dtype=torch.float64) + 0.5) * (2 / resolution) - 1
     face = torch.arange(6)[:, None, None]
@@ -132,7 +133,11 @@ def _padded_texels(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def padded(sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return texel indices of the padded faces' cells, each level's first cell, and the levels' sides, for stacked cubemaps."""
+    """Build look-up tables for stacked cubemaps whose faces get a border one texel wide, so that bilinear look-up has no seams.
+
+    Returns three tensors: the texel index at each cell of the faces with borders, (Σ 6·(side + 2)²,); the index of each cubemap's first
+    cell; and `sides`.
+    """
     indices, starts, texels = [], [], 0
     for side in sides:
         starts.append(sum(len(i) for i in indices))
@@ -158,9 +163,10 @@ def _bilinear(face: Tensor, s: Tensor, t: Tensor, level: Tensor, sides: tuple[in
 
 
 def sample(levels: Tensor, sides: tuple[int, ...], directions: Tensor, level: Tensor) -> Tensor:
-    """Look up values (P, 3): bilinear in direction (P, 3), linear in level (P,) of [0, len(sides) − 1].
+    """Look up values (P, 3) in stacked cubemaps, such as mip levels: bilinearly in each cubemap, linearly between two cubemaps.
 
-    `levels` (Σ 6·side², 3) are stacked cubemaps. Differentiable in levels, directions and level.
+    `levels` (Σ 6·side², 3) are the texels. `directions` (P, 3) need not be normalised. `level` (P,) is the cubemap's index in the stack,
+    and may be fractional. Differentiable in `levels`, `directions` and `level`.
     """
     face, s, t = face_coordinates(directions)
     lower = level.detach().floor().long().clamp(0, max(len(sides) - 2, 0))

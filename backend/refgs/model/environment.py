@@ -1,4 +1,4 @@
-"""Represent the environment's light: a cubemap of linear HDR radiance, prefiltered for the split sum and for irradiance."""
+"""Represent distant light by a cubemap of linear HDR radiance, prefiltered for specular reflection (split sum) and for irradiance."""
 
 import math
 
@@ -13,18 +13,18 @@ from refgs.model import cubemap, harmonics, prefilter
 
 
 def turn_between(camera: Camera, reference: Camera) -> np.ndarray:
-    """Return the rotation (3, 3) about the world's z axis from a camera's heading to a reference's."""
+    """Return the rotation (3, 3) about the world's z axis that turns the heading of `camera` to the heading of `reference`."""
     angle = reference.heading - camera.heading
     sine, cosine = math.sin(angle), math.cos(angle)
     return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
 class Environment:
-    """Represent distant light by its linear `radiance` (6·R², 3), in the texel order of `refgs.model.cubemap`.
+    """Represent distant light by a cubemap of linear `radiance` (6·R², 3). `refgs.model.cubemap` defines the order of the texels.
 
-    Without a `reference` camera the light stands still in the world. With one it turns with the camera, as on a turntable: it is rotated
-    about the world's z axis by the difference between the two cameras' headings. `radiance` is then the light as the reference camera has
-    it. The light does not tilt with the camera: lamps stand in the room, whatever height a photo was taken from.
+    Without a `reference` camera, the light is fixed in the world. With a `reference`, it rotates about the world's z axis together with the
+    rendering camera, as if the object stood on a turntable before a fixed camera. `radiance` is then the light for the reference camera.
+    The light never tilts, because lamps stay where they are when a photo is taken from higher up.
     """
 
     def __init__(self, radiance: Tensor, reference: Camera | None = None):
@@ -44,7 +44,7 @@ class Environment:
         return prefilter.irradiance(self.levels.cpu(), self.sides, normals.cpu()).to(normals)
 
     def turn(self, camera: Camera) -> np.ndarray:
-        """Return the rotation (3, 3) from the world's directions to the light's, for a camera."""
+        """Return the rotation (3, 3) that takes a world direction to the direction in which `radiance` is looked up, for this camera."""
         return np.eye(3) if self.reference is None else turn_between(camera, self.reference)
 
     def panorama(self, height: int) -> np.ndarray:
@@ -58,7 +58,7 @@ class Environment:
     def from_panorama(cls, panorama: np.ndarray, resolution: int, reference: Camera | None = None) -> "Environment":
         """Make the light from an equirectangular picture (H, W, 3) in Blender's orientation.
 
-        Each texel is the picture's mean over the texel's area.
+        Each texel of the cubemap is the mean of the picture over the texel's area.
         """
         fine = max(
             1, math.ceil(panorama.shape[0] / (2 * resolution))

@@ -1,11 +1,12 @@
-"""Prefilter a cubemap by GGX: the second factor of the split sum (paper Eq. 8) at a few fixed roughnesses.
+"""Prefilter a cubemap with the GGX lobe at a few fixed roughnesses, for specular reflection (second factor of the split sum, paper Eq. 8).
 
-With N = V = R (Karis, "Real Shading in Unreal Engine 4", 2013) the filtered radiance is Σ L(l) K(θ) / Σ K(θ), K(θ) = D(cos θ/2) cos θ,
-where θ is the angle between l and the lobe's axis. K depends on θ and roughness alone. So each level is one fixed sparse matrix over the
-texels of the pyramid, which is the cubemap with its pooled mips. Fine texels cover the lobe's core, coarse ones its tail.
+As in Karis ("Real Shading in Unreal Engine 4", 2013), normal, view and reflection direction are assumed to be equal. The filtered radiance
+in a direction is then Σ L(l) K(θ) / Σ K(θ) with K(θ) = D(cos(θ/2)) cos θ, where θ is the angle between that direction and l. K depends only
+on θ and on the roughness, so each filtered level is a constant sparse matrix times the cubemap.
 
-A matrix has the cube's symmetries, so only a 24th of it is computed and kept. This takes 0.05 s for 6×64² texels and 0.25 s for 6×128²:
-too little to cache on disk.
+To keep the matrices small, they read a pyramid: the cubemap, followed by its mips, which are averaged 2×2. Fine texels cover the centre of
+the lobe, coarse texels its tail. The matrices have the cube's symmetries, so only a 24th of their entries is computed and stored. This
+takes 0.05 s for 6×64² texels and 0.25 s for 6×128², so they are not cached on disk.
 """
 
 from collections.abc import Callable
@@ -35,15 +36,15 @@ SAMPLES = 3  # sub-samples of the lobe along each side of a texel
 
 
 def level_sides(resolution: int) -> list[int]:
-    """Return the side of each prefiltered level, in texels. There is one level for each of `ROUGHNESS`, then irradiance."""
+    """Return the side of each prefiltered level in texels: one level for each of `ROUGHNESS`, and a last one for irradiance."""
     sides = [max(resolution // d, min(resolution, LEAST_SIDE)) for d in DIVISOR]
     return [*sides, min(resolution, IRRADIANCE_SIDE)]
 
 
 def level_of(roughness):
-    """Return the fractional level of a roughness, a float array or a number.
+    """Return the index of the prefiltered level for a roughness, which is a number or a float array.
 
-    Levels are interpolated linearly in roughness squared.
+    Between two of `ROUGHNESS`, the index is fractional: it is interpolated linearly in roughness squared.
     """
     return np.interp(np.square(roughness), np.square(ROUGHNESS), np.arange(len(ROUGHNESS)))
 
@@ -56,14 +57,14 @@ def _pyramid_sides(resolution: int) -> list[int]:
 
 
 def ggx_lobe(cosine: np.ndarray, roughness: float) -> np.ndarray:
-    """Evaluate K(θ) of the module's docstring from cos θ, up to a constant factor. It is zero below the horizon."""
+    """Evaluate the GGX lobe K(θ) = D(cos(θ/2)) cos θ from cos θ, without its constant factor. Return 0 where cos θ is negative."""
     a2 = roughness**4  # α² with α = roughness²
     half = (1 + cosine) / 2  # cos²(θ/2)
     return np.maximum(cosine, 0) / (half * (a2 - 1) + 1) ** 2
 
 
 def cosine_lobe(cosine: np.ndarray) -> np.ndarray:
-    """Evaluate the weight of radiance in irradiance from cos θ, up to a constant factor. It is zero below the horizon."""
+    """Evaluate the cosine lobe max(0, cos θ), by which irradiance weights radiance."""
     return np.maximum(cosine, 0)
 
 
@@ -71,14 +72,13 @@ Lobe = Callable[[np.ndarray], np.ndarray]
 LOBES = (*(partial(ggx_lobe, roughness=roughness) for roughness in ROUGHNESS[1:]), cosine_lobe)  # of levels 1 and up
 
 
-def _level(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the numbers of a level's matrix that weight the pyramid's texels in the quarter s, t > 0 of face +x.
+def _level_weights(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute the filter weights of one level: how much each texel of the pyramid adds to each texel of the level.
 
-    Symmetry gives the other numbers.
+    Only the pyramid's texels on face +x with s, t > 0 are listed. The cube's symmetries give the weights of the other texels.
 
-    Returns three arrays, which describe each number of the matrix: the pyramid's texel, the level's texel in orbit order
-    (`cubemap.orbit_order`), and the weight. The weights of each texel of the level sum to one. Pooled mips whose side is below `coarsest`
-    are not used.
+    Returns three arrays with an entry for each weight: the pyramid's texel, the level's texel in orbit order (`cubemap.orbit_order`), and
+    the weight. The complete weights of each texel of the level sum to one. Mips with fewer than `coarsest` texels a side are not read.
     """
     axes = cubemap.texel_directions(side)[cubemap.orbits(side).flatten()].numpy()
     sides = _pyramid_sides(resolution)
@@ -103,9 +103,9 @@ def _level(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.nd
 
 
 def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, side: int, lobe: Lobe) -> np.ndarray:
-    """Average the lobe about each axis over the area of a texel.
+    """Average a lobe about each axis (P, 3) over the area of one texel: (P,).
 
-    The lobe varies within a texel, so several points are averaged. Rows and columns count from the middle of face +x.
+    The texels lie on face +x of a cubemap with `side`. `row` and `column` (P,) count from the middle of the face.
     """
     value = np.zeros(len(axes))
     x, y, z = np.ascontiguousarray(axes.T)
@@ -117,10 +117,11 @@ def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, sid
 
 
 class Matrix(NamedTuple):
-    """Hold a sparse matrix over texels in orbit order (`cubemap.orbit_order`). The cube's symmetries leave the matrix as it is.
+    """Store a sparse matrix that does not change under the 24 symmetries of the cube. It maps texels to texels.
 
-    Only the first of an orbit's 24 rows is kept. The other rows have the same numbers: a symmetry that maps the first row to another row
-    maps the first row's columns to the other row's columns.
+    Texels are in orbit order (`cubemap.orbit_order`): groups of 24 that the symmetries map onto each other. Only the first row of each
+    group is stored. The other rows have the same numbers in other columns: the symmetry that maps the first row's texel to another row's
+    texel also maps the columns.
     """
 
     starts: Tensor  # (orbits + 1), int32: the start of each row's numbers
@@ -140,12 +141,13 @@ class Matrix(NamedTuple):
         return cls(starts, columns, torch.from_numpy(matrix.data).to(device), compositions)
 
 
-def _pair(
+def _matrix_and_transpose(
     shape: tuple[int, int], orbit: np.ndarray, column: np.ndarray, number: np.ndarray, device: torch.device
 ) -> tuple[Matrix, Matrix]:
-    """Make a matrix from the numbers in the first row of each orbit (see `cubemap.orbits`). Return it and its transpose.
+    """Make a `Matrix` and its transpose from the nonzero numbers in the first row of each group of 24 rows (see `Matrix`).
 
-    `shape` is the matrix's numbers of rows and columns, counted in orbits.
+    `orbit`, `column` and `number` have an entry for each nonzero number: its group of rows, its column, its value. `shape` counts rows and
+    columns in groups of 24.
     """
     # A number at row 24 i, column 24 j + h is also at row 24 i + g, column 24 j, where g is the inverse of h.
     inverse = (cubemap.compositions() == 0).int().argmax(dim=1).numpy()
@@ -155,25 +157,25 @@ def _pair(
 
 @lru_cache(maxsize=4)
 def matrices(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
-    """Return the matrix from the pyramid's texels to the stacked levels, and its transpose."""
+    """Return the sparse matrix that filters the pyramid (the cubemap and its mips) into all prefiltered levels, and its transpose."""
     itself = np.arange(resolution**2 // 4)  # level 0
     parts, start = [(itself, SYMMETRIES * itself, np.ones(len(itself)))], 6 * resolution**2
     for side, lobe in zip(level_sides(resolution)[1:], LOBES, strict=True):
         # The cosine falls linearly to the horizon: coarse texels there would misplace the terminator of a sun's light.
         coarsest = side if lobe is cosine_lobe else COARSEST
-        orbit, texel, weight = _level(resolution, side, lobe, coarsest)
+        orbit, texel, weight = _level_weights(resolution, side, lobe, coarsest)
         parts.append((orbit, start + texel, weight))
         start += 6 * side * side
     shape = sum(n * n // 4 for n in _pyramid_sides(resolution)), start // SYMMETRIES
-    transpose, matrix = _pair(shape, *(np.concatenate(p) for p in zip(*parts, strict=True)), device)
+    transpose, matrix = _matrix_and_transpose(shape, *(np.concatenate(p) for p in zip(*parts, strict=True)), device)
     return matrix, transpose
 
 
 @lru_cache(maxsize=4)
 def _pyramid(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
-    """Return the matrix from the cubemap's texels to the pyramid's, and its transpose.
+    """Return the sparse matrix that averages a cubemap into its pyramid (the cubemap and its mips), and its transpose.
 
-    A texel of a pooled mip is the mean of the finer texels by solid angle.
+    A texel of a mip is the mean of four finer texels, weighted by their solid angles.
     """
     mip = sparse.identity(resolution**2 // 4, format="csr")
     mips = [mip]
@@ -186,7 +188,7 @@ def _pyramid(resolution: int, device: torch.device) -> tuple[Matrix, Matrix]:
         mip = sparse.csr_matrix((share, (parent, texel))) @ mip
         mips.append(mip)
     matrix = sparse.vstack(mips, format="coo")
-    return _pair(matrix.shape, matrix.row, SYMMETRIES * matrix.col, matrix.data, device)
+    return _matrix_and_transpose(matrix.shape, matrix.row, SYMMETRIES * matrix.col, matrix.data, device)
 
 
 @lru_cache(maxsize=4)
@@ -198,9 +200,9 @@ _Work = struct("Product", "sparse.cpp")
 
 
 def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tensor:
-    """Multiply a matrix by `dense`.
+    """Multiply a `Matrix` by the values `dense` (columns, 3) of texels in orbit order (`cubemap.orbit_order`).
 
-    `dense` and the product are in orbit order (`cubemap.orbit_order`). If `rows` is given, row i of the product is stored at `rows[i]`.
+    The product is in orbit order, too. With `rows`, its row i is stored at `rows[i]` instead.
     """
     work = _Work(orbits=len(matrix.starts) - 1)
     out = dense.new_empty(SYMMETRIES * work.orbits, 3)
@@ -227,9 +229,10 @@ class _Prefilter(torch.autograd.Function):
 
 
 def prefilter(radiance: Tensor, resolution: int) -> Tensor:
-    """Prefilter a cubemap (6·R², 3) of linear radiance. Returns all levels stacked (Σ 6·side², 3).
+    """Prefilter a cubemap (6·R², 3) of linear radiance for each of `ROUGHNESS`.
 
-    Each level is in orbit order (`cubemap.orbit_order`). The last level is irradiance / π.
+    Returns the levels stacked, (Σ 6·side², 3); `level_sides` gives their sides. The last level is irradiance / π. The texels of each level
+    are in orbit order; `cubemap.in_texel_order` reorders them by face, row, column.
     """
     check(radiance=(radiance, (6 * resolution**2, 3)))
     return _Prefilter.apply(radiance, resolution)

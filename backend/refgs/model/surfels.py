@@ -1,4 +1,4 @@
-"""Represent surfels by raw parameters, which are learned, and by activated values, which are rendered."""
+"""Represent surfels by raw parameters, which are learned, and by the values after the activation functions, which are rendered."""
 
 import math
 from typing import NamedTuple
@@ -25,7 +25,7 @@ logit; sh_dc (N, 1, 3); sh_rest (N, K − 1, 3); albedo (N, 3) logit; metallic (
 
 
 def axes(rotations: Tensor) -> list[Tensor]:
-    """Compute the columns (N, 3) of the rotation matrices of quaternions wxyz (N, 4) of any length."""
+    """Convert quaternions wxyz (N, 4) of any length to rotation matrices. Returns their three columns, (N, 3) each."""
     w, x, y, z = torch.nn.functional.normalize(rotations, dim=-1).unbind(-1)
     return [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1),
@@ -35,11 +35,16 @@ def axes(rotations: Tensor) -> list[Tensor]:
 
 
 class Surfels(NamedTuple):
-    """Hold the activated values of N surfels: world units, linear Rec.709 albedo, materials in 0..1, SH with colour = 0.5 + SH.
+    """Hold the values of N surfels that are rendered, after the activation functions.
 
-    `received` (N, 3) is the irradiance at a surfel, divided by the irradiance at an unoccluded surface. Light from the object itself can
-    raise it above 1. SH are split into the constant (N, 1, 3) and the rest (N, K − 1, 3), which learn at different rates. `indirect` are
-    the SH of the linear radiance that reaches a surfel from the object itself (paper Eq. 10).
+    Lengths are in world units. Albedo is linear Rec.709; albedo, metallic and roughness are in 0..1.
+
+    - `sh_dc` (N, 1, 3) and `sh_rest` (N, K − 1, 3) are spherical harmonics of the colour by viewing direction: colour = 0.5 + SH. The
+      constant is separate because it has its own learning rate.
+    - `received` (N, 3) is the irradiance at the surfel divided by the irradiance without occlusion. It can exceed 1 where the object
+      reflects light onto itself.
+    - `indirect_dc` and `indirect_rest` are spherical harmonics of the linear radiance that the object itself sends to the surfel (paper Eq.
+      10).
     """
 
     positions: Tensor
@@ -56,22 +61,22 @@ class Surfels(NamedTuple):
     indirect_rest: Tensor
 
     def normals(self) -> Tensor:
-        """Compute the unit normals t_u × t_v (N, 3): the third column of each rotation.
+        """Return the unit normals (N, 3): the third column of each rotation matrix.
 
-        3D Gaussians need `with_normals_last` first.
+        For 3D Gaussians, call `with_normals_last` first, so that the third axis is the normal.
         """
         return axes(self.rotations)[2]
 
     def without_directions(self) -> "Surfels":
-        """Drop the harmonics beyond the constant, so that colour no longer depends on direction."""
+        """Drop all spherical harmonics of the colour except the constant, so that the colour no longer depends on the viewing direction."""
         return self._replace(sh_rest=self.sh_rest[:, :0])
 
     def chosen(self, which: Tensor) -> "Surfels":
-        """Select surfels by a mask (N,) or by indices."""
+        """Return the surfels that a mask (N,) or an array of indices selects."""
         return Surfels(*(value[which] for value in self))
 
     def turned(self, which: Tensor) -> "Surfels":
-        """Flip the normals of the surfels that a mask (N,) selects."""
+        """Flip the normals of those surfels that the mask `which` (N,) selects. Returns all surfels."""
         w, x, y, z = self.rotations.unbind(-1)
         turned = torch.stack([-x, w, z, -y], dim=-1)  # q · (0, 1, 0, 0): a half turn about t_u
         return self._replace(rotations=torch.where(which[:, None], turned, self.rotations))
@@ -82,8 +87,6 @@ _Work = struct("Activate", "activate.cpp")
 
 @timed("surfels")
 class _Activate(torch.autograd.Function):
-    """Apply each tensor's activation."""
-
     @staticmethod
     def forward(ctx, *raw):
         raw = [tensor.contiguous() for tensor in raw]
@@ -115,10 +118,10 @@ class _Activate(torch.autograd.Function):
 
 
 def activate(p: Parameters) -> Surfels:
-    """Compute the surfels' activated values from raw parameters.
+    """Apply the activation functions to raw parameters. Returns the surfels as they are rendered.
 
-    Metallic approaches 0 and 1 faster than a logistic function does. One percent of matte white in a black metal would be as bright as its
-    mirror image, and the light would compensate for it.
+    Metallic has a function that gets closer to 0 and 1 than the logistic function. This matters because even one percent of white diffuse
+    colour makes a black metal as bright as its reflections do. Training would change the light to compensate.
     """
     scales, opacities, albedo, metallic, roughness = _Activate.apply(*(p[name] for name in _KINDS))
     return Surfels(
@@ -158,10 +161,11 @@ def initial_parameters(
     metallic: float,
     roughness: float,
 ) -> Parameters:
-    """Make round surfels at points (N, 3) that face along normals (N, 3).
+    """Make the raw parameters of N round surfels at `positions` (N, 3) with unit `normals` (N, 3).
 
-    `spacing` (N,) is the surfels' standard deviation. `colours` (N, 3), sRGB-encoded 0..1, initialise the SH; the default is grey. With
-    three `axes` the surfels are 3D Gaussians, whose thickness along the normals is FLAT times their width.
+    `spacing` (N,) becomes the surfels' standard deviation. `colours` (N, 3), sRGB-encoded in 0..1, become the colours; None is grey. The
+    other arguments are the same for all surfels. With `axes=3` the result is 3D Gaussians, whose third scale, along the normal, is FLAT
+    times the other two.
     """
     n = len(positions)
 
@@ -190,7 +194,7 @@ def initial_parameters(
 
 
 def to_splats(surfels: Surfels) -> Splats:
-    """Convert to the table that `splats.ply` stores."""
+    """Convert surfels to the table `Splats` that is stored in splats.ply."""
     with torch.no_grad():
         values = surfels._asdict() | {"normals": surfels.normals()}
         values["rotations"] = torch.nn.functional.normalize(surfels.rotations, dim=-1)
@@ -200,7 +204,7 @@ def to_splats(surfels: Surfels) -> Splats:
 
 
 def from_splats(splats: Splats) -> Surfels:
-    """Convert from the table that `splats.ply` stores."""
+    """Convert the table `Splats` that is stored in splats.ply to surfels."""
     values = {name: getattr(splats, name) for name in Surfels._fields if hasattr(splats, name)}
     for name in ("sh", "indirect"):
         coefficients = getattr(splats, name)
