@@ -1,12 +1,12 @@
-"""Render by the methods of other papers, for comparison.
+"""Render by the methods of other papers, for comparison with RefGS.
 
-Only `method_of` reads the settings that select these methods. By default it returns RefGS's own: deferred shading in linear radiance.
+`method_of` reads the settings below and returns the method. The default is RefGS's own: deferred shading in linear radiance.
 
 - `shading = "splat"`: each surfel is shaded before blending, as in the paper's initial stage (§3.3).
-- `shading = "sh"`: colour by direction of each surfel, as in 2DGS; there is neither material nor light.
-- `reflection = "mirror"`: a sharp mirror image, weighted by metallic (Ye et al., 3DGS-DR, 2024).
-- `color_space = "display"`: light and materials are a screen's numbers in 0..1, as in the paper.
-- `primitive = "3dgs"`: 3D Gaussians in place of surfels (`refgs.render.volume`).
+- `shading = "sh"`: each surfel has its own colour by viewing direction, as in 2DGS. There are no materials and no light.
+- `reflection = "mirror"`: a sharp mirror image of the light, weighted by metallic (Ye et al., 3DGS-DR, 2024).
+- `color_space = "display"`: light and materials are sRGB-encoded values in 0..1, as in the paper.
+- `primitive = "3dgs"`: 3D Gaussians instead of surfels (`refgs.render.volume`).
 """
 
 import math
@@ -35,34 +35,34 @@ MIRROR_LOGIT = 7.0  # of a perfect mirror: the logit of its base colour, and the
 
 
 class LinearLight:
-    """Light in linear, HDR radiance; pictures are sRGB-encoded."""
+    """Represent light by linear HDR radiance. Pictures show it sRGB-encoded."""
 
     display = False
     brightest = 1e8  # raw texel; beyond it, sums lose what is small
 
     def radiance(self, raw: Tensor) -> Tensor:
-        """Convert raw texels, which are learned, to radiance."""
+        """Convert raw texels of the light, which training changes, to radiance."""
         return torch.nn.functional.softplus(raw)
 
     def raw(self, radiance: float) -> float:
-        """Convert a radiance to a raw texel; the inverse of `radiance`."""
+        """Return the raw texel that `radiance()` would convert to this radiance."""
         return math.log(math.expm1(radiance))
 
     def encode(self, radiance: Tensor) -> Tensor:
-        """Convert radiance to a colour in the picture."""
+        """Convert radiance to the values that a picture stores."""
         return srgb_encode(radiance)
 
     def to_linear(self, panorama):
-        """Convert a panorama of this light, a float array, to linear radiance."""
+        """Convert a panorama (float array) from this representation of light to linear radiance."""
         return panorama
 
     def from_linear(self, panorama):
-        """Convert a panorama of linear radiance to one of this light; the inverse of `to_linear`."""
+        """Convert a panorama (float array) from linear radiance to this representation of light."""
         return panorama
 
 
 class ScreenLight(LinearLight):
-    """Light as display-encoded (sRGB) values 0..1, which pictures show unchanged."""
+    """Represent light by sRGB-encoded values in 0..1. Pictures show these values unchanged."""
 
     display = True
     brightest = 12.0  # raw texel; beyond it, float32's logistic function has no slope
@@ -88,11 +88,12 @@ LINEAR, SCREEN = LinearLight(), ScreenLight()
 
 @dataclass(frozen=True)
 class Method:
-    """Method of rendering surfels under a light. The defaults are RefGS's own method.
+    """Describe a method of rendering surfels. The defaults describe RefGS's own method.
 
-    `draw`, if given, replaces the deferred shading of `render` and takes the same arguments. `unread` names parameters that do not affect
-    pictures. `constants` maps parameters that are equal for all surfels to their raw values. Neither kind is trained. `left_out` are rows
-    for needs.json: each names something that the method does without.
+    - `draw`: a function that replaces deferred shading; it takes the arguments of `render`. None keeps deferred shading.
+    - `unread`: names of the surfels' parameters that do not affect pictures. They are not trained.
+    - `constants`: parameters that have the same raw value for all surfels, {name: value}. They are not trained.
+    - `left_out`: the features of RefGS that the method lacks, as rows of needs.json ("what", "why", "saved").
     """
 
     lit: bool = True
@@ -107,7 +108,7 @@ class Method:
 
 @lru_cache
 def method_of(settings: RenderSettings) -> Method:
-    """Return the method that the settings select."""
+    """Return the rendering method that the settings select."""
     method = Method()
     if settings.shading == "sh":
         row = {"what": "materials and light", "why": "shading = sh", "saved": "shading and the light's prefilter"}
@@ -130,12 +131,12 @@ def method_of(settings: RenderSettings) -> Method:
 
 
 def initial_stage(settings: RenderSettings) -> RenderSettings:
-    """Change settings to those of the paper's initial stage, in which each surfel is shaded before blending (§3.3)."""
+    """Copy the settings, changed so that each surfel is shaded before blending, as in the paper's initial stage (§3.3)."""
     return settings.model_copy(update={"shading": "splat"})
 
 
 def axes_of(settings: SurfelSettings) -> int:
-    """Return the number of scales of a primitive: 3 for 3D Gaussians, 2 for surfels."""
+    """Return the number of scales of a splat: 3 for a 3D Gaussian, 2 for a surfel."""
     return 3 if settings.primitive == "3dgs" else 2
 
 
@@ -149,7 +150,10 @@ def draw_colors(
     occluder: None = None,
     exposure: None = None,
 ) -> Rendering:
-    """Blend the surfels' colours by direction, sRGB-encoded. Takes the arguments of `render`, but reads neither light nor exposure."""
+    """Blend the surfels' own colours by viewing direction, without materials or light.
+
+    Takes the arguments of `render`, but ignores `environment`, `settings`, `occluder` and `exposure`. Colours are sRGB-encoded.
+    """
     normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
     colors = directional(surfels.sh_dc, surfels.sh_rest, 0.5, surfels.positions, camera)
     features, depth, alpha = rasterize(*discs(surfels, camera), stack([normals, colors]), camera, near=near)
@@ -169,7 +173,10 @@ def draw_shaded_surfels(
     occluder: None = None,
     exposure: Tensor | None = None,
 ) -> Rendering:
-    """Shade each surfel, then blend (paper §3.3). Takes the arguments of `render`, but traces no rays."""
+    """Shade each surfel, then blend the shaded surfels (paper §3.3).
+
+    Takes the arguments of `render`, but ignores `occluder`: reflections of the object in itself are not traced.
+    """
     method, matte = method_of(settings), settings.reflection == "none"
     lit = channels(surfels, camera, settings, indirect=False)
     blended = [lit[0], shade_splats(stack(lit), environment, camera, method.mirror), *lit[1 : 2 if matte else 4]]

@@ -1,8 +1,9 @@
-"""Tabulate the first factor of the split sum (paper Eq. 7): the reflectance of a metallic-roughness material under uniform light.
+"""Tabulate the reflectance of a metallic-roughness material under uniform light: the first factor of the split sum (paper Eq. 7).
 
 The material is Blender's Principled BSDF with its defaults: GGX, height-correlated Smith shadowing, and multiple scattering between
-microfacets (Kulla and Conty, "Revisiting Physically Based Shading at Imageworks", 2017). Metals have Schlick's Fresnel term,
-dielectrics the exact one for the index of refraction IOR. Under a dielectric's coat lies a matte base, lit by what the coat transmits.
+microfacets (Kulla and Conty, "Revisiting Physically Based Shading at Imageworks", 2017). Metals use Schlick's approximation of Fresnel
+reflectance. Dielectrics use the exact formula for the index of refraction IOR. Below the surface of a dielectric lies a diffuse base, which
+receives the light that is not reflected.
 """
 
 import itertools
@@ -24,27 +25,33 @@ def fresnel(cosine: np.ndarray) -> np.ndarray:
 
 
 def bounces(average_fresnel, energy, average_energy):
-    """Return the factor by which multiple scattering makes a specular lobe brighter than one bounce does (Kulla and Conty 2017).
+    """Return the factor by which multiple scattering between microfacets brightens a specular lobe (Kulla and Conty 2017).
 
-    `energy` is the albedo of a white lobe of one bounce, `average_energy` its mean over the cosine-weighted hemisphere, `average_fresnel`
-    the mean Fresnel term.
+    `energy` is the reflectance of the lobe with one bounce and no absorption (F = 1). `average_energy` is its mean over the hemisphere,
+    weighted by the cosine. `average_fresnel` is the mean of the Fresnel term, with the same weights.
     """
     again = average_fresnel * average_energy / (1 - average_fresnel * (1 - average_energy))
     return 1 + again * (1 - energy) / energy
 
 
 def _gauss(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return quadrature points and weights over 0..1, dense at both ends, where an integrand may behave like a square root."""
+    """Return the points and weights of a quadrature rule over 0..1.
+
+    The points are dense at both ends, where the integrands can behave like a square root.
+    """
     x, weight = np.polynomial.legendre.leggauss(nodes)
     angle = np.pi / 4 * (x + 1)
     return np.sin(angle) ** 2, weight * np.pi / 4 * np.sin(2 * angle)
 
 
 def one_bounce(n_v: np.ndarray, roughness: float, nodes: int) -> np.ndarray:
-    """Integrate ∫ D G2 F / (4 N·L N·V) N·L dL at N·V (P,) for three Fresnel terms F. Returns (3, P).
+    """Integrate the reflectance of a GGX surface with one bounce under uniform light, for three Fresnel terms F.
 
-    The terms are 1 − (1 − V·H)⁵, (1 − V·H)⁵ and a dielectric's Fresnel reflectance. The integral is over half vectors H with L above the
-    horizon: over the azimuth, and over ψ, where the tangent of the angle from N to H is α tan ψ. D is smooth in ψ.
+    Returns (3, P), for the cosines N·V in `n_v` (P,). The integral is ∫ D G2 F / (4 N·L N·V) N·L dL. The three F are 1 − (1 − V·H)⁵, (1 −
+    V·H)⁵ and a dielectric's Fresnel reflectance.
+
+    The integral is computed over the half vector H, where L is above the horizon. The variables are the azimuth and an angle ψ. The tangent
+    of the angle between N and H is α tan ψ, so that D is smooth in ψ. `nodes` is the number of quadrature points per variable.
     """
     at, weight = _gauss(nodes)
     alpha, s_v = roughness**2, np.sqrt(1 - n_v**2)
@@ -75,12 +82,14 @@ def one_bounce(n_v: np.ndarray, roughness: float, nodes: int) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def reflectance_table(size: int = 64, nodes: int = 16) -> Tensor:
-    """Tabulate reflectance under uniform light: (size, size, 4), rows by √roughness, columns by √N·V, each from 0 to 1.
+    """Tabulate reflectance under uniform light: (size, size, 4). Rows are √roughness and columns √N·V, both from 0 to 1.
 
-    The square roots put more entries at small values, where reflectance changes fastest. The four channels: FG0 and FG1, where
-    F0·FG0 + FG1 is one bounce with Schlick's Fresnel (Karis 2013); the mean of FG0 + FG1 over the cosine-weighted hemisphere, equal along a
-    row; a dielectric's reflectance with multiple scattering. Linear interpolation errs by at most 0.001 where N·V and roughness
-    exceed 0.02.
+    The square roots put more entries at small values, where reflectance changes fastest. Linear interpolation errs by at most 0.001 where
+    N·V and roughness exceed 0.02. The channels are:
+
+    - 0 and 1: FG0 and FG1. With one bounce and Schlick's Fresnel term, the reflectance is F0·FG0 + FG1 (Karis 2013).
+    - 2: the mean of FG0 + FG1 over the hemisphere, weighted by the cosine. It is the same for a whole row.
+    - 3: the reflectance of a dielectric, with multiple scattering.
     """
     root = np.linspace(0, 1, size)
     n_v = np.clip(root**2, LEAST_N_V, 1 - 1e-12)

@@ -1,4 +1,4 @@
-"""Collect the surfels' features that deferred shading blends."""
+"""Collect the features of surfels that are blended before deferred shading."""
 
 from torch import Tensor
 
@@ -11,11 +11,14 @@ from refgs.settings import RenderSettings
 
 
 def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirect: bool) -> list[Tensor]:
-    """Collect the features (N, C) of surfels, as a camera sees them, in the order that `shade` reads.
+    """List the features (N,) or (N, C) of the surfels that `shade` reads, in its order. They are computed for one camera.
 
-    First come normals and albedo. Unless `reflection` is "none", these follow: metallic and roughness; colour by direction (`diffuse
-    = "sh"`) or irradiance divided by that of an unoccluded surface (with `indirect`); radiance from the object itself (with `indirect`);
-    positions.
+    - normal, albedo; no more than these if `settings.reflection` is "none"
+    - metallic, roughness
+    - if `settings.diffuse` is "sh": colour by viewing direction; otherwise, with `indirect`: irradiance divided by that of an unoccluded
+      surface
+    - with `indirect`: radiance from the object itself in the mirror direction
+    - position
     """
     normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)
     if settings.reflection == "none":

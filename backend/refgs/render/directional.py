@@ -41,11 +41,12 @@ class _Directional(torch.autograd.Function):
 def directional(
     constant: Tensor, rest: Tensor, offset: float, positions: Tensor, camera: Camera, normals: Tensor | None = None
 ) -> Tensor:
-    """Evaluate colour (N, 3) = max(0, offset + Σ_k c_k Y_k(d)) of surfels at `positions` (N, 3).
+    """Evaluate spherical harmonics as colours of surfels seen by a camera: (N, 3) = max(0, offset + Σ_k c_k Y_k(d)).
 
-    The coefficients of the harmonics (`refgs.model.harmonics`) are `constant` (N, 1, 3) and `rest` (N, K − 1, 3), K = (degree + 1)². d is
-    the direction from the camera; with unit `normals` (N, 3) it is mirrored at the surfel (paper Eq. 10). float32; differentiable in
-    the coefficients alone.
+    The coefficients c_k are `constant` (N, 1, 3), then `rest` (N, K − 1, 3), in the order of `refgs.model.harmonics`; K = (degree + 1)².
+    The direction d points from the camera to the surfel at `positions` (N, 3). If unit `normals` (N, 3) are given, d is this direction
+    reflected at the surfel (paper Eq. 10). All are float32. Differentiable in `constant` and `rest` only. Raises ValueError for
+    coefficients of other shapes.
     """
     count = len(positions)
     if constant.shape != (count, 1, 3) or rest.shape not in [(count, k - 1, 3) for k in (1, 4, 9, 16)]:

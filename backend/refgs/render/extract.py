@@ -1,4 +1,4 @@
-"""Extract the surface of surfels as a mesh: render depth maps for the cameras, and fuse them."""
+"""Extract a mesh from surfels: render a depth map for each camera, and fuse the depth maps."""
 
 from collections.abc import Sequence
 
@@ -23,11 +23,13 @@ NEARLY_ALL = 0.99  # of the surfels: what the cube holds
 def extract(
     surfels: Surfels, cameras: Sequence[Camera], near: float, centre: np.ndarray, radius: float, resolution: int
 ) -> tuple[Mesh, float]:
-    """Fuse the cameras' depth maps of the foreground's surfels into a mesh, not cleaned. Return it and the width of its voxels.
+    """Fuse depth maps of the surfels from all cameras into a mesh. Return it, not yet cleaned, and the width of a voxel.
 
-    The foreground is the region of interest, the ball of `radius` about `centre`, and the surroundings near it that at least half of the
-    cameras show. Other surfels are left out, even in front of the foreground. A voxel is as wide as the foreground / `resolution`, but not
-    narrower than a typical pixel at the surface. Surfels nearer to a camera than `near` (world units) are not drawn.
+    Only surfels in the foreground are drawn. These are all surfels in the region of interest, which is the ball of `radius` about `centre`.
+    Surfels within twice that radius belong to it too if at least half of the cameras have them in the picture.
+
+    `resolution` is the number of voxels across the foreground. There are fewer if voxels would be narrower than a typical pixel at the
+    surface. Surfels nearer to a camera than `near` (world units) are not drawn.
     """
     shown, half = _foreground(surfels.positions.numpy(force=True), cameras, centre, radius)
     surfels = surfels.chosen(torch.from_numpy(shown).to(surfels.positions.device))
@@ -46,9 +48,9 @@ def extract(
 def _foreground(
     points: np.ndarray, cameras: Sequence[Camera], centre: np.ndarray, radius: float
 ) -> tuple[np.ndarray, float]:
-    """Mark the points (N, 3) in the foreground (see `extract`): bool (N,). Also return half the side of a cube about the centre.
+    """Find the foreground as `extract` defines it: a mask (N,) of `points` (N, 3), and half the side of a cube about `centre`.
 
-    The cube holds nearly all of the marked points, and the ball of `radius`.
+    The cube holds 99 % of the points in the mask, and the ball of `radius`.
     """
     distance = np.linalg.norm(points - centre, axis=1)
     shows = np.mean([inside(camera, *project(camera, points)) for camera in cameras], axis=0)

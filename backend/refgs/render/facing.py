@@ -1,4 +1,4 @@
-"""Turn the normals of surfels towards a camera."""
+"""Compute the normals of surfels, flipped towards a camera."""
 
 import torch
 from torch import Tensor
@@ -35,12 +35,13 @@ class _Facing(torch.autograd.Function):
 
 
 def facing_normals(rotations: Tensor, positions: Tensor, camera: Camera) -> Tensor:
-    """Compute unit normals (N, 3) and turn those that clearly face away from the camera.
+    """Compute the surfels' unit normals (N, 3). Flip those that clearly face away from the camera.
 
-    Takes quaternions wxyz (N, 4) of any length and positions (N, 3), float32; differentiable in the rotations alone.
+    `rotations` (N, 4) are quaternions wxyz of any length, `positions` (N, 3) are in world space, both float32. Differentiable in
+    `rotations` only.
 
-    Normals that face away only slightly stay. On a closed surface they lie just past the horizon and show at the silhouette; turning
-    them would scatter the blended normal. normals.cpp has the angle.
+    Normals that face away only slightly are not flipped (kernels/normals.cpp has the limit). On a closed surface, these surfels lie just
+    beyond the silhouette, where they are still partly visible. Flipping them would make the blended normals noisy there.
     """
     check(rotations=(rotations, (len(positions), 4)), positions=(positions, (len(positions), 3)))
     return _Facing.apply(rotations, positions.detach(), camera)

@@ -1,4 +1,4 @@
-"""Share code between the rasterisers of the CPU and of CUDA cards."""
+"""Hold what the rasterisers for the CPU and for CUDA cards have in common."""
 
 from torch import Tensor
 
@@ -6,9 +6,10 @@ from refgs.camera import Camera
 
 
 class Scene:
-    """Arguments of a rasteriser's kernels; a mixin for the rasteriser's `struct Raster`.
+    """Fill in the arguments that the kernels of both rasterisers read: CPU and CUDA.
 
-    A rasteriser adds three methods: `project` finds the splats of each tile, `blend` draws them, `differentiate` fills in the derivatives.
+    This is a mixin. Each rasteriser has a class `Raster` that derives from its C struct of arguments and from `Scene`. It adds three
+    methods, called in this order: `project` finds the splats of each tile, `blend` draws them, `differentiate` computes the gradients.
     """
 
     def look(self, camera: Camera, near: float, upper: float = 1.0, lower: float = 0.0) -> None:
@@ -18,6 +19,6 @@ class Scene:
         self.upper, self.lower = upper, lower
 
     def keep(self, **tensors: Tensor) -> None:
-        """Attach tensors, and keep them alive as long as this object."""
+        """Pass tensors to the kernels by the names of the struct's fields. Keep a reference to them, so that their memory is not freed."""
         self.attach(**tensors)
         self.kept = getattr(self, "kept", {}) | tensors

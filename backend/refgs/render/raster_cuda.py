@@ -17,12 +17,15 @@ SHORT = 1 << 15  # tiles that an int16 can number: such keys sort in half the ti
 
 
 def how_many(ends: torch.Tensor) -> int:
-    """Read the total, the last of the running sums `ends`. The CPU waits for the card here: it allocates memory by the total."""
+    """Return the last of the running sums `ends`, which is the total, or 0 if there are none.
+
+    The CPU waits here until the card has computed it, because it then allocates memory of this size.
+    """
     return int(ends[-1]) if len(ends) else 0
 
 
 class Raster(struct("Raster", "raster.cu"), Scene):
-    """Arguments of the CUDA rasteriser's kernels."""
+    """Hold the arguments of the CUDA rasteriser's kernels, and run these kernels. `Scene` has the order of the methods."""
 
     def project(self, device: torch.device) -> None:
         def integers(*shape: int) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Rasterise surfels into maps, differentiably."""
+"""Rasterise surfels into maps of features, depth and alpha. Differentiable."""
 
 from typing import NamedTuple
 
@@ -14,10 +14,14 @@ from refgs.render.raster import Scene
 
 
 class Raster(NamedTuple):
-    """Sums over the surfels of a pixel, front to back, with weights w = α Π (1 − α of those in front) (paper Eq. 5).
+    """Hold the maps that the rasteriser returns. Each pixel is a weighted sum over its surfels.
 
-    The maps are premultiplied and have no background; divide by `alpha` for means. `depth` is along the camera's axis: at the ray–surfel
-    intersection (paper Eq. 4), or at the surfel's centre where the low-pass filter draws it.
+    The weight of a surfel is w = α Π (1 − α'), where α' are the alphas of the surfels in front of it (paper Eq. 5). There is no background.
+
+    - `features` (H, W, C): Σ w · feature. Divide by `alpha` for the mean.
+    - `depth` (H, W): Σ w · depth. Divide by `alpha` for the mean. The depth along the camera's axis is that of the ray's intersection with
+      the surfel (paper Eq. 4). It is that of the surfel's centre where the low-pass filter draws the surfel.
+    - `alpha` (H, W): Σ w.
     """
 
     features: Tensor
@@ -26,7 +30,10 @@ class Raster(NamedTuple):
 
 
 def _draw(splats: dict[str, Tensor], camera: Camera, near: float, *trim: float) -> tuple[Scene, Raster]:
-    """Draw `splats`, the tensors that `rasterize` or `trimmed_depth` was given. Returns the kernels' arguments and the maps."""
+    """Rasterise a dict of tensors, named as the arguments of `rasterize`.
+
+    Returns the kernels' arguments, for the backward pass, and the maps. `trim` is empty, or the two limits of `trimmed_depth`.
+    """
     features = splats["features"]
     rasteriser = raster_cuda if load.on_gpu(features) else raster_cpu
     work = rasteriser.Raster(splats=features.shape[0], channels=features.shape[1])
@@ -92,15 +99,20 @@ def rasterize(
     camera: Camera,
     near: float,
 ) -> Raster:
-    """Blend surfels front to back, sorted by their centres' depths, into maps (H, W, C), (H, W), (H, W).
+    """Blend surfels into maps, front to back. The surfels are sorted by the depths of their centres.
 
-    `positions` (N, 3) in the world, `rotations` (N, 4) quaternions wxyz of any length, `scales` (N, 2) standard deviations along the
-    surfel's axes in world units, `opacities` (N,) in [0, 1], `features` (N, C). All are float32, on the CPU or on one CUDA card, and
-    differentiable. Surfels whose centres are nearer than `near` (> 0, world units) are skipped, as are intersections nearer than that.
+    - `positions` (N, 3): centres, in world space
+    - `rotations` (N, 4): quaternions wxyz of any length
+    - `scales` (N, 2): standard deviations along the surfel's two axes, in world units
+    - `opacities` (N,): in 0..1
+    - `features` (N, C): the values to blend
+    - `near`: the smallest depth that is drawn, in world units, > 0. It applies to centres and to intersections with rays.
 
-    kernels/splat.h has the constants of the blending: alpha below 1/255 is skipped, alpha is at most 0.99, a pixel is finished at
-    transmittance 1e-4, the low-pass filter has σ = √2/4 pixels, half of 2DGS's. The result does not depend on the number of threads, and
-    a card returns the same bits each time.
+    All tensors are float32, on the CPU or on one CUDA card, and differentiable.
+
+    Alpha below 1/255 is skipped, and alpha is at most 0.99. A pixel is finished when its transmittance falls below 1e-4. The low-pass
+    filter has σ = √2/4 pixels, half of 2DGS's. (kernels/splat.h has these constants.) Results do not depend on the number of threads. A
+    card returns the same bits each time.
     """
     n, channels = features.shape[0], features.shape[1:2]
     load.check(
@@ -132,11 +144,12 @@ def trimmed_depth(
     upper: float,
     lower: float,
 ) -> tuple[Tensor, Tensor]:
-    """Compute the depth (H, W) of the surface along the camera's axis, and alpha (H, W); not differentiable.
+    """Compute the depth (H, W) of the surface along the camera's axis, and alpha (H, W). Not differentiable.
 
-    The depth is a trimmed mean over the surfels that a ray meets while its transmittance falls from `upper` to `lower`, 1 ≥ upper >
-    lower ≥ 0. Faint surfels in front of the surface and surfels behind it do not count. As both limits approach 0.5, the depth approaches
-    the median, which is 2DGS's depth for unbounded scenes. It is 0 where the transmittance stays above `upper`.
+    The depth is the mean over those surfels of a pixel through which the ray's transmittance falls from `upper` to `lower` (1 ≥ upper >
+    lower ≥ 0). So faint surfels in front of the surface do not count, nor do surfels behind it. The depth is 0 where the transmittance
+    stays above `upper`. With limits close to 0.5, it is nearly the median depth, which 2DGS uses for unbounded scenes.
+
     The other arguments are those of `rasterize`.
     """
     splats = {"positions": positions, "rotations": rotations, "scales": scales, "opacities": opacities}

@@ -1,6 +1,6 @@
-"""Compute what the kernels compute, in float64 with torch's autograd. Tests compare the kernels with these functions.
+"""Compute the same as the rendering kernels, but in float64 with plain torch and its autograd. Tests compare the kernels with this module.
 
-The rasteriser evaluates every splat at every pixel.
+The code is simple and slow: the rasteriser evaluates every splat at every pixel.
 """
 
 import math
@@ -39,10 +39,13 @@ def rasterize(
     upper: float = 1.0,
     lower: float = 0.0,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Rasterise float64 tensors as `refgs.render.rasterize.rasterize` does, with the depth of `trimmed_depth`.
+    """Rasterise float64 tensors as `refgs.render.rasterize.rasterize` does. Returns features, depth, alpha, and a margin (H, W).
 
-    Also returns a margin (H, W). A pixel's value depends on comparisons with thresholds; the margin is the smallest relative distance to a
-    threshold. Where the margin is tiny, rounding can change the value."""
+    Depth only counts the surfels that `trimmed_depth` averages between `upper` and `lower`.
+
+    A pixel depends on comparisons with thresholds, such as the least alpha. The margin is the smallest relative distance from any of these
+    thresholds. Where it is tiny, a rounding error can change the pixel.
+    """
     view = torch.from_numpy(camera.world_to_camera).to(positions.dtype)
     centre = positions @ view[:3, :3].T + view[:3, 3]
     drawn = (centre[:, 2] >= near) & (centre[:, 2] <= FAR) & (opacities >= ALPHA_CUT)
@@ -113,10 +116,12 @@ def shade(
     by_direction: bool = False,
     matte: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Shade float64 tensors as `refgs.render.shade.shade` does, under a light that is rotated by `turn` (3, 3) against the world.
+    """Shade float64 tensors as `refgs.render.shade.shade` does. `levels` and `sides` are the prefiltered light, rotated by `turn` (3, 3).
 
-    Also returns a margin (H, W): the distance of each pixel from the nearest kink of the derivatives, in the units of the variable with the
-    kink. A bilinear look-up has a kink at every texel."""
+    Returns picture, normal, material, radiance, and a margin (H, W). Derivatives jump at some values: for example, those of a bilinear
+    look-up jump at texel centres. The margin is a pixel's smallest distance from such a value. Where it is tiny, a rounding error can
+    change a derivative.
+    """
     view, pixels = torch.from_numpy(camera.world_to_camera), torch.nonzero(alpha > COVERED, as_tuple=True)
     here, margins = alpha[pixels], []
     own = features[pixels] / here[:, None]
@@ -149,7 +154,7 @@ def shade_splats(
     camera: Camera,
     turn: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Shade float64 surfels as `refgs.render.shade.shade_splats` does; also return each one's distance from a kink of the derivatives."""
+    """Shade float64 surfels as `refgs.render.shade.shade_splats` does. Returns radiance (N, 3) and margins (N,), as defined in `shade`."""
     towards, margins, matte = unit(torch.from_numpy(camera.position) - features[:, -3:]), [], features.shape[-1] == 6
     features = _with_matte_material(features) if matte else features
     appearance = features[:, 8:11] if features.shape[-1] > 11 else None
@@ -169,9 +174,13 @@ def radiance_towards(
     mirror: bool = False,
     matte: bool = False,
 ) -> Tensor:
-    """Compute the radiance (P, 3) that leaves surface points in unit directions `towards` (P, 3), by the split sum (paper Eq. 5–10).
+    """Compute the radiance (P, 3) that P surface points send in unit directions `towards` (P, 3), by the split sum (paper Eq. 5–10).
 
-    `maps` (P, 8 or more) are normals, albedo, metallic and roughness.
+    - `maps` (P, 8 or more): normal, albedo, metallic, roughness; with `indirect` also irradiance divided by that of an unoccluded surface
+    - `appearance` (P, 3): a colour that replaces diffuse shading, or None
+    - `levels`, `sides`: the prefiltered light, rotated by `turn`
+    - `indirect`: whether the mirror direction is unoccluded (P, 1), and the radiance from the object there (P, 3); or None
+    - `margins`: a list, to which distances from jumps of the derivatives are appended (see `shade`)
     """
     normal, albedo, (metallic, roughness) = unit(maps[:, :3]), maps[:, 3:6], maps[:, 6:8].unbind(-1)
     if turn is not None:
@@ -200,7 +209,7 @@ def radiance_towards(
 
 
 def _with_matte_material(maps: Tensor) -> Tensor:
-    """Append metallic 0 and roughness 1 to normal and albedo (P, 6)."""
+    """Extend normals and albedos (P, 6) by the material of a matte surface: metallic 0, roughness 1. Returns (P, 8)."""
     return torch.cat([maps, maps.new_tensor([0.0, 1.0]).expand(len(maps), 2)], dim=1)
 
 
@@ -245,7 +254,11 @@ def _cube_margins(directions: Tensor, sides: list[Tensor], margins: list) -> Non
 
 
 def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor, margins: list) -> Tensor:
-    """Look up radiance (P, 3), filtered by the GGX lobe of a roughness (P,) about a direction (P, 3)."""
+    """Look up the prefiltered light (P, 3) in unit directions (P, 3) for roughnesses (P,).
+
+    `levels` are what `prefilter` returns, with the sides `sides`. Distances from jumps of the derivatives are appended to `margins` (see
+    `shade`).
+    """
     known, alpha = torch.tensor(prefilter.ROUGHNESS, dtype=roughness.dtype), roughness**2
     interval = (torch.bucketize(roughness.detach().contiguous(), known) - 1).clamp(0, len(known) - 2)
     low, high = known[interval] ** 2, known[interval + 1] ** 2
@@ -256,7 +269,10 @@ def specular(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughne
 
 
 def table(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> Tensor:
-    """Look up `brdf.reflectance_table` at N·V and roughness (P,): (P, 4)."""
+    """Interpolate `brdf.reflectance_table` at cosines N·V (P,) and roughnesses (P,). Returns (P, 4).
+
+    If `margins` is a list, distances from jumps of the derivatives are appended to it (see `shade`).
+    """
     values, at = reflectance_table().to(n_v.dtype), torch.stack([n_v, roughness], dim=-1)
     places = at.clamp(LEAST_N_V, 1).sqrt() * (len(values) - 1)
     if margins is not None:
@@ -268,13 +284,16 @@ def table(n_v: Tensor, roughness: Tensor, margins: list | None = None) -> Tensor
 
 
 def reflectance(n_v: Tensor, roughness: Tensor, albedo: Tensor, margins: list | None = None) -> tuple[Tensor, Tensor]:
-    """Compute the reflectance under uniform light of a metal (P, 3) and of a dielectric (P, 1), at N·V and roughness (P,)."""
+    """Compute the reflectance under uniform light of a metal (P, 3) and of a dielectric (P, 1), for cosines N·V (P,) and roughnesses (P,).
+
+    `albedo` (P, 3) is the metal's colour. If `margins` is a list, distances from jumps of the derivatives are appended to it (see `shade`).
+    """
     fg0, fg1, average, dielectric = table(n_v, roughness, margins).split(1, dim=-1)
     return (albedo * fg0 + fg1) * bounces((20 * albedo + 1) / 21, fg0 + fg1, average), dielectric
 
 
 def dssim(image: Tensor, target: Tensor) -> Tensor:
-    """Compute the structural dissimilarity as `refgs.render.ssim.dssim` does."""
+    """Compute the structural dissimilarity 1 − mean SSIM, as `refgs.render.ssim.dssim` does."""
     k = torch.arange(-5, 6, dtype=image.dtype)
     window = torch.exp(-(k**2) / (2 * 1.5**2))
     window = torch.outer(window, window) / window.sum() ** 2

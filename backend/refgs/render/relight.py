@@ -1,8 +1,10 @@
-"""Relight surfels: compute shadows on the object, and the light that it reflects onto itself, under another environment.
+"""Relight surfels under another environment, with shadows on the object and light that the object reflects onto itself.
 
-All surfels trace rays in the same directions. Each direction stands for a cell of the sphere, so that a small sun falls wholly into one
-cell. Rays are traced once; each light then takes a few matrix products. A point that a ray hits reflects two kinds of light, by the split
-sum: the environment's, where the point's mirror direction is not occluded, and that of the previous bounce.
+All surfels trace rays in the same directions, spread evenly over the sphere. Each direction stands for a small part of the sphere, and a
+small sun falls into exactly one part. Rays are traced once. After that, each new light only takes a few matrix products.
+
+A point that a ray hits reflects two kinds of light, by the split sum. It reflects the environment where the object does not occlude the
+point's mirror direction. It also reflects the light that other points reflected in the previous bounce.
 """
 
 import math
@@ -38,7 +40,7 @@ Progress = Callable[[int, int], None]
 
 
 def sphere(count: int) -> np.ndarray:
-    """Sample unit directions (count, 3) with about equal cells: a Fibonacci lattice (Swinbank and Purser 2006)."""
+    """Sample `count` unit directions (count, 3) that are spread evenly over the sphere: a Fibonacci lattice (Swinbank and Purser 2006)."""
     z = 1 - (2 * np.arange(count) + 1) / count
     azimuth = np.pi * (3 - math.sqrt(5)) * np.arange(count)
     across = np.sqrt(1 - z * z)
@@ -50,14 +52,15 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def _mirror(directions, normals):
-    """Mirror directions (P, 3) at surfaces with unit normals (P, 3)."""
+    """Reflect directions (P, 3) at surfaces with unit normals (P, 3)."""
     return directions - 2 * (directions * normals).sum(-1)[:, None] * normals
 
 
 def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute two reflectances (P, 3) of materials: for light from the mirror direction, and for irradiance / π.
+    """Return the specular reflectance (P, 3) and the diffuse reflectance (P, 3) of materials.
 
-    `cosine` (P,) is the cosine between viewing direction and normal.
+    Multiply the first by prefiltered radiance from the mirror direction, the second by irradiance / π. `cosine` (P,) is that of the angle
+    between normal and viewing direction.
     """
     metal, dielectric = reference.reflectance(cosine, roughness, albedo)
     metallic = metallic[:, None]
@@ -65,14 +68,18 @@ def _split_sum(albedo: Tensor, metallic: Tensor, roughness: Tensor, cosine: Tens
 
 
 def _prefiltered(levels: Tensor, sides: tuple[int, ...], directions: Tensor, roughness: Tensor) -> Tensor:
-    """Look up prefiltered light (P, 3) at unit directions (P, 3) for roughnesses (P,). `levels` are in texel order."""
+    """Look up prefiltered light (P, 3) in unit directions (P, 3) for roughnesses (P,).
+
+    `levels` are stacked cubemaps with texels in the order face, row, column.
+    """
     return cubemap.sample(levels, sides, directions, torch.from_numpy(prefilter.level_of(roughness.numpy())).float())
 
 
 class Transport:
-    """Rays from the surfels, traced to their hits on the mesh. They do not depend on the light. On the CPU.
+    """Trace rays from all surfels to the object's mesh, and keep the hits. They do not depend on the light, so any light can use them.
 
-    The surfels' normals must point outward. `progress` is called with the number of surfels done and of all.
+    The surfels' normals must point outward, and their tensors must be on the CPU. `directions` is the number of directions on the sphere.
+    `progress` is called with the number of surfels that are done and their total number.
     """
 
     def __init__(
@@ -119,11 +126,15 @@ class Transport:
         self.direction, self.vertex, self.free = (torch.cat(part) for part in zip(*parts, strict=True))
 
     def at_vertices(self, values: Tensor) -> Tensor:
-        """Blend values (N, C) of the surfels at the mesh's vertices: (V, C)."""
+        """Interpolate values (N, C) of the surfels to the mesh's vertices: (V, C)."""
         return torch.from_numpy(self._to_mesh @ values.numpy())
 
     def chunks(self):
-        """Yield a slice of the surfels, the slice of their rays, and each ray's surfel within the slice."""
+        """Yield the surfels in chunks, so that large arrays are needed for one chunk at a time only.
+
+        A chunk is a slice of the surfels, a slice of their rays, and for each ray the index of its surfel in the chunk. Only rays that hit
+        the mesh are counted.
+        """
         for start in range(0, len(self.normals), CHUNK):
             end = min(start + CHUNK, len(self.normals))
             count = self.starts[start + 1 : end + 1] - self.starts[start:end]
@@ -132,7 +143,10 @@ class Transport:
 
 
 def _blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: np.ndarray) -> sparse.csr_matrix:
-    """Compute weights (P, N) of surfels at points (P, 3) of a surface with normals `outward` (P, 3)."""
+    """Compute the weights (P, N) by which values of the surfels are interpolated to `points` (P, 3). Each row sums to one.
+
+    The points lie on a surface with normals `outward` (P, 3). Near surfels that face the same way have the largest weights.
+    """
     positions = surfels.positions.double().numpy()
     near = min(NEIGHBOURS, len(positions))
     distance, at = cKDTree(positions).query(points, k=np.arange(1, near + 1))
@@ -145,22 +159,23 @@ def _blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: n
     return sparse.csr_matrix((weight.ravel().astype(np.float32), at.ravel(), rows), (len(points), len(positions)))
 
 
-def relit(t: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
-    """Return the surfels with the `sh` and `indirect` that they have under `light`. `t` holds their traced rays.
+def relit(transport: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
+    """Return the surfels relit by `light`: with new `sh` (diffuse colour) and `indirect` (radiance from the object itself).
 
-    Render the result with diffuse = "sh" and the occluder that `t` was traced with.
+    `transport` holds the surfels' traced rays. Render the result with the setting diffuse = "sh" and with the occluder of `transport`.
     """
-    received, indirect = _gather(t, light, bounces)
-    sh = _colour(t.surfels, t.normals, received)
-    return t.surfels._replace(
+    received, indirect = _gather(transport, light, bounces)
+    sh = _diffuse_harmonics(transport.surfels, transport.normals, received)
+    return transport.surfels._replace(
         sh_dc=sh[:, :1], sh_rest=sh[:, 1:], indirect_dc=indirect[:, :1], indirect_rest=indirect[:, 1:]
     )
 
 
 def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor:
-    """Compute the ratio (N, 3) of the surfels' irradiance to that of unoccluded surfaces; the object shadows and lights itself.
+    """Compute each surfel's irradiance divided by the irradiance of an unoccluded surface: (N, 3).
 
-    Normals may point either way. Rays are traced from a subset of the surfels; the others interpolate.
+    It includes the object's shadows and the light that the object reflects onto itself. Normals may point inward or outward. For speed,
+    rays are traced from a random subset of the surfels. The others interpolate the result.
     """
     mesh, positions = occluder.mesh, surfels.positions.double().numpy()
     near = cKDTree(mesh.vertices).query(positions)[1]
@@ -177,48 +192,57 @@ def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor
     return torch.from_numpy(blend @ part.numpy())
 
 
-def _gather(t: Transport, light: Environment, bounces: int) -> tuple[Tensor, Tensor]:
-    """Gather light over `bounces`: irradiance / π (N, 3), and harmonics (N, 16, 3) of the radiance that comes from the object."""
-    past = _past_the_object(t, light)
+def _gather(transport: Transport, light: Environment, bounces: int) -> tuple[Tensor, Tensor]:
+    """Compute the light that reaches each surfel, with `bounces` reflections between parts of the object.
+
+    Returns irradiance / π (N, 3), and spherical harmonics (N, 16, 3) of the radiance that comes from the object itself.
+    """
+    past = _past_the_object(transport, light)
     levels = cubemap.in_texel_order(light.levels, light.sides)
-    firsts = [_first(t, rays, levels, light.sides) for _, rays, _ in t.chunks()]
-    basis, count = harmonics.basis(t.directions, DEGREE), (t.starts[1:] - t.starts[:-1]).clamp_min(1)[:, None]
+    firsts = [_first(transport, rays, levels, light.sides) for _, rays, _ in transport.chunks()]
+    basis, count = (
+        harmonics.basis(transport.directions, DEGREE),
+        (transport.starts[1:] - transport.starts[:-1]).clamp_min(1)[:, None],
+    )
 
-    def sums(received: Tensor, mean: Tensor, most: float) -> Tensor:
-        """Sum radiance times harmonics over each surfel's rays: (N, 16, 3). The radiance of a ray is clamped at `most`.
-
-        Of the last bounce, `received` (N, 3) is the surfels' irradiance / π, and `mean` (N, 3) the mean radiance over their rays.
-        """
-        there = t.at_vertices(torch.cat([received, mean], dim=1))
+    # Of the previous bounce: `received` (N, 3), irradiance / π at the surfels, and `mean` (N, 3), the mean radiance over their rays.
+    # The radiance of each ray is clamped at `most`.
+    def harmonic_sums(received: Tensor, mean: Tensor, most: float) -> Tensor:
+        there = transport.at_vertices(torch.cat([received, mean], dim=1))
         of_surfels = []
-        for (surfels, rays, surfel), (first, share, matte) in zip(t.chunks(), firsts, strict=True):
-            scattered, mirrored = there[t.vertex[rays]].split(3, dim=1)
-            brought = torch.zeros(surfels.stop - surfels.start, len(t.directions), 3)
-            brought[surfel, t.direction[rays]] = (first + matte * scattered + share * mirrored).clamp_max(most)
+        for (surfels, rays, surfel), (first, share, matte) in zip(transport.chunks(), firsts, strict=True):
+            scattered, mirrored = there[transport.vertex[rays]].split(3, dim=1)
+            brought = torch.zeros(surfels.stop - surfels.start, len(transport.directions), 3)
+            brought[surfel, transport.direction[rays]] = (first + matte * scattered + share * mirrored).clamp_max(most)
             of_surfels.append((brought.transpose(1, 2) @ basis).transpose(1, 2))
         return torch.cat(of_surfels)
 
     received, mean = past, torch.zeros_like(past)
     for _ in range(bounces):
-        found = sums(received, mean, math.inf)
+        found = harmonic_sums(received, mean, math.inf)
         mean = found[:, 0] / harmonics.DC / count
         # Harmonics of degree 1 are the direction's coordinates: these are sums of radiance · cosine, 4π / D steradians a ray.
         about = torch.stack([-found[:, 3], -found[:, 1], found[:, 2]], dim=1) / harmonics.C1
-        received = past + 4 / len(t.directions) * torch.einsum("nac,na->nc", about, t.normals).clamp_min(0)
-    found = sums(received, mean, WHITE)
-    found[:, 0] += PRIOR * found[:, 0].sum(dim=0) / max(len(t.vertex), 1)
-    return received, t.fit @ found
+        received = past + 4 / len(transport.directions) * torch.einsum(
+            "nac,na->nc", about, transport.normals
+        ).clamp_min(0)
+    found = harmonic_sums(received, mean, WHITE)
+    found[:, 0] += PRIOR * found[:, 0].sum(dim=0) / max(len(transport.vertex), 1)
+    return received, transport.fit @ found
 
 
-def _first(t: Transport, rays: slice, levels: Tensor, sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Shade the hits of rays by the environment's light alone.
+def _first(transport: Transport, rays: slice, levels: Tensor, sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """Shade the points where `rays` (a slice of all rays) hit the mesh, by the environment alone.
 
-    Returns three arrays (P, 3): the radiance that the hit mirrors from the environment to the surfel; its reflectance for light
-    from the object in its mirror direction, zero where that direction is free; and its reflectance for irradiance / π.
+    Returns three arrays (P, 3) for the P rays:
+
+    - environment light that the point mirrors back along the ray; zero where the object occludes the point's mirror direction
+    - specular reflectance of the point, for light from the object; zero where its mirror direction is not occluded
+    - diffuse reflectance of the point; multiply it by irradiance / π
     """
-    vertex, ray, free = t.vertex[rays], t.directions[t.direction[rays]], t.free[rays]
-    albedo, metallic, roughness = t.material[vertex].split((3, 1, 1), dim=1)
-    normals = torch.from_numpy(t.vertex_normals[vertex.numpy()]).float()
+    vertex, ray, free = transport.vertex[rays], transport.directions[transport.direction[rays]], transport.free[rays]
+    albedo, metallic, roughness = transport.material[vertex].split((3, 1, 1), dim=1)
+    normals = torch.from_numpy(transport.vertex_normals[vertex.numpy()]).float()
     share, matte = _split_sum(albedo, metallic[:, 0], roughness[:, 0], -(ray * normals).sum(dim=1))
     first = torch.zeros_like(share)
     # Widths of successive lobes add as Gaussians' do: by their squares. A lobe's width is roughness².
@@ -228,25 +252,25 @@ def _first(t: Transport, rays: slice, levels: Tensor, sides: tuple[int, ...]) ->
     return first, share, matte
 
 
-def _past_the_object(t: Transport, light: Environment) -> Tensor:
-    """Compute the irradiance / π (N, 3) that reaches the surfels from the environment past the object."""
+def _past_the_object(transport: Transport, light: Environment) -> Tensor:
+    """Compute irradiance / π (N, 3) of the surfels from the environment alone, with the object's shadows."""
     texels, area = cubemap.texel_directions(light.resolution), cubemap.texel_solid_angles(light.resolution)
-    cell = torch.from_numpy(cKDTree(t.directions.numpy()).query(texels.numpy())[1])
-    power = torch.zeros(len(t.directions), 3).index_add_(0, cell, light.radiance * area[:, None].float())
-    free = torch.empty_like(t.normals)
-    for surfels, rays, surfel in t.chunks():
-        cosine = (t.normals[surfels] @ t.directions.T).clamp_min(0)
+    cell = torch.from_numpy(cKDTree(transport.directions.numpy()).query(texels.numpy())[1])
+    power = torch.zeros(len(transport.directions), 3).index_add_(0, cell, light.radiance * area[:, None].float())
+    free = torch.empty_like(transport.normals)
+    for surfels, rays, surfel in transport.chunks():
+        cosine = (transport.normals[surfels] @ transport.directions.T).clamp_min(0)
         whole = cosine @ power
-        cosine[surfel, t.direction[rays]] = 0
+        cosine[surfel, transport.direction[rays]] = 0
         free[surfels] = torch.where(whole > 0, cosine @ power / whole, 1)
-    return light.diffuse(t.normals) * free
+    return light.diffuse(transport.normals) * free
 
 
-def _colour(surfels: Surfels, normals: Tensor, received: Tensor) -> Tensor:
-    """Compute harmonics (N, 16, 3) of the diffuse colour, as the renderer takes them.
+def _diffuse_harmonics(surfels: Surfels, normals: Tensor, received: Tensor) -> Tensor:
+    """Compute the diffuse colour by viewing direction as spherical harmonics (N, 16, 3), for colour = 0.5 + SH.
 
-    A coat transmits less at grazing angles. That depends on the angle to the normal alone, so it is a zonal function:
-    Σ_m Y_lm(n) Y_lm(d) = (2l + 1) / 4π P_l(n·d).
+    `received` (N, 3) is irradiance / π. A dielectric's surface transmits less light to its diffuse base at grazing angles. The colour
+    depends only on the angle between normal n and direction d, so its harmonics follow from Σ_m Y_lm(n) Y_lm(d) = (2l + 1) / 4π P_l(n·d).
     """
     size, degrees = ROUGHNESSES, torch.arange(4)
     middle = (torch.arange(size).double() + 0.5) / size  # centres of the table's cells, in cosine and roughness

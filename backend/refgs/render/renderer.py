@@ -25,7 +25,7 @@ SIGNED = 1.0  # added to the residual while it is blended: it may be negative, a
 
 
 def near_plane(radius: float) -> float:
-    """Return the nearest depth that is drawn in a scene of this radius, in world units."""
+    """Return the smallest depth that is drawn in a scene of this radius. Both are in world units."""
     return NEAR * radius
 
 
@@ -35,7 +35,7 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 @timed("visibility")
 def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, occluder: Occluder) -> Tensor:
-    """Trace the mirror direction of each pixel: 0 where the object blocks it, else 1 (H, W)."""
+    """Trace a ray from the surface in the mirror direction of each pixel. Returns (H, W): 0 where the object blocks it, else 1."""
     directions = mirror_directions(features, alpha, camera)
     if load.on_gpu(alpha):
         return occluder.tree(alpha.device).visible(directions, alpha, depth, camera)
@@ -62,14 +62,16 @@ def render(
     occluder: Occluder | None = None,
     exposure: Tensor | None = None,
 ) -> Rendering:
-    """Render surfels for a camera over a background (3,), sRGB-encoded: blend their features, then shade each pixel by the split sum
-    (paper Eq. 5–8).
+    """Render surfels for a camera: blend their features, then shade each pixel by the split sum (paper Eq. 5–8).
 
-    `near` is in world units. Where the `occluder` blocks a pixel's mirror direction, the surfels' own radiance replaces the
-    environment's (paper Eq. 9). Radiance is multiplied by `exposure`, a scalar, before it is encoded.
+    `background` (3,) is sRGB-encoded. `near`, the smallest depth that is drawn, is in world units. `exposure`, a scalar, multiplies the
+    radiance before it is encoded.
 
-    With integrated diffuse light (diffuse = "irradiance"), surfels can have harmonics beyond the constant. These add a residual to the
-    picture: a colour by direction, sRGB-encoded, for the part of the photos that material and light do not explain.
+    `occluder` is the object's mesh, for reflections of the object in itself. Where it blocks a pixel's mirror direction, the pixel reflects
+    the radiance that the surfels store for this (paper Eq. 9). Otherwise it reflects `environment`.
+
+    If the setting diffuse is "irradiance" and `surfels.sh_rest` is not empty, it is a residual: a colour by viewing direction that is added
+    to the picture, sRGB-encoded. It stands for what material and light cannot explain in the photos.
     """
     method = method_of(settings)
     if method.draw is not None:

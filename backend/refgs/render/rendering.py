@@ -1,4 +1,4 @@
-"""Hold the result of rendering a camera."""
+"""Define `Rendering`, the result of rendering a camera."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,17 @@ COVERED = 1 / 255  # pixels with less alpha than this are background
 
 @dataclass(frozen=True)
 class Rendering:
-    """Picture of a camera, and the maps that were shaded.
+    """Hold the picture of a camera, and the maps from which it was shaded.
 
-    `color` (H, W, 3) is sRGB-encoded, over the background. The maps are alpha-weighted means over the surfels of a pixel:
-    linear, zero where nothing is. `normal` (H, W, 3) is in world space, faces the camera, and is not normalised. `depth` (H, W)
-    is along the camera's axis; `blended_depth` is the sum of depths before the division by alpha. With a light, `material` (H, W, 5) is
-    albedo, metallic, roughness. With inter-reflection, `visibility` (H, W) is 0 where the object occludes the mirror
-    direction, else 1. `background` (3,) and `exposure`, a scalar, are the arguments of `render`.
+    `color` (H, W, 3) is sRGB-encoded and includes the background. The maps are means over the surfels of each pixel, weighted by alpha, and
+    zero where nothing is:
+
+    - `normal` (H, W, 3): in world space, towards the camera, not normalised
+    - `depth` (H, W): along the camera's axis; `blended_depth` is `depth` times alpha
+    - `material` (H, W, 5): albedo (linear), metallic, roughness; None without a light
+    - `visibility` (H, W): 0 where the object occludes the mirror direction, else 1; None without inter-reflection
+
+    `background` (3,) and `exposure`, a scalar, are the arguments of `render`.
     """
 
     color: Tensor
@@ -35,7 +39,7 @@ class Rendering:
 
     @property
     def radiance(self) -> Tensor:
-        """Linear radiance (H, W, 3) from the surfels of a pixel to the camera, before exposure; zero where nothing is."""
+        """Compute the linear radiance (H, W, 3) of each pixel from its colour, without background and exposure. Zero where nothing is."""
         alpha = self.alpha[..., None]
         mean = (self.color - (1 - alpha) * self.background) / alpha.clamp_min(COVERED)
         radiance = srgb_decode(mean.clamp_min(0)) * (alpha > COVERED)

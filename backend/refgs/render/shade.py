@@ -1,4 +1,4 @@
-"""Shade blended maps, or each surfel, differentiably."""
+"""Shade blended maps, or single surfels, by the split sum. Differentiable."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -21,10 +21,12 @@ MATTE = 6  # without specular shading: normal and albedo
 
 
 class Shaded(NamedTuple):
-    """Picture (H, W, 3), sRGB-encoded, over the background, and its maps.
+    """Hold a shaded picture and the maps of its pixels. The maps are zero where nothing is.
 
-    The maps are zero where nothing is: blended normals (H, W, 3), not normalised; albedo, metallic and roughness (H, W, 5); linear
-    radiance (H, W, 3) before the background, which is not differentiable.
+    - `color` (H, W, 3): the picture over the background, sRGB-encoded
+    - `normal` (H, W, 3): blended, not normalised
+    - `material` (H, W, 5): albedo, metallic, roughness
+    - `radiance` (H, W, 3): linear, without the background; not differentiable
     """
 
     color: Tensor
@@ -34,11 +36,8 @@ class Shaded(NamedTuple):
 
 
 class _Work(struct("Shade", "pixels.h")):
-    """Arguments of shade.cpp's kernels."""
-
     @classmethod
     def of(cls, features: Tensor, alpha: Tensor, camera: Camera) -> "_Work":
-        """Make the kernels' arguments for one picture, with the fields that all of them read."""
         height, width, channels = features.shape
         work = cls(width=width, height=height, channels=channels, chunk_rows=max(32, -(-height // 16)))
         work.view[:] = camera.world_to_camera[:3].reshape(-1).tolist()
@@ -52,11 +51,15 @@ class _Work(struct("Shade", "pixels.h")):
 
 
 class _Padding(NamedTuple):
-    """Index tables of stacked cubemaps whose faces are padded by one cell.
+    """Hold index tables for cubemaps whose faces get a border one texel wide, so that bilinear look-up has no seams.
 
-    `texel` is the texel under each cell, in orbit order (`cubemap.orbit_order`). The cells of texel i are
-    `cell[starts[i]:starts[i + 1]]`, int32.
-    `first_cells` and `first_lines` say where each level starts, in cells and in rows of cells; there are `lines` rows.
+    A cell is an entry of a face with its border; a line is a row of cells. Several cells can hold the same texel. Texels are in orbit order
+    (`cubemap.orbit_order`).
+
+    - `texel`: the texel that each cell holds
+    - `cell`, `starts`: the cells that hold texel i are `cell[starts[i] : starts[i + 1]]`
+    - `first_cells`, `first_lines`: the first cell and the first line of each cubemap in the stack
+    - `lines`: the number of lines
     """
 
     texel: Tensor
@@ -155,10 +158,10 @@ class _Shade(torch.autograd.Function):
 
 
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
-    """Compute the mirror directions (H, W, 3) in which `shade` looks up light: unit vectors in world space, zero where nothing is.
+    """Compute the mirror direction of each pixel (H, W, 3): the viewing direction reflected at the blended normal. No gradients.
 
-    They are the directions to the camera, mirrored at the blended normals. `features` and `alpha` are those that `shade` takes with a
-    visibility. Without gradients.
+    `shade` looks up the light in these directions. They are unit vectors in world space, and zero where nothing is. `features` and `alpha`
+    are those of `shade` if `visibility` is given there; otherwise ValueError is raised.
     """
     if features.shape != (*alpha.shape, CHANNELS + INDIRECT):
         raise ValueError(f"expected {CHANNELS + INDIRECT} features a pixel, got {tuple(features.shape)}")
@@ -184,23 +187,26 @@ def shade(
 ) -> Shaded:
     """Shade blended maps by the split sum (paper Eq. 5–10), over a background (3,), sRGB-encoded.
 
-    `features` (H, W, C) are sums over a pixel's surfels, in this order:
+    `features` (H, W, C) are sums over the surfels of each pixel, weighted as in `rasterize`, in this order:
 
-    - normal in world space, albedo, metallic, roughness;
-    - with `by_direction`, colour by direction (3), which replaces integrated diffuse light (the paper's substitute);
-    - with a `visibility` (H, W) in 0..1: irradiance divided by that of an unoccluded surface (3), unless colour by direction is there; and
-      radiance from the object itself (3), which replaces the environment's where the visibility is 0 (Eq. 9);
-    - position.
+    - normal in world space (3), albedo (3), metallic, roughness
+    - with `by_direction`: a colour by viewing direction (3), which replaces diffuse shading, as in the paper
+    - otherwise, with `visibility`: irradiance divided by that of an unoccluded surface (3)
+    - with `visibility`: radiance from the object itself (3), which replaces the environment's where `visibility` is 0 (Eq. 9)
+    - position (3)
 
-    With `matte` they are normal and albedo alone. The picture is then albedo times irradiance, and its material has metallic 0,
-    roughness 1.
+    The other arguments change the shading:
 
-    Radiance is multiplied by `exposure`, a scalar (default 1), before it is encoded. With `display`, light and materials are a screen's
-    numbers and nothing is encoded. With `mirror`, a sharp mirror image of the light is weighted by metallic (Ye et al., 3DGS-DR, 2024).
-    The blended normal's bias towards the camera is removed first, by the blended position: see blended.h.
+    - `visibility` (H, W): 0 where the object occludes the mirror direction, 1 where it does not, or between
+    - `exposure`, a scalar, default 1: multiplies radiance before it is encoded
+    - `display`: light and materials are display values in 0..1, so nothing is encoded
+    - `mirror`: reflections are a sharp mirror image of the light, weighted by metallic (Ye et al., 3DGS-DR, 2024)
+    - `matte`: `features` are normal and albedo only. The picture is albedo · irradiance / π, and its material has metallic 0, roughness 1.
 
-    All tensors are float32, on the CPU or on one card. Differentiable in features, alpha, the light and the exposure. The result does not
-    depend on the number of threads, and a card returns the same bits each time. On a card, if any derivative is not finite, all are NaN.
+    Blending biases normals towards the camera. This bias is removed first, by means of the position (see kernels/blended.h).
+
+    All tensors are float32, on the CPU or on one CUDA card. Differentiable in `features`, `alpha`, the light and `exposure`. Results do not
+    depend on the number of threads. A card returns the same bits each time; if any of its derivatives is not finite, all are NaN.
     """
     expected = MATTE if matte else CHANNELS + (3 * by_direction if visibility is None else INDIRECT)
     if features.shape != (*alpha.shape, expected):
@@ -211,10 +217,16 @@ def shade(
 
 
 def shade_splats(features: Tensor, environment: Environment, camera: Camera, mirror: bool = False) -> Tensor:
-    """Shade each surfel by the split sum before blending (paper §3.3, the initial stage): radiance (N, 3) to the camera.
+    """Shade each surfel before blending, by the split sum (paper §3.3, the initial stage). Returns the radiance (N, 3) towards the camera.
 
-    `features` (N, C) are, in this order: normal in world space, albedo, metallic, roughness; colour by direction (3), where that replaces
-    integrated diffuse light; position. Without specular shading they are normal and albedo alone. Differentiable in features and light.
+    `features` (N, C) are, in this order:
+
+    - normal in world space (3), albedo (3), metallic, roughness
+    - if C is 14: a colour by viewing direction (3), which replaces diffuse shading
+    - position (3)
+
+    If C is 6 they are normal and albedo only, and shading is diffuse. With `mirror`, reflections are a sharp mirror image of the light.
+    Differentiable in `features` and the light.
     """
     count, channels = features.shape
     if channels not in (MATTE, CHANNELS, CHANNELS + 3):

@@ -15,10 +15,11 @@ _Work = struct("Ssim", "ssim.cpp")
 
 @torch.no_grad()
 def dssim(image: Tensor, target: Tensor, weight: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Compute 1 − mean SSIM (Wang et al. 2004), a scalar, and `weight` times its derivative by `image`.
+    """Compute the structural dissimilarity 1 − mean SSIM (Wang et al. 2004) of two images. Also returns its gradient times `weight`.
 
-    Takes two float32 images (H, W, 3) in about [0, 1]. Each channel is compared by itself, with an 11×11 Gaussian window of σ 1.5, C1 =
-    0.01², C2 = 0.03² and zeros beyond the border; the mean is over all pixels. Raises ValueError for other shapes.
+    The images are float32 (H, W, 3), in about [0, 1]; ValueError is raised for other shapes. The gradient (H, W, 3) is with respect to
+    `image`. SSIM uses an 11×11 Gaussian window with σ = 1.5, C1 = 0.01², C2 = 0.03², and zeros outside the image. It is computed for each
+    channel, and its mean is over all pixels and channels.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.numel() == 0:
         raise ValueError(f"expected images (H, W, 3), got {tuple(image.shape)}")

@@ -1,4 +1,4 @@
-"""Concatenate the surfels' features."""
+"""Concatenate the features of surfels into one tensor."""
 
 from collections.abc import Sequence
 
@@ -12,8 +12,6 @@ from refgs.kernels.load import check, run
 
 
 class _Work(struct("Stack", "stack.cpp")):
-    """Arguments of stack.cpp's kernels."""
-
     @classmethod
     def of(cls, stacked: Tensor, widths: Sequence[int], parts: Sequence[Tensor | None]) -> "_Work":
         work = cls(rows=len(stacked), parts=len(widths), width=stacked.shape[1])

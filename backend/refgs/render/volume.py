@@ -1,8 +1,8 @@
-"""Draw 3D Gaussians by the rasteriser of surfels, for comparison (paper Tables 3 and 7).
+"""Draw 3D Gaussians with the rasteriser of surfels, for comparison (paper Tables 3 and 7).
 
-EWA splatting (Zwicker et al. 2001, as in Kerbl et al. 2023) projects a Gaussian's covariance by the projection's derivative at its
-centre. A disc perpendicular to the camera's axis, at the centre's depth, has the same picture. Its projection is affine, so the
-rasteriser draws it exactly.
+Each 3D Gaussian is replaced by a disc that looks the same to the camera. EWA splatting (Zwicker et al. 2001, as in Kerbl et al. 2023) gives
+the ellipse that the Gaussian covers in the picture. The disc covers the same ellipse. It lies at the depth of the Gaussian's centre, at
+right angles to the camera's axis. The rasteriser draws such discs exactly.
 """
 
 import torch
@@ -20,7 +20,7 @@ TO_THIRD = ((0.5, 0.5, 0.5, 0.5), (0.5, -0.5, -0.5, -0.5), (1.0, 0.0, 0.0, 0.0))
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Multiply quaternions wxyz (..., 4): rotate by b, then by a."""
+    """Multiply quaternions wxyz (..., 4). The product rotates by b first, then by a."""
     aw, ax, ay, az = a.unbind(-1)
     bw, bx, by, bz = b.unbind(-1)
     return torch.stack(
@@ -35,7 +35,10 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def shortest_last(rotations: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
-    """Reorder the axes of Gaussians so that the shortest, their normal, is the third: quaternions (N, 4), scales (N, 3)."""
+    """Reorder the axes of 3D Gaussians so that the shortest axis, which is the normal, comes third.
+
+    Returns the new `rotations`, quaternions wxyz (N, 4), and `scales` (N, 3).
+    """
     shortest = scales.argmin(dim=1)
     turns = rotations.new_tensor(TO_THIRD)[shortest]
     order = (shortest[:, None] + torch.arange(1, 4, device=scales.device)) % 3
@@ -43,7 +46,7 @@ def shortest_last(rotations: Tensor, scales: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def with_normals_last(surfels: Surfels) -> Surfels:
-    """Reorder the axes of 3D Gaussians so that the normal is the third axis. Surfels are returned unchanged: theirs already is."""
+    """Reorder the axes of 3D Gaussians so that the normal is the third axis. For surfels it already is, so they are returned unchanged."""
     if surfels.scales.shape[1] == 2:
         return surfels
     rotations, scales = shortest_last(surfels.rotations, surfels.scales)
@@ -51,8 +54,11 @@ def with_normals_last(surfels: Surfels) -> Surfels:
 
 
 @timed("surfels")
-class _Angle(torch.autograd.Function):
-    """Half the angle of (x, y). A round Gaussian has no such angle, so its derivative is damped to zero."""
+class _HalfAngle(torch.autograd.Function):
+    """Compute atan2(y, x) / 2, with a derivative that fades to zero near the origin, where the angle is undefined.
+
+    Near means that x and y are tiny compared with `size`.
+    """
 
     @staticmethod
     def forward(ctx, y, x, size):
@@ -68,7 +74,10 @@ class _Angle(torch.autograd.Function):
 
 
 def discs(surfels: Surfels, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the first four arguments of `rasterize`: the surfels' geometry, or for 3D Gaussians that of discs that look the same."""
+    """Return positions, rotations, scales and opacities, the first four arguments of `rasterize`.
+
+    3D Gaussians are replaced by flat discs that look the same to this camera.
+    """
     positions, rotations, scales, opacities, *_ = surfels
     if scales.shape[1] == 3:
         rotations, scales = across_the_axis(positions, rotations, scales, camera)
@@ -76,9 +85,10 @@ def discs(surfels: Surfels, camera: Camera) -> tuple[Tensor, Tensor, Tensor, Ten
 
 
 def across_the_axis(positions: Tensor, rotations: Tensor, scales: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Make discs that have the pictures of 3D Gaussians: quaternions wxyz (N, 4) and standard deviations (N, 2) in world units.
+    """Replace 3D Gaussians by flat discs that look the same to this camera. The discs lie at right angles to the camera's axis.
 
-    Takes `positions` (N, 3), `rotations` (N, 4) of any length and `scales` (N, 3); differentiable in all three.
+    Takes `positions` (N, 3), `rotations` (N, 4) of any length and `scales` (N, 3). Returns the discs' rotations (N, 4), quaternions wxyz,
+    and scales (N, 2), standard deviations in world units. Differentiable in all three arguments.
     """
     columns = [axis.unbind(-1) for axis in axes(rotations)]
     view = camera.world_to_camera.tolist()
@@ -98,13 +108,13 @@ def across_the_axis(positions: Tensor, rotations: Tensor, scales: Tensor, camera
     middle, apart = (xx + yy) / 2, (xx - yy) / 2
     half = torch.sqrt(apart * apart + xy * xy + 1e-12 * middle * middle)
     variances = torch.stack([middle + half, (middle - half).clamp_min(1e-9 * middle.detach())], dim=-1)
-    angle = _Angle.apply(xy, apart, middle.detach()) / 2
+    angle = _HalfAngle.apply(xy, apart, middle.detach()) / 2
     none = torch.zeros_like(angle)
     turn = torch.stack([torch.cos(angle), none, none, torch.sin(angle)], dim=-1)
     return product(_from_camera(camera).to(turn), turn), torch.sqrt(variances + 1e-30)
 
 
 def _from_camera(camera: Camera) -> Tensor:
-    """Return the quaternion wxyz (4,) of the rotation from the camera's axes to the world's."""
+    """Return the rotation from camera space to world space as a quaternion wxyz (4,)."""
     x, y, z, w = Rotation.from_matrix(camera.world_to_camera[:3, :3].T).as_quat()
     return torch.tensor([w, x, y, z])
