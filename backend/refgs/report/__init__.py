@@ -1,1 +1,1 @@
-"""Evaluate runs and write the report page."""
+"""Evaluate trained runs, and write the report page about them."""

@@ -1,4 +1,4 @@
-"""Draw the report's charts as SVG, in the page's text colour."""
+"""Draw the charts of the report page as SVG, in the page's text colour."""
 
 import io
 from collections.abc import Iterator
@@ -37,7 +37,10 @@ PARTS = {  # parts of a run's time and their titles, in the order of the bar
 
 @contextmanager
 def _drawing(width: float, height: float) -> Iterator[tuple[Figure, list[str]]]:
-    """Yield a figure to draw into, and a list that receives its SVG afterwards."""
+    """Yield an empty matplotlib figure of this size in inches, and an empty list.
+
+    When the `with` block ends, the figure is drawn as SVG, and this text is appended to the list.
+    """
     style = {"svg.fonttype": "none", "svg.hashsalt": "refgs", "font.family": "sans-serif", "font.size": 10}
     style |= dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK)
     made: list[str] = []
@@ -55,7 +58,11 @@ def _color(index: int) -> tuple[float, ...]:
 
 
 def error_chart(groups: list[list[Curve]], runs: list[str]) -> str:
-    """Draw a chart for each quantity: error against seconds of training, both logarithmic. Returns "" without groups."""
+    """Draw a chart for each error measure, such as PSNR: error over seconds of training. Both axes are logarithmic.
+
+    `groups` has a list of curves for each measure. `runs` are the labels of all runs; a run has the same colour in all charts. Returns SVG,
+    or "" if `groups` is empty.
+    """
     if not groups:
         return ""
     rows, columns = -(-len(groups) // ACROSS), min(len(groups), ACROSS)
@@ -96,9 +103,9 @@ def _draw_errors(axes: Axes, curves: list[Curve], runs: list[str]) -> None:
 
 
 def parts_chart(parts: dict[str, dict[str, float]]) -> str:
-    """Draw a bar for each run, divided into the seconds of each part of the work (see PARTS).
+    """Draw a bar for each run: the seconds that it spent on each kind of work, such as shading or reading (see PARTS).
 
-    `parts` maps a run to its seconds by part. Returns "" if it is empty.
+    `parts` is {run: {kind of work: seconds}}. Returns SVG, or "" if `parts` is empty.
     """
     if not parts:
         return ""

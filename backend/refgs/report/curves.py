@@ -1,4 +1,4 @@
-"""Analyse curves of error against run time: Pareto fronts, knees, times to given errors.
+"""Compare runs by their curves of error over training time: Pareto fronts, knees, and the time to reach a given error.
 
 Errors and times are compared by their logarithms, so that a 10 % change counts the same everywhere.
 """
@@ -17,9 +17,9 @@ LEAST_KNEE = 0.1  # of the chord's height; a curve that bends less has no knee
 
 
 class Quantity(NamedTuple):
-    """Error measure in history.jsonl: its key, its title, and its unit. Smaller errors are better.
+    """Name an error measure of history.jsonl: its key in the file, its title, and its unit. Smaller errors are better.
 
-    With `decibels` the value is a PSNR in dB, which is −20 log₁₀ of the RMS error for a peak of 1.
+    With `decibels`, the file has a PSNR in dB. `error` converts it to an RMS error, for pixel values in 0..1.
     """
 
     key: str
@@ -30,7 +30,7 @@ class Quantity(NamedTuple):
         return 10 ** (-value / 20) if self.decibels else value
 
     def text(self, error: float) -> str:
-        """Format an error as text. If the quantity is a PSNR, the text is in decibels."""
+        """Format an error for the report: in decibels if it comes from a PSNR, otherwise as a plain number."""
         return f"{-20 * np.log10(error):.4g} dB" if self.decibels else f"{error:.3g}"
 
 
@@ -49,7 +49,7 @@ QUANTITIES = (
 
 
 class Curve(NamedTuple):
-    """Errors of a run against its seconds of training, (n,) each, ascending in time."""
+    """Hold the errors of one run, by one error measure, and when they were measured. The arrays are (n,), sorted by time."""
 
     run: str
     quantity: Quantity
@@ -59,7 +59,10 @@ class Curve(NamedTuple):
 
 
 def curve(run: str, history: list[dict], quantity: Quantity) -> Curve:
-    """Make the curve of a quantity from a history. Lines without the quantity, or without a logarithm of it, are skipped."""
+    """Make the curve of one error measure from the lines of history.jsonl.
+
+    Lines without this measure are skipped. So are errors and times that are not positive, as they have no logarithm.
+    """
     found = [
         (line.get("iteration", 0), line["seconds"], quantity.error(line[quantity.key]))
         for line in history
@@ -70,9 +73,10 @@ def curve(run: str, history: list[dict], quantity: Quantity) -> Curve:
 
 
 def front(curves: list[Curve]) -> list[np.ndarray]:
-    """Mark the points of each curve (n,) that lie on the Pareto front of all curves.
+    """Find the Pareto front of all curves: a mask (n,) for each curve that selects its points on the front.
 
-    A point is on the front if no other point has a smaller error in at most the same time, or at most the same error in less time.
+    A point is on the front if no other point beats it. To beat it takes a smaller error in at most the same time, or at most the same error
+    in less time.
     """
     seconds, errors = (np.concatenate([getattr(c, name) for c in curves]) for name in ("seconds", "errors"))
     order = np.lexsort((errors, seconds))
@@ -82,15 +86,16 @@ def front(curves: list[Curve]) -> list[np.ndarray]:
     return np.split(on, np.cumsum([len(c.errors) for c in curves])[:-1])
 
 
-def knee(found: Curve) -> int | None:
-    """Find the knee of a curve, after which more time brings little (Kneedle, Satopää et al. 2011, without smoothing).
+def knee(curve: Curve) -> int | None:
+    """Find the index of a curve's knee, after which more training time improves little (Kneedle, Satopää et al. 2011, without smoothing).
 
-    The knee is the point of the best error so far that lies furthest below the chord from the first point to the best; both axes are
-    logarithms scaled to 0..1. Returns None for fewer than five points, and for a bend below LEAST_KNEE: a power law is a straight line.
+    Both axes are logarithms, scaled to 0..1. Draw a straight line from the first point to the best point. The knee is the point that lies
+    furthest below this line; each point counts with the best error so far. Returns None if the curve has fewer than five points, or if the
+    knee is less than LEAST_KNEE below the line.
     """
-    if len(found.errors) < 5:
+    if len(curve.errors) < 5:
         return None
-    x, y = np.log(found.seconds), np.log(np.minimum.accumulate(found.errors))
+    x, y = np.log(curve.seconds), np.log(np.minimum.accumulate(curve.errors))
     if x[-1] <= x[0] or y[-1] >= y[0]:
         return None
     below = 1 - (x - x[0]) / (x[-1] - x[0]) - (y - y[-1]) / (y[0] - y[-1])
@@ -98,23 +103,26 @@ def knee(found: Curve) -> int | None:
     return at if below[at] >= LEAST_KNEE else None
 
 
-def time_to(found: Curve, error: float) -> float | None:
-    """Return the seconds after which the curve `found` first has at most this error, or None if it never has.
+def time_to(curve: Curve, error: float) -> float | None:
+    """Return the seconds after which the curve first reaches `error` or less. Return None if it never does.
 
-    Between two points of the curve, the logarithms of seconds and error are interpolated linearly.
+    Between two points of the curve, the logarithms of time and error are interpolated linearly.
     """
-    reached = np.flatnonzero(found.errors <= error)
+    reached = np.flatnonzero(curve.errors <= error)
     if not len(reached):
         return None
     at = reached[0]
     if at == 0:
-        return float(found.seconds[0])
-    x, y = np.log(found.seconds[at - 1 : at + 1]), np.log(found.errors[at - 1 : at + 1])
+        return float(curve.seconds[0])
+    x, y = np.log(curve.seconds[at - 1 : at + 1]), np.log(curve.errors[at - 1 : at + 1])
     return float(np.exp(x[0] + (np.log(error) - y[0]) / (y[1] - y[0]) * (x[1] - x[0])))
 
 
 def levels(curves: list[Curve]) -> list[float]:
-    """Choose a few round errors that the curves pass, the largest first. If the quantity is a PSNR, they are round in decibels."""
+    """Choose about LEVELS round numbers between the worst and the best error of the curves, largest error first.
+
+    The report says when each curve reaches them. If the errors come from a PSNR, they are round numbers of decibels.
+    """
     quantity = curves[0].quantity
     worst, best = max(c.errors[0] for c in curves), min(c.errors.min() for c in curves)
     if best >= worst:
@@ -126,10 +134,11 @@ def levels(curves: list[Curve]) -> list[float]:
 
 
 def as_csv(histories: dict[str, list[dict]], groups: list[list[Curve]]) -> str:
-    """Write the figures of the charts and tables as CSV: run, iteration, seconds, quantity, value, mark.
+    """Write the numbers behind the report's charts as CSV. The columns are run, iteration, seconds, quantity, value, mark.
 
-    Each point of a curve has a row. It is marked "front" on the Pareto front, and "knee" at the knee. Rows marked "reaches" are the times
-    to given errors. Rows with the quantity "part: NAME" have the seconds of that part as value.
+    - Each point of a curve has a row. Its mark is "front" on the Pareto front, "knee" at the knee, both, or empty.
+    - A row with the mark "reaches" has the seconds after which a curve reaches a given error.
+    - A row with the quantity "part: NAME" has as value the seconds spent on this kind of work, such as shading.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

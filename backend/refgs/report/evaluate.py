@@ -1,4 +1,4 @@
-"""Evaluate a run: compare its views with photos, and its maps, light and mesh with ground truth."""
+"""Evaluate a run: compare its views with photos, and its maps, light and mesh with ground truth if there is any."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -32,9 +32,10 @@ Step = Callable[[int, str, int], None]
 
 
 def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None, step: Step) -> dict[str, Any]:
-    """Measure a run on views of its capture and against ground truth. Writes pictures/ and returns the figures.
+    """Compare a run with photos, and with ground truth if it is given. Returns the metrics for metrics.json, such as PSNR.
 
-    `split` names the views, such as "test". `step` is called after each rendering.
+    The photos are those of `views`. Pictures are written to pictures/ in the run's folder: those of the views to pictures/`split`, where
+    `split` is "test" for held-out views. `step` is called after each rendering with the number done, a note, and the total.
     """
     pictures, lit = run.folder / "pictures", run.environment is not None
     hdris = truth.hdris if truth and lit else []
@@ -73,7 +74,7 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
 def _measure_view(
     run: Run, view: View, loaded: LoadedView, truth: GroundTruth | None, pictures: Path, with_lpips: bool
 ) -> dict[str, Any]:
-    """Measure one view and write its pictures."""
+    """Render one view, compare it with its photo and with the true maps, and write all of these as pictures. Returns the metrics."""
     camera, background = loaded.camera, np.array(run.settings.image.background, dtype=np.float32)
     rendering = run.render(camera)
     color = np.clip(rendering.color.numpy(), 0, 1)
@@ -110,7 +111,10 @@ def _measure_view(
 
 
 def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dict[str, float]]:
-    """Measure the recovered light, and write pictures of it and of the true light."""
+    """Compare the recovered light with the true light, and write both as pictures. Returns the metrics.
+
+    If the true light is unknown, or if the recovered light turns with the camera, there are no metrics: {}.
+    """
 
     def write(name: str, panorama: np.ndarray) -> None:
         small = metrics.resized(panorama, min(PANORAMA, len(panorama)))
@@ -133,7 +137,10 @@ def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[
 def _measure_relit(
     run: Run, hdri: str, cameras: list[Camera], truth: GroundTruth, pictures: Path, next_step: Callable[[str], None]
 ) -> dict[str, float]:
-    """Measure views under another light, `hdri`, and write pictures of the renderings and of the ground truth."""
+    """Render the views under another light and compare them with ground truth. Writes both as pictures and returns the metrics.
+
+    `hdri` names the light in the folder of ground truth. `next_step` is called with a note after each view.
+    """
     light = run.light(truth.panorama(f"relight/{hdri}"))
 
     # Each call renders again, because keeping all pictures takes too much memory.
@@ -149,7 +156,7 @@ def _measure_relit(
 
 
 def _measure_speed(run: Run, cameras: list[Camera]) -> dict[str, float | str]:
-    """Measure the renderer's frames per second from the median time of a frame. The CUDA card renders if there is one."""
+    """Measure the frames per second of the renderer, by the median time of a frame. Runs on the CUDA card if there is one."""
     device = torch.device("cuda" if cuda.unusable() is None else "cpu")
     surfels = Surfels(*(value.to(device) for value in run.surfels()))
     light = run.environment and Environment(run.environment.radiance.to(device), run.environment.reference)

@@ -1,4 +1,4 @@
-"""Name the figures of metrics.json, such as PSNR, and format them for the console and the report page."""
+"""Name the metrics of metrics.json, such as PSNR, and format them for the console and the report page."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -13,9 +13,10 @@ RELIT = {
 
 
 class Quantity(NamedTuple):
-    """Describe a figure of metrics.json: its key (nested keys joined by dots), its heading, and its format.
+    """Describe a metric of metrics.json.
 
-    `better` is max or min, or None where no direction is better.
+    `key` joins nested keys by dots, such as "mesh.chamfer". `heading` is its title in tables. `text` formats its value. `better` is the
+    function max or min, whichever picks the better value, or None if neither is better.
     """
 
     key: str
@@ -25,7 +26,7 @@ class Quantity(NamedTuple):
 
 
 def duration(seconds: float) -> str:
-    """Format seconds, from a minute on as minutes and seconds."""
+    """Format a number of seconds: as minutes and seconds from one minute on, otherwise as seconds."""
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"
 
@@ -66,7 +67,7 @@ def is_number(value: object) -> bool:
 
 
 def flatten(values: object, prefix: str = "") -> Iterator[tuple[str, float]]:
-    """Yield ("a.b", number) for each finite number in nested dicts."""
+    """Yield each finite number in nested dicts, with its keys joined by dots: ("a.b", number)."""
     if isinstance(values, dict):
         for key, value in values.items():
             yield from flatten(value, f"{prefix}.{key}" if prefix else str(key))
@@ -75,15 +76,16 @@ def flatten(values: object, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 
 def in_words(metrics: dict, figures: list[Quantity]) -> list[str]:
-    """Format each of the figures that `metrics` contains, together with its heading."""
+    """Format those of `figures` that `metrics` contains, each as its heading and its value."""
     known = dict(flatten(metrics))
     return [f"{heading} {text(known[key])}" for key, heading, text, _ in figures if key in known]
 
 
 def relit_pair(figures: dict[str, float], prefix: str) -> str:
-    """Format PSNR and FLIP of relit pictures, each as "raw / aligned". Aligned pictures are scaled by the factor that fits best.
+    """Format PSNR and FLIP of relit pictures as text, such as "24.10 / 26.30 dB, FLIP 0.081 / 0.072".
 
-    `figures` maps dotted keys to numbers. `prefix` is the keys' beginning, such as "relight.studio.mesh".
+    The first of two numbers is "raw", the second "aligned": measured after the brightness was multiplied by the factor that fits best.
+    `figures` maps dotted keys to numbers. `prefix` is the start of these keys, such as "relight.studio.mesh".
     """
     parts = []
     for name, text in (("psnr", "{:.2f}"), ("flip", "{:.3f}")):
@@ -94,7 +96,7 @@ def relit_pair(figures: dict[str, float], prefix: str) -> str:
 
 
 def relit_in_words(metrics: dict) -> list[str]:
-    """Format a line of PSNR and FLIP for each light, and for each kind of asset relit by it: refgs, splats, mesh."""
+    """Format PSNR and FLIP of relit pictures: a line for each light and each way of rendering (surfels, splats, mesh)."""
     known = dict(flatten(metrics))
     lit = [(hdri, kind) for hdri, kinds in metrics.get("relight", {}).items() for kind in kinds]
     return [

@@ -18,10 +18,11 @@ BY_NAME = {  # in this order; other settings follow, under their own names
 
 
 def labels(names: list[str], facts: list[dict]) -> list[str]:
-    """Make a unique label for each run from its settings, `facts` (the tables of run.toml), or else from its folder's name.
+    """Make a unique label for each run from the settings in which the runs differ.
 
-    If a setting differs only because the presets differ, the label has the preset's name instead. A setting is named without its section
-    if no other section has a setting of that name.
+    `facts` are the contents of the runs' run.toml. `names` are their folders' names, which are added where labels are equal or empty. If a
+    setting differs only because the presets differ, the label has the name of the preset instead. Settings are named without their section,
+    unless another section has a setting with the same name.
     """
     known = [_settings(tables) for tables in facts]
     groups = defaultdict(list)
@@ -48,7 +49,7 @@ def labels(names: list[str], facts: list[dict]) -> list[str]:
 
 
 def _settings(tables: dict) -> dict[str, Hashable]:
-    """Collect the values of run.toml that can tell runs apart, by dotted names."""
+    """Collect the values from run.toml by which a label can tell runs apart: {"section.setting": value}."""
     found = {f"run.{key}": value for key, value in tables.get("run", {}).items() if f"run.{key}" in BY_NAME}
     for name in ("run.capture", "run.preset"):  # only the last part of a path
         if name in found:

@@ -1,11 +1,11 @@
-"""Write the report: one self-contained HTML file for one run folder, or several side by side.
+"""Write the report: one self-contained HTML file about one run folder, or about several side by side.
 
-It reads these files of a run folder. A section without its file is left out:
+It reads these files of a run folder. If a file is missing, its section is left out:
 
-    metrics.json     numbers, nested to any depth: the figures of `refgs.report.figures`, ambiguities.NAME.what (text),
+    metrics.json     numbers, nested to any depth: the metrics of `refgs.report.figures`, ambiguities.NAME.what (text),
                      relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}
     history.jsonl    one object a line: seconds, iteration, parts, and the quantities of `refgs.report.curves`
-    needs.json       a list of {"what", "why"}, with "saved", "cost", "needed" if known
+    needs.json       optional features that were kept or left out: a list of {"what", "why"}, with "saved", "cost", "needed" if known
     run.toml         the settings, and the capture's folder
     pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png, and true_normal/VIEW.png … if known
     pictures/relight/{truth,refgs,splats,mesh}/HDRI_VIEW.png
@@ -50,7 +50,7 @@ LARGEST_SIDE = 512  # pixels, so that the page stays small enough to open
 
 @dataclass
 class RunPage:
-    """Data of one run on the page. `label` names it beside other runs."""
+    """Hold what the report page shows of one run. If it shows several runs, `label` tells them apart."""
 
     name: str
     label: str
@@ -68,16 +68,16 @@ class RunPage:
 
 
 def write_report(runs: list[Path], out: Path) -> None:
-    """Write the page of these run folders to `out`, and the charts' figures beside it as CSV. Both files are replaced.
+    """Write a report page about these run folders to `out`, and a CSV file with the numbers of its charts beside it.
 
-    Raises InputError for a folder that does not exist.
+    Existing files are replaced. Raises InputError if a run folder does not exist.
     """
     pages = [_read_run(folder) for folder in runs]
     if len(pages) > 1:
         for page, label in zip(pages, labels([p.name for p in pages], [p.facts for p in pages]), strict=True):
             page.label = label
-    groups = _curves(pages)
-    parts = {page.label: spent for page in pages if (spent := _parts(page))}
+    groups = _error_curves(pages)
+    parts = {page.label: spent for page in pages if (spent := _seconds_by_work(page))}
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
@@ -93,7 +93,7 @@ def write_report(runs: list[Path], out: Path) -> None:
         passes=PASSES,
         relit_kinds=RELIT,
         errors=error_chart(groups, [page.label for page in pages]),
-        times=_times(groups),
+        times=_time_tables(groups),
         parts=parts_chart(parts),
         timed=list(parts),
         parts_table=_parts_table(parts),
@@ -156,21 +156,21 @@ def _read_run(folder: Path) -> RunPage:
 
 
 def _ambiguities(metrics: dict) -> list[str]:
-    """Collect the sentences on ambiguities: changes to the scene that the photos cannot tell apart."""
+    """Collect the sentences of metrics.json about ambiguities: changes to the scene that the photos cannot tell apart."""
     found = metrics.get("ambiguities")
     known = found.values() if isinstance(found, dict) else ()
     return [facts["what"] for facts in known if isinstance(facts, dict) and "what" in facts]
 
 
 def _lines(text: str) -> list[dict]:
-    """Parse history.jsonl. Lines without a number of seconds are skipped."""
+    """Parse history.jsonl. Skip lines that have no number "seconds"."""
     return [line for line in history.read(text) if is_number(line.get("seconds"))]
 
 
 def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[str, str]]:
-    """Embed the pictures folder/KIND/NAME.png: {name: {kind: data URL}}.
+    """Read the pictures folder/KIND/NAME.png as data URLs: {name: {kind: data URL}}.
 
-    Names that have fewer kinds than others are skipped. Of the rest at most `most` are taken, evenly spaced.
+    Names with fewer kinds than other names are skipped. If more than `most` names are left, `most` of them are taken at even distances.
     """
     count = Counter(path.stem for kind in kinds for path in folder.glob(f"{kind}/*.png"))
     names = sorted(name for name in count if count[name] == max(count.values()))
@@ -194,12 +194,15 @@ def _embed(path: Path) -> str:
 
 
 def _unique_names(groups) -> list[str]:
-    """List every name once, in the order of the runs."""
+    """List the names in all groups without duplicates, in the order in which they first occur."""
     return list(dict.fromkeys(name for group in groups for name in group))
 
 
 def _columns(pages: list[RunPage], figures: list[Quantity]) -> list[dict]:
-    """Make a column for each figure that any run has: its heading, and for each run its text and a flag for the best."""
+    """Make a table column for each of `figures` that at least one run has.
+
+    A column has a heading and a cell for each run: the formatted value, and whether it is the best.
+    """
     columns = []
     for key, heading, text, better in figures:
         values = [page.figures.get(key) for page in pages]
@@ -213,7 +216,10 @@ def _columns(pages: list[RunPage], figures: list[Quantity]) -> list[dict]:
 
 
 def _relit_table(pages: list[RunPage]) -> list[dict]:
-    """Make the table of relit figures: a row for each light and kind of asset, with a cell for each run."""
+    """Make the table of PSNR and FLIP of relit pictures.
+
+    It has a row for each light and each way of rendering (surfels, splats, mesh), with a cell for each run.
+    """
     found = _unique_names({key.rsplit(".", 1)[0] for key in sorted(page.figures) if _is_relit(key)} for page in pages)
     rows = []
     for prefix in sorted(found):
@@ -229,15 +235,18 @@ def _is_relit(key: str) -> bool:
 
 
 def _other_figures(pages: list[RunPage]) -> list[dict]:
-    """Make a row for each figure that no other table shows."""
+    """Make a table row for each metric that is not in another table of the page."""
     shown = {figure.key for figure in HEADLINE + DETAILS}
     keys = [key for key in _unique_names(page.figures for page in pages) if key not in shown and not _is_relit(key)]
     texts = {key: [page.figures.get(key) for page in pages] for key in keys}
     return [{"key": key, "cells": ["–" if x is None else f"{x:.5g}" for x in row]} for key, row in texts.items()]
 
 
-def _curves(pages: list[RunPage]) -> list[list[Curve]]:
-    """Make the curves of error against time: a list for each quantity, with the curve of each run that recorded it."""
+def _error_curves(pages: list[RunPage]) -> list[list[Curve]]:
+    """Make the curves of error over training time.
+
+    Returns a list for each error measure that was recorded, with a curve for each run that recorded it.
+    """
     groups = []
     for quantity in QUANTITIES:
         curves = [curve(page.label, page.history, quantity) for page in pages]
@@ -246,8 +255,8 @@ def _curves(pages: list[RunPage]) -> list[list[Curve]]:
     return groups
 
 
-def _times(groups: list[list[Curve]]) -> list[dict]:
-    """Make a table for each quantity, with a row for each run: times to given errors, and the knee."""
+def _time_tables(groups: list[list[Curve]]) -> list[dict]:
+    """Make a table for each error measure: when each run reached certain errors, and where the knee of its curve is."""
     tables = []
     for curves in groups:
         quantity, errors = curves[0].quantity, levels(curves)
@@ -267,13 +276,16 @@ def _duration_or_dash(seconds: float | None) -> str:
     return "–" if seconds is None else duration(seconds)
 
 
-def _parts(page: RunPage) -> dict[str, float]:
-    """Read the seconds of each part of the work from the last line of the history that has them."""
+def _seconds_by_work(page: RunPage) -> dict[str, float]:
+    """Return the seconds that a run spent on each kind of work, such as shading: {kind of work: seconds}.
+
+    They are in the last line of history.jsonl that has "parts".
+    """
     return next((dict(flatten(line["parts"])) for line in reversed(page.history) if line.get("parts")), {})
 
 
 def _parts_table(parts: dict[str, dict[str, float]]) -> list[dict]:
-    """Make a row for each part of the work (see `charts.PARTS`): seconds and percentage for each run."""
+    """Make a table row for each kind of work, such as shading (see `charts.PARTS`): seconds and percentage for each run."""
     rows = []
     for name, title in PARTS.items():
         seconds = [spent.get(name, 0.0) for spent in parts.values()]
