@@ -1,1 +1,1 @@
-"""Represent what a training learns: the surfels and the environment's light."""
+"""Define what training learns: the surfels, and the light of the environment."""

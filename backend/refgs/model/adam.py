@@ -38,7 +38,7 @@ class Adam:
     def step(self, accepted: Tensor | None = None) -> None:
         """Update all parameters once, with the learning rate `lr` of their group.
 
-        `accepted` is a float32 scalar on the tensors' device. If it is zero, parameters and moments do not change.
+        `accepted` is a float32 scalar on the tensors' device, or None. If it is zero, parameters and moments do not change.
         """
         (beta1, beta2), learned, kept = self.BETAS, [], []
         for group in self.param_groups:

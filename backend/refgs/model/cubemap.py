@@ -15,7 +15,7 @@ SYMMETRIES = 24  # of the cube: all changes of the axes' signs, times all cyclic
 
 
 def _face_direction(face: Tensor, s: Tensor, t: Tensor) -> Tensor:
-    """Return the direction from the cube's centre to the point (s, t) of a face, not normalised."""
+    """Return the direction from the cube's centre to the point (s, t) on a face. It is not normalised."""
     face, s, t = torch.broadcast_tensors(face, s, t)
     axis, sign = face // 2, (1 - 2 * (face % 2)).to(s.dtype)
     direction = torch.stack([sign, s, t], dim=-1)  # along the face's axis and the two that follow it
@@ -25,9 +25,9 @@ def _face_direction(face: Tensor, s: Tensor, t: Tensor) -> Tensor:
 
 
 def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the face index and (s, t) in [−1, 1] of directions (..., 3). s and t are differentiable.
+    """Find the points where directions (..., 3) meet the cube. Returns their face and their coordinates s and t on it, in [−1, 1].
 
-    A zero direction gives face 0, s = t = 0.
+    s and t are differentiable. A direction of length zero gives face 0 and s = t = 0.
     """
     x, y, z = directions.unbind(-1)
     with torch.no_grad():
@@ -43,7 +43,7 @@ def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 @lru_cache(maxsize=32)
 def texel_directions(resolution: int) -> Tensor:
-    """Return the unit directions (6·R², 3) of the texels' centres, float64."""
+    """Return the unit directions to the centres of all texels of a cubemap with R = `resolution`: (6·R², 3), float64."""
     centres = (torch.arange(resolution, dtype=torch.float64) + 0.5) * (2 / resolution) - 1
     face = torch.arange(6)[:, None, None]
     direction = _face_direction(face, centres[None, None, :], centres[None, :, None])
@@ -52,7 +52,7 @@ def texel_directions(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=32)
 def texel_solid_angles(resolution: int) -> Tensor:
-    """Return the exact solid angles (6·R²,) of the texels in steradians, float64. They sum to 4π."""
+    """Return the exact solid angles in steradians of all texels of a cubemap with R = `resolution`: (6·R²,), float64. They sum to 4π."""
     edges = torch.arange(resolution + 1, dtype=torch.float64) * (2 / resolution) - 1
     s, t = edges[None, :], edges[:, None]
     corner = torch.atan2(s * t, torch.sqrt(s * s + t * t + 1))  # area of the rectangle from the face's centre to (s, t)
@@ -62,11 +62,11 @@ def texel_solid_angles(resolution: int) -> Tensor:
 
 @lru_cache(maxsize=32)
 def orbits(resolution: int) -> Tensor:
-    """List groups of 24 texels that symmetries of the cube map onto each other: texel indices (R²/4, 24). R must be even.
+    """List groups of 24 texels that symmetries of the cube map onto each other: texel indices (R²/4, 24), where R = `resolution` is even.
 
     A symmetry changes the signs of some axes (8 ways), then permutes the axes cyclically (3 ways). Each row of the result lists such a
-    group, called an orbit. Its first texel lies on face +x where s, t > 0. Rows follow the row and column of that texel. Each texel occurs
-    once.
+    group, called an orbit. Its first texel lies on face +x where s, t > 0. The rows are sorted by this texel's row and column on the face.
+    Each texel of the cubemap occurs once.
 
     Column 8·p + b holds the image of the first texel under symmetry number 8·p + b. This symmetry flips the signs of x, y and z where b has
     the bits 1, 2 and 4. Then it applies p times the permutation +x → +y → +z → +x.
@@ -97,9 +97,9 @@ def in_texel_order(levels: Tensor, sides: tuple[int, ...]) -> Tensor:
 
 @lru_cache(maxsize=1)
 def compositions() -> Tensor:
-    """Tabulate the products of the cube's 24 symmetries: (24, 24), numbered as the columns of `orbits`.
+    """Tabulate which symmetry results from applying two of the cube's 24 symmetries: (24, 24).
 
-    Entry [a, b] is the number of the symmetry that applies a first, then b.
+    Entry [a, b] is the number of the symmetry that applies a first, then b. They are numbered as the columns of `orbits`.
     """
     first, then = torch.arange(SYMMETRIES)[:, None], torch.arange(SYMMETRIES)
     turn, signs = first // 8, then % 8
@@ -109,7 +109,7 @@ def compositions() -> Tensor:
 
 @lru_cache(maxsize=32)
 def _padded_texels(resolution: int) -> Tensor:
-    """Return a table (6, R + 2, R + 2) of texel indices: the faces, with a border one texel wide.
+    """Return a table (6, R + 2, R + 2) of texel indices: the faces, with a border one texel wide. R = `resolution`.
 
     The border holds the neighbouring faces' texels, so that bilinear look-up has no seams.
     """
@@ -135,8 +135,11 @@ def _padded_texels(resolution: int) -> Tensor:
 def padded(sides: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
     """Build look-up tables for stacked cubemaps whose faces get a border one texel wide, so that bilinear look-up has no seams.
 
-    Returns three tensors: the texel index at each cell of the faces with borders, (Σ 6·(side + 2)²,); the index of each cubemap's first
-    cell; and `sides`.
+    Returns three tensors:
+
+    - the index of the texel at each cell of the faces with borders, (Σ 6·(side + 2)²,)
+    - the index of each cubemap's first cell
+    - the side of each cubemap in texels
     """
     indices, starts, texels = [], [], 0
     for side in sides:

@@ -35,7 +35,7 @@ class Environment:
 
     @property
     def harmonics(self) -> Tensor:
-        """Compute the harmonic coefficients (16, 3) of the radiance, up to degree 3."""
+        """Compute the coefficients (16, 3) of the radiance in spherical harmonics up to degree 3."""
         directions, area = cubemap.texel_directions(self.resolution), cubemap.texel_solid_angles(self.resolution)
         return (harmonics.basis(directions, 3) * area[:, None]).T.float().to(self.radiance.device) @ self.radiance
 

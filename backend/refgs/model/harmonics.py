@@ -24,9 +24,9 @@ C3 = (
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """Evaluate the K = (degree + 1)² real harmonics at unit directions (..., 3). Returns (..., K).
+    """Evaluate all real spherical harmonics up to `degree` in unit directions (..., 3). Returns (..., K), where K = (degree + 1)².
 
-    Odd orders have the sign that 3D Gaussian splatting's files use: (−y, z, −x) at degree 1.
+    The signs are those of 3D Gaussian splatting's files: degree 1 is proportional to (−y, z, −x).
     """
     x, y, z = directions.unbind(-1)
     values = [torch.full_like(x, DC)]

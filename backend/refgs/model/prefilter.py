@@ -1,8 +1,8 @@
 """Prefilter a cubemap with the GGX lobe at a few fixed roughnesses, for specular reflection (second factor of the split sum, paper Eq. 8).
 
 As in Karis ("Real Shading in Unreal Engine 4", 2013), normal, view and reflection direction are assumed to be equal. The filtered radiance
-in a direction is then Σ L(l) K(θ) / Σ K(θ) with K(θ) = D(cos(θ/2)) cos θ, where θ is the angle between that direction and l. K depends only
-on θ and on the roughness, so each filtered level is a constant sparse matrix times the cubemap.
+in a direction is then Σ L(l) K(θ) / Σ K(θ) with K(θ) = D(cos(θ/2)) cos θ. D is the GGX distribution, and θ is the angle between that
+direction and l. K depends only on θ and on the roughness, so each filtered level is a constant sparse matrix times the cubemap.
 
 To keep the matrices small, they read a pyramid: the cubemap, followed by its mips, which are averaged 2×2. Fine texels cover the centre of
 the lobe, coarse texels its tail. The matrices have the cube's symmetries, so only a 24th of their entries is computed and stored. This
@@ -75,10 +75,12 @@ LOBES = (*(partial(ggx_lobe, roughness=roughness) for roughness in ROUGHNESS[1:]
 def _level_weights(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the filter weights of one level: how much each texel of the pyramid adds to each texel of the level.
 
-    Only the pyramid's texels on face +x with s, t > 0 are listed. The cube's symmetries give the weights of the other texels.
+    The pyramid is the cubemap and its mips. Only its texels on face +x with s, t > 0 are listed; the cube's symmetries give the weights of
+    the others. `side` is that of the level, and `lobe` is the filter as a function of the cosine. Mips with fewer than `coarsest` texels a
+    side are not read.
 
     Returns three arrays with an entry for each weight: the pyramid's texel, the level's texel in orbit order (`cubemap.orbit_order`), and
-    the weight. The complete weights of each texel of the level sum to one. Mips with fewer than `coarsest` texels a side are not read.
+    the weight. With those of the other texels, the weights of each texel of the level sum to one.
     """
     axes = cubemap.texel_directions(side)[cubemap.orbits(side).flatten()].numpy()
     sides = _pyramid_sides(resolution)
@@ -103,7 +105,7 @@ def _level_weights(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tup
 
 
 def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, side: int, lobe: Lobe) -> np.ndarray:
-    """Average a lobe about each axis (P, 3) over the area of one texel: (P,).
+    """Average a lobe over the area of P texels. Each texel has its own axis of the lobe: `axes` (P, 3). Returns (P,).
 
     The texels lie on face +x of a cubemap with `side`. `row` and `column` (P,) count from the middle of the face.
     """
@@ -200,9 +202,9 @@ _Work = struct("Product", "sparse.cpp")
 
 
 def _product(matrix: Matrix, dense: Tensor, rows: Tensor | None = None) -> Tensor:
-    """Multiply a `Matrix` by the values `dense` (columns, 3) of texels in orbit order (`cubemap.orbit_order`).
+    """Multiply a `Matrix` by `dense`: values (columns, 3) of texels in orbit order (`cubemap.orbit_order`).
 
-    The product is in orbit order, too. With `rows`, its row i is stored at `rows[i]` instead.
+    The product is in orbit order, too. If `rows` is given, row i of the product is stored as row `rows[i]` of the result.
     """
     work = _Work(orbits=len(matrix.starts) - 1)
     out = dense.new_empty(SYMMETRIES * work.orbits, 3)

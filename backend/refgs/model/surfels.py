@@ -39,8 +39,8 @@ class Surfels(NamedTuple):
 
     Lengths are in world units. Albedo is linear Rec.709; albedo, metallic and roughness are in 0..1.
 
-    - `sh_dc` (N, 1, 3) and `sh_rest` (N, K − 1, 3) are spherical harmonics of the colour by viewing direction: colour = 0.5 + SH. The
-      constant is separate because it has its own learning rate.
+    - `sh_dc` (N, 1, 3) and `sh_rest` (N, K − 1, 3) are spherical harmonics of a view-dependent colour: colour = 0.5 + SH. The constant is
+      separate because it has its own learning rate.
     - `received` (N, 3) is the irradiance at the surfel divided by the irradiance without occlusion. It can exceed 1 where the object
       reflects light onto itself.
     - `indirect_dc` and `indirect_rest` are spherical harmonics of the linear radiance that the object itself sends to the surfel (paper Eq.
@@ -118,7 +118,7 @@ class _Activate(torch.autograd.Function):
 
 
 def activate(p: Parameters) -> Surfels:
-    """Apply the activation functions to raw parameters. Returns the surfels as they are rendered.
+    """Apply the activation functions to the raw parameters `p` (see `Parameters`). Returns the surfels as they are rendered.
 
     Metallic has a function that gets closer to 0 and 1 than the logistic function. This matters because even one percent of white diffuse
     colour makes a black metal as bright as its reflections do. Training would change the light to compensate.

@@ -3,7 +3,7 @@
 `method_of` reads the settings below and returns the method. The default is RefGS's own: deferred shading in linear radiance.
 
 - `shading = "splat"`: each surfel is shaded before blending, as in the paper's initial stage (§3.3).
-- `shading = "sh"`: each surfel has its own colour by viewing direction, as in 2DGS. There are no materials and no light.
+- `shading = "sh"`: each surfel has its own view-dependent colour, as in 2DGS. There are no materials and no light.
 - `reflection = "mirror"`: a sharp mirror image of the light, weighted by metallic (Ye et al., 3DGS-DR, 2024).
 - `color_space = "display"`: light and materials are sRGB-encoded values in 0..1, as in the paper.
 - `primitive = "3dgs"`: 3D Gaussians instead of surfels (`refgs.render.volume`).
@@ -150,7 +150,7 @@ def draw_colors(
     occluder: None = None,
     exposure: None = None,
 ) -> Rendering:
-    """Blend the surfels' own colours by viewing direction, without materials or light.
+    """Blend the surfels' own view-dependent colours, without materials or light.
 
     Takes the arguments of `render`, but ignores `environment`, `settings`, `occluder` and `exposure`. Colours are sRGB-encoded.
     """

@@ -15,9 +15,8 @@ def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirec
 
     - normal, albedo; no more than these if `settings.reflection` is "none"
     - metallic, roughness
-    - if `settings.diffuse` is "sh": colour by viewing direction; otherwise, with `indirect`: irradiance divided by that of an unoccluded
-      surface
-    - with `indirect`: radiance from the object itself in the mirror direction
+    - if `settings.diffuse` is "sh": view-dependent colour; otherwise, with `indirect`: irradiance divided by that of an unoccluded surface
+    - with `indirect`: radiance that comes from the object itself in the mirror direction
     - position
     """
     normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)

@@ -1,4 +1,4 @@
-"""Evaluate the colour of surfels by viewing direction."""
+"""Evaluate the view-dependent colours of surfels."""
 
 import torch
 from torch import Tensor

@@ -162,7 +162,8 @@ def _blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: n
 def relit(transport: Transport, light: Environment, bounces: int = BOUNCES) -> Surfels:
     """Return the surfels relit by `light`: with new `sh` (diffuse colour) and `indirect` (radiance from the object itself).
 
-    `transport` holds the surfels' traced rays. Render the result with the setting diffuse = "sh" and with the occluder of `transport`.
+    `transport` holds the surfels' traced rays. `bounces` counts the reflections between parts of the object. Render the result with the
+    setting diffuse = "sh" and with the occluder of `transport`.
     """
     received, indirect = _gather(transport, light, bounces)
     sh = _diffuse_harmonics(transport.surfels, transport.normals, received)
@@ -267,7 +268,7 @@ def _past_the_object(transport: Transport, light: Environment) -> Tensor:
 
 
 def _diffuse_harmonics(surfels: Surfels, normals: Tensor, received: Tensor) -> Tensor:
-    """Compute the diffuse colour by viewing direction as spherical harmonics (N, 16, 3), for colour = 0.5 + SH.
+    """Compute the view-dependent diffuse colour as spherical harmonics (N, 16, 3), for colour = 0.5 + SH.
 
     `received` (N, 3) is irradiance / π. A dielectric's surface transmits less light to its diffuse base at grazing angles. The colour
     depends only on the angle between normal n and direction d, so its harmonics follow from Σ_m Y_lm(n) Y_lm(d) = (2l + 1) / 4π P_l(n·d).

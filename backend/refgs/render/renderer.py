@@ -70,8 +70,8 @@ def render(
     `occluder` is the object's mesh, for reflections of the object in itself. Where it blocks a pixel's mirror direction, the pixel reflects
     the radiance that the surfels store for this (paper Eq. 9). Otherwise it reflects `environment`.
 
-    If the setting diffuse is "irradiance" and `surfels.sh_rest` is not empty, it is a residual: a colour by viewing direction that is added
-    to the picture, sRGB-encoded. It stands for what material and light cannot explain in the photos.
+    If the setting diffuse is "irradiance", `surfels.sh_rest` may hold a residual: a view-dependent colour, sRGB-encoded, that is added to
+    the picture. It stands for what material and light cannot explain in the photos.
     """
     method = method_of(settings)
     if method.draw is not None:

@@ -190,14 +190,14 @@ def shade(
     `features` (H, W, C) are sums over the surfels of each pixel, weighted as in `rasterize`, in this order:
 
     - normal in world space (3), albedo (3), metallic, roughness
-    - with `by_direction`: a colour by viewing direction (3), which replaces diffuse shading, as in the paper
+    - with `by_direction`: a view-dependent colour (3), which replaces diffuse shading, as in the paper
     - otherwise, with `visibility`: irradiance divided by that of an unoccluded surface (3)
     - with `visibility`: radiance from the object itself (3), which replaces the environment's where `visibility` is 0 (Eq. 9)
     - position (3)
 
     The other arguments change the shading:
 
-    - `visibility` (H, W): 0 where the object occludes the mirror direction, 1 where it does not, or between
+    - `visibility` (H, W): 0 where the object occludes the mirror direction, else 1; values between are allowed
     - `exposure`, a scalar, default 1: multiplies radiance before it is encoded
     - `display`: light and materials are display values in 0..1, so nothing is encoded
     - `mirror`: reflections are a sharp mirror image of the light, weighted by metallic (Ye et al., 3DGS-DR, 2024)
@@ -222,7 +222,7 @@ def shade_splats(features: Tensor, environment: Environment, camera: Camera, mir
     `features` (N, C) are, in this order:
 
     - normal in world space (3), albedo (3), metallic, roughness
-    - if C is 14: a colour by viewing direction (3), which replaces diffuse shading
+    - if C is 14: a view-dependent colour (3), which replaces diffuse shading
     - position (3)
 
     If C is 6 they are normal and albedo only, and shading is diffuse. With `mirror`, reflections are a sharp mirror image of the light.

@@ -76,13 +76,13 @@ def flatten(values: object, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 
 def in_words(metrics: dict, figures: list[Quantity]) -> list[str]:
-    """Format those of `figures` that `metrics` contains, each as its heading and its value."""
+    """Format metrics as text, such as "PSNR 24.31 dB". `figures` says which; those that `metrics` lacks are skipped."""
     known = dict(flatten(metrics))
     return [f"{heading} {text(known[key])}" for key, heading, text, _ in figures if key in known]
 
 
 def relit_pair(figures: dict[str, float], prefix: str) -> str:
-    """Format PSNR and FLIP of relit pictures as text, such as "24.10 / 26.30 dB, FLIP 0.081 / 0.072".
+    """Format PSNR and FLIP of pictures under another light as text, such as "24.10 / 26.30 dB, FLIP 0.081 / 0.072".
 
     The first of two numbers is "raw", the second "aligned": measured after the brightness was multiplied by the factor that fits best.
     `figures` maps dotted keys to numbers. `prefix` is the start of these keys, such as "relight.studio.mesh".
@@ -96,7 +96,7 @@ def relit_pair(figures: dict[str, float], prefix: str) -> str:
 
 
 def relit_in_words(metrics: dict) -> list[str]:
-    """Format PSNR and FLIP of relit pictures: a line for each light and each way of rendering (surfels, splats, mesh)."""
+    """Format PSNR and FLIP of pictures under other lights: a line for each light and each way of rendering (surfels, splats, mesh)."""
     known = dict(flatten(metrics))
     lit = [(hdri, kind) for hdri, kinds in metrics.get("relight", {}).items() for kind in kinds]
     return [

@@ -216,7 +216,7 @@ def _columns(pages: list[RunPage], figures: list[Quantity]) -> list[dict]:
 
 
 def _relit_table(pages: list[RunPage]) -> list[dict]:
-    """Make the table of PSNR and FLIP of relit pictures.
+    """Make the table of PSNR and FLIP of pictures under other lights.
 
     It has a row for each light and each way of rendering (surfels, splats, mesh), with a cell for each run.
     """
