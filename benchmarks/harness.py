@@ -104,13 +104,13 @@ def mean(values: Sequence[float | str | None]) -> float | None:
     return sum(values) / len(values) if values and all(isinstance(v, float | int) for v in values) else None
 
 
-class Way(NamedTuple):
-    """Describe one way to train: `words` are options of `refgs train`.
+class Variant(NamedTuple):
+    """Describe one variant of a training that a benchmark compares with others: its options of `refgs train`, and its time limit.
 
-    `minutes`, if given, limits the time. It is a number, or the name of another way: the limit is then the time that the other way took.
+    `minutes` is the limit, or the name of another variant: each scene is then trained for as long as that variant took.
     """
 
-    words: tuple[object, ...]
+    options: tuple[object, ...]
     minutes: float | str | None = None
 
 
@@ -131,23 +131,28 @@ class Bench:
             if value is not None:
                 self.rows.append(Row(self.name, scene, variant, figure, value, unit, *self.where))
 
-    def runs(self, ways: dict[str, Way]) -> Iterator[tuple[str, dict[str, Path]]]:
-        """Train and evaluate each scene in each way, in OUT/[PRESET/]WAY/SCENE.
+    def runs(self, variants: dict[str, Variant]) -> Iterator[tuple[str, dict[str, Path]]]:
+        """Train and evaluate each variant on each scene. A run's folder is OUT/[PRESET/]VARIANT/SCENE.
 
-        Yields the scene's name, and the folders of its successful runs by way. Raises InputError if `--ways` has a name
-        that no way has.
+        Yields a scene's name, and a dict from the names of variants to the folders of the scene's successful runs. Raises InputError if
+        `--variants` has an unknown name, or lacks a variant whose time limits another.
         """
         options = self.options
-        if unknown := [name for name in options.ways if name not in ways]:
-            raise InputError(f"--ways: no way is called {', '.join(unknown)}: there are {', '.join(ways)}")
+        chosen = options.variants or list(variants)
+        if unknown := [name for name in chosen if name not in variants]:
+            raise InputError(f"--variants: no variant is called {', '.join(unknown)}: there are {', '.join(variants)}")
+        for name in chosen:
+            other = variants[name].minutes
+            if isinstance(other, str) and other not in chosen:
+                raise InputError(f"--variants: {name} is trained for as long as {other}: add {other}")
         preset = getattr(options, "preset", "")
         if preset:
             load_settings(preset)  # report a wrong preset before anything is trained
         out = (options.out or clone_root() / "demo" / self.name) / Path(preset).stem
         for capture in find_scenes(options.scenes, options.only):
             done: dict[str, Path] = {}
-            for name, (words, minutes) in ways.items():
-                if options.ways and name not in options.ways:
+            for name, (words, minutes) in variants.items():
+                if name not in chosen:
                     continue
                 if isinstance(minutes, str):
                     if minutes not in done:
@@ -186,7 +191,7 @@ def scene_options(parser: argparse.ArgumentParser, preset: str | None = None) ->
     parser.add_argument("--scenes", type=Path, required=True, help="folder of captures by benchmarks.scenes")
     parser.add_argument("--out", type=Path, help="folder for the runs (default: demo/BENCHMARK)")
     parser.add_argument("--only", nargs="+", metavar="SCENE", help="measure these scenes")
-    parser.add_argument("--ways", nargs="+", default=[], metavar="WAY", help="train in these ways")
+    parser.add_argument("--variants", nargs="+", default=[], metavar="VARIANT", help="train only these variants")
     if preset:
         parser.add_argument("--preset", default=preset, help=f"a preset's name or a TOML file ({preset})")
     return parser

@@ -10,7 +10,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.harness import Bench, Column, Table, Way, figures, scene_options
+from benchmarks.harness import Bench, Column, Table, Variant, figures, scene_options
 from refgs.formats import history
 
 PRESETS = "quick", "standard"
@@ -59,15 +59,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]))
     parser.add_argument("--minutes", nargs="+", type=float, default=[2, 5, 10, 20])
     bench = Bench("minutes", parser, arguments)
-    ways = {name: Way(("--preset", name)) for name in PRESETS}
-    ways |= {f"{minutes:g} minutes": Way((), minutes) for minutes in bench.options.minutes}
-    for scene, runs in bench.runs(ways):
+    variants = {name: Variant(("--preset", name)) for name in PRESETS}
+    variants |= {f"{minutes:g} minutes": Variant((), minutes) for minutes in bench.options.minutes}
+    for scene, runs in bench.runs(variants):
         presets = {name: run for name, run in runs.items() if name in PRESETS}
-        for way, run in runs.items():
+        for variant, run in runs.items():
             seconds, psnr = course(run)[-1]
-            reached, preset = (None if way in PRESETS else best(presets, seconds)) or (None, None)
-            bench.record(scene, way, "s", seconds=seconds)
-            bench.record(scene, way, "", iterations=_lines(run)[-1]["iteration"], surfels=figures(run)["splats"])
-            bench.record(scene, way, "dB", psnr=psnr, best_preset=reached)
-            bench.record(scene, way, "", preset=preset)
+            reached, preset = (None if variant in PRESETS else best(presets, seconds)) or (None, None)
+            bench.record(scene, variant, "s", seconds=seconds)
+            bench.record(scene, variant, "", iterations=_lines(run)[-1]["iteration"], surfels=figures(run)["splats"])
+            bench.record(scene, variant, "dB", psnr=psnr, best_preset=reached)
+            bench.record(scene, variant, "", preset=preset)
     bench.finish(*TABLES)

@@ -11,7 +11,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.harness import Bench, Column, Table, Way, figures, relit, scene_options
+from benchmarks.harness import Bench, Column, Table, Variant, figures, relit, scene_options
 from refgs.settings import NeedsSettings
 
 ON, AUTO, OFF = "all on", "auto", "no reflections"
@@ -64,16 +64,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]), preset="quick")
     bench = Bench("needs", parser, arguments)
     preset = ("--preset", bench.options.preset)
-    ways = {way: Way((*preset, *(word for c in changes for word in ("--set", c)))) for way, changes in CHANGES.items()}
-    for scene, runs in bench.runs(ways):
+    variants = {
+        variant: Variant((*preset, *(word for c in changes for word in ("--set", c))))
+        for variant, changes in CHANGES.items()
+    }
+    for scene, runs in bench.runs(variants):
         everything = figures(runs[ON])["processor_seconds"] if ON in runs else None
-        for way, run in runs.items():
+        for variant, run in runs.items():
             found = figures(run)
             seconds = found["processor_seconds"]
-            bench.record(scene, way, "s", seconds=seconds)
-            bench.record(scene, way, "", times_as_fast=everything and everything / seconds, left_out=left_out(run))
-            bench.record(scene, way, "%", deciding=deciding(run))
-            bench.record(scene, way, "dB", psnr=found["psnr"], relit_aligned=relit(found, "psnr_aligned"))
-            bench.record(scene, way, "°", normals=found.get("normal_mae_degrees"))
-            bench.record(scene, way, "GB", memory=found.get("peak_memory_bytes", 0) / 1e9)
+            bench.record(scene, variant, "s", seconds=seconds)
+            bench.record(scene, variant, "", times_as_fast=everything and everything / seconds, left_out=left_out(run))
+            bench.record(scene, variant, "%", deciding=deciding(run))
+            bench.record(scene, variant, "dB", psnr=found["psnr"], relit_aligned=relit(found, "psnr_aligned"))
+            bench.record(scene, variant, "°", normals=found.get("normal_mae_degrees"))
+            bench.record(scene, variant, "GB", memory=found.get("peak_memory_bytes", 0) / 1e9)
     bench.finish(*TABLES)

@@ -19,8 +19,8 @@ what they mean. No CUDA card has been measured yet; `refgs bench gpu` does that.
 SECTIONS = (
     (
         "Where the truth is known",
-        """`refgs bench truth --scenes DIR --preset quick --ways deferred`: 100 photos of 256×256 and 8 held-out views, rendered by Cycles;
-3,000 iterations, one scene on each of two cores. Relit and light are compared with Cycles and the true panorama. Base colour and
+        """`refgs bench truth --scenes DIR --preset quick --variants deferred`: 100 photos of 256×256 and 8 held-out views, rendered by
+Cycles; 3,000 iterations, one scene on each of two cores. Relit and light are compared with Cycles and the true panorama. Base colour and
 "aligned" are after one scale a channel. The mean is of the reflective scenes. [The notebook](notebook/scenes.md) has the preset
 `standard`, and colour by direction.""",
         truth.TABLES,

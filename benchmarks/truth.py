@@ -7,7 +7,7 @@ colour (`shading=sh`), to compare the quality of novel views.
 import argparse
 from collections.abc import Sequence
 
-from benchmarks.harness import Bench, Column, Table, Way, figures, relit, scene_options
+from benchmarks.harness import Bench, Column, Table, Variant, figures, relit, scene_options
 from benchmarks.scenes import REFLECTIVE
 
 TABLES = (
@@ -37,21 +37,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]), preset="standard")
     bench = Bench("truth", parser, arguments)
     preset = ("--preset", bench.options.preset)
-    ways = {"deferred": Way(preset), "sh": Way((*preset, "--set", "shading=sh"), "deferred")}
-    for scene, runs in bench.runs(ways):
-        for way, run in runs.items():
-            record(bench, scene, way, figures(run))
+    variants = {"deferred": Variant(preset), "sh": Variant((*preset, "--set", "shading=sh"), "deferred")}
+    for scene, runs in bench.runs(variants):
+        for variant, run in runs.items():
+            record(bench, scene, variant, figures(run))
     bench.finish(*TABLES)
 
 
-def record(bench: Bench, scene: str, way: str, found: dict) -> None:
+def record(bench: Bench, scene: str, variant: str, found: dict) -> None:
     """Add a run's figures to the rows. `found` is its metrics.json.
 
     A run with plain view-dependent colour has no figures of materials and light.
     """
-    bench.record(scene, way, "dB", psnr=found["psnr"], albedo=found.get("albedo", {}).get("psnr_aligned"))
-    bench.record(scene, way, "dB", relit=relit(found, "psnr_raw"), relit_aligned=relit(found, "psnr_aligned"))
-    bench.record(scene, way, "°", normals=found.get("normal_mae_degrees"))
-    bench.record(scene, way, "", ssim=found.get("ssim"), light=found.get("environment", {}).get("log_rmse"))
-    bench.record(scene, way, "", roughness=found.get("roughness_mae"), metallic=found.get("metallic_mae"))
-    bench.record(scene, way, "s", seconds=found.get("processor_seconds"))
+    bench.record(scene, variant, "dB", psnr=found["psnr"], albedo=found.get("albedo", {}).get("psnr_aligned"))
+    bench.record(scene, variant, "dB", relit=relit(found, "psnr_raw"), relit_aligned=relit(found, "psnr_aligned"))
+    bench.record(scene, variant, "°", normals=found.get("normal_mae_degrees"))
+    bench.record(scene, variant, "", ssim=found.get("ssim"), light=found.get("environment", {}).get("log_rmse"))
+    bench.record(scene, variant, "", roughness=found.get("roughness_mae"), metallic=found.get("metallic_mae"))
+    bench.record(scene, variant, "s", seconds=found.get("processor_seconds"))

@@ -107,22 +107,30 @@ def test_what_fails_does_not_stop_the_others(words, monkeypatch, capsys):
 
 
 def test_what_scenes_do_without(words, called, tmp_path, capsys):
-    needs.main([*words, "--ways", "all on", "auto"])
+    needs.main([*words, "--variants", "all on", "auto"])
     found = {r[1:4]: r.value for r in harness.read(tmp_path / "a.csv")}
     assert found["ball", "auto", "times_as_fast"] == 1 and found["ball", "auto", "left_out"] == "specular"
     assert found["ball", "auto", "deciding"] == 2
 
 
-@pytest.mark.parametrize("way", needs.CHANGES)
-def test_ways_are_valid_settings(way):
-    changed = load_settings("quick", [*needs.CHANGES[way]]) != load_settings("quick")
-    assert changed == (way != needs.AUTO)
+@pytest.mark.parametrize("variant", needs.CHANGES)
+def test_variants_are_valid_settings(variant):
+    changed = load_settings("quick", [*needs.CHANGES[variant]]) != load_settings("quick")
+    assert changed == (variant != needs.AUTO)
 
 
-def test_an_unknown_way_is_said(words, called):
-    with pytest.raises(InputError, match="no way is called sideways: there are deferred, sh"):
-        truth.main([*words, "--ways", "deferred", "sideways"])
+def test_an_unknown_variant_is_said(words, called):
+    with pytest.raises(InputError, match="no variant is called sideways: there are deferred, sh"):
+        truth.main([*words, "--variants", "deferred", "sideways"])
     assert not called
+
+
+def test_a_variant_needs_the_one_whose_time_limits_it(words, called):
+    with pytest.raises(InputError, match="--variants: sh is trained for as long as deferred: add deferred"):
+        truth.main([*words, "--variants", "sh"])
+    assert not called
+    truth.main([*words, "--variants", "sh", "deferred"])
+    assert [call[-1] for call in called if call[0] == "train"] == ["standard", "1.5"] * 2
 
 
 def test_no_scene_is_said(scenes):
