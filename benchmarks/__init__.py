@@ -1,3 +1,6 @@
-"""Measure RefGS in a copy of its repository: `refgs bench`, `refgs stability`, and scenes with ground truth."""
+"""Measure the speed, the quality and the numerical stability of RefGS: `refgs bench` and `refgs stability`.
+
+Both commands need a clone of the repository. `benchmarks.scenes` renders test scenes whose true shape, materials and light are known.
+"""
 
 BENCHMARKS = ("kernels", "truth", "paper", "needs", "minutes", "gpu", "page")

@@ -8,7 +8,10 @@ from refgs.errors import InputError
 
 
 def main(what: str = "", *options: str) -> None:
-    """Run a benchmark with its own options. Raise InputError with a list of the benchmarks if the name is unknown."""
+    """Run the benchmark that is called `what`, with its `options`.
+
+    Raise InputError if there is no such benchmark. The message lists all benchmarks.
+    """
     if what not in BENCHMARKS:
         raise InputError(f"no benchmark {what!r}: take one of {', '.join(BENCHMARKS)}")
     importlib.import_module(f"benchmarks.{what}").main(options)

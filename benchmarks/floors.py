@@ -1,7 +1,7 @@
-"""Compute floors: the least time that each part of the program can take on this machine.
+"""Compute the floor of each kernel: the least time that the kernel could take on this machine.
 
-A part needs operations, which are counted by hand from the kernels' formulas. It also needs to move every input and output once between
-memory and processor. The floor is the longer of the two times.
+The cost of a kernel has two parts. Its arithmetic operations are counted by hand from its formulas. Its bytes are all inputs and outputs,
+each moved once between memory and processor. Either part takes a least time; the floor is the longer of both.
 """
 
 import math
@@ -24,33 +24,33 @@ SSIM_OPERATIONS = 208 + 123
 SHADING_OPERATIONS = 410 + 1000
 
 
-class Need(NamedTuple):
-    """Hold how many operations a part of the program does, and how many bytes it moves."""
+class Cost(NamedTuple):
+    """Hold the cost of a kernel: its arithmetic operations, and the bytes that it moves."""
 
     operations: float
     bytes: float
 
 
 class Machine(NamedTuple):
-    """Hold how many operations and bytes a second a machine can do at most."""
+    """Hold the peak speed of a machine: operations and bytes per second."""
 
     operations: float
     bytes: float
 
     @classmethod
     def measured(cls, device: torch.device = torch.device("cpu")) -> "Machine":  # noqa: B008  it never changes
-        """Measure how many operations and bytes a second this machine can do at most."""
+        """Measure the peak speed of this machine, on the CPU or on a GPU."""
         return cls(arithmetic(device=device), bandwidth(device=device))
 
-    def floor(self, need: Need) -> float:
-        """Compute the least time in milliseconds for a part's operations and bytes."""
-        return 1e3 * max(need.operations / self.operations, need.bytes / self.bytes)
+    def floor(self, cost: Cost) -> float:
+        """Compute the least time, in milliseconds, in which this machine can do work of this cost."""
+        return 1e3 * max(cost.operations / self.operations, cost.bytes / self.bytes)
 
 
 def covered_pairs(surfels: list[torch.Tensor], camera: Camera) -> float:
-    """Estimate how many pixels each surfel covers, summed over the surfels of a unit ball.
+    """Estimate in how many pairs of a surfel and a pixel the surfel covers the pixel. The surfels lie on a unit ball.
 
-    The sum is the projected area, in pixels, of the surfels that face the camera.
+    Only surfels that face the camera count. The estimate is the sum of their projected areas in pixels.
     """
     positions, _, scales, opacities, _ = (v.detach().double() for v in surfels)
     towards = torch.from_numpy(camera.position).to(positions) - positions
@@ -62,33 +62,34 @@ def covered_pairs(surfels: list[torch.Tensor], camera: Camera) -> float:
     return float((math.pi * reach * scales.prod(dim=1) * cosine * camera.fx * camera.fy / depth**2).sum())
 
 
-def raster(surfels: list[torch.Tensor], camera: Camera) -> tuple[Need, Need]:
-    """Count the rasteriser's operations and bytes for surfels of a unit ball, for the forward pass and for the backward pass."""
+def raster(surfels: list[torch.Tensor], camera: Camera) -> tuple[Cost, Cost]:
+    """Return the rasteriser's cost for one forward pass, and for one backward pass. The surfels lie on a unit ball."""
     pixels, channels = camera.width * camera.height, surfels[-1].shape[1]
     given, maps, pairs = sum(v.nbytes for v in surfels), 4 * pixels * (channels + 2), covered_pairs(surfels, camera)
-    forward = Need(pairs * (FORWARD_OPERATIONS + CHANNEL_OPERATIONS[0] * channels), given + maps)
-    return forward, Need(pairs * (BACKWARD_OPERATIONS + CHANNEL_OPERATIONS[1] * channels), 2 * given + 2 * maps)
+    forward = Cost(pairs * (FORWARD_OPERATIONS + CHANNEL_OPERATIONS[0] * channels), given + maps)
+    return forward, Cost(pairs * (BACKWARD_OPERATIONS + CHANNEL_OPERATIONS[1] * channels), 2 * given + 2 * maps)
 
 
-def ssim(pixels: int) -> Need:
-    """Count the operations and bytes of D-SSIM and its derivative, for two images of three channels."""
-    return Need(3 * pixels * SSIM_OPERATIONS, 3 * pixels * 4 * 3)
+def ssim(pixels: int) -> Cost:
+    """Return the cost of D-SSIM and its gradient, for two images of three channels."""
+    return Cost(3 * pixels * SSIM_OPERATIONS, 3 * pixels * 4 * 3)
 
 
-def shading(covered: int, pixels: int) -> Need:
-    """Count the operations and bytes of deferred shading, forward and backward.
+def shading(covered: int, pixels: int) -> Cost:
+    """Return the cost of deferred shading, forward and backward together.
 
-    For each of the `pixels`, shading reads eleven channels and alpha twice, writes their derivatives, writes fourteen numbers and reads
-    eleven derivatives. Operations are only needed for the `covered` pixels.
+    Operations are needed only in `covered`, the number of pixels that show a surface. Bytes are moved for all `pixels`.
     """
-    return Need(covered * SHADING_OPERATIONS, 4 * pixels * (3 * 12 + 14 + 11))
+    # Eleven channels and alpha are read twice, and their derivatives are written; fourteen numbers are written, eleven derivatives read.
+    return Cost(covered * SHADING_OPERATIONS, 4 * pixels * (3 * 12 + 14 + 11))
 
 
-def prefiltering(side: int) -> Need:
-    """Count the operations and bytes of prefiltering a cubemap of 6·side² texels, forward and backward.
+def prefiltering(side: int) -> Cost:
+    """Return the cost of prefiltering a cubemap of 6·side² texels, forward and backward together.
 
-    Each pass reads the filter's matrix once, and uses each of its numbers for all symmetries of the cubemap.
+    The filter is a sparse matrix. Because a cube is symmetric, only a part of its entries is stored. Each pass reads every stored entry
+    once and uses it SYMMETRIES times.
     """
     numbers = matrices(side, torch.device("cpu"))[0].numbers.numel()
     texels = 6 * sum(s * s for s in level_sides(side))
-    return Need(2 * 2 * 3 * SYMMETRIES * numbers, 2 * (8 * numbers + 4 * 3 * texels))
+    return Cost(2 * 2 * 3 * SYMMETRIES * numbers, 2 * (8 * numbers + 4 * 3 * texels))

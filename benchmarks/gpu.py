@@ -1,9 +1,11 @@
-"""Measure a CUDA card in one go: `refgs bench gpu`.
+"""Measure the speed of RefGS on an NVIDIA GPU: `refgs bench gpu`.
 
-Four things are timed. The rasteriser draws the ball of `benchmarks.kernels` at three sizes, forward and backward; its times are shown
-beside its floors (the least possible times), and beside gsplat's 2DGS if gsplat is installed. The renderer draws whole frames. One
-iteration is timed kernel by kernel. A scene of 100 views with ground truth is trained by the presets `standard` and `paper`. Every
-measurement waits until the card has finished.
+Four things are measured:
+- the rasteriser, forward and backward, at three sizes. Its times are compared with its floors (the least possible times), and with gsplat's
+  2DGS if gsplat is installed;
+- rendering a whole frame;
+- one training iteration, and each kernel in it;
+- training a scene of 100 photos with the presets `standard` and `paper`: time and quality.
 """
 
 import argparse
@@ -75,7 +77,7 @@ def synchronise(device: torch.device) -> None:
 
 
 def milliseconds(step: Callable[[], object], device: torch.device, rounds: int = ROUNDS) -> list[float]:
-    """Time each round of a step in milliseconds, after some rounds to warm up."""
+    """Call `step` repeatedly; return the milliseconds of each of `rounds` calls. WARM earlier calls are not timed."""
     times = []
     for i in range(WARM + rounds):
         synchronise(device)
@@ -88,7 +90,10 @@ def milliseconds(step: Callable[[], object], device: torch.device, rounds: int =
 
 
 def make_ball(splats: int, width: int, height: int, device: torch.device) -> tuple[list[torch.Tensor], Camera]:
-    """Make the ball of `benchmarks.kernels`, and a camera with an image of this size."""
+    """Make surfels on a unit ball (see `benchmarks.kernels.ball`), and a camera that looks at it.
+
+    The camera's image has `width` × `height` pixels. The surfels' tensors are on `device`.
+    """
     surfels, camera = ball(splats, min(width, height), CHANNELS)
     camera = Camera(camera.name, width, height, camera.fx, camera.fy, width / 2, height / 2, camera.world_to_camera)
     return [v.to(device) for v in surfels], camera
@@ -97,7 +102,10 @@ def make_ball(splats: int, width: int, height: int, device: torch.device) -> tup
 def gsplat_step(
     surfels: list[torch.Tensor], camera: Camera, upstream: list[torch.Tensor]
 ) -> Callable[[], object] | None:
-    """Return a function that renders forward and backward by gsplat's `rasterization_2dgs`; None if gsplat is missing."""
+    """Return a function that renders the surfels with gsplat's `rasterization_2dgs`, and computes their gradients.
+
+    `upstream` are the gradients of the rendered images. Return None if gsplat is not installed.
+    """
     try:
         from gsplat import rasterization_2dgs
     except ImportError:
@@ -120,7 +128,10 @@ def gsplat_step(
 def measure_raster(
     bench: Bench, device: torch.device, sizes: Sequence[tuple[int, int, int]] = SIZES, rounds: int = ROUNDS
 ) -> None:
-    """Record the rasteriser's times at each size, beside its floors (the least possible times) and gsplat's times."""
+    """Time the rasteriser, and gsplat if it is installed, for each of `sizes`: number of surfels, width and height of the image.
+
+    Add the median times, and the rasteriser's floors (the least possible times), to the rows of `bench`.
+    """
     machine = Machine.measured(device)
     for splats, width, height in sizes:
         surfels, camera = make_ball(splats, width, height, device)
@@ -142,9 +153,9 @@ def measure_raster(
         if peer := gsplat_step(inputs, camera, upstream):
             steps["gsplat"] = peer
         times = {name: statistics.median(milliseconds(step, device, rounds)) for name, step in steps.items()}
-        needs = raster(inputs, camera)
-        by_bytes = 1e3 * sum(need.bytes for need in needs) / machine.bytes
-        by_operations = 1e3 * sum(need.operations for need in needs) / machine.operations
+        costs = raster(inputs, camera)
+        by_bytes = 1e3 * sum(cost.bytes for cost in costs) / machine.bytes
+        by_operations = 1e3 * sum(cost.operations for cost in costs) / machine.operations
         size = f"{splats:,} surfels, {width}×{height}"
         bench.record(size, RASTER, "ms", **times, by_bytes=by_bytes, by_operations=by_operations)
 
@@ -152,7 +163,7 @@ def measure_raster(
 def measure_frames(
     bench: Bench, device: torch.device, splats: int = FRAMES[0], side: int = FRAMES[1], rounds: int = 100
 ) -> None:
-    """Record the time of a whole frame, with deferred shading."""
+    """Time the rendering of a whole frame with deferred shading. Add the least and the median time to the rows of `bench`."""
     (positions, rotations, scales, opacities, _), camera = make_ball(splats, side, side, device)
     one = torch.ones(splats, device=device)
     none = [torch.zeros(splats, count, 3, device=device) for count in (1, 0)]
@@ -167,7 +178,7 @@ def measure_frames(
 
 
 def measure_iteration(bench: Bench, device: torch.device, rounds: int = ROUNDS) -> None:
-    """Record the time of a training iteration with deferred shading, and of each kernel in it."""
+    """Time a training iteration with deferred shading, and on a GPU each kernel in it. Add the times to the rows of `bench`."""
     with TemporaryDirectory() as folder:
         trainer = make_trainer(Path(folder), device.type)
         times = milliseconds(trainer.step, device, rounds)
@@ -186,7 +197,10 @@ def measure_iteration(bench: Bench, device: torch.device, rounds: int = ROUNDS) 
 
 
 def measure_trainings(bench: Bench, device: torch.device, folder: Path) -> None:
-    """Train a scene by the presets `standard` and `paper`, and record times and quality. Render its capture if that is missing."""
+    """Train a scene with the presets `standard` and `paper`. Add the times and the quality to the rows of `bench`.
+
+    The scene's photos are rendered into `folder` first, if they are not there yet.
+    """
     name, side, views = SCENE
     capture = folder / f"{name}-{side}"
     if not capture.exists():
@@ -205,7 +219,7 @@ def measure_trainings(bench: Bench, device: torch.device, folder: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run all measurements; exit with status 2 if there is no card."""
+    """Run all measurements; exit with status 2 if there is no usable GPU."""
     bench = Bench("gpu", argparse.ArgumentParser(description=__doc__.splitlines()[0]), arguments)
     if why := cuda.unusable():
         console.print(f"no figures of a card from here: {why}")

@@ -1,7 +1,8 @@
-"""Run benchmarks: find scenes, train on them, record measured figures as rows, print tables of the rows.
+"""Provide what all benchmarks share: they train on scenes, collect measured values as rows, and print tables of the rows.
 
-A benchmark trains only runs that do not exist yet. Beside each new figure, its tables show in brackets the earlier figure from
-docs/measurements.csv. `--csv FILE` writes the rows. `refgs bench page` makes docs/measurements.md from docs/measurements.csv.
+A run that exists already is not trained again. docs/measurements.csv keeps the values of earlier measurements: tables show them in brackets
+beside the new values. `--csv FILE` writes the new rows into a file. `refgs bench page` makes docs/measurements.md from
+docs/measurements.csv.
 """
 
 import argparse
@@ -31,7 +32,10 @@ console = Console(soft_wrap=True, width=None if sys.stdout.isatty() else 200)  #
 
 
 class Row(NamedTuple):
-    """Hold one measured figure, a row of the CSV. `value` is a number, or a word such as the name of a preset."""
+    """Hold one measured value, which is one row of the CSV. `figure` names what was measured, such as "psnr".
+
+    `value` is a number, or a word such as the name of a preset.
+    """
 
     benchmark: str
     scene: str
@@ -45,9 +49,9 @@ class Row(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Describe a column of a table: its heading, its figure and the number's format.
+    """Describe a column of a table. It shows the measured quantity `figure` under a `heading`, with its numbers formatted by `form`.
 
-    If `variant` is given, the column shows that variant's figure. If `variant` is None, each line shows the figure of its own variant.
+    If `variant` is given, the column shows the values of that variant. If not, each line of the table shows its own variant's value.
     """
 
     heading: str
@@ -57,7 +61,10 @@ class Column(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Describe a table: a line for each scene, or for each scene and variant. The last line is the mean over the scenes in `mean`."""
+    """Describe a table. It has one line for each scene, or one for each pair of scene and variant.
+
+    `line` and `variant` are the headings of the first columns. A last line shows the means over those scenes that `mean` names.
+    """
 
     title: str
     benchmark: str
@@ -67,9 +74,9 @@ class Table(NamedTuple):
     mean: tuple[str, ...] = ()
 
     def lines(self, rows: Sequence[Row], kept: Sequence[Row] = ()) -> list[list[str]]:
-        """List the table's lines, headings first. Lines and columns without figures are left out.
+        """Return the table as a list of lines, each a list of cells. The first line has the headings.
 
-        `kept` are earlier figures, which are shown in brackets.
+        `kept` are rows of earlier measurements, whose values are shown in brackets. Lines and columns without values are left out.
         """
         found, before = ({r[1:4]: r.value for r in some if r.benchmark == self.benchmark} for some in (rows, kept))
         lines = dict.fromkeys(
@@ -100,7 +107,10 @@ def _cell(value: float | str | None, kept: float | str | None, form: str) -> str
 
 
 def mean(values: Sequence[float | str | None]) -> float | None:
-    """Average the values. Return None if one is missing or is a word: columns would then average different scenes."""
+    """Average the values. Return None if a value is missing or is a word.
+
+    A mean without the missing value would not be comparable with the means of other columns.
+    """
     return sum(values) / len(values) if values and all(isinstance(v, float | int) for v in values) else None
 
 
@@ -115,7 +125,7 @@ class Variant(NamedTuple):
 
 
 class Bench:
-    """Hold a running benchmark: its options, the rows measured so far, and the runs that failed."""
+    """Hold a benchmark while it runs: its command-line options, the rows measured so far, and the runs that failed."""
 
     def __init__(self, name: str, parser: argparse.ArgumentParser, arguments: Sequence[str] | None):
         parser.prog = f"refgs bench {name}"
@@ -126,7 +136,7 @@ class Bench:
         self.where = this_machine(), date.today().isoformat(), commit()
 
     def record(self, scene: str, variant: str, unit: str, **figures: float | str | None) -> None:
-        """Add figures of a scene and variant to the rows. Skip figures that are None, which were not measured."""
+        """Add measured values of a scene and variant to the rows. Values that are None are skipped."""
         for figure, value in figures.items():
             if value is not None:
                 self.rows.append(Row(self.name, scene, variant, figure, value, unit, *self.where))
@@ -187,7 +197,10 @@ class Bench:
 
 
 def scene_options(parser: argparse.ArgumentParser, preset: str | None = None) -> argparse.ArgumentParser:
-    """Add the options of a benchmark that trains scenes with ground truth."""
+    """Add the command-line options that benchmarks on scenes with ground truth share.
+
+    If `preset` is given, an option `--preset` is added, and `preset` is its default.
+    """
     parser.add_argument("--scenes", type=Path, required=True, help="folder of captures by benchmarks.scenes")
     parser.add_argument("--out", type=Path, help="folder for the runs (default: demo/BENCHMARK)")
     parser.add_argument("--only", nargs="+", metavar="SCENE", help="measure these scenes")
@@ -198,7 +211,10 @@ def scene_options(parser: argparse.ArgumentParser, preset: str | None = None) ->
 
 
 def find_scenes(folder: Path, only: list[str] | None = None) -> list[Path]:
-    """Find the captures in a folder; if `only` is given, only the captures with these names. Raise InputError if none is found."""
+    """Find the captures of test scenes in a folder. If `only` is given, return only captures with these names.
+
+    Raise InputError if none is found.
+    """
     found = [folder / name for name in NAMES if (folder / name / "ground_truth").is_dir()]
     if not found:
         raise InputError(f"{folder}: no scene is here: render them with python -m benchmarks.scenes all --out {folder}")
@@ -223,17 +239,17 @@ def call(*arguments: object) -> int:
 
 
 def train(
-    capture: Path, run: Path, words: Iterable[object], minutes: float | None = None, truth: Path | None = None
+    capture: Path, run: Path, options: Iterable[object], minutes: float | None = None, truth: Path | None = None
 ) -> bool:
-    """Train and evaluate a run; return True on success. Resume an interrupted run; skip a finished one.
+    """Train and evaluate a run; return True if both succeed. An interrupted run is resumed, a finished run is kept as it is.
 
-    `words` are options of `refgs train`; `truth` is the folder of ground truth.
+    `options` are options of `refgs train`, `minutes` is a time limit, and `truth` is the folder of ground truth for the evaluation.
     """
     if figures(run) is not None:
         return True
     if not (run / "splats.ply").exists():
         console.rule(str(run))
-        begun = ["--resume"] if (run / "run.toml").exists() else words
+        begun = ["--resume"] if (run / "run.toml").exists() else options
         limit = [] if minutes is None else ["--minutes", minutes]
         if call("train", capture, "--out", run, *begun, *limit) != 0:
             return False
@@ -241,7 +257,7 @@ def train(
 
 
 def figures(run: Path) -> dict | None:
-    """Read the held-out figures of a finished run; None if it is not finished."""
+    """Read a run's metrics.json, a dict of metrics on held-out views. Return None if the run is not finished."""
     try:
         found = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -249,25 +265,28 @@ def figures(run: Path) -> dict | None:
     return found if "psnr" in found and found.get("split") == "test" else None
 
 
-def relit(found: dict, figure: str) -> float | None:
-    """Average a figure over all lights with which a run was relit. `found` is the run's metrics.json."""
-    return mean([light.get("refgs", {}).get(figure) for light in found.get("relight", {}).values()])
+def relit(metrics: dict, name: str) -> float | None:
+    """Return the mean of one metric over all new lights under which a run was rendered.
+
+    `metrics` is the run's metrics.json, and `name` the metric's name.
+    """
+    return mean([light.get("refgs", {}).get(name) for light in metrics.get("relight", {}).values()])
 
 
 def this_machine() -> str:
-    """Describe this machine by the properties on which CPU times depend."""
+    """Describe the CPU of this machine: architecture, number of cores, and best instruction set."""
     return f"{platform.machine()}, {CORES} cores, {supported()[0]}"
 
 
 def commit() -> str:
-    """Return the commit that is measured."""
+    """Return the git commit of this program."""
     command = ["git", "describe", "--always", "--dirty", "--exclude", "*"]
     done = subprocess.run(command, cwd=clone_root(), capture_output=True, text=True)
     return done.stdout.strip()
 
 
 def read(path: Path) -> list[Row]:
-    """Read rows of a CSV."""
+    """Read all rows of a CSV file."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = [Row(**row) for row in csv.DictReader(file)]
     return [row._replace(value=_number(row.value)) for row in rows]
@@ -281,7 +300,7 @@ def _number(text: str) -> float | str:
 
 
 def write(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows into a CSV; replace old rows of the same benchmark, scene, variant and figure."""
+    """Write rows into a CSV file. An old row with the same benchmark, scene, variant and figure is replaced."""
     merged = {row[:4]: row for row in ([*read(path), *rows] if path.exists() else rows)}
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:

@@ -1,7 +1,7 @@
-"""Time a training iteration with deferred shading, part by part.
+"""Time a training iteration with deferred shading, and each part of it.
 
-The scene is made without Blender: 256×256 photos of a metal ball that fills most of the frame, 20,000 surfels on its visual hull. The
-parts are the functions that a training iteration calls.
+The parts are the functions that an iteration calls, such as rasteriser and losses. The photos show a metal ball and are computed without
+Blender: 256×256 pixels, of which the ball fills most. 20,000 surfels start on the ball's visual hull.
 """
 
 import refgs  # noqa: F401, I001  first: it sets how OpenMP's idle threads wait, which torch reads when it loads
@@ -34,17 +34,17 @@ def make_trainer(folder: Path, device: str = "cpu") -> Trainer:
 
 
 def measure() -> dict[str, list[float]]:
-    """Measure the seconds of each part of an iteration, and of a whole iteration, in each repeat."""
+    """Time REPEATS iterations. Return the seconds of each part and of the whole iteration, in lists with one number per iteration."""
     parts: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as folder:
         trainer = make_trainer(Path(folder))
         for _ in range(REPEATS):
-            _one(trainer, parts)
+            _time_parts(trainer, parts)
     return parts
 
 
-def _one(trainer: Trainer, rows: dict[str, list[float]]) -> None:
-    """Time the parts of one iteration, then one whole iteration. Add the seconds to `rows`."""
+def _time_parts(trainer: Trainer, rows: dict[str, list[float]]) -> None:
+    """Time each part of an iteration, then one whole iteration. Append the seconds to the lists in `rows`."""
     photo, settings, clock = trainer.state.photos[0], trainer.state.settings, time.perf_counter
 
     def record(name: str, since: float) -> float:

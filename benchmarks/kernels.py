@@ -80,7 +80,7 @@ def ball(splats: int = SPLATS, side: int = SIDE, channels: int = CHANNELS) -> tu
 
 
 def _time(*steps: Callable[[], None]) -> list[list[float]]:
-    """Run all steps one after the other, in several rounds. Return the milliseconds of each step in each round."""
+    """Run all steps one after the other, ROUNDS times. Return for each step a list of its milliseconds."""
     rounds = []
     for _ in range(ROUNDS + 3):
         stamps = [time.perf_counter()]
@@ -92,7 +92,7 @@ def _time(*steps: Callable[[], None]) -> list[list[float]]:
 
 
 def measure() -> dict[str, list[float]]:
-    """Time each kernel with the instruction set that REFGS_ISA names. Return each kernel's milliseconds, one number for each round."""
+    """Time each CPU kernel. Return for each a list of milliseconds. The environment variable REFGS_ISA names the instruction set."""
     surfels, camera = ball()
     detached = [v.clone() for v in surfels]
     inputs = [v.requires_grad_() for v in surfels]
@@ -145,27 +145,27 @@ def _prefilter(side: int) -> Callable[[], None]:
     return lambda: torch.autograd.grad(prefilter(radiance, side), radiance, upstream)
 
 
-def _needs() -> dict[str, floors.Need]:
-    """Count the operations and bytes of each kernel that has a floor (a least possible time)."""
+def _costs() -> dict[str, floors.Cost]:
+    """Count the arithmetic operations and the bytes of each kernel whose least possible time is computed."""
     surfels, camera = ball()
     forward, backward = floors.raster(surfels, camera)
     covered = int((rasterize(*surfels, camera, near=0.1).alpha > 1 / 255).sum())
-    needs = {"forward": forward, "backward": backward, "ssim": floors.ssim(SIDE * SIDE)}
-    needs["both"] = floors.Need(*(a + b for a, b in zip(forward, backward, strict=True)))
-    needs["shading"] = floors.shading(covered, SIDE * SIDE)
-    return needs | {f"prefilter {side}": floors.prefiltering(side) for side in (64, 128)}
+    costs = {"forward": forward, "backward": backward, "ssim": floors.ssim(SIDE * SIDE)}
+    costs["both"] = floors.Cost(*(a + b for a, b in zip(forward, backward, strict=True)))
+    costs["shading"] = floors.shading(covered, SIDE * SIDE)
+    return costs | {f"prefilter {side}": floors.prefiltering(side) for side in (64, 128)}
 
 
 def measure_all(bench: Bench, threads: int = THREADS) -> None:
-    """Record each kernel's times with each instruction set, and its floor (the least possible time)."""
+    """Time each kernel with each instruction set of this CPU. Add the times, and the least possible times, to the rows of `bench`."""
     before, chosen = torch.get_num_threads(), os.environ.get("REFGS_ISA")
     torch.set_num_threads(threads)
     try:
         for isa in load.supported():
             os.environ["REFGS_ISA"] = isa
-            times, machine, needs = measure(), floors.Machine.measured(), _needs()
+            times, machine, costs = measure(), floors.Machine.measured(), _costs()
             for step, name in STEPS.items():
-                floor = machine.floor(needs[step]) if step in needs else None
+                floor = machine.floor(costs[step]) if step in costs else None
                 least, median = min(times[step]), statistics.median(times[step])
                 bench.record(name, isa, "ms", least=least, median=median, floor=floor)
     finally:
@@ -176,7 +176,7 @@ def measure_all(bench: Bench, threads: int = THREADS) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Time the kernels, then an iteration with as many threads as a training uses."""
+    """Time the kernels and a training iteration, and print the tables."""
     bench = Bench("kernels", argparse.ArgumentParser(description=__doc__.splitlines()[0]), arguments)
     measure_all(bench)
     for part, seconds in iteration.measure().items():

@@ -1,4 +1,4 @@
-"""Measure what this machine can do at most: arithmetic and memory."""
+"""Measure the peak speed of this machine: arithmetic operations and memory traffic per second."""
 
 import time
 
@@ -15,9 +15,9 @@ _Peak = struct("Peak", "peak.cpp")
 
 
 def arithmetic(seconds: float = 0.5, device: torch.device = CPU) -> float:
-    """Measure floating-point operations a second, on torch's threads or a card.
+    """Measure how many floating-point operations per second this machine can do. Return the best of many runs.
 
-    Return the best of many runs; a multiply-add counts as two operations.
+    The CPU is measured with as many threads as torch uses. A multiply-add counts as two operations.
     """
     on_card = device.type == "cuda"
     launches = 20 if on_card else 1  # several launches, so that waiting for the card adds little
@@ -36,7 +36,10 @@ def arithmetic(seconds: float = 0.5, device: torch.device = CPU) -> float:
 
 
 def bandwidth(seconds: float = 0.5, device: torch.device = CPU) -> float:
-    """Measure bytes read and written a second, on torch's threads or a card, by copying more than the caches hold."""
+    """Measure how many bytes per second this machine can read and write, by copying more memory than fits into the caches.
+
+    The CPU is measured with as many threads as torch uses.
+    """
     source = torch.ones(64 << 20, device=device)
     target, best, started = source.clone(), 0.0, time.perf_counter()
     copies = 20 if device.type == "cuda" else 1

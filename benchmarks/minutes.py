@@ -1,8 +1,8 @@
-"""Measure the PSNR that a training reaches in a given time: `refgs bench minutes --scenes DIR`.
+"""Measure how good a training with a time limit is: `refgs bench minutes --scenes DIR`.
 
-Each scene is trained by the presets `quick` and `standard`, and with a time limit and no preset. The held-out PSNR of a time-limited run
-is compared with the best PSNR that a preset's run had reached by that time. Seconds are counted from
-the start of the command until the asset is written.
+Each scene is trained with time limits and no preset, and also with the presets `quick` and `standard`. The held-out PSNR of a run with a
+time limit is compared with the PSNR that the presets had reached in the same time. Seconds are counted from the start of the command until
+the result is written.
 """
 
 import argparse
@@ -32,7 +32,7 @@ TABLES = (
 
 
 def course(run: Path) -> list[tuple[float, float]]:
-    """List the seconds and held-out PSNR of each measurement of a run.
+    """Read how a run's held-out PSNR grew over time. Return a list of pairs: seconds, PSNR.
 
     Seconds include all that the command does before and after the iterations.
     """
@@ -42,9 +42,9 @@ def course(run: Path) -> list[tuple[float, float]]:
 
 
 def best(presets: dict[str, Path], seconds: float) -> tuple[float, str] | None:
-    """Find the best PSNR that any preset's run had reached within `seconds`. Return this PSNR and the preset's name.
+    """Find which preset had reached the best PSNR after a number of seconds. Return this PSNR and the preset's name.
 
-    `presets` maps the names of presets to run folders. The result is None if no run had been measured by then.
+    `presets` maps names of presets to run folders. Return None if no run has a PSNR from so early.
     """
     reached = [(psnr, name) for name, run in presets.items() for at, psnr in course(run) if at <= seconds]
     return max(reached, default=None)
@@ -55,7 +55,7 @@ def _lines(run: Path) -> list[dict]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train the missing runs; print the PSNR that each run reaches, and the time it takes."""
+    """Train the runs that are missing. Print the PSNR that each run reached, and the time that it took."""
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]))
     parser.add_argument("--minutes", nargs="+", type=float, default=[2, 5, 10, 20])
     bench = Bench("minutes", parser, arguments)

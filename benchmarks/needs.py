@@ -1,9 +1,8 @@
-"""Measure which parts of the method scenes do without, and how much time that saves: `refgs bench needs --scenes DIR`.
+"""Measure how much time it saves to leave out what a scene does not need: `refgs bench needs --scenes DIR`.
 
-A need is a part of the method that a scene may do without.
-
-Each scene is trained three times: with every need "auto" (decided by the photos), with every need on, and without inter-reflection.
-Seconds are processor time, which other programs hardly change.
+A "need" is an optional part of the method, such as inter-reflection. By default, a training decides from the photos which needs the scene
+has. Each scene is trained three times: with this default, with all needs switched on, and without inter-reflection. Seconds are CPU time,
+which other programs hardly change.
 """
 
 import argparse
@@ -48,19 +47,19 @@ TABLES = (
 
 
 def left_out(run: Path) -> str:
-    """List the parts of the method that a run left out, as one text."""
+    """Return the names of the optional parts that a run left out, separated by commas."""
     needs = json.loads((run / "needs.json").read_text(encoding="utf-8"))
     return ", ".join(need["need"] for need in needs if not need.get("needed", True))
 
 
 def deciding(run: Path) -> float:
-    """Compute the percentage of a run's seconds spent on deciding what the scene needs."""
+    """Return which percentage of a run's seconds was spent on deciding which optional parts the scene needs."""
     last = json.loads((run / "history.jsonl").read_text(encoding="utf-8").splitlines()[-1])
     return 100 * last["parts"].get("deciding", 0.0) / last["seconds"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train the missing runs; print the time that leaving out parts of the method saves, and the quality that it costs."""
+    """Train the runs that are missing. Print how much time was saved by leaving out optional parts, and how much quality was lost."""
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]), preset="quick")
     bench = Bench("needs", parser, arguments)
     preset = ("--preset", bench.options.preset)

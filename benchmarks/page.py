@@ -47,7 +47,7 @@ An iteration is of the deferred stage.""",
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """Make the Markdown page from these rows."""
+    """Make the text of docs/measurements.md from rows of docs/measurements.csv."""
     machines, dates = ", ".join(sorted({row.machine for row in rows})), sorted({row.date for row in rows})
     parts = [HEAD.format(machine=machines, date=" to ".join(dict.fromkeys((dates[0], dates[-1]))))]
     for title, text, tables in SECTIONS:

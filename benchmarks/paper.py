@@ -1,11 +1,11 @@
-"""Measure the scenes of the paper's tables with today's program: `refgs bench paper --data DIR`.
+"""Train on the data sets of the paper that RefGS implements, and compare with its tables: `refgs bench paper --data DIR`.
 
 DIR holds the published data sets as they are downloaded; some may be missing. The scenes' folders are `shiny_blender/SCENE`,
 `ref_real/SCENE`, `nerf_synthetic/SCENE` and `glossy_synthetic/SCENE`. Glossy Synthetic may be in NeRO's format, with
 `synthetic_split_128.pkl` beside the scenes, or in NeRF-Blender's format, where folders may be named SCENE_blender.
 
-Each scene is trained on its training views at the photos' size, and evaluated on its test views. Real scenes use the usual reduced
-photos: `images_8` for the sedan, `images_4` for the others. Runs lie in OUT/PRESET/DATA SET/SCENE.
+Each scene is trained on its training views at the photos' size, and evaluated on its test views. Real scenes use the usual reduced photos:
+`images_8` for the sedan, `images_4` for the others. The run folders are OUT/PRESET/DATA SET/SCENE.
 """
 
 import argparse
@@ -26,7 +26,7 @@ FORMS = {"psnr": ("PSNR", ".2f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".
 
 
 class Scene(NamedTuple):
-    """Hold a scene of the paper that was found on this disk: the data set's key, the scene's name, and the folder to train on."""
+    """Describe a scene of the paper that was found on this disk: its data set, its name, and the folder to train on."""
 
     data_set: str
     name: str
@@ -55,7 +55,7 @@ def find_scenes(data: Path) -> list[Scene]:
 
 
 def tables() -> list[Table]:
-    """Lay out the paper's Tables 1, 8 and 2, with the paper's figures beside ours."""
+    """Describe the tables to print: the paper's Tables 1, 8 and 2, each with our values beside the paper's."""
     result = []
     for key, data_set in PAPER.items():
         columns = [
@@ -70,12 +70,12 @@ def tables() -> list[Table]:
     return [*result, Table(title, "paper", columns, mean=mean)]
 
 
-def record(bench: Bench, scene: Scene, found: dict) -> None:
-    """Add a scene's figures to the rows. `found` is its run's metrics.json."""
-    seconds = found.get("training_seconds")
-    bench.record(scene.name, scene.data_set, "dB", psnr=found["psnr"])
-    bench.record(scene.name, scene.data_set, "", ssim=found.get("ssim"), lpips=found.get("lpips"))
-    bench.record(scene.name, scene.data_set, "°", normals=found.get("normal_mae_degrees"))
+def record(bench: Bench, scene: Scene, metrics: dict) -> None:
+    """Add a scene's metrics, and the paper's values, to the rows of `bench`. `metrics` is the run's metrics.json."""
+    seconds = metrics.get("training_seconds")
+    bench.record(scene.name, scene.data_set, "dB", psnr=metrics["psnr"])
+    bench.record(scene.name, scene.data_set, "", ssim=metrics.get("ssim"), lpips=metrics.get("lpips"))
+    bench.record(scene.name, scene.data_set, "°", normals=metrics.get("normal_mae_degrees"))
     bench.record(scene.name, scene.data_set, "h", hours=None if seconds is None else seconds / 3600)
     theirs = PAPER[scene.data_set]
     place = theirs["scenes"].index(scene.name)
@@ -83,7 +83,7 @@ def record(bench: Bench, scene: Scene, found: dict) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure the scenes that were found and print the tables; exit with status 1 if a scene failed."""
+    """Train on all scenes that are found, and print the tables. Exit with status 1 if a scene failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, required=True, help="folder with shiny_blender/SCENE and so on")
     parser.add_argument("--out", type=Path, help="folder for the runs (default: demo/paper)")

@@ -33,7 +33,7 @@ TABLES = (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train the missing runs; print the errors of each scene against the ground truth."""
+    """Train the runs that are missing. Print the errors of each scene against its ground truth."""
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]), preset="standard")
     bench = Bench("truth", parser, arguments)
     preset = ("--preset", bench.options.preset)
@@ -44,14 +44,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     bench.finish(*TABLES)
 
 
-def record(bench: Bench, scene: str, variant: str, found: dict) -> None:
-    """Add a run's figures to the rows. `found` is its metrics.json.
+def record(bench: Bench, scene: str, variant: str, metrics: dict) -> None:
+    """Add a run's metrics to the rows of `bench`. `metrics` is the run's metrics.json.
 
-    A run with plain view-dependent colour has no figures of materials and light.
+    A run with plain view-dependent colour has no metrics of materials and light.
     """
-    bench.record(scene, variant, "dB", psnr=found["psnr"], albedo=found.get("albedo", {}).get("psnr_aligned"))
-    bench.record(scene, variant, "dB", relit=relit(found, "psnr_raw"), relit_aligned=relit(found, "psnr_aligned"))
-    bench.record(scene, variant, "°", normals=found.get("normal_mae_degrees"))
-    bench.record(scene, variant, "", ssim=found.get("ssim"), light=found.get("environment", {}).get("log_rmse"))
-    bench.record(scene, variant, "", roughness=found.get("roughness_mae"), metallic=found.get("metallic_mae"))
-    bench.record(scene, variant, "s", seconds=found.get("processor_seconds"))
+    bench.record(scene, variant, "dB", psnr=metrics["psnr"], albedo=metrics.get("albedo", {}).get("psnr_aligned"))
+    bench.record(scene, variant, "dB", relit=relit(metrics, "psnr_raw"), relit_aligned=relit(metrics, "psnr_aligned"))
+    bench.record(scene, variant, "°", normals=metrics.get("normal_mae_degrees"))
+    bench.record(scene, variant, "", ssim=metrics.get("ssim"), light=metrics.get("environment", {}).get("log_rmse"))
+    bench.record(scene, variant, "", roughness=metrics.get("roughness_mae"), metallic=metrics.get("metallic_mae"))
+    bench.record(scene, variant, "s", seconds=metrics.get("processor_seconds"))

@@ -1,7 +1,7 @@
-"""Render captures with ground truth by Cycles: `python -m benchmarks.scenes NAME --out DIR`.
+"""Render test scenes whose true shape, materials and light are known: `python -m benchmarks.scenes NAME --out DIR`.
 
-Each scene is a module with a function `build()`. `solids` sculpts the meshes. `scripts.demo` photographs the scenes, and builds one more
-scene, the jar. `analytic` makes captures without Blender.
+Each scene is a module with a function `build()`, and is rendered by Blender's Cycles. `solids` helps to model the meshes. `scripts.demo`
+places cameras and renders the photos. `analytic` makes simpler captures without Blender.
 """
 
 import importlib
@@ -15,5 +15,5 @@ NAMES = REFLECTIVE + MATTE
 
 
 def build(name: str) -> Scene:
-    """Build a scene by its name."""
+    """Build the mesh and the materials of the scene with this name."""
     return jar.build() if name == "jar" else importlib.import_module(f"benchmarks.scenes.{name}").build()

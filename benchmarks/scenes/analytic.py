@@ -58,9 +58,11 @@ def sunny(direction: np.ndarray) -> np.ndarray:
 
 
 def reflect(material: Material, ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Compute the radiance (P, 3) of a convex object under `sunny`, seen along unit rays (P, 3).
+    """Compute the radiance (P, 3) that P surface points of a convex object reflect to a camera. The light is `sunny`.
 
-    Quadrature integrates the specular lobe over its visible normals (Heitz 2018) and the diffuse base over the cosine."""
+    `ray` (P, 3) are unit vectors from the camera to the points, and `normal` (P, 3) the points' normals. The specular part is integrated
+    over the microfacet normals that the camera sees (Heitz 2018), the diffuse part over the hemisphere.
+    """
     view, alpha = -ray, material.roughness**2
     n_v = (view * normal).sum(-1).clip(1e-3, 1 - 1e-9)
     side = view - (view * normal).sum(-1, keepdims=True) * normal
@@ -102,7 +104,7 @@ def reflect(material: Material, ray: np.ndarray, normal: np.ndarray) -> np.ndarr
 
 
 def banded(ray: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Compute the radiance (P, 3) of a ball with three horizontal bands of materials (BANDS)."""
+    """Compute the radiance (P, 3) of points of a ball whose material changes with height, in three bands (BANDS)."""
     color, left = np.zeros_like(ray), np.ones(len(ray), bool)
     for lowest, material in BANDS:
         here = left & (normal[:, 2] >= lowest)
@@ -123,13 +125,13 @@ def photo(
     angle: float = ANGLE,
     matte: bool = False,
 ) -> np.ndarray:
-    """Compute a photo, RGBA in 0..1, of balls (B, 4), given by centre and radius.
+    """Compute a photo of balls, RGBA in 0..1. `balls` (B, 4) has each ball's centre and radius.
 
-    A ball is a mirror with Schlick's Fresnel. With `bands` it has three horizontal bands of materials (BANDS); with `matte` it is matte
-    with a pattern.
+    By default, balls are mirrors with Schlick's Fresnel. If `bands` is set, they have three horizontal bands of materials (BANDS). If
+    `matte` is set, they are matte with a pattern.
 
-    `matrix` is the camera-to-world matrix, `angle` the field of view in radians, `stops` the exposure in powers of two. Each pixel has
-    `samples`² rays; alpha is their mean. The sky in the mirrors stands still; with `turning`, it rotates about z with the camera.
+    `matrix` is the camera-to-world matrix, `angle` the field of view in radians, and `stops` the exposure in powers of two. Each pixel is
+    the mean of `samples`² rays. If `turning` is set, the sky turns about z together with the camera.
     """
     focal = 0.5 * size / np.tan(angle / 2)
     grid = (np.arange(size * samples) + 0.5) / samples
@@ -189,9 +191,9 @@ def write_ball_capture(
     distance: float = DISTANCE,
     matte: bool = False,
 ) -> None:
-    """Write a NeRF-Blender capture of balls with 24 training and 4 test views.
+    """Write photos of balls as a NeRF-Blender capture with 24 training and 4 test views.
 
-    `stops` are exposures in powers of two, which the training views take in turn. The other arguments are explained at `photo`.
+    `stops` is a list of exposures in powers of two; the training views use them in turn. See `photo` for the other arguments.
     """
     angle = ANGLE if distance == DISTANCE else 2 * np.arctan(np.tan(ANGLE / 2) * DISTANCE / distance)
     steps = np.arange(VIEWS + 4) + 0.5

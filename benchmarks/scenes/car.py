@@ -63,7 +63,7 @@ def build() -> Scene:
 
 
 def _windows(cabin: Solid) -> Solid:
-    """Make glass panes that stand out a little from the cabin, on both sides, in front and behind."""
+    """Make the glass panes on all four sides of the cabin. They stand out a little."""
     panes = (box((-0.10, 0, 0.235), (0.34, 0.6, 0.085), 0.06), box((-0.10, 0, 0.235), (0.8, 0.21, 0.085), 0.06))
     outside = [
         carve(0.03, lambda points: cabin(points) - 0.008, lambda points, pane=pane: -pane(points)) for pane in panes

@@ -51,5 +51,5 @@ def build() -> Scene:
 
 
 def _frame(one: Solid, other: Solid, thickness: float) -> Solid:
-    """Make a tube along the line where two surfaces meet."""
+    """Make a tube along the curve where the surfaces of two solids meet."""
     return lambda points: np.hypot(one(points), other(points)) - thickness

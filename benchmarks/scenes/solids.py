@@ -1,7 +1,8 @@
-"""Blend and carve solids, and mesh them by `sculpt`.
+"""Model meshes with signed distance functions.
 
-A solid is a function from points (n, 3) to n signed distances, negative inside. The distances need not be exact. They must be smooth near
-the surface, and between two points they must not differ by much more than the points' distance.
+A solid is a function that takes points (n, 3) and returns n signed distances, negative inside. `sculpt` turns a solid into a mesh.
+Distances need not be exact, but must be smooth near the surface. Between two points, they must not differ by much more than the points are
+apart.
 """
 
 from collections.abc import Callable
@@ -32,7 +33,7 @@ def ellipsoid(centre, radii) -> Solid:
 
 
 def box(centre, half, round: float) -> Solid:
-    """Make a box along the axes, with edges of radius `round`; `half` (3,) is half its size."""
+    """Make a box along the axes. `half` (3,) is half its size, and `round` the radius of its rounded edges."""
     centre, inner = np.asarray(centre, float), np.asarray(half, float) - round
 
     def distance(points):
@@ -55,7 +56,7 @@ def ring(centre, axis, radius: float, thickness: float) -> Solid:
 
 
 def disc(centre, axis, radius: float, half: float, round: float) -> Solid:
-    """Make a cylinder about `axis`, with edges of radius `round`; `half` is half its height."""
+    """Make a cylinder about `axis`. `half` is half its height, and `round` the radius of its rounded edges."""
     centre, axis = np.asarray(centre, float), np.asarray(axis, float) / np.linalg.norm(axis)
 
     def distance(points):
@@ -74,9 +75,9 @@ def disc(centre, axis, radius: float, half: float, round: float) -> Solid:
 
 
 def sweep(path, radii) -> Solid:
-    """Make a round limb along a cubic spline through `path` (n, 3), with radii (n,) or one radius. Its ends are half balls.
+    """Make a tube along a smooth curve through the points `path` (n, 3). Its ends are half balls.
 
-    Distances are capped at FAR.
+    `radii` are the tube's radii at these points (n,), or one radius. Distances larger than FAR are returned as FAR.
     """
     path = np.asarray(path, float)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -125,10 +126,10 @@ def mirrored(solid: Solid) -> Solid:
 
 
 def sculpt(solid: Solid, low, high, cell: float, material: int) -> Mesh:
-    """Mesh the surface of a solid within `low` to `high` (3,), in triangles of about `cell`.
+    """Turn a solid into a triangle mesh. `low` and `high` (3,) are the corners of the box that is searched; edges are about `cell` long.
 
-    Marching cubes find the triangles. Then vertices slide along the surface until all triangles are about as large: uneven triangles would
-    show in reflections. `material` is the index of all faces' material.
+    Marching cubes make the triangles. Then vertices slide along the surface until triangles have similar sizes: uneven triangles would be
+    visible in reflections. All faces get the material with the index `material`.
     """
     block = 4
     low = np.asarray(low, float) - 2 * cell

@@ -6,7 +6,7 @@ from typing import NamedTuple
 NEVER = -1
 
 
-class Found(NamedTuple):
+class Outcome(NamedTuple):
     """Hold the outcome of a case: whether all values are finite, the error, and how long a disturbed training took to recover.
 
     `error` is in the unit of its case. `recovered` is a number of iterations, NEVER if the training did not recover, or None if nothing
@@ -26,17 +26,17 @@ class Case(NamedTuple):
     """
 
     name: str
-    run: Callable[[], Found]
+    run: Callable[[], Outcome]
     against: str
     most: float
     because: str
     guard: str
     unit: str = ""
 
-    def holds(self, found: Found) -> bool:
+    def holds(self, found: Outcome) -> bool:
         return found.finite and found.error <= self.most
 
-    def row(self, found: Found) -> list[str]:
+    def row(self, found: Outcome) -> list[str]:
         error, most = (
             f"{v:.2f} {self.unit}" if self.unit else f"{v:.0e}" if v else "0" for v in (found.error, self.most)
         )

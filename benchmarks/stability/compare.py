@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from benchmarks.stability.cases import Found
+from benchmarks.stability.cases import Outcome
 from refgs.camera import Camera
 from refgs.model.environment import Environment
 from refgs.render import reference
@@ -45,17 +45,17 @@ def outcome(
     by: Sequence[Tensor],
     exact_by: Sequence[Tensor],
     terms: Sequence[Tensor] | None = None,
-) -> Found:
+) -> Outcome:
     """Check that values and gradients are finite, and compute the error: the values' error, or a tenth of the gradients' if that is larger.
 
     `found` are the float32 values and `by` their gradients; `expected` and `exact_by` are the same in float64. `terms`, if given, has the
     size of the terms that cancel in the gradients.
     """
     finite = all(bool(v.isfinite().all()) for v in (*found, *by))
-    return Found(finite, max(worst(found, expected), 0.1 * worst(by, exact_by, terms)))
+    return Outcome(finite, max(worst(found, expected), 0.1 * worst(by, exact_by, terms)))
 
 
-def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest: int | None = None) -> Found:
+def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest: int | None = None) -> Outcome:
     """Compare the rasteriser with the float64 reference, forward and backward.
 
     `inputs` are the surfels' tensors. If the number `nearest` is given, the reference draws only the surfels nearest to the camera, so many
@@ -123,7 +123,7 @@ def _order(inputs: Sequence[Tensor], camera: Camera) -> Tensor:
     return torch.argsort(depth.float(), stable=True)
 
 
-def shading(features: Tensor, alpha: Tensor, radiance: Tensor, camera: Camera, kink: bool = False) -> Found:
+def shading(features: Tensor, alpha: Tensor, radiance: Tensor, camera: Camera, kink: bool = False) -> Outcome:
     """Compare deferred shading with the float64 reference, forward and backward.
 
     `features` and `alpha` are the maps that `shade` takes; `radiance` (6·R², 3) is the light. Set `kink` if derivatives jump in every

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from benchmarks.stability import compare
-from benchmarks.stability.cases import Case, Found
+from benchmarks.stability.cases import Case, Outcome
 from refgs.camera import Camera
 from refgs.model import harmonics
 from refgs.render import reference
@@ -62,7 +62,7 @@ def surfels(
     return [torch.tensor(v, dtype=torch.float32) for v in values]
 
 
-def moved(scale: float = 1.0, offset: float = 0.0) -> Found:
+def moved(scale: float = 1.0, offset: float = 0.0) -> Outcome:
     """Scale and move a scene together with its camera; compare the rasteriser with float64."""
     view = camera()
     position, rotation, size, *rest = surfels(view)
@@ -72,12 +72,12 @@ def moved(scale: float = 1.0, offset: float = 0.0) -> Found:
     return compare.raster([position * scale + offset, rotation, size * scale, *rest], view, near=0.1 * scale)
 
 
-def seen(focal: float = 1.1, centre: tuple[float, float] | None = None, **how) -> Found:
+def seen(focal: float = 1.1, centre: tuple[float, float] | None = None, **how) -> Outcome:
     view = camera(focal, centre)
     return compare.raster(surfels(view, **how), view, near=min(0.1, 0.1 / focal))
 
 
-def on_the_camera() -> Found:
+def on_the_camera() -> Outcome:
     """Compare the rasteriser with float64 where surfels lie at the camera's centre, about 1e-7 from it, or behind the camera."""
     view = camera()
     position, *rest = surfels(view)
@@ -88,7 +88,7 @@ def on_the_camera() -> Found:
     return compare.raster([position, *rest], view)
 
 
-def towards_the_camera() -> Found:
+def towards_the_camera() -> Outcome:
     """Compare view-dependent colours and normals with float64, for surfels at distances 0, 1e-7 … 1e5 from the camera."""
     view, generator = camera(), torch.Generator().manual_seed(0)
     way = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator, dtype=torch.float64), dim=-1)
@@ -113,11 +113,11 @@ def towards_the_camera() -> Found:
     return compare.outcome([color.detach(), normal.detach()], [expected.detach(), column.detach()], by, exact_by)
 
 
-def across_near() -> Found:
+def across_near() -> Outcome:
     return compare.raster(scenes.surfels("across_near", 4), scenes.camera(), near=scenes.NEAR)
 
 
-def coincident(count: int = 3000) -> Found:
+def coincident(count: int = 3000) -> Outcome:
     """Compare the rasteriser with float64 where all surfels lie in the same place, in different colours."""
     view = camera(size=(16, 12))
     one = surfels(view, 1, pixels=(3.0, 3.0), depth=(2.0, 2.0))
@@ -128,7 +128,7 @@ def coincident(count: int = 3000) -> Found:
     )
 
 
-def ties() -> Found:
+def ties() -> Outcome:
     """Compare the rasteriser with float64 where all surfels have exactly the same depth, and are drawn in the order of their index."""
     view = dataclasses.replace(camera(), world_to_camera=np.eye(4))
     position, *rest = surfels(view)
@@ -136,7 +136,7 @@ def ties() -> Found:
     return compare.raster([position, *rest], view)
 
 
-def one_pixel(count: int = 1_000_000) -> Found:
+def one_pixel(count: int = 1_000_000) -> Outcome:
     """Compare the rasteriser with float64 where all surfels lie in one pixel and are smaller than it.
 
     They lie around the pixel's centre, not on it. At the centre, the distance to the surfel and the low-pass filter's distance would both
@@ -152,7 +152,7 @@ def one_pixel(count: int = 1_000_000) -> Found:
     return compare.raster([position, rotation, scale, 0.05 * opacity, features], view, nearest=15_000)
 
 
-def nothing() -> Found:
+def nothing() -> Outcome:
     """Check that without surfels the picture is empty and gradients have no rows."""
     view = camera()
     leaves = [v[:0].requires_grad_() for v in surfels(view)]

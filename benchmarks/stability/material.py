@@ -8,7 +8,7 @@ import trimesh
 from torch import Tensor
 
 from benchmarks.stability import compare
-from benchmarks.stability.cases import Case, Found
+from benchmarks.stability.cases import Case, Outcome
 from refgs.camera import Camera
 from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
@@ -60,7 +60,7 @@ def lit(
     sun: float = 0.0,
     scale: float = 1.0,
     kink: bool = False,
-) -> Found:
+) -> Outcome:
     """Compare the shading of a ball with float64. Material values that are not given are random.
 
     `grazing` is explained at `ball`, `sun` and `scale` at `light`, `kink` at `compare.shading`.
@@ -76,7 +76,7 @@ def lit(
     return compare.shading(features.float(), alpha.float(), light(sun, scale), view, kink)
 
 
-def one_sun(radiance: float) -> Found:
+def one_sun(radiance: float) -> Outcome:
     """Check that the prefilter is linear, forward and backward.
 
     The result for a smooth light with a sun of this radiance must be the sum of two results: for the smooth light, and for the sun alone.
@@ -93,10 +93,10 @@ def one_sun(radiance: float) -> Found:
     )
     dim = exact < 1e-3 * radiance  # texels out of the sun's reach: its size must not hide their error
     error = max(error, float(((found.detach() - exact).abs() / exact)[dim].max()) / 10)
-    return Found(bool(found.isfinite().all() and by.isfinite().all()), error)
+    return Outcome(bool(found.isfinite().all() and by.isfinite().all()), error)
 
 
-def likeness(kind: str) -> Found:
+def likeness(kind: str) -> Outcome:
     """Compare D-SSIM of two images, and its gradient, with float64.
 
     `kind` names the images: "constant", "black and white", "noise" or "over-exposed".
@@ -115,10 +115,10 @@ def likeness(kind: str) -> Found:
     (exact_by,) = torch.autograd.grad(expected, exact)
     found, by = dssim(image, target)
     finite = bool(found.isfinite() and by.isfinite().all())
-    return Found(finite, max(abs(float(found - expected.detach())), compare.worst([by], [exact_by]) / 50))
+    return Outcome(finite, max(abs(float(found - expected.detach())), compare.worst([by], [exact_by]) / 50))
 
 
-def activations() -> Found:
+def activations() -> Outcome:
     """Compare activations of raw values 0 … ±1e4 with float64. Check that no derivative is zero in the range that training allows."""
     raw = torch.tensor([-1e4, -87, -12, -6, -1, 0, 1, 6, 12, 87, 1e4])
     names = ("scale", "opacity", "albedo", "metallic", "roughness")
@@ -144,10 +144,10 @@ def activations() -> Found:
         float(((f - e).abs() / e)[2:-2].max()) for f, e in zip((v.detach() for v in found), expected, strict=True)
     )
     error = max(error, *(float(((by[i] - exact_by[i]).abs() / exact_by[i])[rows].max()) / 1e3 for i, rows in within))
-    return Found(finite and alive, error)
+    return Outcome(finite and alive, error)
 
 
-def steps(size: float) -> Found:
+def steps(size: float) -> Outcome:
     """Compare a hundred steps of Adam, on random gradients of a given size, with torch's Adam in float64."""
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(1000, generator=generator)
@@ -157,10 +157,10 @@ def steps(size: float) -> Found:
     for gradient in gradients:
         value.grad, exact.grad = gradient, gradient.double()
         ours.step(), torchs.step()
-    return Found(bool(value.isfinite().all()), compare.worst([value.detach()], [exact.detach()]))
+    return Outcome(bool(value.isfinite().all()), compare.worst([value.detach()], [exact.detach()]))
 
 
-def rays(scale: float, offset: float) -> Found:
+def rays(scale: float, offset: float) -> Outcome:
     """Trace random rays inside a hollow ball with an opening. Return the share of rays whose visibility is wrong.
 
     `scale` and `offset` scale and move the ball and the rays.
@@ -177,7 +177,7 @@ def rays(scale: float, offset: float) -> Found:
     b = (inner * way).sum(axis=1)
     leaves = inner + (-b + np.sqrt(b * b - (inner**2).sum(axis=1) + 1))[:, None] * way
     clear = np.abs(leaves[:, 2] - 0.3) > 0.06  # leave out the rim, which is jagged by its triangles
-    return Found(True, float((found != (leaves[:, 2] > 0.3))[clear].mean()))
+    return Outcome(True, float((found != (leaves[:, 2] > 0.3))[clear].mean()))
 
 
 SHADE = "float64, same input"

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from benchmarks.stability.cases import Case, Found
+from benchmarks.stability.cases import Case, Outcome
 from benchmarks.stability.geometry import camera, surfels
 from benchmarks.stability.photos import NOISE
 from benchmarks.stability.training import TOTAL, ball, train, trainer, usual
@@ -27,14 +27,14 @@ AT, UNTIL, LONG = 50, 90, 300  # iterations: start and end of a disturbance, len
 
 def disturbed(
     start: Callable[[Trainer], None], end: Callable[[Trainer], None] | None = None, total: int = TOTAL
-) -> Found:
+) -> Outcome:
     """Train with and without a disturbance. Return the PSNR in dB that is lost at the end, and when the disturbed training recovered.
 
     `start` makes the disturbance at iteration AT; `end`, if given, undoes it at iteration UNTIL.
     """
     course = train(ball(), total=total, disturb={AT: start} | ({UNTIL: end} if end else {}))
     since = UNTIL if end else AT
-    return Found(course.finite, max(0.0, usual(total).end - course.end), course.back_after(since, usual(total)))
+    return Outcome(course.finite, max(0.0, usual(total).end - course.end), course.back_after(since, usual(total)))
 
 
 def faster(factor: float, geometry: bool) -> Callable[[Trainer], None]:
@@ -89,21 +89,21 @@ def nan_value(name: str) -> Callable[[Trainer], None]:
     return change
 
 
-def stopped() -> Found:
+def stopped() -> Outcome:
     """Check that a training whose gradients stay NaN goes back to its checkpoint, then ends with a one-line error."""
     try:
         train(ball(), disturb={AT: nan_gradient("albedo", every=True)})
     except InputError as error:
-        return Found("again after going back" in str(error), 0.0)
-    return Found(False, 1.0)
+        return Outcome("again after going back" in str(error), 0.0)
+    return Outcome(False, 1.0)
 
 
-def with_settings(*changes: str, total: int = TOTAL) -> Found:
+def with_settings(*changes: str, total: int = TOTAL) -> Outcome:
     course = train(ball(), *changes, total=total)
-    return Found(course.finite, max(0.0, usual(total).end - course.end))
+    return Outcome(course.finite, max(0.0, usual(total).end - course.end))
 
 
-def trajectories() -> Found:
+def trajectories() -> Outcome:
     """Take thirty steps of Adam twice: with the float32 kernels, and with the float64 reference.
 
     Returns the difference of the two final pictures, divided by how much the picture changed during the steps.
@@ -129,7 +129,7 @@ def trajectories() -> Found:
                 leaf.grad = None
         pictures.append(draw(*leaves, view, 0.1)[0].detach().double())
     error = float((pictures[0] - pictures[1]).norm() / (pictures[1] - first).norm())
-    return Found(bool(pictures[0].isfinite().all()), error)
+    return Outcome(bool(pictures[0].isfinite().all()), error)
 
 
 STAGES = ["initial.until=0.25", "indirect.start=0.3", "indirect.every=15", "indirect.least=0", "indirect.resolution=32"]
@@ -160,7 +160,7 @@ def bits(made: Trainer) -> list[Tensor]:
     ]
 
 
-def resumed() -> Found:
+def resumed() -> Outcome:
     """Stop a training in each stage (see CUTS) and resume it. Return the share of tensors that differ from an uninterrupted training's."""
     whole = trainer(ball(), *STAGES, total=100)
     copies: dict[int, Path] = {}
@@ -179,16 +179,16 @@ def resumed() -> Found:
     return same(whole, others)
 
 
-def same(whole: Trainer, others: list[Trainer]) -> Found:
+def same(whole: Trainer, others: list[Trainer]) -> Outcome:
     differ = [
         a.shape != b.shape or not torch.equal(a, b)
         for made in others
         for a, b in zip(bits(whole), bits(made), strict=True)
     ]
-    return Found(all(bool(v.isfinite().all()) for v in bits(whole)), sum(differ) / len(differ))
+    return Outcome(all(bool(v.isfinite().all()) for v in bits(whole)), sum(differ) / len(differ))
 
 
-def threads() -> Found:
+def threads() -> Outcome:
     """Run the same training on one, two and three threads. Return the share of tensors that differ."""
     before, made = torch.get_num_threads(), []
     try:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.stability.cases import Case, Found
+from benchmarks.stability.cases import Case, Outcome
 from benchmarks.stability.training import TOTAL, Course, ball, changed, train, usual
 from refgs.errors import InputError
 from refgs.model.surfels import activate
@@ -14,12 +14,12 @@ ONE = ["surfels.start=1", "surfels.budget=1"]
 NOISE = 0.7  # dB: another seed changes less than this (docs/stability.md)
 
 
-def against(course: Course, least: float) -> Found:
+def against(course: Course, least: float) -> Outcome:
     """Return by how many dB a training's final PSNR on held-out views falls short of `least`; 0 if it does not."""
-    return Found(course.finite, max(0.0, least - course.end))
+    return Outcome(course.finite, max(0.0, least - course.end))
 
 
-def elsewhere(scale: float, offset: float) -> Found:
+def elsewhere(scale: float, offset: float) -> Outcome:
     """Train on a scaled and moved scene. Check that the splats lie where the scene is, and return how many dB the PSNR changes."""
 
     def pose(matrix: np.ndarray) -> np.ndarray:
@@ -33,26 +33,26 @@ def elsewhere(scale: float, offset: float) -> Found:
     place = surfels.positions.detach().numpy().astype(float) @ to_capture[:3, :3].T + to_capture[:3, 3]
     # The 75th percentile, because half of the surfels start inside the object.
     radius = np.percentile(np.linalg.norm((place - offset) / scale, axis=1), 75)
-    return Found(course.finite and 0.9 < radius < 1.05, abs(course.end - usual().end))
+    return Outcome(course.finite and 0.9 < radius < 1.05, abs(course.end - usual().end))
 
 
 def photographed(
     photo: Callable[[np.ndarray, int], np.ndarray], least: Callable[[], float], total: int = TOTAL
-) -> Found:
+) -> Outcome:
     return against(train(changed(photo=photo), total=total), least())
 
 
-def of_these(**how) -> Found:
+def of_these(**how) -> Outcome:
     return against(train(ball(**how)), usual().end)
 
 
-def refused(make: Callable[[], object]) -> Found:
+def refused(make: Callable[[], object]) -> Outcome:
     """Check that a bad capture is refused with a one-line error. `make` trains on the capture."""
     try:
         make()
     except InputError as error:
-        return Found("\n" not in str(error), 0.0)
-    return Found(False, 1.0)
+        return Outcome("\n" not in str(error), 0.0)
+    return Outcome(False, 1.0)
 
 
 def mixed(pixels: np.ndarray, index: int) -> np.ndarray:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.scenes.analytic import sky, sunny
-from benchmarks.stability.cases import Case, Found
+from benchmarks.stability.cases import Case, Outcome
 from benchmarks.stability.material import RESOLUTION, SIDE, ball
 from benchmarks.stability.training import ball as capture
 from benchmarks.stability.training import train
@@ -167,7 +167,7 @@ def tables() -> list[tuple[str, list[str], list[list[str]]]]:
     return [("Which trades are stiff", headings, rows)]
 
 
-def by_autograd() -> Found:
+def by_autograd() -> Outcome:
     """Compare the Jacobian by central differences with autograd through the reference."""
     scene = SCENES["half metal, half dielectric, suns"]
     upstream = torch.randn(
@@ -176,14 +176,14 @@ def by_autograd() -> Found:
     at = torch.zeros(8).double().requires_grad_()
     (exact,) = torch.autograd.grad(scene.pictures(at) @ upstream, at)
     found = scene.jacobian().T @ upstream * len(upstream) ** 0.5
-    return Found(bool(exact.isfinite().all()), float(((found - exact).abs() / exact.abs().max()).max()))
+    return Outcome(bool(exact.isfinite().all()), float(((found - exact).abs() / exact.abs().max()).max()))
 
 
-def said() -> Found:
+def said() -> Outcome:
     """Train an all-metal ball. Check that the report calls the light's scale and white balance ambiguous, but not the metallic value."""
     trades = ambiguities(train(capture(), total=300).trainer.state)
     right = "what" in trades["light_scale"] and "what" in trades["white_balance"] and "what" not in trades["metal"]
-    return Found(all(v["left"] <= v["alone"] for v in trades.values()), 0.0 if right else 1.0)
+    return Outcome(all(v["left"] <= v["alone"] for v in trades.values()), 0.0 if right else 1.0)
 
 
 CASES = [

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from benchmarks.stability import geometry, material, optimisation, photos, stiffness
-from benchmarks.stability.cases import Case, Found
+from benchmarks.stability.cases import Case, Outcome
 
 QUICK = [*geometry.CASES, *material.CASES, stiffness.CASES[0]]
 SLOW = [*photos.CASES, *optimisation.CASES, *stiffness.CASES[1:]]
@@ -21,9 +21,11 @@ def test_case(case):
 
 
 def test_a_case_can_fail():
-    case = Case("", lambda: Found(True, 0.0), "", 1e-3, "", "")
-    assert case.holds(Found(True, 1e-3)) and not case.holds(Found(True, 2e-3)) and not case.holds(Found(False, 0.0))
-    assert not case.holds(Found(True, float("nan")))
+    case = Case("", lambda: Outcome(True, 0.0), "", 1e-3, "", "")
+    assert (
+        case.holds(Outcome(True, 1e-3)) and not case.holds(Outcome(True, 2e-3)) and not case.holds(Outcome(False, 0.0))
+    )
+    assert not case.holds(Outcome(True, float("nan")))
 
 
 def test_the_command():
