@@ -1,7 +1,7 @@
 """Compute the floor of each kernel: the least time that the kernel could take on this machine.
 
-The cost of a kernel has two parts. Its arithmetic operations are counted by hand from its formulas. Its bytes are all inputs and outputs,
-each moved once between memory and processor. Either part takes a least time; the floor is the longer of both.
+A kernel's arithmetic operations are counted by hand from its formulas. Its bytes are all its inputs and outputs, each moved once between
+memory and processor. Both need some time even at the machine's peak speed. The floor is the longer of the two times.
 """
 
 import math
@@ -43,12 +43,12 @@ class Machine(NamedTuple):
         return cls(arithmetic(device=device), bandwidth(device=device))
 
     def floor(self, cost: Cost) -> float:
-        """Compute the least time, in milliseconds, in which this machine can do work of this cost."""
+        """Compute the least time, in milliseconds, that this machine needs for a kernel of this cost."""
         return 1e3 * max(cost.operations / self.operations, cost.bytes / self.bytes)
 
 
 def covered_pairs(surfels: list[torch.Tensor], camera: Camera) -> float:
-    """Estimate in how many pairs of a surfel and a pixel the surfel covers the pixel. The surfels lie on a unit ball.
+    """Estimate how many pixels the surfels of a unit ball cover. A pixel counts once for each surfel that covers it.
 
     Only surfels that face the camera count. The estimate is the sum of their projected areas in pixels.
     """

@@ -1,8 +1,7 @@
-"""Provide what all benchmarks share: they train on scenes, collect measured values as rows, and print tables of the rows.
+"""Share code between the benchmarks: train on scenes, collect measured values as rows, and print tables of the rows.
 
-A run that exists already is not trained again. docs/measurements.csv keeps the values of earlier measurements: tables show them in brackets
-beside the new values. `--csv FILE` writes the new rows into a file. `refgs bench page` makes docs/measurements.md from
-docs/measurements.csv.
+A finished run is not trained again. docs/measurements.csv keeps the values of earlier measurements: tables show them in brackets beside the
+new values. `--csv FILE` writes the new rows into a file. `refgs bench page` makes docs/measurements.md from docs/measurements.csv.
 """
 
 import argparse
@@ -145,7 +144,7 @@ class Bench:
         """Train and evaluate each variant on each scene. A run's folder is OUT/[PRESET/]VARIANT/SCENE.
 
         Yields a scene's name, and a dict from the names of variants to the folders of the scene's successful runs. Raises InputError if
-        `--variants` has an unknown name, or lacks a variant whose time limits another.
+        `--variants` has an unknown name. Also raises it if a variant is named without the variant whose time is its time limit.
         """
         options = self.options
         chosen = options.variants or list(variants)
@@ -257,7 +256,7 @@ def train(
 
 
 def figures(run: Path) -> dict | None:
-    """Read a run's metrics.json, a dict of metrics on held-out views. Return None if the run is not finished."""
+    """Read a run's metrics.json. Return None if the run has not been evaluated on held-out views yet."""
     try:
         found = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -44,7 +44,10 @@ def measure() -> dict[str, list[float]]:
 
 
 def _time_parts(trainer: Trainer, rows: dict[str, list[float]]) -> None:
-    """Time each part of an iteration, then one whole iteration. Append the seconds to the lists in `rows`."""
+    """Time each part of an iteration, then one whole iteration.
+
+    `rows` maps the names of the parts to lists of seconds, to which the new times are appended.
+    """
     photo, settings, clock = trainer.state.photos[0], trainer.state.settings, time.perf_counter
 
     def record(name: str, since: float) -> float:

@@ -44,7 +44,7 @@ def course(run: Path) -> list[tuple[float, float]]:
 def best(presets: dict[str, Path], seconds: float) -> tuple[float, str] | None:
     """Find which preset had reached the best PSNR after a number of seconds. Return this PSNR and the preset's name.
 
-    `presets` maps names of presets to run folders. Return None if no run has a PSNR from so early.
+    `presets` maps names of presets to run folders. Return None if no run had measured its PSNR by then.
     """
     reached = [(psnr, name) for name, run in presets.items() for at, psnr in course(run) if at <= seconds]
     return max(reached, default=None)

@@ -47,19 +47,22 @@ TABLES = (
 
 
 def left_out(run: Path) -> str:
-    """Return the names of the optional parts that a run left out, separated by commas."""
+    """Return the names of the optional parts of the method that a run left out, separated by commas."""
     needs = json.loads((run / "needs.json").read_text(encoding="utf-8"))
     return ", ".join(need["need"] for need in needs if not need.get("needed", True))
 
 
 def deciding(run: Path) -> float:
-    """Return which percentage of a run's seconds was spent on deciding which optional parts the scene needs."""
+    """Return which percentage of a run's time was spent on deciding which optional parts of the method the scene needs."""
     last = json.loads((run / "history.jsonl").read_text(encoding="utf-8").splitlines()[-1])
     return 100 * last["parts"].get("deciding", 0.0) / last["seconds"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train the runs that are missing. Print how much time was saved by leaving out optional parts, and how much quality was lost."""
+    """Train the runs that are missing.
+
+    Print how much time was saved by leaving out optional parts of the method, and how much quality was lost.
+    """
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]), preset="quick")
     bench = Bench("needs", parser, arguments)
     preset = ("--preset", bench.options.preset)

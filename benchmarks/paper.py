@@ -34,7 +34,10 @@ class Scene(NamedTuple):
 
 
 def find_scenes(data: Path) -> list[Scene]:
-    """Find the paper's scenes in a folder. If there are none, raise InputError that says which folders are expected."""
+    """Find the paper's scenes in a folder.
+
+    Raise InputError if there are none. Its message names the folders where scenes are expected.
+    """
     scenes = []
     for key, data_set in PAPER.items():
         for number, name in enumerate(data_set["scenes"]):

@@ -1,4 +1,4 @@
 """Test every kernel and the training in extreme and ill-conditioned cases: `refgs stability [--only WORD]`.
 
-Each module has a group of cases, in its list CASES. docs/stability.md keeps the printed tables.
+Each module tests one group of cases, which are in its list CASES. docs/stability.md has the results.
 """

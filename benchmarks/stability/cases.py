@@ -7,10 +7,9 @@ NEVER = -1
 
 
 class Outcome(NamedTuple):
-    """Hold the outcome of a case: whether all values are finite, the error, and how long a disturbed training took to recover.
+    """Hold the outcome of a case. `finite` is True if no value is NaN or infinite; `error` has the unit of the case.
 
-    `error` is in the unit of its case. `recovered` is a number of iterations, NEVER if the training did not recover, or None if nothing
-    was disturbed.
+    `recovered` is for cases that disturb a training: the number of iterations that it took to recover, or NEVER. It is None in other cases.
     """
 
     finite: bool
@@ -19,10 +18,12 @@ class Outcome(NamedTuple):
 
 
 class Case(NamedTuple):
-    """Describe an ill-conditioned or extreme case. It passes if all values are finite and its error is at most `most`.
+    """Describe an extreme or ill-conditioned case. It passes if all values are finite and its error is at most `most`.
 
-    `run` computes the outcome; `against` names what results are compared with. `because` says why an error of `most` is allowed; `guard`
-    says what the program does in such a case.
+    - `run` runs the case and returns the outcome;
+    - `against` names what the results are compared with, such as "float64, same input";
+    - `because` gives the reason why an error of `most` is allowed;
+    - `guard` tells how the program protects itself in this case.
     """
 
     name: str
@@ -57,5 +58,5 @@ HEADINGS = ["case", "finite", "error", "at most", "compared with", "back after, 
 
 
 def line(cells: list[str]) -> str:
-    """Write a row of a Markdown table."""
+    """Return a row of a Markdown table with these cells."""
     return f"| {' | '.join(cells)} |"

@@ -1,6 +1,6 @@
-"""Compare float32 kernels with the float64 reference.
+"""Compare the float32 kernels with a float64 reference implementation.
 
-Errors are relative: the largest error in a tensor of values or gradients is divided by the largest exact number in it.
+Errors are relative. The error of a tensor is its largest difference from the reference, divided by the reference's largest absolute value.
 """
 
 from collections.abc import Sequence
@@ -22,14 +22,15 @@ FLOAT32 = "float32, sums of hundreds of terms"
 
 
 class Undecided(Exception):
-    """Report that too much of a picture depends on comparisons that rounding can flip."""
+    """Report that too few pixels can be compared. In all others, rounding could flip a threshold test and change the value."""
 
 
 def worst(found: Sequence[Tensor], expected: Sequence[Tensor], terms: Sequence[Tensor] | None = None) -> float:
-    """Return the largest relative error of tensors: a tensor's largest error is divided by its largest expected number.
+    """Return the largest relative error of several tensors.
 
-    If numbers are sums of larger terms that cancel, `terms` has the size of these terms. Errors are then divided by the largest term. If
-    all expected numbers and terms are zero, errors are not divided.
+    The error of a tensor is its largest difference from `expected`, divided by the largest absolute value in `expected`. Values that are
+    differences of large, nearly equal numbers cannot be so accurate. For them, `terms` gives the size of those numbers, and the error is
+    divided by the larger of the two sizes.
     """
     errors = [0.0]
     for value, exact, summed in zip(found, expected, terms or expected, strict=True):
@@ -46,20 +47,21 @@ def outcome(
     exact_by: Sequence[Tensor],
     terms: Sequence[Tensor] | None = None,
 ) -> Outcome:
-    """Check that values and gradients are finite, and compute the error: the values' error, or a tenth of the gradients' if that is larger.
+    """Compare float32 values and gradients with float64.
 
-    `found` are the float32 values and `by` their gradients; `expected` and `exact_by` are the same in float64. `terms`, if given, has the
-    size of the terms that cancel in the gradients.
+    The error is the values' relative error, or a tenth of the gradients' relative error if that is larger. `found` are the float32 values
+    and `by` their gradients. `expected` and `exact_by` are the same in float64. `terms` belongs to the gradients and is explained at
+    `worst`.
     """
     finite = all(bool(v.isfinite().all()) for v in (*found, *by))
     return Outcome(finite, max(worst(found, expected), 0.1 * worst(by, exact_by, terms)))
 
 
 def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest: int | None = None) -> Outcome:
-    """Compare the rasteriser with the float64 reference, forward and backward.
+    """Compare the rasteriser's images and gradients with the float64 reference.
 
-    `inputs` are the surfels' tensors. If the number `nearest` is given, the reference draws only the surfels nearest to the camera, so many
-    of them. They must occlude all others.
+    `inputs` are the surfels' tensors. The reference is slow: if `nearest` is given, it draws only this number of surfels, those nearest to
+    the camera. They must hide all others.
     """
     order = None if nearest is None else _order(inputs, camera)
     few = inputs if order is None else [v[order[:nearest]] for v in inputs]
@@ -72,11 +74,13 @@ def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest:
     upstream = [
         torch.randn(m.shape, generator=generator) * safe.reshape(safe.shape + (1,) * (m.ndim - 2)) for m in maps
     ]
-    exact_by = _learned(torch.autograd.grad(maps, exact, [u.double() for u in upstream], retain_graph=True), few)
+    exact_by = _parameter_gradients(
+        torch.autograd.grad(maps, exact, [u.double() for u in upstream], retain_graph=True), few
+    )
     terms = _terms(maps, upstream, exact, exact_by, generator)
     leaves = [v.clone().requires_grad_() for v in inputs]
     found = rasterize(*leaves, camera, near)
-    by = _learned(torch.autograd.grad(found, leaves, upstream), inputs)
+    by = _parameter_gradients(torch.autograd.grad(found, leaves, upstream), inputs)
     if order is not None:
         hidden = [g[order[nearest:]] for g in by]
         nothing = [torch.zeros_like(g).double() for g in hidden]
@@ -85,8 +89,11 @@ def raster(inputs: Sequence[Tensor], camera: Camera, near: float = 0.1, nearest:
     return outcome([m.detach()[safe] for m in found], [m.detach()[safe] for m in maps], by, exact_by, terms)
 
 
-def _learned(by: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
-    """Convert derivatives by quaternion and by scale to derivatives by rotation angle and by the scale's logarithm; keep the others."""
+def _parameter_gradients(by: Sequence[Tensor], inputs: Sequence[Tensor]) -> list[Tensor]:
+    """Convert gradients of the rasteriser's inputs, `by`, to gradients of the parameters that training optimises.
+
+    The gradient of a quaternion becomes that of the rotation angle, the gradient of a scale that of its logarithm. The others stay.
+    """
     position, rotation, scale, *rest = by
     return [position, rotation * inputs[1].double().norm(dim=-1, keepdim=True), scale * inputs[2].double(), *rest]
 
@@ -98,11 +105,13 @@ def _terms(
     exact_by: Sequence[Tensor],
     generator: torch.Generator,
 ) -> list[Tensor]:
-    """Estimate the size of the terms that cancel in each derivative: the derivative's error is compared with this size.
+    """Estimate how accurate float32 gradients can be.
 
-    - The derivative by a surfel's alpha is the colour that the surfel adds, minus the colour that it occludes. The kernel computes the
-      occluded colour from the pixel's total colour, so both have the same rounding error. To estimate this error in all derivatives, each
-      pixel's total is divided by 1 - alpha, multiplied by a random number, and propagated back.
+    Most gradients are differences of larger numbers, which have larger rounding errors. Return the size of those numbers for each gradient.
+
+    - The derivative by a surfel's alpha is the colour that the surfel adds, minus the colour that it hides. The kernel computes the hidden
+      colour from the pixel's total colour, and thus with its rounding error. To estimate the effect on all gradients, each pixel's total is
+      divided by 1 - alpha, multiplied by a random number, and propagated back.
     - The derivative by rotation is a difference of derivatives by position, times the radius. The derivative by scale is a difference of
       derivatives by rotation.
     """
@@ -111,7 +120,7 @@ def _terms(
     total = (features * by_features).abs().sum(dim=-1) + (depth * by_depth).abs() + (alpha * by_alpha).abs()
     by = torch.randn(total.shape, generator=generator) * total / (1 - alpha)
     inputs = [v.detach() for v in exact]
-    terms = _learned(torch.autograd.grad(maps[2], exact, by, materialize_grads=True), inputs)
+    terms = _parameter_gradients(torch.autograd.grad(maps[2], exact, by, materialize_grads=True), inputs)
     moved, turned = (v.norm(dim=-1, keepdim=True) for v in exact_by[:2])
     moved = moved * inputs[2].amax(dim=-1, keepdim=True)
     terms[1], terms[2] = terms[1].abs() + moved, terms[2].abs() + moved + turned
@@ -124,10 +133,10 @@ def _order(inputs: Sequence[Tensor], camera: Camera) -> Tensor:
 
 
 def shading(features: Tensor, alpha: Tensor, radiance: Tensor, camera: Camera, kink: bool = False) -> Outcome:
-    """Compare deferred shading with the float64 reference, forward and backward.
+    """Compare images and gradients of deferred shading with the float64 reference.
 
-    `features` and `alpha` are the maps that `shade` takes; `radiance` (6·R², 3) is the light. Set `kink` if derivatives jump in every
-    pixel: gradients are then not compared, but must be finite.
+    `features` and `alpha` are the inputs of `shade`, and `radiance` (6·R², 3) is the light. Set `kink` if the derivative jumps in every
+    pixel, so that gradients cannot be compared: they must then only be finite.
     """
     light = Environment(radiance)
     light.levels = light.levels.requires_grad_()

@@ -1,4 +1,4 @@
-"""Test the rasteriser, and other kernels that read positions, with unusual surfels and cameras."""
+"""Test the rasteriser, and other kernels that use positions, with extreme surfels and cameras."""
 
 import dataclasses
 from functools import partial
@@ -37,10 +37,11 @@ def surfels(
     aspect: float = 3.0,
     edge_on: float | None = None,
 ) -> list[Tensor]:
-    """Make `count` surfels at random places in a camera's picture. Returns the rasteriser's input tensors.
+    """Make `count` surfels at random places in a camera's view. Return the rasteriser's input tensors.
 
-    `pixels` is the range of standard deviations in pixels, `depth` the range of depths, `aspect` the largest ratio of the two scales.
-    Normals are random. If `edge_on` is given, discs are seen edge-on instead, to within `edge_on` radians.
+    `pixels` is the range of the surfels' standard deviations in pixels, and `depth` the range of their depths. `aspect` is the largest
+    ratio of a surfel's two scales. Normals are random. If `edge_on` is given, surfels are seen edge-on instead; the angle is off by at most
+    `edge_on` radians.
     """
     rng = np.random.default_rng(0)
     z = rng.uniform(*depth, count)
@@ -63,7 +64,7 @@ def surfels(
 
 
 def moved(scale: float = 1.0, offset: float = 0.0) -> Outcome:
-    """Scale and move a scene together with its camera; compare the rasteriser with float64."""
+    """Multiply a scene and its camera by `scale`, then move both by `offset`. Compare the rasteriser with float64."""
     view = camera()
     position, rotation, size, *rest = surfels(view)
     pose = view.world_to_camera.copy()
@@ -78,7 +79,7 @@ def seen(focal: float = 1.1, centre: tuple[float, float] | None = None, **how) -
 
 
 def on_the_camera() -> Outcome:
-    """Compare the rasteriser with float64 where surfels lie at the camera's centre, about 1e-7 from it, or behind the camera."""
+    """Compare the rasteriser with float64. Some surfels lie at the camera's centre, some 1e-7 from it, some behind the camera."""
     view = camera()
     position, *rest = surfels(view)
     here = torch.from_numpy(view.position).float()
@@ -89,7 +90,7 @@ def on_the_camera() -> Outcome:
 
 
 def towards_the_camera() -> Outcome:
-    """Compare view-dependent colours and normals with float64, for surfels at distances 0, 1e-7 … 1e5 from the camera."""
+    """Compare view-dependent colours and normals with float64. Surfels are 0, 1e-7, 1e-3, 1 and 1e5 away from the camera."""
     view, generator = camera(), torch.Generator().manual_seed(0)
     way = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator, dtype=torch.float64), dim=-1)
     distance = torch.tensor([0.0, 1e-7, 1e-3, 1.0, 1e5], dtype=torch.float64).repeat(60)[:, None]
@@ -118,7 +119,7 @@ def across_near() -> Outcome:
 
 
 def coincident(count: int = 3000) -> Outcome:
-    """Compare the rasteriser with float64 where all surfels lie in the same place, in different colours."""
+    """Compare the rasteriser with float64 on `count` surfels that differ only in opacity and colour."""
     view = camera(size=(16, 12))
     one = surfels(view, 1, pixels=(3.0, 3.0), depth=(2.0, 2.0))
     generator = torch.Generator().manual_seed(0)
@@ -129,7 +130,7 @@ def coincident(count: int = 3000) -> Outcome:
 
 
 def ties() -> Outcome:
-    """Compare the rasteriser with float64 where all surfels have exactly the same depth, and are drawn in the order of their index."""
+    """Compare the rasteriser with float64 on surfels of exactly equal depth. They must be drawn in the order of their index."""
     view = dataclasses.replace(camera(), world_to_camera=np.eye(4))
     position, *rest = surfels(view)
     position[:, 2] = 2.0
@@ -137,10 +138,10 @@ def ties() -> Outcome:
 
 
 def one_pixel(count: int = 1_000_000) -> Outcome:
-    """Compare the rasteriser with float64 where all surfels lie in one pixel and are smaller than it.
+    """Compare the rasteriser with float64 on `count` surfels that all lie in one pixel and are smaller than it.
 
-    They lie around the pixel's centre, not on it. At the centre, the distance to the surfel and the low-pass filter's distance would both
-    be zero, and rounding would decide which one is less.
+    The rasteriser uses the smaller of two distances: that of the surfel and that of the low-pass filter. At the pixel's centre both would
+    be zero, and rounding would choose. So no surfel lies exactly there.
     """
     view = camera(size=(3, 3))
     _, rotation, scale, opacity, features = surfels(view, count, pixels=(0.01, 0.38), depth=(1.0, 1.0))
@@ -153,7 +154,7 @@ def one_pixel(count: int = 1_000_000) -> Outcome:
 
 
 def nothing() -> Outcome:
-    """Check that without surfels the picture is empty and gradients have no rows."""
+    """Check that a scene without surfels renders as an empty picture, and that the gradients have no rows."""
     view = camera()
     leaves = [v[:0].requires_grad_() for v in surfels(view)]
     maps = rasterize(*leaves, view, near=0.1)

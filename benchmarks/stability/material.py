@@ -1,4 +1,4 @@
-"""Test shading, prefilter, D-SSIM, activations, optimiser and ray tracing with extreme materials, lights and images."""
+"""Test shading, prefilter, D-SSIM, activations, Adam and ray tracing with extreme materials, lights and images."""
 
 from functools import partial
 
@@ -24,9 +24,10 @@ SIDE, RESOLUTION = 32, 16
 
 
 def ball(grazing: float | None = None) -> tuple[Tensor, Tensor, Camera]:
-    """Make the picture of a ball that is seen from far away and fills it: normals and positions (H, W, 3), float64, and the camera.
+    """Make a picture in which a ball covers every pixel. Return maps of normals and positions (H, W, 3), float64, and the camera.
 
-    If `grazing` is given, all normals are changed to have this cosine with the view direction.
+    The camera is far away. If `grazing` is given, normals are replaced so that the cosine between normal and view direction is `grazing` in
+    every pixel.
     """
     view = Camera("far", SIDE, SIDE, 1e3, 1e3, SIDE / 2 + 0.13, SIDE / 2 - 0.17, np.eye(4))
     y, x = torch.meshgrid(*[(torch.arange(SIDE, dtype=torch.float64) + 0.5) / SIDE * 1.2 - 0.6] * 2, indexing="ij")
@@ -45,7 +46,7 @@ def ball(grazing: float | None = None) -> tuple[Tensor, Tensor, Camera]:
 
 
 def light(sun: float = 0.0, scale: float = 1.0) -> Tensor:
-    """Make a cubemap (6·R², 3) of smooth radiance times `scale`, and add the radiance `sun` to one texel, which the ball mirrors."""
+    """Make a cubemap (6·R², 3) of smooth radiance times `scale`. Add the radiance `sun` to one texel that the ball reflects."""
     way = cubemap.texel_directions(RESOLUTION)
     radiance = scale * torch.exp(0.7 * way + 0.2 * torch.sin(5 * way[:, [1, 2, 0]]))
     radiance[int((way @ torch.tensor([0.3, 0.4, -0.87], dtype=torch.float64)).argmax())] += sun
@@ -61,9 +62,10 @@ def lit(
     scale: float = 1.0,
     kink: bool = False,
 ) -> Outcome:
-    """Compare the shading of a ball with float64. Material values that are not given are random.
+    """Compare the shading of a ball with the float64 reference. Material values that are not given are random.
 
-    `grazing` is explained at `ball`, `sun` and `scale` at `light`, `kink` at `compare.shading`.
+    `grazing` is the cosine between normal and view direction. `scale` multiplies the light, and `sun` is the extra radiance of one texel.
+    Set `kink` if gradients cannot be compared, because the derivative jumps in every pixel.
     """
     normal, position, view = ball(grazing)
     generator = torch.Generator().manual_seed(0)
@@ -77,9 +79,9 @@ def lit(
 
 
 def one_sun(radiance: float) -> Outcome:
-    """Check that the prefilter is linear, forward and backward.
+    """Check that the prefilter and its gradient are linear, with a light that has one very bright texel of this `radiance`.
 
-    The result for a smooth light with a sun of this radiance must be the sum of two results: for the smooth light, and for the sun alone.
+    Prefiltering the whole light must give the same as prefiltering the smooth light and the bright texel separately, and adding both.
     """
     smooth, texel = light(), light(sun=1.0) - light()
     both = (smooth + radiance * texel).requires_grad_()
@@ -119,7 +121,10 @@ def likeness(kind: str) -> Outcome:
 
 
 def activations() -> Outcome:
-    """Compare activations of raw values 0 … ±1e4 with float64. Check that no derivative is zero in the range that training allows."""
+    """Compare activations, such as the sigmoid for opacity, with float64, for inputs from -1e4 to 1e4.
+
+    Check also that derivatives are positive for all inputs that training allows.
+    """
     raw = torch.tensor([-1e4, -87, -12, -6, -1, 0, 1, 6, 12, 87, 1e4])
     names = ("scale", "opacity", "albedo", "metallic", "roughness")
     empty = {
@@ -148,7 +153,7 @@ def activations() -> Outcome:
 
 
 def steps(size: float) -> Outcome:
-    """Compare a hundred steps of Adam, on random gradients of a given size, with torch's Adam in float64."""
+    """Compare a hundred steps of Adam with torch's Adam in float64. The gradients are random; `size` is their standard deviation."""
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(1000, generator=generator)
     gradients = size * torch.randn(100, 1000, generator=generator)
@@ -161,9 +166,9 @@ def steps(size: float) -> Outcome:
 
 
 def rays(scale: float, offset: float) -> Outcome:
-    """Trace random rays inside a hollow ball with an opening. Return the share of rays whose visibility is wrong.
+    """Trace random rays from inside a hollow ball with an opening. The error is the fraction of rays whose visibility is wrong.
 
-    `scale` and `offset` scale and move the ball and the rays.
+    Ball and rays are multiplied by `scale` and moved by `offset`.
     """
     shape = trimesh.creation.icosphere(4)
     open_side = shape.triangles_center[:, 2] < 0.3

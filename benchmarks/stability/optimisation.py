@@ -1,4 +1,4 @@
-"""Disturb trainings, which must recover, and repeat trainings, which must agree bit for bit."""
+"""Test trainings: after a disturbance they must recover, and when repeated they must give the same bits."""
 
 import functools
 import math
@@ -28,9 +28,9 @@ AT, UNTIL, LONG = 50, 90, 300  # iterations: start and end of a disturbance, len
 def disturbed(
     start: Callable[[Trainer], None], end: Callable[[Trainer], None] | None = None, total: int = TOTAL
 ) -> Outcome:
-    """Train with and without a disturbance. Return the PSNR in dB that is lost at the end, and when the disturbed training recovered.
+    """Train for `total` iterations with and without a disturbance. Measure the PSNR (dB) lost at the end, and how long the recovery took.
 
-    `start` makes the disturbance at iteration AT; `end`, if given, undoes it at iteration UNTIL.
+    At iteration AT, the function `start` changes the trainer. At iteration UNTIL, the function `end` undoes the change, if it is given.
     """
     course = train(ball(), total=total, disturb={AT: start} | ({UNTIL: end} if end else {}))
     since = UNTIL if end else AT
@@ -38,7 +38,10 @@ def disturbed(
 
 
 def faster(factor: float, geometry: bool) -> Callable[[Trainer], None]:
-    """Return a disturbance that multiplies the learning rates of geometry, or those of light and materials, by `factor`."""
+    """Return a function that multiplies a trainer's learning rates by `factor`.
+
+    If `geometry` is set, only the rates of geometry change, otherwise only those of light and materials.
+    """
 
     def change(made: Trainer) -> None:
         rates = made.state.settings.rates
@@ -54,7 +57,7 @@ def _set(made: Trainer, section: str, values: dict[str, float]) -> None:
 
 
 def heavier(factor: float) -> Callable[[Trainer], None]:
-    """Return a disturbance that multiplies all loss weights by `factor`, except D-SSIM's, which is a fraction of the colour loss."""
+    """Return a function that multiplies a trainer's loss weights by `factor`, except D-SSIM's, which is a fraction and not a weight."""
 
     def change(made: Trainer) -> None:
         loss = made.state.settings.loss
@@ -65,7 +68,10 @@ def heavier(factor: float) -> Callable[[Trainer], None]:
 
 
 def nan_gradient(name: str, every: bool = False) -> Callable[[Trainer], None]:
-    """Return a disturbance that sets one number of a parameter's gradient to NaN, once or in every later step."""
+    """Return a function that puts a NaN into the gradient of a trainer's parameter `name` at the next step.
+
+    If `every` is set, it does so at all later steps, too.
+    """
 
     def change(made: Trainer) -> None:
         judge = made.guard.judge
@@ -90,7 +96,10 @@ def nan_value(name: str) -> Callable[[Trainer], None]:
 
 
 def stopped() -> Outcome:
-    """Check that a training whose gradients stay NaN goes back to its checkpoint, then ends with a one-line error."""
+    """Train with gradients that stay NaN from some iteration on.
+
+    Check that the training returns to its last checkpoint, fails again, and then ends with a one-line error.
+    """
     try:
         train(ball(), disturb={AT: nan_gradient("albedo", every=True)})
     except InputError as error:
@@ -106,7 +115,7 @@ def with_settings(*changes: str, total: int = TOTAL) -> Outcome:
 def trajectories() -> Outcome:
     """Take thirty steps of Adam twice: with the float32 kernels, and with the float64 reference.
 
-    Returns the difference of the two final pictures, divided by how much the picture changed during the steps.
+    The error is the difference of the two final pictures, divided by how much the picture changed during the steps.
     """
     view = camera(size=(24, 18))
     target = reference.rasterize(*(v.double() for v in surfels(view, 60)), view, 0.1)[0].float()
@@ -161,7 +170,10 @@ def bits(made: Trainer) -> list[Tensor]:
 
 
 def resumed() -> Outcome:
-    """Stop a training in each stage (see CUTS) and resume it. Return the share of tensors that differ from an uninterrupted training's."""
+    """Stop a training in each of its stages, such as before and after inter-reflection starts, and resume it.
+
+    The error is the fraction of tensors that differ from those of a training without a stop.
+    """
     whole = trainer(ball(), *STAGES, total=100)
     copies: dict[int, Path] = {}
     for cut, in_stage in CUTS.items():
@@ -189,7 +201,7 @@ def same(whole: Trainer, others: list[Trainer]) -> Outcome:
 
 
 def threads() -> Outcome:
-    """Run the same training on one, two and three threads. Return the share of tensors that differ."""
+    """Train the same scene with one, two and three threads. The error is the fraction of tensors that differ."""
     before, made = torch.get_num_threads(), []
     try:
         for count in (1, 2, 3):

@@ -1,4 +1,4 @@
-"""Train on unusual captures, and compare the held-out PSNR with that of the usual capture."""
+"""Train on unusual photos. Compare the PSNR on held-out views with that of a training on the usual photos."""
 
 import functools
 from collections.abc import Callable
@@ -15,12 +15,18 @@ NOISE = 0.7  # dB: another seed changes less than this (docs/stability.md)
 
 
 def against(course: Course, least: float) -> Outcome:
-    """Return by how many dB a training's final PSNR on held-out views falls short of `least`; 0 if it does not."""
+    """Compare a finished training with a PSNR of `least` dB on held-out views.
+
+    The error is how many dB the training's final PSNR is lower, or 0 if it is not.
+    """
     return Outcome(course.finite, max(0.0, least - course.end))
 
 
 def elsewhere(scale: float, offset: float) -> Outcome:
-    """Train on a scaled and moved scene. Check that the splats lie where the scene is, and return how many dB the PSNR changes."""
+    """Train on a scene that is multiplied by `scale` and moved by `offset`. The error is the change of the PSNR in dB.
+
+    Check also that the surfels end up where the scene is.
+    """
 
     def pose(matrix: np.ndarray) -> np.ndarray:
         matrix[:3, 3] = scale * matrix[:3, 3] + offset
@@ -47,7 +53,7 @@ def of_these(**how) -> Outcome:
 
 
 def refused(make: Callable[[], object]) -> Outcome:
-    """Check that a bad capture is refused with a one-line error. `make` trains on the capture."""
+    """Call `make`, which trains on a bad capture. Check that it raises InputError with a message of one line."""
     try:
         make()
     except InputError as error:
@@ -56,7 +62,7 @@ def refused(make: Callable[[], object]) -> Outcome:
 
 
 def mixed(pixels: np.ndarray, index: int) -> np.ndarray:
-    """Resize a photo to 24×24 pixels if `index` is 1, 4, 7 …, so that the capture has photos of two sizes."""
+    """Resize every third photo to 24×24 pixels, so that the capture has photos of two sizes. `index` is the photo's number."""
     if index % 3 == 0:
         return pixels
     from PIL import Image
@@ -91,8 +97,8 @@ NORMALISED = "what is far from the origin or of an odd size is learned in the ru
 LEAST = "as a picture without detail"
 
 
-def _poor(name: str, photo, least: float, guard: str, total: int = TOTAL) -> Case:
-    """Make a case that trains on uninformative photos. It passes if held-out views reach `least` dB."""
+def _without_detail(name: str, photo, least: float, guard: str, total: int = TOTAL) -> Case:
+    """Make a case that trains for `total` iterations on photos without detail. It passes if the held-out PSNR reaches `least` dB."""
     run = functools.partial(photographed, photo, lambda: least, total)
     return _case(name, run, guard, 0.0, LEAST, f"{least:g} dB")
 
@@ -139,13 +145,15 @@ CASES = [
         LEAST,
         "8 dB",
     ),
-    _poor(
+    _without_detail(
         "total darkness", with_color(0.0), 25.0, "raw light stays above −12, where its slope still counts", total=450
     ),
-    _poor("over-exposed by 4 stops, clipped", brighter(4), 24.0, "a prediction is clipped only where the photo is"),
-    _poor("constant, masked", with_color(0.5), 28.0, ""),
-    _poor("constant, no masks", opaque, 24.0, "white masks are not used, and that is said"),
-    _poor("noise", noise, 10.0, ""),
+    _without_detail(
+        "over-exposed by 4 stops, clipped", brighter(4), 24.0, "a prediction is clipped only where the photo is"
+    ),
+    _without_detail("constant, masked", with_color(0.5), 28.0, ""),
+    _without_detail("constant, no masks", opaque, 24.0, "white masks are not used, and that is said"),
+    _without_detail("noise", noise, 10.0, ""),
     _case(
         "exposures of ±1 stop",
         lambda: of_these(stops=(0.0, 1.0, 0.0, -1.0, 0.0)),

@@ -1,7 +1,8 @@
-"""Measure in float64 how well photos tell light from material.
+"""Measure how well photos can distinguish changes of light from changes of material, in float64.
 
-A change of the light and a change of the material may cancel in the pictures. For each such pair of changes, tables show the singular
-values of the pictures' Jacobian, and the effect of each loss weight.
+Two changes may cancel: a brighter light and a darker base colour give almost the same pictures. For each such pair of changes, a table
+shows the singular values of the pictures' Jacobian. If the smaller one is near zero, photos cannot distinguish the two. The table also
+shows how much each loss weight helps.
 """
 
 from collections.abc import Callable
@@ -40,7 +41,7 @@ TRADES = {
 
 
 class Scene(NamedTuple):
-    """Describe a ball under a light. `light` maps directions to radiance.
+    """Describe a ball under a light. `light` is a function that maps directions to radiance.
 
     `materials` has one material for the whole ball, or two for its left and right half. A material is base colour, metallic and roughness.
     """
@@ -49,9 +50,9 @@ class Scene(NamedTuple):
     materials: tuple[tuple[Tensor, float, float], ...]
 
     def radiance(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Compute three maps (6·R², 3): the light's radiance, its change by a tint, and its change by a blur.
+        """Compute three cubemaps (6·R², 3): the light's radiance, its change by a tint, and its change by a blur.
 
-        The blur averages neighbouring texels; a texel is a sixteenth of a face's side.
+        The tint adds red and removes blue. The blur averages 3×3 neighbouring texels.
         """
         base = torch.from_numpy(self.light(cubemap.texel_directions(RESOLUTION).numpy())).float()
         faces = torch.nn.functional.pad(
@@ -61,9 +62,9 @@ class Scene(NamedTuple):
         return base, base * torch.tensor([1.0, 0.0, -1.0]), mean - base
 
     def pictures(self, change: Tensor) -> Tensor:
-        """Render all views, and return their sRGB values as one vector (P,).
+        """Apply eight changes to the scene, such as a brighter light or a higher roughness. Then render the ball from all views.
 
-        `change` (8,) has the amounts by which light, materials and exposure are changed first (LIGHT, ALBEDO … EXPOSURE).
+        Return the sRGB values as one vector (P,). `change` (8,) has the size of each change; its indices are LIGHT, ALBEDO … EXPOSURE.
         """
         normal, position, view = ball()
         base, tint, blur = (prefilter.prefilter(radiance, RESOLUTION).double() for radiance in self.radiance())
@@ -91,14 +92,17 @@ class Scene(NamedTuple):
         return torch.cat(found)
 
     def jacobian(self) -> Tensor:
-        """Compute the pictures' derivatives (P, 8) by each of the eight changes, divided by √P. Central differences are used."""
+        """Compute the derivatives (P, 8) of all sRGB values with respect to the eight changes (see `pictures`), divided by √P.
+
+        Central differences are used.
+        """
         columns = [self.pictures(STEP * e) - self.pictures(-STEP * e) for e in torch.eye(8).double()]
         return torch.stack(columns, dim=1) / (2 * STEP) / len(columns[0]) ** 0.5
 
     def weights(self, change: Tensor) -> dict[str, Tensor]:
-        """Compute each weighted loss term for the light, materials and exposure changed by `change` (8,), see `pictures`.
+        """Apply eight changes (see `pictures`) to the scene. Then compute the loss terms of light, materials and exposure.
 
-        The weights are those of the preset `standard` at the end of a training.
+        Each term is multiplied by its weight in the preset `standard` at the end of a training.
         """
         loss = load_settings("standard").loss
         base, tint, blur = (radiance.double().mean(dim=0) for radiance in self.radiance())
@@ -113,7 +117,10 @@ class Scene(NamedTuple):
         }
 
     def derivatives(self, weight: str) -> tuple[Tensor, Tensor]:
-        """Compute the first (8,) and second (8, 8) derivatives of a loss term by the eight changes."""
+        """Compute the gradient (8,) and the Hessian (8, 8) of one loss term with respect to the eight changes (see `pictures`).
+
+        `weight` is the term's name in the settings, such as "loss.light".
+        """
         at = torch.zeros(8).double()
         return tuple(
             derivative(lambda change: self.weights(change)[weight], at)
@@ -138,7 +145,7 @@ SCENES = {
 def condition(hessian: Tensor) -> str:
     """Return the condition number of a 2×2 Hessian as text.
 
-    It is "no minimum" if the smaller eigenvalue is negative, and "∞" if that is zero.
+    The text is "no minimum" if an eigenvalue is negative, and "∞" if the smaller one is zero.
     """
     low, high = torch.linalg.eigvalsh(hessian).tolist()
     if abs(low) < ROUNDING * high:
@@ -147,7 +154,10 @@ def condition(hessian: Tensor) -> str:
 
 
 def tables() -> list[tuple[str, list[str], list[list[str]]]]:
-    """Make a table that shows how well each scene's photos distinguish the two changes of each pair: title, headings, rows."""
+    """Make a table with a line for each scene and each pair of changes that may cancel. Return its title, headings and lines in a list.
+
+    It shows how well the scene's photos distinguish the two changes.
+    """
     weights, rows = ("loss.light", "loss.metallic", "loss.matte", "loss.exposure"), []
     for name, scene in SCENES.items():
         jacobian = scene.jacobian()
@@ -168,7 +178,7 @@ def tables() -> list[tuple[str, list[str], list[list[str]]]]:
 
 
 def by_autograd() -> Outcome:
-    """Compare the Jacobian by central differences with autograd through the reference."""
+    """Compare the Jacobian, which is computed by central differences, with torch's automatic differentiation."""
     scene = SCENES["half metal, half dielectric, suns"]
     upstream = torch.randn(
         len(scene.pictures(torch.zeros(8).double())), generator=torch.Generator().manual_seed(0)
@@ -179,8 +189,11 @@ def by_autograd() -> Outcome:
     return Outcome(bool(exact.isfinite().all()), float(((found - exact).abs() / exact.abs().max()).max()))
 
 
-def said() -> Outcome:
-    """Train an all-metal ball. Check that the report calls the light's scale and white balance ambiguous, but not the metallic value."""
+def ambiguities_are_reported() -> Outcome:
+    """Train on a metal ball. Its photos cannot tell a brighter or tinted light from a brighter or tinted base colour.
+
+    Check that the training reports both as ambiguous, and does not report the metallic value.
+    """
     trades = ambiguities(train(capture(), total=300).trainer.state)
     right = "what" in trades["light_scale"] and "what" in trades["white_balance"] and "what" not in trades["metal"]
     return Outcome(all(v["left"] <= v["alone"] for v in trades.values()), 0.0 if right else 1.0)
@@ -190,7 +203,7 @@ CASES = [
     Case("stiffness: the Jacobian", by_autograd, "autograd, float64", 1e-6, "differences of second order", ""),
     Case(
         "stiffness: a ball of metal",
-        said,
+        ambiguities_are_reported,
         "what is known of it",
         0.0,
         "it is said or not",

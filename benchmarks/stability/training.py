@@ -1,4 +1,4 @@
-"""Train on a small metal ball, undisturbed or disturbed, for the stability cases to compare."""
+"""Train on photos of a small metal ball, with or without a disturbance. The stability cases compare such trainings."""
 
 import atexit
 import functools
@@ -50,9 +50,10 @@ def changed(
     photo: Callable[[np.ndarray, int], np.ndarray] = lambda pixels, index: pixels,
     views: int | None = None,
 ) -> Path:
-    """Copy the ball's capture and return the new folder. Only the first `views` training views are kept.
+    """Copy the photos of the metal ball into a new folder with changes, and return the folder.
 
-    `pose` changes each camera-to-world matrix, `photo` changes each photo (H, W, 4) in 0..1, given its index.
+    `pose` changes each camera-to-world matrix. `photo` changes each photo (H, W, 4) in 0..1; its second argument is the photo's number. If
+    `views` is given, only this number of training views is kept.
     """
     folder = Path(tempfile.mkdtemp(dir=workspace()))
     for split in ("train", "test"):
@@ -69,7 +70,7 @@ def changed(
 
 
 class Course(NamedTuple):
-    """Hold a finished training: its held-out PSNR in dB by iteration, its warnings, and the trainer."""
+    """Hold a finished training: the held-out PSNR (dB) measured at some iterations, the warnings, and the trainer."""
 
     psnr: dict[int, float]
     said: list[str]
@@ -92,9 +93,9 @@ class Course(NamedTuple):
         return self.trainer.state.render(view.camera)
 
     def back_after(self, start: int, undisturbed: "Course") -> int:
-        """Count the iterations from `start` until the PSNR has recovered: it then stays within BACK dB of an undisturbed training's.
+        """Count the iterations from `start` until this training has recovered. Return NEVER if it has not recovered at the end.
 
-        Return NEVER if the PSNR has not recovered at the end.
+        It has recovered when its PSNR no longer falls more than BACK dB below that of the undisturbed training.
         """
         late = [i for i in self.psnr if i > start and self.psnr[i] < undisturbed.psnr.get(i, undisturbed.end) - BACK]
         return NEVER if late and max(late) == max(self.psnr) else max(late, default=start - LOOK) + LOOK - start
@@ -116,9 +117,9 @@ def trainer(
 def train(
     capture: Path, *changes: str, total: int = TOTAL, disturb: dict[int, Callable[[Trainer], None]] | None = None
 ) -> Course:
-    """Train on a capture to the end, and measure the held-out PSNR every LOOK iterations.
+    """Train on a capture for `total` iterations, and measure the held-out PSNR every LOOK iterations.
 
-    `changes` are settings. `disturb` maps an iteration to a function that is called at that iteration.
+    `changes` are settings, such as "train.seed=1". `disturb` maps iterations to functions, which are called with the trainer at that time.
     """
     said: list[str] = []
     made, psnr = trainer(capture, *changes, total=total, said=said), {}

@@ -1,4 +1,4 @@
-"""Test the benchmarks' harness: training, tables, the kept figures, and the page that is generated from them."""
+"""Test what all benchmarks share: training the missing runs, tables, the CSV of earlier values, and the page made from it."""
 
 import json
 from argparse import ArgumentParser
@@ -29,13 +29,16 @@ def scenes(tmp_path):
 
 @pytest.fixture
 def words(scenes, tmp_path):
-    """Return the options of a benchmark of these scenes, as words of a command line."""
+    """Return the command-line options of a benchmark on the test's scenes."""
     return ["--scenes", str(scenes), "--out", str(tmp_path / "out"), "--csv", str(tmp_path / "a.csv")]
 
 
 @pytest.fixture
 def called(monkeypatch):
-    """Replace calls of refgs by a fake that writes finished runs; return the list of commands that are called."""
+    """Replace the calls of refgs' commands: none runs, but the files of a finished run are written.
+
+    Return a list that receives the arguments of each call.
+    """
     found = []
 
     def call(command: str, folder: Path, *words: object) -> int:

@@ -1,4 +1,4 @@
-"""Test finding the best PSNR that a preset had reached by a given time; the whole command's seconds count."""
+"""Test how the preset with the best PSNR after a number of seconds is found. The seconds of the whole command count."""
 
 import json
 

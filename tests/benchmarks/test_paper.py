@@ -1,4 +1,4 @@
-"""Test the benchmark of the paper's tables: the scenes it finds, the runs it repeats, and the figures side by side."""
+"""Test the benchmark on the paper's data sets: which scenes it finds, which runs it skips, and the tables that it prints."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from tests.makers.captures import colmap, nero, shiny_blender
 
 
 def finish(run: Path, **figures: float) -> None:
-    """Write the files that a run has after `refgs evaluate`, with the given figures."""
+    """Write the files of a run that is trained and evaluated. `figures` are its metrics."""
     run.mkdir(parents=True)
     (run / "run.toml").touch()
     (run / "splats.ply").touch()
@@ -20,9 +20,9 @@ def finish(run: Path, **figures: float) -> None:
 
 
 def test_the_papers_figures_are_its_means():
-    """Check that means of the figures kept from the paper's Table 1 agree with its Tables 5 and 6.
+    """Check the numbers that were copied from the paper: their means over a data set's scenes are the means that the paper prints.
 
-    Only the mean PSNR of Glossy Synthetic, 30.33, differs from the mean of its scenes.
+    The paper's mean PSNR of Glossy Synthetic, 30.33, is the only one that differs slightly.
     """
 
     def mean(data_set: str, measure: str) -> float:
@@ -72,7 +72,10 @@ def test_nothing_there_is_said_in_one_line(tmp_path):
 
 
 def test_tables_of_finished_runs(tmp_path, capsys):
-    """Check that tables are printed from finished runs without training. If a scene lacks LPIPS, its cell and the mean are empty."""
+    """Check that finished runs are not trained again, and that their tables are right.
+
+    One scene has no LPIPS: its cell and the column's mean are empty.
+    """
     data, out = tmp_path / "data", tmp_path / "runs"
     figures = "psnr", "ssim", "lpips", "normal_mae_degrees", "training_seconds"
     measured = {
@@ -117,7 +120,7 @@ def test_a_scene_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, caps
 
 
 def test_from_photos_to_the_tables(tmp_path, monkeypatch, capsys):
-    """Train, evaluate and print a tiny version of Shiny Blender's ball, all in this process."""
+    """Train and evaluate a tiny version of Shiny Blender's ball, and print the tables."""
     shiny_blender(tmp_path / "shiny_blender" / "ball")
     preset = tmp_path / "tiny.toml"
     preset.write_text(

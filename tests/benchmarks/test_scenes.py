@@ -1,4 +1,4 @@
-"""Test captures with ground truth: their files agree with each other, the true mesh and the light."""
+"""Test captures with ground truth: photos, depth, normals and materials agree with the true mesh and the true light."""
 
 import json
 import subprocess
@@ -46,7 +46,10 @@ def read(path):
 
 @pytest.fixture(scope="module")
 def rings(tmp_path_factory):
-    """Render all scenes where only the folder of the scene `rings` is missing. Return that folder and the finished process."""
+    """Render all scenes into a folder where all but `rings` exist already, so that only `rings` is rendered.
+
+    Return the folder of `rings`, and the finished process.
+    """
     pytest.importorskip("bpy")
     out = tmp_path_factory.mktemp("all")
     for name in set(NAMES) - {"rings"}:
@@ -61,7 +64,10 @@ def passes(capture):
 
 
 def camera_rays(capture, per_side=1):
-    """Compute a test view's origin (3,), unit rays (SIZE·n, SIZE·n, 3), n × n a pixel, and camera axis from transforms_test.json alone."""
+    """Compute a test view's rays from transforms_test.json. Each pixel has n × n rays, where n is `per_side`.
+
+    Return the origin (3,), the unit directions (SIZE·n, SIZE·n, 3), and the camera's viewing direction (3,).
+    """
     transforms = json.loads((capture[0] / "transforms_test.json").read_text())
     matrix = np.array(transforms["frames"][0]["transform_matrix"])
     focal = SIZE * per_side / 2 / np.tan(transforms["camera_angle_x"] / 2)
@@ -139,7 +145,10 @@ def test_materials_are_where_they_belong(capture):
 
 
 def lookup(panorama, directions):
-    """Read a panorama in directions, in Blender's orientation: u = 0.5 − atan2(y, x)/2π, v = 0.5 + asin(z)/π from the bottom."""
+    """Look up a panorama in these directions. Blender's orientation is used.
+
+    That is, u = 0.5 − atan2(y, x)/2π from the left, and v = 0.5 + asin(z)/π from the bottom.
+    """
     height, width = panorama.shape[:2]
     u = 0.5 - np.arctan2(directions[..., 1], directions[..., 0]) / (2 * np.pi)
     v = 0.5 - np.arcsin(directions[..., 2].clip(-1, 1)) / np.pi
@@ -193,7 +202,10 @@ def pixel_means(values, per_side):
 
 
 def march(solid, origins, directions):
-    """March rays (n, 3) to the surface of the signed distance `solid`. Return which rays hit it, and the end points of all."""
+    """March rays (n, 3) until they hit the surface of a signed distance function, `solid`.
+
+    Return which rays hit it, and the end points of all rays.
+    """
     along = np.zeros(len(directions))
     for _ in range(200):
         distance = solid(origins + directions * along[:, None])

@@ -1,4 +1,4 @@
-"""Run every case of `refgs stability`, and the command itself. Cases that train are slow tests."""
+"""Run every case of `refgs stability`, and the command itself. Cases that train are marked as slow."""
 
 import subprocess
 import sys

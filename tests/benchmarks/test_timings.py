@@ -1,4 +1,4 @@
-"""Test that the benchmarks of kernels and cards run; their figures depend on the machine."""
+"""Test that the benchmarks of CPU kernels and of GPUs run. How fast they run is not tested."""
 
 from argparse import ArgumentParser
 from functools import partial
@@ -18,7 +18,7 @@ def bench():
 
 
 def test_the_cards_benchmark_runs(bench, capsys):
-    """Run the card's benchmark on the CPU, except for its trainings."""
+    """Run the GPU benchmark on the CPU, without its trainings."""
     gpu.measure_raster(bench, CPU, [(500, 60, 40)], rounds=2)
     gpu.measure_frames(bench, CPU, 500, 40, rounds=2)
     gpu.measure_iteration(bench, CPU, rounds=1)
@@ -35,7 +35,7 @@ def test_no_card_is_said(monkeypatch, capsys):
 
 
 def test_the_kernels_benchmark_runs(monkeypatch, bench):
-    """Check that a small version of the kernels' benchmark records every step, on one instruction set."""
+    """Run the benchmark of CPU kernels on a small scene. Check that it records a time for every kernel."""
     for name, value in {"SPLATS": 300, "SIDE": 24, "ROUNDS": 1}.items():
         monkeypatch.setattr(kernels, name, value)
     monkeypatch.setattr(kernels.load, "supported", lambda: ["sse4"])
@@ -47,9 +47,9 @@ def test_the_kernels_benchmark_runs(monkeypatch, bench):
 
 
 def test_covered_pairs_are_about_those_that_are_blended():
-    """Check that the estimate of the pixels that surfels cover, summed over surfels, is within 15 % of the pixels that are blended.
+    """Check the estimate of how many pixels the surfels cover. It must agree to 15 % with what the rasteriser blends.
 
-    Surfels are so transparent that none is occluded, so the sum of alpha gives the number of blended pixels.
+    Surfels are almost transparent, so that none hides another. The number of blended pixels is computed from the sum of alpha.
     """
     (positions, rotations, scales, _, _), camera = gpu.make_ball(2000, 200, 150, CPU)
     opacities = torch.full((2000,), 0.02)
