@@ -37,7 +37,7 @@ def new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
 
 
 def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
-    """Return the node tree of a material or a world, without nodes: the old nodes are removed."""
+    """Remove all nodes from the node tree of a material or a world, and return the empty tree."""
     if data.node_tree is None:  # from 5.0 a tree always exists, and `use_nodes` is deprecated
         data.use_nodes = True
     data.node_tree.nodes.clear()
@@ -45,7 +45,7 @@ def node_tree(data: bpy.types.Material | bpy.types.World) -> bpy.types.NodeTree:
 
 
 def modifier_input(modifier: bpy.types.NodesModifier, name: str) -> tuple[bpy.types.bpy_struct, str]:
-    """Find the property that holds an input of a geometry-nodes modifier. Returns its struct and its name, for `layout.prop`."""
+    """Find where Blender stores an input of a geometry-nodes modifier. Returns the two arguments for `layout.prop`: owner and property."""
     identifier = modifier.node_group.interface.items_tree[name].identifier
     if hasattr(modifier, "properties"):  # from 5.2
         return getattr(modifier.properties.inputs, identifier), "value"
@@ -90,9 +90,9 @@ def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
 
 
 def usd_keeps_textures() -> dict[str, str | bool]:
-    """Return the USD exporter's options that keep textures in their place instead of copying them.
+    """Return options for Blender's USD exporter: the file refers to the existing textures, and the exporter copies none.
 
-    Raises KeyError where Blender is built without USD, as Debian's is.
+    Raises KeyError if Blender was built without USD, as Debian's Blender is.
     """
     known = bpy.ops.wm.usd_export.get_rna_type().properties
     return {"export_textures_mode": "KEEP"} if "export_textures_mode" in known else {"export_textures": False}

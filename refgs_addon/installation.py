@@ -1,9 +1,10 @@
-"""Install and remove the trainer in a Python environment of its own. This module needs no bpy.
+"""Install the trainer into a Python environment of its own, or remove it. This module needs no bpy.
 
-Run as a program, this file speaks the job protocol (docs/job-protocol.md) and takes one command: `install` or `remove`. When its standard
-input closes, which happens whenever Blender ends, it kills its child process and exits. An interrupted installation does no harm: a
-marker file is written last, and an environment without the marker counts as not installed. Finished downloads stay in uv's cache, and the
-next installation uses them.
+Blender also runs this file as a separate process. That process reads one command, `install` or `remove`, from stdin, and prints events to
+stdout (docs/job-protocol.md). When Blender ends, stdin closes: the process then kills uv or the trainer, and exits.
+
+An interrupted installation does no harm. The last step writes a marker file, and without that file the trainer counts as not installed.
+Finished downloads stay in uv's cache for the next installation.
 """
 
 import contextlib
@@ -45,7 +46,7 @@ def bundled_version() -> str:
 
 
 def installed(home: Path) -> str:
-    """Return the version of the installed trainer, or "" without one."""
+    """Return the version of the trainer that is installed in the folder `home`, or "" if none is."""
     try:
         return _marker(home).read_text(encoding="utf-8")
     except OSError:
@@ -53,32 +54,32 @@ def installed(home: Path) -> str:
 
 
 def interrupted(home: Path) -> bool:
-    """Check whether an installation was stopped halfway."""
+    """Check whether an installation into the folder `home` was stopped halfway."""
     return not installed(home) and (home / "cache").is_dir()
 
 
 def python(home: Path) -> Path:
-    """Return the path of the environment's Python."""
+    """Return the path of Python in the trainer's environment. `home` is the folder where the trainer is installed."""
     return home / "env" / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
 
 
 def needed_bytes() -> float:
-    """Estimate the bytes of an installation. If nvidia-smi exists, the estimate is larger, because uv may choose torch's CUDA build."""
+    """Estimate the disk space in bytes for the trainer. A machine with nvidia-smi needs more, because it may get torch's CUDA build."""
     return NEEDED_WITH_CARD if shutil.which("nvidia-smi") else NEEDED
 
 
 def free_bytes(home: Path) -> float:
-    """Return the free bytes on the disk of a folder, which need not exist yet."""
+    """Return the free bytes on the disk for the folder `home`. The folder may not exist yet."""
     return shutil.disk_usage(next(folder for folder in (home, *home.parents) if folder.is_dir())).free
 
 
 def space_line(home: Path) -> str:
-    """Describe the space that an installation needs and the space that is free."""
+    """Describe the needed and the free disk space, such as "it needs about 2 GB; 80 GB are free"."""
     return f"it needs about {needed_bytes() / GB:.0f} GB; {free_bytes(home) / GB:.0f} GB are free"
 
 
 def disk_full_line(home: Path) -> str:
-    """Return a line for the artist if the disk is too full for the rest of the installation, else ""."""
+    """Return an error message if the disk has too little space to complete the installation, else ""."""
     if installed(home) or free_bytes(home) + folder_bytes(home) >= needed_bytes():
         return ""
     return f"too little space on the disk of {home} ({space_line(home)}): free some, or choose a Python that has the trainer"
@@ -106,7 +107,7 @@ _child: subprocess.Popen | None = None
 
 
 class _Failed(Exception):
-    """Stop the command and report one line to the artist."""
+    """End the command with an error. The exception's text is the one line that the artist sees."""
 
 
 def main() -> None:
@@ -176,10 +177,10 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
     if not was:  # update an environment in place; start an interrupted one anew, as it may be broken
         _emit("stage", what="Making a Python environment")
         _delete(home / "env")
-        _uv(program, variables, home, "venv", "--python", PYTHONS, str(home / "env"))
+        _run_uv(program, variables, home, "venv", "--python", PYTHONS, str(home / "env"))
     _emit("stage", what="Resolving the trainer's dependencies")
     # --no-build: the artist's machine may have no compiler.
-    _uv(program, variables, home, "pip", "install", "--no-build", "--python", str(python(home)), str(trainer))
+    _run_uv(program, variables, home, "pip", "install", "--no-build", "--python", str(python(home)), str(trainer))
     _emit("stage", what="Starting the trainer for the first time", part=0.99)
     _start_trainer(python(home))
     _marker(home).write_text(trainer.name.split("-")[1], encoding="utf-8")
@@ -205,10 +206,11 @@ def _unpack(uv: Path, home: Path) -> Path:
 
 
 def _uv_environment(home: Path) -> dict[str, str]:
-    """Return the environment variables for uv. Variables that are already set, such as a studio's mirror, take precedence.
+    """Return the environment variables for uv. Variables that the user has set, such as the address of a package mirror, keep their values.
 
-    uv downloads its own Python, because Blender's changes with the next Blender and the system's with its updates. uv chooses the build
-    of torch for this machine's card. An empty UV_TORCH_BACKEND makes uv take the build of the package index, which mirrors need.
+    uv downloads a Python for the trainer, because an update may replace Blender's Python or the system's. UV_TORCH_BACKEND "auto" lets uv
+    choose the build of torch for this machine's GPU. If the user has set UV_TORCH_BACKEND to "", it is removed: uv then takes torch from
+    the package index, as some mirrors require. Variables for Python itself (PYTHON…) are removed too.
     """
     set_here = {"UV_TORCH_BACKEND": "auto", "UV_PYTHON_INSTALL_DIR": str(home / "python")}
     if not os.environ.keys() & {
@@ -230,10 +232,10 @@ def _start(words: list[str], **how) -> subprocess.Popen:
     return _child
 
 
-def _uv(program: Path, variables: dict[str, str], home: Path, *words: str) -> None:
-    """Run uv and report its progress. Raises _Failed with what is wrong and what to do."""
+def _run_uv(program: Path, variables: dict[str, str], home: Path, *arguments: str) -> None:
+    """Run uv with these command-line arguments and report its progress. Raises _Failed with a message for the artist if uv fails."""
     options = ["--color", "never", "--cache-dir", str(home / "cache")]
-    process = _start([str(program), *options, *words], stderr=subprocess.STDOUT, env=variables, cwd=home)
+    process = _start([str(program), *options, *arguments], stderr=subprocess.STDOUT, env=variables, cwd=home)
     fetching: dict[str, str] = {}  # size by package
     ended = threading.Event()
     threading.Thread(target=_report_download, args=(home, fetching, ended), daemon=True).start()
@@ -258,9 +260,10 @@ def _uv(program: Path, variables: dict[str, str], home: Path, *words: str) -> No
 
 
 def _report_download(home: Path, fetching: dict[str, str], ended: threading.Event) -> None:
-    """Report uv's downloads every two seconds until `ended` is set. uv itself is silent while it downloads torch, which takes minutes.
+    """Report the progress of uv's downloads every two seconds, until the event `ended` is set. Runs in a thread of its own.
 
-    `fetching` maps the packages being downloaded to their sizes.
+    uv prints nothing while it downloads torch, which takes minutes. So the progress is the size of uv's cache folder. `fetching` maps each
+    package that uv downloads now to its size, as uv prints it.
     """
     while not ended.wait(2):
         now = list(fetching.items())
@@ -287,7 +290,7 @@ def _start_trainer(python: Path) -> None:
 
 
 def explain_uv_error(text: str, home: str) -> str:
-    """Turn uv's error into one line for the artist. Returns "" for errors that the artist cannot fix."""
+    """Turn what uv printed into one error message for the artist. Returns "" for an error that the artist cannot fix."""
     lower = text.lower()
     if re.search(r"no space left|os error (28|112|122)\b", lower):
         return f"the disk of {home} is full: free some space and resume"

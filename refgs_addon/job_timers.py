@@ -1,4 +1,4 @@
-"""Run two timers: one polls the jobs and redraws the window after a change, one follows trainings that other processes run."""
+"""Run two timers. One polls this Blender's jobs and redraws the window. The other redraws it for trainings in other processes."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ _since_preview = 0.0
 
 
 def follow_jobs() -> None:
-    """Poll the jobs until all have ended."""
+    """Start a timer that polls the jobs until all have ended. Does nothing if the timer runs already."""
     if not bpy.app.timers.is_registered(_poll_jobs):
         bpy.app.timers.register(_poll_jobs, first_interval=POLL_SECONDS, persistent=True)
 
@@ -36,7 +36,7 @@ def _poll_jobs() -> float | None:
 
 
 def follow_other_processes() -> None:
-    """Redraw the panel every other second while another process trains a listed run."""
+    """Start a timer that redraws the panel every two seconds, until no other process trains a run from the scenes' lists."""
     if not bpy.app.timers.is_registered(_poll_other_processes):
         bpy.app.timers.register(_poll_other_processes, first_interval=OTHER_SECONDS, persistent=True)
 
@@ -59,7 +59,7 @@ def redraw() -> None:
 
 
 def unregister() -> None:
-    """Stop the timers. Stop all jobs cleanly, except those that the artist chose to keep when Blender closes."""
+    """Stop the timers and all jobs. Trainings that the artist chose to keep continue after Blender closes."""
     for timer in (_poll_jobs, _poll_other_processes):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)

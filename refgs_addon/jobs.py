@@ -1,10 +1,10 @@
-"""Start the backend's processes and follow them without blocking the window. This module needs no bpy.
+"""Run the trainer and other slow programs as separate processes, so that Blender stays responsive. This module needs no bpy.
 
-Each job has a `refgs worker` process of its own (docs/job-protocol.md). A thread reads the worker's events into a queue, and `poll`
-handles them.
+Each job has its own worker process, which gets commands on stdin and prints events to stdout (docs/job-protocol.md). A thread reads the
+events into a queue, and `poll` handles them.
 
-When Blender ends, the worker's standard input closes and the worker stops. A kept job, one that the artist chose to finish without
-Blender, continues. A lock in the run folder shows whether any process works in that folder.
+When Blender ends, the stdin of each worker closes, and the worker stops. The artist can choose to keep a training: its worker then finishes
+without Blender. A worker locks the run folder in which it works, so that every Blender can see that this folder is in use.
 """
 
 import contextlib
@@ -35,10 +35,10 @@ LOCK, PROGRESS, STOP = "run.lock", "progress.json", "stop"  # files in a run fol
 
 @dataclass
 class Job:
-    """Hold the commands for one worker process, in order, and the events that the worker has sent so far.
+    """Store the commands for one worker process, in order, and what the process has reported so far.
 
-    `state` is "waiting" (for earlier jobs), "starting", "running", "paused", or one of ENDED. A job without commands only asks for the
-    worker's version.
+    `state` is "waiting" (for earlier jobs), "starting", "running", "paused", "done", "cancelled" or "failed". A job without commands starts
+    the worker only to learn its version.
     """
 
     name: str
@@ -74,7 +74,7 @@ class Job:
 
     @property
     def active(self) -> bool:
-        """Return True while the job's process works."""
+        """Return True from the start of the job's process until the job has ended, also while it is paused."""
         return not self.ended and self.state != "waiting"
 
     def start(self) -> None:
@@ -105,13 +105,16 @@ class Job:
             self._close()
 
     def tell(self, command: str, **facts) -> None:
-        """Send a command to the process. Write errors are ignored, because `poll` reports a process that has ended."""
+        """Send a command with its arguments (`facts`) to the process, as one line of JSON. Write errors are ignored.
+
+        A write fails if the process has ended, and `poll` reports that.
+        """
         with contextlib.suppress(OSError, ValueError):
             self._process.stdin.write(json.dumps({"command": command} | facts).encode() + b"\n")
             self._process.stdin.flush()
 
     def keep(self, on: bool) -> None:
-        """Choose whether the job finishes after Blender closes or is killed. A job that still waits at that time never starts."""
+        """Choose whether the job continues after Blender closes. A job that still waits when Blender closes never starts."""
         self.kept = on
         if self.active:
             self.tell("keep", on=on)
@@ -179,7 +182,7 @@ class Job:
         self._close()
 
     def _close(self) -> None:
-        """Make the process exit."""
+        """Make the process exit, even if the artist chose to keep it after Blender closes."""
         if self._process is not None:
             if self.kept:
                 self.tell("keep", on=False)
@@ -222,15 +225,16 @@ JOBS: list[Job] = []
 
 
 def check(python: Path, capture: Path, out: Path, log: Path) -> Job:
-    """Check a capture without waiting for other jobs. The worker writes cameras.json and thumbnails into `out`.
+    """Start a job that reads all photos and cameras of a capture and reports problems. It does not wait for other jobs.
 
-    `results["check"]` has `lines`, `cameras`, `thumbnails` and more: docs/job-protocol.md.
+    A capture is a folder with photos. The worker writes cameras.json and thumbnails of the photos into the folder `out`. The finished job's
+    `results["check"]` has `lines` (the report), `cameras`, `thumbnails` and more: docs/job-protocol.md.
     """
     return _add(Job(capture.name, python, [_check(capture, out)], log))
 
 
 def find_cameras(python: Path, capture: Path, out: Path, log: Path) -> Job:
-    """Find the cameras of a folder's photos, without waiting for other jobs. Then check the capture as `check` does."""
+    """Start a job that computes the cameras from the photos in a folder, then does the same as `check`. It does not wait for other jobs."""
     return _add(Job(capture.name, python, [{"command": "poses", "capture": str(capture)}, _check(capture, out)], log))
 
 
@@ -239,26 +243,29 @@ def _check(capture: Path, out: Path) -> dict:
 
 
 def query_trainer(python: Path, log: Path) -> Job:
-    """Ask a Python which trainer it has. The job's `ready` then has the trainer's release and device."""
+    """Start a job that asks a Python for the version of its trainer.
+
+    The job's `ready` then has the keys `refgs` (version), `card` (the GPU's name, or None) and `no_card` (why there is no GPU).
+    """
     return _add(Job("trainer", python, [], log))
 
 
 def install(home: Path, log: Path) -> Job:
-    """Install the bundled trainer into its own environment, or resume an interrupted installation.
+    """Start a job that installs the bundled trainer into the folder `home`, or resumes an interrupted installation.
 
-    The job's `ready` then has the trainer's release and device.
+    The job's `ready` then has the trainer's version and GPU, as after `query_trainer`.
     """
     arguments = {"uv": str(installation.wheel("uv")), "trainer": str(installation.wheel("refgs"))}
     return _run_installation("install", home, log, arguments)
 
 
 def remove(home: Path, log: Path) -> Job:
-    """Remove the trainer's environment, even an incomplete one."""
+    """Start a job that removes the trainer from the folder `home`, even an incomplete one."""
     return _run_installation("remove", home, log, {})
 
 
 def _run_installation(command: str, home: Path, log: Path, arguments: dict[str, str]) -> Job:
-    """Run installation.py as a job in Blender's own Python. That file needs only the standard library."""
+    """Start a job that runs installation.py in Blender's own Python. That file needs only the standard library."""
     commands = [{"command": command, "home": str(home)} | arguments]
     return _add(Job(command, Path(sys.executable), commands, log, arguments=("-I", installation.__file__)))
 
@@ -275,11 +282,13 @@ def train(
     mesh: bool = True,
     resume: bool = False,
 ) -> Job:
-    """Train a capture, write the run into the folder `out`, and make its mesh. The job waits until earlier trainings have ended.
+    """Start a job that trains on a capture (a folder with photos) and writes the result into the run folder `out`.
 
-    `preset` names the settings. With `minutes` and no preset, the settings are chosen to fit that time. With neither, the preset is
-    "standard". `settings` override a preset's values by name: `{"train.iterations": 2000}`. `resume` continues a stopped run. Raises
-    InputError if there is no capture, if `out` is being trained already, or if a new run's `out` is not empty.
+    With `mesh`, the job also makes a mesh after the training. It waits until earlier trainings have ended.
+
+    `preset` is the name of a set of settings. If it is None, the settings are chosen so that the training takes `minutes`. If both are
+    None, the preset is "standard". `settings` overrides single settings: `{"train.iterations": 2000}`. `resume` continues a stopped
+    training. Raises InputError if `capture` is not a folder, if `out` is being trained already, or if a new run's `out` is not empty.
     """
     if not capture.is_dir():
         raise InputError(f"{capture} is not a folder: choose the folder of a capture")
@@ -297,23 +306,24 @@ def train(
 
 
 def export(python: Path, run: Path, log: Path) -> Job:
-    """Make a run's mesh and textures. The job waits until earlier trainings have ended."""
+    """Start a job that makes the mesh and textures of a run folder. It waits until earlier trainings have ended."""
     return _add(Job(run.name, python, [{"command": "export", "run": str(run)}], log, run))
 
 
 def display_splats(python: Path, run: Path, file: Path, log: Path) -> Job:
-    """Write a run as display splats: splats with fixed colours, for viewers without lights.
+    """Start a job that writes a run as display splats: splats with fixed colours, for viewers without lights.
 
-    The job does not wait for other jobs. An existing file is replaced.
+    The job does not wait for other jobs. It replaces an existing `file`.
     """
     command = {"command": "export", "run": str(run), "display_splats": str(file)}
     return _add(Job(file.name, python, [command], log))
 
 
 def render(blender: Path, arguments: tuple[str, ...], command: Mapping[str, object], log: Path) -> Job:
-    """Render in another Blender, which runs `render_worker`, without waiting for other jobs.
+    """Start a job that renders in another Blender process, which runs `render_worker`. It does not wait for other jobs.
 
-    `results["render"]["png"]` is the picture's file.
+    `arguments` are the command line of that Blender, and `command` is the worker's command. The finished job's `results["render"]["png"]`
+    is the path of the picture.
     """
     return _add(Job(Path(command["png"]).name, blender, [dict(command)], log, arguments=arguments, program=BLENDER))
 
@@ -336,18 +346,18 @@ def poll() -> bool:
 
 
 def trainings() -> list[Job]:
-    """List the jobs that work in a run folder or wait for it. Only these jobs can be kept when Blender closes."""
+    """List the jobs that train a run or make its mesh, both running and waiting. Only these jobs can be kept when Blender closes."""
     return [job for job in JOBS if job.run and not job.ended]
 
 
 def keep_all(on: bool) -> None:
-    """Choose whether all trainings finish after Blender closes. A training that still waits at that time never starts."""
+    """Choose whether all trainings continue after Blender closes. A training that still waits when Blender closes never starts."""
     for job in trainings():
         job.keep(on)
 
 
 def stop_all() -> None:
-    """Stop all jobs cleanly, except kept ones, which finish without Blender. Clear the list."""
+    """Stop all jobs and clear the list. Jobs that the artist chose to keep continue without Blender."""
     for job in JOBS:
         if job.kept and job.active:
             job.close_input()
@@ -390,7 +400,7 @@ def stop_run(folder: Path) -> None:
 
 
 def stop_requested(folder: Path) -> bool:
-    """Check whether the training in a folder was asked to stop."""
+    """Check whether a request to stop the training in this folder is pending."""
     return (folder / STOP).exists()
 
 

@@ -92,14 +92,14 @@ def log_file(name: str) -> Path:
 
 
 def capture_folder(capture: Path) -> Path:
-    """Return the folder for the cameras and thumbnails that a capture's check writes."""
+    """Return the folder into which the check of a capture writes cameras.json and thumbnails."""
     return _folder("captures") / f"{capture.name} {crc32(str(capture).encode()):08x}"
 
 
 def _folder(name: str) -> Path:
-    """Return a subfolder of the extension's user folder, which survives updates.
+    """Return the path of the folder `name` for the add-on's own data. Updates of the add-on keep this folder.
 
-    An add-on that is not installed as an extension gets a temporary folder.
+    If the add-on is not installed as a Blender extension, the folder is temporary.
     """
     try:
         return Path(bpy.utils.extension_path_user(PACKAGE, path=name))
@@ -108,7 +108,7 @@ def _folder(name: str) -> Path:
 
 
 def query_trainer() -> None:
-    """Ask the chosen Python which trainer it has. `status` then shows the answer."""
+    """Start a job that asks the chosen Python for the version of its trainer. `status` then shows the answer."""
     forget_queries()
     if set_up():
         _own_jobs.append(jobs.query_trainer(python(), log_file("trainer")))
@@ -141,7 +141,7 @@ def stop() -> None:
 
 
 def forget_queries() -> None:
-    """Stop the job that the preferences started, if any, and drop its result."""
+    """Stop the newest job that the preferences started, and drop its result."""
     for job in _own_jobs:
         job.stop()
         if job in jobs.JOBS:

@@ -1,4 +1,4 @@
-"""Define the properties stored in the .blend: the capture, its training settings and the runs trained from the capture."""
+"""Define the properties stored in the .blend: the capture (a folder with photos), the training settings and the list of runs."""
 
 import bpy
 from bpy.props import (
@@ -13,7 +13,7 @@ from bpy.props import (
 
 
 class KnownRun(bpy.types.PropertyGroup):
-    """Store a run folder that was trained from this file."""
+    """Store one entry in the scene's list of runs: the folder of a training's result, and the capture that was trained."""
 
     folder: StringProperty(subtype="DIR_PATH")
     capture: StringProperty(subtype="DIR_PATH")

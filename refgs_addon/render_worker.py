@@ -1,8 +1,8 @@
-"""Render a copy of the file in a second Blender without a window. `scene.render_process` starts this program.
+"""Render a copy of the open .blend in a second Blender without a window. `scene.render_process` starts this program.
 
-It speaks the job protocol (docs/job-protocol.md) and takes one command: {"command": "render", "png": …, "hdris": […], "size": …,
-"samples": …}. With HDRIs it renders a contact sheet, without them the scene camera's view. It exits when its standard input closes, so
-that it never outlives the first Blender.
+It reads one command from stdin, {"command": "render", "png": …, "hdris": […], "size": …, "samples": …}, and prints events to stdout
+(docs/job-protocol.md). With HDRIs it renders a contact sheet: the view under each light. Without HDRIs it renders the scene camera's view.
+It exits when stdin closes, so that it never outlives the first Blender.
 """
 
 import json
@@ -17,7 +17,7 @@ from .jobs import PROTOCOL
 
 
 def main() -> None:
-    """Run the one command from stdin, then end the process."""
+    """Read one command from stdin, run it, and end the process."""
     events = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
     os.dup2(2, 1)  # Blender prints to stdout: only events may go there
 

@@ -13,7 +13,11 @@ def modifier_tree(name: str) -> bpy.types.NodeTree:
 
 
 def add(tree: bpy.types.NodeTree, kind: str, inputs: dict | None = None, **properties) -> bpy.types.Node:
-    """Add a node. `inputs` maps the name or index of a socket to another node's output or to a value."""
+    """Add a node of the Blender type `kind`, such as "ShaderNodeMath", and return it.
+
+    `inputs` maps an input socket (its name or index) to a value, or to another node's output, which is linked to it. `properties` are set
+    on the node.
+    """
     node = tree.nodes.new(kind)
     for name, value in properties.items():
         setattr(node, name, value)
@@ -30,7 +34,7 @@ def add(tree: bpy.types.NodeTree, kind: str, inputs: dict | None = None, **prope
 
 
 def add_input(tree: bpy.types.NodeTree, name: str, kind: str, description: str = "", **properties):
-    """Add an input socket of a type ("Float", "Object" …) to a tree, and return it."""
+    """Add an input socket of a type ("Float", "Object" …) to a node tree, and return it. `properties` are set on the socket."""
     socket = tree.interface.new_socket(name, in_out="INPUT", socket_type=f"NodeSocket{kind}", description=description)
     for key, value in properties.items():
         setattr(socket, key, value)
@@ -58,20 +62,23 @@ def scaled(tree: bpy.types.NodeTree, vector, factor) -> bpy.types.NodeSocket:
 
 
 def read_attribute(tree: bpy.types.NodeTree, name: str, kind: str) -> bpy.types.NodeSocket:
-    """Add a node that reads a named attribute of the geometry; return its output."""
+    """Add a node that reads the geometry's attribute `name`, and return its output. `kind` is its data type, such as "FLOAT"."""
     return out(add(tree, "GeometryNodeInputNamedAttribute", {"Name": name}, data_type=kind))
 
 
 def store_attribute(tree: bpy.types.NodeTree, geometry, name: str, kind: str, value) -> bpy.types.NodeSocket:
-    """Add a node that stores a named attribute of the geometry; return the geometry."""
+    """Add a node that stores `value` as the attribute `name` of a geometry, and return its output: the geometry with that attribute.
+
+    `kind` is the attribute's data type, such as "FLOAT".
+    """
     inputs = {"Geometry": geometry, "Name": name, "Value": value}
     return out(add(tree, "GeometryNodeStoreNamedAttribute", inputs, data_type=kind))
 
 
 def object_frame(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[bpy.types.Node, bpy.types.NodeSocket]:
-    """Add nodes that transform the points' positions into the frame of the object `item`.
+    """Add nodes that compute each point's position in the coordinates of another object. `item` is a socket that holds that object.
 
-    Returns the object's Object Info node, and the output with the positions.
+    Returns the Object Info node of that object, and the output with the positions.
     """
     info = add(tree, "GeometryNodeObjectInfo", {"Object": item}, transform_space="RELATIVE")
     inverse = add(tree, "FunctionNodeInvertMatrix", {"Matrix": info.outputs["Transform"]}).outputs["Matrix"]
@@ -80,6 +87,6 @@ def object_frame(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[
 
 
 def max_component(tree: bpy.types.NodeTree, vector: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """Add nodes that compute a vector's largest absolute component, which is at most 1 in the cube from -1 to 1. Returns their output."""
+    """Add nodes that compute max(|x|, |y|, |z|) of a vector, and return their output. It is at most 1 in the cube from -1 to 1."""
     x, y, z = add(tree, "ShaderNodeSeparateXYZ", {0: vector_math(tree, "ABSOLUTE", vector)}).outputs
     return math(tree, "MAXIMUM", math(tree, "MAXIMUM", x, y), z)

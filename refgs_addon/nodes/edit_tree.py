@@ -1,4 +1,7 @@
-"""Build two node trees: one edits the splats' materials and keeps the learned values, the other shows the edits on the mesh."""
+"""Build the two node trees for edits. An edit is a modifier on the splats that changes their materials.
+
+One tree is the edit itself. The other copies the changes from the splats to the mesh. Both keep the materials learned from the photos.
+"""
 
 import bpy
 
@@ -26,15 +29,15 @@ _MIXED = "RefGS Edited"  # node that marks a mesh's material as showing the edit
 
 
 def edit_tree() -> bpy.types.NodeTree:
-    """Make the tree `RefGS Edit`, or return the existing one, which all edits in the file share.
+    """Make the node tree `RefGS Edit`, or return the existing one. All edits (modifiers that change the splats' materials) share it.
 
-    The tree blends the splats' base_color, metallic and roughness with the edit's values. The weight of each new value is its amount,
-    an input of the tree, times a mask. The input Where chooses the mask:
-    - "Everywhere": 1;
-    - "Box" or "Sphere": 1 inside the object Region (an Empty of size 1). Falloff is the part of the region over which the mask falls
-      to 0 at the border;
-    - "Similar": 1 for the material of the splat nearest to Region, 0 for a material that differs by more than Tolerance;
-    - "Painted": the weight of the vertex group Painted at the nearest point of Region, which is a mesh.
+    The tree blends each splat's base_color, metallic and roughness with new values. The weight of a new value is its amount, which is an
+    input of the tree, times a mask, 0..1 for each splat. The input Where selects the mask:
+    - "Everywhere": 1 for all splats;
+    - "Box" or "Sphere": 1 inside the object Region, an Empty, and 0 outside. Falloff is the width of the soft border, as a fraction of the
+      region;
+    - "Similar": 1 if the splat's material equals that of the splat nearest to Region, 0 if it differs by more than Tolerance;
+    - "Painted": the weight that is painted on the mesh Region, at the point nearest to the splat. Painted is the name of its vertex group.
     """
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]
@@ -94,7 +97,10 @@ def edit_tree() -> bpy.types.NodeTree:
 
 
 def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.NodeSocket:
-    """Compute the mask of each splat, 0..1."""
+    """Add the nodes for the mask that `edit_tree` describes, 0..1 for each splat, and return their output.
+
+    `group` are the inputs of the tree.
+    """
     menu = add(tree, "GeometryNodeMenuSwitch", data_type="FLOAT")
     menu.enum_items.clear()
     for name in REGIONS:
@@ -138,9 +144,10 @@ def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.N
 
 
 def mesh_edits_tree() -> bpy.types.NodeTree:
-    """Make the tree `RefGS Follow`, or return the existing one. The tree copies the edits of the nearest splat to each vertex of a mesh.
+    """Make the node tree `RefGS Follow`, or return the existing one. It makes a mesh show the edits of the splats.
 
-    Distances to the splats are measured in the run's frame.
+    Each vertex gets the edits of the splat nearest to it. Distances are measured in the local coordinates of the mesh and of the splats. So
+    it does not matter where the two objects stand.
     """
     if MESH_EDITS in bpy.data.node_groups:
         return bpy.data.node_groups[MESH_EDITS]
@@ -162,7 +169,7 @@ def mesh_edits_tree() -> bpy.types.NodeTree:
 
 
 def add_edits_to_material(material: bpy.types.Material) -> None:
-    """Make a mesh's material show the edits on top of its textures. Does nothing where the material already shows them."""
+    """Add nodes to a mesh's material that blend the values of the edits over its textures. Does nothing if it has these nodes already."""
     nodes = material.node_tree.nodes
     principled = next((node for node in nodes if node.type == "BSDF_PRINCIPLED"), None)
     if principled is None or _MIXED in nodes:

@@ -1,4 +1,4 @@
-"""Build the splats' materials: a Principled BSDF that reads attributes, and an unlit one that shows a single attribute."""
+"""Build the splats' materials. One is a Principled BSDF that reads attributes. The other shows a single attribute without lighting."""
 
 import bpy
 
@@ -15,8 +15,9 @@ _SURFACE = {"metallic": "Metallic", "roughness": "Roughness", "specular": SPECUL
 def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material:
     """Make a Principled material for the quads of `nodes.splats_tree`. It reads each splat's base colour, metallic and roughness.
 
-    `constants` are values that all splats share, of metallic, roughness or specular. They replace the splats' own. The back of a splat is
-    black, like the inside of a solid. A lit back would shine through where the front splats leave a few per cent uncovered.
+    `constants` can give one value for all splats: of "metallic", "roughness" or "specular". The material then uses it in place of the
+    splats' own values. The back of a splat is black, like the inside of a solid. A lit back would shine through the small gaps between the
+    front splats.
     """
     material = bpy.data.materials.new(name)
     tree = node_tree(material)
@@ -45,9 +46,10 @@ def principled(material: bpy.types.Material) -> bpy.types.ShaderNode:
 
 
 def connect_edits(material: bpy.types.Material) -> None:
-    """Make a material of `splat_material` read all attributes that edits change.
+    """Change a material of `splat_material` so that it shows edits of the splats.
 
-    If the material's specular is 0, splats whose roughness is edited get specular reflection again.
+    It then reads metallic and roughness from each splat, even if all splats had the same value. If its specular is 0, splats whose
+    roughness is edited get specular reflection.
     """
     tree = material.node_tree
     shader = principled(material)
@@ -62,7 +64,7 @@ def connect_edits(material: bpy.types.Material) -> None:
 
 
 def values_material() -> bpy.types.Material:
-    """Make the material `RefGS Splat Values`, or return the existing one, which all runs share. It shows the attribute `display` unlit."""
+    """Make the material `RefGS Splat Values`, or return the existing one. It shows the attribute `display` without lighting."""
     if VALUES_NAME in bpy.data.materials:
         return bpy.data.materials[VALUES_NAME]
     material = bpy.data.materials.new(VALUES_NAME)
@@ -72,10 +74,10 @@ def values_material() -> bpy.types.Material:
 
 
 def _finish(material: bpy.types.Material, shader: bpy.types.NodeSocket) -> None:
-    """Mix a shader with transparency by the splat's alpha, opacity · exp(-(u² + v²) / 2).
+    """Make a splat transparent by its alpha, opacity · exp(-(u² + v²) / 2), and connect its shader to the material's output.
 
-    In each sample Eevee keeps a quad with a probability equal to its alpha, and shows the nearest kept quad. The average over samples
-    equals front-to-back compositing by each pixel's depths, for any number of overlapping quads.
+    In each sample, Eevee draws a quad with a probability equal to its alpha, and shows the nearest one that it draws. The average over the
+    samples equals front-to-back alpha compositing with a depth for each pixel. This holds for any number of overlapping quads.
     """
     material.surface_render_method = "DITHERED"
     tree = material.node_tree
@@ -92,10 +94,11 @@ def _attribute(tree: bpy.types.NodeTree, name: str, output: int) -> bpy.types.No
 
 
 def _normal(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
-    """Compute the bent normal n + u·dn/du + v·dn/dv in world space, and whether the splat's front is visible.
+    """Add nodes for the bent normal n + u·dn/du + v·dn/dv in world space, and for the visible side.
 
-    At silhouettes the bent normal can face away from the viewer, where a BSDF is black. Such a normal is turned back until it is
-    perpendicular to the view direction.
+    Returns two outputs: the normal, and 1 on the splat's front, else 0. (u, v) is the position on the splat. Near silhouettes the bent
+    normal can point away from the viewer, and a BSDF would be black. Such a normal is turned until it is perpendicular to the view
+    direction.
     """
     u_v = add(tree, "ShaderNodeSeparateXYZ", {"Vector": _attribute(tree, "gaussian", VECTOR)}).outputs
     centre = _attribute(tree, "normal", VECTOR)

@@ -22,12 +22,14 @@ DISPLAYS = ("Shaded", "Base Color", "Roughness", "Metallic", "Normal")
 
 
 def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
-    """Make the tree `RefGS Splats`, or return the existing one, which all runs in the file share.
+    """Make the node tree `RefGS Splats`, or return the existing one, which all runs share. It draws each point as a quad.
 
-    The tree reads the points' attributes: scale (standard deviations along two axes), rotation (quaternion), opacity 0..1, and for the
-    displays base_color, roughness, metallic and normal. The quads keep all attributes of the points. They add `gaussian`, the position on
-    the splat in standard deviations. Quads are realised, because Eevee draws them several times faster than instances. The display
-    "Shaded" uses the splats' own material. All other displays use `values_material`, which shows the attribute `display`.
+    The tree reads these attributes of the points: scale (standard deviations along two axes), rotation (quaternion), opacity 0..1, and
+    base_color, roughness, metallic and normal. The quads keep all attributes of their points. They get one more, `gaussian`: the position
+    on the splat in standard deviations. Quads are realised, because Eevee draws them several times faster than instances.
+
+    The input Display selects what is shown. "Shaded" uses the splats' own material. Every other choice copies one attribute to `display`,
+    and uses `values_material` to show it without lighting.
     """
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]

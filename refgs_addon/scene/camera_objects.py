@@ -14,9 +14,10 @@ PHOTO = "refgs_photo"  # custom property of a camera's data: the file of its pho
 
 
 def read_cameras(path: Path, capture: Path | None) -> list[dict]:
-    """Read the frames of a cameras.json: camera-to-world matrices with OpenGL's axes, and pinhole intrinsics.
+    """Read the cameras of a cameras.json. Returns one dictionary for each photo.
 
-    Each frame's `photo` is the path of its photo. Without a `capture` folder it is "".
+    It has the camera-to-world matrix with OpenGL's axes, the pinhole intrinsics, and as `photo` the path of the photo in the folder
+    `capture`. Without `capture`, `photo` is "". Raises InputError if the file cannot be read, or RefGS did not write it.
     """
     try:
         frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
@@ -35,18 +36,19 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
 
 
 def light_of(path: Path) -> str:
-    """Read from a cameras.json the view that the recovered light belongs to. Returns the view's name.
+    """Return the name of the only photo for which the recovered light is right, or "" if it is right for all photos.
 
-    Only a light that turned with the camera differs from view to view. For a light that stood still the result is "".
+    A light that turned with the camera was different in each photo. The run then stores it as it was in one photo, which cameras.json
+    names.
     """
     return Path(json.loads(path.read_text(encoding="utf-8")).get("light_of", "")).stem
 
 
 def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Object:
-    """Add a camera for a frame to a collection, with the frame's pose, focal length and principal point.
+    """Add a camera object to a collection, with the pose, focal length and principal point of a `frame` of `read_cameras`.
 
-    Blender stores resolution and pixel aspect in the scene, not in the camera. For `frame_camera` the camera's data stores them too, as
-    the properties `refgs_size` (pixels) and `refgs_pixel_aspect`.
+    Blender stores one resolution and one pixel aspect for the whole scene. So the camera's data get these of the photo as custom
+    properties, `refgs_size` (pixels) and `refgs_pixel_aspect`, for `frame_camera`.
     """
     data = bpy.data.cameras.new(frame["name"])
     width, height = frame["w"], frame["h"]
@@ -111,10 +113,10 @@ def photo_shown(camera: bpy.types.Object | None) -> float:
 
 
 def next_camera(scene: bpy.types.Scene, collection: bpy.types.Collection, steps: int = 1) -> bpy.types.Object:
-    """Switch the scene to the camera that comes `steps` photos after its present one, and return that camera.
+    """Switch the scene to the camera that is `steps` places after the present one in a collection, and return that camera.
 
-    `collection` holds the cameras of a run or a capture. If the old camera shows its photo, the new camera then shows its own photo.
-    Raises InputError if the collection has no cameras.
+    After the last camera comes the first. If the old camera shows its photo, the new camera shows its own photo. Raises InputError if the
+    collection has no cameras.
     """
     cameras = [item for item in collection.all_objects if item.type == "CAMERA"]
     if not cameras:

@@ -1,4 +1,4 @@
-"""Show the cameras of a checked capture in the scene, before the training."""
+"""Show the cameras of a capture (a folder with photos) in the scene, before its training."""
 
 from pathlib import Path
 
@@ -11,9 +11,10 @@ CAPTURE = "refgs_capture"  # custom property of a collection of cameras: the cap
 
 
 def show_cameras(scene: bpy.types.Scene, capture: Path, cameras: Path) -> bpy.types.Collection:
-    """Add a capture's cameras to a scene in a collection `NAME cameras`. An earlier collection of the capture is replaced.
+    """Add the cameras of a capture (a folder with photos) to a scene, in a new collection `NAME cameras`.
 
-    `cameras` is the path of the cameras.json that a check wrote. Raises InputError where the file cannot be read.
+    An earlier collection of the same capture is replaced. `cameras` is the path of cameras.json. Raises InputError if that file cannot be
+    read.
     """
     frames = read_cameras(cameras, capture)
     remove_cameras(scene, capture)
@@ -27,7 +28,7 @@ def show_cameras(scene: bpy.types.Scene, capture: Path, cameras: Path) -> bpy.ty
 
 
 def cameras_of(scene: bpy.types.Scene, capture: Path) -> bpy.types.Collection | None:
-    """Find the collection that `show_cameras` added for a capture."""
+    """Find the collection of cameras that `show_cameras` added for a capture. Returns None if there is none."""
     return next((item for item in _captures(scene) if item[CAPTURE] == str(capture)), None)
 
 
@@ -46,9 +47,10 @@ def remove_cameras(scene: bpy.types.Scene, capture: Path) -> None:
 
 
 def replace_cameras(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bpy.types.Object]) -> None:
-    """Replace a capture's cameras by those of its run, and give the run's cameras the same names.
+    """Remove the cameras that `show_cameras` added for a capture, because its run is imported and has the same cameras.
 
-    If the scene's camera was one of the capture's, the run's camera of the same photo becomes the scene's camera.
+    `cameras` maps names to the camera objects of the run, which are renamed to these names. If the scene looked through a removed camera,
+    it looks through the run's camera of the same photo instead. Does nothing if `show_cameras` added none.
     """
     known = cameras_of(scene, capture)
     if known is None:
@@ -63,9 +65,10 @@ def replace_cameras(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bp
 
 
 def active_cameras(context: bpy.types.Context) -> bpy.types.Collection | None:
-    """Find the collection of cameras to step through, which belongs to a run or a capture.
+    """Find the collection whose cameras the buttons Next and Previous step through: that of a run or of a capture.
 
-    That is the collection of the active object, else that of the scene's camera, else the newest run, else the newest capture.
+    The first match counts: the collection with the active object, the one with the scene's camera, the newest run, the newest capture.
+    Returns None if there is no run and no capture.
     """
     captures = _captures(context.scene)
     for item in (context.view_layer.objects.active, context.scene.camera):

@@ -23,11 +23,12 @@ def contact_sheet(
     samples: int = 32,
     progress: Callable[[int, str], None] = lambda done, what: None,
 ) -> None:
-    """Render the scene camera's view in Eevee under several lights into one PNG: the recovered light, if any, and each HDRI.
+    """Render the scene camera's view in Eevee under several lights, and put all pictures into one PNG.
 
-    The pictures are laid out in rows on a transparent, roughly square sheet. `size` is the longer side of each picture in pixels.
-    `progress` gets the number of finished pictures and the name of the next light. The scene's light is restored. Raises InputError where
-    there is no camera, a light cannot be read, or the file cannot be written.
+    The lights are the light recovered from the photos, if there is one, and each HDRI. The pictures lie in rows on a transparent, roughly
+    square sheet. `size` is the longer side of each picture in pixels. `progress` is called with the number of finished pictures and the
+    name of the next light. The scene's light is restored. Raises InputError if there is no camera, a light cannot be read, or the file
+    cannot be written.
     """
     import numpy as np
 

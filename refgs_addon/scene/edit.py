@@ -1,4 +1,4 @@
-"""Edit materials. Each edit is a modifier on the splats, and can be changed, switched off, reordered or removed at any time."""
+"""Edit the splats' materials. Each edit is a modifier, which the artist can change, switch off, move or remove at any time."""
 
 import bpy
 
@@ -15,11 +15,12 @@ from .run_parts import parts
 def add_edit(
     collection: bpy.types.Collection, where: str = "Everywhere", material: str = "Gold"
 ) -> bpy.types.NodesModifier:
-    """Add an edit to a run's splats, after the earlier edits. The mesh, if there is one, shows the edit too.
+    """Add an edit, a modifier that changes the splats' materials, after the earlier edits of a run. The mesh shows the edit too.
 
-    `where` is one of REGIONS. "Box", "Sphere" and "Similar" get an Empty in the middle of the splats, which the artist moves, rotates and
-    scales. "Painted" gets a copy of the mesh to paint weights on, all zero at first. `material` is the name of a preset. Raises
-    InputError where the collection has no splats, or no mesh to paint on.
+    `collection` is the run's. `where` selects the splats, as in `nodes.edit_tree`: "Everywhere", "Box", "Sphere", "Similar" or "Painted".
+    "Box", "Sphere" and "Similar" get an Empty in the middle of the splats, which the artist moves, rotates and scales. "Painted" gets a
+    copy of the mesh on which the artist paints. `material` is the name of a material preset. Raises InputError if the collection has no
+    splats, or no mesh for "Painted".
     """
     if where not in REGIONS:
         raise InputError(f"there is no region {where}: choose one of {', '.join(REGIONS)}")
@@ -46,12 +47,12 @@ def add_edit(
 
 
 def edits(splats: bpy.types.Object) -> list[bpy.types.NodesModifier]:
-    """List the edits of splats in the order in which Blender applies them."""
+    """List the edits of the object `splats` in the order in which Blender applies them. An edit is a modifier that changes materials."""
     return [m for m in splats.modifiers if m.type == "NODES" and m.node_group and m.node_group.name == NAME]
 
 
 def remove_edit(splats: bpy.types.Object, name: str) -> None:
-    """Remove an edit. Remove the object that marks its region too, unless another edit uses that object."""
+    """Remove an edit, and the object that marks where it applies. Another edit may use this object too: then it stays."""
     edit = splats.modifiers.get(name)
     if edit is None or edit not in edits(splats):
         raise InputError(f"{splats.name} has no edit {name}")
@@ -71,9 +72,9 @@ def splats_of(collection: bpy.types.Collection) -> bpy.types.Object:
 
 
 def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: str) -> bpy.types.Object:
-    """Make an Empty that marks an edit's region, in the middle of the splats.
+    """Make an Empty in the middle of the splats that marks where an edit applies.
 
-    The Empty is a third as large as the splats' extent. For "Similar" it marks a single splat, and is a sixth as large.
+    It is a third as large as all splats together. For "Similar", which needs only one point, it is a sixth as large.
     """
     shape = {"Box": "CUBE", "Sphere": "SPHERE", "Similar": "ARROWS"}[where]
     region = add_region(splats, collection, f"{where} of {splats.name}", shape)
@@ -82,9 +83,10 @@ def _region(splats: bpy.types.Object, collection: bpy.types.Collection, where: s
 
 
 def _paint_target(mesh: bpy.types.Object, collection: bpy.types.Collection) -> tuple[bpy.types.Object, str]:
-    """Make the object that the artist paints weights on, or find the existing one, and add a vertex group. Returns object and group name.
+    """Make an object on which the artist paints where an edit applies, or reuse it. Add a vertex group for the new edit.
 
-    The object shares the mesh's data but has no modifiers. The mesh's own modifiers depend on the splats, and so on the painted weights.
+    Returns the object and the name of the group. The object shares the data of the mesh, but has no modifiers. The modifiers of the mesh
+    itself depend on the painted weights: painting there would make a cycle.
     """
     found = [item for item in collection.objects if item.get(REGION) and item.data == mesh.data]
     if found:

@@ -22,7 +22,7 @@ DARK = 0.02  # a darker base colour does not reveal how much light falls on it
 
 
 def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
-    """Evaluate the splats' materials after all edits: base_color (N, 3) linear Rec.709, metallic (N,), roughness (N,)."""
+    """Return the splats' materials after all edits: base_color (N, 3) linear Rec.709, metallic (N,), roughness (N,)."""
     drawing = splats.modifiers[SPLATS]
     before = drawing.show_viewport, splats.hide_viewport, splats.hide_get()
     drawing.show_viewport = splats.hide_viewport = False  # Blender does not evaluate hidden objects
@@ -42,10 +42,10 @@ def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
 
 
 def export_splats(collection: bpy.types.Collection, path: Path) -> None:
-    """Write a run's splats with their edits as a splats.ply.
+    """Write the splats of a run, with the edits of their materials, as a splats.ply.
 
-    The new file is the run's own file with the edited materials. Its fixed colours (f_dc), which viewers without lights show, change in
-    proportion to the base colour. Raises InputError where the run's file is missing or has changed, or the new file cannot be written.
+    The new file is a copy of the run's file with the edited materials. Viewers without lights show its fixed colours (f_dc). These change
+    in proportion to the base colour. Raises InputError if the run's file is missing or has changed, or the new file cannot be written.
     """
     splats = splats_of(collection)
     source = run_folder(collection) / "splats.ply"

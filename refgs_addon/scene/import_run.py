@@ -16,7 +16,7 @@ from .world_light import light_with_recovered, load_panorama
 
 @dataclass
 class Run:
-    """Hold the imported data of a run. Parts that the run folder lacks are None or empty."""
+    """Hold the objects that `import_run` made. What the run folder does not contain is None or empty here."""
 
     collection: bpy.types.Collection
     splats: bpy.types.Object
@@ -104,7 +104,7 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
 
 
 def data_blocks() -> set[bpy.types.ID]:
-    """List all data-blocks in the file of the kinds that an import can add."""
+    """List all data-blocks in the open file, of the kinds that an import can add."""
     kinds = ("objects", "pointclouds", "meshes", "cameras", "materials", "images", "worlds", "collections")
     kinds += ("node_groups", "scenes")
     return {item for kind in kinds for item in getattr(bpy.data, kind)}

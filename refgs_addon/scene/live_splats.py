@@ -25,9 +25,10 @@ _reader = ThreadPoolExecutor(1)
 
 
 def watch(job: jobs.Job, scene: bpy.types.Scene, on: bool = True) -> None:
-    """Show a job's surfels in a scene, renewed with each preview of the training. With `on` False, remove them.
+    """Show the surfels of a training job in a scene, and update them with each of its previews. With `on` False, remove them.
 
-    The object is added here, without points, because making its nodes takes too long for the timer that calls `update`.
+    The object is added here, still without points. Later the timer calls `update`, which only has to replace the points. Making the
+    object's nodes would take too long there.
     """
     for live in [live for live in _shown if live.job is job]:
         _remove(live)
@@ -45,7 +46,10 @@ def is_watched(job: jobs.Job) -> bool:
 
 
 def update() -> None:
-    """Renew the surfels in the scene from the newest previews, which a background thread reads. Remove those of ended trainings."""
+    """Replace the shown surfels by those of the newest preview. Remove those of ended trainings. Called by a timer.
+
+    A background thread reads the files, so that this function returns at once.
+    """
     for live in list(_shown):
         deleted = live.item not in bpy.data.objects
         if live.job.ended or deleted or live.scene not in bpy.data.scenes:
@@ -60,9 +64,9 @@ def update() -> None:
 
 
 def _read(path: Path) -> dict | None:
-    """Read a preview's splats as attributes for a point cloud, or return None if the file cannot be read.
+    """Read a preview's splats as attributes for `point_cloud`. Returns None if the file cannot be read.
 
-    The normal is constant over each splat, because its change across the splat would take longer to compute than everything else.
+    The normal does not change across a splat here: computing its change would take longer than everything else.
     """
     import numpy as np
 

@@ -17,7 +17,7 @@ INPUTS = ("Base Color", "Color Amount", "Metallic", "Metallic Amount", "Roughnes
 
 
 def materials() -> dict[str, Path]:
-    """Map the names of all materials to their files. Where names collide, the artist's preset takes precedence."""
+    """Map the names of all material presets to their files. If a name occurs twice, the artist's preset is used."""
     folders = [ROOT / "presets" / PRESETS, *map(Path, bpy.utils.preset_paths(PRESETS)), _user_folder()]
     files = (file for folder in folders for file in folder.glob("[!.]*.py"))
     found = {bpy.path.display_name(file.name, title_case=False): file for file in files}
@@ -25,9 +25,9 @@ def materials() -> dict[str, Path]:
 
 
 def read_material(name: str) -> dict[str, float | tuple[float, ...]]:
-    """Read the inputs that a material sets: base colour RGBA in linear Rec.709, all others 0..1.
+    """Read a material preset: values by the names of an edit's inputs, such as "Base Color" and "Roughness Amount".
 
-    Raises InputError for a preset that is missing or invalid.
+    A colour is RGBA in linear Rec.709; all other values are 0..1. Raises InputError if the preset is missing or invalid.
     """
     file = materials().get(name)
     if file is None:
@@ -40,18 +40,18 @@ def read_material(name: str) -> dict[str, float | tuple[float, ...]]:
 
 
 def set_material(edit: bpy.types.NodesModifier, name: str) -> None:
-    """Set an edit to the values of a material. Raises InputError for a preset that is missing or invalid."""
+    """Set the values of an edit to those of the preset `name`. Raises InputError if the preset is missing or invalid."""
     set_inputs(edit, read_material(name))
 
 
 def set_inputs(edit: bpy.types.NodesModifier, values: dict[str, float | tuple[float, ...]]) -> None:
-    """Set the inputs of an edit from values by name."""
+    """Set inputs of an edit. `values` maps the names of the inputs to their new values."""
     for name, value in values.items():
         compat.set_modifier_input(edit, name, value)
 
 
 def save_material(edit: bpy.types.NodesModifier, name: str) -> Path:
-    """Save an edit's values as a preset of the artist. Raises InputError where the name is empty or exists already."""
+    """Save the values of an edit as a new preset. Raises InputError if the name is empty or exists already."""
     stem = AddPresetBase.as_filename(name)
     if not stem:
         raise InputError("the material has no name: type one first")
@@ -91,7 +91,10 @@ def _identifier(name: str) -> str:
 
 
 def _rounded(name: str, value) -> float | tuple[float, ...]:
-    """Convert a value for an edit and round it. A typed 0.2 is stored in single precision, as 0.20000000298."""
+    """Round a value of an edit to six decimals, as Python numbers. Only for the name "Base Color" is the value a colour.
+
+    Blender stores numbers in single precision: a typed 0.2 comes back as 0.20000000298.
+    """
     if name == "Base Color":
         r, g, b, alpha = value
         return tuple(round(float(part), 6) for part in (r, g, b, alpha))

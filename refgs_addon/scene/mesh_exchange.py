@@ -54,9 +54,9 @@ def _specular(item: bpy.types.Object) -> float:
 
 
 def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:
-    """Make a Principled BSDF with one texture for each input.
+    """Make a Principled BSDF material that reads each input from its own texture.
 
-    Two inputs cannot share a texture: FBX cannot pick one of its channels, and the exporters read no other nodes.
+    Two inputs cannot share the channels of one texture: FBX cannot select a channel, and both exporters ignore the nodes that could.
     """
     material = bpy.data.materials.new(name)
     tree, inputs = node_tree(material), {SPECULAR: specular}

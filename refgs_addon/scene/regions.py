@@ -1,4 +1,4 @@
-"""Add and read regions: Empties that mark the splats to edit or crop, or the part of a capture to train."""
+"""Add and read regions: Empties that mark a part of space. They mark what to edit, what to draw, or what to train."""
 
 import math
 from pathlib import Path
@@ -14,7 +14,10 @@ REGION = "refgs_region"  # custom property of an object that marks a region
 
 
 def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name: str, shape: str) -> bpy.types.Object:
-    """Add an Empty, scaled so that the cube from -1 to 1 in its frame holds nearly all splats. `shape` is "CUBE", "SPHERE" or "ARROWS"."""
+    """Add an Empty that surrounds nearly all splats. `shape` is "CUBE", "SPHERE" or "ARROWS".
+
+    Its scale is half the size of the splats' bounding box, without the outermost splats.
+    """
     region = bpy.data.objects.new(name, None)
     region[REGION] = True
     region.empty_display_type = shape
@@ -53,11 +56,11 @@ def training_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
 
 
 def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
-    """Show the box that limits the training. Make the box if there is none.
+    """Show the box that limits the training: only what is inside is trained. Make the box if there is none.
 
-    A new box surrounds the ball that the cameras look at, which the capture's last check found. If the capture was not checked, the box
-    is 2 m wide around the origin: the trainer moves the ball to the origin and scales it to a radius of 1 m. (The trainer does not move
-    captures in NeRF-Blender's layout.)
+    If the capture was checked, a new box surrounds the ball at which its cameras look. The check has found this ball. Otherwise the new box
+    is 2 m wide around the origin. This fits most captures too, because the trainer moves and scales the cameras until that ball has its
+    centre at the origin and a radius of 1 m. (It leaves the cameras of captures from NeRF-Blender as they are.)
     """
     box = training_region(scene)
     if box is None:
@@ -81,9 +84,9 @@ def _looked_at(scene: bpy.types.Scene) -> tuple[Vector, float]:
 
 
 def region_settings(scene: bpy.types.Scene) -> dict[str, list[float]]:
-    """Return the trainer's settings that describe the scene's training box, or {} if there is no box.
+    """Return the trainer's settings for the scene's training box, or {} if there is no box.
 
-    The box limits what is trained, and its Z axis becomes the result's up direction. Raises InputError for a box without volume.
+    Only what is inside the box is trained, and its Z axis becomes the result's up direction. Raises InputError if the box has no volume.
     """
     box = training_region(scene)
     if box is None:

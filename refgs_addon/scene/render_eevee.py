@@ -53,7 +53,7 @@ def _save(picture: bpy.types.Image, scene: bpy.types.Scene, path: Path, kind: st
 
 @contextlib.contextmanager
 def _restored(scene: bpy.types.Scene) -> Iterator[None]:
-    """Restore every render setting that a preview changes."""
+    """Restore all render settings that a preview changes, at the end of the `with` block."""
     render = scene.render
     touched = [
         (scene, ["camera"]),

@@ -20,10 +20,10 @@ _numbers = itertools.count()
 def render_in_background(
     scene: bpy.types.Scene, png: Path, hdris: Sequence[Path] | None = None, size: int | None = None, samples: int = 64
 ) -> jobs.Job:
-    """Render the scene camera's view in another process, from a copy of the file in its present state. Returns the job.
+    """Start a job that renders the scene camera's view in another Blender process, from a copy of the open file. Returns the job.
 
-    Without `hdris` the PNG is that of `render_preview`; with `hdris` it is that of `contact_sheet`. Raises InputError where there is no
-    camera or the PNG's folder does not exist.
+    Without `hdris` the PNG is what `render_preview` renders; with `hdris` it is what `contact_sheet` renders. Raises InputError if there is
+    no camera, or the PNG's folder does not exist.
     """
     if scene.camera is None:
         raise InputError("there is no camera to look through: add one, or import a RefGS run with cameras.json")
@@ -43,7 +43,7 @@ def render_in_background(
 
 
 def _save_copy(path: str) -> None:
-    """Save a copy of the file. Blender's thumbnail for its file browser is switched off, because it takes a rendering."""
+    """Save a copy of the open file without a thumbnail. For the thumbnail Blender would render the scene, which takes time."""
     preferences = bpy.context.preferences
     kind, changed = preferences.filepaths.file_preview_type, preferences.is_dirty
     preferences.filepaths.file_preview_type = "NONE"

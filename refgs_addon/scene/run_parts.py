@@ -7,7 +7,7 @@ FOLDER = "refgs_folder"  # custom property of a run's collection: its run folder
 
 
 def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]:
-    """List the objects of a run's collection by part: "splats" and "mesh". Returns {} for any other collection."""
+    """Return the objects of an imported run as lists under "splats" and "mesh". For any other collection return {}."""
     found: dict[str, list[bpy.types.Object]] = {}
     for item in collection.objects:
         if KEY in item:

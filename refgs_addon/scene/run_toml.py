@@ -1,4 +1,4 @@
-"""Read facts about a run from its run.toml. A missing or unreadable file counts as empty."""
+"""Read from run.toml how a run was trained. If the file is missing or cannot be read, the functions answer as for an empty file."""
 
 import math
 import tomllib
@@ -14,7 +14,7 @@ def capture_of(run: Path) -> Path | None:
 
 
 def up_was_chosen(run: Path) -> bool:
-    """Check whether the artist chose another up direction than the capture's. The run is then rotated against the capture."""
+    """Check whether the artist chose a new up direction for the run. Its cameras are then rotated from those of the capture."""
     try:
         x, y, z = _table(run, "settings")["region"]["up"]
         return math.hypot(x, y) > 1e-3 * z and any((x, y, z))

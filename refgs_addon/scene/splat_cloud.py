@@ -1,4 +1,4 @@
-"""Read a splats.ply, and make a point cloud of its splats with the materials as attributes."""
+"""Read a splats.ply, and make a Blender point cloud of it. Each splat is a point with its material as attributes."""
 
 import itertools
 import os
@@ -36,9 +36,10 @@ def add_splats(
     collection: bpy.types.Collection,
     constants: dict[str, float] | None = None,
 ) -> bpy.types.Object:
-    """Add an object for a `point_cloud` to a collection, with the modifier and material that draw its splats.
+    """Add an object that draws the splats of a point cloud, with the modifier and the material for it. Returns the object.
 
-    `constants` (from `read_constants`) are values that all splats share. The material uses them in place of attributes.
+    `cloud` comes from `point_cloud`. `constants` comes from `read_constants`: the values that all splats share. The material uses them in
+    place of attributes.
     """
     result = bpy.data.objects.new(name, cloud)
     collection.objects.link(result)
@@ -56,10 +57,10 @@ def add_splats(
 def cloud_attributes(
     splats: dict[str, np.ndarray], normal_u: np.ndarray, normal_v: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return the attributes for a cloud's points: the arrays of `read_splats`, and the slopes of the normal.
+    """Return the attributes that a point cloud needs: the arrays of `read_splats`, and how the normal changes across each splat.
 
-    `normal_u` and `normal_v` (N, 3) are these slopes: the changes of the normal along the splat's two axes, per standard deviation.
-    Blender's types need more components: scale gets a third one, and base_color a fourth, both 1.
+    `normal_u` and `normal_v` (N, 3) are the change of the normal along the splat's first and second axis, per standard deviation. Blender's
+    types need more components: scale gets a third one and base_color a fourth, both 1.
     """
     one = np.ones((len(splats["position"]), 1), np.float32)
     return splats | {
@@ -72,7 +73,7 @@ def cloud_attributes(
 
 
 def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointCloud:
-    """Make a point cloud with these attributes on its points."""
+    """Make a point cloud. `values` maps the name of each attribute to an array with one row for each point."""
     cloud = compat.new_point_cloud(name, len(values["position"]))
     for key, value in values.items():
         kind = _TYPES.get(key, "FLOAT" if value.ndim == 1 else "FLOAT_VECTOR")
@@ -83,12 +84,16 @@ def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointClou
 
 
 def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
-    """Read a run's splats.ply, or a PLY of 3DGS or 2DGS (binary, little-endian, 3DGS's property names).
+    """Read the splats of a PLY file, and count those left out because a value is not finite. Returns arrays by name, and the count.
 
-    Returns float32 arrays and a count. The arrays are position (N, 3), normal (N, 3) unit, scale (N, 2) standard deviations, rotation (N,
-    4) unit quaternions wxyz, opacity (N,) 0..1, base_color (N, 3) linear, metallic (N,), roughness (N,). The count is the number of
-    splats left out because a value is not finite. Splats without materials become matte, in the colour of their constant spherical
-    harmonic. Missing or zero normals are set to the shortest axis. Raises InputError for any other file.
+    The file is a run's splats.ply, or comes from a 3DGS or 2DGS program. It is binary and little-endian, with 3DGS's property names.
+
+    The float32 arrays are:
+    - position (N, 3), normal (N, 3) of unit length, scale (N, 2) in standard deviations, rotation (N, 4) as unit quaternions wxyz;
+    - opacity (N,) 0..1, base_color (N, 3) linear, metallic (N,), roughness (N,).
+
+    Splats without materials become matte; their base colour is that of their constant spherical harmonic. Splats without normals get their
+    shortest axis as normal. Raises InputError for any other file.
     """
     all_rows = read_rows(path)
     rows = finite_rows(all_rows)
@@ -156,9 +161,9 @@ def _flatten_gaussians(rotation: np.ndarray, scale: np.ndarray) -> tuple[np.ndar
 
 
 def finite_rows(rows: np.ndarray) -> np.ndarray:
-    """Select the rows of a PLY whose values are all finite, as the trainer does.
+    """Select the rows of a PLY whose values are all finite. The trainer selects the same rows.
 
-    Only the opacity, which is stored as a logit, may be infinite: such a splat is fully transparent or opaque.
+    Opacity is stored as a logit and may be infinite, which means fully transparent or fully opaque.
     """
     fine = np.ones(len(rows), bool)
     floats = [name for name in rows.dtype.names if rows.dtype[name].kind == "f"]
@@ -190,10 +195,10 @@ def read_rows(path: Path) -> np.ndarray:
 
 
 def read_constants(path: Path) -> dict[str, float]:
-    """Read from the header of a run's splats.ply the values that all splats share: of metallic, roughness or specular.
+    """Read the values that all splats of a splats.ply share: "metallic", "roughness" or "specular". Returns them by name.
 
-    The header stores them as comments. Specular is the Principled BSDF's Specular IOR Level. A constant is ignored if the file also has a
-    column of that name.
+    They are comments in the file's header, and are ignored if the file also has a column of that name. Specular is the Principled BSDF's
+    Specular IOR Level. Raises InputError if the file cannot be read, or a value is not a number.
     """
     try:
         with open(path, "rb") as file:
@@ -212,10 +217,13 @@ def read_constants(path: Path) -> dict[str, float]:
     return found
 
 
-def _parse_header(head: bytes, found: bytes, path: Path) -> tuple[np.dtype, int]:
-    """Parse a PLY header into the numpy type of a row and the number of rows. `found` is the header's last line."""
+def _parse_header(head: bytes, last_line: bytes, path: Path) -> tuple[np.dtype, int]:
+    """Parse the header of a PLY file. Returns the numpy type of a row, and the number of rows.
+
+    `last_line` is the line "end_header", or empty if it was not found. `path` is only for error messages.
+    """
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
-    if not found or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
+    if not last_line or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
         raise InputError(f"{path} is not a binary little-endian PLY file: export the run again")
     first, *lines = [line for line in lines[2:] if line and line[0] in ("element", "property")] or [[]]
     properties = list(itertools.takewhile(lambda line: line[0] == "property", lines))
@@ -231,11 +239,11 @@ def _parse_header(head: bytes, found: bytes, path: Path) -> tuple[np.dtype, int]
 
 
 def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the change of the normal across each splat: dn/du and dn/dv (N, 3) per standard deviation.
+    """Estimate how the normal changes across each splat: dn/du and dn/dv (N, 3) per standard deviation.
 
-    With a constant normal on each splat, a curved mirror would look faceted. A weighted least-squares fit finds how the normals of the
-    neighbours that face the same way differ from the splat's own. Neighbours are splats that are close along space-filling curves. These
-    are not always the nearest splats, but finding them takes only a second for a million splats.
+    Without this, a curved mirror would look faceted. Each splat's normal is compared with the normals of its neighbours that face the same
+    way, in a weighted least-squares fit. Neighbours are splats that are close along space-filling curves. They are not always the nearest
+    splats, but they are found fast: in a second for a million splats.
     """
     position, normal = (splats[key].astype(np.float32) for key in ("position", "normal"))
     count = len(position)
@@ -253,10 +261,10 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
     reach = np.maximum(np.where(np.isfinite(beside), 64 * beside, 1), 1e-24)
 
     def gather(order: np.ndarray) -> np.ndarray:
-        """Sum products over each splat's neighbours along one curve: (7, N), for the least-squares fit.
+        """Sum seven products over each splat's neighbours along one curve, for the least-squares fit. Returns (7, N).
 
-        The products are w·u·u, w·u·v, w·v·v, w·u·du, w·u·dv, w·v·du, w·v·dv. (u, v) is the offset to the neighbour and (du, dv) the
-        difference of the normals, both along the splat's axes; w is the neighbour's weight.
+        `order` has the splats' indices along the curve. The products are w·u·u, w·u·v, w·v·v, w·u·du, w·u·dv, w·v·du and w·v·dv. (u, v) is
+        the offset to the neighbour and (du, dv) the difference of the normals, both along the splat's axes. w is the neighbour's weight.
         """
         place, facing_way, *axes, width = (values[order] for values in (position, normal, *tangents, reach))
         found = np.zeros((7, count), np.float32)
@@ -284,9 +292,10 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
 
 
 def _morton_order(position: np.ndarray, shift: float) -> np.ndarray:
-    """Order points (N, 3) along a Morton curve through their bounding cube. `shift` moves the curve by a fraction of the cube's side.
+    """Sort points (N, 3) along a Morton curve through their bounding cube. Returns their indices in that order.
 
-    Points that lie close together can be far apart along one curve. A curve with another shift is then likely to join them.
+    Points that lie close together can be far apart along one curve. Along a second curve they are likely to be close: `shift` moves the
+    curve by this fraction of the cube's side.
     """
     low = position.min(axis=0)
     cells = (position - low) / max((position - low).max(), 1e-30) / 2 + np.float32(shift)

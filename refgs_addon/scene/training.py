@@ -13,7 +13,7 @@ from .regions import region_settings
 
 
 def check(scene: bpy.types.Scene) -> jobs.Job:
-    """Check the scene's capture. The job's `results["check"]` has the result."""
+    """Start a job that reads the photos and cameras of the scene's capture and reports problems, in its `results["check"]`."""
     capture = _capture(scene)
     job = jobs.check(python(), capture, capture_folder(capture), log_file(f"check {capture.name}"))
     follow_jobs()
@@ -21,7 +21,10 @@ def check(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
-    """Find the cameras of the scene's photos, then check the capture. Earlier jobs that failed for lack of cameras are removed."""
+    """Start a job that computes the cameras from the scene's photos, and then checks the capture.
+
+    Earlier jobs that failed because the photos have no cameras are removed from the list.
+    """
     capture = _capture(scene)
     job = jobs.find_cameras(python(), capture, capture_folder(capture), log_file(f"cameras {capture.name}"))
     jobs.JOBS[:] = [known for known in jobs.JOBS if not known.no_cameras]
@@ -30,9 +33,10 @@ def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
 
 
 def train(scene: bpy.types.Scene) -> jobs.Job:
-    """Train the scene's capture with its settings, once earlier trainings have ended. Adds the run folder to the scene's list.
+    """Start a job that trains on the scene's capture with the scene's settings. Add the new run folder to the scene's list.
 
-    Raises InputError where the trainer or the capture is missing, the run folder is not empty, or the training box is flat.
+    The job waits until earlier trainings have ended. Raises InputError if there is no trainer or no capture, if the run folder is not
+    empty, or if the training box is flat.
     """
     settings, capture = scene.refgs, _capture(scene)
     out = Path(bpy.path.abspath(settings.out)) if settings.out else _free_folder(capture, scene)
@@ -66,10 +70,10 @@ def apply_edits(scene: bpy.types.Scene, collection: bpy.types.Collection, out: P
 
 
 def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.Job:
-    """Let the trainer write a run with its edits as display splats, for viewers without lights.
+    """Start a job in which the trainer writes a run with its edits as display splats, for viewers without lights.
 
-    Display splats have fixed colours: those that the recovered light gives them. Replaces the file. Raises InputError where the trainer,
-    the run or the file's folder is missing.
+    Display splats have fixed colours: how the run looks under the light recovered from the photos. An existing file is replaced. Raises
+    InputError if there is no trainer, or the run or the file's folder does not exist.
     """
     from .edit import edits, splats_of
     from .export_run import export_run, run_folder
@@ -87,7 +91,7 @@ def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.
 
 
 def resume(scene: bpy.types.Scene, folder: Path) -> jobs.Job:
-    """Resume a stopped run that the scene lists."""
+    """Start a job that resumes a stopped run of the scene's list. Raises InputError if the run is not stopped or not in the list."""
     known = next((known for known in scene.refgs.runs if Path(known.folder) == folder), None)
     state = jobs.run_state(folder)
     if state == "training":
@@ -110,7 +114,7 @@ def forget(scene: bpy.types.Scene, folder: Path) -> None:
 
 
 def _choices(settings: bpy.types.PropertyGroup) -> dict[str, object]:
-    """Return the trainer's settings that the artist chose in the scene. They override the preset's."""
+    """Return the settings that the artist chose in the scene, by the trainer's names. What is "auto" is left to the preset."""
     chosen = {
         "surfels.budget": settings.splats or "auto",
         "light.frame": settings.light,
@@ -137,7 +141,7 @@ def _capture(scene: bpy.types.Scene) -> Path:
 
 
 def _free_folder(capture: Path, scene: bpy.types.Scene) -> Path:
-    """Find a name for a run folder beside the capture. The folder must not exist, nor be in the scene's list of runs."""
+    """Return a path for a new run folder beside the capture. No file has it, and no run in the scene's list."""
     taken = {Path(known.folder) for known in scene.refgs.runs}
     number, out = 1, capture.with_name(f"{capture.name} RefGS")
     while out in taken or out.exists():

@@ -12,10 +12,10 @@ KEY = "refgs_turntable"  # custom property of the Empty that rotates
 
 
 def add_turntable(scene: bpy.types.Scene, collection: bpy.types.Collection, seconds: float = 4.0) -> bpy.types.Object:
-    """Parent a run's splats, mesh and regions to an Empty that rotates once in `seconds`. Sets the scene's frame range to that length.
+    """Make a run rotate once about itself in `seconds`, by parenting its objects to a rotating Empty. Returns the Empty.
 
-    The rotation is complete one frame after the last frame, so that a loop does not pause. Raises InputError where the run has a
-    turntable already.
+    The scene's frame range is set to that length. The full turn is reached one frame after the last frame, so that a loop does not pause.
+    Raises InputError if the run has a turntable already.
     """
     found = parts(collection)
     if not found:

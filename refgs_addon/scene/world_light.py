@@ -31,7 +31,7 @@ def load_panorama(path: Path) -> bpy.types.Image:
 
 
 def light_with_recovered(scene: bpy.types.Scene, name: str, image: bpy.types.Image) -> bpy.types.World:
-    """Give the scene a new world with a run's recovered panorama."""
+    """Give the scene a new world that shows `image`, the panorama of light recovered from a run's photos."""
     world = panorama_world(name)
     world[RECOVERED] = image
     world.node_tree.nodes[IMAGE].image = image
