@@ -14,9 +14,9 @@ REGION = "refgs_region"  # custom property of an object that marks a region
 
 
 def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name: str, shape: str) -> bpy.types.Object:
-    """Add an Empty that surrounds nearly all splats. `shape` is "CUBE", "SPHERE" or "ARROWS".
+    """Add an Empty around the splats: in its frame, nearly all splats lie in the cube from -1 to 1.
 
-    Its scale is half the size of the splats' bounding box, without the outermost splats.
+    `shape` is how Blender displays the Empty: "CUBE", "SPHERE" or "ARROWS".
     """
     region = bpy.data.objects.new(name, None)
     region[REGION] = True

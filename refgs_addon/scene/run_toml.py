@@ -14,7 +14,7 @@ def capture_of(run: Path) -> Path | None:
 
 
 def up_was_chosen(run: Path) -> bool:
-    """Check whether the artist chose a new up direction for the run. Its cameras are then rotated from those of the capture."""
+    """Check whether the artist chose a new up direction for the run. The run is then rotated relative to its capture."""
     try:
         x, y, z = _table(run, "settings")["region"]["up"]
         return math.hypot(x, y) > 1e-3 * z and any((x, y, z))

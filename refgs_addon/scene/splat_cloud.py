@@ -84,13 +84,16 @@ def point_cloud(name: str, values: dict[str, np.ndarray]) -> bpy.types.PointClou
 
 
 def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
-    """Read the splats of a PLY file, and count those left out because a value is not finite. Returns arrays by name, and the count.
+    """Read the splats of a PLY file. Returns their arrays by name, and the number of splats left out because a value is not finite.
 
-    The file is a run's splats.ply, or comes from a 3DGS or 2DGS program. It is binary and little-endian, with 3DGS's property names.
-
-    The float32 arrays are:
-    - position (N, 3), normal (N, 3) of unit length, scale (N, 2) in standard deviations, rotation (N, 4) as unit quaternions wxyz;
-    - opacity (N,) 0..1, base_color (N, 3) linear, metallic (N,), roughness (N,).
+    The file is a run's splats.ply, or comes from a 3DGS or 2DGS program. It is binary and little-endian, with 3DGS's property names. The
+    float32 arrays are:
+    - position (N, 3);
+    - normal (N, 3), of unit length;
+    - scale (N, 2), in standard deviations;
+    - rotation (N, 4), unit quaternions wxyz;
+    - opacity, metallic and roughness (N,), all 0..1;
+    - base_color (N, 3), linear.
 
     Splats without materials become matte; their base colour is that of their constant spherical harmonic. Splats without normals get their
     shortest axis as normal. Raises InputError for any other file.

@@ -141,7 +141,7 @@ def _capture(scene: bpy.types.Scene) -> Path:
 
 
 def _free_folder(capture: Path, scene: bpy.types.Scene) -> Path:
-    """Return a path for a new run folder beside the capture. No file has it, and no run in the scene's list."""
+    """Return a path for a new run folder beside the capture. Nothing exists there, and no run of the scene's list uses it."""
     taken = {Path(known.folder) for known in scene.refgs.runs}
     number, out = 1, capture.with_name(f"{capture.name} RefGS")
     while out in taken or out.exists():

@@ -1,4 +1,4 @@
-"""Draw a checked capture in the Train panel: thumbnails, and a button for its cameras."""
+"""Draw the result of a capture's check in the Train panel: some photos, and a button that shows the cameras."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -29,9 +29,10 @@ class ShowCameras(OnJob, bpy.types.Operator):
 
 
 def draw_capture(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job) -> None:
-    """Draw some photos of a checked capture, and a button that shows its cameras.
+    """Draw the result of a capture's check: some photos, and a button that shows the cameras.
 
-    `job` is the job that checked the capture, and `number` is the job's index in the list of jobs.
+    `job` is the job that made the check, and `number` is its index in the list of jobs. Draws nothing if the job is of another kind or has
+    not ended.
     """
     checked = job.results.get("check", {})
     if "cameras" not in checked:

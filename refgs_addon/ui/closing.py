@@ -1,7 +1,7 @@
-"""Ask what becomes of running trainings before Blender closes.
+"""Ask before Blender closes whether running trainings continue or stop.
 
-Blender does not tell add-ons before it closes. So only the quit key and an entry in the File menu ask the question. For all other ways to
-close Blender, each training has a checkbox that keeps it running.
+Blender does not tell an add-on that it is about to close. So only the quit key and an entry in the File menu can ask. Blender can be closed
+in other ways too: for these, each training has a checkbox that keeps it running.
 """
 
 import sys
@@ -86,7 +86,7 @@ class Quit(ReportsErrors, bpy.types.Operator):
 
 
 def quit_question() -> str:
-    """Return the title of the question before quitting."""
+    """Return the title of the dialog that asks before quitting, such as "A training is running"."""
     number = len(jobs.trainings())
     return "A training is running" if number == 1 else f"{number} trainings are running or waiting"
 

@@ -1,4 +1,4 @@
-"""Handle files that are dropped on the 3D view: a run.toml imports its run, a transforms.json chooses its capture."""
+"""Handle files that are dropped on the 3D view. A run.toml imports its run. A transforms.json makes its folder the capture to train."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from .operators import ReportsErrors, import_run_folder
 
 
 class _Drop(ReportsErrors):
-    """Store the path of a dropped file. Base of the operators on such a file."""
+    """Store the path of a dropped file. Base class of the operators that handle the file."""
 
     filepath: StringProperty(subtype="FILE_PATH", options={"SKIP_SAVE"})
 
@@ -47,7 +47,7 @@ class DropCapture(_Drop, bpy.types.Operator):
 
 
 class _OnView:
-    """Accept files that are dropped on the 3D view. Base of the file handlers."""
+    """Accept files only if they are dropped on the 3D view. Base class of the file handlers."""
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:

@@ -1,4 +1,4 @@
-"""Define the operators that export the active run, and add their entries to the File menu."""
+"""Define the operators that export a run, and add them to the File menu."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -13,7 +13,7 @@ from .operators import ImportRun, OnRun, has_trainer
 
 
 class _Export(OnRun, ExportHelper):
-    """Export a part of the active run to a file. Base of the export operators."""
+    """Ask for a file and export a part of the active run to it. Base class of the export operators."""
 
     bl_options: ClassVar = {"REGISTER"}
 

@@ -1,4 +1,4 @@
-"""Make icons for the panels: a training's newest preview and its curve, and thumbnails of files."""
+"""Make icons for the panels: a training's newest preview, its PSNR curve, and thumbnails of files."""
 
 import math
 from pathlib import Path
@@ -22,7 +22,7 @@ _drawn: dict[int, tuple[int, int]] = {}  # number of points in the drawn curve b
 
 
 def preview_icon(job: jobs.Job) -> int:
-    """Return the icon of a job's newest preview, or 0 where there is none yet."""
+    """Return the number of the icon with a training job's newest preview picture, or 0 if there is none yet."""
     if not job.preview or _pictures is None:
         return 0
     key = f"{job.serial} {job.preview['iteration']}"
@@ -36,9 +36,9 @@ def preview_icon(job: jobs.Job) -> int:
 
 
 def thumbnail(file: Path, version: int = 0) -> int:
-    """Return the icon of a file's thumbnail, or 0 in a Blender without a window. Blender makes the thumbnail in the background.
+    """Return the number of the icon with a file's thumbnail, or 0 in a Blender without a window.
 
-    A new `version` reloads a file that was overwritten.
+    Blender makes the thumbnail in the background. If the file was overwritten, pass another `version` to load it again.
     """
     if _pictures is None:
         return 0
@@ -47,7 +47,10 @@ def thumbnail(file: Path, version: int = 0) -> int:
 
 
 def curve_icon(job: jobs.Job) -> int:
-    """Return an icon with the curve of a job's PSNR. Returns 0 before the second point, or if Blender has no window or no numpy."""
+    """Return the number of an icon with the PSNR curve of a job.
+
+    Returns 0 while the curve has fewer than two points, and if Blender has no window or no numpy.
+    """
     if len(job.curve) < 2 or _pictures is None:
         return 0
     key = f"{job.serial} curve"
@@ -65,10 +68,10 @@ def curve_icon(job: jobs.Job) -> int:
 
 
 def plot(trained: list[tuple[float, float]], held_out: list[tuple[float, float]]) -> "np.ndarray":
-    """Plot PSNR over log time as RGBA (height, width, 4), bottom row first.
+    """Plot PSNR over log time. Returns RGBA pixels (height, width, 4), bottom row first.
 
-    `trained` and `held_out` are points (seconds, PSNR). Those of the training views are joined by a line, those of the held-out views
-    are dots. The grid is at 1, 10, 100 … seconds and every 5 dB.
+    `trained` and `held_out` are points (seconds, PSNR), measured on the training views and on the held-out views. The former are drawn as a
+    line, the latter as dots. The grid lines are at 1, 10, 100 … seconds and every 5 dB.
     """
     import numpy as np
 

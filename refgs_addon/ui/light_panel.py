@@ -38,7 +38,10 @@ def _lights(self, context: bpy.types.Context) -> list[tuple[str, str, str, int, 
 
 
 def _number(file: Path) -> int:
-    """Return a number for a file's menu item, above OTHER. It is a hash of the path, so other files in the folder do not change it."""
+    """Return the number of a panorama file in the menu of lights. It is a hash of the path, greater than OTHER.
+
+    So the number of a file stays the same when other files are added to the folder or removed.
+    """
     return 2 + crc32(str(file).encode()) % (1 << 30)
 
 

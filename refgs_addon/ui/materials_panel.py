@@ -1,4 +1,4 @@
-"""Draw the Materials panel, which edits the materials of a run."""
+"""Draw the Materials panel, in which the artist changes the materials of a run's splats."""
 
 from typing import ClassVar
 
@@ -49,7 +49,7 @@ class AddEdit(OnRun, bpy.types.Operator):
 
 
 class _OfEdit(ReportsErrors):
-    """Find the modifier of one edit. Base of the operators on an edit."""
+    """Store which edit an operator works on. Base class. An edit is a modifier of the splats that changes their materials."""
 
     splats: StringProperty(name="Splats", options={"HIDDEN"})
     edit: StringProperty(name="Edit", options={"HIDDEN"})
@@ -68,7 +68,10 @@ class RemoveEdit(_OfEdit, bpy.types.Operator):
 
 
 class SetMaterial(_OfEdit, bpy.types.Operator):
-    """Set an edit to the values of a preset. Blender's own operator for presets cannot be undone."""
+    """Set the values of an edit to those of a material preset.
+
+    Blender's own operator does the same, but the artist could not undo it.
+    """
 
     bl_idname = "refgs.set_material"
     bl_label = "Set Material"
@@ -81,9 +84,9 @@ class SetMaterial(_OfEdit, bpy.types.Operator):
 
 
 class KeepMaterial(_OfEdit, bpy.types.Operator):
-    """Save or remove a preset, for the buttons + and − in Blender's list of presets.
+    """Save the values of an edit as a material preset, or remove a preset. The list of presets shows this as buttons + and −.
 
-    Blender's own operator overwrites a preset of the same name (4.3), and cannot read a modifier's inputs.
+    Blender's own operator cannot do this: it does not read the inputs of a modifier, and 4.3 overwrites a preset of the same name.
     """
 
     bl_idname = "refgs.keep_material"

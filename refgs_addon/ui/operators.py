@@ -22,7 +22,7 @@ from ..scene.world_light import hdris
 
 
 class ReportsErrors:
-    """Run `work`, and report an InputError in one line. Base of all operators."""
+    """Call the operator's method `work`, and show an InputError as one line. Base class of all operators."""
 
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
@@ -40,7 +40,7 @@ class ReportsErrors:
 
 
 class OnJob(ReportsErrors):
-    """Find one job of the list. Base of the operators on a job."""
+    """Give an operator the job at the index `number` in the list of jobs. Base class of the operators on one job."""
 
     bl_options: ClassVar = {"REGISTER"}
 
@@ -52,7 +52,7 @@ class OnJob(ReportsErrors):
 
 
 class OnRun(ReportsErrors):
-    """Disable the button without an active run, and say in its tooltip what to do. Base of the operators on the active run."""
+    """Disable the operator's button while no run is imported; its tooltip then says so. Base class of the operators on the active run."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -61,19 +61,19 @@ class OnRun(ReportsErrors):
 
 
 class OnRunFolder(ReportsErrors):
-    """Store the folder of a listed run. Base of the operators on such a run."""
+    """Store the folder of a run from the scene's list. Base class of the operators on such a run."""
 
     folder: StringProperty(name="Run Folder")
 
 
 def has_trainer(operator: type[bpy.types.Operator]) -> bool:
-    """Check that a trainer is set up. If none is, the button's tooltip says what to do."""
+    """Return True if a trainer is set up. If not, the tooltip of the operator's button says what to do."""
     operator.poll_message_set("Set up the trainer in the add-on's preferences first")
     return set_up()
 
 
 def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder: Path) -> None:
-    """Import a run, and report to the artist what was imported and what to be aware of."""
+    """Import a run folder, and report the number of splats. Warn the artist of problems, such as splats that were left out."""
     from ..scene.import_run import import_run
 
     run = import_run(folder, context.scene)
@@ -196,7 +196,7 @@ class Turntable(OnRun, bpy.types.Operator):
 
 
 class _Render(ReportsErrors, ExportHelper):
-    """Render in another Blender process, or in this process if Blender has no window. Base of the operators that render."""
+    """Render in another Blender process. If Blender has no window, render in this process. Base class of the operators that render."""
 
     bl_options: ClassVar = {"REGISTER"}
     filename_ext = ".png"

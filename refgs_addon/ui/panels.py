@@ -1,4 +1,4 @@
-"""Draw the Run and Preview panels. Define the RefGS tab in the 3D view's sidebar, which holds all panels."""
+"""Draw the Run and Preview panels. Define the tab RefGS in the 3D view's sidebar, where all panels are."""
 
 from pathlib import Path
 

@@ -19,7 +19,7 @@ from .panels import Tab
 
 
 class _OnCapture(ReportsErrors):
-    """Disable the button without a capture or a trainer, and say in its tooltip what to do. Base of the operators on the capture."""
+    """Disable the operator's button without a capture or a trainer; its tooltip then says what to do. Base class."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -252,13 +252,13 @@ def draw_status(self, context: bpy.types.Context) -> None:
 
 
 def _fraction(job: jobs.Job) -> float:
-    """Return how much of a training is done, 0..1. For other jobs, return how much of the present stage is done."""
+    """Return how much of a training is done, 0..1. A job of another kind has several stages, and each counts from 0 to 1."""
     facts = job.progress
     return facts["done" if "stage" in facts else "iteration"] / max(facts["total"], 1) if facts else 0.0
 
 
 def _status(job: jobs.Job) -> str:
-    """Describe a job's progress in a few words."""
+    """Describe the progress of a job in a few words, such as "paused" or "3:20 left"."""
     if job.state == "paused":
         return "paused"
     if "train" in job.results:
@@ -283,7 +283,7 @@ def _command_button(layout: bpy.types.UILayout, number: int, command: str, text:
 
 
 def _draw_run(box: bpy.types.UILayout, folder: Path) -> None:
-    """Draw the buttons for a run folder."""
+    """Draw a run of the scene's list: a button that imports or resumes it, or the progress of its training."""
     state = jobs.run_state(folder)
     row = box.row(align=True)
     if state == "finished":
@@ -305,7 +305,7 @@ def _draw_run(box: bpy.types.UILayout, folder: Path) -> None:
 
 
 def other_process_status(folder: Path) -> tuple[float, str]:
-    """Return the progress of a run that another process trains: the fraction done, 0..1, and a few words."""
+    """Return the progress of a run that another process trains: the fraction that is done, 0..1, and a short description."""
     facts = jobs.run_progress(folder)
     if not facts:
         return (1.0, "Making the mesh") if (folder / "splats.ply").exists() else (0.0, "Starting")
