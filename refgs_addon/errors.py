@@ -2,7 +2,7 @@
 
 
 class InputError(Exception):
-    """Report one line to the artist: what is wrong, where, and what to do.
+    """Report a problem that the artist can fix, in one line: what is wrong, where, and what to do.
 
     Operators show the line in Blender. Programs without a window print it to stderr.
     """

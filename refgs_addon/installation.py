@@ -1,7 +1,7 @@
 """Install the trainer into a Python environment of its own, or remove it. This module needs no bpy.
 
 Blender also runs this file as a separate process. That process reads one command, `install` or `remove`, from stdin, and prints events to
-stdout (docs/job-protocol.md). When Blender ends, stdin closes: the process then kills uv or the trainer, and exits.
+stdout (docs/job-protocol.md). When Blender ends, stdin closes: the process then kills the program that it has started, and exits.
 
 An interrupted installation does no harm. The last step writes a marker file, and without that file the trainer counts as not installed.
 Finished downloads stay in uv's cache for the next installation.
@@ -35,12 +35,12 @@ NEEDED, NEEDED_WITH_CARD = 2 * GB, 7 * GB  # torch's CUDA builds include CUDA's 
 
 
 def wheel(name: str) -> Path | None:
-    """Find a wheel that is bundled with the add-on. Returns None in a copy of the repository, which bundles no wheels."""
+    """Find the wheel (Python package file) of `name` that comes with the add-on. Returns None if there is none, as in the repository."""
     return next(WHEELS.glob(f"{name}-*.whl"), None)
 
 
 def bundled_version() -> str:
-    """Return the version of the bundled trainer, or "" without one."""
+    """Return the version of the trainer that comes with the add-on, or "" if none does."""
     file = wheel("refgs") if wheel("uv") else None
     return file.name.split("-")[1] if file else ""
 
@@ -150,7 +150,7 @@ def exit_with_stdin() -> None:
 
 @contextlib.contextmanager
 def _locked(home: Path) -> Iterator[None]:
-    """Hold the installation's lock, which keeps other processes out. Raises _Failed if another process holds it.
+    """Hold a lock that keeps other processes from installing or removing the trainer. Raises _Failed if another process holds it.
 
     The system frees the lock when this process ends, even by a crash.
     """

@@ -59,7 +59,7 @@ def redraw() -> None:
 
 
 def unregister() -> None:
-    """Stop the timers and all jobs. Trainings that the artist chose to keep continue after Blender closes."""
+    """Stop the timers and all jobs, except trainings that should continue after Blender closes."""
     for timer in (_poll_jobs, _poll_other_processes):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)

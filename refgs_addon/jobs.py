@@ -3,8 +3,8 @@
 Each job has its own worker process, which gets commands on stdin and prints events to stdout (docs/job-protocol.md). A thread reads the
 events into a queue, and `poll` handles them.
 
-When Blender ends, the stdin of each worker closes, and the worker stops. The artist can choose to keep a training: its worker then finishes
-without Blender. A worker locks the run folder in which it works, so that every Blender can see that this folder is in use.
+When Blender ends, the stdin of each worker closes, and the worker stops. The artist can choose that a training continues: its worker then
+finishes without Blender. A worker locks the run folder in which it works, so that every Blender can see that this folder is in use.
 """
 
 import contextlib
@@ -182,14 +182,14 @@ class Job:
         self._close()
 
     def _close(self) -> None:
-        """Make the process exit, even if the artist chose to keep it after Blender closes."""
+        """Make the process exit, even if it should continue after Blender closes."""
         if self._process is not None:
             if self.kept:
                 self.tell("keep", on=False)
             self.close_input()
 
     def close_input(self) -> None:
-        """Close the process's standard input. The process then stops, unless the job is kept."""
+        """Close the process's standard input. The process then stops, unless it should continue without Blender (`keep`)."""
         with contextlib.suppress(OSError):
             self._process.stdin.close()
 
@@ -346,7 +346,7 @@ def poll() -> bool:
 
 
 def trainings() -> list[Job]:
-    """List the jobs that train a run or make its mesh, both running and waiting. Only these jobs can be kept when Blender closes."""
+    """List the jobs that train a run or make its mesh, both running and waiting. Only these jobs can continue after Blender closes."""
     return [job for job in JOBS if job.run and not job.ended]
 
 
@@ -357,7 +357,7 @@ def keep_all(on: bool) -> None:
 
 
 def stop_all() -> None:
-    """Stop all jobs and clear the list. Jobs that the artist chose to keep continue without Blender."""
+    """Stop all jobs and clear the list. Only jobs that should continue without Blender (`Job.keep`) run on."""
     for job in JOBS:
         if job.kept and job.active:
             job.close_input()
@@ -379,9 +379,10 @@ def run_state(folder: Path) -> str:
 
 
 def run_progress(folder: Path) -> dict:
-    """Read the progress of the training in a folder, whichever process runs it: `iteration` of `total` iterations, and `seconds_left`.
+    """Return the progress of the training in a folder, whichever process runs it.
 
-    The result is empty before the first iteration and while the mesh is made.
+    The dictionary has `iteration`, `total` (the number of iterations) and `seconds_left`. It is empty before the first iteration and while
+    the mesh is made.
     """
     try:
         return json.loads((folder / PROGRESS).read_text(encoding="utf-8"))

@@ -76,7 +76,7 @@ def python() -> Path:
 
 
 def home() -> Path:
-    """Return the folder for the installed trainer."""
+    """Return the folder in which the add-on installs the trainer."""
     return _folder("trainer")
 
 
@@ -134,7 +134,7 @@ def remove() -> None:
 
 
 def stop() -> None:
-    """Stop the installation, which can be resumed."""
+    """Stop the running installation. It can be resumed later."""
     if job := installing():
         job.stop()
         job.line = "Stopping …"
@@ -176,7 +176,7 @@ def status() -> tuple[str, str]:
 
 
 def installation_problem() -> str:
-    """Return a line for the artist if the trainer cannot be installed now, else ""."""
+    """Return why the trainer cannot be installed now, as a line for the artist, or "" if it can."""
     if not installation.bundled_version():
         return "This copy of the add-on contains no trainer: choose a Python that has it"
     if preferences().python:

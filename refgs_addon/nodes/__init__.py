@@ -52,7 +52,7 @@ def math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSoc
 
 
 def vector_math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
-    """Add a vector math node for sockets and vectors; return its output."""
+    """Add a vector math node and return its output. Each of `inputs` is a socket or a vector."""
     return out(add(tree, "ShaderNodeVectorMath", dict(enumerate(inputs)), operation=operation))
 
 
@@ -76,7 +76,7 @@ def store_attribute(tree: bpy.types.NodeTree, geometry, name: str, kind: str, va
 
 
 def object_frame(tree: bpy.types.NodeTree, item: bpy.types.NodeSocket) -> tuple[bpy.types.Node, bpy.types.NodeSocket]:
-    """Add nodes that compute each point's position in the coordinates of another object. `item` is a socket that holds that object.
+    """Add nodes that compute each point's position in the local coordinates of another object. `item` is a socket with that object.
 
     Returns the Object Info node of that object, and the output with the positions.
     """

@@ -99,7 +99,7 @@ def edit_tree() -> bpy.types.NodeTree:
 def _mask(tree: bpy.types.NodeTree, group: bpy.types.NodeOutputs) -> bpy.types.NodeSocket:
     """Add the nodes for the mask that `edit_tree` describes, 0..1 for each splat, and return their output.
 
-    `group` are the inputs of the tree.
+    `group` holds the inputs of the tree.
     """
     menu = add(tree, "GeometryNodeMenuSwitch", data_type="FLOAT")
     menu.enum_items.clear()

@@ -1,4 +1,4 @@
-"""Build the world's node tree: a panorama with a rotation and a strength."""
+"""Build the node tree of a Blender world that shows a panorama with a rotation and a strength."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ RECOVERED = "refgs_recovered"  # custom property of a world: the run's recovered
 def panorama_world(name: str) -> bpy.types.World:
     """Make a world that shows a panorama. The image is set later.
 
-    The mapping type is Texture. A rotation about z then rotates the environment itself, counter-clockwise seen from above.
+    Its Mapping node has the type Texture: a rotation about z then rotates the environment itself, counter-clockwise seen from above.
     """
     world = bpy.data.worlds.new(name)
     # By default Eevee moves all radiance above 10 into one sun lamp, which makes several softboxes a single hard sun. Without that,

@@ -76,6 +76,8 @@ def values_material() -> bpy.types.Material:
 def _finish(material: bpy.types.Material, shader: bpy.types.NodeSocket) -> None:
     """Make a splat transparent by its alpha, opacity · exp(-(u² + v²) / 2), and connect its shader to the material's output.
 
+    (u, v) is the position on the splat in standard deviations.
+
     In each sample, Eevee draws a quad with a probability equal to its alpha, and shows the nearest one that it draws. The average over the
     samples equals front-to-back alpha compositing with a depth for each pixel. This holds for any number of overlapping quads.
     """

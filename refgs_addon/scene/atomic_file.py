@@ -10,7 +10,7 @@ from ..errors import InputError
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yield a temporary file beside `path`, then rename it to `path`. Raises InputError where a write fails."""
+    """Yield a temporary file beside `path`, and rename it to `path` at the end of the `with` block. Raises InputError if a write fails."""
     # Keep the extension last: Blender appends a missing one.
     temporary = path.with_name(f".{path.stem}.part{path.suffix}")
     try:

@@ -16,8 +16,8 @@ PHOTO = "refgs_photo"  # custom property of a camera's data: the file of its pho
 def read_cameras(path: Path, capture: Path | None) -> list[dict]:
     """Read the cameras of a cameras.json. Returns one dictionary for each photo.
 
-    It has the camera-to-world matrix with OpenGL's axes, the pinhole intrinsics, and as `photo` the path of the photo in the folder
-    `capture`. Without `capture`, `photo` is "". Raises InputError if the file cannot be read, or RefGS did not write it.
+    Each dictionary has the camera-to-world matrix with OpenGL's axes, the pinhole intrinsics, and as `photo` the path of the photo in the
+    folder `capture`. Without `capture`, `photo` is "". Raises InputError if the file cannot be read, or RefGS did not write it.
     """
     try:
         frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
@@ -47,8 +47,8 @@ def light_of(path: Path) -> str:
 def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Object:
     """Add a camera object to a collection, with the pose, focal length and principal point of a `frame` of `read_cameras`.
 
-    Blender stores one resolution and one pixel aspect for the whole scene. So the camera's data get these of the photo as custom
-    properties, `refgs_size` (pixels) and `refgs_pixel_aspect`, for `frame_camera`.
+    Blender stores one resolution and one pixel aspect for the whole scene. The values for this photo are stored in the camera's data, as
+    the custom properties `refgs_size` (pixels) and `refgs_pixel_aspect`. `frame_camera` sets the scene to them.
     """
     data = bpy.data.cameras.new(frame["name"])
     width, height = frame["w"], frame["h"]

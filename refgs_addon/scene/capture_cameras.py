@@ -65,7 +65,7 @@ def replace_cameras(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bp
 
 
 def active_cameras(context: bpy.types.Context) -> bpy.types.Collection | None:
-    """Find the collection whose cameras the buttons Next and Previous step through: that of a run or of a capture.
+    """Find the collection through which the buttons "next camera" and "previous camera" step: that of a run or of a capture.
 
     The first match counts: the collection with the active object, the one with the scene's camera, the newest run, the newest capture.
     Returns None if there is no run and no capture.

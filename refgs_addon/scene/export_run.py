@@ -112,7 +112,10 @@ def export_run(collection: bpy.types.Collection, folder: Path) -> None:
 
 
 def export_light(collection: bpy.types.Collection, path: Path) -> None:
-    """Copy a run's recovered light, an equirectangular EXR. Raises InputError where it is missing or cannot be written."""
+    """Copy the light recovered from a run's photos, an equirectangular EXR, to `path`.
+
+    Raises InputError if the run has no such file, or the copy cannot be written.
+    """
     light = run_folder(collection) / "environment.exr"
     if not light.is_file():
         raise InputError(f"{light} does not exist: the run has no light")
@@ -122,7 +125,7 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
 def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
     """Write a run's mesh with its textures. A .glb is a copy of the run's file; `mesh_exchange` writes .usdc and .fbx.
 
-    Raises InputError where the run has no mesh, or has edits, which the mesh's textures do not contain.
+    Raises InputError if the run has no mesh. Raises InputError too if the run has edits, because the mesh's textures do not contain them.
     """
     mesh = run_folder(collection) / "mesh.glb"
     if edits(splats_of(collection)):

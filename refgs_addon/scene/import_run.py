@@ -1,4 +1,4 @@
-"""Import a run folder: a collection of the run's splats, mesh and cameras, and its recovered light."""
+"""Import a run folder, the result of a training: its splats, mesh and cameras, and the light recovered from the photos."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,11 +31,11 @@ class Run:
 
 
 def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
-    """Import a run folder into a scene, in a new collection `RefGS NAME`.
+    """Import a run folder, the result of a training, into a scene, as a new collection `RefGS NAME`.
 
     splats.ply must exist. mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be missing. The mesh is hidden
-    at first, because it overlaps the splats; `run_parts.show` shows it. The run's cameras replace those that
-    `capture_cameras.show_cameras` added for the same capture. Raises InputError; Blender's file is then unchanged.
+    at first, because it overlaps the splats; `run_parts.show` shows it. If `capture_cameras.show_cameras` added the cameras of the same
+    capture, the run's cameras replace them. If this function raises InputError, it leaves the open file unchanged.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -1,4 +1,4 @@
-"""Show a training's current surfels in the 3D view. When the training ends, they are removed; the finished run can be imported."""
+"""Show in the 3D view what a training has learned so far, as surfels (flat splats). They are removed when the training ends."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass

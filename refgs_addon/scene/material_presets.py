@@ -91,7 +91,7 @@ def _identifier(name: str) -> str:
 
 
 def _rounded(name: str, value) -> float | tuple[float, ...]:
-    """Round a value of an edit to six decimals, as Python numbers. Only for the name "Base Color" is the value a colour.
+    """Round a value of an edit to six decimals. `name` is the edit's input: "Base Color" has four numbers, every other input one.
 
     Blender stores numbers in single precision: a typed 0.2 comes back as 0.20000000298.
     """

@@ -1,4 +1,4 @@
-"""Compare two panoramas: find the rotation and the scale between them."""
+"""Compare two panoramas: find the rotation and the brightness factor between them."""
 
 import math
 
@@ -11,7 +11,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # Rec.709
 
 
 def best_rotation(image: bpy.types.Image, other: bpy.types.Image) -> tuple[float, float]:
-    """Find the rotation about z and the factor that make the panorama `image` most like `other`. Both are equirectangular.
+    """Find the rotation about z and the brightness factor that make the panorama `image` most like `other`. Both are equirectangular.
 
     The rotation is in radians, -π..π, counter-clockwise seen from above. It maximises the correlation of the log luminances, weighted by
     solid angle. The factor is the mean luminance of `other` over the sphere, divided by that of `image`.

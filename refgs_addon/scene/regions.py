@@ -58,9 +58,9 @@ def training_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
 def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
     """Show the box that limits the training: only what is inside is trained. Make the box if there is none.
 
-    If the capture was checked, a new box surrounds the ball at which its cameras look. The check has found this ball. Otherwise the new box
-    is 2 m wide around the origin. This fits most captures too, because the trainer moves and scales the cameras until that ball has its
-    centre at the origin and a radius of 1 m. (It leaves the cameras of captures from NeRF-Blender as they are.)
+    The check of a capture finds a ball at which the cameras look, and a new box surrounds this ball. If the capture was not checked, the
+    new box is 2 m wide around the origin. This fits most captures too, because the trainer moves and scales the cameras until the ball's
+    centre is the origin and its radius is 1 m. (It leaves the cameras of captures from NeRF-Blender as they are.)
     """
     box = training_region(scene)
     if box is None:

@@ -7,7 +7,7 @@ FOLDER = "refgs_folder"  # custom property of a run's collection: its run folder
 
 
 def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]:
-    """Return the objects of an imported run as lists under "splats" and "mesh". For any other collection return {}."""
+    """Return the objects of an imported run as {"splats": [objects], "mesh": [objects]}. For any other collection return {}."""
     found: dict[str, list[bpy.types.Object]] = {}
     for item in collection.objects:
         if KEY in item:
@@ -23,7 +23,7 @@ def show(collection: bpy.types.Collection, part: str) -> None:
 
 
 def active_run(context: bpy.types.Context) -> bpy.types.Collection | None:
-    """Find the run of the active object, else the scene's newest run."""
+    """Find the collection of the run to which the active object belongs. If it belongs to none, find the scene's newest run."""
     runs = [collection for collection in context.scene.collection.children if parts(collection)]
     chosen = context.view_layer.objects.active
     of_chosen = [run for run in runs if chosen is not None and chosen.name in run.all_objects]

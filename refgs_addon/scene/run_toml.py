@@ -14,7 +14,7 @@ def capture_of(run: Path) -> Path | None:
 
 
 def up_was_chosen(run: Path) -> bool:
-    """Check whether the artist chose a new up direction for the run. The run is then rotated relative to its capture."""
+    """Check whether the artist chose a new up direction for the run. The run is then rotated relative to the capture's cameras."""
     try:
         x, y, z = _table(run, "settings")["region"]["up"]
         return math.hypot(x, y) > 1e-3 * z and any((x, y, z))
@@ -23,7 +23,7 @@ def up_was_chosen(run: Path) -> bool:
 
 
 def newer_release(run: Path) -> str:
-    """Return the release that trained a run if it is newer than this add-on, else ""."""
+    """Return the release of RefGS that trained a run, if it is newer than this add-on, else ""."""
     made_by = _table(run, "run").get("refgs")
     own = tomllib.loads(MANIFEST.read_text(encoding="utf-8"))["version"]
     try:

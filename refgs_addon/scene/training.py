@@ -13,7 +13,10 @@ from .regions import region_settings
 
 
 def check(scene: bpy.types.Scene) -> jobs.Job:
-    """Start a job that reads the photos and cameras of the scene's capture and reports problems, in its `results["check"]`."""
+    """Start a job that reads the photos and cameras of the scene's capture and reports problems.
+
+    The job's `results["check"]` is the report. Raises InputError if there is no trainer or no capture.
+    """
     capture = _capture(scene)
     job = jobs.check(python(), capture, capture_folder(capture), log_file(f"check {capture.name}"))
     follow_jobs()
@@ -114,7 +117,7 @@ def forget(scene: bpy.types.Scene, folder: Path) -> None:
 
 
 def _choices(settings: bpy.types.PropertyGroup) -> dict[str, object]:
-    """Return the settings that the artist chose in the scene, by the trainer's names. What is "auto" is left to the preset."""
+    """Return the settings that the artist chose in the scene, by the trainer's names. Settings at "auto" are left to the preset."""
     chosen = {
         "surfels.budget": settings.splats or "auto",
         "light.frame": settings.light,

@@ -1,4 +1,4 @@
-"""Light the scene with a run's recovered panorama or with an HDRI."""
+"""Light the scene with the panorama recovered from a run's photos, or with an HDRI."""
 
 from pathlib import Path
 
@@ -40,11 +40,11 @@ def light_with_recovered(scene: bpy.types.Scene, name: str, image: bpy.types.Ima
 
 
 def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, strength: float = 1.0) -> None:
-    """Light the scene with an HDRI. With `hdri` None, light it with the recovered light again.
+    """Light the scene with an HDRI. With `hdri` None, light it again with the panorama recovered from the run's photos.
 
     `rotation` rotates the environment about z, in radians, counter-clockwise seen from above; `strength` multiplies its radiance. The
-    world keeps the recovered light. A world that RefGS did not make is replaced in the scene, but not changed. Raises InputError where
-    the HDRI cannot be read, or the scene has no recovered light.
+    scene's world remembers the recovered panorama. A world that RefGS did not make is not changed: the scene gets a new one. Raises
+    InputError if the HDRI cannot be read, or there is no recovered panorama.
     """
     world = scene.world if is_panorama(scene.world) else None
     if hdri is not None:
@@ -59,9 +59,9 @@ def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, st
 
 
 def match_light(scene: bpy.types.Scene) -> None:
-    """Rotate and scale the scene's HDRI until it matches the recovered light.
+    """Rotate and scale the scene's HDRI until it matches the light recovered from the run's photos.
 
-    The rotation is matched by log luminance, the scale by the mean radiance over the sphere. Raises InputError where the scene has no
+    The rotation is matched by log luminance, the scale by the mean radiance over the sphere. Raises InputError if the scene has no
     recovered light, or already uses it.
     """
     world = scene.world

@@ -60,7 +60,7 @@ class Quit(ReportsErrors, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Enable this operator only while trainings run or wait. Without any, the quit key works as in plain Blender."""
+        """Enable this operator only while trainings run or wait. Otherwise the quit key works as in plain Blender."""
         cls.poll_message_set("Nothing is being trained")
         return bool(jobs.trainings())
 

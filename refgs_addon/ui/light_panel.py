@@ -1,4 +1,4 @@
-"""Draw the Light panel, which chooses the panorama that lights the scene."""
+"""Draw the Light panel, in which the artist chooses the panorama that lights the scene."""
 
 import math
 from pathlib import Path

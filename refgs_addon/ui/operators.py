@@ -61,7 +61,7 @@ class OnRun(ReportsErrors):
 
 
 class OnRunFolder(ReportsErrors):
-    """Store the folder of a run from the scene's list. Base class of the operators on such a run."""
+    """Store the folder of a run from the scene's list. Base class of the operators on one listed run."""
 
     folder: StringProperty(name="Run Folder")
 

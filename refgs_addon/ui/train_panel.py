@@ -19,7 +19,10 @@ from .panels import Tab
 
 
 class _OnCapture(ReportsErrors):
-    """Disable the operator's button without a capture or a trainer; its tooltip then says what to do. Base class."""
+    """Disable the operator's button without a capture or a trainer; its tooltip then says what to do.
+
+    Base class of the operators on the scene's capture, the folder with the photos.
+    """
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
