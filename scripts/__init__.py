@@ -1,1 +1,1 @@
-"""Hold programs of the repository that are installed neither with the trainer nor with the extension."""
+"""Hold scripts that run only in a clone of this repository. They are not installed with the trainer or the Blender extension."""

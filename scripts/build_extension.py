@@ -1,10 +1,12 @@
-"""Build the extension for release: a zip for each platform. It contains the trainer's wheel, and that of uv, which installs the trainer.
+"""Build the Blender extension for release: one zip for each platform.
 
     python scripts/build_extension.py [FOLDER]      # into dist/
 
-Blender's own tool builds and validates the zips. It comes with Blender's Python module (`pip install -e ".[blender]"`). macOS on Intel
-has no zip here, because torch is no longer built for it. `blender --command extension build` makes one without the trainer, for any
-platform.
+Each zip holds the add-on's code, the trainer as a Python wheel, and uv, a package installer, which later installs the trainer.
+
+Blender's own tool builds and validates the zips. The tool comes with Blender's Python module (`pip install -e ".[blender]"`). There is no
+zip for macOS on Intel, because torch is no longer built for it. To build a zip without the trainer, for any platform, run `blender
+--command extension build`.
 """
 
 import importlib.util
@@ -21,15 +23,15 @@ PLATFORMS = {"linux-x64": "manylinux2014_x86_64", "windows-x64": "win_amd64", "m
 LARGEST = 60e6  # bytes of a zip, at most
 
 
-def run(*words: str | Path) -> None:
-    """Run Python with these arguments; show its output only if it fails."""
-    done = subprocess.run([sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+def run(*arguments: str | Path) -> None:
+    """Run Python with these command-line arguments. If it fails, exit and show its output."""
+    done = subprocess.run([sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     if done.returncode != 0:
-        sys.exit(f"{' '.join(map(str, words))}\n{done.stdout}")
+        sys.exit(f"{' '.join(map(str, arguments))}\n{done.stdout}")
 
 
 def blender_tool() -> Path:
-    """Find Blender's tool for extensions."""
+    """Find the script with which Blender builds extensions; it is part of the module bpy."""
     bpy = importlib.util.find_spec("bpy")
     if bpy is None:
         sys.exit('Blender\'s Python module is missing: pip install -e ".[blender]"')
@@ -37,7 +39,10 @@ def blender_tool() -> Path:
 
 
 def build_trainer(source: Path, wheels: Path) -> None:
-    """Build the trainer's wheel, presets included, from a copy without leftovers of earlier builds."""
+    """Build the trainer's wheel, with its presets, and write it into the folder `wheels`.
+
+    The code is first copied into the folder `source`, without files that earlier builds left.
+    """
     shutil.copytree(ROOT / "backend", source / "backend", ignore=shutil.ignore_patterns("*.egg-info", "__pycache__"))
     shutil.copytree(ROOT / "presets", source / "backend" / "refgs" / "presets")
     for name in ("pyproject.toml", "README.md", "LICENSE"):
@@ -46,7 +51,10 @@ def build_trainer(source: Path, wheels: Path) -> None:
 
 
 def stage(folder: Path, wheels: Path) -> None:
-    """Make the extension's folder: the repository's files, the wheels, and a manifest that lists uv's wheels."""
+    """Assemble the extension in `folder`, ready to be zipped: the add-on's code, the files in `wheels`, and the manifest.
+
+    The manifest lists the platforms and the wheels of uv, which Blender then installs.
+    """
     shutil.copytree(ROOT / "refgs_addon", folder / "refgs_addon", ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("__init__.py", "LICENSE"):
         shutil.copy(ROOT / name, folder)

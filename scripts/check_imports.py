@@ -1,12 +1,12 @@
-"""Check the imports of the trainer and of the extension.
+"""Check that modules of the trainer and of the extension import only what they may.
 
-The trainer's packages are ordered in layers, called floors. A module imports only from its own floor and from those below. No modules
-import each other in a circle. The trainer never imports bpy, the extension never torch.
+The trainer's packages are ordered in layers, called floors. A module imports only from its own floor and from those below. Imports never
+form a circle. The trainer never imports bpy. The extension never imports torch.
 
     python scripts/check_imports.py [FOLDER]      # this repository, or a folder that is laid out like it
 
-Imports at the top, inside functions and under TYPE_CHECKING all count. Print a line for each import that breaks a rule; exit with
-status 1 if there is one.
+Imports at the top, inside functions and under TYPE_CHECKING all count. Print a line for each import that breaks a rule; exit with status 1
+if there is one.
 """
 
 import ast
@@ -51,7 +51,10 @@ def modules(root: Path, package: str) -> dict[str, Path]:
 
 
 def imports(files: dict[str, Path], root: Path) -> Iterator[Import]:
-    """Find all imports in files. `from package import name` counts as an import of the module `package.name`, else of `package`."""
+    """Find all imports in `files`, which maps module names to paths.
+
+    `from package import name` imports the module `package.name` if `files` has it, otherwise the module `package`.
+    """
     for source, file in files.items():
         package = source if file.name == "__init__.py" else source.rpartition(".")[0]
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"), str(file))):
@@ -67,12 +70,12 @@ def imports(files: dict[str, Path], root: Path) -> Iterator[Import]:
                 yield Import(source, target, f"{file.relative_to(root).as_posix()}:{node.lineno}")
 
 
-def circles(found: list[Import]) -> Iterator[list[Import]]:
+def circles(all_imports: list[Import]) -> Iterator[list[Import]]:
     """Find modules that import each other in a circle. Yields each circle as a list of its imports.
 
-    After finding a circle, ignore one of its imports and search again.
+    After a circle is found, one of its imports is dropped and the search starts again.
     """
-    places = {(i.source, i.target): i for i in found if i.source != i.target}
+    places = {(i.source, i.target): i for i in all_imports if i.source != i.target}
     while True:
         graph: dict[str, list[str]] = {}
         for source, target in places:
@@ -88,13 +91,13 @@ def circles(found: list[Import]) -> Iterator[list[Import]]:
 
 
 def floor(module: str) -> int | None:
-    """Return the number of the floor of a module of `refgs`; 0 is the lowest. Returns None if FLOORS does not list the module."""
+    """Return the floor (layer) of a module of `refgs` as a number; 0 is the lowest. Returns None if FLOORS does not list the module."""
     part = [*module.split("."), ""][1]
     return next((height for height, names in enumerate(FLOORS) if part in names), None)
 
 
 def check(root: Path) -> list[str]:
-    """Describe each import that breaks a rule."""
+    """Check all imports of the repository in `root`. Returns a message for each broken rule."""
     wrong = []
     for half, folder, package in (("backend", root / "backend", "refgs"), ("refgs_addon", root, "refgs_addon")):
         files = modules(folder, package)

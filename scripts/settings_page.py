@@ -27,7 +27,7 @@ BOUNDS = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 
 
 def page() -> str:
-    """Return the page's text."""
+    """Return the text of docs/settings.md."""
     tables = {preset: load_settings(preset).model_dump() for preset in PRESETS}
     parts = [HEAD]
     for section, field in Settings.model_fields.items():
@@ -53,9 +53,9 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def _allowed(key: str, info: FieldInfo) -> str | None:
-    """Describe the values that a setting may have. Values that only serve comparison with papers are left out.
+    """Describe the values that a setting accepts, for the table on the page.
 
-    Returns None if a single value is left.
+    Leaves out values that exist only to compare with papers. Returns None if one value is left: then there is nothing to choose.
     """
     if get_origin(info.annotation) is Literal:
         values = [value for value in get_args(info.annotation) if value not in COMPARISON.get(key, ())]

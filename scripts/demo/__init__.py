@@ -1,5 +1,5 @@
-"""Make the capture of `refgs demo`: photograph a jar by Cycles, with ground truth.
+"""Render the photos for `refgs demo`: a jar, by Blender's Cycles, with ground truth of shape and materials.
 
-`jar` is the object, `shapes` builds meshes, `light` reads Blender's HDRIs, `cycles` drives Blender, `capture` places the cameras and
-writes the folder, `photograph` is the command line. `benchmarks.scenes` photographs its own objects the same way.
+`jar` builds the object from the meshes of `shapes`. `light` reads the HDRIs that come with Blender. `cycles` renders. `capture` places the
+cameras and writes the folder. `photograph` is the command line. `benchmarks.scenes` renders its own objects with these modules.
 """

@@ -1,4 +1,4 @@
-"""Photograph the jar of `refgs demo`: `python -m scripts.demo jar --out DIR`."""
+"""Render the photos of the jar for `refgs demo`: `python -m scripts.demo jar --out DIR`."""
 
 from scripts.demo import jar
 from scripts.demo.photograph import main

@@ -1,4 +1,4 @@
-"""Place the cameras around a scene and write its capture (layout: `write_capture`)."""
+"""Place cameras around a scene, render it, and write photos, cameras and ground truth. `write_capture` lists the files."""
 
 import json
 import shutil
@@ -28,23 +28,28 @@ def write_capture(
     relight: list[str],
     progress: Callable[[int, int, str], None],
 ) -> None:
-    """Render `scene` into the new folder `out`, in NeRF-Blender's layout and frame (Z up; cameras look along −z).
+    """Render `scene` into the new folder `out`: photos, cameras and ground truth, laid out like the data set NeRF-Blender.
 
-    transforms_{train,test}.json    camera_angle_x, fl_x fl_y cx cy w h, and frames: file_path, transform_matrix
-    {train,test}/NAME.png           8-bit sRGB, straight alpha
-    ground_truth/
-        light.exr                   the panorama it was lit by, (512, 1024) RGB, as Blender's world shows it
-        mesh.ply                    the true mesh
-        color/NAME.exr              test views: linear, premultiplied RGBA, before clipping and rounding
-        normal|albedo/NAME.exr      RGB: world-space unit normal; base colour
-        roughness|metallic|depth|alpha/NAME.exr     Y: one channel; depth along the camera's axis
-        visibility/NAME.exr         Y: 1 where the mirror direction about the true normal leaves the object, 0 where the
-                                    object occludes it
-        relight/HDRI/NAME.exr       color of the test views under another panorama, which is relight/HDRI.exr
-    All but the photos are float32. In a partly covered pixel, albedo, roughness, metallic, depth, visibility and normal (normalised
+    Z is up; cameras look along −z. Photos have `size` × `size` pixels. `train` and `test` are the numbers of training and test views;
+    `samples` is Cycles' number of samples a pixel. `relight` names HDRIs of Blender under which the test views are rendered again.
+
+        transforms_{train,test}.json    camera_angle_x, fl_x fl_y cx cy w h, and frames: file_path, transform_matrix
+        {train,test}/NAME.png           8-bit sRGB, straight alpha
+        ground_truth/
+            light.exr                   the panorama that lights the photos, (512, 1024) RGB, as Blender's world shows it
+            mesh.ply                    the true mesh
+            color/NAME.exr              test views: linear, premultiplied RGBA, before clipping and rounding
+            normal|albedo/NAME.exr      RGB: world-space unit normal; base colour
+            roughness|metallic|depth|alpha/NAME.exr     Y: one channel; depth along the camera's axis
+            visibility/NAME.exr         Y: 1 where the ray mirrored at the true normal leaves the object, 0 where the object
+                                        occludes it
+            relight/HDRI/NAME.exr       color of the test views under another panorama, which is relight/HDRI.exr
+
+    All files but the photos are float32. In a partly covered pixel, albedo, roughness, metallic, depth, visibility and normal (normalised
     again) are means over the covered part. They are zero where alpha is zero.
 
-    `progress(done, total, what)` is called after every view. Raises InputError if `out` exists or an HDRI is unknown.
+    `progress(done, total, what)` is called after every view; `what` is a text such as "train views". Raises InputError if `out` exists or
+    an HDRI is unknown.
     """
     if out.exists():
         raise InputError(f"{out} exists: choose another folder, or remove it")
@@ -135,7 +140,10 @@ def _transforms(split: str, cameras: np.ndarray, size: int) -> dict:
 
 
 def _write_photo(path: Path, color: np.ndarray) -> None:
-    """Write a photo by Blender's Standard view transform: sRGB, clipped at one."""
+    """Write `color` (linear, premultiplied RGBA) as an 8-bit sRGB file with straight alpha, clipped at one.
+
+    Blender's view transform "Standard" gives the same colours.
+    """
     alpha = color[..., 3:]
     straight = color[..., :3] / np.where(alpha > 0, alpha, 1)
     pixels = np.concatenate([srgb_encode(straight).clip(0, 1), alpha], -1)

@@ -1,4 +1,4 @@
-"""Render a scene's object under a panorama by Cycles, view by view; the only module here that drives Blender."""
+"""Render one object with Blender's Cycles, lit by a panorama, one view at a time."""
 
 import tempfile
 from pathlib import Path
@@ -16,10 +16,10 @@ VECTORS, SCALARS = ("normal", "albedo"), ("roughness", "metallic", "depth")
 
 
 class Renderer:
-    """Render one object in square pictures of `size` pixels, 40° wide. Blender's current file is replaced.
+    """Render one object in square pictures of `size` pixels, with a field of view of 40°. Replaces Blender's current file.
 
-    The settings suit pictures that are to be compared: a box filter one pixel wide (a pixel is the mean over its own square), a fixed
-    number of samples, and no clamping of bright paths. Then Intel's denoiser runs.
+    The settings make pictures comparable: a box filter one pixel wide (a pixel is the mean over its own square), the same number of
+    `samples` in every pixel, and no clamping of bright paths. Intel's denoiser removes the noise that is left.
     """
 
     def __init__(self, mesh: Mesh, materials: tuple[Material, ...], size: int, samples: int):
@@ -70,7 +70,7 @@ class Renderer:
         scene.render.image_settings.color_depth = "32"
 
     def set_light(self, path: Path) -> None:
-        """Light the object by a panorama (EXR, linear, Blender's orientation)."""
+        """Light the object by the panorama in an EXR file: linear, in Blender's orientation."""
         self._panorama.image = bpy.data.images.load(str(path))
 
     def render(self, camera_to_world: np.ndarray, seed: int) -> dict[str, np.ndarray]:
@@ -83,10 +83,10 @@ class Renderer:
         return _passes(self._channels(camera_to_world, seed))
 
     def visibility(self, camera_to_world: np.ndarray, seed: int) -> np.ndarray:
-        """Render visibility (h, w): the fraction of the mirrored rays that miss the object, over the covered part of each pixel.
+        """Render visibility (h, w): the fraction of a pixel's mirrored rays that do not hit the object again.
 
-        For this the object becomes a perfect mirror in a white world, in which it reflects itself as black. Visibility is zero where alpha
-        is zero.
+        For this, the object is rendered as a perfect mirror in a white world: where it reflects itself, it is black. In a partly covered
+        pixel only the covered part counts. Visibility is zero where alpha is zero.
         """
         scene, layer, world = self.scene, self.scene.view_layers[0], self.scene.world
         layer.material_override, scene.world = self._mirror, self._white
@@ -102,7 +102,7 @@ class Renderer:
         return (channels["ViewLayer.Combined.R"] / np.where(alpha > 0, alpha, 1)).clip(0, 1)
 
     def _channels(self, camera_to_world: np.ndarray, seed: int) -> dict[str, np.ndarray]:
-        """Render and read the channels of Cycles' multilayer EXR, (h, w) float32 each."""
+        """Render one view. Return the channels of Cycles' multilayer EXR file by name, (h, w) float32 each."""
         self._camera.matrix_world = Matrix(camera_to_world.tolist())  # without Matrix, rows would be read as columns
         self.scene.cycles.seed = seed
         with tempfile.TemporaryDirectory() as folder:
@@ -129,9 +129,9 @@ class Renderer:
 
 
 def _material(values: Material, attribute: str) -> bpy.types.Material:
-    """Make a Principled BSDF. Its inputs, the shading normal and the depth are also written to render passes.
+    """Make a Principled BSDF with these values. Render passes record its inputs, the normal and the depth.
 
-    A textured base colour is read from a colour attribute of the mesh.
+    If the base colour is a texture, it is read from the mesh's colour attribute named `attribute`.
     """
     material = bpy.data.materials.new("Material")
     material.use_nodes = True
@@ -174,7 +174,10 @@ def _mirror() -> bpy.types.Material:
 
 
 def _passes(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Read the passes of a multilayer EXR. All except color and alpha are divided by alpha: Cycles counts a ray that misses as zero."""
+    """Turn the channels of Cycles' EXR file into one array for each render pass.
+
+    All passes except color and alpha are divided by alpha, because Cycles counts a ray that misses the object as zero.
+    """
 
     def pick(name: str, letters: str) -> np.ndarray:
         return np.stack([channels[f"ViewLayer.{name}.{letter}"] for letter in letters], -1).astype(np.float32)

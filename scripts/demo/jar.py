@@ -1,4 +1,7 @@
-"""Build a lidded urn of gold, copper and glazed ceramic with a dark band, which stands in a room. It is shiny and partly concave."""
+"""Build the object of `refgs demo`: a lidded urn of gold, copper and glazed ceramic with a dark band, lit by the HDRI of a room.
+
+The urn is shiny and partly concave.
+"""
 
 import numpy as np
 
@@ -28,14 +31,17 @@ HANDLE = [(0.232, 0.62), (0.464, 0.68), (0.673, 0.62), (0.76, 0.46), (0.719, 0.2
 
 
 def build() -> Scene:
-    """Build the urn, two units high, 0.8 from the axis to the handles."""
+    """Build the urn as a scene. It is two units high. The handles reach 0.8 from the axis."""
     side = np.array([(x, 0.0, z) for x, z in HANDLE])
     handles = [tube(side * (sign, 1, 1), 0.045, COPPER, closed=False) for sign in (1, -1)]
     return Scene(join(lathe(PROFILE, rows=320, columns=288, flutes=_flutes), *handles), MATERIALS, light="interior")
 
 
 def _flutes(angle: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return factors of the radius that cut sixteen shallow grooves. The grooves fade towards both ends of the body."""
+    """Compute how much sixteen shallow vertical grooves scale the radius at each angle and height: factors up to 1.
+
+    The grooves fade out towards both ends of the urn's body.
+    """
     fade = np.clip((z + 0.66) / 0.25, 0, 1) * np.clip((0.09 - z) / 0.2, 0, 1)
     fade = fade * fade * (3 - 2 * fade)
     return 1 + 0.022 * fade * (np.cos(16 * angle) - 1)

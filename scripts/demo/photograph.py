@@ -1,9 +1,9 @@
-"""Photograph objects from a command line: `NAME --out DIR` writes a capture with ground truth.
+"""Run the command that photographs an object: `NAME --out DIR` renders photos and ground truth into the new folder DIR.
 
-With `all` in place of NAME, each object's capture is written into DIR/NAME.
+With `all` in place of NAME, each object is rendered into DIR/NAME.
 
-Standard output carries JSON lines: {"event": "progress", "done": 3, "total": 104, "what": "train views"}. Blender's own messages go to
-standard error. If the input is wrong, one line says so and the exit status is 2.
+Progress goes to standard output as JSON lines: {"event": "progress", "done": 3, "total": 104, "what": "train views"}. Blender's own
+messages go to standard error. Wrong input ends the command with one line of explanation and exit status 2.
 """
 
 import argparse
@@ -19,7 +19,10 @@ from scripts.demo.shapes import Scene
 
 
 def main(program: str, scenes: dict[str, Callable[[], Scene]]) -> None:
-    """Photograph one of the scenes, or all, and end the process."""
+    """Parse the command line, photograph the object that it names, and end the process.
+
+    `program` is the program's name for the help. `scenes` maps the names of objects to functions that build them.
+    """
     status = _run(program, scenes)
     sys.stderr.flush()
     os._exit(status)  # Blender sometimes hangs when it cleans up at the end of a process

@@ -1,4 +1,4 @@
-"""Build an object's triangle mesh in numpy, with a material for each face."""
+"""Build triangle meshes in numpy, with a material for each triangle."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 
 @dataclass(frozen=True)
 class Material:
-    """Principled BSDF: linear Rec.709 base colour, metallic 0..1, perceptual roughness 0..1.
+    """Hold values of a Principled BSDF: linear Rec.709 base colour, metallic 0..1, perceptual roughness 0..1.
 
-    A texture is a function from points (n, 3) to base colours (n, 3). It is evaluated at the vertices and interpolated linearly between
-    them.
+    The base colour may be a texture: a function from points (n, 3) to colours (n, 3). It is evaluated at the vertices and interpolated
+    linearly between them.
     """
 
     base_color: tuple[float, float, float] | Callable[[np.ndarray], np.ndarray]
@@ -22,7 +22,10 @@ class Material:
 
 @dataclass(frozen=True)
 class Mesh:
-    """Vertices (n, 3); triangles (m, 3), counter-clockwise seen from outside; material (m,), an index for each triangle."""
+    """Hold a triangle mesh: vertices (n, 3), triangles (m, 3), and for each triangle the index of its material (m,).
+
+    Triangles are counter-clockwise seen from outside.
+    """
 
     vertices: np.ndarray
     triangles: np.ndarray
@@ -31,9 +34,10 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Scene:
-    """Hold an object, which lies about the origin with Z up, and how it is photographed.
+    """Hold an object around the origin, with Z up, and the light and the lowest camera to photograph it with.
 
-    `light` names one of Blender's HDRIs; `lowest` is the smallest z of a camera's direction from the origin.
+    `light` names one of Blender's HDRIs. The cameras stand on a sphere around the origin. None stands below the height `lowest`, given as a
+    fraction of the sphere's radius (-1..1).
     """
 
     mesh: Mesh
@@ -43,23 +47,23 @@ class Scene:
 
 
 def moved(mesh: Mesh, by: tuple[float, float, float]) -> Mesh:
-    """Move a mesh."""
+    """Return a copy of a mesh, translated by the vector `by`."""
     return Mesh(mesh.vertices + by, mesh.triangles, mesh.material)
 
 
 def step(start: float, end: float, values: np.ndarray) -> np.ndarray:
-    """Compute a smooth step that rises from 0 at `start` to 1 at `end`, for textures."""
+    """Compute a smooth step: 0 up to `start`, 1 from `end` on, and 3t² − 2t³ between."""
     t = ((values - start) / (end - start)).clip(0, 1)
     return t * t * (3 - 2 * t)
 
 
-def mix(one, other, share: np.ndarray) -> np.ndarray:
-    """Mix two colours (n, 3): `share` (n,) is the weight of `other`, 0..1."""
-    return np.asarray(one) + share[:, None] * (np.asarray(other) - np.asarray(one))
+def mix(one, other, weight: np.ndarray) -> np.ndarray:
+    """Blend two colours: `weight` (n,) is 0 for the colour `one` and 1 for the colour `other`. Returns (n, 3)."""
+    return np.asarray(one) + weight[:, None] * (np.asarray(other) - np.asarray(one))
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """Join meshes, which may intersect."""
+    """Concatenate meshes into one. They may intersect; no face is cut or removed."""
     offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
@@ -69,10 +73,13 @@ def join(*meshes: Mesh) -> Mesh:
 
 
 def lathe(segments: list[tuple[int, list[tuple[float, float]]]], rows: int, columns: int, flutes=None) -> Mesh:
-    """Rotate a profile about z, which makes a closed surface.
+    """Make a closed surface of revolution: rotate a profile about z.
 
-    `segments`: (material, [(radius, z), …]) from the lowest point on the axis to the highest. Each segment starts where the one before
-    ended. A monotone cubic joins all points without overshooting. `flutes(angle, z)` returns factors of the radius.
+    `segments` lists the profile as (material, [(radius, z), …]), from the lowest point on the axis to the highest. A monotone cubic spline
+    joins all points without overshooting. The material changes at the last point of each segment.
+
+    `rows` is the number of steps along the profile, `columns` that around the axis. `flutes(angle, z)`, if given, returns factors that
+    scale the radius.
     """
     points = np.array([point for _, segment in segments for point in segment])
     ends = np.cumsum([len(segment) for _, segment in segments])[:-1] - 1
@@ -102,7 +109,11 @@ def lathe(segments: list[tuple[int, list[tuple[float, float]]]], rows: int, colu
 
 
 def tube(path: np.ndarray, radius: float, material: int, closed: bool, rows: int = 128, columns: int = 32) -> Mesh:
-    """Make a round tube along a cubic spline through the points `path` (n, 3), which lie in a plane. Open ends are not capped."""
+    """Make a round tube along a cubic spline through the points `path` (n, 3), which lie in a plane.
+
+    `material` is the index of its material. There are `rows` steps along the tube and `columns` around it. If `closed`, the tube returns to
+    its start; otherwise its ends stay open.
+    """
     path = np.asarray(path, float)
     if closed:
         path = np.concatenate([path, path[:1]])
@@ -122,7 +133,10 @@ def tube(path: np.ndarray, radius: float, material: int, closed: bool, rows: int
 
 
 def _grid_triangles(bands: int, columns: int) -> np.ndarray:
-    """Triangulate a grid whose last column joins its first, with two triangles for each cell. Returns indices (2·bands·columns, 3)."""
+    """Triangulate a grid of `bands` × `columns` cells whose last column joins its first, as around a tube.
+
+    Returns vertex indices (2·bands·columns, 3), two triangles for each cell. The vertices are numbered row by row.
+    """
     row, column = np.meshgrid(np.arange(bands), np.arange(columns), indexing="ij")
     a, b = row * columns + column, row * columns + (column + 1) % columns
     c, d = b + columns, a + columns
