@@ -24,10 +24,10 @@ CARDS = ["emulated", pytest.param("cuda", marks=NO_CARD)]
 
 @pytest.fixture(scope="session", autouse=True)
 def no_package_of_the_clone() -> None:
-    """Remove the parent of the repository's folder from sys.path; pytest puts it there.
+    """Remove the folder that holds this clone from sys.path, where pytest puts it.
 
-    The repository has an __init__.py for Blender, so pytest takes it for a package. If its folder is named refgs, processes that
-    tests start would import that folder in place of the trainer.
+    The clone has an __init__.py for Blender, so pytest takes it for a package. If the clone's folder is named refgs, programs that tests
+    start would import that folder in place of the trainer.
     """
     parent = str(Path(__file__).parents[2])
     sys.path[:] = [folder for folder in sys.path if folder != parent]
@@ -35,9 +35,9 @@ def no_package_of_the_clone() -> None:
 
 @pytest.fixture(params=CARDS)
 def card(request, monkeypatch) -> torch.device:
-    """Run the test with emulated CUDA kernels and, if there is a CUDA card, on it. Returns the device for tensors.
+    """Run the test with CUDA kernels emulated on the CPU, and again on a CUDA card if there is one. Returns the torch device.
 
-    Tests of code that differs between CPU and CUDA use it.
+    It is for tests of code that differs between CPU and CUDA.
     """
     if request.param == "emulated":
         emulate(monkeypatch)
@@ -46,9 +46,9 @@ def card(request, monkeypatch) -> torch.device:
 
 @pytest.fixture(params=[*load.supported(), *CARDS])
 def device(request, monkeypatch) -> torch.device:
-    """Run the test on everything that has kernels. Returns the device for tensors.
+    """Run the test once for each build of the kernels. Returns the torch device.
 
-    That is: each instruction set of this CPU, CUDA kernels emulated on the CPU, and a card if there is one.
+    The builds are: one for each instruction set of this CPU, CUDA kernels emulated on the CPU, and CUDA kernels on a card if there is one.
     """
     if request.param == "emulated":
         emulate(monkeypatch)
@@ -67,7 +67,7 @@ def ball_capture(tmp_path_factory):
 
 @pytest.fixture
 def python(tmp_path):
-    """Return a fake Python executable whose trainer speaks the job protocol but does not train."""
+    """Return a fake Python executable. It always runs fake_worker.py, which imitates the trainer but does not train."""
     from refgs_addon import jobs
 
     if sys.platform == "win32":

@@ -68,9 +68,9 @@ def test_smooth_normals_do_not_depend_on_the_triangulation():
 
 
 def test_no_edge_has_three_faces():
-    """No edge has more than two faces after simplifying a very thin sheet, and two thin sheets that cross.
+    """Check that no edge has more than two faces after a mesh is simplified.
 
-    Simplification folds such sheets until edges touch.
+    The meshes are a very thin sheet, and two thin sheets that cross. Simplification folds such sheets until edges touch.
     """
     rng = np.random.default_rng(0)
     sheet = ball(level=6)

@@ -22,10 +22,10 @@ def degrees(a, b):
 
 
 def expected(masks, cameras, low, high, resolution):
-    """Compute in float64, from all views, the values that carving must find.
+    """Compute a visual hull from masks with numpy in float64: the reference for the program's `_carve`.
 
-    Return for each voxel: the smallest mask value, the second smallest, the values of all views, and the distance in pixels to the
-    nearest picture border.
+    Each voxel's centre is projected into all views, where the masks are interpolated. Return for each voxel: the smallest mask value, the
+    second smallest, the values of all views, and the distance in pixels to the nearest picture border.
     """
     grid = np.stack(np.meshgrid(*((np.arange(resolution) + 0.5) / resolution,) * 3, indexing="ij"), axis=-1)
     points, values, border = low + grid * (high - low), [], np.full(3 * (resolution,), np.inf)
@@ -55,10 +55,10 @@ def expected(masks, cameras, low, high, resolution):
 
 @pytest.mark.parametrize("isa", supported())
 def test_carving_matches_float64(isa, monkeypatch):
-    """Carved values match float64 to 1e-4.
+    """Check the voxel values from which the visual hull is made: those of `_carve` match float64 to 1e-4.
 
-    Masks are noise of several sizes. Some cameras are inside the volume and some see only a part of it. The number of voxels is no
-    multiple of the vector width.
+    Masks are noise of several sizes. Some cameras are inside the volume and some see only a part of it. The number of voxels is no multiple
+    of the SIMD width.
     """
     monkeypatch.setenv("REFGS_ISA", isa)
     rng = np.random.default_rng(0)
@@ -94,7 +94,7 @@ def test_points_lie_evenly_on_the_hull_of_a_sphere():
 
 
 def test_some_points_lie_inside():
-    """Inner points fill the volume evenly and take the normal of the nearest surface point."""
+    """Check points placed inside the hull: they fill it evenly, and take the normal of the nearest point on its surface."""
     positions, normals, _ = visual_hull_points(DISCS, VIEWS, (0.1, 0, -0.1), 1.5, 4000, resolution=48, on_hull=1000)
     assert positions.shape == normals.shape == (4000, 3)
     assert np.abs(sphere(positions[:1000])).max() < VOXEL

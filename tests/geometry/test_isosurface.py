@@ -8,7 +8,11 @@ CORNERS = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), axis=-1)
 
 
 def blocks_about(sdf, blocks, band=6.0):
-    """Cut a cube into `blocks`³ blocks. Return the indices (B, 3) of blocks near the surface, and the signed distances of their voxels."""
+    """Split a cubic voxel grid into `blocks`³ blocks, and keep those whose centre is within `band` voxels of the surface.
+
+    `sdf` computes signed distances. Return the indices (B, 3) of the blocks that are kept, and the signed distances (B, BLOCK³) of their
+    voxels.
+    """
     block = np.stack(np.meshgrid(*[np.arange(blocks)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     block = block[np.abs(sdf(BLOCK * block + BLOCK / 2)) < band]
     return block, sdf(BLOCK * block[:, None] + CORNERS).astype(np.float32)
@@ -19,7 +23,10 @@ def ball(centre, radius):
 
 
 def test_it_is_the_surface_of_the_whole_grid_across_chunks():
-    """A surface across eight chunks of 64³ voxels has the vertices of marching cubes on the whole grid, and as many faces."""
+    """Check that a ball across eight chunks of 64³ voxels gets the same vertices as by marching cubes on the whole grid.
+
+    The number of faces is the same, too.
+    """
     sdf = ball([63.7, 64.2, 60.1], 40.3)
     mesh = isosurface(*blocks_about(sdf, 32))
     grid = np.stack(np.meshgrid(*[np.arange(128)] * 3, indexing="ij"), axis=-1)
@@ -31,7 +38,7 @@ def test_it_is_the_surface_of_the_whole_grid_across_chunks():
 
 
 def test_a_surface_on_the_planes_between_chunks_has_no_cracks():
-    """A surface that passes exactly through voxel centres is watertight, although many of its vertices coincide there."""
+    """Check that a surface exactly through voxel centres is watertight, although many of its vertices coincide there."""
     for middle, radius in ((64.0, 32.0), (64.0, 20.5), (63.5, 30.0)):
         mesh = isosurface(*blocks_about(lambda p, m=middle, r=radius: np.abs(p - m).max(axis=-1) - r, 32))
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -41,7 +48,7 @@ def test_a_surface_on_the_planes_between_chunks_has_no_cracks():
 
 
 def test_space_between_costs_nothing():
-    """Two balls far apart are meshed from their own blocks; a grid around both would take 17 TB."""
+    """Check that two balls far apart are meshed in little memory: one grid around both would take 17 TB."""
     block, signed = blocks_about(ball([30.0, 30.0, 30.0], 12.0), 16)
     mesh = isosurface(np.concatenate([block, block + 4096]), np.concatenate([signed, signed]))
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)

@@ -1,4 +1,4 @@
-"""Trace rays against shapes whose visibility is known, at extreme scales and far from the origin."""
+"""Compare ray-traced visibility with formulas, for simple shapes that are huge, tiny or far from the origin."""
 
 import numpy as np
 import pytest
@@ -16,9 +16,9 @@ def directions(count: int, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_nothing_is_hidden_on_a_sphere(scale, moved):
-    """No ray from a sphere is occluded, down to one degree above the horizon.
+    """Check that a sphere does not occlude itself: rays from its points are free, down to one degree above the horizon.
 
-    The mesh is slightly smaller, as large, or slightly larger than the sphere.
+    The radius of the mesh is 1 % smaller than the points', equal, or 1 % larger.
     """
     normals, towards = directions(20_000), directions(20_000, seed=1)
     tangent = np.cross(normals, towards)
@@ -32,7 +32,7 @@ def test_nothing_is_hidden_on_a_sphere(scale, moved):
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_two_plates_that_face_each_other(scale, moved):
-    """From the lower plate, exactly the directions that meet the upper plate are occluded."""
+    """Check rays from the lower of two plates: exactly those that meet the upper plate are occluded."""
     occluder = as_occluder(plate(0.0, 1), plate(1.0, -1), scale=scale, moved=moved)
     rng = np.random.default_rng(3)
     points = np.concatenate([rng.uniform(-0.9, 0.9, (20_000, 2)), np.zeros((20_000, 1))], axis=1)
@@ -50,7 +50,7 @@ def test_two_plates_that_face_each_other(scale, moved):
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_the_inside_of_a_bowl(scale, moved):
-    """From the bottom of a half sphere, exactly the directions within 45° of its axis are free."""
+    """Check rays from the bottom of a half sphere: exactly those within 45° of its axis are free."""
     occluder = as_occluder(inside(0.0), scale=scale, moved=moved)
     ways = directions(20_000, seed=5)
     ways = ways[ways[:, 2] > 0.05]
@@ -62,7 +62,10 @@ def test_the_inside_of_a_bowl(scale, moved):
 
 
 def test_a_point_below_the_mesh_is_not_in_its_shadow():
-    """Points inside the mesh are not occluded by it: surfels may lie below the mesh that was fused from them."""
+    """Check that rays which leave a mesh from inside are not occluded by it.
+
+    Surfels may lie inside the mesh, because it only approximates them.
+    """
     normals = directions(2000)
     occluder = as_occluder(trimesh.creation.icosphere(5))
     assert occluder.visible(0.8 * normals, normals, normals).all()

@@ -1,4 +1,4 @@
-"""Fuzz the kernels with hypothesis over the ranges in docs/stability.md, compared with float64."""
+"""Test the kernels on random input (by hypothesis) against float64, over the ranges in docs/stability.md."""
 
 import math
 
@@ -70,7 +70,10 @@ ANYTHING = st.floats(allow_nan=False, width=32)
 @FUZZ
 @given(st.lists(st.tuples(*[ANYTHING] * 9), min_size=1, max_size=6), st.floats(0, 1, width=32))
 def test_rasteriser_takes_any_number(rows, opacity):
-    """The picture is finite for all float32 input except NaN, even for infinite and denormal numbers."""
+    """Check that the rasteriser's maps are finite for all float32 input except NaN, even for infinite and denormal numbers.
+
+    Each of `rows` holds a surfel's position, rotation and scale.
+    """
     rows = torch.tensor(rows)
     position, rotation, scale = (v.contiguous().requires_grad_() for v in rows.split((3, 4, 2), dim=1))
     opacities = torch.full((len(rows),), opacity).requires_grad_()
@@ -153,7 +156,10 @@ CARDS_NAN = float(np.uint32(0x7FFFFFFF).view(np.float32))
 @example([CARDS_NAN] * 20)
 @given(st.lists(st.floats(width=32), min_size=1, max_size=20))
 def test_activations(numbers):
-    """NaN stays NaN. Other raw values give activated values that are finite and monotonic."""
+    """Check the functions that turn raw parameters into scales, opacities and materials: they are finite and monotonic.
+
+    NaN gives NaN. No other number does.
+    """
     raw = torch.tensor(sorted(numbers, key=lambda x: (math.isnan(x), x)))
     rest = ("position", "rotation", "sh_dc", "sh_rest", "received", "indirect_dc", "indirect_rest")
     learned = ("scale", "opacity", "albedo", "metallic", "roughness")

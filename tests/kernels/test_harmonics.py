@@ -59,7 +59,10 @@ def test_same_bits_for_any_number_of_threads():
 
 
 def turned(values, turn):
-    """Rotate harmonics (N, K, 3) by a matrix (3, 3): the colour of each direction becomes that of the rotated direction."""
+    """Rotate spherical harmonics (N, K, 3) by the matrix `turn` (3, 3).
+
+    Each direction's colour becomes that of the rotated direction.
+    """
     directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(2)).double())
     degree = math.isqrt(values.shape[1]) - 1
     before, after = (harmonics.basis(d, degree) for d in (directions, directions @ turn.T))
@@ -72,7 +75,7 @@ TURN = torch.from_numpy(Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix())
 @pytest.mark.parametrize("coefficients", [4, 9, 16])
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_harmonics_are_of_the_world(mirrored, coefficients):
-    """Rotating a surfel and its harmonics about the camera keeps its colour; rotating the surfel alone changes it."""
+    """Check that a surfel rotated about the camera keeps its colour if its harmonics rotate too, and changes it otherwise."""
     values, positions, normals = surfels(coefficients)
     camera, turn = scenes.camera(40, 30), TURN.float()
     middle = torch.from_numpy(camera.position).float()  # rotate about the camera, so that it need not move
@@ -87,9 +90,9 @@ def test_harmonics_are_of_the_world(mirrored, coefficients):
 
 
 def test_a_picture_turns_with_its_object():
-    """Rotating surfels, camera, harmonics and room together leaves the picture unchanged.
+    """Check that the picture stays the same if surfels, camera, harmonics and occluding mesh are rotated together.
 
-    The closed room occludes the environment, so all reflected light comes from the object.
+    The mesh is a closed room that hides the environment, so reflections show only the light stored in the surfels' harmonics.
     """
     generator = torch.Generator().manual_seed(3)
     positions, rotations, scales, opacities, _ = scenes.surfels("mixed", 1)

@@ -1,6 +1,6 @@
-"""Test reading structures from the C++ sources into ctypes.
+"""Test how ctypes structures are made from the structures in the C++ sources.
 
-In test_build.py and test_cuda.py the compilers check that the layouts agree.
+In test_build.py and test_cuda.py the compilers check that both have the same memory layout.
 """
 
 import functools
@@ -41,7 +41,7 @@ struct alignas(16) Base {
 
 @pytest.fixture
 def sources(monkeypatch, tmp_path):
-    """Return an empty folder that is read in place of the kernels' sources."""
+    """Return an empty folder. During the test, the C++ sources are read from it."""
     monkeypatch.setattr(layout, "HERE", tmp_path)
     for name in ("_text", "_made"):
         monkeypatch.setattr(layout, name, functools.cache(getattr(layout, name).__wrapped__))

@@ -1,4 +1,4 @@
-"""Compare the rasteriser with the float64 reference. Check determinism, surfels of equal depth, empty and extreme input."""
+"""Compare the rasteriser with the float64 reference. Check determinism, surfels of equal depth, and empty or extreme input."""
 
 import functools
 import gc
@@ -27,9 +27,11 @@ FORWARD, GRADIENT = 1e-5, 1e-4
 
 @functools.cache
 def case(kind: str, channels: int, size: tuple[int, int] = (45, 30), centre: tuple[float, float] | None = None):
-    """Make inputs, a camera and upstream gradients; return them with the reference's maps, safe pixels and gradients.
+    """Make random surfels, a camera and upstream gradients; run the float64 reference on them.
 
-    A pixel is safe if none of its numbers is near a threshold with which it is compared, so that rounding cannot change the pixel.
+    `kind` is one of `scenes.KINDS`, `centre` the principal point. Return surfels, camera, the reference's maps, the mask of safe pixels,
+    the upstream gradients and the reference's gradients. In a safe pixel no number is near a threshold with which it is compared, so
+    rounding cannot change the pixel much.
     """
     camera, inputs = scenes.camera(*size, centre), scenes.surfels(kind, channels)
     exact = [v.double().requires_grad_() for v in inputs]
@@ -42,7 +44,7 @@ def case(kind: str, channels: int, size: tuple[int, int] = (45, 30), centre: tup
 
 
 def run(device, inputs: tuple[Tensor, ...], camera, upstream: list[Tensor]) -> tuple[Raster, tuple[Tensor, ...]]:
-    """Rasterise on a device; return the maps and gradients, moved to the CPU."""
+    """Rasterise on a device and differentiate. Return the maps and the gradients, moved to the CPU."""
     inputs = [v.to(device, copy=True).requires_grad_() for v in inputs]
     raster = rasterize(*inputs, camera, near=scenes.NEAR)
     gradients = torch.autograd.grad(raster, inputs, [u.to(device) for u in upstream])
@@ -50,7 +52,10 @@ def run(device, inputs: tuple[Tensor, ...], camera, upstream: list[Tensor]) -> t
 
 
 def check(device, inputs, camera, maps, safe, upstream, gradients) -> None:
-    """Check maps and gradients against the reference's; errors are relative to a tensor's largest value."""
+    """Rasterise on a device. Check maps and gradients against the reference's, which `case` returns.
+
+    Errors are relative to a tensor's largest value.
+    """
     assert safe.float().mean() > 0.9
     raster, found = run(device, inputs, camera, upstream)
     assert all(expected[safe].abs().max() > 0.05 for expected in maps)
@@ -97,7 +102,7 @@ def test_trimmed_depth_matches_reference(kind, trim, device):
 
 
 def test_trimmed_depth_is_that_of_the_surface(device):
-    """Trimmed depth is the surface's depth, in spite of fog in front and a disc 1000 times as far behind.
+    """Check that `trimmed_depth` is the surface's depth, in spite of fog in front and a disc 1000 times as far behind.
 
     The fog and the disc both change the mean depth.
     """
@@ -112,14 +117,17 @@ def test_trimmed_depth_is_that_of_the_surface(device):
 
 
 def test_more_tiles_than_16_bits_number(monkeypatch):
-    """More tiles than 16 bits can number are sorted correctly. Images of over eight million pixels have so many."""
+    """Check sorting with tile numbers of more than 16 bits, as images of over eight million pixels need."""
     emulate(monkeypatch)
     monkeypatch.setattr(raster_cuda, "SHORT", 0)
     check(torch.device("cpu"), *case("mixed", 3, (33, 20), (-25.0, 60.0)))
 
 
 def test_instruction_sets_differ(monkeypatch):
-    """Each instruction set, chosen by REFGS_ISA, loads another library. The `device` fixture relies on this."""
+    """Check that each value of REFGS_ISA, the variable that chooses an instruction set, loads another library.
+
+    The `device` fixture relies on this.
+    """
     paths = set()
     for isa in load.supported():
         monkeypatch.setenv("REFGS_ISA", isa)
@@ -128,7 +136,7 @@ def test_instruction_sets_differ(monkeypatch):
 
 
 def test_reference_gradients():
-    """The reference's derivatives agree with finite differences."""
+    """Check that the reference's derivatives agree with finite differences."""
     inputs, camera, *_ = case("mixed", 2, (11, 8))
     exact = [v[::12].double().requires_grad_() for v in inputs]
     margin = reference.rasterize(*exact, camera, scenes.NEAR)[3]
@@ -204,7 +212,7 @@ def test_absurd_input_stays_finite(device):
 
 
 def test_exactly_edge_on_is_a_dot(device):
-    """A disc seen exactly edge-on is drawn by the low-pass filter alone, at the depth of its centre."""
+    """Check that a disc seen exactly edge-on is drawn by the low-pass filter alone, at the depth of its centre."""
     camera = scenes.camera(9, 9, (4.5, 4.5))
     centre = torch.tensor(camera.camera_to_world @ [0, 0, 2, 1], dtype=torch.float64)[:3]
     right, down, forward = camera.camera_to_world[:3, :3].T

@@ -24,7 +24,7 @@ TURN = reference.rotation_matrices(torch.tensor([[0.8, 0.3, -0.4, 0.5]], dtype=t
 
 
 class Light:
-    """Stand in for an Environment, with roughness levels and an exposure that get gradients."""
+    """Stand in for an Environment: random light whose prefiltered levels and exposure require gradients."""
 
     def __init__(self, dtype: torch.dtype, device: torch.device | str = "cpu", resolution: int = 16):
         generator = torch.Generator().manual_seed(2)
@@ -38,9 +38,10 @@ class Light:
 
 
 def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
-    """Make smooth random maps of features (H, W, C) and alpha (H, W). A third of the pixels is empty.
+    """Make smooth random maps for shading: features (H, W, C) and alpha (H, W). A third of the pixels is empty.
 
-    The features are the normal, the material, `colours` RGB colours and the position, which lies up to ten pixels beside its pixel.
+    The features are the normal, the material, `colours` RGB colours and a position, in this order. The position is seen up to ten pixels
+    away from its pixel.
     """
     generator = torch.Generator().manual_seed(1)
 
@@ -61,9 +62,12 @@ def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
 
 @functools.cache
 def case(appearance: bool, indirect: bool, size: tuple[int, int]):
-    """Make a camera, inputs and upstream gradients; return them with the reference's maps, safe pixels and gradients.
+    """Make random maps of features and alpha, a camera and upstream gradients; run the float64 reference on them.
 
-    Safe pixels are not near a kink, where derivatives jump. If `indirect`, a visibility map has free, occluded and partly occluded pixels.
+    If `appearance`, pixels have a colour by direction. If `indirect`, a visibility map has free, occluded and partly occluded pixels.
+
+    Return camera, maps, visibility, the reference's maps, the mask of safe pixels, the upstream gradients and the reference's gradients. A
+    pixel is safe if it is not near a kink, where derivatives jump.
     """
     camera = scenes.camera(*size)
     mean, alpha = means(camera, 2 if indirect else int(appearance))
@@ -83,7 +87,10 @@ def case(appearance: bool, indirect: bool, size: tuple[int, int]):
 
 
 def run(camera, inputs, visibility, upstream, device, by_direction=False) -> tuple[list[Tensor], list[Tensor]]:
-    """Shade the inputs (features, alpha) on a device; return the maps and gradients, moved to the CPU."""
+    """Shade the inputs (features, alpha) on a device and differentiate. Return the maps and the gradients, moved to the CPU.
+
+    `visibility` and `by_direction` are arguments of `shade`. `upstream` are the upstream gradients.
+    """
     light = Light(torch.float32, device)
     leaves = [*(v.to(device).clone().requires_grad_() for v in inputs), light.levels, light.exposure]
     visibility = None if visibility is None else visibility.to(device)
@@ -105,9 +112,10 @@ def test_matches_reference(indirect, appearance, size, device):
 
 @pytest.mark.parametrize("how", ["display", "mirror", "matte"])
 def test_other_ways_match_reference(how, device):
-    """Shading as display colours, as mirrors and as matte surfaces matches the reference.
+    """Check three options of `shade` against the reference.
 
-    Display colours are not encoded as sRGB. For mirrors, metallic is the share of mirrored light.
+    With "display", colours are those of a screen and are not encoded as sRGB. With "mirror", surfaces are sharp mirrors, weighted by
+    metallic. With "matte", nothing is specular.
     """
     by_direction = how != "matte"
     camera, (features, alpha), *_ = case(by_direction, False, (45, 30))
@@ -151,7 +159,7 @@ def test_surfels_match_reference(count, more, device):
 
 
 def test_mirror_directions(device):
-    """Views are mirrored at the reference's blended normals. Mirror directions are zero in pixels that nothing covers."""
+    """Check mirror directions: each pixel's ray is mirrored at the reference's blended normal. They are zero in empty pixels."""
     camera, (features, alpha), _, maps, _, _, _ = case(False, True, (37, 70))
     covered = alpha > reference.COVERED
     normal, ray = reference.unit(maps[1][covered]), reference.unit(scenes.camera_rays(camera)[covered].double())
@@ -173,7 +181,10 @@ def test_same_bits_from_call_to_call_for_any_number_of_threads(device):
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-10, 1e10, 1e30])
 def test_gradients_of_any_size(scale, device):
-    """Gradients are summed as integers: tiny, huge, and tiny beside huge ones keep their precision."""
+    """Check that gradients keep their precision if they are tiny, huge, or tiny beside huge ones.
+
+    This is not obvious, because the kernels sum gradients as integers.
+    """
     camera, inputs, visibility, _, _, upstream, gradients = case(False, False, (37, 70))
     _, by = run(camera, inputs, visibility, [u * scale for u in upstream], device)
     check_near(NAMES, [value / scale for value in by], gradients, GRADIENT)
@@ -186,7 +197,7 @@ def test_gradients_of_any_size(scale, device):
 
 
 def test_upstream_that_is_no_number(device):
-    """NaN or infinite upstream gradients make the gradients not finite; the maps stay finite."""
+    """Check that upstream gradients of NaN or infinity show in the gradients as values that are not finite. The maps stay finite."""
     camera, inputs, visibility, _, _, upstream, _ = case(False, False, (45, 30))
     for wrong in (float("nan"), float("inf")):
         for u in (given := [u.clone() for u in upstream]):
@@ -205,7 +216,7 @@ def test_nothing_there(device):
 
 
 def test_one_pixel(device):
-    """A single pixel, a row and a column are shaded although they lack neighbours to interpolate."""
+    """Check images of a single pixel, row or column, in which pixels lack neighbours to interpolate between."""
     light, mean = Light(torch.float32, device), torch.tensor([0, 0, -1, 0.5, 0.5, 0.5, 0, 0.5, 0, 0, 3.0])
     for size in ((1, 1), (1, 5), (5, 1)):
         camera = Camera("small", *size, 50, 50, size[0] / 2, size[1] / 2, np.eye(4))
@@ -218,7 +229,10 @@ def test_one_pixel(device):
 
 
 def white_ball(metallic: float, roughness: float, side: int = 64) -> Tensor:
-    """Shade a white ball under a light of radiance 1, seen by a nearly orthographic camera."""
+    """Shade a white ball under a light of radiance 1, seen by a nearly orthographic camera. Return the radiance of its pixels.
+
+    The image has `side` × `side` pixels.
+    """
     camera = Camera("far", side, side, 1e4, 1e4, side / 2, side / 2, np.eye(4))
     y, x = torch.meshgrid(*[(torch.arange(side) + 0.5) / side * 2 - 1] * 2, indexing="ij")
     inside = x**2 + y**2 < 1
@@ -233,7 +247,7 @@ def white_ball(metallic: float, roughness: float, side: int = 64) -> Tensor:
 @pytest.mark.parametrize("metallic", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("roughness", [0.0, 0.1, 0.3, 0.6, 1.0])
 def test_white_furnace(metallic, roughness):
-    """Under a light of radiance 1, a white surface has radiance 1 at every angle, to 0.001.
+    """Check that a white surface under a light of radiance 1 has radiance 1 at every angle, to 0.001.
 
     This includes light that bounces several times between microfacets.
     """

@@ -1,4 +1,4 @@
-"""Compare the kernels that activate, stack and track surfels on screen with torch in float64."""
+"""Compare kernels with torch in float64: activating raw parameters, concatenating them, and averaging screen-space gradients."""
 
 import numpy as np
 import pytest
