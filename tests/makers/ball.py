@@ -20,7 +20,10 @@ BOX = trimesh.creation.box((1.0, 1.4, 0.8)).subdivide().subdivide()
 
 
 def write_run(folder, capture):
-    """Write the run folder of a metal ball, whose upper half is rough and lower half smooth. The run's mesh is a box."""
+    """Write the output folder of a training, as if a metal ball had been learned. Its upper half is rough, its lower half smooth.
+
+    The mesh in the folder is a box. Return the folder.
+    """
     create_run(folder, capture, load_settings("quick", ["environment.resolution=16"]), "quick", "cpu")
     points = spread(3000)
     look = {"opacity": 0.95, "sh_degree": 0, "albedo": 0.7, "metallic": 0.9, "roughness": 0.3}

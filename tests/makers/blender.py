@@ -1,4 +1,4 @@
-"""Read data from Blender: attributes, the mesh that a modifier makes, and a material's shader."""
+"""Read data from Blender: attributes, the mesh that a modifier makes, and a material's shader node."""
 
 import bpy
 import numpy as np
@@ -7,7 +7,7 @@ FIELDS = {"FLOAT": ("value", 1), "FLOAT_VECTOR": ("vector", 3), "FLOAT_COLOR": (
 
 
 def attribute(data, name):
-    """Read an attribute of a mesh or a point cloud: (N,) float32, or (N, width) for vectors, colours and quaternions."""
+    """Read a named attribute of a mesh or a point cloud: (N,) float32, or (N, width) for vectors, colours and quaternions."""
     found = data.attributes[name]
     field, width = FIELDS[found.data_type]
     values = np.empty((len(found.data), width), np.float32)

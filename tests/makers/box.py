@@ -12,7 +12,7 @@ SIZE = 64
 
 
 def textured_box():
-    """Make a box of 2 × 4 × 6 units that stands on the ground, and its textures: a colour ramp, the others constant."""
+    """Make a box of 2 × 4 × 6 units that stands on the ground, and its textures. Base colour is a ramp; the others are constant."""
     box = trimesh.creation.box((2, 4, 6)).subdivide()
     vertices = np.array(box.vertices) + np.array([0, 0, 3])
     mesh = unwrap(Mesh(vertices, np.array(box.faces), smooth_normals(vertices, box.faces)))
@@ -26,7 +26,7 @@ def textured_box():
 
 
 def glb_chunks(file):
-    """Read a binary glTF file: its JSON as a mapping, and the bytes of its buffer."""
+    """Read a binary glTF file. Return its JSON as a mapping, and the bytes of its buffer."""
     data = file.read_bytes()
     length = int.from_bytes(data[12:16], "little")
     return json.loads(data[20 : 20 + length]), data[28 + length :]

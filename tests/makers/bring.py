@@ -1,4 +1,4 @@
-"""Make the wheels that the extension carries: an empty trainer and a fake uv."""
+"""Make the Python wheels that the extension contains: an empty one for the trainer, and one with a fake uv (package installer)."""
 
 import sys
 import zipfile
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def bring(folder: Path, version: str = "9.9") -> Path:
-    """Write an empty wheel for the trainer and a wheel of the fake uv; return their folder."""
+    """Write an empty wheel of the trainer and a wheel of the fake uv (package installer). Return their folder."""
     folder = folder / f"wheels {version}"
     folder.mkdir()
     (folder / f"refgs-{version}-py3-none-any.whl").touch()

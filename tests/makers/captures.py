@@ -1,4 +1,4 @@
-"""Make tiny captures of every layout: photos around a ball with a red top and a green bottom."""
+"""Write tiny data sets of photos with cameras, one function for each layout. The photos show a ball with a red top and a green bottom."""
 
 import json
 import pickle
@@ -16,7 +16,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def look_at(position: ArrayLike, target: ArrayLike = (0, 0, 0)) -> np.ndarray:
-    """Return the camera-to-world matrix, with OpenGL axes, of a camera that looks at `target`; +Z is up."""
+    """Return the camera-to-world matrix (OpenGL axes) of a camera at `position` that looks at `target`, with +Z up."""
     back = np.subtract(position, target) / np.linalg.norm(np.subtract(position, target))
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -26,7 +26,7 @@ def look_at(position: ArrayLike, target: ArrayLike = (0, 0, 0)) -> np.ndarray:
 
 
 def ring(count: int = 16, distance: float = 3.0, centre: np.ndarray = CENTRE) -> list[np.ndarray]:
-    """Return camera-to-world matrices on a ring around the ball, at alternating heights."""
+    """Return `count` camera-to-world matrices all around the ball, alternately low and high. They look at `centre` from `distance`."""
     poses = []
     for i in range(count):
         azimuth, elevation = 2 * np.pi * i / count, (0.2, 0.9)[i % 2]
@@ -36,7 +36,10 @@ def ring(count: int = 16, distance: float = 3.0, centre: np.ndarray = CENTRE) ->
 
 
 def ball(pose: np.ndarray, width: int, height: int, focal: float, centre: np.ndarray = CENTRE) -> np.ndarray:
-    """Ray-cast the ball to RGBA (H, W, 4) uint8, with the principal point in the middle."""
+    """Render the ball by ray casting: RGBA (H, W, 4) uint8. The principal point is the image's centre.
+
+    `pose` is the camera-to-world matrix, `focal` the focal length in pixels, `centre` the ball's centre.
+    """
     normals = ball_normals(pose, width, height, focal, centre)
     image = np.zeros((height, width, 4), np.uint8)
     image[..., :3] = np.where(normals[..., 2:] > 0, (220, 0, 0), (20, 200, 0))
@@ -46,7 +49,10 @@ def ball(pose: np.ndarray, width: int, height: int, focal: float, centre: np.nda
 
 
 def ball_normals(pose: np.ndarray, width: int, height: int, focal: float, centre: np.ndarray = CENTRE) -> np.ndarray:
-    """Return the ball's normals (H, W, 3) in the world, NaN off the ball."""
+    """Compute the ball's world-space normals (H, W, 3) as a camera sees them; NaN where a ray misses the ball.
+
+    The arguments are those of `ball`.
+    """
     u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     rays = np.stack([u / focal, -v / focal, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
@@ -85,7 +91,7 @@ def nerf_blender(folder: Path, splits: dict[str, int] | None = None) -> Path:
 
 
 def nerfstudio(folder: Path, count: int = 16, poses: list[np.ndarray] | None = None) -> Path:
-    """Write a Nerfstudio capture with shared intrinsics, whose PNGs have neither alpha nor masks."""
+    """Write a data set in Nerfstudio's layout. All photos share their intrinsics. They have neither alpha nor masks."""
     frames = []
     for i, pose in enumerate(poses or ring(count)):
         write(folder / "images" / f"{i:04d}.png", ball(pose, 64, 48, 60.0)[..., :3])
@@ -101,7 +107,10 @@ def colmap(
     model: tuple[int, str, list[float]] = (1, "PINHOLE", [60.0, 60.0, 32.0, 24.0]),
     count: int = 16,
 ) -> Path:
-    """Write a COLMAP capture: a sparse model with one camera, `count` images and 50 points on the ball."""
+    """Write a data set in COLMAP's layout: `count` photos, one camera, and 50 points on the ball.
+
+    `model` is the camera model's number, name and parameters. COLMAP's files are binary or text.
+    """
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
     rng = np.random.default_rng(0)
@@ -139,7 +148,7 @@ def colmap(
 
 
 def shiny_blender(folder: Path) -> Path:
-    """Write a capture like Ref-NeRF's scene `ball`: opaque photos, NAME_alpha.png, world-space normals and disparities."""
+    """Write a data set in the layout of Ref-NeRF's scene `ball`: opaque photos, NAME_alpha.png, world-space normals and disparities."""
     nerf_blender(folder)
     for split in ("train", "test"):
         frames = json.loads((folder / f"transforms_{split}.json").read_text())["frames"]
@@ -157,9 +166,9 @@ def shiny_blender(folder: Path) -> Path:
 
 
 def nero(folder: Path, count: int = 16, split: tuple[list, list] | None = None, protocol: int = 4) -> Path:
-    """Write a capture like a scene of NeRO's Glossy Synthetic: opaque photos, 16-bit depth, pickled cameras.
+    """Write a data set in the layout of NeRO's Glossy Synthetic: opaque photos, 16-bit depth, pickled cameras.
 
-    If `split` is given, it is written into a file beside the scene's folder.
+    `split`, if given, lists the training and test views; it is pickled into a file beside `folder`. `protocol` is pickle's version.
     """
     folder.mkdir(parents=True)
     for i, pose in enumerate(ring(count)):

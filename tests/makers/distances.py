@@ -1,4 +1,4 @@
-"""Define simple shapes by signed distances, and compute their depth maps and masks for cameras."""
+"""Define simple shapes by signed distance functions (SDFs). Compute their depth maps and masks for cameras."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def torus(p: np.ndarray) -> np.ndarray:
 
 
 def gradient(sdf, p: np.ndarray) -> np.ndarray:
-    """Compute outward unit normals at points of the surface, by central differences."""
+    """Compute outward unit normals at surface points `p`: central differences of the signed distance function."""
     step = 1e-4 * np.eye(3)
     g = np.stack([sdf(p + step[a]) - sdf(p - step[a]) for a in range(3)], axis=-1)
     return g / np.linalg.norm(g, axis=-1, keepdims=True)
@@ -53,9 +53,9 @@ def around(count: int, size: int, distance: float = 4.5) -> list[Camera]:
 
 
 def depth(camera: Camera, sdf) -> tuple[np.ndarray, np.ndarray]:
-    """Sphere-trace a signed distance through pixel centres.
+    """Sphere-trace a signed distance function along the rays through pixel centres.
 
-    Return depth along the camera's axis and coverage, (H, W) float32 each.
+    Return depth along the camera's axis (0 where a ray misses) and coverage (1 where it hits, else 0), (H, W) float32 each.
     """
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
@@ -69,6 +69,6 @@ def depth(camera: Camera, sdf) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mask(camera: Camera, sdf) -> np.ndarray:
-    """Compute the mask (H, W) of a shape; its edges are antialiased with 2 × 2 samples a pixel."""
+    """Compute the mask (H, W) of a shape. Its edges are antialiased with 2 × 2 samples a pixel."""
     fine = depth(camera.resized(2 * camera.width, 2 * camera.height), sdf)[1]
     return fine.reshape(camera.height, 2, camera.width, 2).mean((1, 3))

@@ -1,4 +1,4 @@
-"""Run the CUDA kernels on the CPU: compile their sources as C++ with emulator.h, which emulates CUDA's language."""
+"""Run the CUDA kernels on the CPU. Their sources are compiled as C++ with emulator.h, which emulates CUDA's language."""
 
 import ctypes
 import functools
@@ -40,6 +40,6 @@ def _launch(name: str, work: ctypes.Structure, device, blocks: int, threads: int
 
 
 def emulate(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make CPU tensors count as CUDA tensors, so that the emulated CUDA kernels and their callers run on them."""
+    """Run the emulated CUDA kernels on CPU tensors until the test ends: the program then takes CPU tensors for CUDA tensors."""
     monkeypatch.setattr(load, "on_gpu", lambda tensor: True)
     monkeypatch.setattr(cuda, "launch", _launch)

@@ -1,6 +1,7 @@
-"""Stand in for uv, and print the lines that uv prints.
+"""Imitate uv, the Python package installer, for tests of the add-on. Print what uv prints; install a fake trainer.
 
-The variable FAKE_UV names a failure: "hang" (while fetching), "network", "full" (disk), "mute" (the trainer never answers).
+The environment variable FAKE_UV names a failure: "hang" (a download does not end), "network", "full" (the disk is full), "mute" (the
+installed trainer fails).
 """
 
 import json

@@ -1,7 +1,8 @@
-"""Stand in for the trainer's worker: speak the job protocol without training.
+"""Imitate the trainer's process for tests of the add-on: read commands and answer with events, without training.
 
-The capture's name chooses the behaviour: "good", "crash", "noise" (lines that are no events), "bare" (photos without cameras), "slow".
-The variable FAKE chooses "newer": a newer protocol.
+A word in the path of the photos chooses the behaviour: "crash" (end in the middle of the training), "noise" (also print lines that are no
+events), "bare" (report photos without cameras), "slow", or "good" for none of them. If the environment variable FAKE contains "newer", the
+trainer reports a newer version of the protocol.
 """
 
 import json
@@ -81,7 +82,10 @@ def png(grey):
 
 
 def check(command):
-    """Answer a check: write two cameras on opposite sides of the origin, four units away, and their photos."""
+    """Answer the command `check`, which reads the photos of a folder: write two cameras and two small photos, and say what was found.
+
+    The cameras are on opposite sides of the origin, four units away.
+    """
     out, frames = Path(command["out"]), []
     out.mkdir(parents=True, exist_ok=True)
     for number, side in enumerate((1, -1)):

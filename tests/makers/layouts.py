@@ -1,4 +1,7 @@
-"""Assert in C++ that Python's layouts of the kernels' structures are right; the compilers check the static assertions."""
+"""Check that Python (ctypes) and C++ lay out the kernels' structures alike: add static assertions to a copy of the C++ sources.
+
+Compiling the copy checks them.
+"""
 
 import ctypes
 import re
@@ -20,22 +23,25 @@ OFFSET = """
 
 
 def used() -> list[tuple[str, str]]:
-    """List the structures that Python code reads, as pairs of name and C++ source."""
+    """List the C++ structures that Python code reads, as pairs: name and source file."""
     files = [file for folder in ("backend", "benchmarks") for file in (ROOT / folder).rglob("*.py")]
     return sorted({pair for file in files for pair in re.findall(r'\bstruct\("(\w+)", "([\w.]+)"\)', file.read_text())})
 
 
-def fields(made: type[ctypes.Structure]) -> list[tuple[str, type]]:
-    """List the names and types of a structure's fields, including those of its bases."""
-    return [field for part in made.__mro__ if "_fields_" in vars(part) for field in part._fields_]
+def fields(structure: type[ctypes.Structure]) -> list[tuple[str, type]]:
+    """List the names and types of a ctypes structure's fields, including those of its base classes."""
+    return [field for part in structure.__mro__ if "_fields_" in vars(part) for field in part._fields_]
 
 
-def assertions(made: type[ctypes.Structure]) -> str:
-    """Return static assertions of a structure's size and of each field's offset and size, nested structures included."""
-    name = made.__name__
-    lines = [f'static_assert(sizeof({name}) == {ctypes.sizeof(made)}, "size of {name}");']
-    for field, kind in fields(made):
-        at, what = getattr(made, field), f"{name}::{field}"
+def assertions(structure: type[ctypes.Structure]) -> str:
+    """Write C++ static assertions that check a ctypes structure: its size, and the offset and size of each field.
+
+    Nested structures are checked, too.
+    """
+    name = structure.__name__
+    lines = [f'static_assert(sizeof({name}) == {ctypes.sizeof(structure)}, "size of {name}");']
+    for field, kind in fields(structure):
+        at, what = getattr(structure, field), f"{name}::{field}"
         lines.append(f'static_assert(OFFSET({name}, {field}) == {at.offset}, "offset of {what}");')
         lines.append(f'static_assert(sizeof({what}) == {at.size}, "size of {what}");')
         part = kind._type_ if issubclass(kind, ctypes.Array) else kind
@@ -45,7 +51,7 @@ def assertions(made: type[ctypes.Structure]) -> str:
 
 
 def asserted(folder: Path) -> Path:
-    """Copy the kernels' sources to a new folder, with assertions of the layout of every structure that Python reads."""
+    """Copy the kernels' sources to a new folder and return it. Add assertions for the layout of each structure that Python reads."""
     shutil.copytree(HERE, folder, ignore=shutil.ignore_patterns("*.py", "__pycache__"))
     for name, source in used():
         text = assertions(struct(name, source))

@@ -25,20 +25,23 @@ def plate(z: float, up: int) -> trimesh.Trimesh:
 
 
 def inside(height: float, level: int = 5) -> trimesh.Trimesh:
-    """Make the part of the unit sphere below a height; its faces face the centre."""
+    """Make the part of the unit sphere below z = `height`. Its faces point to the centre.
+
+    `level` is the icosphere's number of subdivisions.
+    """
     ball = trimesh.creation.icosphere(level)
     return trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < height][:, ::-1], process=False)
 
 
 def as_occluder(*shapes: trimesh.Trimesh, scale: float = 1.0, moved: float = 0.0) -> Occluder:
-    """Make an occluder of all shapes together. They are scaled, then moved by `moved` along each axis."""
+    """Make one occluder of all shapes. Coordinates are multiplied by `scale`; then `moved` is added to each."""
     whole = trimesh.util.concatenate(shapes)
     return Occluder(Mesh(whole.vertices * scale + moved, np.asarray(whole.faces)))
 
 
 @functools.cache
 def bowl() -> tuple[Occluder, np.ndarray, np.ndarray]:
-    """Make a bowl: the inside of the lower half of the unit sphere. Return it with points on it and their normals."""
+    """Make a bowl: the inside of the lower half of the unit sphere. Return the occluder, points on it, and their inward normals."""
     occluder = as_occluder(inside(0.0))
     points = trimesh.creation.icosphere(3).vertices
     points = points[points[:, 2] < -0.1]
@@ -67,10 +70,13 @@ def even(radiance: float = 1.0) -> Environment:
     return Environment(torch.full((6 * 32**2, 3), radiance))
 
 
-def mirrors(monkeypatch: pytest.MonkeyPatch, part: float) -> None:
-    """Make all surfaces mirror the share `part` of the light at any angle, and reflect the rest diffusely."""
+def mirrors(monkeypatch: pytest.MonkeyPatch, specular: float) -> None:
+    """Replace the reflectance of all surfaces: they mirror the fraction `specular` of the light, at any angle.
+
+    They reflect the rest diffusely, times their albedo.
+    """
 
     def shares(albedo, metallic, roughness, cosine):
-        return torch.full_like(albedo, part), (1 - part) * albedo
+        return torch.full_like(albedo, specular), (1 - specular) * albedo
 
     monkeypatch.setattr(relight, "_split_sum", shares)

@@ -1,4 +1,4 @@
-"""Make a ball of splats whose base colour is a formula; read textures as a renderer does."""
+"""Make a ball of splats whose base colour is given by a formula. Read textures of its mesh as a renderer does."""
 
 import numpy as np
 import trimesh
@@ -12,12 +12,15 @@ from tests.makers.distances import spread
 
 
 def paint(p: np.ndarray) -> np.ndarray:
-    """Compute the smooth base colour (P, 3) of points on the unit sphere."""
+    """Compute the ball's base colour (P, 3), which varies smoothly, at points (P, 3) on the unit sphere."""
     return 0.5 + 0.4 * np.sin(2 * p + [0, 1, 2])
 
 
 def sphere_of_splats(count: int = 4000, radius: float = 1.0, outward: float = 1.0) -> Splats:
-    """Cover a sphere evenly with painted splats, each as large as the spacing between them."""
+    """Cover a sphere evenly with splats that have the colours of `paint`. Each is as large as the spacing between them.
+
+    Normals are multiplied by `outward`: −1 turns them inward.
+    """
     n = spread(count)
     u = np.cross(n, [0.3, 0.5, 0.8])
     u /= np.linalg.norm(u, axis=1, keepdims=True)
@@ -45,7 +48,7 @@ def ball(level: int = 3, radius: float = 1.0) -> Mesh:
 
 
 def on_surface(mesh: Mesh, count: int = 3000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw random points of a mesh: return their faces, barycentric weights and uv."""
+    """Draw random points of a mesh. Return the vertex indices of their faces (P, 3), their barycentric weights (P, 3) and uv (P, 2)."""
     rng = np.random.default_rng(2)
     faces = mesh.faces[rng.integers(len(mesh.faces), size=count)]
     weights = rng.dirichlet([1, 1, 1], size=count)
@@ -53,7 +56,7 @@ def on_surface(mesh: Mesh, count: int = 3000) -> tuple[np.ndarray, np.ndarray, n
 
 
 def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Read a texture bilinearly, as a renderer does; v points up."""
+    """Interpolate a texture bilinearly at `uv`, as a renderer does. The texture's first row is at the top, v = 1."""
     size = len(texture)
     x, y = uv[:, 0] * size - 0.5, (1 - uv[:, 1]) * size - 0.5
     x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
@@ -67,7 +70,10 @@ def look_up(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 def shaded_normals(mesh: Mesh, normal_map: np.ndarray, faces, weights, uv) -> np.ndarray:
-    """Compute the normals (P, 3) that a renderer shades with at points by `on_surface`; they are not normalised."""
+    """Compute the normals (P, 3) that a renderer gets from a normal map. They are not normalised.
+
+    `faces`, `weights` and `uv` describe points of the mesh, as `on_surface` returns them.
+    """
     tangents, signs = vertex_tangents(mesh)
     n, t = (np.einsum("nk,nkc->nc", weights, a[faces]) for a in (mesh.normals, tangents))
     c = look_up(normal_map, uv)

@@ -1,7 +1,7 @@
-"""Compute outgoing radiance in three ways: by Monte Carlo of the rendering equation, by the exact split sum, by the kernels.
+"""Compute the radiance that a surface reflects in three ways: by Monte Carlo, by the exact split sum, and by the program's kernels.
 
-The split sum differs from Monte Carlo because it assumes N = V = R: its lobes neither stretch at grazing angles nor end at the horizon.
-The kernels differ from the exact split sum by their texels and roughness levels.
+Monte Carlo integrates the rendering equation. The split sum approximates it, because it assumes N = V = R: its lobes neither stretch at
+grazing angles nor end at the horizon. The kernels approximate the split sum by a cubemap's texels and a few roughness levels.
 """
 
 import functools
@@ -35,7 +35,7 @@ METAL, DIELECTRIC = Material(1.0, 0.7), Material(0.0, 0.5)
 
 
 class View(NamedTuple):
-    """Hold the direction from a surface with the normal +z to the camera, and the mirror direction."""
+    """Hold two unit directions from a surface with the normal +z: `way` to the camera, and `mirrored`, its mirror direction."""
 
     way: np.ndarray
     mirrored: np.ndarray
@@ -47,9 +47,9 @@ class View(NamedTuple):
 
 
 def light_and_view(kind: str, angle: float) -> tuple[Radiance, View]:
-    """Return a light as a function from directions (P, 3) to radiance (P,), and the view at an angle to the normal.
+    """Return a light and a view. The light is a function from directions (P, 3) to radiance (P,).
 
-    `kind` is "constant", "gradient" or "sun"; the sun is in the mirror direction.
+    `kind` is "constant", "gradient" or "sun"; the sun is in the mirror direction. `angle` is in degrees between view and normal.
     """
     view, slope = View.at(angle), np.array([-0.48, 0.48, 0.424])
     lights = {
@@ -61,7 +61,11 @@ def light_and_view(kind: str, angle: float) -> tuple[Radiance, View]:
 
 
 class Reflected(NamedTuple):
-    """Hold the exact reflection of a constant light: the factor for multiple bounces, the specular part, and the base's diffuse part."""
+    """Hold what a surface reflects of a constant light of radiance 1.
+
+    `specular` is its specular and `base` its diffuse radiance. `bounces` is the factor for light that bounces several times between
+    microfacets; it is part of `specular`.
+    """
 
     bounces: float
     specular: float
@@ -82,7 +86,7 @@ class Reflected(NamedTuple):
 
 
 def even(angle: float, roughness: float, material: Material) -> float:
-    """Compute the exact outgoing radiance under the constant light."""
+    """Compute exactly the radiance that a surface reflects under a constant light of radiance 1. `angle` is in degrees."""
     reflected = Reflected.of(material, View.at(angle).way[2], roughness)
     return reflected.specular + reflected.base
 
@@ -90,7 +94,8 @@ def even(angle: float, roughness: float, material: Material) -> float:
 def half_vectors(sine, cosine, alpha: float, u: np.ndarray, phi: np.ndarray) -> np.ndarray:
     """Sample half vectors (..., 3) about +z by the distribution of visible normals (Heitz 2018).
 
-    `u` in 0..1 and `phi` in 0..2π are random numbers; the view direction is (sine, 0, cosine)."""
+    `u` in 0..1 and `phi` in 0..2π are random numbers. The view direction is (sine, 0, cosine).
+    """
     length = np.hypot(alpha * sine, cosine)
     x, z = alpha * sine / length, cosine / length
     t1, t2 = np.sqrt(u) * np.cos(phi), np.sqrt(u) * np.sin(phi)
@@ -102,10 +107,11 @@ def half_vectors(sine, cosine, alpha: float, u: np.ndarray, phi: np.ndarray) -> 
 
 
 def monte_carlo(kind: str, angle: float, roughness: float, material: Material, samples=30_000) -> tuple[float, float]:
-    """Integrate the rendering equation; return outgoing radiance and its standard error.
+    """Integrate the rendering equation by Monte Carlo. Return the reflected radiance and its standard error.
 
-    A third of the samples follows the visible normals (Heitz 2018), a third the cosine, a third the sun. The balance heuristic weights
-    them."""
+    Light directions are sampled in three equal parts: by visible normals (Heitz 2018), by the cosine, and towards the sun. The balance
+    heuristic weights them.
+    """
     light, (v, sun) = light_and_view(kind, angle)
     rng, alpha = np.random.default_rng(0), roughness**2
     n = samples // 3
@@ -141,7 +147,10 @@ def monte_carlo(kind: str, angle: float, roughness: float, material: Material, s
 
 
 def lobe_mean(light: Radiance, axes: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Compute the mean radiance over GGX lobes (Eq. 8) by quadrature: (P,) from unit axes (P, 3) and roughnesses (P,)."""
+    """Average a light over GGX lobes: the split sum's prefiltered light, here by quadrature.
+
+    Returns mean radiance (P,) from the lobes' unit axes (P, 3) and roughnesses (P,).
+    """
     x, weight = np.polynomial.legendre.leggauss(200)
     psi, alpha = np.pi / 4 * (x + 1), roughness[:, None] ** 2
     tangent = alpha * np.tan(psi)  # tangent of half the angle from the axis
@@ -161,7 +170,10 @@ def lobe_mean(light: Radiance, axes: np.ndarray, roughness: np.ndarray) -> np.nd
 
 
 def split_sum(kind: str, angle: float, roughness: float, material: Material) -> float:
-    """Compute outgoing radiance by the split sum (Eq. 7 and 8), both factors exact, plus Lambert's diffuse part."""
+    """Compute the radiance that a surface reflects by the split sum: prefiltered light times the BRDF's integral, plus diffuse light.
+
+    Both factors are exact. Diffuse light is Lambert's. `angle` is in degrees.
+    """
     light, view = light_and_view(kind, angle)
     filtered = lobe_mean(light, view.mirrored[None], np.array([roughness]))[0]
     d, area = (v.numpy() for v in (cubemap.texel_directions(128), cubemap.texel_solid_angles(128)))
@@ -171,7 +183,7 @@ def split_sum(kind: str, angle: float, roughness: float, material: Material) -> 
 
 
 def pixels(view: View, materials: list[tuple[float, Material]]) -> tuple[Tensor, Camera]:
-    """Make features for `shade`, one pixel for each roughness and material, and the camera."""
+    """Make a row of pixels, one for each pair of roughness and material: their features, as `shade` takes them, and the camera."""
     count = len(materials)
     right, up = np.array([0.0, 1.0, 0.0]), np.cross(view.way, [0.0, 1.0, 0.0])
     pose = np.eye(4)
@@ -188,13 +200,13 @@ def pixels(view: View, materials: list[tuple[float, Material]]) -> tuple[Tensor,
 
 
 def environment(light: Radiance, resolution: int = RESOLUTION) -> Environment:
-    """Make a grey environment from a light's radiance at the centres of the texels."""
+    """Make a grey Environment from a light, whose radiance is read at the centres of the cubemap's texels."""
     radiance = torch.from_numpy(light(cubemap.texel_directions(resolution).numpy())).float()
     return Environment(radiance[:, None].expand(-1, 3).contiguous())
 
 
 def shaded(kind: str, angle: float, materials: list[tuple[float, Material]]) -> Tensor:
-    """Compute outgoing radiance (P,) by the kernels, one pixel for each roughness and material."""
+    """Compute the radiance (P,) that surfaces reflect by the program's kernels, for P pairs of roughness and material."""
     light, view = light_and_view(kind, angle)
     features, camera = pixels(view, materials)
     return shade(features, torch.ones(1, len(materials)), environment(light), camera, torch.zeros(3)).radiance[0, :, 0]

@@ -1,4 +1,4 @@
-"""Write a run folder with a few splats, by public libraries alone (none of the trainer's code)."""
+"""Write the output folder of a training, with a few random splats. Only public libraries are used, none of the trainer's code."""
 
 import json
 
@@ -17,14 +17,14 @@ COLUMNS = [
 
 
 def quaternion_matrix(q):
-    """Compute the rotation matrices (N, 3, 3) of unit quaternions wxyz, by v + 2 q × (q × v + w v) for each axis v."""
+    """Compute the rotation matrices (N, 3, 3) of unit quaternions (N, 4) in the order w, x, y, z."""
     w, xyz = q[:, :1, None], q[:, None, 1:]
     axes = np.eye(3)[None]
     return np.swapaxes(axes + 2 * np.cross(xyz, np.cross(xyz, axes) + w * axes), 1, 2)
 
 
 def write_ply(path, columns):
-    """Write splats.ply from a mapping of property name to values."""
+    """Write `columns` as a PLY file of float32. They map each property's name to its values."""
     rows = np.zeros(len(columns["x"]), dtype=[(name, "<f4") for name in columns])
     for name, value in columns.items():
         rows[name] = value
@@ -43,7 +43,7 @@ def read_exr(path):
 
 
 def random_columns(count=COUNT, seed=0):
-    """Make the columns of splats.ply for random splats; opacities are logits, scales are logarithms."""
+    """Make random splats as the columns of a PLY file, by name. Opacities are logits, scales are logarithms."""
     rng = np.random.default_rng(seed)
     columns = {name: rng.normal(size=count) for name in COLUMNS}
     for name in ("albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"):
@@ -67,7 +67,7 @@ FRAMES = [
 
 
 def write_run(folder):
-    """Write a whole run folder: random splats, a box for the mesh, a grey sky, two cameras."""
+    """Write the output folder of a training: random splats, a box for the mesh, a grey sky, two cameras. Return the folder."""
     folder.mkdir()
     write_ply(folder / "splats.ply", random_columns())
     write_panorama(folder / "environment.exr", np.full((16, 32, 3), 0.5))

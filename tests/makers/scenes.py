@@ -1,4 +1,4 @@
-"""Make random surfels that are hard to rasterise: several kinds, each alone and mixed."""
+"""Make random surfels of several kinds that are hard to rasterise, such as huge, edge-on, or smaller than a pixel."""
 
 from collections.abc import Callable
 
@@ -16,9 +16,9 @@ CHANNELS = {"plain": 3, "edge_on": 1, "across_near": 16, "huge": 5, "sub_pixel":
 
 
 def camera(width: int = 45, height: int = 30, centre: tuple[float, float] | None = None) -> Camera:
-    """Place a rolled camera at (0.3, −0.2, −0.4) that looks along +z.
+    """Place a camera at (0.3, −0.2, −0.4) that looks roughly along +z and is rolled.
 
-    By default its image is neither square nor a multiple of the tile size.
+    By default its image is neither square nor a multiple of the tile size. `centre` is the principal point.
     """
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_euler("xyz", [4, -6, 25], degrees=True).as_matrix()
@@ -28,7 +28,7 @@ def camera(width: int = 45, height: int = 30, centre: tuple[float, float] | None
 
 
 def camera_rays(camera: Camera) -> Tensor:
-    """Compute world-space rays (H, W, 3), float32, through pixel centres. Each has unit depth along the camera's axis."""
+    """Compute world-space rays (H, W, 3), float32, through pixel centres. A ray's length is such that its depth is 1."""
     x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
     rotation = torch.from_numpy(camera.world_to_camera[:3, :3].copy())
@@ -37,9 +37,9 @@ def camera_rays(camera: Camera) -> Tensor:
 
 
 def meetings(camera: Camera, balls: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Intersect the rays through pixel centres with balls, row by row.
+    """Intersect the rays through all P pixel centres with balls (B, 4), given by centre and radius.
 
-    Return unit rays (P, 3), which of them hit a ball (P,), the first points (P, 3) and the normals there (P, 3).
+    Return unit rays (P, 3), whether each hits a ball (P,), its first hit point (P, 3) and the normal there (P, 3). Pixels are in row order.
     """
     rays = camera_rays(camera).double().numpy().reshape(-1, 3)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -47,9 +47,9 @@ def meetings(camera: Camera, balls: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def surfels(kind: str, channels: int, seed: int = 0) -> tuple[Tensor, ...]:
-    """Make float32 positions, rotations, scales, opacities and features of surfels of this kind.
+    """Make random surfels of a kind in KINDS. Return float32 positions, rotations, scales, opacities and features (N, channels).
 
-    Depths differ by more than rounding, so the order is certain.
+    Their depths differ by more than rounding errors, so the order in which they are drawn is certain.
     """
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     if kind == "mixed":

@@ -6,17 +6,20 @@ from refgs.formats.splats import Splats
 
 
 def arrays(splats):
-    """Return the arrays of splats or textures as a mapping by name."""
+    """Return all arrays of a Splats or Textures object, by name."""
     return {name: value for name, value in vars(splats).items() if isinstance(value, np.ndarray)}
 
 
 def chosen(splats, which):
-    """Copy the splats that indices, a mask or a slice select."""
+    """Copy a subset of splats. It is selected by indices, a mask or a slice."""
     return replace(splats, **{name: np.array(value[which]) for name, value in arrays(splats).items()})
 
 
 def make(count=7, coefficients=16, indirect=0):
-    """Make random splats, no two values alike."""
+    """Make random splats, no two values alike.
+
+    `coefficients` is the number of spherical harmonics of their colour, `indirect` that of their indirect light.
+    """
     rng = np.random.default_rng(1)
 
     def f(*shape):

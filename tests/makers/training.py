@@ -1,4 +1,4 @@
-"""Make trainings that are small enough for a test, and compare what they learned."""
+"""Make trainings that are short enough for a test, and compare what they learned."""
 
 from pathlib import Path
 
@@ -23,9 +23,10 @@ TINY = ["surfels.start=600", "surfels.budget=800", "surfels.hull=48", "train.lig
 def trainer(
     capture, folder, *changes, total=150, preset="quick", report=lambda event, facts: None, device="cpu"
 ) -> Trainer:
-    """Return a small trainer that is ready to run; create its run folder if it is missing.
+    """Make a small Trainer that is ready to run. Create its output folder if it is missing.
 
-    `capture` is a capture or its folder, `total` the number of iterations. `changes` are further settings, as "section.name=value".
+    `capture` is a data set or its folder. `total` is the number of iterations. `changes` are settings, as "section.name=value". The trainer
+    calls `report(event, facts)` for each event.
     """
     settings = load_settings(preset, [*SMALL, f"train.iterations={total}", *changes])
     if isinstance(capture, Path):
@@ -37,7 +38,7 @@ def trainer(
 
 
 def trained(*arguments, **options) -> Trainer:
-    """Make a trainer as `trainer` does with these arguments; train to the end and write the asset."""
+    """Train a small scene to the end, write its results, and return the Trainer. The arguments are those of `trainer`."""
     made = trainer(*arguments, **options)
     made.run()
     write_asset(made.state)
@@ -45,24 +46,27 @@ def trained(*arguments, **options) -> Trainer:
 
 
 def learned(made: Trainer) -> dict[str, torch.Tensor]:
-    """Copy the learned parameters of the surfels, by name, and the light."""
+    """Copy what a training has learned: the surfels' parameters by name, and the light as "light"."""
     return {name: v.detach().clone() for name, v in (made.state.parameters | {"light": made.state.light}).items()}
 
 
 def check_equal(one: Trainer, other: Trainer) -> None:
-    """Check that two trainings made the same decisions and learned the same values, bit for bit."""
+    """Check that two trainings have learned the same values, bit for bit.
+
+    What the trainer chose automatically must be the same, too.
+    """
     assert one.state.decided == other.state.decided
     torch.testing.assert_close(learned(one), learned(other), rtol=0, atol=0)
 
 
 def put(made: Trainer, **values) -> None:
-    """Set parameters of all surfels, by name, to one raw value each (before the activation)."""
+    """Set parameters of all surfels. `values` maps a parameter's name to its new raw value (before the activation)."""
     with torch.no_grad():
         for name, value in values.items():
             made.state.parameters[name][:] = torch.as_tensor(value)
 
 
 def asset_error(made: Trainer) -> float:
-    """Compute by how much a held-out view rendered from the run folder differs from the training's: the mean absolute difference."""
+    """Render a held-out view twice: from the training's state, and from the files it wrote. Return the mean absolute difference."""
     camera = made.state.test[0].camera
     return float((made.state.render(camera).color - open_run(made.state.folder).render(camera).color).abs().mean())

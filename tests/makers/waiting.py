@@ -1,4 +1,4 @@
-"""Wait for the add-on's jobs, which run in processes of their own."""
+"""Wait for the add-on's background jobs, each of which is a process of its own."""
 
 import time
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from refgs_addon import jobs
 
 
 def until(condition: Callable[[], object], seconds: float = 30) -> None:
-    """Poll the jobs until the condition holds; fail after `seconds`."""
+    """Poll the add-on's background jobs until `condition()` is true. Fail after `seconds`."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, [(job.name, job.state, job.line) for job in jobs.JOBS]
@@ -16,6 +16,6 @@ def until(condition: Callable[[], object], seconds: float = 30) -> None:
 
 
 def final_state(job: jobs.Job, seconds: float = 30) -> str:
-    """Wait until a job has ended, and return its state; fail after `seconds`."""
+    """Wait until a background job has ended, and return its state. Fail after `seconds`."""
     until(lambda: job.ended, seconds)
     return job.state
