@@ -5,8 +5,9 @@
 Each zip holds the add-on's code, the trainer as a Python wheel, and uv, a package installer, which later installs the trainer.
 
 Blender's own tool builds and validates the zips. The tool comes with Blender's Python module (`pip install -e ".[blender]"`). There is no
-zip for macOS on Intel, because torch is no longer built for it. To build a zip without the trainer, for any platform, run `blender
---command extension build`.
+zip for macOS on Intel, because torch is no longer built for it.
+
+To build a zip without the trainer, for any platform, run `blender --command extension build` instead.
 """
 
 import importlib.util

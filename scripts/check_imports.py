@@ -45,7 +45,7 @@ class Import(NamedTuple):
 
 
 def modules(root: Path, package: str) -> dict[str, Path]:
-    """Map module names to files, for a package that lies in `root`."""
+    """Map the names of a package's modules to their files. The package's folder lies in `root`."""
     files = sorted((root / package).rglob("*.py"))
     return {".".join(f.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): f for f in files}
 

@@ -59,7 +59,7 @@ def device(request, monkeypatch) -> torch.device:
 
 @pytest.fixture(scope="session")
 def ball_capture(tmp_path_factory):
-    """Write a small capture of a metal ball, in photos of 64 × 64 pixels, whose ground truth is known by formula. Returns its folder."""
+    """Write a small data set of a metal ball: photos of 64 × 64 pixels, cameras, and exact ground truth. Return its folder."""
     folder = tmp_path_factory.mktemp("ball")
     write_ball_capture(folder, 64)
     return folder

@@ -1,4 +1,4 @@
-"""Test that help and wrong arguments are answered without importing torch, which takes seconds."""
+"""Test that help and errors in arguments are printed without importing torch, which takes seconds."""
 
 import subprocess
 import sys
@@ -12,7 +12,10 @@ HELP, WRONG = 0, 2
 
 
 def refgs(tmp_path, *words) -> tuple[int, str, set[str]]:
-    """Run a command; return its status, its output and the slow packages that it imported."""
+    """Run the command `refgs` with these arguments. Return its exit status, its output, and the slow packages that it imported.
+
+    Slow packages are torch, scipy and trimesh.
+    """
     program = (
         "import sys\n"
         "from refgs.cli import main\n"

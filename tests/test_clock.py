@@ -1,4 +1,4 @@
-"""Test the clock that times the parts of a training, with a fake time that only the test advances."""
+"""Test the clock that measures how long each step of a training takes. Time is faked: only the test advances it."""
 
 from types import SimpleNamespace
 
@@ -11,7 +11,7 @@ from refgs.clock import Clock, timed
 
 @pytest.fixture
 def time(monkeypatch):
-    """Replace the module `time` that the clock uses. The test advances the fake's `now`, in seconds."""
+    """Replace the module `time` that the clock uses by a fake. To let time pass, tests increase its `now`, in seconds."""
     fake = SimpleNamespace(now=0.0, perf_counter=lambda: fake.now)
     monkeypatch.setattr(clock, "time", fake)
     return fake

@@ -1,4 +1,4 @@
-"""Test all stages of the demo with fewer and smaller photos and a shorter training."""
+"""Test the demo from rendering photos to the final report, with fewer and smaller photos and a shorter training."""
 
 import json
 import subprocess

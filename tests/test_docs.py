@@ -1,4 +1,4 @@
-"""Test that all pages, headings, commands, options and buttons that the docs name exist."""
+"""Test that the pages, headings, commands, options and buttons that the docs name exist."""
 
 import re
 from pathlib import Path

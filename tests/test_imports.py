@@ -1,4 +1,4 @@
-"""Test scripts/check_imports.py: it finds upward imports, circles and forbidden imports in made trees, and none in the repository."""
+"""Test scripts/check_imports.py: it finds forbidden imports and circles in small examples, and nothing in this repository."""
 
 import re
 import subprocess
@@ -11,14 +11,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def check(root):
-    """Run the script; return its exit status and output."""
+    """Run scripts/check_imports.py on the folder `root`. Return its exit status and output."""
     command = [sys.executable, ROOT / "scripts" / "check_imports.py", root]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     return done.returncode, done.stdout
 
 
 def write(root, files):
-    """Write a small source tree that obeys the import rules. Then add or replace `files`."""
+    """Write a small source tree into `root` that obeys the import rules. Then add or replace `files`, a mapping of path to text."""
     right = {
         "backend/refgs/__init__.py": "",
         "backend/refgs/camera.py": "import numpy",
@@ -79,7 +79,7 @@ def test_each_rule_finds_what_breaks_it(tmp_path, name, text, expected):
 
 
 def test_no_test_imports_another():
-    """Check that tests import shared code from tests/makers only, and no test from another."""
+    """Check that tests import shared code only from tests/makers, never from each other."""
     for file in (ROOT / "tests").rglob("*.py"):
         imported = re.findall(r"(?m)^ *(?:from|import) ((?:tests\.|test_|makers|conftest)\S*)", file.read_text("utf-8"))
         assert all(name.startswith("tests.makers") for name in imported), f"{file}: {imported}"

@@ -1,4 +1,4 @@
-"""Test the zips that are released, which hold the trainer's wheel and uv, and install from one, which downloads gigabytes."""
+"""Test the zips that are released: what they contain, and that one installs a working trainer, which downloads gigabytes."""
 
 import platform
 import subprocess
@@ -19,7 +19,7 @@ NAMES = {("Linux", "x86_64"): "linux_x64", ("Windows", "AMD64"): "windows_x64", 
 
 @pytest.fixture(scope="module")
 def archives(tmp_path_factory):
-    """Build and validate the zips of all platforms; return them by platform."""
+    """Build and validate the zips of all platforms. Return their paths by platform."""
     out = tmp_path_factory.mktemp("dist")
     subprocess.run([sys.executable, ROOT / "scripts" / "build_extension.py", out], check=True)
     return {archive.stem.split("-")[-1]: archive for archive in out.glob("*.zip")}
@@ -27,7 +27,7 @@ def archives(tmp_path_factory):
 
 @pytest.fixture
 def archive(archives):
-    """Return the zip for this platform."""
+    """Return the path of the zip for this platform."""
     name = NAMES.get((platform.system(), platform.machine()))
     if name is None:
         pytest.skip("there is no zip for this platform")
@@ -48,9 +48,9 @@ def test_the_zips(archives):
 
 @pytest.mark.timeout(3000)
 def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
-    """Check that a released zip installs a working trainer by the real uv, and removes it again.
+    """Check that a released zip installs a working trainer by the real uv (package installer), and can remove it again.
 
-    The installation uses this machine's Python and the package index's torch, because a mirror may have no other.
+    uv uses this machine's Python and takes torch from the default package index, because a mirror may have no other.
     """
     monkeypatch.setenv("UV_PYTHON_PREFERENCE", "only-system")
     monkeypatch.setenv("UV_TORCH_BACKEND", "")

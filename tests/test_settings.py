@@ -96,7 +96,10 @@ def test_a_run_of_before_a_setting_still_opens():
     [("0.9.0", "update RefGS"), ("1.0.0", "update RefGS"), *((wrong, "is broken") for wrong in ("0.2.9", "one", 5))],
 )
 def test_a_run_of_a_newer_release_is_not_read(tmp_path, made_by, says):
-    """Check that a run of a newer minor or major release is refused. A run of a newer patch release is read."""
+    """Check that results of a newer minor or major release are refused with "update RefGS". A newer patch release is accepted.
+
+    The file in this test has no settings, so an accepted release still ends in the error "is broken". So does a wrong version number.
+    """
     (tmp_path / "run.toml").write_text(f"[run]\nrefgs = {json.dumps(made_by)}\n")
     with pytest.raises(InputError, match=says):
         read_run_facts(tmp_path)

@@ -1,4 +1,4 @@
-"""Test the job protocol with a real worker process."""
+"""Test the protocol of commands and events between the add-on and the trainer, with a real worker process."""
 
 import json
 import queue
@@ -29,7 +29,7 @@ PATIENCE = 120  # seconds
 
 
 class Talk:
-    """Start a worker process, send it commands, and collect the events that it sends."""
+    """Start a worker process, send it commands, and collect the events that it prints."""
 
     def __init__(self):
         pipe = subprocess.PIPE
@@ -48,7 +48,7 @@ class Talk:
         self.process.stdin.flush()
 
     def until(self, event: str) -> dict:
-        """Wait for the next event with this name and return it."""
+        """Wait for the worker's next event with this name, and return it."""
         while line := self.lines.get(timeout=PATIENCE):
             self.heard.append(json.loads(line))
             if self.heard[-1]["event"] == event:
@@ -56,7 +56,7 @@ class Talk:
         raise AssertionError(f"it ended before {event}: {self.heard[-3:]}")
 
     def end(self) -> int:
-        """Close the worker's input, and return its exit status."""
+        """Close the worker's standard input, wait until it ends, and return its exit status."""
         self.process.stdin.close()
         return self.process.wait(timeout=PATIENCE)
 
@@ -70,19 +70,19 @@ def talk():
 
 
 def train(capture, run, *changes) -> dict:
-    """Return the fields of a command `train` that starts a small training."""
+    """Return the fields of the command `train`, with settings for a small training and further `changes`."""
     return {"capture": str(capture), "out": str(run), "preset": "quick", "settings": [*SMALL, *changes]}
 
 
 @pytest.fixture
 def run(talk, ball_capture, tmp_path):
-    """Start a training in the worker, and return its run folder."""
+    """Start a training in the worker, and return the folder for its results."""
     talk.tell("train", **train(ball_capture, tmp_path / "run"))
     return tmp_path / "run"
 
 
 def test_jobs_one_after_another(talk, ball_capture, tmp_path):
-    """Check that jobs run in order, and that a wrong command is answered by one line and does not affect the next job."""
+    """Check that commands run in order. A wrong command is answered by one line, and the next command still runs."""
     run = tmp_path / "größe 'a'"
     talk.tell("check", capture=str(ball_capture))
     talk.tell("check", capture=str(ball_capture), out=str(tmp_path / "found"))
@@ -139,7 +139,10 @@ def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture
 
 
 def test_photos_without_cameras(talk, tmp_path):
-    """Check that photos without cameras are reported, and that the search for their cameras can be interrupted and repeated."""
+    """Check that photos without cameras are reported.
+
+    The search for their cameras can fail, start again, and be interrupted.
+    """
     for number in range(4):
         noise = np.random.default_rng(number).integers(0, 255, (96, 128, 3), np.uint8)
         cv2.imwrite(str(tmp_path / f"{number}.png"), noise)
@@ -158,7 +161,10 @@ def test_photos_without_cameras(talk, tmp_path):
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")
 @pytest.mark.parametrize("left", [False, True])
 def test_a_terminated_training_ends_with_a_checkpoint(talk, run, left):
-    """Check a training that is not kept, and a kept training whose worker's input was closed."""
+    """Check that a training whose process gets SIGTERM is cancelled and ends with status 0.
+
+    If `left`, the training was first told to go on alone (command `keep`), and its standard input was closed.
+    """
     if left:
         talk.tell("keep", on=True)
     talk.until("progress")
@@ -171,7 +177,7 @@ def test_a_terminated_training_ends_with_a_checkpoint(talk, run, left):
 
 
 def free(run) -> bool:
-    """Return True if no process holds the lock of a run."""
+    """Return True if no process holds the lock of a training's folder."""
     try:
         with RunLock(run):
             return True
@@ -180,7 +186,10 @@ def free(run) -> bool:
 
 
 def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
-    """Check that a training with `keep` runs to its end after both pipes are closed, even if it was paused, and exports its mesh."""
+    """Check that after the command `keep` a training runs to its end even if its input and output pipes are closed.
+
+    It goes on although it was paused, and then exports its mesh.
+    """
     run = tmp_path / "run"
     small = train(ball_capture, run, "train.iterations=60", "mesh.resolution=32", "mesh.triangles=500")
     commands = [
@@ -202,7 +211,7 @@ def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
 
 
 def test_what_waits_goes_with_the_input(talk, run):
-    """Check that a worker whose input is closed right after `stop` writes the surfels and drops the export that was waiting."""
+    """Check closing a worker's input right after `stop`: it writes the surfels, and drops the export that was queued."""
     talk.tell("export", run=str(run), texture=64)
     talk.until("progress")
     talk.tell("stop")
@@ -221,9 +230,9 @@ def test_a_training_that_is_kept_no_longer(talk, run):
 
 
 def test_a_folder_that_is_trained_in(talk, ball_capture, run):
-    """Check that while a process trains a run, another cannot train it, but can read its progress and stop it.
+    """Check that only one process can train a folder. Another process can read the training's progress and stop it.
 
-    After the process is killed, the run can be trained again.
+    After the training process is killed, the folder can be trained again.
     """
     until((run / PROGRESS).exists, PATIENCE)
     assert json.loads((run / PROGRESS).read_text()).keys() == {"iteration", "total", "seconds_left"}

@@ -176,7 +176,7 @@ def _mirror() -> bpy.types.Material:
 def _passes(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Turn the channels of Cycles' EXR file into one array for each render pass.
 
-    All passes except color and alpha are divided by alpha, because Cycles counts a ray that misses the object as zero.
+    All passes except color and alpha are divided by alpha: when Cycles averages a pixel, a ray that misses the object counts as zero.
     """
 
     def pick(name: str, letters: str) -> np.ndarray:

@@ -52,7 +52,7 @@ def moved(mesh: Mesh, by: tuple[float, float, float]) -> Mesh:
 
 
 def step(start: float, end: float, values: np.ndarray) -> np.ndarray:
-    """Compute a smooth step: 0 up to `start`, 1 from `end` on, and 3t² − 2t³ between."""
+    """Compute a smooth step: 0 up to `start`, 1 from `end` on, with a smooth rise between them (3t² − 2t³ for t in 0..1)."""
     t = ((values - start) / (end - start)).clip(0, 1)
     return t * t * (3 - 2 * t)
 

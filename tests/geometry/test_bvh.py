@@ -24,7 +24,10 @@ SHAPES = {"rings": rings(), "half open": inside(0.3, 4), "five faces": trimesh.c
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(("scale", "moved"), [(1.0, 0.0), (1e3, 2e4)])
 def test_as_embree(shape, scale, moved, card, monkeypatch):
-    """Trace rays that are mirrored at random normals. Check that at most 0.2 % of the pixels differ from Embree's in visibility."""
+    """Trace rays that are mirrored at random normals. Check that at most 0.2 % of the pixels differ from Embree's in visibility.
+
+    Meshes of ordinary size at the origin are tested, and meshes 1000 times as large far from it.
+    """
     occluder = as_occluder(SHAPES[shape], scale=scale, moved=moved)
     matrix = scenes.camera().world_to_camera.copy()
     matrix[:3, 3] = [0, 0, 3.0 * scale] - matrix[:3, :3] @ np.full(3, moved)

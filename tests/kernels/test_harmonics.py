@@ -75,7 +75,10 @@ TURN = torch.from_numpy(Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix())
 @pytest.mark.parametrize("coefficients", [4, 9, 16])
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_harmonics_are_of_the_world(mirrored, coefficients):
-    """Check that a surfel rotated about the camera keeps its colour if its harmonics rotate too, and changes it otherwise."""
+    """Check that a surfel rotated about the camera keeps its colour if its harmonics rotate too, and changes it otherwise.
+
+    If `mirrored`, harmonics are evaluated in the mirror direction in place of the view direction.
+    """
     values, positions, normals = surfels(coefficients)
     camera, turn = scenes.camera(40, 30), TURN.float()
     middle = torch.from_numpy(camera.position).float()  # rotate about the camera, so that it need not move

@@ -1,4 +1,4 @@
-"""Compare the kernel for facing normals (turned towards the camera) with torch in float64."""
+"""Compare the kernel that turns normals towards the camera with torch in float64."""
 
 import torch
 from torch import Tensor

@@ -136,7 +136,7 @@ def test_instruction_sets_differ(monkeypatch):
 
 
 def test_reference_gradients():
-    """Check that the reference's derivatives agree with finite differences."""
+    """Check that the derivatives of the float64 reference agree with finite differences."""
     inputs, camera, *_ = case("mixed", 2, (11, 8))
     exact = [v[::12].double().requires_grad_() for v in inputs]
     margin = reference.rasterize(*exact, camera, scenes.NEAR)[3]

@@ -40,8 +40,8 @@ class Light:
 def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
     """Make smooth random maps for shading: features (H, W, C) and alpha (H, W). A third of the pixels is empty.
 
-    The features are the normal, the material, `colours` RGB colours and a position, in this order. The position is seen up to ten pixels
-    away from its pixel.
+    The features are the normal, the material, `colours` RGB colours and a position, in this order. The position projects up to ten pixels
+    away from its own pixel.
     """
     generator = torch.Generator().manual_seed(1)
 
@@ -66,8 +66,8 @@ def case(appearance: bool, indirect: bool, size: tuple[int, int]):
 
     If `appearance`, pixels have a colour by direction. If `indirect`, a visibility map has free, occluded and partly occluded pixels.
 
-    Return camera, maps, visibility, the reference's maps, the mask of safe pixels, the upstream gradients and the reference's gradients. A
-    pixel is safe if it is not near a kink, where derivatives jump.
+    Return camera, (features, alpha), visibility, the reference's maps, the mask of safe pixels, the upstream gradients and the reference's
+    gradients. A pixel is safe if it is not near a kink, where derivatives jump.
     """
     camera = scenes.camera(*size)
     mean, alpha = means(camera, 2 if indirect else int(appearance))
@@ -159,7 +159,7 @@ def test_surfels_match_reference(count, more, device):
 
 
 def test_mirror_directions(device):
-    """Check mirror directions: each pixel's ray is mirrored at the reference's blended normal. They are zero in empty pixels."""
+    """Check mirror directions: a pixel's ray is mirrored at the blended normal. In an empty pixel the direction is zero."""
     camera, (features, alpha), _, maps, _, _, _ = case(False, True, (37, 70))
     covered = alpha > reference.COVERED
     normal, ray = reference.unit(maps[1][covered]), reference.unit(scenes.camera_rays(camera)[covered].double())
@@ -197,7 +197,7 @@ def test_gradients_of_any_size(scale, device):
 
 
 def test_upstream_that_is_no_number(device):
-    """Check that upstream gradients of NaN or infinity show in the gradients as values that are not finite. The maps stay finite."""
+    """Check NaN and infinite upstream gradients: the gradients then hold values that are not finite. The shaded maps stay finite."""
     camera, inputs, visibility, _, _, upstream, _ = case(False, False, (45, 30))
     for wrong in (float("nan"), float("inf")):
         for u in (given := [u.clone() for u in upstream]):

@@ -20,9 +20,9 @@ BOX = trimesh.creation.box((1.0, 1.4, 0.8)).subdivide().subdivide()
 
 
 def write_run(folder, capture):
-    """Write the output folder of a training, as if a metal ball had been learned. Its upper half is rough, its lower half smooth.
+    """Write the output folder of a training on the data set `capture`, and return it. The learned object is a metal ball.
 
-    The mesh in the folder is a box. Return the folder.
+    The ball's upper half is rough, its lower half smooth. The mesh in the folder is a box.
     """
     create_run(folder, capture, load_settings("quick", ["environment.resolution=16"]), "quick", "cpu")
     points = spread(3000)

@@ -82,7 +82,7 @@ def png(grey):
 
 
 def check(command):
-    """Answer the command `check`, which reads the photos of a folder: write two cameras and two small photos, and say what was found.
+    """Answer the command `check`, which inspects a folder of photos: write two cameras and two small photos, and report them.
 
     The cameras are on opposite sides of the origin, four units away.
     """

@@ -28,7 +28,7 @@ def camera(width: int = 45, height: int = 30, centre: tuple[float, float] | None
 
 
 def camera_rays(camera: Camera) -> Tensor:
-    """Compute world-space rays (H, W, 3), float32, through pixel centres. A ray's length is such that its depth is 1."""
+    """Compute world-space rays (H, W, 3), float32, through pixel centres. They are not unit vectors: each ends at depth 1."""
     x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
     rotation = torch.from_numpy(camera.world_to_camera[:3, :3].copy())

@@ -1,4 +1,4 @@
-"""Compare the optimiser with torch's Adam in float64, changed to leave numbers with a zero gradient untouched."""
+"""Compare the program's Adam optimiser with torch's in float64. Both leave an element alone if its gradient is zero."""
 
 import torch
 from torch import Tensor
@@ -11,9 +11,9 @@ RATES = [1e-3, 0.0, 3e-2, 1e-4, 1.0]
 
 
 def tensors(steps: int) -> tuple[list[Tensor], list[list[Tensor]]]:
-    """Make values, and gradients from 1e-12 to 1e3 for each step.
+    """Make start values, and gradients for each step. The sizes of gradients range from 1e-12 to 1e3.
 
-    Some gradients are zero, and one tensor has no gradient in one step.
+    In one step all gradients of a tensor are zero. In another step one tensor has no gradient.
     """
     generator = torch.Generator().manual_seed(0)
     sizes = [10.0 ** (15 * torch.rand(s, generator=generator) - 12) for s in SHAPES]
@@ -32,7 +32,7 @@ def train(optimizer: torch.optim.Optimizer | Adam, values: list[Tensor], gradien
 
 
 class Held(torch.optim.Adam):
-    """Change torch's Adam: a number whose gradient is zero keeps its value and moments."""
+    """Extend torch's Adam: an element whose gradient is zero keeps its value and its moments."""
 
     @torch.no_grad()
     def step(self) -> None:

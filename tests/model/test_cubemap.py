@@ -31,7 +31,10 @@ def test_a_texels_own_direction_reads_that_texel():
 
 
 def test_no_seam_between_faces():
-    """The error of reading a smooth function on face edges falls with the texel size, as it does inside a face."""
+    """Check that reading a cubemap shows no seam at the edges between faces: there, errors shrink with the texel size.
+
+    The cubemap holds a smooth function. At a seam, errors would not shrink.
+    """
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(4000, 3))
     direction[:, 1] = direction[:, 0] * rng.choice([-1, 1], 4000)  # half way between x and y faces

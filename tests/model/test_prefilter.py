@@ -9,9 +9,9 @@ from refgs.model.environment import Environment
 
 
 def errors(radiance: torch.Tensor, fine: torch.Tensor, rows: int) -> list[float]:
-    """Return the relative RMS error of each prefiltered level of `radiance`, on `rows` random texels.
+    """Measure the relative RMS error of each prefiltered level of the cubemap `radiance`, at `rows` random texels.
 
-    Exact values are sums over the finer cubemap `fine`, weighted by the level's lobe.
+    Exact values are sums over `fine`, a cubemap of the same light with more texels, weighted by the level's lobe.
     """
     side, fine_side = (math.isqrt(len(v) // 6) for v in (radiance, fine))
     levels = prefilter.prefilter(radiance, side).cpu()
@@ -30,7 +30,7 @@ def errors(radiance: torch.Tensor, fine: torch.Tensor, rows: int) -> list[float]
 
 
 def light(side: int) -> torch.Tensor:
-    """Make a cubemap of a striped sky with a soft sun."""
+    """Make a cubemap with a striped sky and a soft sun."""
     d, towards = cubemap.texel_directions(side), torch.tensor([0.3, 0.5, 0.8], dtype=torch.float64)
     sun = torch.exp(20 * (d @ towards / towards.norm() - 1))
     stripes = 0.3 + 0.2 * torch.sin(6 * d[:, 2])
@@ -38,7 +38,7 @@ def light(side: int) -> torch.Tensor:
 
 
 def test_levels_match_direct_integration(device):
-    """Check that each prefiltered level is within 0.5 % of sums over a cubemap four times as fine."""
+    """Check that each prefiltered level matches direct sums over a cubemap four times as fine, to 0.5 %."""
     assert max(errors(light(32).to(device), light(128), rows=40)) < 0.005
 
 
@@ -48,9 +48,10 @@ def test_levels_of_large_cubemaps_match_direct_integration(side):
 
 
 def test_smaller_cells_bring_the_error_down(monkeypatch):
-    """Summing over four times as many cells of the light at least halves the error of every level.
+    """Check that summing the light over four times as many cells at least halves the error of a prefiltered level.
 
     The light is constant within a texel. The sharpest lobe is left out: it is no wider than a texel, so its error is small from the start.
+    Irradiance is left out, too, because it has cells of its own.
     """
     side, found = 32, []
     radiance = light(side)
@@ -89,7 +90,7 @@ def test_irradiance_of_a_constant_and_of_a_cosine_sky():
 
 
 def test_a_sun_leaves_what_faces_away_from_it_dark():
-    """Irradiance from one bright texel follows the cosine, and is zero on surfaces that face away from it."""
+    """Check irradiance from a single bright texel: it follows the cosine, and is zero on surfaces that face away."""
     side, texel = 64, 1234
     directions = cubemap.texel_directions(side)
     radiance = torch.zeros(6 * side**2, 3)
@@ -102,7 +103,7 @@ def test_a_sun_leaves_what_faces_away_from_it_dark():
 
 
 def test_panorama_round_trip():
-    """A smooth light is the same after cubemap → panorama → cubemap, to 0.5 %."""
+    """Check that converting a smooth light from cubemap to panorama and back changes it by less than 0.5 % on average."""
     original = light(64)
     back = Environment.from_panorama(Environment(original).panorama(256), 64).radiance
     assert float((back - original).abs().mean() / original.mean()) < 0.005

@@ -1,4 +1,4 @@
-"""Compare the table of reflectances with integrals of the BRDF and with Cycles."""
+"""Compare the table of the BRDF's reflectances with numeric integrals and with renders by Cycles."""
 
 import numpy as np
 import pytest
@@ -34,10 +34,11 @@ def dielectric(cosine: np.ndarray) -> np.ndarray:
 
 
 def integrate(n_v: np.ndarray, roughness: np.ndarray, nodes: int) -> np.ndarray:
-    """Integrate D G2 F / (4 N·L N·V) N·L over all L above the horizon, for three F; return (3, P).
+    """Integrate D G2 F / (4 N·L N·V) N·L over all light directions L above the horizon, for three F. Return (3, P).
 
-    F is 1 − (1 − V·H)⁵, (1 − V·H)⁵ (Schlick), and the Fresnel reflectance of a dielectric. Light directions are in polar coordinates
-    about the mirrored view; the program's own table is integrated over half vectors instead.
+    F is 1 − (1 − V·H)⁵, (1 − V·H)⁵ (Schlick), and the Fresnel reflectance of a dielectric. `nodes` is the number of quadrature nodes in
+    each dimension. Light directions are in polar coordinates about the mirrored view. The program's own table is integrated differently:
+    over half vectors.
     """
     x, weight = np.polynomial.legendre.leggauss(nodes)
     at, weight = np.sin(np.pi / 4 * (x + 1)) ** 2, weight * np.pi / 4 * np.cos(np.pi / 2 * x)
@@ -79,7 +80,7 @@ def grid(n_v: np.ndarray, roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def test_the_integral_converges():
-    """With 32 nodes the integral's error is below 2.5e-5, a 40th of the table's tolerance; with 64, below 1e-7."""
+    """Check that `integrate` converges: with 32 nodes its error is below 2.5e-5, with 64 nodes below 1e-7."""
     points = grid(np.array([0.02, 0.05, 0.3, 0.7, 1 - 1e-9]), np.array([0.03, 0.05, 0.1, 0.3, 1.0]))
     finest = integrate(*points, 96)
     found = [abs(integrate(*points, nodes) - finest).max() for nodes in (32, 64)]
@@ -87,10 +88,10 @@ def test_the_integral_converges():
 
 
 def test_table_everywhere():
-    """All values of the table are exact to 0.001, also between its entries.
+    """Check that all values of the BRDF table are exact to 0.001, also between its entries.
 
-    They are FG0, FG1, the mean of FG0 + FG1 over all angles, and the dielectric's reflectance with bounces. The reflectances for F0 = 0.04
-    and F0 = 1 are compared, too.
+    Reflectance is F0 · FG0 + FG1. The table holds FG0, FG1, the mean of FG0 + FG1 over all angles, and a dielectric's reflectance with
+    multiple bounces. The reflectances for F0 = 0.04 and F0 = 1 are checked, too.
     """
     n_v, roughness = grid(np.linspace(0.02, 1 - 1e-9, 59), np.linspace(0.03, 1, 61))
     exact = integrate(n_v, roughness, 32)
@@ -116,7 +117,7 @@ def test_table_everywhere():
 
 @pytest.mark.parametrize(("roughness", "angle", "metal", "black"), CYCLES)
 def test_reflects_as_cycles_does(roughness, angle, metal, black):
-    """Reflectance of a metal and of a dielectric's coat agrees with Cycles to 0.0015."""
+    """Check the reflectance of a metal and the specular reflectance of a dielectric: they agree with Cycles to 0.0015."""
     n_v, albedo = torch.tensor([np.cos(np.radians(angle))]), torch.tensor([[0.9, 0.6, 0.3]]).double()
     found = reference.reflectance(n_v, torch.tensor([roughness]).double(), albedo)
     assert found[0][0].tolist() == pytest.approx(metal, abs=1.5e-3)

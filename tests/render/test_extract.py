@@ -14,13 +14,13 @@ NEAR = 0.01
 
 
 def sheet(positions, normals, size, opacity):
-    """Make round surfels of the same size at positions (N, 3), facing along normals (N, 3)."""
+    """Make round surfels of one size at positions (N, 3), with normals (N, 3)."""
     opacities = torch.tensor(np.broadcast_to(opacity, len(positions)), dtype=torch.float32)
     return surfels(positions, normals)._replace(scales=torch.full((len(positions), 2), size), opacities=opacities)
 
 
 def ball(opacity, thickness, count=12000):
-    """Make surfels of a ball of radius 1, at random depths up to `thickness` below its surface."""
+    """Make surfels that form a ball of radius 1. Each lies at a random depth below the ball's surface, up to `thickness`."""
     normals = spread(count)
     depth = thickness * np.random.default_rng(0).uniform(size=(count, 1))
     return sheet((1 - depth) * normals, normals, 0.03, opacity)
@@ -38,12 +38,15 @@ def test_a_ball_of_one_layer():
 
 
 def test_what_is_hardly_there_has_no_surface():
-    """Nearly transparent surfels give no surface, because the picture's alpha is too low where they are drawn."""
+    """Check that nearly transparent surfels give no mesh, because they render with a too low alpha."""
     assert len(radii(ball(0.004, 0.1))) == 0
 
 
 def test_voxels_are_no_finer_than_pixels():
-    """Check that voxels are at least as wide as a typical pixel at the surface: above 104 a side, the mesh gets no finer."""
+    """Check that a mesh is extracted with voxels no smaller than a typical pixel at the surface.
+
+    For the views of this test, the finest grid has 104 voxels a side. Asking for more gives the same mesh.
+    """
     layer = ball(0.95, 0.0)
     fine, finer, coarse = (len(radii(layer, resolution)) for resolution in (120, 240, 75))
     assert coarse < fine == finer == len(radii(layer, 104))
@@ -54,7 +57,7 @@ ARC = [look_at([FLAT * np.cos(turn), FLAT * np.sin(turn), HIGH], 96) for turn in
 
 
 def place():
-    """Make a ball on the ground with far walls and some fog, for cameras on one side and no masks."""
+    """Make surfels of a ball on the ground, with far walls and some fog. The cameras in ARC see it from one side."""
     rng = np.random.default_rng(1)
     grid = np.stack(np.meshgrid(*[np.linspace(-5, 5, 100)] * 2, [-1.0]), axis=-1).reshape(-1, 3)
     ground = sheet(grid, np.tile([0.0, 0, 1], (len(grid), 1)), 0.08, 0.95)

@@ -1,4 +1,4 @@
-"""Compare occluded light and light reflected between surfaces with closed forms."""
+"""Compare shadows and light that surfaces reflect onto each other with exact formulas."""
 
 import math
 
@@ -16,7 +16,7 @@ from tests.makers.occluders import as_occluder, bowl, even, mirrors, plate, surf
 
 
 def colour(directions: torch.Tensor) -> torch.Tensor:
-    """Compute the radiance (P, 3) of the light `colourful` from directions (P, 3)."""
+    """Compute the radiance (P, 3) of the environment `colourful()` in directions (P, 3)."""
     x, y, z = directions.unbind(-1)
     return torch.stack([1 + 0.5 * x, 1 + 0.8 * z, 1 - 0.6 * y * x], dim=1)
 
@@ -26,7 +26,7 @@ def colourful() -> Environment:
 
 
 def test_an_open_plane_has_the_whole_light():
-    """An unoccluded plane receives the diffuse light of the environment exactly. Its relit colour is exact to 0.02."""
+    """Check an unoccluded plane: it receives exactly the environment's diffuse light. Its relit colour is right to 0.02."""
     light, up = colourful(), np.tile([0.0, 0.0, 1.0], (5, 1))
     plane = surfels(np.zeros((5, 3)), up)
     transport = relight.Transport(plane, as_occluder(plate(0.0, 1)))
@@ -41,9 +41,9 @@ def test_an_open_plane_has_the_whole_light():
 
 
 def test_between_two_plates():
-    """The middle of a black plate below another receives 1 minus the upper plate's form factor (Howell, B-4).
+    """Check the light at the middle of a black plate below another: 1 minus the upper plate's form factor (Howell, B-4).
 
-    Four times as many directions at least halve the error.
+    Four times as many ray directions at least halve the error.
     """
     occluder = as_occluder(plate(0.0, 1), plate(1.0, -1))
     middle = surfels(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), albedo=0.0)
@@ -58,7 +58,7 @@ def test_between_two_plates():
 
 @pytest.mark.parametrize("albedo", [0.0, 0.5, 0.9])
 def test_inside_a_matte_bowl(albedo, monkeypatch):
-    """Every point of a matte bowl receives x = 1/2 + albedo · x / 2: it sees half sky, half bowl."""
+    """Check the light in a matte bowl. A point sees half sky, half bowl, so it receives x = 1/2 + albedo · x / 2."""
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
     found, _ = relight._gather(relight.Transport(surfels(points, normals, albedo), occluder), even(), 20)
@@ -68,9 +68,10 @@ def test_inside_a_matte_bowl(albedo, monkeypatch):
 
 
 def test_what_training_takes_of_it(monkeypatch):
-    """Check the share of an unoccluded surface's light that surfels receive: 2/3 in a bowl, all on a convex ball. Training uses it.
+    """Check the light that surfels receive, relative to unoccluded ones: 2/3 in a bowl of albedo 1/2, 1 on a convex ball.
 
-    The share does not depend on the side to which normals point, and is nearly the same if only some surfels trace rays.
+    The training multiplies light by this ratio. It must not depend on the side to which normals point, and hardly on how many surfels trace
+    rays.
     """
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
@@ -88,7 +89,10 @@ def test_what_training_takes_of_it(monkeypatch):
 
 @pytest.mark.parametrize("part", [0.0, 0.3, 1.0])
 def test_a_white_bowl_under_an_even_sky_cannot_be_seen(part, monkeypatch):
-    """In a white bowl under an even sky, all received and indirect light is 1, whatever share its surface mirrors."""
+    """Check that no light is lost: the points of a white bowl under a sky of radiance 1 receive radiance 1 from everywhere.
+
+    `part` is the fraction of the light that the bowl mirrors; it reflects the rest diffusely.
+    """
     occluder, points, normals = bowl()
     mirrors(monkeypatch, part)
     transport = relight.Transport(surfels(points, normals, 1.0), occluder)
@@ -101,7 +105,7 @@ def test_a_white_bowl_under_an_even_sky_cannot_be_seen(part, monkeypatch):
 
 
 def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
-    """Check that a point under a mirror sees in it the light from below, exact to 0.05 in every direction."""
+    """Check a perfect mirror above a point: in every direction the point sees the reflected light from below, to 0.05."""
     light = colourful()
     mirrors(monkeypatch, 1.0)
     below = surfels(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))._replace(roughness=torch.tensor([0.05]))
@@ -115,7 +119,7 @@ def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
 
 
 def test_a_light_that_the_object_hides_reaches_nothing():
-    """A point between two plates receives less than 0.1 % of the sun that a point above them receives in full."""
+    """Check that a sun hidden by a plate hardly lights the point below: it receives less than 0.1 % of what a point above does."""
     radiance = torch.full((6 * 32**2, 3), 1e-3)
     radiance[cubemap.texel_directions(32)[:, 2] > 0.99] = 100.0
     occluder = as_occluder(plate(0.0, 1), plate(1.0, -1))

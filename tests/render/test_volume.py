@@ -1,4 +1,4 @@
-"""Compare 3D Gaussians, which are drawn as discs, with EWA splatting in float64."""
+"""Compare 3D Gaussians, which the program draws as flat discs, with EWA splatting in float64."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ CAMERA = scenes.camera(60, 40)
 
 
 def gaussians(count: int, seed: int = 0) -> tuple[torch.Tensor, ...]:
-    """Make random Gaussians in view, large and small: positions, rotations and scales."""
+    """Make random 3D Gaussians of different sizes that the camera sees. Return positions, rotations and scales."""
     generator = torch.Generator().manual_seed(seed)
     slope = torch.tensor([20 / CAMERA.fx, 14 / CAMERA.fy, 0.0]) * (2 * torch.rand(count, 3, generator=generator) - 1)
     depth = 2 + torch.rand(count, 1, generator=generator, dtype=torch.float64)
@@ -26,9 +26,9 @@ def gaussians(count: int, seed: int = 0) -> tuple[torch.Tensor, ...]:
 
 
 def covariances(positions, rotations, scales) -> tuple[torch.Tensor, torch.Tensor]:
-    """Project covariances to the image (Zwicker et al. 2001, eq. 31, without the low-pass filter).
+    """Project 3D Gaussians to the image (Zwicker et al. 2001, eq. 31, without the low-pass filter).
 
-    Return the covariances and the centres in pixels.
+    Return their 2D covariances (N, 2, 2) and their centres (N, 2) in pixels.
     """
     view = torch.from_numpy(CAMERA.world_to_camera)
     t = positions @ view[:3, :3].T + view[:3, 3]
@@ -55,7 +55,10 @@ def test_one_gaussians_picture_is_that_of_its_projected_covariance():
 
 
 def test_gradients_are_those_of_the_projected_covariance():
-    """Derivatives of the disc's covariance by position, rotation and scales match the projected covariance in float64."""
+    """Check a Gaussian's disc: its covariance in the image, and its gradients by position, rotation and scales.
+
+    They match those of the projected 3D Gaussian in float64.
+    """
     inputs = gaussians(50)
     upstream = torch.randn(50, 2, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     upstream = upstream + upstream.transpose(1, 2)
