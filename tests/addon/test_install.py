@@ -19,7 +19,10 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def home(tmp_path, monkeypatch):
-    """Return the folder that the trainer is installed into. The add-on gets the wheels of a fake trainer and a fake uv."""
+    """Set up a fake installer, and return the folder that the trainer will be installed into.
+
+    The fake installer is a script named uv, and the trainer's package is empty.
+    """
     monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     yield tmp_path / "user" / "trainer"
     jobs.stop_all()
@@ -31,7 +34,7 @@ def install(home):
 
 @pytest.fixture
 def hanging(home, monkeypatch):
-    """Start an installation that hangs while it fetches; return its job."""
+    """Start an installation that hangs during its download; return its job."""
     monkeypatch.setenv("FAKE_UV", "hang")
     job = install(home)
     until(lambda: job.fraction > 0)

@@ -123,7 +123,7 @@ time.sleep(600)
 
 @pytest.fixture
 def killed(python, tmp_path):
-    """Return a function that starts a process like Blender, which trains, kills it, and returns the run folder."""
+    """Return a function that simulates a crash of Blender during a paused training. That function returns the training's run folder."""
 
     def killed(kept: str) -> Path:
         capture, run = tmp_path / "slow photos", tmp_path / "run"

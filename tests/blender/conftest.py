@@ -1,4 +1,7 @@
-"""Provide Blender, as a Python module, to the tests. A process has one Blender file, so each test opens an empty one."""
+"""Provide fixtures for tests that run Blender as a Python module (bpy).
+
+A process can have only one file open, so each test starts with an empty one.
+"""
 
 import pytest
 
@@ -9,7 +12,7 @@ bpy = pytest.importorskip("bpy", reason="needs Blender's Python module")
 
 @pytest.fixture
 def run_folder(tmp_path):
-    """Write a run folder named pot; return its path."""
+    """Write a small run folder (the result of a training) named pot; return its path."""
     return write_run(tmp_path / "pot")
 
 
@@ -22,7 +25,7 @@ def scene():
 
 @pytest.fixture
 def run(run_folder, scene):
-    """Import the run folder into the scene, and return the imported run."""
+    """Import the training's result in `run_folder` into the scene, and return the imported run."""
     from refgs_addon.scene.import_run import import_run
 
     return import_run(run_folder, scene)

@@ -1,4 +1,4 @@
-"""Test rendering in another Blender: it renders the file's unsaved state, or reports one line of error."""
+"""Test rendering in a second Blender process. It renders the open file with its unsaved changes, or reports one line of error."""
 
 import time
 

@@ -1,4 +1,7 @@
-"""Test runs whose metallic, roughness or specular is the same for all splats: the file's header stores the value once."""
+"""Test imported splats that all have the same metallic, roughness or specular.
+
+The header of the PLY file stores this value once, in place of a column.
+"""
 
 import numpy as np
 import pytest
@@ -15,8 +18,8 @@ from tests.makers.blender import principled
 MATTE = {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
 
 
-def say_once(folder, constants):
-    """Replace columns of the run's splats.ply by constants, a value by name, in the file's header."""
+def move_to_header(folder, constants):
+    """Rewrite the run's splats.ply: drop each column named in `constants`, and store its one value in the PLY header."""
     file = folder / "splats.ply"
     data = PlyData.read(str(file))["vertex"].data
     rows = data[[name for name in data.dtype.names if name not in constants]].copy()
@@ -28,13 +31,13 @@ def say_once(folder, constants):
 
 
 def attributes(material):
-    """List the names that a material's Attribute nodes read."""
+    """List the names of the attributes that a material's Attribute nodes read."""
     return [node.attribute_name for node in material.node_tree.nodes if node.type == "ATTRIBUTE"]
 
 
 @pytest.mark.parametrize("constants", [MATTE, {"metallic": 1.0}, {}])
 def test_the_material_reads_what_varies_alone(constants, run_folder, scene):
-    say_once(run_folder, constants)
+    move_to_header(run_folder, constants)
     run = import_run(run_folder, scene)
     material = run.splats.data.materials[0]
     assert {"metallic", "roughness"} & {*attributes(material)} == {"metallic", "roughness"} - {*constants}
@@ -46,8 +49,8 @@ def test_the_material_reads_what_varies_alone(constants, run_folder, scene):
 
 
 def test_an_edit_has_it_read_all(run_folder, scene):
-    """Check that a matte run's material has constants until an edit makes splats gold, and then reads all attributes."""
-    say_once(run_folder, MATTE)
+    """Check that an edit makes the material read attributes of the splats, although metallic and roughness were constants before."""
+    move_to_header(run_folder, MATTE)
     run = import_run(run_folder, scene)
     add_edit(run.collection, "Everywhere", "Gold")
     add_edit(run.collection, "Box", "Gold")
@@ -59,8 +62,11 @@ def test_an_edit_has_it_read_all(run_folder, scene):
 
 
 def test_what_is_exported_says_it_as_the_run_did(run_folder, scene, tmp_path):
-    """Check that an export keeps the constants of the file's header, and writes columns once an edit changes the values."""
-    say_once(run_folder, MATTE)
+    """Check that exporting without edits writes the same file, with constant values in the PLY header.
+
+    After an edit to gold, the exported file has columns in place of the constants.
+    """
+    move_to_header(run_folder, MATTE)
     run = import_run(run_folder, scene)
     export_splats(run.collection, tmp_path / "same.ply")
     assert read_constants(tmp_path / "same.ply") == MATTE
@@ -76,7 +82,7 @@ def test_a_column_has_the_last_word(run_folder):
     file = run_folder / "splats.ply"
     file.write_bytes(file.read_bytes().replace(b"element vertex", b"comment constant metallic 0\nelement vertex", 1))
     assert read_constants(file) == {} and backend_splats(file).constants == {}
-    say_once(run_folder, {"metallic": 0.25})
+    move_to_header(run_folder, {"metallic": 0.25})
     file.write_bytes(file.read_bytes().replace(b"metallic 0.25", b"metallic much", 1))
     with pytest.raises(InputError, match="metallic is much, not a number"):
         read_constants(file)

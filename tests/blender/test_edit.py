@@ -20,7 +20,7 @@ CHROME_ROUGHNESS = 0.02
 
 
 def drawn(run, name):
-    """Read an attribute of the splats as drawn, with all edits: one value a splat, from the first corner of its quad."""
+    """Read an attribute of the splats after all edits: one value per splat, taken from the first corner of its quad."""
     return attribute(evaluated_mesh(run.splats), name)[::4]
 
 
@@ -94,9 +94,9 @@ def test_what_is_like_the_splat_at_the_region(run):
 
 
 def test_the_mesh_follows_all_edits(run):
-    """Check that each splat's summed edits, over its learned material, give the drawn material.
+    """Check that the drawn material is the learned material, blended with all edits.
 
-    Each corner of the mesh must get the edits of the nearest splat.
+    Each vertex of the mesh must get the edits of its nearest splat.
     """
     first = add_edit(run.collection, material="Gold")
     compat.set_modifier_input(first, "Color Amount", 0.7)
@@ -148,7 +148,7 @@ def test_the_buttons(addon, run):
 
 
 def test_what_is_painted_on_the_mesh(run):
-    """Check that painting one side of the mesh with weight 1 edits the splats on that side, and the mesh there."""
+    """Check that weights painted on the upper half of the mesh edit the splats above it, and not the splats below it."""
     run.mesh[0].data.transform(Matrix.Translation((-1, 3, -2)))  # into the middle of the splats
     add_edit(run.collection, "Painted", "Gold")
     canvas = next(item for item in run.collection.objects if item.get("refgs_region"))

@@ -81,7 +81,10 @@ def level(item):
 
 @pytest.mark.parametrize("specular", [1.0, 0.0])
 def test_what_mirrors_nothing_is_not_given_gloss(run_folder, scene, tmp_path, specular):
-    """Check that an export to FBX keeps specular 0. Only Blender's importer in Python reads the value back."""
+    """Check that specular levels 1 and 0 survive an export to FBX and an import.
+
+    The test uses Blender's importer written in Python, because the newer importer does not read the level.
+    """
     ending, read = IMPORTERS[1]
     mesh, textures = textured_box()
     write_glb(run_folder / "mesh.glb", mesh, replace(textures, specular=specular))

@@ -36,9 +36,9 @@ def test_registers_and_unregisters_twice(scene):
 
 
 def test_registers_and_draws_without_numpy():
-    """Check that the add-on works without numpy, which Debian's Blender may lack.
+    """Check that the add-on registers without numpy, which Debian's Blender may lack.
 
-    Buttons that need numpy report that, and a training's curve is not drawn.
+    The panel then shows no curve of the training's progress.
     """
     code = """if True:
         import sys

@@ -126,8 +126,11 @@ def test_normals_bend_as_a_sphere_does(tmp_path):
         assert np.median(error) < 0.1 and error.max() < 0.3
 
 
-def others(scales, normals):
-    """Make columns of splats as other programs write them: no materials, quaternions of any length, zero or missing normals."""
+def foreign_columns(scales, normals):
+    """Make the columns of a PLY file of splats from another program.
+
+    There are no materials. Each splat has `scales` scales. Quaternions are not normalised. Normals are zero, or missing.
+    """
     rng = np.random.default_rng(4)
     columns = {name: value for name, value in random_columns().items() if name not in MATERIALS}
     for i in range(4):
@@ -144,7 +147,7 @@ def others(scales, normals):
 @pytest.mark.parametrize("scales", [2, 3])
 def test_other_programs_splats(scene, tmp_path, scales, normals):
     """Check that splats of other programs become matte discs across their shortest axis, in the colours that those programs show."""
-    columns = others(scales, normals)
+    columns = foreign_columns(scales, normals)
     folder = tmp_path / "d'un autre été"
     folder.mkdir()
     write_ply(folder / "splats.ply", columns)
@@ -164,7 +167,10 @@ def test_other_programs_splats(scene, tmp_path, scales, normals):
 
 
 def test_splats_that_are_not_finite_are_left_out(run_folder, addon, tmp_path, capfd):
-    """Check that the add-on leaves out the same splats as the trainer does, and keeps unknown columns."""
+    """Check that an import leaves out splats with NaN or infinite values, as the trainer does.
+
+    Columns that the add-on does not know are kept, and exported again.
+    """
     columns = {**random_columns(), "semantic": np.arange(COUNT), "weight": np.linspace(0, 1, COUNT)}
     columns |= {f"f_rest_{i}": np.zeros(COUNT) for i in range(9)}
     columns["x"][3], columns["roughness"][[5, 6]], columns["f_rest_4"][7] = np.nan, np.inf, np.nan
@@ -199,7 +205,7 @@ def test_splats_that_are_not_finite_are_left_out(run_folder, addon, tmp_path, ca
 
 def test_edits_of_what_has_no_materials_cannot_be_written(scene, tmp_path):
     (tmp_path / "other").mkdir()
-    write_ply(tmp_path / "other" / "splats.ply", others(3, True))
+    write_ply(tmp_path / "other" / "splats.ply", foreign_columns(3, True))
     run = import_run(tmp_path / "other", scene)
     with pytest.raises(InputError, match=r"has no materials to edit: add them .* --splats"):
         export_splats(run.collection, tmp_path / "edited.ply")
@@ -254,7 +260,7 @@ def test_cameras_project_as_the_photos_did(run, scene):
 
 
 def with_photos(run_folder, capture):
-    """Link a run folder to a capture with photos."""
+    """Write two photos into the new folder `capture`, and make the run refer to them."""
     file = run_folder / "cameras.json"
     content = json.loads(file.read_text())
     for frame in content["frames"]:
@@ -344,8 +350,8 @@ def without_materials(path):
     write_ply(path, {k: v for k, v in random_columns().items() if k not in ("metallic", "roughness")})
 
 
-def header(old, new):
-    """Return a function that replaces bytes in a file, given by its path."""
+def replacing(old, new):
+    """Return a function that replaces the bytes `old` by `new` in the file at a path."""
     return lambda path: path.write_bytes(path.read_bytes().replace(old, new))
 
 
@@ -358,13 +364,13 @@ def bent_camera(path):
     [
         ("splats.ply", Path.unlink, "cannot read"),
         ("splats.ply", cut, "truncated"),
-        ("splats.ply", header(b"element vertex ", b"element vertex x"), "broken header"),
-        ("splats.ply", header(b"property float y", b"property float x"), "broken header"),
-        ("splats.ply", header(b"element vertex ", b"element vertex -"), "is empty"),
+        ("splats.ply", replacing(b"element vertex ", b"element vertex x"), "broken header"),
+        ("splats.ply", replacing(b"property float y", b"property float x"), "broken header"),
+        ("splats.ply", replacing(b"element vertex ", b"element vertex -"), "is empty"),
         ("splats.ply", without_properties, "is empty"),
-        ("splats.ply", header(b"property float y", b"property list uchar float y"), "is not a PLY of splats"),
-        ("splats.ply", header(b"element vertex", b"element face 0\nelement vertex"), "is not a PLY of splats"),
-        ("splats.ply", header(b"property float y", b"property floaty y"), "broken header"),
+        ("splats.ply", replacing(b"property float y", b"property list uchar float y"), "is not a PLY of splats"),
+        ("splats.ply", replacing(b"element vertex", b"element face 0\nelement vertex"), "is not a PLY of splats"),
+        ("splats.ply", replacing(b"property float y", b"property floaty y"), "broken header"),
         ("splats.ply", not_json, "not a binary little-endian PLY"),
         ("splats.ply", infinite, "has no splat with finite values"),
         ("splats.ply", without_materials, "has no metallic, roughness"),

@@ -16,7 +16,7 @@ from tests.makers.runs import write_panorama
 
 
 def room(height=48, seed=0):
-    """Return a function that draws a panorama of lamps, rotated by an angle: (height, 2 × height, 3)."""
+    """Return a function that draws a dim panorama with four random lamps, rotated by an angle: (height, 2 × height, 3)."""
     rng = np.random.default_rng(seed)
     azimuth = math.pi * (1 - 2 * (np.arange(2 * height) + 0.5) / (2 * height))
     elevation = math.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]

@@ -27,7 +27,7 @@ def clouds():
 
 
 def shown():
-    """Update the view, and return the number of surfels that it shows."""
+    """Update the live preview, and return the number of points that the 3D view shows."""
     live_splats.update()
     return len(clouds()[0].data.points)
 

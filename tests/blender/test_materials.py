@@ -1,4 +1,4 @@
-"""Test that one list holds the material presets of the add-on and of the artist."""
+"""Test the list of material presets: those of the add-on, and those that the user saved."""
 
 import bpy
 import pytest
@@ -20,7 +20,7 @@ OURS = ["Brushed Steel", "Chrome", "Clay", "Copper", "Glazed Ceramic", "Gold", "
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """Return the folder of the artist's own presets, which does not exist yet."""
+    """Redirect the user's own material presets to a folder that does not exist yet; return its path."""
     (tmp_path / "scripts").mkdir()
     monkeypatch.setenv("BLENDER_USER_SCRIPTS", str(tmp_path / "scripts"))
     return tmp_path / "scripts" / "presets" / "refgs_material"

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the fake uv is 
 
 @pytest.fixture
 def online(addon, tmp_path, monkeypatch):
-    """Give the enabled add-on online access, the wheels of a fake trainer and an own user folder."""
+    """Allow online access in Blender, and give the add-on a fake installer and an empty user folder."""
     monkeypatch.setattr(installation, "WHEELS", bring(tmp_path))
     monkeypatch.setattr(preferences, "_folder", lambda name: tmp_path / name)
     bpy.context.preferences.system.use_online_access = True
@@ -23,7 +23,7 @@ def online(addon, tmp_path, monkeypatch):
 
 @pytest.fixture
 def hanging(online, monkeypatch):
-    """Start an installation that hangs while it fetches; return its job."""
+    """Start an installation that hangs during its download; return its job."""
     monkeypatch.setenv("FAKE_UV", "hang")
     bpy.ops.refgs.install_trainer()
     job = preferences.installing()

@@ -131,11 +131,11 @@ def test_relight_leaves_the_artists_own_world_alone(scene, tmp_path):
     assert scene.world != own and "Mine" in bpy.data.worlds
 
 
-def snapshot(owner):
-    """Read all settings of a Blender struct that are numbers, switches or text, by name."""
+def snapshot(struct):
+    """Read the settings of a Blender struct: all writable numbers, booleans and texts, by name."""
     kinds = (bool, int, float, str)
-    names = [p.identifier for p in owner.bl_rna.properties if not p.is_readonly]
-    return {name: getattr(owner, name) for name in names if isinstance(getattr(owner, name), kinds)}
+    names = [p.identifier for p in struct.bl_rna.properties if not p.is_readonly]
+    return {name: getattr(struct, name) for name in names if isinstance(getattr(struct, name), kinds)}
 
 
 def test_a_preview_puts_the_settings_back(run, scene, tmp_path):

@@ -29,7 +29,7 @@ from tests.makers.waiting import final_state, until
 
 @pytest.fixture
 def addon(addon, python):
-    """Choose the fake trainer in the preferences of the enabled add-on. Returns the scene."""
+    """Select the fake trainer in the add-on's preferences. Returns the scene."""
     preferences.preferences().python = str(python)
     return addon
 
@@ -83,12 +83,12 @@ def test_the_buttons_train_and_the_file_remembers(addon, capture, tmp_path):
 
 
 def test_what_is_to_be_learned(addon, capture):
-    assert told(training.train(addon).run) == {}
+    assert settings_sent(training.train(addon).run) == {}
     settings = addon.refgs
     settings.splats, settings.light, settings.exposures, settings.reflections = 5000, "camera", "off", "off"
     job = training.train(addon)
     changes = {"surfels.budget": 5000, "light.frame": "camera", "light.exposure": "off", "needs.reflections": "off"}
-    assert told(job.run) == changes
+    assert settings_sent(job.run) == changes
     until(lambda: job.decided)
     assert job.decided == {"light": "the light stands still: it brightens so"}
 
@@ -123,7 +123,7 @@ def test_a_capture_that_is_not_there(addon):
 
 @pytest.fixture
 def checked(addon, capture):
-    """Let the fake trainer check the capture. Returns the check's job and the job's number in the add-on's list."""
+    """Run the check of the capture, with the fake trainer. Returns the job of this check and its index in the add-on's list of jobs."""
     job = training.check(addon)
     assert final_state(job) == "done"
     for number in range(2):
@@ -177,7 +177,10 @@ def test_a_checked_capture_is_shown(addon, checked, capture, monkeypatch):
 
 
 def test_a_run_brings_its_own_cameras(addon, checked, capture, run_folder):
-    """Check that a run's cameras replace the capture's, and that the scene's camera stays on the same photo."""
+    """Check that importing a run removes the cameras that were shown for its capture.
+
+    The active camera becomes the run's camera of the same photo.
+    """
     _, number = checked
 
     def rename(content):
@@ -250,8 +253,8 @@ def test_taken_away_while_it_trains(addon, capture):
     ui.register()
 
 
-def told(out):
-    """Read the settings, by name, that the fake trainer got for the run folder `out`."""
+def settings_sent(out):
+    """Wait until the fake trainer has started in the run folder `out`. Returns the settings that it was given, by name."""
     until(lambda: (out / "started").is_file() and (out / "started").read_text())
     words = dict(word.split("=", 1) for word in json.loads((out / "started").read_text())["settings"])
     return {key: value if value.isalpha() else json.loads(value) for key, value in words.items()}
@@ -262,14 +265,14 @@ def test_a_box_is_the_region_and_its_up_the_results(addon, capture):
     box = addon.refgs.region
     assert bpy.context.view_layer.objects.active == box and box.name in addon.objects
     assert bpy.ops.refgs.add_training_region() == {"FINISHED"} and len(addon.objects) == 1
-    words = told(training.train(addon).run)
+    words = settings_sent(training.train(addon).run)
     assert words["region.centre"] == [0, 0, 0] and words["region.size"] == [2, 2, 2]
     assert words["region.rotation"] == [0, 0, 0] and words["region.up"] == [0, 0, 1]
 
     box.location, box.scale, box.empty_display_size = (1, 2, 3), (1, -2, 0.5), 0.5
     box.rotation_euler = [math.radians(angle) for angle in (90, 0, 90)]
     matrix = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])  # x to y, y to z, z to x
-    words = told(training.train(addon).run)
+    words = settings_sent(training.train(addon).run)
     assert words["region.centre"] == [1, 2, 3]
     assert words["region.size"] == pytest.approx([1, 2, 0.5])
     found = Rotation.from_euler("xyz", words["region.rotation"], degrees=True).as_matrix()
@@ -280,7 +283,7 @@ def test_a_box_is_the_region_and_its_up_the_results(addon, capture):
     with pytest.raises(InputError, match="RefGS Region is flat"):
         training.train(addon)
     bpy.data.objects.remove(box)
-    assert addon.refgs.region is None and told(training.train(addon).run) == {}
+    assert addon.refgs.region is None and settings_sent(training.train(addon).run) == {}
 
 
 UP = [("", (0, 0, 0), False), ("", (0, 0, 2), False), ("", (0, 0, -1), True), ("", (0, 0.1, 1), True)]

@@ -1,4 +1,4 @@
-"""Test the turntable: the run rotates once, and nothing else moves."""
+"""Test the turntable animation: the imported run rotates once, and nothing else moves."""
 
 import math
 

@@ -105,22 +105,22 @@ def test_cameras_in_one_place(tmp_path):
     refused(lambda: read_capture(nerfstudio(tmp_path, poses=poses)), "one place")
 
 
-def _pose(row, column, value):
-    """Return a function that changes one number of a pose."""
+def _pose_entry(row, column, value):
+    """Return a function that sets one entry of a pose matrix to `value`."""
     return lambda matrix: matrix[row].__setitem__(column, value)
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (_pose(1, 3, float("nan")), "NaN"),
-        (_pose(0, 0, float("inf")), "NaN or infinity"),
-        (_pose(0, 0, "abc"), "4×4"),
+        (_pose_entry(1, 3, float("nan")), "NaN"),
+        (_pose_entry(0, 0, float("inf")), "NaN or infinity"),
+        (_pose_entry(0, 0, "abc"), "4×4"),
         (lambda m: m.pop(), None),  # 3×4 is read
         (lambda m: m.pop(0) and m.pop(0), "4×4"),
         (lambda m: [row.__setitem__(0, 0.0) for row in m], "inverted"),
         (lambda m: [row.__setitem__(slice(0, 3), [0, 0, 0]) for row in m], "inverted"),
-        (_pose(3, 0, 0.5), "inverted"),
+        (_pose_entry(3, 0, 0.5), "inverted"),
         (lambda m: [row.__setitem__(0, -row[0]) for row in m[:3]], "left-handed"),
         (lambda m: [row.__setitem__(0, 1.3 * row[0]) for row in m[:3]], "30%"),
         (lambda m: [row.__setitem__(0, 1.004 * row[0]) for row in m[:3]], None),

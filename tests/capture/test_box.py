@@ -1,4 +1,7 @@
-"""Test the settings for the region, a box to reconstruct, and for the up direction. Both are in the capture's own frame."""
+"""Test two settings: the box to reconstruct (`region`), and the up direction.
+
+Both are given in the capture's own coordinates.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +17,7 @@ UP = np.array([0.6, 0.0, 0.8])
 
 
 def region(**numbers):
-    """Make the settings of a region, such as `centre=(0, 0, 1)`; others keep their defaults."""
+    """Make settings with a box to reconstruct (region). `numbers` are its values, for example `centre=(0, 0, 1)`."""
     changes = [f"region.{key}={list(map(float, value))}" for key, value in numbers.items()]
     return load_settings("quick", changes).region
 

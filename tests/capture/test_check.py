@@ -74,7 +74,7 @@ def test_blurred_photos_are_named(tmp_path):
 
 
 def test_what_is_shown_of_it(tmp_path):
-    """Check that the written cameras are the capture's, and that thumbnails are small, masked photos."""
+    """Check the files that the check of a capture writes: all cameras, and small masked photos as thumbnails."""
     capture = read_capture(nerf_blender(tmp_path / "capture", {"train": 24, "test": 6}))
     out = tmp_path / "new" / "out"
     found = check(capture, out)

@@ -34,7 +34,10 @@ def project(camera, point):
 
 
 def assert_sees_the_ball(capture):
-    """Assert that points of the ball project to pixels of their colour, and points just beside the ball to the background."""
+    """Assert that the cameras and photos of a capture of the red and green ball agree.
+
+    Points on the ball must project to pixels of their colour, and points just beside it to the background.
+    """
     to_run = np.linalg.inv(capture.to_capture)
     for view in capture.views:
         loaded = load_view(view, None)
@@ -344,7 +347,10 @@ def test_glossy_synthetic_without_depth_takes_the_photos_alpha(tmp_path):
 
 
 def test_glossy_synthetic_converted_to_nerf_blender(tmp_path):
-    """Check a Glossy Synthetic scene in the NeRF-Blender layout: photos of both splits lie in `rgb`, and w, h, fl_x and fl_y are given."""
+    """Check that a Glossy Synthetic scene converted to the NeRF-Blender layout can be read.
+
+    Photos of both splits are in the folder `rgb`. The JSON files give the image size and the focal lengths.
+    """
     folder = nerf_blender(tmp_path)
     (folder / "rgb").mkdir()
     numbers = count()

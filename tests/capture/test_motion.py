@@ -94,7 +94,7 @@ def test_photos_become_a_capture(photos):
 
 
 def test_one_that_is_interrupted_goes_on(photos):
-    """Check that an interrupted search for camera poses writes no capture, and that the next search reuses its features."""
+    """Check that an interrupted search for camera poses writes no capture. The next search must reuse the image features already found."""
 
     def interrupt(event: str, facts: dict) -> None:
         if facts.get("stage") == "matching":
@@ -126,7 +126,11 @@ def test_no_photos(tmp_path):
 
 
 def test_what_stands_still_contradicts_what_turns():
-    """Check that matches on a turning object contradict the poses that fit the still room behind it, and the other way round."""
+    """Check how matches that contradict the camera poses are recognised.
+
+    A block turns in front of a room that stands still. Poses that fit the block contradict the matches in the room, and poses that fit
+    the room contradict the matches on the block.
+    """
     rng, focal, count = np.random.default_rng(0), 1000, 36
     block, room = rng.uniform(-0.8, 0.8, (100, 3)), np.add(rng.uniform(-2, 2, (50, 3)), [0, 6, 0])
     places, around, inside = [], [], []
@@ -140,7 +144,7 @@ def test_what_stands_still_contradicts_what_turns():
         places.append(seen[:, :2] / seen[:, 2:])
 
     def contradicted(poses: list[np.ndarray], reach: int, features: slice) -> np.ndarray:
-        """Tell for each match of these features, between photos at most `reach` apart, if the poses contradict it: bool (N,)."""
+        """Return for each match whether the poses contradict it: bool (N,). Only photos at most `reach` apart are matched."""
         far = []
         for a, b in pairs(count):
             if min(b - a, count - b + a) <= reach:

@@ -21,8 +21,8 @@ def refused(file, data: bytes, says: str) -> None:
     assert message.startswith(f"{file}: ") and says in message and "\n" not in message
 
 
-class _Runs:
-    """Create a file when it is unpickled by `pickle.load`, as malicious code would."""
+class _CreatesFile:
+    """Create the file `path` as soon as `pickle.load` reads this object, as malicious code could."""
 
     def __init__(self, path):
         self.path = path
@@ -34,7 +34,7 @@ class _Runs:
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_nothing_is_run(tmp_path, protocol):
     trace = tmp_path / "trace"
-    refused(tmp_path / "0-camera.pkl", pickle.dumps((_Runs(trace), PAIR[1]), protocol), "system")
+    refused(tmp_path / "0-camera.pkl", pickle.dumps((_CreatesFile(trace), PAIR[1]), protocol), "system")
     assert not trace.exists()
 
 

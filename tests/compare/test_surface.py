@@ -1,4 +1,4 @@
-"""Test the comparison of a mesh with the true mesh."""
+"""Test the comparison of a reconstructed mesh with the true mesh."""
 
 from dataclasses import replace
 

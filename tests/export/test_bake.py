@@ -51,9 +51,9 @@ def test_the_normal_map_mends_a_coarse_mesh():
 
 @pytest.mark.parametrize("size", [128, 320])
 def test_how_many_rows_are_baked_at_a_time_does_not_matter(unwrapped, monkeypatch, size):
-    """Baking in chunks of 37 rows gives the same textures as baking all rows at once.
+    """Check that baking in chunks of 37 rows gives the same textures as baking all rows at once.
 
-    A small texture is composited at every texel; a large one at a lower resolution, then enlarged.
+    A small texture is computed at every texel. A large one is computed at a lower resolution, then enlarged.
     """
     splats, found = sphere_of_splats(300), []
     for rows in (37, size):
@@ -83,8 +83,8 @@ def test_charts_keep_a_128th_of_the_side_apart(unwrapped):
         assert others[charts == chart].min() >= 4
 
 
-def shown(mesh, outer, inner):
-    """Bake two layers of splats, the inner one black. Return how far the texels' colours (T, 3) are from the outer layer's alone."""
+def change_by_inner(mesh, outer, inner):
+    """Bake two layers of splats, the inner one black. Return how much the inner layer changes the texels' colours (T, 3)."""
     inner.albedo[:] = 0
     both = Splats(**{name: np.concatenate([value, getattr(inner, name)]) for name, value in arrays(outer).items()})
     alone = bake(mesh, outer, 128)
@@ -92,7 +92,7 @@ def shown(mesh, outer, inner):
 
 
 def test_the_inside_of_a_shell_does_not_show_outside(unwrapped):
-    assert shown(unwrapped, sphere_of_splats(), sphere_of_splats(radius=0.97, outward=-1)).max() < 0.02
+    assert change_by_inner(unwrapped, sphere_of_splats(), sphere_of_splats(radius=0.97, outward=-1)).max() < 0.02
 
 
 def test_far_or_transparent_splats_still_give_colour(unwrapped):
@@ -115,14 +115,14 @@ def test_normals_are_those_of_the_point_not_of_the_splats_middle(unwrapped):
 
 
 def test_the_nearer_layer_hides_the_farther(unwrapped):
-    """Only the outer of two outward-facing layers shows in the texture; the inner one is not blended in."""
+    """Check that only the outer of two outward-facing layers shows in the texture. The inner one must not be blended in."""
     outer, inner = sphere_of_splats(), sphere_of_splats(radius=0.96)
     outer.opacities[:], inner.opacities[:] = 0.95, 0.95
-    assert shown(unwrapped, outer, inner).mean() < 0.02
+    assert change_by_inner(unwrapped, outer, inner).mean() < 0.02
 
 
 def test_what_stands_in_the_open_and_what_does_not():
-    """Half of the light reaches the ground beside a wall; all of it reaches a sphere."""
+    """Check openness, the fraction of the light that reaches a surface: about 1/2 on the ground beside a wall, and 1 on a sphere."""
     np.testing.assert_allclose(openness(ball()), 1)
     ground = trimesh.creation.box((8, 8, 0.1)).subdivide().subdivide().subdivide()
     wall = trimesh.creation.box((0.1, 8, 8)).apply_translation((-4, 0, 4))

@@ -28,7 +28,7 @@ def run(ball_capture, tmp_path_factory):
 
 
 def quality(run, splats, cameras):
-    """Render splats by their colours alone; return the mean PSNR against the run's own rendering."""
+    """Render splats with their stored colours, without lights. Return the mean PSNR (dB) against the run's own rendering."""
     settings = run.settings.render.model_copy(update={"shading": "sh"})
     background = torch.tensor(run.settings.image.background)
     values = []
@@ -85,7 +85,10 @@ def test_splats_alone_are_exported_unless_the_mesh_is_named(run, tmp_path, monke
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_run_of_few_splats_leaves_in_every_format(run, tmp_path, monkeypatch, count):
-    """A run of no splats, or of one, is written in every format but the mesh, which is refused with an error."""
+    """Check that a run of no splats, or of one, can be exported as splats.
+
+    Exporting its mesh gives an error, because it has none.
+    """
     monkeypatch.setattr("refgs.export.display.ITERATIONS", 3)
     folder = tmp_path / "des éclats, été"
     shutil.copytree(run.folder, folder, ignore=shutil.ignore_patterns("mesh.glb"))

@@ -19,7 +19,7 @@ def cameras(count=12):
 
 
 def unit_sphere(camera):
-    """Render the unit sphere: its alpha and nothing else."""
+    """Render the alpha mask of the unit sphere. Colours and normals are zero."""
     y, x = np.mgrid[:SIDE, :SIDE] + 0.5 - SIDE / 2
     edge = FOCAL / np.sqrt(DISTANCE**2 - 1)
     alpha = torch.from_numpy((edge - np.hypot(x, y) + 0.5).clip(0, 1).astype(np.float32))
@@ -48,7 +48,7 @@ def test_what_sticks_out_is_pulled_in():
 
 @pytest.mark.parametrize("corner", [1.0, 0.0])
 def test_without_a_background_nothing_moves(corner):
-    """A mesh stays as it is if it covers all of the picture, or all but a small corner."""
+    """Check that a mesh is not moved if it covers the whole picture, or all but a small corner."""
     mesh, alpha = ball(4, 0.9), torch.ones(SIDE, SIDE)
     alpha[:6, :6] = corner
     assert fit_to_outlines(mesh, lambda camera: Rendering(None, alpha, None, None), cameras(3), VOXEL) is mesh

@@ -1,4 +1,4 @@
-"""Test removing a known shadow from base colours."""
+"""Test the correction that removes shadows from the learned base colours."""
 
 import numpy as np
 import pytest
@@ -12,9 +12,9 @@ from tests.makers.occluders import as_occluder, bowl, even, mirrors, surfels
 
 @pytest.mark.parametrize("albedo", [0.1, 0.5, 0.8])
 def test_the_shadow_of_a_bowl_goes(albedo, monkeypatch):
-    """The base colour learned in a bowl, albedo · x, is corrected to the albedo. Metals keep their base colour.
+    """Check that base colours learned inside a bowl are corrected to the true albedo. Metals keep their base colour.
 
-    Every point of half a sphere receives the light x = 1/2 + albedo · x / 2.
+    A point of the bowl receives the light x = 1/2 + albedo · x / 2, so its base colour is learned as albedo · x.
     """
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
@@ -34,7 +34,7 @@ def test_what_is_convex_stays_as_it_is():
 
 
 def test_the_dark_is_not_made_white():
-    """Between two plates that nearly touch, base colours are brightened by at most 1 / LEAST."""
+    """Check that dark hollows are brightened by a limited factor: at most 1 / LEAST, here between two plates that nearly touch."""
     low, high = (trimesh.creation.box((2, 2, 0.1)).apply_translation([0, 0, z]) for z in (-0.05, 0.11))
     seen = surfels(np.zeros((4, 3)), np.tile([0.0, 0.0, 1.0], (4, 1)), 0.1)
     found = unshadowed(to_splats(seen), seen, as_occluder(low, high.subdivide()).mesh, even())

@@ -11,7 +11,7 @@ from tests.makers.painted_ball import ball
 
 @pytest.fixture(scope="module")
 def bumpy():
-    """Make a wavy sphere, large enough to be unwrapped in several parts."""
+    """Make a wavy sphere. It has so many triangles that the unwrapping splits it into several parts."""
     sphere = ball(4)
     vertices = sphere.vertices * (1 + 0.15 * np.sin(5 * sphere.vertices).prod(axis=1, keepdims=True))
     return Mesh(vertices, sphere.faces, smooth_normals(vertices, sphere.faces))
@@ -30,7 +30,7 @@ def test_it_is_the_same_surface(bumpy, unwrapped):
 
 
 def test_nothing_overlaps(unwrapped):
-    """No point of the texture lies in two triangles, and no triangle is flipped."""
+    """Check that no point of the texture lies in two triangles, and that no triangle is flipped."""
     size, count = 1024, np.zeros((1024, 1024), int)
     for corners in unwrapped.uv[unwrapped.faces] * size:
         low, high = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)

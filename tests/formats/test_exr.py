@@ -29,7 +29,7 @@ def test_the_file_says_what_it_is(tmp_path):
 
 
 def test_of_several_parts_the_first_in_colour_is_read(tmp_path):
-    """In a file of several parts (depth, left eye, right eye) the first part with colours is read."""
+    """Check that an EXR file of several parts (depth, left eye, right eye) is read from its first part with colours."""
 
     def part(name, channels):
         header = {"name": name, "type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}

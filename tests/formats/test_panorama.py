@@ -55,8 +55,11 @@ def test_sampling_is_smooth_across_the_seam_and_finite_at_the_poles():
 
 
 @pytest.fixture
-def seen(tmp_path):
-    """Return a function that renders a panorama by Cycles, seen in a direction (x, y, z), and returns the mean colour."""
+def look_at(tmp_path):
+    """Return a function that renders a view of a panorama with Cycles, and returns the mean colour of the view.
+
+    Its arguments are the panorama, the view's direction (x, y, z) and the field of view in degrees.
+    """
     bpy = pytest.importorskip("bpy")
     mathutils = pytest.importorskip("mathutils")
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -90,17 +93,17 @@ def seen(tmp_path):
     return look
 
 
-def test_blender_sees_the_same_panorama(seen):
+def test_blender_sees_the_same_panorama(look_at):
     panorama = 0.5 + 0.4 * directions(64, 128)
     for direction in np.concatenate([np.eye(3), -np.eye(3)]):
-        np.testing.assert_allclose(seen(panorama, direction, 10), 0.5 + 0.4 * direction, atol=2e-3)
+        np.testing.assert_allclose(look_at(panorama, direction, 10), 0.5 + 0.4 * direction, atol=2e-3)
 
 
-def test_blender_sees_a_lamp_where_it_is_and_nowhere_else(seen):
+def test_blender_sees_a_lamp_where_it_is_and_nowhere_else(look_at):
     lamp = np.array([0.48, -0.6, 0.64])
     near = np.exp(60 * (directions(128, 256) @ lamp - 1))[..., None]
     panorama = np.float32(50) * near * (1, 0.5, 0.25)
     for signs in np.ndindex(2, 2, 2):
         direction = lamp * (1 - 2 * np.array(signs))
         bright = np.array([50, 25, 12.5]) if signs == (0, 0, 0) else 0
-        np.testing.assert_allclose(seen(panorama, direction, 2), bright, rtol=0.02, atol=0.1)
+        np.testing.assert_allclose(look_at(panorama, direction, 2), bright, rtol=0.02, atol=0.1)

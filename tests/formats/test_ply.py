@@ -33,7 +33,7 @@ LAYOUTS = {
 
 
 def table(names, count=COUNT, kind="<f4"):
-    """Make PLY rows as 3D Gaussian trainings write them: quaternions of any length, zero normals."""
+    """Make random PLY rows like those of 3D Gaussian splatting: quaternions are not normalised, and normals are zero."""
     rng = np.random.default_rng(3)
     rows = np.empty(count, [(name, kind) for name in names])
     for name in names:
@@ -42,7 +42,10 @@ def table(names, count=COUNT, kind="<f4"):
 
 
 def save(path, rows, *more, format="<"):
-    """Write rows as a PLY file: `format` is text, or the byte order of binary numbers, < or >."""
+    """Write `rows` as the vertices of a PLY file. `more` are further elements.
+
+    `format` is "text", or the byte order of a binary file: "<" for little-endian, ">" for big-endian.
+    """
     how = {"text": True} if format == "text" else {"byte_order": format}
     PlyData([PlyElement.describe(rows, "vertex"), *more], **how).write(str(path))
     return path
@@ -221,7 +224,10 @@ def test_our_own_lacks_nothing(tmp_path):
 
 @pytest.mark.parametrize("format", ["text", "<", ">"])
 def test_no_damage_is_a_fault_of_ours(tmp_path, format):
-    """A damaged file gives a one-line error or finite splats. Random bytes, mostly of the header, are changed, removed or inserted."""
+    """Check that a damaged file is read as finite splats, or refused with a one-line error.
+
+    The test changes, removes and inserts random bytes, mostly in the header.
+    """
     rng = np.random.default_rng(7)
     rows = table(LAYOUTS["2DGS"], 6)
     face = PlyElement.describe(np.array([([0, 1, 2],)], [("vertex_indices", "O")]), "face")

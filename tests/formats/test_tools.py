@@ -1,4 +1,4 @@
-"""Open exported files in other programs, which tests/tools/package.json lists."""
+"""Test that other programs can open the exported files. tests/tools/package.json lists these programs."""
 
 import json
 import shutil
@@ -34,14 +34,14 @@ def said(*words, folder=TOOLS):
     return done.stdout
 
 
-def transform(source, target, *words):
-    """Convert a splat file by PlayCanvas's splat-transform, on the CPU."""
+def transform(source, target, *options):
+    """Convert a splat file with PlayCanvas's program splat-transform, on the CPU. `options` go to its command line."""
     program = TOOLS / "node_modules" / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
-    return said(program, "-q", "-w", "-g", "cpu", "--max-workers", "0", source, *words, target)
+    return said(program, "-q", "-w", "-g", "cpu", "--max-workers", "0", source, *options, target)
 
 
 def discs(count=COUNT, degree=3):
-    """Make random surfels of many sizes and orientations, with spherical harmonics."""
+    """Make random surfels of many sizes and orientations, with spherical harmonics up to `degree`."""
     rng = np.random.default_rng(5)
     turn = Rotation.random(count, random_state=5)
     values = {
@@ -107,9 +107,9 @@ def test_few_splats_open_too(tmp_path, count):
 
 
 def test_gltf_of_splats(tmp_path):
-    """The glTF file that splat-transform writes (KHR_gaussian_splatting) holds activated values.
+    """Check the glTF file (KHR_gaussian_splatting) that splat-transform makes from exported splats.
 
-    It is upright with the rotation that docs/formats.md recommends.
+    The file holds scales and opacities, not their logarithms and logits. With the rotation that docs/formats.md recommends, +Y is up.
     """
     splats = discs()
     write_display_splats(tmp_path / "a.ply", splats)

@@ -1,4 +1,7 @@
-"""Test the report's curves: Pareto fronts, knees and times to an error. Test the names of runs."""
+"""Test the report's curves of error over time: Pareto fronts, knees, and the time to reach an error.
+
+Test also the names that the report gives to runs.
+"""
 
 import numpy as np
 import pytest
@@ -29,7 +32,7 @@ def test_a_decibel_is_the_same_step_of_the_error_everywhere():
 
 
 def test_the_front_is_what_nothing_beats():
-    """The front holds exactly the points that no other point beats in both seconds and error."""
+    """Check that the Pareto front holds exactly the points that no other point beats in both seconds and error."""
     random = np.random.default_rng(0)
     times = [np.sort(random.integers(1, 30, 25)) for _ in range(3)]
     curves = [of(t, (100 / t + random.exponential(20, 25)).round()) for t in times]

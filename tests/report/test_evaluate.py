@@ -1,4 +1,4 @@
-"""Evaluate a run against known ground truth. The capture's frame is rotated, moved and scaled from the run's."""
+"""Test the evaluation of a run against known ground truth. The ground truth is in rotated, moved and scaled coordinates."""
 
 import json
 
@@ -32,12 +32,12 @@ DUSK = Environment.from_panorama(dusk(directions(64, 128)).astype(np.float32), 1
 
 
 def turned(light, turn, height=64):
-    """Sample `light` as a panorama, rotated by `turn`."""
+    """Sample the light as a panorama (height, 2 × height, 3), rotated by the matrix `turn`."""
     return light(directions(height, 2 * height) @ turn)
 
 
 def write_truth(folder, run, views):
-    """Write every kind of ground truth, made from the run itself: without further changes all errors are zero."""
+    """Write ground truth of every kind, rendered from the run itself. So if the run is evaluated unchanged, all its errors are zero."""
     for name, light in {"light": sky, "relight/dusk": dusk}.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_exr(folder / f"{name}.exr", turned(light, TURN))

@@ -17,7 +17,7 @@ VIEWS = [f"test_{i:03d}" for i in range(8)]
 
 
 class Page(HTMLParser):
-    """Parsed page: pictures with their captions, text, tags, and every address that a browser would load."""
+    """Parse an HTML report. Collects its pictures with captions, its text, its tags, and every address that a browser would load."""
 
     def __init__(self, html: str):
         super().__init__()
@@ -53,7 +53,7 @@ def picture(path, value, side=24, channels=3):
 
 
 def pixels(address):
-    """Decode the picture of a data address."""
+    """Decode the picture in a data: URL."""
     return cv2.imdecode(np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8), -1)
 
 
@@ -112,13 +112,13 @@ def charts(html):
 
 
 def places(svg, gid):
-    """Read the points (n, 2) of the lines named `gid` in an SVG; y points down."""
+    """Read the lines of an SVG that are in groups named `gid`. Each is an array of points (n, 2); y points down."""
     paths = re.findall(rf'<g id="{gid}">\s*<path d="([^"]+)"', svg)
     return [np.array(re.findall(r"[ML] (\S+) (\S+)", path), float) for path in paths]
 
 
 def test_the_charts_draw_the_history(run):
-    """Errors that are a power of time are drawn as straight lines. Bars are proportional to seconds."""
+    """Check the charts: an error that is a power of time is drawn as a straight line, and bars are proportional to seconds."""
     page = reported(run)
     errors, parts = charts(page.html)
     for words in ("held-out views: RMS error", "training views: RMS error", "training loss", "seconds of training"):

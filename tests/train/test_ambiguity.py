@@ -1,4 +1,7 @@
-"""Test the report of ambiguities. Two changes of the model are ambiguous if together they leave the photos nearly the same."""
+"""Test the report of ambiguities.
+
+An ambiguity is a pair of changes, such as a brighter light and darker materials, that together leave the photos nearly the same.
+"""
 
 import json
 
@@ -18,9 +21,9 @@ def ball(ball_capture, tmp_path_factory):
 
 
 def test_what_is_left_is_what_both_changes_leave(ball):
-    """Check that the reported residual `left` agrees to 30 % with a second measurement.
+    """Check the reported value `left`: how much two changes that nearly cancel still alter the pictures.
 
-    The second measurement renders both changes together, each a tenth as large.
+    It must agree to 30 % with a direct measurement, which renders both changes together at a tenth of their size.
     """
     found = ambiguities(ball)
     now = ball.surfels(), ball.environment().radiance

@@ -1,4 +1,7 @@
-"""Test training on CUDA without a card. The tests use emulated kernels, or fake tensors that have a shape and a device but no values."""
+"""Test training on CUDA without a GPU.
+
+The tests use emulated kernels, or fake tensors that have a shape and a device but no values.
+"""
 
 import numpy as np
 import pytest
@@ -23,7 +26,7 @@ START = [*TINY, "surfels.metallic=0.8"]
     "changes", [["indirect.start=0"], ["render.shading=sh"], ["initial.until=0.99", "needs.initial=on"]]
 )
 def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
-    """Check that a training takes the same steps with the kernels for the CPU and for cards, with self-occlusion too."""
+    """Check that training with the CPU's kernels and with emulated CUDA kernels gives nearly the same first three steps."""
     figures, values = [], []
     for name in ("cpu", "card"):
         made = trainer(ball_capture, tmp_path / name, *START, *changes, total=3000)
@@ -42,7 +45,7 @@ def test_trains_as_the_cpu_does(ball_capture, tmp_path, monkeypatch, changes):
 
 
 def follow_to_the_card(monkeypatch) -> list[str]:
-    """Patch the program so that it runs with fake tensors on a card. Return a list that records the names of launched kernels."""
+    """Replace parts of the program so that it runs on fake CUDA tensors. Return a list that receives the names of launched kernels."""
 
     def empty(value):
         if isinstance(value, Tensor):
@@ -72,9 +75,9 @@ def follow_to_the_card(monkeypatch) -> list[str]:
 
 
 def backward(loss: Tensor) -> None:
-    """Compute gradients by visiting autograd's nodes, because autograd's own engine needs a card.
+    """Compute gradients without autograd's own engine, which needs a GPU: visit the nodes of the graph from the loss backwards.
 
-    Every function must take its arguments with a derivative first.
+    In each autograd function, the arguments that have a derivative must come first.
     """
     order: list = []
 
@@ -103,9 +106,9 @@ def backward(loss: Tensor) -> None:
 
 @pytest.mark.parametrize("indirect", [False, True])
 def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, indirect):
-    """Check that an iteration never mixes devices and waits for the card only once, in `how_many`.
+    """Check that a training step keeps all its tensors on the GPU, and reads a value back only once, in `how_many`.
 
-    With fake tensors, reading a value is an error. Making a tensor whose size depends on a value is an error too.
+    The tensors are fake. Reading a value of one is an error, and so is making a tensor whose size depends on a value.
     """
     ball = as_occluder(trimesh.creation.icosphere(2))
     tree = ball.tree(torch.device("cpu"))

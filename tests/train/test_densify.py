@@ -12,7 +12,10 @@ SETTINGS = load_settings("quick").densify
 
 
 def make():
-    """Make the parameters of 20 random surfels, and an optimiser of them and a light that has done one step."""
+    """Make the parameters of 20 random surfels, and an Adam optimiser after one step.
+
+    The optimiser also holds the parameter `environment`, a light.
+    """
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(20, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -71,7 +74,7 @@ def test_faint_surfels_go_and_one_stays():
 
 
 def test_screen_gradient_is_by_pixels_of_motion():
-    """Check that the screen gradient is the length of dL/d(pixel) times half the image's width in pixels."""
+    """Check the screen gradient, which decides where surfels are added: |dL/d(pixel position)| times half the image's width in pixels."""
     camera = Camera("a", 200, 100, 150.0, 150.0, 100.0, 50.0, np.eye(4))
     position = torch.tensor([[0.3, -0.2, 2.5]])
     wanted = torch.tensor([2.0, -1.0])  # dL/d(pixel)

@@ -1,4 +1,4 @@
-"""Test the choice of the device, the warning if the chosen device is not the requested one, and a card whose memory is full."""
+"""Test the choice of the device, the warning if the requested device cannot be used, and a GPU that runs out of memory."""
 
 import warnings
 
@@ -13,13 +13,13 @@ from tests.makers.training import trainer
 
 
 def chosen(device: str) -> tuple[str, list[str]]:
-    """Choose a device. Return its name and the warnings."""
+    """Choose the device for a training. Return its name and the warnings."""
     said = []
     return train_job.choose_device(device, lambda event, facts: said.append(facts["what"])), said
 
 
-def card(monkeypatch, capability: tuple[int, int], driver: str | None = None) -> None:
-    """Make torch report a card of this compute capability. If `driver` is given, loading kernels fails with the message `driver`."""
+def fake_gpu(monkeypatch, capability: tuple[int, int], driver: str | None = None) -> None:
+    """Make torch report a GPU of this compute capability. If `driver` is given, loading a kernel fails with this message."""
 
     def module(source: str, device: int) -> int:
         if driver:
@@ -35,7 +35,7 @@ def card(monkeypatch, capability: tuple[int, int], driver: str | None = None) ->
 
 
 def test_a_card_is_taken(monkeypatch):
-    card(monkeypatch, (7, 5))
+    fake_gpu(monkeypatch, (7, 5))
     assert [chosen(d) for d in ("auto", "cuda", "cpu")] == [("cuda", []), ("cuda", []), ("cpu", [])]
 
 
@@ -59,26 +59,26 @@ def test_a_driver_that_is_too_old_for_torch(monkeypatch):
 
 @pytest.mark.parametrize("asked", ["auto", "cuda"])
 def test_a_card_that_is_too_old(monkeypatch, asked):
-    card(monkeypatch, (6, 1))
+    fake_gpu(monkeypatch, (6, 1))
     device, (line,) = chosen(asked)
     assert device == "cpu" and "GeForce is too old: its compute capability is 6.1, 7.5" in line
 
 
 def test_a_driver_that_refuses(monkeypatch):
-    card(monkeypatch, (8, 6), driver="adam.cpp: CUDA_ERROR_INVALID_IMAGE\nand more")
+    fake_gpu(monkeypatch, (8, 6), driver="adam.cpp: CUDA_ERROR_INVALID_IMAGE\nand more")
     device, (line,) = chosen("auto")
     assert device == "cpu" and line.endswith("(adam.cpp: CUDA_ERROR_INVALID_IMAGE): a newer driver may do")
 
 
-def of_many(capture, folder, start: int, report=lambda *event: None) -> Trainer:
-    """Make a trainer of `start` surfels, whose budget is far larger."""
+def trainer_from(capture, folder, start: int, report=lambda *event: None) -> Trainer:
+    """Make a trainer that begins with `start` surfels. It may grow to far more."""
     changes = f"surfels.start={start}", "surfels.budget=24000", "surfels.inside=0.0", "surfels.opacity=0.73"
     return trainer(capture, folder / "run", "surfels.hull=48", *changes, total=12, report=report)
 
 
 def test_full_memory_lowers_the_budget_and_goes_on(ball_capture, tmp_path, monkeypatch):
     reports = []
-    made = of_many(ball_capture, tmp_path, 2000, lambda *event: reports.append(event))
+    made = trainer_from(ball_capture, tmp_path, 2000, lambda *event: reports.append(event))
     step = made.step
 
     def limited() -> dict:
@@ -97,7 +97,7 @@ def test_full_memory_lowers_the_budget_and_goes_on(ball_capture, tmp_path, monke
 
 
 def test_memory_that_is_far_too_small(ball_capture, tmp_path, monkeypatch):
-    made = of_many(ball_capture, tmp_path, 1200)
+    made = trainer_from(ball_capture, tmp_path, 1200)
     monkeypatch.setattr(made, "step", lambda: (_ for _ in ()).throw(torch.OutOfMemoryError()))
     with pytest.raises(InputError, match="memory is too small"):
         made.run()

@@ -37,9 +37,9 @@ def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
 
 
 def test_a_disk_that_is_full(ball_capture, small_disk):
-    """Check that a training on a full disk ends with a one-line error, and resumes once there is space.
+    """Check that a training on a full disk ends with a one-line error, and can be resumed once there is space.
 
-    In this test a file other than a checkpoint cannot be written. test_checkpoint.py tests checkpoints that cannot be written.
+    Here the file that cannot be written is not a checkpoint. test_checkpoint.py tests checkpoints.
     """
     filler = small_disk / "filler"
 

@@ -1,4 +1,7 @@
-"""Test the settings in effect. The program keeps the requested settings, and run.toml records each change and its reason."""
+"""Test how run.toml records the settings that the program changed.
+
+For each it records the requested value, the value in effect, and the reason.
+"""
 
 import tomllib
 
@@ -44,7 +47,7 @@ def test_a_plan_changes_each_number_that_differs():
 def test_a_run_says_what_changed_its_settings(ball_capture, tmp_path):
     """Check that run.toml records the settings that the training changed, and that a resumed run keeps these records.
 
-    Settings change because of the photos, or because a scene can do without a part of the method (needs).
+    The training changes settings to suit the photos, or to leave out a part of the method that the scene does not need.
     """
     out, words = tmp_path / "run", [*SMALL, "train.iterations=40", "needs.specular=off"]
     train_job.train(

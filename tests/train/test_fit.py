@@ -1,4 +1,4 @@
-"""Test the choice of settings for a training of which the user gives only the duration."""
+"""Test how the settings of a training are chosen when the user gives only its duration."""
 
 import json
 import tomllib
@@ -27,7 +27,10 @@ def test_it_lies_between_the_presets():
 
 @pytest.mark.parametrize("part, factor", [(0.25, 2), (0.5, 2**0.5), (1.01, 1), (1.99, 1), (4, 0.5**0.5)])
 def test_rates_change_only_beyond_the_presets(part, factor):
-    """Check the learning rates of a schedule that has `part` times the iterations of `quick`; `standard` has twice as many."""
+    """Check the learning rates of a schedule with `part` times the iterations of the preset `quick`.
+
+    The preset `standard` has twice as many iterations, at the same rates. Shorter schedules have higher rates, and longer ones lower rates.
+    """
     assert STANDARD.train.iterations == 2 * QUICK.train.iterations
     rates = _scheduled(QUICK, part * QUICK.train.iterations, QUICK, STANDARD).rates
     assert rates.position == pytest.approx(factor * QUICK.rates.position)

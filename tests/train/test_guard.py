@@ -1,4 +1,4 @@
-"""Test the guard, which rejects steps of the optimiser that are not finite."""
+"""Test the guard, which rejects steps of the optimiser that contain NaN or infinity."""
 
 import math
 
@@ -30,9 +30,9 @@ def learner(device):
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, 1e30])
 def test_a_step_that_is_not_finite_leaves_all_as_it_was(device, wrong):
-    """Check that a step that is not finite leaves values and moments unchanged, bit for bit.
+    """Check that a rejected step of the optimiser changes neither the values nor Adam's moments, bit for bit.
 
-    1e30 is finite, but its square, which Adam stores, overflows float32.
+    A gradient of 1e30 is rejected too, because its square overflows float32.
     """
     values, optimizer = learner(device)
     guard, motion = Guard(torch.device(device)), ScreenGradient(50, torch.device(device))
@@ -176,9 +176,10 @@ def test_resumed_in_every_stage_it_is_the_same_run():
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e-6, 1.0), (1e6, 0.0), (1.0, 1e5), (1e3, -1e7)])
 def test_a_capture_anywhere_is_learned_about_the_origin(scale, offset):
-    """Check that the scale and offset of a capture do not change its cameras in the run's frame, up to rounding.
+    """Check that a capture is moved and scaled so that its cameras come out the same, up to rounding,
+    wherever it lies and however large it is.
 
-    `to_capture` maps the cameras back to the capture's frame.
+    `to_capture` must map the cameras back to the capture's own coordinates.
     """
 
     def moved(pose: np.ndarray) -> np.ndarray:

@@ -34,9 +34,9 @@ def test_lines_are_evenly_spaced_by_logarithm():
 
 @pytest.mark.parametrize(("cost", "lines"), [(0.1, 26), (2.0, 5), (100.0, 2)])
 def test_measuring_has_its_share(cost, lines):
-    """Check that measuring takes at most 2.5 % of the training's time. Expensive measurements are made less often, evenly spread.
+    """Check that measurements take at most 2.5 % of the training's time, not counting the first and the last.
 
-    The training has 3,000 iterations of 0.1 s.
+    The training has 3,000 iterations of 0.1 s. A measurement takes `cost` seconds. `lines` is how many measurements are expected.
     """
     spent, at = 0.0, []
     for i in [*filter(history.due, range(3000)), 3000]:
@@ -51,7 +51,7 @@ def test_measuring_has_its_share(cost, lines):
 
 
 def test_measuring_is_not_in_the_seconds(ball_capture, tmp_path, monkeypatch):
-    """Check that the training's seconds do not include the time for measuring, which is 1000 s each in this test."""
+    """Check that time spent on measurements does not count as training time. In this test a measurement takes 1000 s."""
 
     class Time:
         now = 0.0
@@ -135,7 +135,7 @@ def dusk(direction):
 
 
 def write_truth(capture):
-    """Write ground truth of the held-out views, also under another light. It is computed by formula for the ball."""
+    """Write the ball's ground truth for the held-out views, also under a second light. It is computed by formula."""
     truth = capture / "ground_truth"
     for name in ("alpha", "normal", "albedo", "roughness", "metallic", "relight/dusk"):
         (truth / name).mkdir(parents=True)
@@ -164,7 +164,7 @@ def known_capture(ball_capture, tmp_path_factory):
 
 
 def test_errors_against_the_truth(known_capture, tmp_path):
-    """Check that the recorded errors agree with a second computation, and that training lowers them."""
+    """Check that the errors recorded during training agree with a second computation, and that training lowers them."""
     changes = "surfels.metallic=0.9", "surfels.budget=1500", "surfels.start=1500"
     made = make(known_capture, tmp_path / "run", *changes, total=250)
     start = made.measures.errors(made.state)
@@ -195,9 +195,9 @@ def test_errors_against_the_truth(known_capture, tmp_path):
 
 
 def test_a_light_known_exactly_leaves_the_relit_picture_alone(known_capture, tmp_path):
-    """Check that surfels with the true material, relit by a known light, reach a PSNR of 20 dB.
+    """Check that surfels with the true material, relit by the known light, reach a PSNR over 20 dB.
 
-    The remaining error is at the outline. Surfels with another metal do not reach 20 dB.
+    Surfels of another metal must stay below 20 dB.
     """
     made = make(known_capture, tmp_path / "run", "surfels.start=3000", "surfels.budget=3000", "surfels.hull=96")
     logit = np.log(F0 / (1 - F0))

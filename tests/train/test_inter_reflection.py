@@ -20,9 +20,9 @@ CHANGES += ["indirect.every=200", "indirect.resolution=64", "residual.start=1"]
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Train with inter-reflection and without it. Return both trainers and a list of two PSNRs.
+    """Train on the same capture with inter-reflection and without it. Return both trainers and two PSNRs.
 
-    These are the PSNRs of the first trainer just before and just after inter-reflection starts.
+    Both PSNRs are of the first training: just before and just after its inter-reflection starts.
     """
     folder = tmp_path_factory.mktemp("two")
     write_ball_capture(folder / "capture", 64, TWO)
@@ -55,9 +55,9 @@ def test_pictures_gain_where_the_balls_mirror_each_other(trained):
 
 
 def test_joining_loses_nothing(trained):
-    """Check that PSNR drops by less than 0.1 dB when inter-reflection starts.
+    """Check that starting inter-reflection lowers the PSNR by less than 0.1 dB.
 
-    Indirect light is initialised with the environment's light.
+    The indirect light is first set to the environment's light, so the pictures hardly change.
     """
     before, after = trained[2]
     assert after > before - 0.1
@@ -81,7 +81,7 @@ def test_visibility_is_that_of_the_balls(trained):
 
 
 def test_the_run_folder_has_it_all(trained):
-    """Check that the run folder renders as the training did. Relit by its own environment, it must look nearly the same."""
+    """Check that the saved run renders like the trainer. Relighting it with its own environment must hardly change the pictures."""
     made = trained[0]
     run, view = open_run(made.state.folder), made.state.test[0]
     shown, asset = made.state.render(view.camera), run.render(view.camera)

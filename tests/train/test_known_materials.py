@@ -41,7 +41,10 @@ def views(tmp_path_factory) -> list[tuple]:
 
 
 def learn(views: list[tuple], steps: int, rate: float, leaves: list[Tensor], materials, light) -> None:
-    """Fit the parameters `leaves` to the photos by Adam. `materials()` (3, 5) and `light()` compute the model from `leaves`."""
+    """Fit the tensors `leaves` to the photos with Adam.
+
+    From these tensors `materials` computes the materials of the three bands (3, 5), and `light` the environment's light.
+    """
     optimiser = torch.optim.Adam([leaf.requires_grad_() for leaf in leaves])
     for step, (camera, photo, alpha, band, normal, point) in enumerate(itertools.islice(itertools.cycle(views), steps)):
         optimiser.param_groups[0]["lr"] = rate * 0.1 ** (step / steps)

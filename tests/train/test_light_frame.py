@@ -48,9 +48,9 @@ def test_heading_is_the_turn_about_the_vertical():
 @pytest.mark.parametrize("turning", [False, True])
 @pytest.mark.parametrize("how", [{}, {"balls": TWO}, {"stops": STOPS}], ids=["one ball", "two balls", "exposures"])
 def test_auto_tells_which_light_it_was(tmp_path, how, turning):
-    """Check that the photos alone tell a light that turns with the camera from a fixed one.
+    """Check that the photos alone show whether the light turns with the camera or stands still.
 
-    Two balls that mirror each other, or different exposures, do not confuse it.
+    The answer must also be right for two balls that mirror each other, and for photos of different exposures.
     """
     write_ball_capture(tmp_path / "capture", 48, turning=turning, **how)
     found = trainer(tmp_path / "capture", tmp_path / "run", METAL, total=600).state

@@ -28,7 +28,7 @@ def huber(difference: Tensor) -> Tensor:
 
 
 def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress: float) -> dict[str, Tensor]:
-    """Compute all terms of the objective in float64, each times its weight."""
+    """Compute every weighted term of the training's loss in float64, by name. The tests compare the program with these values."""
     photo = view.image.double() / 255
     mask = None if view.mask is None else view.mask.double() / 255
     if mask is not None:
@@ -108,7 +108,10 @@ def gradients(loss: Tensor, rendering: Rendering) -> dict[str, Tensor]:
 
 
 def check(rendering: Rendering, view: Photo, weights: LossSettings, progress: float, scale: float, device) -> Tensor:
-    """Check the loss against the reference, and the gradients of `scale` times the loss. Return the mean squared error of the picture."""
+    """Compare the loss, and the gradients of `scale` times the loss, with the float64 reference.
+
+    Return the mean squared error of the picture.
+    """
     exact, found = leaves(rendering, torch.float64), leaves(rendering, torch.float32, device)
     expected = sum(reference(exact, view, weights, progress).values())
     loss, square = objective(found, None, moved(view, device), BACKGROUND.to(device), weights, progress)
@@ -135,7 +138,10 @@ def test_matches_float64(size, material, masked, device):
 
 
 def test_the_light_is_held_to_be_neutral_on_the_whole(device):
-    """Check that the penalty on a light whose mean is not grey, and the penalty's derivative, match float64."""
+    """Check the loss term that keeps the environment's light neutral: its value and derivative match float64.
+
+    The term grows as the light's mean colour departs from grey.
+    """
     rendering, view = pictures(8, 8, masked=True, material=True)
     only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, matte=0, light=0.5, exposure=0)
     mean = torch.rand(3, generator=torch.Generator().manual_seed(0))

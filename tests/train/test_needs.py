@@ -1,6 +1,6 @@
-"""Test the decisions which parts of the method (needs) a scene can do without.
+"""Test the decisions to leave out optional parts of the training that a scene does not need, such as specular shading.
 
-A part is left out if a measured statistic is below the part's threshold.
+A part is left out if a measured number is below the part's threshold.
 """
 
 import json
@@ -47,7 +47,10 @@ def matte(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def chalk(matte, tmp_path_factory):
-    """Train the matte ball until every need (part of the method) is decided, and write its asset."""
+    """Train on the matte ball until it is decided which optional parts of the training to leave out.
+
+    Writes the trained model, and returns the trainer.
+    """
     made = trainer(matte, tmp_path_factory.mktemp("runs") / "chalk", *DULL, total=300)
     made.run()
     write_asset(made.state)
@@ -94,7 +97,7 @@ def test_a_convex_mirror_keeps_specular_and_does_without_reflections(ball_captur
 
 @pytest.mark.parametrize("word", ["on", "off"])
 def test_forced_either_way(word, matte, ball_capture, tmp_path):
-    """Check that the setting needs.specular, on or off, overrules the decision by the photos."""
+    """Check that the setting needs.specular (on or off) overrides the automatic choice whether to train specular shading."""
     made = trainer(matte if word == "on" else ball_capture, tmp_path / "run", f"needs.specular={word}", total=120)
     made.run()
     assert ("metallic" in made.state.parameters) == (word == "on")
@@ -106,7 +109,10 @@ def test_forced_either_way(word, matte, ball_capture, tmp_path):
 
 
 def test_the_asset_says_so_once(chalk):
-    """Check that a column whose values are all equal is written once, in the PLY header, and that the run renders as before."""
+    """Check the PLY file of a ball with the same metallic, roughness and specular everywhere: the header stores these values once.
+
+    The file has no columns for them, and it renders like the trained model.
+    """
     splats, run = read_splats(chalk.state.folder / "splats.ply"), open_run(chalk.state.folder)
     assert splats.constants == {"metallic": 0.0, "roughness": 1.0, "specular": 0.0}
     assert (splats.metallic == 0).all() and (splats.roughness == 1).all()
@@ -128,7 +134,7 @@ def test_needs_are_written_down(chalk):
 
 
 def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
-    """Check that a run keeps its decisions when it is resumed.
+    """Check that a resumed training keeps its decisions which optional parts, such as specular shading, to leave out.
 
     Its parameters and light equal those of an uninterrupted run, bit for bit.
     """
@@ -145,9 +151,9 @@ def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
 
 
 def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
-    """Check that a training keeps its decisions when it returns to an earlier checkpoint.
+    """Check that a training keeps its decisions which optional parts to leave out, even if it returns to an earlier checkpoint.
 
-    The guard against values that are not finite returns to such a checkpoint.
+    It returns to a checkpoint if values become NaN or infinite.
     """
     made = trainer(matte, tmp_path / "run", *DULL, "train.light_first=0", total=200)
     made.run(stop=lambda: made.state.iteration == 96)
@@ -163,7 +169,7 @@ def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
 
 
 def test_reflections_by_what_they_could_be_worth(ball_capture, tmp_path):
-    """Check that a mirror keeps inter-reflection if a fifth of its reflections are occluded, and that a rough black dielectric does not.
+    """Check when inter-reflection is kept: for a mirror with a fifth of its reflections occluded, but not for a rough black dielectric.
 
     The dielectric reflects so little light that occlusion hardly changes the photos.
     """
@@ -195,9 +201,9 @@ def test_views_that_show_the_same_from_the_same_place(ball_capture, tmp_path):
 
 
 def test_the_part_about_the_mask_is_all_that_counts(ball_capture, tmp_path):
-    """Check that a crop about the mask gives the same loss and gradients as the full photo.
+    """Check that a photo cropped to its mask gives the same loss and gradients as the full photo.
 
-    The rendering is empty outside the crop.
+    Outside the mask, the model renders nothing.
     """
     made, generator = trainer(ball_capture, tmp_path / "run", total=10), torch.Generator().manual_seed(0)
     camera = made.state.photos[0].camera
@@ -278,7 +284,7 @@ def test_weighted_quantiles():
 
 
 def test_degrees_by_what_they_are_worth(ball_capture, tmp_path):
-    """Check that spherical harmonics are kept up to the highest degree that the photos show, from three down to zero."""
+    """Check that the degree of spherical harmonics is lowered to what the photos need: 3, 2, 1 or 0."""
     changes = ["needs.specular=on", "needs.reflections=off", "needs.light=on", "residual.start=0.5"]
     made = trainer(ball_capture, tmp_path / "run", *changes, total=10)
     made.run(stop=lambda: made.state.iteration == 6)
@@ -288,7 +294,7 @@ def test_degrees_by_what_they_are_worth(ball_capture, tmp_path):
             rest[:] = 0.1 * torch.randn(rest.shape, generator=torch.Generator().manual_seed(0))
             rest[:, kept:] = 0
             for view, photo in enumerate(made.state.photos):
-                made.state.photos[view] = photographed(made.state, photo)
+                made.state.photos[view] = with_rendering(made.state, photo)
         made.state.needs.pop("degrees", None)
         needs.evaluate_due(made.state, "iteration", progress=1.0)
         assert made.state.parameters["sh_rest"].shape[1] == kept
@@ -307,8 +313,8 @@ def test_what_all_have_alike_is_said_once(ball_capture, tmp_path):
     assert open_run(tmp_path / "run").settings.render.reflection == "microfacet"
 
 
-def photographed(state, photo, noise=0.0):
-    """Replace a photo by the model's own rendering, with Gaussian noise of standard deviation `noise`."""
+def with_rendering(state, photo, noise=0.0):
+    """Replace the photo's pixels by the model's own rendering plus Gaussian noise of standard deviation `noise` (colours are 0 … 1)."""
     color = state.render(photo.camera).color
     color = color + noise * torch.randn(color.shape, generator=torch.Generator().manual_seed(0))
     return photo._replace(image=(color.clamp(0, 1) * 255).round().byte(), mask=torch.full_like(photo.mask, 255))
@@ -326,14 +332,14 @@ def test_specular_on_synthetic_surfels(ball_capture, tmp_path):
         with torch.no_grad():
             made.state.light.copy_(light)
             for view, photo in enumerate(made.state.photos):
-                made.state.photos[view] = photographed(made.state, photo, noise=0.01)
+                made.state.photos[view] = with_rendering(made.state, photo, noise=0.01)
         assert least < probe.specular_explains(made.state) < most
 
 
 def test_shares_are_weights(ball_capture, tmp_path):
-    """Check the blended shares: the weights by which each surfel contributes to the pixels, summed over the pixels.
+    """Check `blended_shares`, which sums the blending weights of each surfel over all pixels.
 
-    Over all surfels, the weights add up to the sum of alpha. The weighted mean of a constant map is the same constant.
+    The weights of all surfels add up to the sum of alpha. The weighted mean of a constant map is the constant.
     """
     made = trainer(ball_capture, tmp_path / "run", total=10)
     photo, surfels = made.state.photo(0), made.state.surfels()

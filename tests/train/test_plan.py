@@ -26,9 +26,10 @@ def clock(monkeypatch) -> _Time:
 def _train(
     clock: _Time, made: Plan, pace, paused: float = 0.0, start: float = 12.0, first: int = 0, growth: float = 1.5
 ) -> tuple[int, float]:
-    """Follow a plan as a trainer does; `pace` gives the seconds of an iteration. Return how many iterations ran, and their seconds.
+    """Simulate a training that follows a plan. Return the number of iterations and the seconds, without pauses.
 
-    The seconds include the time until the asset is written, but no pauses.
+    `pace` gives the seconds of an iteration. Iterations begin at `first`, after `start` seconds; at iteration 100 the training pauses for
+    `paused` seconds. Writing the result at the end counts too.
     """
     begun = clock.now
     clock.now += start
@@ -59,7 +60,7 @@ def test_it_ends_on_time_whatever_an_iteration_takes(clock, pace, minutes):
 def test_where_iterations_grow_slower_as_expected_their_number_is_known_at_once(clock):
     """Check that the planned number of iterations is right to 2 % from the start, if iterations slow down as predicted.
 
-    Learning rates follow the fraction of iterations done, so the planned number must not change.
+    Learning rates depend on this number, so it must not change during the training.
     """
     made, asked = Plan(5), []
     whole = made.total

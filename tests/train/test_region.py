@@ -1,4 +1,4 @@
-"""Test training a region (a box) of a capture. The result holds only the ball inside the box, and `region.up` points upwards."""
+"""Test training on a box (region) of a capture. The result holds only the ball inside the box, and `region.up` points upwards."""
 
 import json
 
@@ -98,9 +98,9 @@ def test_a_box_with_nothing_in_it_is_said_in_a_line(balls, tmp_path):
 
 
 def test_up_turns_the_result_and_nothing_else(ball_capture, tmp_path):
-    """Check that `region.up` rotates the result together with its cameras and environment.
+    """Check that the setting `region.up` rotates the result, its cameras and its environment together.
 
-    So the run renders the same pictures as without `region.up`.
+    The rendered pictures stay the same.
     """
     up = np.array([0.6, 0.0, 0.8])
     folders = [tmp_path / "plain", tmp_path / "turned"]

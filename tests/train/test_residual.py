@@ -38,9 +38,9 @@ def test_it_learns_when_material_and_light_have(ball_capture, tmp_path):
 
 
 def test_it_adds_its_blend_to_the_picture(learned):
-    """Check that the residuals of the surfels are blended and added to the picture.
+    """Check that the surfels' residual colours are blended into a picture and added to the shaded picture.
 
-    The residual of a surfel is Σ_k c_k Y_k(d). d is the direction from the camera to the surfel.
+    A surfel's residual is Σ_k c_k Y_k(d). c_k are its coefficients of spherical harmonics; d is the direction from camera to surfel.
     """
     run, camera = open_run(learned.state.folder), learned.state.test[0].camera
     surfels = run.surfels()

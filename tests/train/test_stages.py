@@ -1,4 +1,7 @@
-"""Test the stages of a training: initial per-splat shading, opacity resets, normal propagation, display colours."""
+"""Test the stages of a training, from its initial shading per splat to its end.
+
+Test also three regular steps: resets of opacity, the growth of mirror-like surfels, and the diffusion of the environment's light.
+"""
 
 import pytest
 import torch
@@ -60,7 +63,7 @@ def test_learns_and_renders_as_it_trained(ball_capture, tmp_path, changes):
 
 
 def test_the_papers_schedule_runs_to_its_end(ball_capture, tmp_path):
-    """Check that the preset `paper`, shortened to 300 iterations, runs all its stages and gains 4 dB."""
+    """Check that the preset `paper`, shortened to 300 iterations, trains to its end and gains 4 dB of PSNR on held-out views."""
     changes = ["needs.initial=on", "train.light_first=0", "densify.every=20", "propagation.every=100"]
     changes += ["rates.environment=0.05", "propagation.rest=10", "indirect.every=60", "indirect.resolution=32"]
     made = trainer(ball_capture, tmp_path / "run", *changes, total=300, preset="paper")

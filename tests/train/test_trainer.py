@@ -28,7 +28,7 @@ from tests.makers.training import SMALL, asset_error, check_equal, put, trained,
 
 @pytest.fixture(scope="module")
 def ball(ball_capture, tmp_path_factory):
-    """Train the metal ball for 700 iterations and write its asset."""
+    """Train on the metal ball for 700 iterations, and write the trained model."""
     folder = tmp_path_factory.mktemp("runs") / "ball"
     return trained(ball_capture, folder, "train.checkpoint_every=200", "surfels.metallic=0.9", total=700)
 
@@ -60,9 +60,9 @@ def test_the_asset_renders_as_the_training_did(ball):
 
 
 def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
-    """Check that writing the asset turns its normals outward, but does not change the rotations of surfels.
+    """Check that writing the trained model turns its normals outward, but keeps the surfels' rotations as they were learned.
 
-    The rotations must stay, because shading near the horizon depends on which side of a surfel is its front.
+    A surfel's rotation tells its front from its back. Turning it over would change the shading near the horizon.
     """
     made = trainer(ball_capture, tmp_path / "run", total=10)
     made.run()
@@ -146,9 +146,9 @@ def test_shading_sh_learns_colour_alone(ball_capture, tmp_path):
 
 
 def test_sh_diffuse_leaves_an_albedo_that_relights(ball_capture, tmp_path):
-    """Check the albedo in the asset of a training with diffuse=sh.
+    """Check the albedo that is written after a training with diffuse=sh: there, spherical harmonics give the diffuse colour.
 
-    A dielectric's albedo is its colour divided by irradiance / π. A metal's albedo is its reflectance.
+    A dielectric's albedo is its diffuse colour divided by irradiance / π. A metal's albedo is its reflectance.
     """
     made = trainer(ball_capture, tmp_path / "run", "diffuse=sh", "surfels.metallic=0.1", total=100)
     made.run()

@@ -1,6 +1,6 @@
-"""Train in a Blender window, and close Blender with simulated key presses. test_window.py starts this script.
+"""Train in a Blender window, then close Blender with simulated key presses. test_window.py starts this script.
 
-stage.py has the command line; its words are the Python with the trainer, the capture and the letter to press at last.
+Arguments: the Python with the trainer, the capture, and the letter key that answers the closing dialogue. stage.py has the command line.
 """
 
 import bpy
@@ -18,7 +18,10 @@ def press(letter, **held):
 
 
 def artist():
-    """Train, then press the keys that close Blender. Yields conditions; each is awaited before the next step."""
+    """Train, then press the keys that close Blender.
+
+    Each `yield` gives a function; the next step waits until this function returns true.
+    """
     install()
     bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
     settings = bpy.context.scene.refgs

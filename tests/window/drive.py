@@ -1,6 +1,6 @@
 """Install the extension in a Blender window, open its tab, take a screenshot and write a report.
 
-stage.py has the command line; its word is the run folder.
+Its argument is the run folder. stage.py has the command line.
 """
 
 import importlib.util
@@ -12,7 +12,10 @@ from stage import MODULE, WORDS, act, after, area, choose_tab, install, photogra
 
 
 def artist():
-    """Install the extension, import a run, open the tab and disable the extension. Yields the conditions to await."""
+    """Install the extension, import a run, open the tab and disable the extension.
+
+    Each `yield` gives a function; the next step waits until this function returns true.
+    """
     report["numpy"], drawn = importlib.util.find_spec("numpy") is not None, set()
     install()
     report["enabled"] = MODULE in bpy.context.preferences.addons

@@ -1,6 +1,6 @@
-"""Install the extension in a Blender window, take screenshots, and write a report, for the scripts beside this file.
+"""Provide functions for the scripts that run in a Blender window: install the extension, take screenshots, write a report.
 
-blender --python-expr "import sys; sys.path.append(FOLDER)" --python SCRIPT.py -- EXTENSION.zip [WORD ...] OUT
+blender --python-expr "import sys; sys.path.append(FOLDER)" --python SCRIPT.py -- EXTENSION.zip [ARGUMENT ...] OUT
 """
 
 import json
@@ -41,7 +41,7 @@ def region(kind):
 
 
 def view():
-    """Override the context with the 3D view, as Blender does for a button in the sidebar."""
+    """Return a context manager that makes the 3D view the context of operators, as for a button in the sidebar."""
     return bpy.context.temp_override(area=area(), region=region("WINDOW"))
 
 
@@ -69,15 +69,15 @@ def quit_blender():
 
 
 def after(seconds):
-    """Return a condition that holds once this time has passed."""
+    """Return a function that returns true once `seconds` have passed."""
     due = time.monotonic() + seconds
     return lambda: time.monotonic() >= due
 
 
 def act(steps):
-    """Run a generator's steps in the window. Each step yields the condition to await before the next step.
+    """Run a script's steps in the window. `steps` is a generator: it yields a function, and goes on once this function returns true.
 
-    Blender closes when the steps or the patience end, or a step fails.
+    Blender quits after the last step, after an error, or if a wait takes longer than PATIENCE seconds.
     """
     waiting, begun = None, 0.0
 

@@ -1,7 +1,7 @@
 """Test the extension in a real Blender window: build, install, show its tab, train, and close Blender.
 
-Blender is the command in REFGS_BLENDER, which must open a window. Without that variable it is `blender` in the PATH, under xvfb-run where
-there is no DISPLAY.
+Set REFGS_BLENDER to the command of a Blender that can open a window. By default this is `blender` from the PATH, and xvfb-run gives it
+a display if DISPLAY is not set.
 """
 
 import json
@@ -41,7 +41,10 @@ def blender_command():
 
 
 def in_window(script, tmp_path, *words):
-    """Run a script in a Blender window, with the extension's zip as its argument. Returns the script's report."""
+    """Build the extension, and run a script with it in a Blender window. Returns the script's report.
+
+    `words` are further arguments of the script.
+    """
     command = blender_command()
     bpy = pytest.importorskip("bpy", reason="the extension is built with the tool in Blender's Python module")
     tool = Path(bpy.utils.resource_path("LOCAL"), "scripts", "addons_core", "bl_pkg", "cli", "blender_ext.py")

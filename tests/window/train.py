@@ -1,6 +1,6 @@
 """Act as an artist in a Blender window: train a capture with the real trainer, and take a screenshot of each step.
 
-stage.py has the command line; its words are the Python with the trainer and the capture.
+Arguments: the Python with the trainer, and the capture. stage.py has the command line.
 """
 
 import contextlib
@@ -24,14 +24,17 @@ def tell(command):
 
 
 def artist():
-    """Press the buttons of a whole session. After each click, yield a condition to await and the screenshot's name."""
+    """Press the buttons of a whole session.
+
+    After each, yield a function that returns true once the button's work is done, and the name of a screenshot to take, or None.
+    """
     install()
     area().spaces.active.show_region_ui = True
     bpy.data.objects.remove(bpy.data.objects["Cube"])  # it is where the object will be
     yield lambda: True, None
     choose_tab()
     yield lambda: True, "empty"
-    measure_ours()
+    measure_addon()
     bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
     settings = bpy.context.scene.refgs
     settings.capture, settings.preset, settings.limited, settings.minutes = CAPTURE, "quick", True, 2.0
@@ -66,11 +69,11 @@ def artist():
         report["imported"] = str(error)
     yield lambda: True, "imported"
     if numpy():
-        yield from work_with_it(folder)
+        yield from use_result(folder)
 
 
-def work_with_it(folder):
-    """Compare the run with its photos, relight it, edit it, apply the edits and render it."""
+def use_result(folder):
+    """Compare the result with its photos, relight it, edit it, apply the edits and render it. Yields as `artist` does."""
     report["left"] = [item.name for item in bpy.data.objects if "in training" in item.name]
     scene, manager = bpy.context.scene, bpy.context.window_manager
     area().spaces.active.shading.type = "MATERIAL"
@@ -106,8 +109,8 @@ def measured():
     ours = max(ours, time.perf_counter() - start)
 
 
-def measure_ours():
-    """Measure how long the add-on blocks the window apart from clicks: in its timer and while it draws its panels."""
+def measure_addon():
+    """Start to measure how long the add-on's timer and panels block the window. Clicks on buttons are not included."""
     timers = addon("job_timers")
     look = timers._poll_jobs
 
@@ -141,9 +144,9 @@ steps, waiting, due, longest = artist(), None, time.perf_counter() + 3.0, 0.0
 
 
 def tick() -> float | None:
-    """Run the session's next step once its condition holds. Blender calls this ten times a second.
+    """Run the session's next step once the function that it waits for returns true. Blender calls this ten times a second.
 
-    The delay of a call is the time for which the window was busy.
+    A call that comes late shows how long the window was busy.
     """
     global waiting, due, longest, ours
     now = time.perf_counter()
