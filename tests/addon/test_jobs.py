@@ -1,4 +1,4 @@
-"""Test that the add-on starts and follows the trainer's processes, with a fake worker."""
+"""Test that the add-on starts the trainer's processes and follows their output. A fake worker stands in for the trainer."""
 
 import json
 import subprocess

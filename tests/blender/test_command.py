@@ -60,7 +60,7 @@ def test_bad_input_is_one_line(run_folder, tmp_path, capfd, monkeypatch, argumen
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names the shared libraries of Linux")
 def test_missing_libraries_are_named(run_folder, tmp_path):
-    """Check that the error names a missing system library. A fake of the system's tool `ldd` reports it as missing."""
+    """Check that the error message names a missing system library. A fake of the system's tool `ldd` reports the library as missing."""
     tool = tmp_path / "bin" / "ldd"
     tool.parent.mkdir()
     tool.write_text("#!/bin/sh\nprintf '\\tlibXfixes.so.3 => not found\\n\\tlibm.so.6 => /lib/libm.so.6 (0x1)\\n'\n")

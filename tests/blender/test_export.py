@@ -1,4 +1,4 @@
-"""Test the export of a run with its edits. The run itself must not change."""
+"""Test the export of an imported run with its material edits. The run's own files must not change."""
 
 import json
 import shutil
@@ -44,7 +44,10 @@ def test_edits_are_written_and_nothing_else_changes(run, run_folder, tmp_path, p
 
 
 def test_a_viewer_without_lights_shows_the_new_colour(run, run_folder, tmp_path):
-    """Check that an edit scales the stored colours, which viewers without lights show, like the base colour."""
+    """Check that changing the base colour scales the stored colours by the same factor.
+
+    Viewers without lights show the stored colours.
+    """
     rows = read_rows(run_folder / "splats.ply").copy()
     edit = add_edit(run.collection)
     run.splats.data.attributes["base_color"].data.foreach_set("color", [0.4, 0.4, 0.4, 1.0] * 40)

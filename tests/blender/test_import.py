@@ -30,7 +30,7 @@ from tests.makers.runs import COUNT, FRAMES, SIZE, quaternion_matrix, random_col
 
 
 def stacked(columns, names):
-    """Stack columns of splats.ply, named as in "x y z", side by side: (N, number of names)."""
+    """Stack the columns of splats.ply that `names` lists (such as "x y z") side by side: (N, number of names)."""
     return np.stack([columns[name] for name in names.split()], axis=1)
 
 
@@ -146,7 +146,10 @@ def foreign_columns(scales, normals):
 @pytest.mark.parametrize("normals", [False, True])
 @pytest.mark.parametrize("scales", [2, 3])
 def test_other_programs_splats(scene, tmp_path, scales, normals):
-    """Check that splats of other programs become matte discs across their shortest axis, in the colours that those programs show."""
+    """Check the import of splats from other programs.
+
+    They become matte discs, perpendicular to their shortest axis, with the colours that those programs show.
+    """
     columns = foreign_columns(scales, normals)
     folder = tmp_path / "d'un autre été"
     folder.mkdir()

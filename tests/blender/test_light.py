@@ -1,4 +1,4 @@
-"""Test the scene's light: list the panoramas, choose one, and match it with the recovered light."""
+"""Test the scene's light: list the panoramas, choose one, and rotate it to match the light that the training recovered."""
 
 import math
 

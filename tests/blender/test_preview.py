@@ -30,7 +30,7 @@ def scene(scene):
 
 
 def coloured_sky(direction):
-    """Return the sky's linear RGB radiance, which differs for every unit direction (…, 3)."""
+    """Return the sky's linear RGB radiance in the unit directions (…, 3). No two directions have the same colour."""
     return 0.5 + 0.4 * np.asarray(direction)
 
 
@@ -52,13 +52,16 @@ def camera_at(scene, eye):
 
 
 def rendered(scene, tmp_path, camera, samples):
-    """Render a.png and a.exr, and read the EXR file: (h, w, 4)."""
+    """Render the view of `camera` to a.png and a.exr. Return the pixels of the EXR file: (h, w, 4)."""
     render_preview(scene, tmp_path / "a.png", camera, samples=samples, exr=tmp_path / "a.exr")
     return read_exr(tmp_path / "a.exr")
 
 
 def one_mirror(folder, normal):
-    """Write a run of one large opaque splat at the origin that mirrors the sky: white, metallic, almost smooth."""
+    """Write a run folder with one large opaque splat at the origin.
+
+    The splat is white, metallic and almost smooth, so it mirrors the sky.
+    """
     folder.mkdir()
     z = np.asarray(normal, float)
     quaternion = np.array([1 + z[2], -z[1], z[0], 0]) / np.linalg.norm([1 + z[2], -z[1], z[0]])  # z to the normal

@@ -1,4 +1,4 @@
-"""Test contact sheets: each picture equals a preview under its light, and the scene does not change."""
+"""Test contact sheets, one picture per light. Each picture must equal a preview under its light, and the scene must not change."""
 
 import bpy
 import numpy as np

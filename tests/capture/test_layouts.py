@@ -1,4 +1,4 @@
-"""Test all layouts of captures: the cameras project points of the scene to where the photos show them."""
+"""Test reading captures in every supported layout. The cameras must project points of the scene to where the photos show them."""
 
 import json
 from functools import partial
@@ -65,7 +65,7 @@ MAKERS["colmap-text"] = partial(colmap, binary=False)
 
 @pytest.fixture(params=MAKERS)
 def capture(request, tmp_path):
-    """Write a capture of each layout, and return it as it is read."""
+    """Write a capture in one of the supported layouts, and read it. A test that uses this fixture runs once for each layout."""
     capture = read_capture(MAKERS[request.param](tmp_path / "été dans le jardin"))
     assert capture.layout == request.param.removesuffix("-text")
     return capture
@@ -371,7 +371,7 @@ def test_glossy_synthetic_converted_to_nerf_blender(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".png", ".PNG", ".webp"])
 def test_reduced_photos_of_a_colmap_capture(tmp_path, suffix):
-    """Check that a path to the folder `images_4` selects its reduced photos. Every eighth photo is held out."""
+    """Check that the path of a capture's folder `images_4` selects the reduced photos in it. Every eighth photo is held out."""
     folder = colmap(tmp_path / "sedan")
     for i, pose in enumerate(ring(16)):
         write(folder / "images_4" / f"{i:04d}.png", ball(pose, 16, 12, 15.0)[..., :3])

@@ -25,7 +25,7 @@ def quiet(event: str, facts: dict) -> None:
 
 
 def speckled(pose: np.ndarray) -> np.ndarray:
-    """Ray-cast a block on a floor, both with random speckles, from a camera-to-world matrix: RGB (H, W, 3) uint8."""
+    """Ray-cast a block on a floor, both with random speckles: RGB (H, W, 3) uint8. `pose` is the camera-to-world matrix."""
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     rays = np.stack([u / FOCAL, -v / FOCAL, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
     eye, half, middle = pose[:3, 3], np.array([0.6, 0.5, 0.4]), np.array([0, 0, 0.4])
@@ -47,7 +47,7 @@ def pictures():
 
 @pytest.fixture
 def photos(tmp_path, pictures):
-    """Write the photos, with a space in their names, but no cameras. Returns the folder."""
+    """Write the pictures as photo files with a space in their names, without cameras. Returns the folder."""
     for number, picture in enumerate(pictures):
         write(tmp_path / f"stone {number:02d}.png", picture)
     return tmp_path
@@ -144,7 +144,10 @@ def test_what_stands_still_contradicts_what_turns():
         places.append(seen[:, :2] / seen[:, 2:])
 
     def contradicted(poses: list[np.ndarray], reach: int, features: slice) -> np.ndarray:
-        """Return for each match whether the poses contradict it: bool (N,). Only photos at most `reach` apart are matched."""
+        """Return for each match whether the poses contradict it: bool (N,). Only photos at most `reach` apart are matched.
+
+        `features` selects the scene's points to match.
+        """
         far = []
         for a, b in pairs(count):
             if min(b - a, count - b + a) <= reach:

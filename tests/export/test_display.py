@@ -1,4 +1,4 @@
-"""Test the splats for viewers without lights: they look like the run and have the properties that such viewers read."""
+"""Test the export of splats for viewers without lights. They look like the run, and have the properties that such viewers read."""
 
 import shutil
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Test unwrapping: charts cover the whole surface, do not overlap, and have an even texel density."""
+"""Test UV unwrapping: charts cover the whole surface, do not overlap, and have an even texel density."""
 
 import numpy as np
 import pytest

@@ -60,7 +60,7 @@ def stacked(rows, *names):
 
 
 def covariances(rows):
-    """Compute the covariances (N, 3, 3) of a PLY's rows."""
+    """Compute the covariances (N, 3, 3) of the Gaussians in a PLY's rows."""
     scales = [np.exp(rows[f"scale_{i}"]) for i in range(3) if f"scale_{i}" in rows.dtype.names]
     scales = np.stack(scales + [0 * scales[0]] * (3 - len(scales)), axis=1)
     turn = Rotation.from_quat(stacked(rows, "rot_1", "rot_2", "rot_3", "rot_0")).as_matrix() * scales[:, None]

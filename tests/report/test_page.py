@@ -40,7 +40,7 @@ class Page(HTMLParser):
 
 
 def reported(*runs, out=None):
-    """Write the report page of runs, by default beside the first one, and parse it."""
+    """Write the report page of some runs, and parse it. The default file is report.html in the first run's folder."""
     out = out or runs[0] / "report.html"
     write_report(runs, out)
     return Page(out.read_text(encoding="utf-8"))

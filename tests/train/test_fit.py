@@ -40,7 +40,7 @@ def test_rates_change_only_beyond_the_presets(part, factor):
 def test_more_time_brings_more_of_all(ball_capture, tmp_path):
     """Check that a longer training has more surfels, more iterations and lower learning rates.
 
-    The shortest duration is less than the preset `quick` takes, the longest more than `standard` takes. No training is run to its end.
+    The durations range from less than the preset `quick` takes to more than `standard` takes. No training is run to its end.
     """
     capture = read_capture(ball_capture)
     said, found = [], []

@@ -176,10 +176,9 @@ def test_resumed_in_every_stage_it_is_the_same_run():
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e-6, 0.0), (1e-6, 1.0), (1e6, 0.0), (1.0, 1e5), (1e3, -1e7)])
 def test_a_capture_anywhere_is_learned_about_the_origin(scale, offset):
-    """Check that a capture is moved and scaled so that its cameras come out the same, up to rounding,
-    wherever it lies and however large it is.
+    """Check that cameras come out the same, up to rounding, wherever a capture lies and however large it is.
 
-    `to_capture` must map the cameras back to the capture's own coordinates.
+    Reading a capture moves and scales it. `to_capture` must map the cameras back to the capture's own coordinates.
     """
 
     def moved(pose: np.ndarray) -> np.ndarray:

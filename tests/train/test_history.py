@@ -164,7 +164,10 @@ def known_capture(ball_capture, tmp_path_factory):
 
 
 def test_errors_against_the_truth(known_capture, tmp_path):
-    """Check that the errors recorded during training agree with a second computation, and that training lowers them."""
+    """Check that the errors recorded by a training agree with an independent computation from the ground truth.
+
+    Check also that training lowers the errors.
+    """
     changes = "surfels.metallic=0.9", "surfels.budget=1500", "surfels.start=1500"
     made = make(known_capture, tmp_path / "run", *changes, total=250)
     start = made.measures.errors(made.state)

@@ -26,7 +26,7 @@ METALLIC = torch.tensor([[material.metallic] for _, material in BANDS])
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory) -> list[tuple]:
-    """Return camera, photo, and maps of alpha, material band (one-hot), normal and position of every training view."""
+    """Return for every training view its camera, photo, and maps of alpha, material band (one-hot), normal and position."""
     folder, found = tmp_path_factory.mktemp("bands"), []
     write_ball_capture(folder, 48, samples=2, bands=True)
     for view in read_capture(folder).train_views:
@@ -75,7 +75,7 @@ def learned(views) -> tuple[Tensor, Environment]:
 
 @pytest.mark.parametrize("start", [0.12, 0.88])
 def test_roughness_under_a_known_light(views, start):
-    """Check that roughness is recovered to 0.12 from either start, if light and metallic are given.
+    """Check that roughness is recovered to 0.12 from a low and from a high initial value, if light and metallic are given.
 
     The split-sum approximation causes the error: a true roughness of 0.5 is learned as 0.59, and 0.6 as 0.70.
     """

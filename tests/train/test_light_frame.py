@@ -1,4 +1,4 @@
-"""Test light that turns with the camera and photos of different exposures, on balls with known ground truth."""
+"""Test light that turns with the camera, and photos of different exposures. The scenes are balls with known ground truth."""
 
 import json
 import tomllib

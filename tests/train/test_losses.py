@@ -175,7 +175,7 @@ def test_far_away_where_hardly_anything_is(device):
 
 
 def test_nothing_waits_for_a_card(monkeypatch):
-    """Check that the objective reads no tensor's value, forward or backward, so that the CPU never waits for the card."""
+    """Check that computing the loss and its gradients reads no tensor's value, so the CPU never waits for the GPU."""
     emulate(monkeypatch)
     rendering, view = pictures(30, 20, masked=True, material=True)
     found = leaves(rendering, torch.float32)

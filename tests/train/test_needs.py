@@ -67,9 +67,9 @@ def test_what_is_matte_goes_without_specular(chalk):
 
 
 def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
-    """Check that a training of a matte scene leaves out a fifth of its remaining iterations.
+    """Check that training on a matte scene skips a fifth of its remaining iterations.
 
-    It keeps all iterations if needs.iterations is on, or if the user gave a duration.
+    None are skipped if the setting needs.iterations is on, or if the user gave a duration.
     """
     found = chalk.state.needs["iterations"]
     assert not found["needed"] and found["seconds"] > 0
@@ -134,7 +134,7 @@ def test_needs_are_written_down(chalk):
 
 
 def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
-    """Check that a resumed training keeps its decisions which optional parts, such as specular shading, to leave out.
+    """Check that a resumed training keeps its decisions about which optional parts to leave out, such as specular shading.
 
     Its parameters and light equal those of an uninterrupted run, bit for bit.
     """
@@ -151,7 +151,7 @@ def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):
 
 
 def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
-    """Check that a training keeps its decisions which optional parts to leave out, even if it returns to an earlier checkpoint.
+    """Check that a training keeps its decisions about which optional parts to leave out when it returns to an earlier checkpoint.
 
     It returns to a checkpoint if values become NaN or infinite.
     """
@@ -264,9 +264,9 @@ def test_what_the_part_about_the_mask_saves_is_timed(ball_capture, tmp_path, mon
 
 
 def test_texels_by_the_lobe():
-    """Check that the smallest cubemap is chosen whose texels are no wider than LOBE · roughness², in radians.
+    """Check the choice of the cubemap's side: the smallest whose texels are no wider than LOBE · roughness², in radians.
 
-    roughness² is the width of the specular lobe. A texel is π / 2 divided by the side wide. The side is limited to 16 … 256.
+    The width of the specular lobe is roughness². A texel is (π / 2) / side wide. The side is limited to 16 … 256.
     """
     lobe = lighting.Light.LOBE
     for roughness, side in ((1.0, 16), (0.5, 16), (0.4, 32), (0.2, 128), (0.05, 256)):

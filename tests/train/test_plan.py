@@ -26,10 +26,11 @@ def clock(monkeypatch) -> _Time:
 def _train(
     clock: _Time, made: Plan, pace, paused: float = 0.0, start: float = 12.0, first: int = 0, growth: float = 1.5
 ) -> tuple[int, float]:
-    """Simulate a training that follows a plan. Return the number of iterations and the seconds, without pauses.
+    """Simulate a training that follows the plan `made`. Return the number of iterations and the seconds, without pauses.
 
     `pace` gives the seconds of an iteration. Iterations begin at `first`, after `start` seconds; at iteration 100 the training pauses for
-    `paused` seconds. Writing the result at the end counts too.
+    `paused` seconds. Writing the result at the end counts too. The plan expects the
+    last iteration to take `growth` times as long as the first.
     """
     begun = clock.now
     clock.now += start

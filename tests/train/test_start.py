@@ -1,4 +1,4 @@
-"""Test placing the first surfels of captures without masks."""
+"""Test where the first surfels are placed in captures without masks."""
 
 import dataclasses
 

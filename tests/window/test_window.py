@@ -78,7 +78,7 @@ def test_the_tab_shows_in_a_window(tmp_path):
 
 @pytest.mark.window
 def test_an_artist_trains(tmp_path, ball_capture):
-    """Check an artist's whole session with the real trainer.
+    """Check a whole session in a Blender window with the real trainer.
 
     The session checks and trains a capture, shows live surfels, pauses, stops, resumes, finishes and imports the run. Then it compares
     with a photo, relights, edits, applies the edits, and renders in another Blender.
@@ -113,7 +113,7 @@ def test_an_artist_trains(tmp_path, ball_capture):
 @pytest.mark.window
 @pytest.mark.parametrize("letter", ["S", "L"])
 def test_closing_asks(tmp_path, ball_capture, letter):
-    """Check that Ctrl-Q asks about a running training, and that Cancel, Stop Cleanly and Leave Running do as they say."""
+    """Check that Ctrl-Q asks about a running training, and that the answers Cancel, Stop Cleanly and Leave Running do what they say."""
     capture = tmp_path / "photos"
     shutil.copytree(ball_capture, capture)
     report = in_window("close.py", tmp_path, sys.executable, capture, letter)
