@@ -106,7 +106,7 @@ def backward(loss: Tensor) -> None:
 
 @pytest.mark.parametrize("indirect", [False, True])
 def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, indirect):
-    """Check that a training step keeps all its tensors on the GPU, and reads a value back only once, in `how_many`.
+    """Check that a training step keeps all its tensors on the GPU, and reads a value back only once, in the rasteriser's `how_many`.
 
     The tensors are fake. Reading a value of one is an error, and so is making a tensor whose size depends on a value.
     """

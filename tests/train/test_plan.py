@@ -28,9 +28,10 @@ def _train(
 ) -> tuple[int, float]:
     """Simulate a training that follows the plan `made`. Return the number of iterations and the seconds, without pauses.
 
-    `pace` gives the seconds of an iteration. Iterations begin at `first`, after `start` seconds; at iteration 100 the training pauses for
-    `paused` seconds. Writing the result at the end counts too. The plan expects the
-    last iteration to take `growth` times as long as the first.
+    `pace` gives the seconds of an iteration. Iterations begin at `first`, after `start` seconds. At iteration 100 the training pauses for
+    `paused` seconds. Writing the result at the end counts too.
+
+    The plan expects the last iteration to take `growth` times as long as the first.
     """
     begun = clock.now
     clock.now += start

@@ -1,6 +1,6 @@
 """Train in a Blender window, then close Blender with simulated key presses. test_window.py starts this script.
 
-Arguments: the Python with the trainer, the capture, and the letter key that answers the closing dialogue. stage.py has the command line.
+Arguments: the Python with the trainer, the capture, and the letter key that answers the closing dialogue. stage.py shows the command line.
 """
 
 import bpy

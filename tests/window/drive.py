@@ -1,6 +1,6 @@
 """Install the extension in a Blender window, open its tab, take a screenshot and write a report.
 
-Its argument is the run folder. stage.py has the command line.
+Its argument is the run folder. stage.py shows the command line.
 """
 
 import importlib.util

@@ -1,6 +1,6 @@
 """Act as an artist in a Blender window: train a capture with the real trainer, and take a screenshot of each step.
 
-Arguments: the Python with the trainer, and the capture. stage.py has the command line.
+Arguments: the Python with the trainer, and the capture. stage.py shows the command line.
 """
 
 import contextlib
