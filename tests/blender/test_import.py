@@ -172,7 +172,8 @@ def test_other_programs_splats(scene, tmp_path, scales, normals):
 def test_splats_that_are_not_finite_are_left_out(run_folder, addon, tmp_path, capfd):
     """Check that an import leaves out splats with NaN or infinite values, as the trainer does.
 
-    Columns that the add-on does not know are kept, and exported again.
+    An infinite opacity is kept: stored as a logit, it stands for 0 or 1. Columns that the add-on does not know are kept, and exported
+    again.
     """
     columns = {**random_columns(), "semantic": np.arange(COUNT), "weight": np.linspace(0, 1, COUNT)}
     columns |= {f"f_rest_{i}": np.zeros(COUNT) for i in range(9)}
