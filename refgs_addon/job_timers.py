@@ -36,7 +36,7 @@ def _poll_jobs() -> float | None:
 
 
 def follow_other_processes() -> None:
-    """Start a timer that redraws the panel every two seconds, until no other process trains a run from the scenes' lists."""
+    """Start a timer that redraws the panel every two seconds. It ends when no run listed in the scenes is trained by another process."""
     if not bpy.app.timers.is_registered(_poll_other_processes):
         bpy.app.timers.register(_poll_other_processes, first_interval=OTHER_SECONDS, persistent=True)
 

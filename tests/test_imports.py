@@ -1,4 +1,4 @@
-"""Test scripts/check_imports.py: it finds forbidden imports and circles in small examples, and nothing in this repository."""
+"""Test scripts/check_imports.py: it finds forbidden imports and import cycles in small examples, and none in this repository."""
 
 import re
 import subprocess

@@ -166,7 +166,8 @@ def _check_passes(run, passes: list[str], format: str) -> None:
 def _relight(run, hdri: Path):
     """Load a panorama and return it as a light for the run.
 
-    If the run has inter-reflection (the object reflects itself), its rays are traced under this light first, with a progress bar.
+    If the object reflects itself (inter-reflection), rays are traced first to find how it looks in its own reflections under this light; a
+    progress bar shows that.
     """
     from refgs.formats.panorama import read_environment
 

@@ -96,11 +96,11 @@ def _attribute(tree: bpy.types.NodeTree, name: str, output: int) -> bpy.types.No
 
 
 def _normal(tree: bpy.types.NodeTree) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
-    """Add nodes for the bent normal n + u·dn/du + v·dn/dv in world space, and for the visible side.
+    """Add nodes for the normal at a position (u, v) on a curved splat, and for the splat's visible side.
 
-    Returns two outputs: the normal, and 1 on the splat's front, else 0. (u, v) is the position on the splat. Near silhouettes the bent
-    normal can point away from the viewer, and a BSDF would be black. Such a normal is turned until it is perpendicular to the view
-    direction.
+    The normal is n + u·dn/du + v·dn/dv, in world space. Returns two outputs: the normal, and 1 on the splat's front, else 0. Near
+    silhouettes the normal can point away from the viewer, and a BSDF would be black. Such a normal is turned until it is perpendicular to
+    the view direction.
     """
     u_v = add(tree, "ShaderNodeSeparateXYZ", {"Vector": _attribute(tree, "gaussian", VECTOR)}).outputs
     centre = _attribute(tree, "normal", VECTOR)

@@ -75,7 +75,8 @@ def after(seconds):
 
 
 def act(steps):
-    """Run a script's steps in the window. `steps` is a generator: it yields a function, and goes on once this function returns true.
+    """Run a script's steps in the window. `steps` is a generator that yields conditions: functions that are called
+    again and again until they return true. Then the generator runs on to the next condition.
 
     Blender quits after the last step, after an error, or if a wait takes longer than PATIENCE seconds.
     """

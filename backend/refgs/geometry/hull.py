@@ -132,7 +132,7 @@ def _carve(masks, cameras, low, high, resolution):
     """Compare the voxels of the box from `low` to `high` with all masks, to carve the visual hull.
 
     Returns three arrays (resolution, resolution, resolution): the smallest alpha of each voxel in any view, the second smallest, and the
-    view with the smallest. A voxel that fewer than an eighth of the views see counts as empty, because hardly any mask confirms it.
+    view with the smallest. Voxels seen by fewer than an eighth of the views count as empty.
     """
     masks, voxel = [np.ascontiguousarray(mask, np.float32) for mask in masks], (high - low) / resolution
     views = [_silhouette(mask, camera, low, voxel) for mask, camera in zip(masks, cameras, strict=True)]

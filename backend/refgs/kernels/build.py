@@ -65,7 +65,7 @@ def _fingerprint(target: Target) -> str:
 
 
 def sizes() -> dict[str, int]:
-    """Find the library's functions that return a size. Returns their names, and how many integers each takes as arguments."""
+    """Find the kernel library's functions that return one integer. Returns the number of integers that each takes, by name."""
     text = "".join((HERE / source).read_text(encoding="utf-8") for source in SOURCES)
     found = re.findall(r"^EXPORT int64_t (\w+)\((.*?)\)", text, re.MULTILINE)
     return {name: parameters.count("int64_t") for name, parameters in found}

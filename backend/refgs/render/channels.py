@@ -11,7 +11,7 @@ from refgs.settings import RenderSettings
 
 
 def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirect: bool) -> list[Tensor]:
-    """List the features (N,) or (N, C) of the surfels that `shade` reads, in its order. They are computed for one camera.
+    """List the surfels' features that are blended for a picture and then shaded: tensors (N,) or (N, C), in the order that `shade` reads.
 
     - normal, albedo; no more than these if `settings.reflection` is "none"
     - metallic, roughness

@@ -13,10 +13,10 @@ MIRRORED = 1.2  # factor of an iteration's time for inter-reflection: 1 without,
 
 
 def iterations_time(growth: float, progress: float) -> float:
-    """Compute how long all iterations up to a progress of 0..1 take together, relative to the whole training.
+    """Compute how long all iterations up to a progress of 0..1 take together.
 
-    The unit is the time of the whole training if every iteration took as long as the first. In fact iterations slow down: at the end, one
-    takes `growth` times as long as at the start.
+    Iterations slow down: the last takes `growth` times as long as the first. The unit of the result is the time of the whole training if
+    iterations did not slow down, so the result for a progress of 1 is more than 1.
     """
     first, last = GROWS
     ramp = min(max(progress - first, 0.0), last - first)

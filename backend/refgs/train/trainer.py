@@ -127,7 +127,8 @@ class Trainer:
         history.record(self.state, self.measures, float(means["loss"]), decibels(float(means["square"])))
 
     def _should_stop(self, stop: Callable[[], bool]) -> bool:
-        """Call `stop` and return its answer. `stop` may pause the training by returning late; the plan does not count this time."""
+        """Call `stop` and return its answer. While `stop` does not return, the training is paused; a time limit
+        does not count that time."""
         begun = time.perf_counter()
         stopped = stop()
         self.state.plan.wait(time.perf_counter() - begun)
