@@ -61,8 +61,8 @@ def _more_metal(old: Explanation, size: float) -> Explanation:
 class Trade(NamedTuple):
     """Hold two changes of the scene that may cancel in the pictures, such as a brighter light and a darker base colour.
 
-    `change` is the first one, and `size` is how strong it is. `made_up` is the second one, which may make up for the first. `words` names
-    the first change for the user, and `answer` names the second.
+    `change` makes the first change, with the strength `size`. `made_up` makes the second change. Two texts describe them to the user:
+    `words` the first change, and `answer` what the second one changes.
     """
 
     words: str
@@ -91,7 +91,8 @@ def ambiguities(state: State) -> dict[str, dict]:
     - `error`: how much the pictures differ from the photos.
     - `what`: a message for the user. It is present only if `left` is less than UNSEEN times `error`.
 
-    `alone`, `left` and `error` are root mean squares of encoded colours. Changes are linear estimates, from a small step of each change.
+    `alone`, `left` and `error` are root mean squares of differences of encoded colours. To measure how a change alters the pictures,
+    a small part of it is made, and the difference is scaled up to the whole change.
     """
     light = state.environment()
     if light is None:

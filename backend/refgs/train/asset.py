@@ -76,7 +76,9 @@ def _constant_columns(state: State, surfels: Surfels, kept: Tensor) -> dict[str,
 
 
 def _with_relightable_albedo(surfels: Surfels, environment: Environment, state: State) -> Surfels:
-    """Return surfels that have both an albedo, for viewers that light them, and SH colours, for viewers without lights.
+    """Return surfels that have both an albedo and SH colours.
+
+    Programs that light the surfels use the albedo. Programs that display the surfels without lighting use the SH colours.
 
     If the training learned diffuse colour as SH, compute the albedo: the mean SH colour divided by the irradiance, or for metals the
     learned reflectance. If the training learned the albedo, compute the SH colour: the albedo times the irradiance.
@@ -113,8 +115,8 @@ def _irradiance(surfels: Surfels, environment: Environment, state: State) -> Ten
 def _seen_side(surfels: Surfels, state: State) -> Tensor:
     """Find out which side of each surfel (N,) the training views see.
 
-    1 is the side that the normal points to, −1 is the other side, and 0 means that no view sees the surfel. If no view sees any surfel, all
-    count as seen.
+    1 is the side that the normal points to, −1 is the other side, and 0 means that no view sees the surfel. If no view sees any surfel, the
+    result is 1 for all.
     """
     surfels = Surfels(*(value.detach() for value in surfels))
     normals = surfels.normals()

@@ -136,7 +136,7 @@ def faint(settings: DensifySettings, rates: RateSettings, iteration: int, total:
 
 @torch.no_grad()
 def propagate_normals(parameters: Parameters, optimizer: Adam, settings: PropagationSettings) -> None:
-    """Propagate normals from mirror-like surfels to the surfels around them (paper §3.3).
+    """Propagate normals from mirror-like surfels to the surfels around them (Ref-Gaussian paper, §3.3).
 
     Smooth, metallic surfels are enlarged, and all opacities are raised to at least `settings.opacity`. The enlarged surfels then cover
     their neighbours' pixels, which are shaded with the enlarged surfels' normals. Further training adapts the neighbours to these normals.
@@ -178,9 +178,9 @@ def fewer_surfels(state: State) -> None:
 def take(parameters: Parameters, optimizer: Adam, index: Tensor, fresh: Sequence[Tensor] = ()) -> None:
     """Replace all surfels by the rows `index` of their parameters. A row may be taken more than once.
 
-    Adam's moments move with their rows. Only the rows of the result that `fresh` lists start with zero moments. Adam then moves these rows
-    faster than others at first: pictures get worse for a while, but captures without masks end better. If memory runs out, all surfels stay
-    as they were.
+    Each row keeps its Adam moments. Only the rows whose indices in the result are in `fresh` start with zero moments. Adam then moves
+    these rows faster than others at first. Pictures get worse for a while, but for captures without masks, the final result is better. If
+    memory runs out, all surfels stay as they were.
     """
     groups = [group for group in optimizer.param_groups if group["name"] in parameters]  # without light and exposures
     made = []

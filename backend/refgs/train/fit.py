@@ -20,11 +20,11 @@ STEPS, MOST = 64, 2.0  # steps in which settings richer than quick are tried, an
 def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, device: str, report: Report) -> Trainer:
     """Make a trainer whose settings let the training end within `plan.minutes`.
 
-    A few iterations with the preset `quick` measure how long an iteration takes. Then the richest settings that fit into the time are
-    chosen from those that `between` makes, from `quick` to beyond `standard`. If even `quick` takes too long, or the richest settings leave
-    time to spare, the number of iterations is changed instead.
+    First, run a few iterations with the preset `quick` to measure how long an iteration takes. Then try settings from `quick` to beyond
+    `standard` (see `between`), and choose the most detailed ones whose iterations all fit. If none fit, choose `quick`. Finally,
+    set the number of iterations to as many as fit.
 
-    If the settings stay those of `quick`, the measured iterations are kept as the first of the training. `changes` are the user's settings,
+    If `quick` is chosen, the training continues after the measured iterations. Otherwise it starts anew. `changes` are the user's settings,
     such as "train.seed=1".
     """
     quick, standard = (load_settings(preset, changes) for preset in ("quick", "standard"))
@@ -96,9 +96,9 @@ def between(quick: Settings, standard: Settings, part: float) -> Settings:
 def _scheduled(settings: Settings, iterations: float, quick: Settings, standard: Settings) -> Settings:
     """Set the number of iterations, and adapt the schedule and the learning rates to it.
 
-    The learning rates suit every number of iterations from that of `quick` to that of `standard`. Outside this range, they are multiplied
-    by √(nearest number in the range / iterations), at most by FASTEST. This keeps the total noise of the training constant, because each
-    step adds the noise of one view.
+    The learning rates stay as they are if the number of iterations lies between that of `quick` and that of `standard`. Otherwise they are
+    multiplied by √(nearest number in this range / iterations), but never by more than FASTEST. Each step adds noise, because it uses only
+    one view. With this factor, the noise of all steps together stays about the same.
     """
     tables, part = settings.model_dump(), iterations / settings.train.iterations
     usual = min(max(iterations, quick.train.iterations), standard.train.iterations)

@@ -27,9 +27,12 @@ def due(iteration: int) -> bool:
 def allowed(iteration: int, total: int, seconds: float) -> float:
     """Return how many seconds may have been spent on measuring errors before this iteration.
 
-    If more were spent, errors are not measured now. `total` is the training's number of iterations, and `seconds` is how long it has taken
-    so far. At the end, the limit is the fraction SHARE of the training's time. Before, it grows with the logarithm of the iteration,
-    because errors are measured at iterations that are evenly spaced by logarithm. FLIP has a limit of its own, of the same size.
+    If measuring has taken longer than this limit, errors are not measured now. `total` is the training's number of iterations, and
+    `seconds` is how long it has taken so far.
+
+    At the end of the training, the limit is the fraction SHARE of the training's time. Before, it grows with the logarithm of the
+    iteration, because errors are measured at iterations that are evenly spaced by logarithm. The time for the image error FLIP is counted
+    separately, and compared with the same limit.
     """
     lines = math.log(max(total / FIRST, 1)) or 1.0
     passed = min(math.log(max(iteration / FIRST, 1)) / lines, 1.0)

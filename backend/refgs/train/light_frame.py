@@ -86,9 +86,11 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
 
 
 def _visibility(camera: Camera, positions: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return two arrays for the points whose `indices` are given: whether the point is inside the picture, and how far it is hidden.
+    """Find out whether the camera's picture contains the points with these `indices`, and whether other points may hide them.
 
-    The latter is its distance in world units behind the nearest of all `positions` (N, 3) at the same pixel.
+    Returns two arrays with an entry for each of these points. The first tells whether the point is inside the picture. The second is how
+    far the point lies behind the nearest point at the same pixel or next to it: the difference of their depths, in world units. The nearest
+    point is searched among all `positions` (N, 3).
     """
     pixels, depth = project(camera, positions)
     ahead = inside(camera, pixels, depth)

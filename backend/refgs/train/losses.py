@@ -1,4 +1,4 @@
-"""Compute the training loss (paper §3.3): colour, normal consistency, edge-aware smoothness, and further terms such as the mask."""
+"""Compute the training loss (Ref-Gaussian paper, §3.3): colour, normal consistency, edge-aware smoothness, and further terms."""
 
 from typing import NamedTuple
 
@@ -162,9 +162,10 @@ def objective(
 
     - Colour: (1 − λ) L1 + λ D-SSIM of sRGB pictures. The photo is composited over `background`. The rendering is clipped only where the
       photo is clipped, so that other pixels that are too bright still have a gradient.
-    - Normals: 1 − ÑᵀN where the surface is opaque around the pixel. Ñ is the normal of the depth map, by central differences.
-    - Smoothness: ‖∇N‖ exp(−‖∇C‖) where the surface is opaque, with the photo's colour C and forward differences. Metallic and roughness are
-      smoothed with a weight of their own, because photos do not determine them where the mirrored light is uniform.
+    - Normals: 1 − ÑᵀN where the surface is opaque around the pixel. N is the rendered normal. Ñ is the normal of the depth map, by central
+      differences.
+    - Smoothness: ‖∇N‖ exp(−‖∇C‖) where the surface is opaque. C is the photo's colour, and ∇ takes forward differences. Metallic and
+      roughness are smoothed with a weight of their own, because photos do not determine them where the mirrored light is uniform.
     - Mask: |α − mask|.
     - Light: the squared difference between `light` (3,), the mean radiance that the object mirrors, and grey. Without this term, white
       balance drifts, because warm metal under neutral light looks almost like neutral metal under warm light.

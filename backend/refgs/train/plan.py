@@ -15,8 +15,8 @@ MIRRORED = 1.2  # factor of an iteration's time for inter-reflection: 1 without,
 def iterations_time(growth: float, progress: float) -> float:
     """Compute how long all iterations up to a progress of 0..1 take together.
 
-    Iterations slow down: the last takes `growth` times as long as the first. The unit of the result is the time of the whole training if
-    iterations did not slow down, so the result for a progress of 1 is more than 1.
+    Iterations slow down: the last takes `growth` times as long as the first. If all were as fast as the first, the whole training would
+    take 1 unit of time. The result is in this unit, so that it is more than 1 for a progress of 1.
     """
     first, last = GROWS
     ramp = min(max(progress - first, 0.0), last - first)
@@ -60,8 +60,9 @@ class Plan:
     def total(self, iteration: int, views: int) -> int | None:
         """Choose the total number of iterations so that the training ends in time.
 
-        Returns None at iterations at which the choice is not made anew. The choice depends on how long iterations have taken so far.
-        `views` is the number of photos, because writing the asset renders all of them.
+        The choice depends on how long iterations have taken so far. It is made FIRST iterations after `begin`, and then at every multiple
+        of EVERY. At other iterations, or without a time limit, returns None. `views` is the number of photos. They count because writing
+        the asset renders all of them.
         """
         done = iteration - self._marks[0][0]
         if self.minutes is None or not (done == FIRST or (done > 0 and iteration % EVERY == 0)):

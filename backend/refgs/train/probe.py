@@ -86,8 +86,8 @@ def psnr_loss(state: State, change: Change) -> float:
 def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: bool = False) -> float:
     """Measure how many seconds a change of what is rendered would save in all remaining iterations.
 
-    An iteration is timed without the change and with it, except for the optimiser's step. If `whole` is true, the iteration without the
-    change renders the whole photo, and the one with it renders only the crop that the training uses.
+    Time two iterations: one without the change, and one with it. The optimiser's step is not timed. Both render only the crop of the photo
+    that the training uses. If `whole` is true, the first one renders the whole photo, so that the result includes what cropping saves.
     """
     fastest = [math.inf, math.inf]
     for _ in range(REPEATS):
@@ -132,7 +132,7 @@ def specular_explains(state: State) -> float:
     """Compute how many dB of PSNR the training views lose if reflections no longer change with the view.
 
     For the comparison, each surfel's specular colour is replaced by its mean over the photos. A matte surface could learn this mean as
-    albedo, so that the loss shows what only specular shading can explain.
+    albedo. The dB lost therefore show what only specular shading can explain.
     """
     inputs, some = state.inputs(), spread_views(state, SEVERAL)
     photos, dull = [state.photo(view) for view in some], without_specular(inputs)

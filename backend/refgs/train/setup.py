@@ -101,7 +101,7 @@ def _stop_learning_unused(state: State) -> None:
 def start_deferred(state: State) -> None:
     """Start the second stage of a training, deferred shading: pixels are shaded after blending. The first stage shades each surfel.
 
-    The surfels' geometry is kept. Colours, materials and light are reset and learned anew (paper §3.3).
+    The surfels' geometry is kept. Colours, materials and light are reset and learned anew (Ref-Gaussian paper, §3.3).
     """
     state.initial = False
     for name, row in start_appearance(state.settings).items():

@@ -20,9 +20,11 @@ AROUND = 0.5  # part of the surfels, at the most, that lie outside the region
 def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings) -> tuple[Parameters, int, str]:
     """Make the initial parameters of the surfels.
 
-    Returns the parameters, the number of surfels on the visual hull, and a message for the user that says where the surfels start. If all
-    photos have masks, these surfels come first, and the others start inside the hull, because masks do not show hollows. Without masks,
-    surfels start at structure-from-motion points or at random, and the number means nothing.
+    Returns the parameters, the number of surfels on the visual hull, and a message for the user that says where the surfels start.
+
+    If all photos have masks, most surfels start on the visual hull of the masks. Their rows come first in the parameters. The other surfels
+    start inside the hull, because masks do not show hollows. If any photo has no mask, surfels start at structure-from-motion points or at
+    random positions. The returned number then has no meaning.
     """
     count, seed = min(settings.surfels.start, settings.surfels.budget), settings.train.seed
     colours, opacity, shown = None, settings.surfels.opacity, count

@@ -96,7 +96,8 @@ class State:
     def residual_start(self) -> float:
         """Return the progress (0..1) from which on the residual learns, or 1 if it never learns.
 
-        The residual is a colour that changes with the direction. It is added for what material and light do not explain of the photos.
+        The residual is a colour that changes with the direction. It is added to the shaded colour, and learns those parts of the photos
+        that material and light do not explain.
         """
         settings = self.settings
         return settings.residual.start if self.method.deferred and settings.render.diffuse == "irradiance" else 1.0

@@ -1,4 +1,4 @@
-"""Trace inter-reflection on a mesh made from the surfels. Explain why a training does not trace it."""
+"""Trace inter-reflection on a mesh made from the surfels. For trainings that do not trace it, give the user the reason."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Decide whether a scene needs specular shading, and columns for metallic and roughness in splats.ply."""
+"""Decide whether a scene needs specular shading, and whether splats.ply needs columns for metallic and roughness."""
 
 from typing import Any
 

@@ -48,7 +48,7 @@ class Need:
     def due(self, state: State, moment: Moment, progress: float) -> bool:
         """Tell whether to decide about this optional part now, at this moment of the training.
 
-        It is not called if the user's setting is "on", or after the decision has been made.
+        This method is not called if the user's setting is "on", or if the decision has already been made.
         """
         return True
 

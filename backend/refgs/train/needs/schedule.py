@@ -1,4 +1,7 @@
-"""Decide whether a training needs its first stage, which shades each surfel instead of each pixel, and all of its iterations."""
+"""Decide whether a training can skip two things: its first stage, and the last fifth of its remaining iterations.
+
+The first stage shades each surfel, before blending. The second stage shades each pixel, after blending.
+"""
 
 from typing import Any
 
@@ -26,9 +29,9 @@ class Initial(Need):
 
 
 class Iterations(Need):
-    """Decide whether the training needs the last fifth of its iterations.
+    """Decide whether the training needs the last fifth of its remaining iterations. A matte scene does not.
 
-    A matte scene does not need them. A training that must end within a given time does all of its iterations.
+    If the user gave a time limit, nothing is decided here, because `Plan` then chooses the number of iterations that fills the time.
     """
 
     name, what = "iterations", "all iterations"
