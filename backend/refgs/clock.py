@@ -3,8 +3,8 @@
 The decorator `timed` names a function, or an autograd Function, as a part. While `Clock.iteration` is active, the run time of its calls is
 added to that part. A part that is called inside another part counts for the outer one only.
 
-On the CPU every iteration is measured, which costs about 25 µs. A GPU runs asynchronously. There only one in `SAMPLED` iterations is
-measured, by CUDA events, and its times are multiplied by `SAMPLED`.
+On the CPU every iteration is measured, which takes about 25 µs each time. A GPU runs asynchronously. There only one in `SAMPLED`
+iterations is measured, by CUDA events, and its times are multiplied by `SAMPLED`.
 """
 
 import functools
@@ -52,10 +52,11 @@ class Clock:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Time a `with` block as the part `name`. It is meant for work that is done only at intervals and is always measured.
+        """Time a `with` block as the part `name`.
 
-        The time of other `part` blocks inside it is subtracted. The clock does not wait for the GPU. So the block must end with its results
-        on the CPU.
+        Use it for work that is not done in every iteration. The block is timed whenever it runs, on a GPU too. The time of other `part`
+        blocks inside it is subtracted. The clock does not wait for the GPU, so the block itself must: for example, by copying its results
+        to the CPU.
         """
         begun, known = time.perf_counter(), sum(self.seconds.values())
         before, self._within = self._within, True

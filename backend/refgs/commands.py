@@ -166,8 +166,8 @@ def _check_passes(run, passes: list[str], format: str) -> None:
 def _relight(run, hdri: Path):
     """Load a panorama and return it as a light for the run.
 
-    If the object reflects itself (inter-reflection), rays are traced first to find how it looks in its own reflections under this light; a
-    progress bar shows that.
+    If the run has inter-reflection, also compute the object's reflections of itself under this light. This traces rays and shows a progress
+    bar. The run caches the result for rendering. Raises InputError if the run has no materials.
     """
     from refgs.formats.panorama import read_environment
 

@@ -77,7 +77,7 @@ def _check_blender(root: Path) -> None:
 
 
 def _child(root: Path, what: str, module: str, *arguments: object) -> None:
-    """Run a Python module that needs Blender in a child process.
+    """Start a child process that runs a Python module which uses Blender, and wait for its end.
 
     The module prints its progress as JSON lines, and a progress bar with the label `what` shows it. Raises InputError with the module's
     last line if it exits with status 2.

@@ -72,9 +72,9 @@ class Run:
     def relit(self, light: Environment, progress: Progress = lambda done, total: None) -> Surfels:
         """Return the surfels as they look under another light.
 
-        If the run has a mesh for it, the object's reflections in itself are traced under that light too. The first call takes seconds,
-        because rays are traced; later calls are faster. The result for the last light is cached. progress(done, total) is called while rays
-        are traced.
+        If the run has inter-reflection, the object's reflections of itself are computed for this light too, with rays against the run's
+        mesh. The first call traces the rays, which takes seconds. Later calls reuse them. The result for the last light is cached.
+        progress(done, total) is called while rays are traced.
         """
         if self.occluder is None:
             return self.surfels().without_directions()  # learned under the recovered light: wrong under this one
@@ -191,8 +191,8 @@ def open_run(folder: Path) -> Run:
 def light_of(panorama: np.ndarray, settings: Settings, reference: Camera | None = None) -> Environment:
     """Make a light from an equirectangular image (H, W, 3) of linear radiance, in Blender's orientation.
 
-    Without `reference`, the light stands still in the world. With `reference`, it turns with the camera, and the image shows it in the
-    orientation that it has for the camera `reference`.
+    Without `reference`, the light stands still in the world. With `reference`, the light turns with the camera. The image then shows how
+    the light is oriented in the world when the photo of the camera `reference` is taken.
     """
     panorama = method_of(settings.render).light.from_linear(panorama)
     return Environment.from_panorama(panorama, settings.environment.resolution, reference)

@@ -218,8 +218,9 @@ def _logged(out: Path) -> Iterator[None]:
 
 
 def peak_memory(children: bool = False) -> int | None:
-    """Return the peak memory of this process in bytes. With `children`, return the peak memory of its largest ended child process.
+    """Return the peak memory of this process in bytes.
 
+    With `children`, return the peak memory of one child process instead: the largest among those that have ended.
     Return None on Windows, where this cannot be read.
     """
     try:

@@ -71,7 +71,7 @@ class During(_Command):
 
 
 class Keep(_Command):
-    """Command that sets whether jobs continue when the input is closed (`on` = True) or are ended.
+    """Command that sets what happens to jobs when the input ends: they continue if `on` is True, otherwise they are ended.
 
     It takes effect at once, even while a job is running.
     """
@@ -134,7 +134,8 @@ class Worker:
     def send(self, event: str, facts: dict[str, Any]) -> None:
         """Write an event to the output as a JSON line.
 
-        If the reader is gone, act as if the input had ended. Ignore this if a `Keep` command has told jobs to go on.
+        If writing fails because nobody reads the output any more, act as if the input had ended. After a `Keep` command with `on` = True,
+        ignore the failure instead, so that jobs continue.
         """
         try:
             self._events.write(json.dumps({"event": event} | facts) + "\n")

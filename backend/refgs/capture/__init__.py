@@ -39,7 +39,10 @@ __all__ = [
 
 
 def find_layout(folder: Path) -> str | None:
-    """Return the layout of a folder's camera files: "nerf-blender", "nerfstudio", "colmap" or "nero". None without cameras."""
+    """Return the layout of a folder's camera files: "nerf-blender", "nerfstudio", "colmap" or "nero".
+
+    Return None if the folder has no camera files.
+    """
     if (folder / "transforms_train.json").is_file():
         return "nerf-blender"
     if (folder / "transforms.json").is_file():
@@ -52,8 +55,9 @@ def find_layout(folder: Path) -> str | None:
 def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
     """Read the photos' cameras from a capture's folder, and convert them to the run's frame, the world coordinates used in training.
 
-    `wanted` may set a box around the part to reconstruct, and an up direction. Both are given in the run's frame as it is without them.
-    Only the photos' headers and some masks are read; photos are not decoded. Raises InputError with a message of one line.
+    `wanted` may set a box around the part to reconstruct, and an up direction. Give both in the run's frame that results from a call
+    without `wanted`. Only the photos' headers and some masks are read; photos are not decoded.
+    Raises InputError with a message of one line.
     """
     folder = Path(folder)
     layout = _check_layout(folder)
@@ -131,7 +135,7 @@ def _check_photos(views: list[View]) -> None:
 
 
 def _shared_photos(views: list[View]) -> list[str]:
-    """Return a warning if a photo is both a training view and a test view, otherwise an empty list."""
+    """Check whether photos are both training and test views. Return a list with one warning if so, otherwise an empty list."""
     tested, trained = ({view.image_path for view in views if view.split == split} for split in ("test", "train"))
     shared = tested & trained
     if not shared:
@@ -181,10 +185,10 @@ def _unique_names(views: list[View]) -> list[View]:
 
 
 def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.ndarray]], list[str]]:
-    """Sample small masks from the views.
+    """Choose some of the views that have masks, and reduce their masks to low resolution.
 
-    Return the views, the pairs (view, mask), and warnings. If all masks are white everywhere they are useless: the views are then returned
-    without masks, the pairs are empty, and there is a warning.
+    Return all views, a list of the pairs (view, reduced mask), and warnings. If the chosen masks are all white everywhere, they are
+    useless: then return the views without masks, an empty list of pairs, and a warning.
     """
     silhouettes = sample_silhouettes(views)
     if silhouettes or not any(view.masked for view in views):

@@ -1,7 +1,7 @@
 """Read COLMAP captures: a sparse model in `sparse/0` or `sparse`, binary or text, with photos in `images` or in the capture's folder.
 
 Some data sets, such as the real scenes of Ref-NeRF and mip-NeRF 360, also have reduced photos in `images_2`, `images_4` and `images_8`. To
-use them, name such a folder as the capture. Reduced photos may have another file suffix than the photos that the model names.
+use them, pass the path of such a folder as the capture's. Reduced photos may have another file suffix than the photos that the model names.
 """
 
 import re

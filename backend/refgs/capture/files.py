@@ -39,7 +39,8 @@ def find_photos(folder: Path) -> list[Path]:
 def report_missing(source: Path, missing: list[str], total: int) -> None:
     """Raise InputError if any photos are missing.
 
-    `source` is the file or folder that names the photos, `missing` are the names of the missing ones, and `total` is the number of all.
+    `missing` are the names of the missing photos. `total` is the number of all photos that the capture lists, missing or not. `source`
+    is the file or folder that lists them; the error message begins with it.
     """
     if missing:
         raise InputError(
@@ -68,8 +69,8 @@ class Masks:
     def find(self, image: Path, named: object, where: str) -> Path | None:
         """Return the mask file of the photo `image`, None if it has none.
 
-        `named` is the mask's path if the capture's file gives one, relative to the folder. Otherwise the mask is found by the photo's name.
-        Raises InputError if the mask `named` is missing. `where` is a name for the camera in the error message.
+        `named` is the mask's path, relative to the capture's folder, if the capture's JSON file gives one. If `named` is empty, the mask is
+        found by the photo's name. Raises InputError if the mask `named` is missing. `where` is a name for the camera in the error message.
         """
         if named:
             path = find_image(self.folder / str(named).replace("\\", "/"))

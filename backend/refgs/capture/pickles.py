@@ -1,7 +1,8 @@
 """Read pickled NumPy arrays safely.
 
-`pickle.load` can run any code that a file names, and captures come from untrusted sources. This reader accepts only the few names that
-pickled arrays need, and loads them into plain containers. It refuses any other name. The arrays are then made from the containers' bytes.
+`pickle.load` can call any function that the file names, and captures come from untrusted sources. This reader accepts only the few classes
+and functions that pickled arrays need. It replaces them by its own, which only keep an array's bytes, shape and type. The arrays are made
+from these later. A file that names any other class or function is refused.
 """
 
 import pickle

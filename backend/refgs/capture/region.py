@@ -30,10 +30,13 @@ class Region:
 def find_region(
     views: list[View], up: np.ndarray, points: np.ndarray | None, silhouettes: list[tuple[View, np.ndarray]]
 ) -> Region:
-    """Find the ball that the cameras look at. Use the poses first, then make it tighter by masks, or without masks by the points.
+    """Find the region of interest: a ball around what the cameras look at.
 
-    `up` is the world's up direction. `points` are from structure from motion, or None. `silhouettes` are pairs of a view and its small
-    mask.
+    First estimate it from the poses. Then fit it to the masked object if there are masks, otherwise to the points. If
+    that fails, keep the estimate. If the cameras look outwards, as in a room, return a ball around the cameras instead.
+
+    `up` is the world's up direction. `points` are from structure from motion, or None. `silhouettes` are the pairs that
+    `sample_silhouettes` returns.
     """
     centre, distances, miss = look_at_centre(views)
     ahead = float((distances > 0).mean())
@@ -68,9 +71,10 @@ def is_near(region: Region) -> bool:
 
 
 def region_in(box: Box, views: list[View], silhouettes: list[tuple[View, np.ndarray]]) -> Region:
-    """Find the region of interest inside a box. With masks it is a ball about the masked object; without masks it is a ball about the box.
+    """Find the region of interest inside a box: a ball around the part of the masked object that is in the box.
 
-    `silhouettes` are pairs of a view and its small mask. Raises InputError if no photo shows the box.
+    If there are no masks, or nothing in the box fits them, return the ball around the box. `silhouettes` are the pairs that
+    `sample_silhouettes` returns. Raises InputError if no photo shows the box.
     """
     if not any(inside(view.camera, *project(view.camera, box.grid(5))).any() for view in views):
         raise InputError("no photo shows the region: put its box where the cameras look")
@@ -128,9 +132,10 @@ def run_frame(up: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
 
 
 def sample_silhouettes(views: list[View], count: int = 24) -> list[tuple[View, np.ndarray]]:
-    """Return pairs of a view and its small mask, for about `count` views spread over the capture.
+    """Choose about `count` of the views that have masks, and reduce their masks to low resolution.
 
-    Return an empty list if there are no masks, or if they are white everywhere. Raises InputError if all masks are empty.
+    The views are evenly spaced in the list. Return the pairs (view, reduced mask); a reduced mask is bool (H, W). Return an empty list if
+    there are no masks, or if they are white everywhere. Raises InputError if all masks are empty.
     """
     masked = [view for view in views if view.masked]
     chosen = masked[:: max(1, len(masked) // count)]
@@ -176,9 +181,9 @@ def _carve(
 ) -> tuple | None:
     """Return a ball (centre, radius) about the visual hull: the space that lies inside the masks of the photos. None if it is empty.
 
-    The search covers the cube centre ± half, and only the inside of `box` if given. It tests a grid of 49³ points, twice: the second grid
-    covers what the first has left. A point is kept if at least half of the views see it, and if it is inside the mask in nine tenths of
-    these.
+    Test a grid of 49³ points in the cube centre ± half. Then test a second grid of 49³ points, over the bounding box of the points that
+    were kept. A point is kept if at least half of the views (and at least two) see it, and if it is inside the mask in nine tenths of
+    these. If `box` is given, only points inside it are kept.
     """
     low, high = centre - half, centre + half
     for _ in range(2):

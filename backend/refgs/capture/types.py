@@ -52,7 +52,8 @@ class Capture:
     - `centre` (3,) and `radius` are the region of interest: a ball about the object, or about a room's foreground.
     - `bounded` is a guess: True if the photos surround one object, False if they show a room or an open scene. `bounded_because` says why.
     - `box` is the user's box around the part to reconstruct, or None. It makes the region of interest smaller.
-    - `reach` is the radius of a ball about `centre` that also contains the region of interest as it is without the box.
+    - `reach` is the radius of a ball about `centre` that contains the whole region of interest found without the box. It equals `radius` if
+      there is no box.
     - `warnings` are lines of text about what was left out or looks wrong.
     """
 
