@@ -170,16 +170,17 @@ def relit(
     pairs: Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]],
     measures: tuple[Callable[[np.ndarray, np.ndarray], float], ...] = (psnr, flip),
 ) -> dict[str, float]:
-    """Measure the errors of an object's renderings under another light. Returns means over the views, by name.
+    """Measure the errors of an object's renderings under another light, as means over the views.
 
     Each call of `pairs()` yields the rendered and the true picture of every view, in premultiplied linear RGBA. Both are composited over
-    white and then compared by each function in `measures`. For `psnr`, for example, the results are:
+    white and then compared by each function in `measures`. Returns a dictionary. It has two entries for each function, and one factor:
 
-    - psnr_raw: the PSNR of the renderings as they are
-    - psnr_aligned: the PSNR after the renderings' radiance is multiplied by `scale`
-    - scale: the least-squares factor, the same for all views. It is needed because photos do not tell how bright the base colours are.
+    - NAME_raw, such as psnr_raw: the result for the renderings as they are
+    - NAME_aligned, such as psnr_aligned: the result after the renderings' radiance is multiplied by `scale`
+    - scale: a least-squares factor, the same for all views and functions
 
-    The fit of `scale` leaves out pixels of 1 or brighter in either picture, such as a sun in a mirror. A few of them would dominate it.
+    The factor is needed because photos do not tell how bright the base colours are. Its fit leaves out pixels that are 1 or brighter in
+    either picture, such as a sun in a mirror. A few of them would dominate the fit.
     """
     product = power = 0.0
     for image, reference in pairs():
@@ -205,12 +206,13 @@ def _elevations(height: int) -> np.ndarray:
 
 
 def environment_log_rmse(environment: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
-    """Compute the RMS error of a recovered panorama's log radiance. Returns the error and a factor, the brightness correction.
+    """Compute the RMS error of a recovered panorama's log radiance, after a correction of its brightness.
 
-    The recovered panorama is first multiplied by this factor, which makes the mean difference of the logarithms zero. Both panoramas are
-    equirectangular (h, w, 3) and linear. The larger one is averaged down to the size of the smaller one. Pixels are weighted by solid
-    angle. The logarithm is natural: an error of 0.1 is about 10 %. A thousandth of a panorama's mean radiance is added before the
-    logarithm, because darker light cannot be seen.
+    The correction is one factor. It is chosen such that the mean difference of the logarithms is zero. Returns the error and the factor.
+
+    Both panoramas are equirectangular (h, w, 3) and linear. The larger one is averaged down to the size of the smaller one. Pixels are
+    weighted by solid angle. The logarithm is natural: an error of 0.1 is about 10 %. A thousandth of a panorama's mean radiance is added to
+    it before the logarithm. So differences between almost black pixels hardly count.
     """
     a, b = (resized(x, min(len(environment), len(reference))) for x in (environment, reference))
     weight = np.cos(_elevations(len(a)))
@@ -268,9 +270,10 @@ def lights_error(environment: np.ndarray, reference: np.ndarray) -> tuple[float,
     Returns the mean angle and the number of true lights; None if there is no bright light.
 
     - Lights are found by `find_lights` in both panoramas, reduced to at most 128 rows.
-    - The MOST_LIGHTS brightest true lights count, if they have at least twice the mean brightness and a quarter of the brightest light's.
-    - Each true light is matched to a recovered light of its own, so that the sum of the angles is least. Of the recovered lights, the
-      brightest are used, twice as many as true ones.
+    - A true light is used if it has at least twice the panorama's mean brightness, and at least a quarter of the brightest light's. If
+      there are more than MOST_LIGHTS, only the brightest MOST_LIGHTS are used.
+    - If N true lights are used, the 2N brightest recovered lights are used.
+    - Each true light is matched to at most one recovered light, and no two to the same one. The sum of the angles is as small as possible.
     - A true light without a match within LOST_LIGHT degrees has the error LOST_LIGHT.
     - The mean is weighted by the true lights' brightness. It does not depend on the overall brightness of a panorama.
     """

@@ -30,9 +30,9 @@ def compare(mesh: Mesh, truth: Mesh, cameras: list[Camera]) -> dict[str, float]:
     - chamfer: the mean distance from one surface to the other, in both directions, divided by the true mesh's `radius`
     - normal_consistency: the mean absolute cosine between the normals of the two surfaces
 
-    POINTS samples are taken on each mesh. Each is compared with the nearest point on the other mesh. Only samples count that a camera sees
-    and that their own mesh does not hide, because photos show nothing else. The nearest point on the other mesh may be hidden. If no sample
-    of a mesh counts, the dictionary is empty.
+    POINTS samples are taken on each mesh. Samples that no camera sees are left out, because photos do not show that part of the surface. A
+    sample is also unseen if its own mesh hides it. Each visible sample is compared with the nearest point on the other mesh, visible or
+    not. If one of the meshes has no visible sample, the dictionary is empty.
     """
     unit = radius(truth)
     samples = []

@@ -22,8 +22,10 @@ class GroundTruth:
 
     - light.exr: the light, as a panorama
     - mesh.ply: the mesh
-    - PASS/VIEW.exr: a map of each view, such as its normals, for each name in PASSES; alpha/VIEW.exr: its alpha
-    - relight/HDRI.exr: another light; relight/HDRI/VIEW.exr: each view under this light
+    - normal/VIEW.exr: the normals of the view named VIEW. The folders of the other maps have the names in PASSES.
+    - alpha/VIEW.exr: the object's alpha in this view
+    - relight/HDRI.exr: another light, named HDRI
+    - relight/HDRI/VIEW.exr: the view under this light
 
     `scripts.demo.capture` writes these files. Normals, lights and the mesh are converted to the coordinates of the training. `to_capture`
     is the matrix (4, 4) from these coordinates to the capture's.
@@ -101,8 +103,9 @@ def known_maps(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Read one view's true maps, such as normals and base colour, by name. Returns them, and the object's alpha (h, w).
 
-    If `truth` has no maps, read the normals that the data set publishes, if any. `camera` is the view's camera, resized to the
-    rendering. `to_capture` is the matrix (4, 4) from the training's coordinates to the capture's.
+    If `truth` is None or has no maps, read the true normals that some published captures contain. If there are none, return {} and an
+    alpha of 0. `camera` is the view's camera, resized to the rendering. `to_capture` is the matrix (4, 4) from the training's coordinates
+    to the capture's.
     """
     known, alpha = truth.maps(camera) if truth else ({}, np.zeros((camera.height, camera.width), np.float32))
     if not known and (published := published_normals(view, max(camera.width, camera.height))):

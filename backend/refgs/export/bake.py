@@ -123,11 +123,13 @@ def _uv_scene(mesh: Mesh, size: int) -> EmbreeScene:
 
 
 def _rasterise(mesh: Mesh, scene: EmbreeScene, size: int, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the point on the mesh that each texel in `rows` of a texture belongs to. R is the number of rows, S is `size`.
+    """Find the face and the point of the mesh for each texel in `rows` of a texture. R is the number of rows, S is `size`.
 
-    Returns the face (R, S), the barycentric weights in it (R, S, 3), and the point (R, S, 3). `scene` is the result of `_uv_scene`. Texels
-    without a face have −1. A texel just outside a face gets that face and the weights of its neighbour inside. Its point lies on the face's
-    plane, outside the face.
+    Returns the index of the face (R, S), −1 if none, the barycentric weights in it (R, S, 3), and the point (R, S, 3). `scene` is the
+    result of `_uv_scene`.
+
+    A texel just outside a chart copies the face and the weights of a neighbour inside. Its point is not copied. It is computed at the
+    texel's own place, on the plane of the face. So weights and point of such a texel do not agree.
     """
     first, last = max(rows.start - 1, 0), min(rows.stop + 1, size)
     y, x = np.mgrid[first:last, :size].astype(np.float32) + np.float32(0.5)

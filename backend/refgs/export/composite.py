@@ -28,8 +28,9 @@ def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress:
     the surface and face outwards. A splat's alpha is its opacity times its Gaussian where the ray meets the splat's plane. The result is
     divided by the sum of the weights. If no splat meets the ray, the nearest splats give the values.
 
-    The blended normal is correct at the mean position of the splats, not at the point. So it is extrapolated to the point, by a slope from
-    weighted least squares. `progress` is called with the number of points done and their total.
+    The blended normal belongs to the mean position of the splats, not to the point. So the change of the normals with position is fitted to
+    the splats by weighted least squares, and the blended normal is corrected by it. `progress` is called with the number of points done and
+    their total.
     """
     table, values = _geometry(splats), _appearance(splats)
     spread = float(np.median(splats.scales[:, :2].mean(axis=1))) or 1.0

@@ -22,9 +22,10 @@ def displayed(run: Run, progress: Callable[[int, int], None] = lambda done, tota
     """Return the run's splats with spherical harmonics that reproduce its renderings, for viewers that compute no lighting.
 
     The harmonics have degree 3 and give sRGB-encoded colours by view direction. Adam fits them to renderings from the training cameras
-    under the run's light, by squared error. Mirror images become blurred, because degree 3 is low. Positions and shapes of splats stay. A
-    run without a light has harmonics from its training: its splats are returned unchanged. `progress` is called with the number of
-    iterations done and their total.
+    under the run's light, by squared error. Mirror images become blurred, because degree 3 is low. Positions and shapes of splats stay.
+
+    If the run has no light, the training itself has fitted such harmonics. Then the splats are returned unchanged. `progress` is called
+    with the number of iterations done and their total.
     """
     splats = run.splats
     if run.environment is None:

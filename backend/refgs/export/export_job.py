@@ -172,7 +172,7 @@ def _make_mesh(run: "Run", report: Report) -> Any:
 def _baked_splats(run: "Run", mesh: Any) -> "Splats":
     """Return the run's splats for baking. If their base colours contain shadows, the shadows are removed.
 
-    Base colours contain shadows if the light was fixed to the object and the training computed no shadows.
+    Base colours contain shadows if the training computed no shadows and the light did not move relative to the object.
     """
     from refgs.export.unshadowed import unshadowed
     from refgs.render.baselines import method_of

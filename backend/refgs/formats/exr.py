@@ -39,8 +39,8 @@ def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
 def read_exr(path: str | os.PathLike) -> np.ndarray:
     """Read an EXR file as float32: (H, W, 4) for RGBA, (H, W, 3) for RGB, or (H, W) for a single channel.
 
-    If the file has several parts, the first part with R, G and B is read; without one, the first part. Raises InputError if the file is
-    missing or broken, or has other channels.
+    If the file has several parts, the first part with R, G and B is read. If no part has them, the first part is read. Without R, G and B
+    the part must have one channel. Raises InputError if it does not, or if the file is missing or broken.
     """
     path = Path(path)
     if not path.is_file():

@@ -24,8 +24,9 @@ def write_glb(path: str | os.PathLike, mesh: Mesh, textures: Textures) -> None:
 
     - base colour, sRGB-encoded
     - occlusion, roughness and metallic, linear, as R, G and B of one picture
-    - the normal map, and the MikkTSpace tangents that it was made with, because not every program computes them
-    - the extension KHR_materials_specular, if the material has no specular reflection
+    - the normal map
+    - the MikkTSpace tangents that the normal map was made with. Some programs do not compute them.
+    - the extension KHR_materials_specular, only if specular reflection must be turned off
 
     The maps are also written as files beside the mesh, by `write_textures`. `mesh` must have normals and uv.
     """

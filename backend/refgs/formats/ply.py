@@ -20,9 +20,9 @@ _END = re.compile(rb"[\r\n]end_header(\r\n|\n|\r)")
 
 
 def read_ply(path: str | os.PathLike) -> PlyData:
-    """Read all elements of a PLY file (Turk 1994): text, or binary of either endianness, which is mapped into memory.
+    """Read all elements of a PLY file (Turk 1994). The file may be text, or binary of either endianness.
 
-    Raises InputError for a file that is missing, not a PLY, truncated, or longer than its header says.
+    Binary rows are mapped into memory. Raises InputError for a file that is missing, not a PLY, truncated, or longer than its header says.
     """
     path = Path(path)
     try:
@@ -73,7 +73,11 @@ def _check_header(file, path: Path) -> None:
 
 
 def _elements(lines: list[list[str]], path: Path) -> list[tuple[int, list[int]]]:
-    """Parse the header of a PLY file. Returns, for each element, the number of rows and the minimum bytes of each property."""
+    """Parse the header of a PLY file. Returns, for each element, its number of rows and a list of sizes.
+
+    The sizes are the bytes of each property. For a list property, only the number that stores its length counts, because a list may be
+    empty. Raises InputError for a broken header.
+    """
     elements: list[tuple[int, list[int]]] = []
     for line in lines:
         match line:

@@ -129,10 +129,11 @@ def _silhouette(mask: np.ndarray, camera: Camera, low: np.ndarray, voxel: np.nda
 
 
 def _carve(masks, cameras, low, high, resolution):
-    """Compare the voxels of the box from `low` to `high` with all masks, to carve the visual hull.
+    """Look up the alpha of each voxel in all masks. The voxels fill the box from `low` to `high`.
 
-    Returns three arrays (resolution, resolution, resolution): the smallest alpha of each voxel in any view, the second smallest, and the
-    view with the smallest. Voxels seen by fewer than an eighth of the views count as empty.
+    Returns three arrays (resolution, resolution, resolution). For each voxel they have the smallest alpha in any view, the second smallest,
+    and the index of the view that has the smallest. Voxels seen by fewer than two views, or by fewer than an eighth of all views, have the
+    alpha 0.
     """
     masks, voxel = [np.ascontiguousarray(mask, np.float32) for mask in masks], (high - low) / resolution
     views = [_silhouette(mask, camera, low, voxel) for mask, camera in zip(masks, cameras, strict=True)]

@@ -39,7 +39,8 @@ def isosurface(block: np.ndarray, signed: np.ndarray) -> Mesh:
 def _assign_to_chunks(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """List which blocks each chunk needs. Returns K pairs: the index of a block (K,), and the position of a chunk that needs it (K, 3).
 
-    A block lies in one chunk. If it is the first block there along an axis, the previous chunk needs it too, because the meshes must join.
+    A chunk needs the blocks inside it. It also needs the next layer of blocks along each axis, so that its mesh joins the next chunk's.
+    So a block at the lower side of its chunk is also listed for the neighbouring chunks on that side.
     """
     rows, chunks = [], []
     for back in np.ndindex(2, 2, 2):

@@ -9,10 +9,11 @@ from refgs.formats.mesh import Mesh
 
 
 def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
-    """Remove small loose parts, simplify the mesh to about `triangles` faces at most, and compute smooth normals.
+    """Remove small loose parts of a mesh, simplify it to about `triangles` faces if it has more, and compute smooth normals.
 
-    A part is removed if its area is less than `keep` times the largest part's area. Faces keep their winding. After this, an edge has at
-    most two faces. Simplification is by quadric error (Garland and Heckbert 1997). Raises InputError if the mesh has no valid face.
+    A part is removed if its area is less than `keep` times the largest part's area. Simplification is by quadric error (Garland and
+    Heckbert 1997). In the returned mesh, no edge has more than two faces. Faces keep their winding. Raises InputError if the mesh has no
+    valid face.
     """
     work = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     work.update_faces(np.isfinite(work.triangles).all((1, 2)))

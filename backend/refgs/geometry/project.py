@@ -22,8 +22,8 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def sample(image: np.ndarray, pixels: np.ndarray, clamp: bool = False) -> np.ndarray:
     """Interpolate a float32 image (H, W) or (H, W, C) at pixel positions (N, 2), bilinearly. Returns (N,) or (N, C).
 
-    The centre of the first pixel is at (0.5, 0.5). Outside the image the result is 0; with `clamp`, it is the nearest pixel's value. OpenCV
-    rounds positions to 1/32 of a pixel.
+    The centre of the first pixel is at (0.5, 0.5). Outside the image the result is 0. If `clamp` is true, it is the nearest pixel's value
+    instead. Positions are rounded to 1/32 of a pixel, because OpenCV's `remap` does the work.
     """
     count = len(pixels)
     rows = max(1, -(-count // _ROW))

@@ -65,7 +65,10 @@ def _fingerprint(target: Target) -> str:
 
 
 def sizes() -> dict[str, int]:
-    """Find the kernel library's functions that return one integer. Returns the number of integers that each takes, by name."""
+    """Find the C++ functions that return one integer, such as a buffer's size. Returns the number of integer arguments of each, by name.
+
+    Python needs this number to declare and call the functions.
+    """
     text = "".join((HERE / source).read_text(encoding="utf-8") for source in SOURCES)
     found = re.findall(r"^EXPORT int64_t (\w+)\((.*?)\)", text, re.MULTILINE)
     return {name: parameters.count("int64_t") for name, parameters in found}

@@ -113,8 +113,8 @@ _kept = threading.local()
 def borrow(name: str, count: int) -> torch.Tensor:
     """Return a buffer for at least `count` 32-bit numbers. In one thread, calls with the same name return the same memory.
 
-    Buffers are kept for the next call, because their sizes change from view to view. If they were freed, they would leave gaps in malloc's
-    memory.
+    A buffer is kept for the next call. A larger request replaces it by a larger buffer. Needed sizes change from view to view, so freeing
+    and allocating each time would fragment the memory.
     """
     memory = _kept.__dict__.get(name)
     if memory is None or len(memory) < count:
