@@ -1,8 +1,9 @@
-"""Prefilter a cubemap with the GGX lobe at a few fixed roughnesses, for specular reflection (second factor of the split sum, paper Eq. 8).
+"""Prefilter a cubemap with the GGX lobe at a few fixed roughnesses, for specular reflection.
 
-As in Karis ("Real Shading in Unreal Engine 4", 2013), normal, view and reflection direction are assumed to be equal. The filtered radiance
-in a direction is then Σ L(l) K(θ) / Σ K(θ) with K(θ) = D(cos(θ/2)) cos θ. D is the GGX distribution, and θ is the angle between that
-direction and l. K depends only on θ and on the roughness, so each filtered level is a constant sparse matrix times the cubemap.
+The result is the second factor of the split sum (Ref-Gaussian paper, Eq. 8). As in Karis ("Real Shading in Unreal Engine 4", 2013),
+normal, view and reflection direction are assumed to be equal. The filtered radiance in a direction is then Σ L(l) K(θ) / Σ K(θ) with K(θ) =
+D(cos(θ/2)) cos θ. D is the GGX distribution, and θ is the angle between that direction and l. K depends only on θ and on the roughness, so
+each filtered level is a constant sparse matrix times the cubemap.
 
 To keep the matrices small, they read a pyramid: the cubemap, followed by its mips, which are averaged 2×2. Fine texels cover the centre of
 the lobe, coarse texels its tail. The matrices have the cube's symmetries, so only a 24th of their entries is computed and stored. This
@@ -75,12 +76,12 @@ LOBES = (*(partial(ggx_lobe, roughness=roughness) for roughness in ROUGHNESS[1:]
 def _level_weights(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the filter weights of one level: how much each texel of the pyramid adds to each texel of the level.
 
-    The pyramid is the cubemap and its mips. Only its texels on face +x with s, t > 0 are listed; the cube's symmetries give the weights of
-    the others. `side` is that of the level, and `lobe` is the filter as a function of the cosine. Mips with fewer than `coarsest` texels a
-    side are not read.
+    The pyramid is the cubemap and its mips. Mips with fewer than `coarsest` texels a side are not read. `side` is the side of the level in
+    texels, and `lobe` is the filter as a function of the cosine.
 
     Returns three arrays with an entry for each weight: the pyramid's texel, the level's texel in orbit order (`cubemap.orbit_order`), and
-    the weight. With those of the other texels, the weights of each texel of the level sum to one.
+    the weight. Of the pyramid, only the texels on face +x with s, t > 0 are listed. The weights of its other texels follow from the cube's
+    symmetries. Together, the listed and the other weights of a texel of the level sum to one.
     """
     axes = cubemap.texel_directions(side)[cubemap.orbits(side).flatten()].numpy()
     sides = _pyramid_sides(resolution)
@@ -105,9 +106,10 @@ def _level_weights(resolution: int, side: int, lobe: Lobe, coarsest: int) -> tup
 
 
 def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, side: int, lobe: Lobe) -> np.ndarray:
-    """Average a lobe over the area of P texels. Each texel has its own axis of the lobe: `axes` (P, 3). Returns (P,).
+    """Average a lobe over the area of each of P texels. Returns (P,).
 
-    The texels lie on face +x of a cubemap with `side`. `row` and `column` (P,) count from the middle of the face.
+    `axes` (P, 3) are unit directions: for each texel, the one in which the lobe points. The texels lie on face +x of a cubemap with `side`
+    texels a side. `row` and `column` (P,) are their places on the face, counted from its middle.
     """
     value = np.zeros(len(axes))
     x, y, z = np.ascontiguousarray(axes.T)
@@ -121,9 +123,9 @@ def _lobe_over_texels(axes: np.ndarray, row: np.ndarray, column: np.ndarray, sid
 class Matrix(NamedTuple):
     """Store a sparse matrix that does not change under the 24 symmetries of the cube. It maps texels to texels.
 
-    Texels are in orbit order (`cubemap.orbit_order`): groups of 24 that the symmetries map onto each other. Only the first row of each
-    group is stored. The other rows have the same numbers in other columns: the symmetry that maps the first row's texel to another row's
-    texel also maps the columns.
+    Rows and columns stand for texels in orbit order (`cubemap.orbit_order`): groups of 24 that the symmetries map onto each other. A
+    symmetry that maps texel a to a' and texel b to b' leaves the matrix unchanged: element (a', b') equals element (a, b). So the first row
+    of each group determines the other 23 rows, and only the first is stored.
     """
 
     starts: Tensor  # (orbits + 1), int32: the start of each row's numbers
@@ -146,10 +148,10 @@ class Matrix(NamedTuple):
 def _matrix_and_transpose(
     shape: tuple[int, int], orbit: np.ndarray, column: np.ndarray, number: np.ndarray, device: torch.device
 ) -> tuple[Matrix, Matrix]:
-    """Make a `Matrix` and its transpose from the nonzero numbers in the first row of each group of 24 rows (see `Matrix`).
+    """Make a `Matrix` and its transpose from the first row of each group of 24 rows. The other rows follow from it (see `Matrix`).
 
-    `orbit`, `column` and `number` have an entry for each nonzero number: its group of rows, its column, its value. `shape` counts rows and
-    columns in groups of 24.
+    `orbit`, `column` and `number` list the nonzero elements of these rows: the index of the group, the column, and the value. `shape` is
+    the number of groups of rows and the number of groups of 24 columns.
     """
     # A number at row 24 i, column 24 j + h is also at row 24 i + g, column 24 j, where g is the inverse of h.
     inverse = (cubemap.compositions() == 0).int().argmax(dim=1).numpy()

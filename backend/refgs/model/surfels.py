@@ -35,7 +35,7 @@ def axes(rotations: Tensor) -> list[Tensor]:
 
 
 class Surfels(NamedTuple):
-    """Hold the values of N surfels that are rendered, after the activation functions.
+    """Hold N surfels as they are rendered: their values after the activation functions.
 
     Lengths are in world units. Albedo is linear Rec.709; albedo, metallic and roughness are in 0..1.
 
@@ -43,8 +43,8 @@ class Surfels(NamedTuple):
       separate because it has its own learning rate.
     - `received` (N, 3) is the irradiance at the surfel divided by the irradiance without occlusion. It can exceed 1 where the object
       reflects light onto itself.
-    - `indirect_dc` and `indirect_rest` are spherical harmonics of the linear radiance that the object itself sends to the surfel (paper Eq.
-      10).
+    - `indirect_dc` and `indirect_rest` are spherical harmonics of the linear radiance that the object itself sends to the surfel
+      (Ref-Gaussian paper, Eq. 10).
     """
 
     positions: Tensor
@@ -120,8 +120,9 @@ class _Activate(torch.autograd.Function):
 def activate(p: Parameters) -> Surfels:
     """Apply the activation functions to the raw parameters `p` (see `Parameters`). Returns the surfels as they are rendered.
 
-    Metallic has a function that gets closer to 0 and 1 than the logistic function. This matters because even one percent of white diffuse
-    colour makes a black metal as bright as its reflections do. Training would change the light to compensate.
+    The function of metallic gets closer to 0 and 1 than the logistic function. This matters for mirrors: at metallic 0.985, a mirror also
+    has a little diffuse white. This white is as bright as the mirror image of a dark corner. Training then makes the light too dark there,
+    to compensate.
     """
     scales, opacities, albedo, metallic, roughness = _Activate.apply(*(p[name] for name in _KINDS))
     return Surfels(

@@ -2,10 +2,10 @@
 
 `method_of` reads the settings below and returns the method. The default is RefGS's own: deferred shading in linear radiance.
 
-- `shading = "splat"`: each surfel is shaded before blending, as in the paper's initial stage (§3.3).
+- `shading = "splat"`: each surfel is shaded before blending, as in the initial stage of the Ref-Gaussian paper (§3.3).
 - `shading = "sh"`: each surfel has its own view-dependent colour, as in 2DGS. There are no materials and no light.
 - `reflection = "mirror"`: a sharp mirror image of the light, weighted by metallic (Ye et al., 3DGS-DR, 2024).
-- `color_space = "display"`: light and materials are sRGB-encoded values in 0..1, as in the paper.
+- `color_space = "display"`: light and materials are sRGB-encoded values in 0..1, as in the Ref-Gaussian paper.
 - `primitive = "3dgs"`: 3D Gaussians instead of surfels (`refgs.render.volume`).
 """
 
@@ -93,7 +93,7 @@ class Method:
     - `draw`: a function that replaces deferred shading; it takes the arguments of `render`. None keeps deferred shading.
     - `unread`: names of the surfels' parameters that do not affect pictures. They are not trained.
     - `constants`: parameters that have the same raw value for all surfels, {name: value}. They are not trained.
-    - `left_out`: the features of RefGS that the method lacks, as rows of needs.json ("what", "why", "saved").
+    - `left_out`: the features of RefGS that the method lacks. Each is an entry of needs.json: "what" is left out, "why", what is "saved".
     """
 
     lit: bool = True
@@ -131,7 +131,7 @@ def method_of(settings: RenderSettings) -> Method:
 
 
 def initial_stage(settings: RenderSettings) -> RenderSettings:
-    """Copy the settings, changed so that each surfel is shaded before blending, as in the paper's initial stage (§3.3)."""
+    """Copy the settings, changed to shade each surfel before blending, as in the initial stage of the Ref-Gaussian paper (§3.3)."""
     return settings.model_copy(update={"shading": "splat"})
 
 
@@ -173,7 +173,7 @@ def draw_shaded_surfels(
     occluder: None = None,
     exposure: Tensor | None = None,
 ) -> Rendering:
-    """Shade each surfel, then blend the shaded surfels (paper §3.3).
+    """Shade each surfel, then blend the shaded surfels (Ref-Gaussian paper, §3.3).
 
     Takes the arguments of `render`, but ignores `occluder`: reflections of the object in itself are not traced.
     """

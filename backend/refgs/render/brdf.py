@@ -1,4 +1,6 @@
-"""Tabulate the reflectance of a metallic-roughness material under uniform light: the first factor of the split sum (paper Eq. 7).
+"""Tabulate the reflectance of a metallic-roughness material under uniform light.
+
+This is the first factor of the split sum (Ref-Gaussian paper, Eq. 7).
 
 The material is Blender's Principled BSDF with its defaults: GGX, height-correlated Smith shadowing, and multiple scattering between
 microfacets (Kulla and Conty, "Revisiting Physically Based Shading at Imageworks", 2017). Metals use Schlick's approximation of Fresnel

@@ -13,10 +13,11 @@ from refgs.settings import RenderSettings
 def channels(surfels: Surfels, camera: Camera, settings: RenderSettings, indirect: bool) -> list[Tensor]:
     """List the surfels' features that are blended for a picture and then shaded: tensors (N,) or (N, C), in the order that `shade` reads.
 
-    - normal, albedo; no more than these if `settings.reflection` is "none"
+    - normal, albedo; the list ends here if `settings.reflection` is "none"
     - metallic, roughness
-    - if `settings.diffuse` is "sh": view-dependent colour; otherwise, with `indirect`: irradiance divided by that of an unoccluded surface
-    - with `indirect`: radiance that comes from the object itself in the mirror direction
+    - view-dependent colour, if `settings.diffuse` is "sh"
+    - irradiance divided by that of an unoccluded surface, if `settings.diffuse` is not "sh" and `indirect` is true
+    - radiance that comes from the object itself in the mirror direction, if `indirect` is true
     - position
     """
     normals = facing_normals(with_normals_last(surfels).rotations, surfels.positions, camera)

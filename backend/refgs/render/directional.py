@@ -45,8 +45,8 @@ def directional(
 
     The coefficients c_k are `constant` (N, 1, 3), then `rest` (N, K − 1, 3), in the order of `refgs.model.harmonics`; K = (degree + 1)².
     The direction d points from the camera to the surfel at `positions` (N, 3). If unit `normals` (N, 3) are given, d is this direction
-    reflected at the surfel (paper Eq. 10). All are float32. Differentiable in `constant` and `rest` only. Raises ValueError for
-    coefficients of other shapes.
+    reflected at the surfel (Ref-Gaussian paper, Eq. 10). All are float32. Differentiable in `constant` and `rest` only. Raises ValueError
+    for coefficients of other shapes.
     """
     count = len(positions)
     if constant.shape != (count, 1, 3) or rest.shape not in [(count, k - 1, 3) for k in (1, 4, 9, 16)]:

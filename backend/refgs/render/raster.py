@@ -19,6 +19,6 @@ class Scene:
         self.upper, self.lower = upper, lower
 
     def keep(self, **tensors: Tensor) -> None:
-        """Pass tensors to the kernels by the names of the struct's fields. Keep a reference to them, so that their memory is not freed."""
+        """Set fields of the C struct, by name, to the memory of tensors. Keep the tensors in `kept`, so that this memory is not freed."""
         self.attach(**tensors)
         self.kept = getattr(self, "kept", {}) | tensors

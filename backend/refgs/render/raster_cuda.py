@@ -17,15 +17,15 @@ SHORT = 1 << 15  # tiles that an int16 can number: such keys sort in half the ti
 
 
 def how_many(ends: torch.Tensor) -> int:
-    """Return the last of the running sums `ends`, which is the total, or 0 if there are none.
+    """Return the last of the running sums `ends`, which is the total. Return 0 if `ends` is empty.
 
-    The CPU waits here until the card has computed it, because it then allocates memory of this size.
+    `ends` is on the card. The CPU waits here until the card has computed it, because the CPU needs the total to allocate memory.
     """
     return int(ends[-1]) if len(ends) else 0
 
 
 class Raster(struct("Raster", "raster.cu"), Scene):
-    """Hold the arguments of the CUDA rasteriser's kernels, and run these kernels. `Scene` has the order of the methods."""
+    """Hold the arguments of the CUDA rasteriser's kernels, and run these kernels. `Scene` says in which order to call the methods."""
 
     def project(self, device: torch.device) -> None:
         def integers(*shape: int) -> torch.Tensor:

@@ -16,11 +16,12 @@ from refgs.render.raster import Scene
 class Raster(NamedTuple):
     """Hold the maps that the rasteriser returns. Each pixel is a weighted sum over its surfels.
 
-    The weight of a surfel is w = α Π (1 − α'), where α' are the alphas of the surfels in front of it (paper Eq. 5). There is no background.
+    The weight of a surfel is w = α Π (1 − α'), where α' are the alphas of the surfels in front of it (Ref-Gaussian paper, Eq. 5). No
+    background is added.
 
     - `features` (H, W, C): Σ w · feature. Divide by `alpha` for the mean.
-    - `depth` (H, W): Σ w · depth. Divide by `alpha` for the mean. The depth along the camera's axis is that of the ray's intersection with
-      the surfel (paper Eq. 4). It is that of the surfel's centre where the low-pass filter draws the surfel.
+    - `depth` (H, W): Σ w · depth. Divide by `alpha` for the mean. Depth is along the camera's axis, at the point where the ray meets the
+      surfel (Ref-Gaussian paper, Eq. 4). Where the surfel's alpha comes from the low-pass filter, the centre's depth is used instead.
     - `alpha` (H, W): Σ w.
     """
 

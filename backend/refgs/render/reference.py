@@ -174,7 +174,9 @@ def radiance_towards(
     mirror: bool = False,
     matte: bool = False,
 ) -> Tensor:
-    """Compute the radiance (P, 3) that P surface points send in unit directions `towards` (P, 3), by the split sum (paper Eq. 5–10).
+    """Compute the radiance (P, 3) that P surface points send in unit directions `towards` (P, 3), by the split sum.
+
+    The equations are Eq. 5–10 of the Ref-Gaussian paper.
 
     - `maps` (P, 8 or more): normal, albedo, metallic, roughness; with `indirect` also irradiance divided by that of an unoccluded surface
     - `appearance` (P, 3): a colour that replaces diffuse shading, or None

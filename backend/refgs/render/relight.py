@@ -130,10 +130,10 @@ class Transport:
         return torch.from_numpy(self._to_mesh @ values.numpy())
 
     def chunks(self):
-        """Yield the surfels in chunks, so that large arrays are needed for one chunk at a time only.
+        """Split the surfels into chunks, so that large arrays are needed for only one chunk at a time.
 
-        A chunk is a slice of the surfels, a slice of their rays, and for each ray the index of its surfel in the chunk. Only rays that hit
-        the mesh are counted.
+        Yields for each chunk a slice that selects its surfels, a slice that selects their rays, and the index in the chunk of each ray's
+        surfel. The rays are only those that hit the mesh.
         """
         for start in range(0, len(self.normals), CHUNK):
             end = min(start + CHUNK, len(self.normals))
@@ -268,10 +268,11 @@ def _past_the_object(transport: Transport, light: Environment) -> Tensor:
 
 
 def _diffuse_harmonics(surfels: Surfels, normals: Tensor, received: Tensor) -> Tensor:
-    """Compute the view-dependent diffuse colour as spherical harmonics (N, 16, 3), for colour = 0.5 + SH.
+    """Compute the diffuse colour as spherical harmonics (N, 16, 3) of the viewing direction, for colour = 0.5 + SH.
 
-    `received` (N, 3) is irradiance / π. A dielectric's surface transmits less light to its diffuse base at grazing angles. The colour
-    depends only on the angle between normal n and direction d, so its harmonics follow from Σ_m Y_lm(n) Y_lm(d) = (2l + 1) / 4π P_l(n·d).
+    `received` (N, 3) is irradiance / π. The colour gets darker at grazing viewing angles. There, a dielectric reflects more light at its
+    surface, so less comes from its diffuse base. The colour depends only on the angle between normal n and direction d, so its harmonics
+    follow from Σ_m Y_lm(n) Y_lm(d) = (2l + 1) / 4π P_l(n·d).
     """
     size, degrees = ROUGHNESSES, torch.arange(4)
     middle = (torch.arange(size).double() + 0.5) / size  # centres of the table's cells, in cosine and roughness

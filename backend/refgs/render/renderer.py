@@ -62,13 +62,13 @@ def render(
     occluder: Occluder | None = None,
     exposure: Tensor | None = None,
 ) -> Rendering:
-    """Render surfels for a camera: blend their features, then shade each pixel by the split sum (paper Eq. 5–8).
+    """Render surfels for a camera: blend their features, then shade each pixel by the split sum (Ref-Gaussian paper, Eq. 5–8).
 
     `background` (3,) is sRGB-encoded. `near`, the smallest depth that is drawn, is in world units. `exposure`, a scalar, multiplies the
     radiance before it is encoded.
 
     `occluder` is the object's mesh, for reflections of the object in itself. Where it blocks a pixel's mirror direction, the pixel reflects
-    the radiance that the surfels store for this (paper Eq. 9). Otherwise it reflects `environment`.
+    the radiance that the surfels store for this (Ref-Gaussian paper, Eq. 9). Otherwise it reflects `environment`.
 
     If the setting diffuse is "irradiance", `surfels.sh_rest` may hold a residual: a view-dependent colour, sRGB-encoded, that is added to
     the picture. It stands for what material and light cannot explain in the photos.

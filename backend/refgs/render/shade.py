@@ -160,8 +160,8 @@ class _Shade(torch.autograd.Function):
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
     """Compute the mirror direction of each pixel (H, W, 3): the viewing direction reflected at the blended normal. No gradients.
 
-    `shade` looks up the light in these directions. They are unit vectors in world space, and zero where nothing is. `features` and `alpha`
-    are those of `shade` if `visibility` is given there; otherwise ValueError is raised.
+    `shade` looks up the light in these directions. They are unit vectors in world space, and zero where nothing is. Takes the `features`
+    and `alpha` that `shade` takes together with `visibility`. Raises ValueError for features of another shape.
     """
     if features.shape != (*alpha.shape, CHANNELS + INDIRECT):
         raise ValueError(f"expected {CHANNELS + INDIRECT} features a pixel, got {tuple(features.shape)}")
@@ -185,14 +185,14 @@ def shade(
     by_direction: bool = False,
     matte: bool = False,
 ) -> Shaded:
-    """Shade blended maps by the split sum (paper Eq. 5–10), over a background (3,), sRGB-encoded.
+    """Shade blended maps by the split sum (Ref-Gaussian paper, Eq. 5–10), over a background (3,), sRGB-encoded.
 
     `features` (H, W, C) are sums over the surfels of each pixel, weighted as in `rasterize`, in this order:
 
     - normal in world space (3), albedo (3), metallic, roughness
-    - with `by_direction`: a view-dependent colour (3), which replaces diffuse shading, as in the paper
-    - otherwise, with `visibility`: irradiance divided by that of an unoccluded surface (3)
-    - with `visibility`: radiance from the object itself (3), which replaces the environment's where `visibility` is 0 (Eq. 9)
+    - if `by_direction` is true: a view-dependent colour (3), which replaces diffuse shading, as in the Ref-Gaussian paper
+    - if `visibility` is given and `by_direction` is false: irradiance divided by that of an unoccluded surface (3)
+    - if `visibility` is given: radiance from the object itself (3), which replaces the environment's where `visibility` is 0 (Eq. 9)
     - position (3)
 
     The other arguments change the shading:
@@ -217,7 +217,9 @@ def shade(
 
 
 def shade_splats(features: Tensor, environment: Environment, camera: Camera, mirror: bool = False) -> Tensor:
-    """Shade each surfel before blending, by the split sum (paper §3.3, the initial stage). Returns the radiance (N, 3) towards the camera.
+    """Shade each surfel before blending, by the split sum. Returns the radiance (N, 3) towards the camera.
+
+    This is the initial stage of the Ref-Gaussian paper (§3.3).
 
     `features` (N, C) are, in this order:
 

@@ -1,4 +1,4 @@
-"""Draw 3D Gaussians with the rasteriser of surfels, for comparison (paper Tables 3 and 7).
+"""Draw 3D Gaussians with the rasteriser of surfels, for comparison (Ref-Gaussian paper, Tables 3 and 7).
 
 Each 3D Gaussian is replaced by a disc that looks the same to the camera. EWA splatting (Zwicker et al. 2001, as in Kerbl et al. 2023) gives
 the ellipse that the Gaussian covers in the picture. The disc covers the same ellipse. It lies at the depth of the Gaussian's centre, at

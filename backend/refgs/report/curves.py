@@ -89,9 +89,9 @@ def front(curves: list[Curve]) -> list[np.ndarray]:
 def knee(curve: Curve) -> int | None:
     """Find the index of a curve's knee, after which more training time improves little (Kneedle, Satopää et al. 2011, without smoothing).
 
-    Both axes are logarithms, scaled to 0..1. Draw a straight line from the first point to the best point. The knee is the point that lies
-    furthest below this line; each point counts with the best error so far. Returns None if the curve has fewer than five points, or if the
-    knee is less than LEAST_KNEE below the line.
+    Each error is first replaced by the smallest error up to that time. Both axes are then logarithms, scaled to 0..1. A straight line joins
+    the first and the last point. The knee is the point that lies furthest below this line. Returns None if the curve has fewer than five
+    points, if it never improves, or if the knee is less than LEAST_KNEE below the line.
     """
     if len(curve.errors) < 5:
         return None

@@ -32,10 +32,11 @@ Step = Callable[[int, str, int], None]
 
 
 def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None, step: Step) -> dict[str, Any]:
-    """Compare a run with photos, and with ground truth if it is given. Returns the metrics for metrics.json, such as PSNR.
+    """Compare a run with the photos of `views`, and with ground truth if it is given. Returns the metrics for metrics.json, such as PSNR.
 
-    The photos are those of `views`. Pictures are written to pictures/ in the run's folder: those of the views to pictures/`split`, where
-    `split` is "test" for held-out views. `step` is called after each rendering with the number done, a note, and the total.
+    Writes pictures into the run's folder: of the views to pictures/`split`, of the light to pictures/, and of the views under other lights
+    to pictures/relight. `split` is "test" for held-out views. After each rendering, `step` is called with the number of renderings that are
+    done, a note, and their total number.
     """
     pictures, lit = run.folder / "pictures", run.environment is not None
     hdris = truth.hdris if truth and lit else []

@@ -76,7 +76,7 @@ def flatten(values: object, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 
 def in_words(metrics: dict, figures: list[Quantity]) -> list[str]:
-    """Format metrics as text, such as "PSNR 24.31 dB". `figures` says which; those that `metrics` lacks are skipped."""
+    """Format those metrics that `figures` lists as text, such as "PSNR 24.31 dB". Skip those that `metrics` lacks."""
     known = dict(flatten(metrics))
     return [f"{heading} {text(known[key])}" for key, heading, text, _ in figures if key in known]
 
@@ -85,7 +85,8 @@ def relit_pair(figures: dict[str, float], prefix: str) -> str:
     """Format PSNR and FLIP of pictures under another light as text, such as "24.10 / 26.30 dB, FLIP 0.081 / 0.072".
 
     The first of two numbers is "raw", the second "aligned": measured after the brightness was multiplied by the factor that fits best.
-    `figures` maps dotted keys to numbers. `prefix` is the start of these keys, such as "relight.studio.mesh".
+    `figures` has the metrics as a flat dict. Its keys are joined by dots, such as "relight.studio.mesh.psnr_raw". `prefix` is the start of
+    the keys to format, such as "relight.studio.mesh".
     """
     parts = []
     for name, text in (("psnr", "{:.2f}"), ("flip", "{:.3f}")):

@@ -2,9 +2,9 @@
 
 It reads these files of a run folder. If a file is missing, its section is left out:
 
-    metrics.json     numbers, nested to any depth: the metrics of `refgs.report.figures`, ambiguities.NAME.what (text),
-                     relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}
-    history.jsonl    one object a line: seconds, iteration, parts, and the quantities of `refgs.report.curves`
+    metrics.json     nested objects. Their numbers are metrics: those that `refgs.report.figures` names,
+                     relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}, and any others. ambiguities.NAME.what is text.
+    history.jsonl    one object a line: seconds, iteration, parts (seconds by kind of work), and the errors that `refgs.report.curves` names
     needs.json       optional features that were kept or left out: a list of {"what", "why"}, with "saved", "cost", "needed" if known
     run.toml         the settings, and the capture's folder
     pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png, and true_normal/VIEW.png … if known
@@ -170,7 +170,8 @@ def _lines(text: str) -> list[dict]:
 def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[str, str]]:
     """Read the pictures folder/KIND/NAME.png as data URLs: {name: {kind: data URL}}.
 
-    Names with fewer kinds than other names are skipped. If more than `most` names are left, `most` of them are taken at even distances.
+    Names with fewer kinds than other names are skipped. If more than `most` are left, only `most` of them are
+    read, evenly spaced in alphabetical order.
     """
     count = Counter(path.stem for kind in kinds for path in folder.glob(f"{kind}/*.png"))
     names = sorted(name for name in count if count[name] == max(count.values()))
@@ -199,7 +200,7 @@ def _unique_names(groups) -> list[str]:
 
 
 def _columns(pages: list[RunPage], figures: list[Quantity]) -> list[dict]:
-    """Make a table column for each of `figures` that at least one run has.
+    """Make a table column for each metric in the list `figures`, except those that no run has.
 
     A column has a heading and a cell for each run: the formatted value, and whether it is the best.
     """
