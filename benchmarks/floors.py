@@ -63,7 +63,10 @@ def covered_pairs(surfels: list[torch.Tensor], camera: Camera) -> float:
 
 
 def raster(surfels: list[torch.Tensor], camera: Camera) -> tuple[Cost, Cost]:
-    """Return the rasteriser's cost for one forward pass, and for one backward pass. The surfels lie on a unit ball."""
+    """Compute by formula how many operations the rasteriser does, and how many bytes it moves.
+
+    Return one Cost for a forward pass and one for a backward pass. The surfels must lie on the unit ball.
+    """
     pixels, channels = camera.width * camera.height, surfels[-1].shape[1]
     given, maps, pairs = sum(v.nbytes for v in surfels), 4 * pixels * (channels + 2), covered_pairs(surfels, camera)
     forward = Cost(pairs * (FORWARD_OPERATIONS + CHANNEL_OPERATIONS[0] * channels), given + maps)
@@ -71,24 +74,24 @@ def raster(surfels: list[torch.Tensor], camera: Camera) -> tuple[Cost, Cost]:
 
 
 def ssim(pixels: int) -> Cost:
-    """Return the cost of D-SSIM and its gradient, for two images of three channels."""
+    """Compute by formula the operations and bytes of D-SSIM and its gradient, for two images with three channels and `pixels` pixels."""
     return Cost(3 * pixels * SSIM_OPERATIONS, 3 * pixels * 4 * 3)
 
 
 def shading(covered: int, pixels: int) -> Cost:
-    """Return the cost of deferred shading, forward and backward together.
+    """Compute by formula the operations and bytes of deferred shading, forward and backward together.
 
-    Operations are needed only in `covered`, the number of pixels that show a surface. Bytes are moved for all `pixels`.
+    The image has `pixels` pixels; `covered` of them show a surface. Operations are counted only for these, bytes for all pixels.
     """
     # Eleven channels and alpha are read twice, and their derivatives are written; fourteen numbers are written, eleven derivatives read.
     return Cost(covered * SHADING_OPERATIONS, 4 * pixels * (3 * 12 + 14 + 11))
 
 
 def prefiltering(side: int) -> Cost:
-    """Return the cost of prefiltering a cubemap of 6·side² texels, forward and backward together.
+    """Compute by formula the operations and bytes of prefiltering a cubemap of 6·side² texels, forward and backward together.
 
-    The filter is a sparse matrix. Because a cube is symmetric, only a part of its entries is stored. Each pass reads every stored entry
-    once and uses it SYMMETRIES times.
+    The filter is a sparse matrix. Because a cube is symmetric, each number in it occurs SYMMETRIES times but is stored only once. Each pass
+    reads every stored number once and uses it SYMMETRIES times.
     """
     numbers = matrices(side, torch.device("cpu"))[0].numbers.numel()
     texels = 6 * sum(s * s for s in level_sides(side))

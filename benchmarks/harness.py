@@ -31,9 +31,9 @@ console = Console(soft_wrap=True, width=None if sys.stdout.isatty() else 200)  #
 
 
 class Row(NamedTuple):
-    """Hold one measured value, which is one row of the CSV. `figure` names what was measured, such as "psnr".
+    """Hold one measured value, which is one row of the CSV.
 
-    `value` is a number, or a word such as the name of a preset.
+    `figure` is the name of the measured quantity, such as "psnr". `value` is a number, or a word such as the name of a preset.
     """
 
     benchmark: str
@@ -50,7 +50,7 @@ class Row(NamedTuple):
 class Column(NamedTuple):
     """Describe a column of a table. It shows the measured quantity `figure` under a `heading`, with its numbers formatted by `form`.
 
-    If `variant` is given, the column shows the values of that variant. If not, each line of the table shows its own variant's value.
+    If `variant` is given, all values in the column are of that variant. If not, each value is of the variant that its line is about.
     """
 
     heading: str
@@ -60,9 +60,10 @@ class Column(NamedTuple):
 
 
 class Table(NamedTuple):
-    """Describe a table. It has one line for each scene, or one for each pair of scene and variant.
+    """Describe a table. It has one line for each scene. If `variant` is not empty, it has one line for each pair of scene and variant.
 
-    `line` and `variant` are the headings of the first columns. A last line shows the means over those scenes that `mean` names.
+    `line` is the heading of the column of scenes, and `variant` that of the column of variants. `mean` has names of scenes. If the table
+    has more than one line of these scenes, the means of these lines follow as the last line.
     """
 
     title: str
@@ -114,9 +115,10 @@ def mean(values: Sequence[float | str | None]) -> float | None:
 
 
 class Variant(NamedTuple):
-    """Describe one variant of a training that a benchmark compares with others: its options of `refgs train`, and its time limit.
+    """Describe one of the ways to train that a benchmark compares: the options of `refgs train`, and a time limit.
 
-    `minutes` is the limit, or the name of another variant: each scene is then trained for as long as that variant took.
+    `minutes` is a number, the name of another variant, or None for no limit. With a name, a training may take as long as the training of
+    that variant took on the same scene.
     """
 
     options: tuple[object, ...]
@@ -141,10 +143,12 @@ class Bench:
                 self.rows.append(Row(self.name, scene, variant, figure, value, unit, *self.where))
 
     def runs(self, variants: dict[str, Variant]) -> Iterator[tuple[str, dict[str, Path]]]:
-        """Train and evaluate each variant on each scene. A run's folder is OUT/[PRESET/]VARIANT/SCENE.
+        """Train and evaluate the variants on each scene. A run's folder is OUT/[PRESET/]VARIANT/SCENE.
 
-        Yields a scene's name, and a dict from the names of variants to the folders of the scene's successful runs. Raises InputError if
-        `--variants` has an unknown name. Also raises it if a variant is named without the variant whose time is its time limit.
+        Yield for each scene its name, and a dict from the names of variants to the folders of the runs that succeeded.
+
+        Raise InputError if `--variants` has an unknown name. If variant A may take as long as variant B, also raise it if `--variants`
+        names A but not B.
         """
         options = self.options
         chosen = options.variants or list(variants)
@@ -265,9 +269,9 @@ def figures(run: Path) -> dict | None:
 
 
 def relit(metrics: dict, name: str) -> float | None:
-    """Return the mean of one metric over all new lights under which a run was rendered.
+    """Average the metric `name` over all lights with which the evaluation relit a run.
 
-    `metrics` is the run's metrics.json, and `name` the metric's name.
+    `metrics` is the run's metrics.json. Return None if there are no such lights, or if one of them lacks the metric.
     """
     return mean([light.get("refgs", {}).get(name) for light in metrics.get("relight", {}).values()])
 

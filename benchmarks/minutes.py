@@ -55,7 +55,7 @@ def _lines(run: Path) -> list[dict]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train the runs that are missing. Print the PSNR that each run reached, and the time that it took."""
+    """Train and evaluate all runs that are not finished yet. Print the PSNR that each run reached, and the time that it took."""
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]))
     parser.add_argument("--minutes", nargs="+", type=float, default=[2, 5, 10, 20])
     bench = Bench("minutes", parser, arguments)

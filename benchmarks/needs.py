@@ -1,8 +1,8 @@
-"""Measure how much time it saves to leave out what a scene does not need: `refgs bench needs --scenes DIR`.
+"""Measure how much time is saved by leaving out the optional parts that a scene does not need: `refgs bench needs --scenes DIR`.
 
 A "need" is an optional part of the method, such as inter-reflection. By default, a training decides from the photos which needs the scene
-has. Each scene is trained three times: with this default, with all needs switched on, and without inter-reflection. Seconds are CPU time,
-which other programs hardly change.
+has. Each scene is trained three times: with this default, with all needs switched on, and without inter-reflection. All times are CPU
+times, because other programs on the machine hardly change these.
 """
 
 import argparse
@@ -59,7 +59,7 @@ def deciding(run: Path) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train the runs that are missing.
+    """Train and evaluate all runs that are not finished yet.
 
     Print how much time was saved by leaving out optional parts of the method, and how much quality was lost.
     """

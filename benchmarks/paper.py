@@ -1,4 +1,6 @@
-"""Train on the data sets of the paper that RefGS implements, and compare with its tables: `refgs bench paper --data DIR`.
+"""Train on the data sets of the Ref-Gaussian paper, and compare with the paper's tables: `refgs bench paper --data DIR`.
+
+The paper is "Reflective Gaussian Splatting" (Yao et al., ICLR 2025). RefGS implements its method.
 
 DIR holds the published data sets as they are downloaded; some may be missing. The scenes' folders are `shiny_blender/SCENE`,
 `ref_real/SCENE`, `nerf_synthetic/SCENE` and `glossy_synthetic/SCENE`. Glossy Synthetic may be in NeRO's format, with
@@ -26,7 +28,7 @@ FORMS = {"psnr": ("PSNR", ".2f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".
 
 
 class Scene(NamedTuple):
-    """Describe a scene of the paper that was found on this disk: its data set, its name, and the folder to train on."""
+    """Describe a scene of the Ref-Gaussian paper that was found on this disk: its data set, its name, and the folder to train on."""
 
     data_set: str
     name: str
@@ -34,7 +36,7 @@ class Scene(NamedTuple):
 
 
 def find_scenes(data: Path) -> list[Scene]:
-    """Find the paper's scenes in a folder.
+    """Find the scenes of the Ref-Gaussian paper in a folder.
 
     Raise InputError if there are none. Its message names the folders where scenes are expected.
     """
@@ -58,7 +60,7 @@ def find_scenes(data: Path) -> list[Scene]:
 
 
 def tables() -> list[Table]:
-    """Describe the tables to print: the paper's Tables 1, 8 and 2, each with our values beside the paper's."""
+    """Describe the tables to print: Tables 1, 8 and 2 of the Ref-Gaussian paper, with the measured values beside the paper's."""
     result = []
     for key, data_set in PAPER.items():
         columns = [
@@ -74,7 +76,7 @@ def tables() -> list[Table]:
 
 
 def record(bench: Bench, scene: Scene, metrics: dict) -> None:
-    """Add a scene's metrics, and the paper's values, to the rows of `bench`. `metrics` is the run's metrics.json."""
+    """Add a scene's metrics, and the Ref-Gaussian paper's values, to the rows of `bench`. `metrics` is the run's metrics.json."""
     seconds = metrics.get("training_seconds")
     bench.record(scene.name, scene.data_set, "dB", psnr=metrics["psnr"])
     bench.record(scene.name, scene.data_set, "", ssim=metrics.get("ssim"), lpips=metrics.get("lpips"))

@@ -1,7 +1,7 @@
 """Measure the method on scenes with ground truth: `refgs bench truth --scenes DIR`.
 
-Each scene is trained by a preset and compared with all its ground truth. It is also trained for the same time with plain view-dependent
-colour (`shading=sh`), to compare the quality of novel views.
+Each scene is trained twice. The first run uses a preset; its normals, materials, light and relit images are compared with the ground truth.
+The second run has plain view-dependent colour (`shading=sh`) and takes as long as the first. Both runs are compared on novel views.
 """
 
 import argparse
@@ -33,7 +33,7 @@ TABLES = (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train the runs that are missing. Print the errors of each scene against its ground truth."""
+    """Train and evaluate all runs that are not finished yet. Print the errors of each scene against its ground truth."""
     parser = scene_options(argparse.ArgumentParser(description=__doc__.splitlines()[0]), preset="standard")
     bench = Bench("truth", parser, arguments)
     preset = ("--preset", bench.options.preset)

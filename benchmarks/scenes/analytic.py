@@ -20,7 +20,7 @@ TWO = np.array([[-0.6, 0.0, 0.0, 0.5], [0.6, 0.0, 0.0, 0.5]])
 def sky(direction: np.ndarray) -> np.ndarray:
     """Compute the sky's linear radiance (…, 3): bright above, dark below, warmer towards +x.
 
-    It is so smooth that a low roughness hardly blurs it.
+    It is so smooth that a mirror and a slightly rough surface show almost the same reflection of it.
     """
     x, y, z = np.moveaxis(direction, -1, 0)
     return np.stack([0.5 + 0.3 * z + 0.2 * x, 0.5 + 0.35 * z + 0.1 * y, 0.5 + 0.4 * z - 0.2 * x], axis=-1)

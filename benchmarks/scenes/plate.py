@@ -51,7 +51,7 @@ HOLLOW = [(0.15, 0.44), (0.11, 0.37), (0.0, 0.33)]
 
 
 def build() -> Scene:
-    """Build the plate, 2 units wide, its floor at z = -0.36."""
+    """Build the plate and the objects on it. The plate is 2 units wide; the objects stand at z = -0.36."""
     ball = [(0.30 * abs(np.cos(a)), 0.30 * np.sin(a)) for a in np.linspace(-np.pi / 2, np.pi / 2, 65)]
     turned = np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])
     cube = box((0, 0, 0), (0.15, 0.15, 0.15), 0.04)

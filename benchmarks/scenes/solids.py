@@ -1,8 +1,7 @@
 """Model meshes with signed distance functions.
 
 A solid is a function that takes points (n, 3) and returns n signed distances, negative inside. `sculpt` turns a solid into a mesh.
-Distances need not be exact, but must be smooth near the surface. Between two points, they must not differ by much more than the points are
-apart.
+Distances need not be exact, but must be smooth near the surface. Their gradients must not be much longer than 1.
 """
 
 from collections.abc import Callable

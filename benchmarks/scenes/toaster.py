@@ -10,7 +10,7 @@ SLICE = (0.36, 0.05, 0.25)  # half a slice
 
 
 def toast(points: np.ndarray) -> np.ndarray:
-    """Compute base colours of toast: golden in the middle, brown towards the crust, darker where the grid was hot."""
+    """Compute base colours of toast: golden in the middle, brown towards the crust, with darker vertical stripes."""
     x, z = points[:, 0] / SLICE[0], (points[:, 2] - 0.36) / SLICE[2]
     crust = step(0.55, 1.0, np.maximum(np.abs(x), np.abs(z)))
     grid = 0.5 + 0.5 * np.cos(7 * np.pi * x)

@@ -7,8 +7,9 @@ NEVER = -1
 
 
 class Outcome(NamedTuple):
-    """Hold the outcome of a case. `finite` is True if no value is NaN or infinite; `error` has the unit of the case.
+    """Hold the outcome of a case. `finite` is True if no value is NaN or infinite.
 
+    `error` is measured in the unit that `Case.unit` names; it has no unit if that is empty.
     `recovered` is for cases that disturb a training: the number of iterations that it took to recover, or NEVER. It is None in other cases.
     """
 

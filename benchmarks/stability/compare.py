@@ -22,15 +22,19 @@ FLOAT32 = "float32, sums of hundreds of terms"
 
 
 class Undecided(Exception):
-    """Report that too few pixels can be compared. In all others, rounding could flip a threshold test and change the value."""
+    """Report that less than a fraction SAFE of the pixels can be compared.
+
+    The other pixels are too near to a threshold or a kink: rounding could change their values or gradients much.
+    """
 
 
 def worst(found: Sequence[Tensor], expected: Sequence[Tensor], terms: Sequence[Tensor] | None = None) -> float:
     """Return the largest relative error of several tensors.
 
-    The error of a tensor is its largest difference from `expected`, divided by the largest absolute value in `expected`. Values that are
-    differences of large, nearly equal numbers cannot be so accurate. For them, `terms` gives the size of those numbers, and the error is
-    divided by the larger of the two sizes.
+    The error of a tensor is its largest difference from `expected`, divided by the largest absolute value in `expected`.
+
+    A small difference of large numbers has the rounding errors of the large numbers. For tensors of such differences, `terms` has the large
+    numbers. If the largest absolute value in `terms` is larger than that in `expected`, the error is divided by it instead.
     """
     errors = [0.0]
     for value, exact, summed in zip(found, expected, terms or expected, strict=True):
@@ -49,9 +53,10 @@ def outcome(
 ) -> Outcome:
     """Compare float32 values and gradients with float64.
 
-    The error is the values' relative error, or a tenth of the gradients' relative error if that is larger. `found` are the float32 values
-    and `by` their gradients. `expected` and `exact_by` are the same in float64. `terms` belongs to the gradients and is explained at
-    `worst`.
+    `found` are the float32 values and `by` the float32 gradients. `expected` and `exact_by` are the same in float64.
+
+    Two relative errors are computed by `worst`: that of the values, and that of the gradients with `terms`. The error of the outcome is the
+    maximum of the first and a tenth of the second.
     """
     finite = all(bool(v.isfinite().all()) for v in (*found, *by))
     return Outcome(finite, max(worst(found, expected), 0.1 * worst(by, exact_by, terms)))
@@ -105,15 +110,15 @@ def _terms(
     exact_by: Sequence[Tensor],
     generator: torch.Generator,
 ) -> list[Tensor]:
-    """Estimate how accurate float32 gradients can be.
+    """Estimate the size of the large numbers whose small differences the gradients are. Return one tensor for each gradient.
 
-    Most gradients are differences of larger numbers, which have larger rounding errors. Return the size of those numbers for each gradient.
+    `worst` takes them as `terms`: the gradients have the rounding errors of these numbers. There are two sources:
 
-    - The derivative by a surfel's alpha is the colour that the surfel adds, minus the colour that it hides. The kernel computes the hidden
-      colour from the pixel's total colour, and thus with its rounding error. To estimate the effect on all gradients, each pixel's total is
-      divided by 1 - alpha, multiplied by a random number, and propagated back.
-    - The derivative by rotation is a difference of derivatives by position, times the radius. The derivative by scale is a difference of
-      derivatives by rotation.
+    - The gradient of a surfel's alpha is the colour that the surfel adds, minus the colour that it hides. The kernel computes the hidden
+      colour from the pixel's total colour, and so with the total's rounding error. To estimate its effect on all gradients, make a random
+      gradient of the alpha image and propagate it back. In each pixel, it is the total, divided by 1 - alpha, times a random number.
+    - The gradient of a rotation is a difference of gradients of positions, times the surfel's radius. So add the length of the position's
+      gradient, times the radius. The gradient of a scale is a difference of gradients of rotations. So add the lengths of both.
     """
     features, depth, alpha = (m.detach() for m in maps)
     by_features, by_depth, by_alpha = upstream

@@ -140,8 +140,9 @@ def ties() -> Outcome:
 def one_pixel(count: int = 1_000_000) -> Outcome:
     """Compare the rasteriser with float64 on `count` surfels that all lie in one pixel and are smaller than it.
 
-    The rasteriser uses the smaller of two distances: that of the surfel and that of the low-pass filter. At the pixel's centre both would
-    be zero, and rounding would choose. So no surfel lies exactly there.
+    In each pixel, the rasteriser measures the distance to the surfel's centre twice: in the surfel's plane, and in the image (the low-pass
+    filter). It uses the smaller distance. If a surfel's centre lay exactly at the pixel's centre, both would be zero, and rounding would
+    decide which is used. So no surfel lies there.
     """
     view = camera(size=(3, 3))
     _, rotation, scale, opacity, features = surfels(view, count, pixels=(0.01, 0.38), depth=(1.0, 1.0))

@@ -15,9 +15,9 @@ NOISE = 0.7  # dB: another seed changes less than this (docs/stability.md)
 
 
 def against(course: Course, least: float) -> Outcome:
-    """Compare a finished training with a PSNR of `least` dB on held-out views.
+    """Return the outcome of a finished training that should reach a PSNR of `least` dB on held-out views.
 
-    The error is how many dB the training's final PSNR is lower, or 0 if it is not.
+    Its error is the number of dB by which the final PSNR is below `least`. If the final PSNR is not below, the error is 0.
     """
     return Outcome(course.finite, max(0.0, least - course.end))
 

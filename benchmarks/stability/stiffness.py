@@ -1,8 +1,10 @@
 """Measure how well photos can distinguish changes of light from changes of material, in float64.
 
 Two changes may cancel: a brighter light and a darker base colour give almost the same pictures. For each such pair of changes, a table
-shows the singular values of the pictures' Jacobian. If the smaller one is near zero, photos cannot distinguish the two. The table also
-shows how much each loss weight helps.
+shows the singular values of the pictures' Jacobian. If the smaller one is near zero, photos cannot distinguish the two.
+
+Some loss terms also depend on the two changes. For each such term, the table shows the condition number of the loss with this term. It also
+shows how far the term pulls the solution in the direction that photos determine least.
 """
 
 from collections.abc import Callable

@@ -35,9 +35,9 @@ def words(scenes, tmp_path):
 
 @pytest.fixture
 def called(monkeypatch):
-    """Replace the calls of refgs' commands: none runs, but the files of a finished run are written.
+    """Replace `harness.call`, so that no command of refgs runs. The replacement only writes the files of a finished run.
 
-    Return a list that receives the arguments of each call.
+    Return a list to which it appends the arguments of each call.
     """
     found = []
 

@@ -1,4 +1,7 @@
-"""Test how the preset with the best PSNR after a number of seconds is found. The seconds of the whole command count."""
+"""Test how `best` finds the preset that has reached the best PSNR after a number of seconds.
+
+The seconds are those since the command started, not only those of the iterations.
+"""
 
 import json
 
