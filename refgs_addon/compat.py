@@ -68,7 +68,7 @@ def set_modifier_input(modifier: bpy.types.NodesModifier, name: str, value) -> N
 
 
 def get_modifier_input(modifier: bpy.types.NodesModifier, name: str):
-    """Return the value of a modifier's input. A menu returns its item's name; an empty object input returns None."""
+    """Return the value of a modifier's input. For a menu, this is the name of the chosen item. For an empty object input, it is None."""
     owner, path = modifier_input(modifier, name)
     if path == "value":
         return owner.value
@@ -90,7 +90,7 @@ def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
 
 
 def usd_keeps_textures() -> dict[str, str | bool]:
-    """Return options for Blender's USD exporter: the file refers to the existing textures, and the exporter copies none.
+    """Return the arguments that stop Blender's USD exporter from copying textures. The USD file then refers to the existing texture files.
 
     Raises KeyError if Blender was built without USD, as Debian's Blender is.
     """

@@ -208,9 +208,11 @@ def _unpack(uv: Path, home: Path) -> Path:
 def _uv_environment(home: Path) -> dict[str, str]:
     """Return the environment variables for uv. Variables that the user has set, such as the address of a package mirror, keep their values.
 
-    uv downloads a Python for the trainer, because an update may replace Blender's Python or the system's. UV_TORCH_BACKEND "auto" lets uv
-    choose the build of torch for this machine's GPU. If the user has set UV_TORCH_BACKEND to "", it is removed: uv then takes torch from
-    the package index, as some mirrors require. Variables for Python itself (PYTHON…) are removed too.
+    uv downloads a Python of its own for the trainer. Blender's Python or the system's would not do, because an update may replace it.
+
+    UV_TORCH_BACKEND is "auto": uv chooses the build of torch for this machine's GPU. Some mirrors need torch from the package index
+    instead. For these, the user sets UV_TORCH_BACKEND to "", and this function removes the variable. It also removes all variables whose
+    names begin with PYTHON.
     """
     set_here = {"UV_TORCH_BACKEND": "auto", "UV_PYTHON_INSTALL_DIR": str(home / "python")}
     if not os.environ.keys() & {

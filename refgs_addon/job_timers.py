@@ -1,4 +1,4 @@
-"""Run two timers. One polls this Blender's jobs and redraws the window. The other redraws it for trainings in other processes."""
+"""Run two timers. One polls this Blender's jobs. The other watches trainings in other processes. Both redraw Blender's windows."""
 
 from pathlib import Path
 
@@ -36,7 +36,10 @@ def _poll_jobs() -> float | None:
 
 
 def follow_other_processes() -> None:
-    """Start a timer that redraws the panel every two seconds. It ends when no run listed in the scenes is trained by another process."""
+    """Start a timer that redraws the panel every two seconds, while another process trains a run.
+
+    Only the runs in the scenes' lists of runs count. When none of them is in training any more, the timer ends.
+    """
     if not bpy.app.timers.is_registered(_poll_other_processes):
         bpy.app.timers.register(_poll_other_processes, first_interval=OTHER_SECONDS, persistent=True)
 

@@ -243,9 +243,10 @@ def _check(capture: Path, out: Path) -> dict:
 
 
 def query_trainer(python: Path, log: Path) -> Job:
-    """Start a job that asks a Python for the version of its trainer.
+    """Start a job that finds the version of the trainer that the Python program `python` can import.
 
-    The job's `ready` then has the keys `refgs` (version), `card` (the GPU's name, or None) and `no_card` (why there is no GPU).
+    When the trainer has answered, the job's `ready` has the keys `refgs` (version), `card` (the GPU's name, or None) and `no_card` (why
+    there is no GPU).
     """
     return _add(Job("trainer", python, [], log))
 
@@ -253,7 +254,7 @@ def query_trainer(python: Path, log: Path) -> Job:
 def install(home: Path, log: Path) -> Job:
     """Start a job that installs the bundled trainer into the folder `home`, or resumes an interrupted installation.
 
-    The job's `ready` then has the trainer's version and GPU, as after `query_trainer`.
+    After the installation, the job's `ready` has the trainer's version and GPU, with the same keys as for `query_trainer`.
     """
     arguments = {"uv": str(installation.wheel("uv")), "trainer": str(installation.wheel("refgs"))}
     return _run_installation("install", home, log, arguments)
@@ -284,7 +285,7 @@ def train(
 ) -> Job:
     """Start a job that trains on a capture (a folder with photos) and writes the result into the run folder `out`.
 
-    With `mesh`, the job also makes a mesh after the training. It waits until earlier trainings have ended.
+    The job first waits until earlier trainings have ended. With `mesh`, it also makes a mesh after the training.
 
     `preset` is the name of a set of settings. If it is None, the settings are chosen so that the training takes `minutes`. If both are
     None, the preset is "standard". `settings` overrides single settings: `{"train.iterations": 2000}`. `resume` continues a stopped
@@ -322,8 +323,8 @@ def display_splats(python: Path, run: Path, file: Path, log: Path) -> Job:
 def render(blender: Path, arguments: tuple[str, ...], command: Mapping[str, object], log: Path) -> Job:
     """Start a job that renders in another Blender process, which runs `render_worker`. It does not wait for other jobs.
 
-    `arguments` are the command line of that Blender, and `command` is the worker's command. The finished job's `results["render"]["png"]`
-    is the path of the picture.
+    `arguments` are the command-line arguments of that Blender. `command` is the dictionary that `render_worker` then reads from stdin: what
+    to render. The finished job's `results["render"]["png"]` is the path of the picture.
     """
     return _add(Job(Path(command["png"]).name, blender, [dict(command)], log, arguments=arguments, program=BLENDER))
 

@@ -141,7 +141,7 @@ def stop() -> None:
 
 
 def forget_queries() -> None:
-    """Stop the newest job that the preferences started, and drop its result."""
+    """Stop and forget the job that the preferences started, if any: a query of the trainer's version, an installation or a removal."""
     for job in _own_jobs:
         job.stop()
         if job in jobs.JOBS:

@@ -31,8 +31,8 @@ _MIXED = "RefGS Edited"  # node that marks a mesh's material as showing the edit
 def edit_tree() -> bpy.types.NodeTree:
     """Make the node tree `RefGS Edit`, or return the existing one. All edits (modifiers that change the splats' materials) share it.
 
-    The tree blends each splat's base_color, metallic and roughness with new values. The weight of a new value is its amount, which is an
-    input of the tree, times a mask, 0..1 for each splat. The input Where selects the mask:
+    The tree blends each splat's base_color, metallic and roughness with new values. The weight of a new value is amount · mask. The amount
+    is an input of the tree, one for each of the three values. The mask is 0..1 for each splat. The input Where selects the mask:
     - "Everywhere": 1 for all splats;
     - "Box" or "Sphere": 1 inside the object Region, an Empty, and 0 outside. Falloff is the width of the soft border, as a fraction of the
       region;

@@ -15,9 +15,10 @@ _SURFACE = {"metallic": "Metallic", "roughness": "Roughness", "specular": SPECUL
 def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material:
     """Make a Principled material for the quads of `nodes.splats_tree`. It reads each splat's base colour, metallic and roughness.
 
-    `constants` can give one value for all splats: of "metallic", "roughness" or "specular". The material then uses it in place of the
-    splats' own values. The back of a splat is black, like the inside of a solid. A lit back would shine through the small gaps between the
-    front splats.
+    `constants` may have the keys "metallic", "roughness" and "specular". Such a value holds for all splats, and the material does not read
+    that value from each splat.
+
+    The back of a splat is black, like the inside of a solid. A lit back would shine through the small gaps between the front splats.
     """
     material = bpy.data.materials.new(name)
     tree = node_tree(material)
@@ -48,8 +49,8 @@ def principled(material: bpy.types.Material) -> bpy.types.ShaderNode:
 def connect_edits(material: bpy.types.Material) -> None:
     """Change a material of `splat_material` so that it shows edits of the splats.
 
-    It then reads metallic and roughness from each splat, even if all splats had the same value. If its specular is 0, splats whose
-    roughness is edited get specular reflection.
+    It then reads metallic and roughness from each splat, even if all splats had the same value. With a specular of 0, the
+    roughness of a non-metal would have no effect. So splats with edited roughness then get a specular above 0.
     """
     tree = material.node_tree
     shader = principled(material)
@@ -78,8 +79,8 @@ def _finish(material: bpy.types.Material, shader: bpy.types.NodeSocket) -> None:
 
     (u, v) is the position on the splat in standard deviations.
 
-    In each sample, Eevee draws a quad with a probability equal to its alpha, and shows the nearest one that it draws. The average over the
-    samples equals front-to-back alpha compositing with a depth for each pixel. This holds for any number of overlapping quads.
+    Eevee renders many samples of a pixel. In each sample, it draws a quad with a probability equal to its alpha, and of all drawn quads the
+    nearest one is visible. The average over the samples equals alpha compositing of the quads, sorted by depth in each pixel.
     """
     material.surface_render_method = "DITHERED"
     tree = material.node_tree

@@ -16,8 +16,8 @@ PHOTO = "refgs_photo"  # custom property of a camera's data: the file of its pho
 def read_cameras(path: Path, capture: Path | None) -> list[dict]:
     """Read the cameras of a cameras.json. Returns one dictionary for each photo.
 
-    Each dictionary has the camera-to-world matrix with OpenGL's axes, the pinhole intrinsics, and as `photo` the path of the photo in the
-    folder `capture`. Without `capture`, `photo` is "". Raises InputError if the file cannot be read, or RefGS did not write it.
+    Each dictionary has the camera-to-world matrix with OpenGL's axes and the pinhole intrinsics. Its key `photo` is the path of the photo
+    in the folder `capture`, or "" if `capture` is None. Raises InputError if the file cannot be read, or RefGS did not write it.
     """
     try:
         frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
@@ -36,10 +36,9 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
 
 
 def light_of(path: Path) -> str:
-    """Return the name of the only photo for which the recovered light is right, or "" if it is right for all photos.
+    """Read from cameras.json which photo the recovered light belongs to. Returns the photo's name, or "" if the light fits all photos.
 
-    A light that turned with the camera was different in each photo. The run then stores it as it was in one photo, which cameras.json
-    names.
+    If the light turned with the camera, it had another rotation in each photo. Then the run's panorama fits only the named photo.
     """
     return Path(json.loads(path.read_text(encoding="utf-8")).get("light_of", "")).stem
 

@@ -47,10 +47,11 @@ def remove_cameras(scene: bpy.types.Scene, capture: Path) -> None:
 
 
 def replace_cameras(scene: bpy.types.Scene, capture: Path, cameras: dict[str, bpy.types.Object]) -> None:
-    """Remove the cameras that `show_cameras` added for a capture, because its run is imported and has the same cameras.
+    """Replace the cameras that `show_cameras` added for a capture by the cameras of an imported run.
 
-    `cameras` maps names to the camera objects of the run, which are renamed to these names. If the scene looked through a removed camera,
-    it looks through the run's camera of the same photo instead. Does nothing if `show_cameras` added none.
+    `cameras` maps names to the run's camera objects. The capture's cameras are removed, and each run camera gets its name from `cameras`.
+    If the scene looked through a removed camera, it looks through the run's camera of the same photo instead. Does nothing if
+    `show_cameras` added none.
     """
     known = cameras_of(scene, capture)
     if known is None:

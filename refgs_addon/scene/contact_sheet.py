@@ -25,10 +25,10 @@ def contact_sheet(
 ) -> None:
     """Render the scene camera's view in Eevee under several lights, and put all pictures into one PNG.
 
-    The lights are the light recovered from the photos, if there is one, and each HDRI. The pictures lie in rows on a transparent, roughly
-    square sheet. `size` is the longer side of each picture in pixels. `progress` is called with the number of finished pictures and the
-    name of the next light. The scene's light is restored. Raises InputError if there is no camera, a light cannot be read, or the file
-    cannot be written.
+    Each HDRI gives one picture. The light recovered from the photos, if there is one, gives the first picture. The pictures lie in rows on
+    a transparent, roughly square sheet. `size` is the longer side of each picture in pixels. `progress` is called with the number of
+    finished pictures and the name of the next light. The scene's light is restored. Raises InputError if there is no camera, a light cannot
+    be read, or the file cannot be written.
     """
     import numpy as np
 

@@ -44,8 +44,9 @@ def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
 def export_splats(collection: bpy.types.Collection, path: Path) -> None:
     """Write the splats of a run, with the edits of their materials, as a splats.ply.
 
-    The new file is a copy of the run's file with the edited materials. Viewers without lights show its fixed colours (f_dc). These change
-    in proportion to the base colour. Raises InputError if the run's file is missing or has changed, or the new file cannot be written.
+    The new file is a copy of the run's file with the edited materials. Each splat also has a fixed colour (f_dc), for viewers without
+    lights. Where an edit changes the base colour, the fixed colour changes by the same factor. Raises InputError if the run's file is
+    missing or has changed, or the new file cannot be written.
     """
     splats = splats_of(collection)
     source = run_folder(collection) / "splats.ply"

@@ -25,10 +25,10 @@ _reader = ThreadPoolExecutor(1)
 
 
 def watch(job: jobs.Job, scene: bpy.types.Scene, on: bool = True) -> None:
-    """Show the surfels of a training job in a scene, and update them with each of its previews. With `on` False, remove them.
+    """Show the surfels of a training job in a scene. With `on` False, remove them.
 
-    The object is added here, still without points. Later the timer calls `update`, which only has to replace the points. Making the
-    object's nodes would take too long there.
+    This function adds an object without points, and makes its nodes, which takes some time. Later a timer calls `update`, which must be
+    fast: it only replaces the points, each time the training writes a preview.
     """
     for live in [live for live in _shown if live.job is job]:
         _remove(live)

@@ -25,7 +25,7 @@ def materials() -> dict[str, Path]:
 
 
 def read_material(name: str) -> dict[str, float | tuple[float, ...]]:
-    """Read a material preset: values by the names of an edit's inputs, such as "Base Color" and "Roughness Amount".
+    """Read a material preset. Returns a dictionary from the names of an edit's inputs, such as "Roughness Amount", to their values.
 
     A colour is RGBA in linear Rec.709; all other values are 0..1. Raises InputError if the preset is missing or invalid.
     """

@@ -14,7 +14,7 @@ REGION = "refgs_region"  # custom property of an object that marks a region
 
 
 def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name: str, shape: str) -> bpy.types.Object:
-    """Add an Empty around the splats: in its frame, nearly all splats lie in the cube from -1 to 1.
+    """Add an Empty around the splats. In the Empty's local coordinates, nearly all splats lie in the cube from -1 to 1.
 
     `shape` is how Blender displays the Empty: "CUBE", "SPHERE" or "ARROWS".
     """
@@ -58,9 +58,9 @@ def training_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
 def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
     """Show the box that limits the training: only what is inside is trained. Make the box if there is none.
 
-    The check of a capture finds a ball at which the cameras look, and a new box surrounds this ball. If the capture was not checked, the
-    new box is 2 m wide around the origin. This fits most captures too, because the trainer moves and scales the cameras until the ball's
-    centre is the origin and its radius is 1 m. (It leaves the cameras of captures from NeRF-Blender as they are.)
+    The check of a capture finds the sphere that the cameras look at. A new box encloses this sphere. If the capture was not checked, the
+    new box is 2 m wide around the origin. That is right for most captures: the trainer turns, moves and scales the cameras so that the
+    sphere has its centre at the origin and a radius of 1 m. Captures from NeRF-Blender usually keep their cameras unchanged.
     """
     box = training_region(scene)
     if box is None:

@@ -1,4 +1,4 @@
-"""Read from run.toml how a run was trained. If the file is missing or cannot be read, the functions answer as for an empty file."""
+"""Read from run.toml how a run was trained. A file that is missing or cannot be read counts as an empty file."""
 
 import math
 import tomllib

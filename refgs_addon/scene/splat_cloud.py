@@ -264,10 +264,11 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
     reach = np.maximum(np.where(np.isfinite(beside), 64 * beside, 1), 1e-24)
 
     def gather(order: np.ndarray) -> np.ndarray:
-        """Sum seven products over each splat's neighbours along one curve, for the least-squares fit. Returns (7, N).
+        """Compute the sums that each splat's least-squares fit needs, over the splat's neighbours along one curve. Returns (7, N).
 
-        `order` has the splats' indices along the curve. The products are w·u·u, w·u·v, w·v·v, w·u·du, w·u·dv, w·v·du and w·v·dv. (u, v) is
-        the offset to the neighbour and (du, dv) the difference of the normals, both along the splat's axes. w is the neighbour's weight.
+        `order` has the splats' indices along the curve. The seven sums are of w·u·u, w·u·v, w·v·v, w·u·du, w·u·dv, w·v·du and w·v·dv.
+        w is the neighbour's weight. (u, v) is the offset to the neighbour, and (du, dv) the difference of the normals. Both are measured
+        along the splat's two axes.
         """
         place, facing_way, *axes, width = (values[order] for values in (position, normal, *tangents, reach))
         found = np.zeros((7, count), np.float32)

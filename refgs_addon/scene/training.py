@@ -117,7 +117,7 @@ def forget(scene: bpy.types.Scene, folder: Path) -> None:
 
 
 def _choices(settings: bpy.types.PropertyGroup) -> dict[str, object]:
-    """Return the settings that the artist chose in the scene, by the trainer's names. Settings at "auto" are left to the preset."""
+    """Return the settings that the artist chose, as {trainer's name of the setting: value}. Leave out settings whose value is "auto"."""
     chosen = {
         "surfels.budget": settings.splats or "auto",
         "light.frame": settings.light,

@@ -86,7 +86,8 @@ class SetMaterial(_OfEdit, bpy.types.Operator):
 class KeepMaterial(_OfEdit, bpy.types.Operator):
     """Save the values of an edit as a material preset, or remove a preset. The list of presets shows this as buttons + and −.
 
-    Blender's own operator cannot do this: it does not read the inputs of a modifier, and 4.3 overwrites a preset of the same name.
+    Blender's own operator cannot do this, because it does not read the inputs of a modifier. In Blender 4.3 it also overwrites a preset of
+    the same name.
     """
 
     bl_idname = "refgs.keep_material"

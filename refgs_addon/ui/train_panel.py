@@ -255,7 +255,7 @@ def draw_status(self, context: bpy.types.Context) -> None:
 
 
 def _fraction(job: jobs.Job) -> float:
-    """Return how much of a training is done, 0..1. A job of another kind has several stages, and each counts from 0 to 1."""
+    """Return how much of a job is done, 0..1. For a job with several stages, return how much of the present stage is done."""
     facts = job.progress
     return facts["done" if "stage" in facts else "iteration"] / max(facts["total"], 1) if facts else 0.0
 
