@@ -1,7 +1,7 @@
 """Check that modules of the trainer and of the extension import only what they may.
 
-The trainer's packages are ordered in layers, called floors. A module imports only from its own floor and from those below. Imports never
-form a circle. The trainer never imports bpy. The extension never imports torch.
+The trainer's packages are ordered in layers, called floors. A module imports only from its own floor and from those below. There are no
+import cycles. The trainer never imports bpy. The extension never imports torch.
 
     python scripts/check_imports.py [FOLDER]      # this repository, or a folder that is laid out like it
 
@@ -71,9 +71,9 @@ def imports(files: dict[str, Path], root: Path) -> Iterator[Import]:
 
 
 def circles(all_imports: list[Import]) -> Iterator[list[Import]]:
-    """Find modules that import each other in a circle. Yields each circle as a list of its imports.
+    """Find import cycles. Yields each cycle as a list of its imports.
 
-    After a circle is found, one of its imports is dropped and the search starts again.
+    After each cycle, the search starts again and ignores the last import of that cycle.
     """
     places = {(i.source, i.target): i for i in all_imports if i.source != i.target}
     while True:

@@ -55,7 +55,7 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 def _allowed(key: str, info: FieldInfo) -> str | None:
     """Describe the values that a setting accepts, for the table on the page.
 
-    Leaves out values that exist only to compare with papers. Returns None if one value is left: then there is nothing to choose.
+    Leaves out values that exist only to compare with papers. Returns None if only one value is left to choose.
     """
     if get_origin(info.annotation) is Literal:
         values = [value for value in get_args(info.annotation) if value not in COMPARISON.get(key, ())]

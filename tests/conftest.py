@@ -24,7 +24,7 @@ CARDS = ["emulated", pytest.param("cuda", marks=NO_CARD)]
 
 @pytest.fixture(scope="session", autouse=True)
 def no_package_of_the_clone() -> None:
-    """Remove the folder that holds this clone from sys.path, where pytest puts it.
+    """Remove the parent folder of this clone from sys.path. Pytest has added it.
 
     The clone has an __init__.py for Blender, so pytest takes it for a package. If the clone's folder is named refgs, programs that tests
     start would import that folder in place of the trainer.

@@ -50,7 +50,8 @@ def test_the_zips(archives):
 def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
     """Check that a released zip installs a working trainer by the real uv (package installer), and can remove it again.
 
-    uv uses this machine's Python and takes torch from the default package index, because a mirror may have no other.
+    uv uses this machine's Python. It takes torch from the default package index, because a package mirror may lack the builds of torch for
+    certain GPUs.
     """
     monkeypatch.setenv("UV_PYTHON_PREFERENCE", "only-system")
     monkeypatch.setenv("UV_TORCH_BACKEND", "")

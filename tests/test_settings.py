@@ -98,7 +98,8 @@ def test_a_run_of_before_a_setting_still_opens():
 def test_a_run_of_a_newer_release_is_not_read(tmp_path, made_by, says):
     """Check that results of a newer minor or major release are refused with "update RefGS". A newer patch release is accepted.
 
-    The file in this test has no settings, so an accepted release still ends in the error "is broken". So does a wrong version number.
+    The file in this test has no settings. If its release is accepted, reading therefore fails later, with the error "is broken". A version
+    number that cannot be read gives the same error.
     """
     (tmp_path / "run.toml").write_text(f"[run]\nrefgs = {json.dumps(made_by)}\n")
     with pytest.raises(InputError, match=says):

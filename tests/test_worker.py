@@ -163,7 +163,7 @@ def test_photos_without_cameras(talk, tmp_path):
 def test_a_terminated_training_ends_with_a_checkpoint(talk, run, left):
     """Check that a training whose process gets SIGTERM is cancelled and ends with status 0.
 
-    If `left`, the training was first told to go on alone (command `keep`), and its standard input was closed.
+    If `left`, the command `keep` comes first: the training then goes on although its standard input is closed.
     """
     if left:
         talk.tell("keep", on=True)
@@ -188,7 +188,7 @@ def free(run) -> bool:
 def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
     """Check that after the command `keep` a training runs to its end even if its input and output pipes are closed.
 
-    It goes on although it was paused, and then exports its mesh.
+    When the input closes, the training is paused. It resumes by itself, and the export that waits in the queue runs after it.
     """
     run = tmp_path / "run"
     small = train(ball_capture, run, "train.iterations=60", "mesh.resolution=32", "mesh.triangles=500")
@@ -211,7 +211,7 @@ def test_a_training_that_is_kept_needs_nobody(ball_capture, tmp_path):
 
 
 def test_what_waits_goes_with_the_input(talk, run):
-    """Check closing a worker's input right after `stop`: it writes the surfels, and drops the export that was queued."""
+    """Close a worker's input right after the command `stop`. Check that the worker writes the surfels, but skips a queued export."""
     talk.tell("export", run=str(run), texture=64)
     talk.until("progress")
     talk.tell("stop")
@@ -230,9 +230,9 @@ def test_a_training_that_is_kept_no_longer(talk, run):
 
 
 def test_a_folder_that_is_trained_in(talk, ball_capture, run):
-    """Check that only one process can train a folder. Another process can read the training's progress and stop it.
+    """Check that only one process at a time can write a training into a folder. Another can read its progress and stop it.
 
-    After the training process is killed, the folder can be trained again.
+    After the process is killed, another process can resume the training in this folder.
     """
     until((run / PROGRESS).exists, PATIENCE)
     assert json.loads((run / PROGRESS).read_text()).keys() == {"iteration", "total", "seconds_left"}

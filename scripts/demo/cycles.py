@@ -129,7 +129,7 @@ class Renderer:
 
 
 def _material(values: Material, attribute: str) -> bpy.types.Material:
-    """Make a Principled BSDF with these values. Render passes record its inputs, the normal and the depth.
+    """Make a Principled BSDF with these values. It also writes render passes: albedo, metallic, roughness, normal and depth.
 
     If the base colour is a texture, it is read from the mesh's colour attribute named `attribute`.
     """

@@ -38,7 +38,7 @@ def build() -> Scene:
 
 
 def _flutes(angle: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Compute how much sixteen shallow vertical grooves scale the radius at each angle and height: factors up to 1.
+    """Make sixteen shallow vertical grooves: return factors, up to 1, that scale the urn's radius at each angle and height.
 
     The grooves fade out towards both ends of the urn's body.
     """

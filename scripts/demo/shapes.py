@@ -34,7 +34,7 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Scene:
-    """Hold an object around the origin, with Z up, and the light and the lowest camera to photograph it with.
+    """Hold an object around the origin, with Z up, its light, and how low cameras may stand.
 
     `light` names one of Blender's HDRIs. The cameras stand on a sphere around the origin. None stands below the height `lowest`, given as a
     fraction of the sphere's radius (-1..1).

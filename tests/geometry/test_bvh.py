@@ -24,7 +24,9 @@ SHAPES = {"rings": rings(), "half open": inside(0.3, 4), "five faces": trimesh.c
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(("scale", "moved"), [(1.0, 0.0), (1e3, 2e4)])
 def test_as_embree(shape, scale, moved, card, monkeypatch):
-    """Trace rays that are mirrored at random normals. Check that at most 0.2 % of the pixels differ from Embree's in visibility.
+    """Check visibility by the CUDA kernel against Embree's: fewer than 0.2 % of the pixels may differ.
+
+    One ray is traced for each pixel: the camera's ray, mirrored at a random normal.
 
     Meshes of ordinary size at the origin are tested, and meshes 1000 times as large far from it.
     """

@@ -22,10 +22,10 @@ def degrees(a, b):
 
 
 def expected(masks, cameras, low, high, resolution):
-    """Compute a visual hull from masks with numpy in float64: the reference for the program's `_carve`.
+    """Compute with numpy in float64 what `_carve` computes: the smallest mask values of each voxel.
 
-    Each voxel's centre is projected into all views, where the masks are interpolated. Return for each voxel: the smallest mask value, the
-    second smallest, the values of all views, and the distance in pixels to the nearest picture border.
+    Each voxel's centre is projected into all views, where the masks are interpolated. Return for each voxel: the smallest mask value in any
+    view, the second smallest, its mask values in all views, and the distance in pixels to the nearest picture border in any view.
     """
     grid = np.stack(np.meshgrid(*((np.arange(resolution) + 0.5) / resolution,) * 3, indexing="ij"), axis=-1)
     points, values, border = low + grid * (high - low), [], np.full(3 * (resolution,), np.inf)
@@ -55,7 +55,7 @@ def expected(masks, cameras, low, high, resolution):
 
 @pytest.mark.parametrize("isa", supported())
 def test_carving_matches_float64(isa, monkeypatch):
-    """Check the voxel values from which the visual hull is made: those of `_carve` match float64 to 1e-4.
+    """Check `_carve`, which finds each voxel's two smallest mask values among all views: they match float64 to 1e-4.
 
     Masks are noise of several sizes. Some cameras are inside the volume and some see only a part of it. The number of voxels is no multiple
     of the SIMD width.

@@ -23,9 +23,9 @@ def ball(centre, radius):
 
 
 def test_it_is_the_surface_of_the_whole_grid_across_chunks():
-    """Check that a ball across eight chunks of 64³ voxels gets the same vertices as by marching cubes on the whole grid.
+    """Check the mesh of a ball that lies in eight chunks of 64³ voxels.
 
-    The number of faces is the same, too.
+    It has the same vertices and the same number of faces as a mesh by marching cubes on one grid of 128³ voxels.
     """
     sdf = ball([63.7, 64.2, 60.1], 40.3)
     mesh = isosurface(*blocks_about(sdf, 32))
@@ -38,7 +38,10 @@ def test_it_is_the_surface_of_the_whole_grid_across_chunks():
 
 
 def test_a_surface_on_the_planes_between_chunks_has_no_cracks():
-    """Check that a surface exactly through voxel centres is watertight, although many of its vertices coincide there."""
+    """Check that the meshes of three cubes, each across several chunks, are watertight after coincident vertices are merged.
+
+    The sides of one cube lie exactly on voxel centres. Those of the other two lie half way between voxel centres.
+    """
     for middle, radius in ((64.0, 32.0), (64.0, 20.5), (63.5, 30.0)):
         mesh = isosurface(*blocks_about(lambda p, m=middle, r=radius: np.abs(p - m).max(axis=-1) - r, 32))
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)

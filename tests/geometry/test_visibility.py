@@ -16,9 +16,9 @@ def directions(count: int, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize(("scale", "moved"), FRAMES)
 def test_nothing_is_hidden_on_a_sphere(scale, moved):
-    """Check that a sphere does not occlude itself: rays from its points are free, down to one degree above the horizon.
+    """Check that a sphere does not occlude itself: rays from its points are free if they rise at least one degree above the surface.
 
-    The radius of the mesh is 1 % smaller than the points', equal, or 1 % larger.
+    The points lie on an exact sphere. The radius of its mesh is 99 %, 100 % or 101 % of the exact radius.
     """
     normals, towards = directions(20_000), directions(20_000, seed=1)
     tangent = np.cross(normals, towards)

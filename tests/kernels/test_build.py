@@ -1,4 +1,4 @@
-"""Test compiling, caching and choosing the CPU kernels."""
+"""Test compiling and caching the CPU kernels. Test the error for an unknown instruction set."""
 
 import subprocess
 import sys

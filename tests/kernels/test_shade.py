@@ -64,7 +64,8 @@ def means(camera: Camera, colours: int) -> tuple[Tensor, Tensor]:
 def case(appearance: bool, indirect: bool, size: tuple[int, int]):
     """Make random maps of features and alpha, a camera and upstream gradients; run the float64 reference on them.
 
-    If `appearance`, pixels have a colour by direction. If `indirect`, a visibility map has free, occluded and partly occluded pixels.
+    If `appearance`, pixels have a view-dependent colour, which replaces diffuse shading. If `indirect`, a visibility map has free, occluded
+    and partly occluded pixels.
 
     Return camera, (features, alpha), visibility, the reference's maps, the mask of safe pixels, the upstream gradients and the reference's
     gradients. A pixel is safe if it is not near a kink, where derivatives jump.
@@ -114,8 +115,8 @@ def test_matches_reference(indirect, appearance, size, device):
 def test_other_ways_match_reference(how, device):
     """Check three options of `shade` against the reference.
 
-    With "display", colours are those of a screen and are not encoded as sRGB. With "mirror", surfaces are sharp mirrors, weighted by
-    metallic. With "matte", nothing is specular.
+    With "display", light and materials are already display values, so the result is not encoded as sRGB. With "mirror", surfaces are sharp
+    mirrors: metallic blends their own colour with the mirrored light. With "matte", nothing is specular.
     """
     by_direction = how != "matte"
     camera, (features, alpha), *_ = case(by_direction, False, (45, 30))

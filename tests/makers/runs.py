@@ -24,7 +24,7 @@ def quaternion_matrix(q):
 
 
 def write_ply(path, columns):
-    """Write `columns` as a PLY file of float32. They map each property's name to its values."""
+    """Write a PLY file of float32. `columns` maps the name of each property to its values."""
     rows = np.zeros(len(columns["x"]), dtype=[(name, "<f4") for name in columns])
     for name, value in columns.items():
         rows[name] = value

@@ -16,9 +16,9 @@ def chosen(splats, which):
 
 
 def make(count=7, coefficients=16, indirect=0):
-    """Make random splats, no two values alike.
+    """Make random splats.
 
-    `coefficients` is the number of spherical harmonics of their colour, `indirect` that of their indirect light.
+    Their colour has `coefficients` spherical harmonics, and their indirect light has `indirect`. If `indirect` is 0, `received` is 1.
     """
     rng = np.random.default_rng(1)
 

@@ -53,7 +53,7 @@ def learned(made: Trainer) -> dict[str, torch.Tensor]:
 def check_equal(one: Trainer, other: Trainer) -> None:
     """Check that two trainings have learned the same values, bit for bit.
 
-    What the trainer chose automatically must be the same, too.
+    The decisions that the trainer reported to the user (`state.decided`) must be the same, too.
     """
     assert one.state.decided == other.state.decided
     torch.testing.assert_close(learned(one), learned(other), rtol=0, atol=0)

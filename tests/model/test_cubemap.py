@@ -31,9 +31,9 @@ def test_a_texels_own_direction_reads_that_texel():
 
 
 def test_no_seam_between_faces():
-    """Check that reading a cubemap shows no seam at the edges between faces: there, errors shrink with the texel size.
+    """Check that a cubemap has no seam at the edges between its faces.
 
-    The cubemap holds a smooth function. At a seam, errors would not shrink.
+    The cubemap stores a smooth function and is sampled at the edges. With smaller texels, the error must shrink. At a seam it would not.
     """
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(4000, 3))

@@ -48,10 +48,10 @@ def test_levels_of_large_cubemaps_match_direct_integration(side):
 
 
 def test_smaller_cells_bring_the_error_down(monkeypatch):
-    """Check that summing the light over four times as many cells at least halves the error of a prefiltered level.
+    """Check that a prefiltered level's error at least halves if `prefilter.CELLS` is four times as large.
 
-    The light is constant within a texel. The sharpest lobe is left out: it is no wider than a texel, so its error is small from the start.
-    Irradiance is left out, too, because it has cells of its own.
+    The filter then reads finer texels of the light's mips. The light is constant within a texel of the cubemap. The sharpest lobe is left
+    out: it is no wider than a texel, so its error is small from the start. Irradiance is left out, too: it always reads fine texels.
     """
     side, found = 32, []
     radiance = light(side)

@@ -26,7 +26,10 @@ def colourful() -> Environment:
 
 
 def test_an_open_plane_has_the_whole_light():
-    """Check an unoccluded plane: it receives exactly the environment's diffuse light. Its relit colour is right to 0.02."""
+    """Check an unoccluded plane: it receives exactly the environment's diffuse light.
+
+    `relit` gives its surfels a diffuse colour for each view direction. From four directions, this colour is right to 0.02.
+    """
     light, up = colourful(), np.tile([0.0, 0.0, 1.0], (5, 1))
     plane = surfels(np.zeros((5, 3)), up)
     transport = relight.Transport(plane, as_occluder(plate(0.0, 1)))
@@ -68,10 +71,11 @@ def test_inside_a_matte_bowl(albedo, monkeypatch):
 
 
 def test_what_training_takes_of_it(monkeypatch):
-    """Check the light that surfels receive, relative to unoccluded ones: 2/3 in a bowl of albedo 1/2, 1 on a convex ball.
+    """Check `received`: the light that a surfel receives, divided by the light that it would receive if nothing occluded it.
 
-    The training multiplies light by this ratio. It must not depend on the side to which normals point, and hardly on how many surfels trace
-    rays.
+    It is 2/3 in a bowl of albedo 1/2, and 1 on a convex ball. The training multiplies light by this ratio. The ratio must not depend on
+    whether normals point inward or outward. Its RMS error in the bowl is below 3 %, or below 5 % if only a quarter of the
+    surfels trace rays.
     """
     occluder, points, normals = bowl()
     mirrors(monkeypatch, 0.0)
@@ -105,7 +109,10 @@ def test_a_white_bowl_under_an_even_sky_cannot_be_seen(part, monkeypatch):
 
 
 def test_a_mirror_sends_the_light_that_it_faces(monkeypatch):
-    """Check a perfect mirror above a point: in every direction the point sees the reflected light from below, to 0.05."""
+    """Check the light that a point sees in a perfect mirror above it: that of the environment below, to 0.05.
+
+    Directions whose mirrored light is occluded are left out.
+    """
     light = colourful()
     mirrors(monkeypatch, 1.0)
     below = surfels(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))._replace(roughness=torch.tensor([0.05]))
