@@ -49,7 +49,10 @@ def test_the_material_reads_what_varies_alone(constants, run_folder, scene):
 
 
 def test_an_edit_has_it_read_all(run_folder, scene):
-    """Check that an edit makes the material read attributes of the splats, although metallic and roughness were constants before."""
+    """Check that after an edit, the material reads metallic and roughness from attributes of the splats.
+
+    Before the edit, both are constants.
+    """
     move_to_header(run_folder, MATTE)
     run = import_run(run_folder, scene)
     add_edit(run.collection, "Everywhere", "Gold")

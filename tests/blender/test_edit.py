@@ -148,7 +148,10 @@ def test_the_buttons(addon, run):
 
 
 def test_what_is_painted_on_the_mesh(run):
-    """Check that weights painted on the upper half of the mesh edit the splats above it, and not the splats below it."""
+    """Check that weights painted on the upper half of the mesh edit the splats higher than the whole mesh, but not those lower.
+
+    The mesh is first moved into the middle of the splats.
+    """
     run.mesh[0].data.transform(Matrix.Translation((-1, 3, -2)))  # into the middle of the splats
     add_edit(run.collection, "Painted", "Gold")
     canvas = next(item for item in run.collection.objects if item.get("refgs_region"))

@@ -129,7 +129,8 @@ def test_normals_bend_as_a_sphere_does(tmp_path):
 def foreign_columns(scales, normals):
     """Make the columns of a PLY file of splats from another program.
 
-    There are no materials. Each splat has `scales` scales. Quaternions are not normalised. Normals are zero, or missing.
+    The file has no materials. `scales` is the number of its scale columns: 2 or 3. Quaternions are not normalised. If
+    `normals` is true, the file has normals, which are all zero.
     """
     rng = np.random.default_rng(4)
     columns = {name: value for name, value in random_columns().items() if name not in MATERIALS}

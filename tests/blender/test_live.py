@@ -22,7 +22,7 @@ def preview(job, tmp_path, iteration, count):
 
 
 def clouds():
-    """Return the file's point clouds."""
+    """Return the point clouds in the open Blender file."""
     return [item for item in bpy.data.objects if item.type == "POINTCLOUD"]
 
 

@@ -1,4 +1,4 @@
-"""Test training from Blender with a fake trainer: the scene's settings, the buttons, and the runs that the file lists."""
+"""Test training from Blender with a fake trainer: the scene's settings, the buttons, and the runs that the Blender file lists."""
 
 import json
 import math

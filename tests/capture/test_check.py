@@ -74,7 +74,10 @@ def test_blurred_photos_are_named(tmp_path):
 
 
 def test_what_is_shown_of_it(tmp_path):
-    """Check the files that the check of a capture writes: all cameras, and small masked photos as thumbnails."""
+    """Check the files that `check` writes: cameras.json with all cameras, and thumbnails of up to 12 photos.
+
+    If the capture has masks, the thumbnails have an alpha channel.
+    """
     capture = read_capture(nerf_blender(tmp_path / "capture", {"train": 24, "test": 6}))
     out = tmp_path / "new" / "out"
     found = check(capture, out)

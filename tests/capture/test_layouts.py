@@ -371,7 +371,10 @@ def test_glossy_synthetic_converted_to_nerf_blender(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".png", ".PNG", ".webp"])
 def test_reduced_photos_of_a_colmap_capture(tmp_path, suffix):
-    """Check that the path of a capture's folder `images_4` selects the reduced photos in it. Every eighth photo is held out."""
+    """Check that reading the folder `images_4` of a capture uses the reduced photos in this folder, and cameras that match their size.
+
+    Every eighth photo is held out, as for the photos of full size.
+    """
     folder = colmap(tmp_path / "sedan")
     for i, pose in enumerate(ring(16)):
         write(folder / "images_4" / f"{i:04d}.png", ball(pose, 16, 12, 15.0)[..., :3])

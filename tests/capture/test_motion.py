@@ -144,9 +144,10 @@ def test_what_stands_still_contradicts_what_turns():
         places.append(seen[:, :2] / seen[:, 2:])
 
     def contradicted(poses: list[np.ndarray], reach: int, features: slice) -> np.ndarray:
-        """Return for each match whether the poses contradict it: bool (N,). Only photos at most `reach` apart are matched.
+        """Return for each match between two photos whether the poses contradict it: bool (N,).
 
-        `features` selects the scene's points to match.
+        The photos form a closed ring. Of the pairs chosen by `pairs`, only photos at most `reach` places apart are matched. Only the
+        scene's points in the slice `features` are matched.
         """
         far = []
         for a, b in pairs(count):

@@ -51,9 +51,9 @@ def test_the_normal_map_mends_a_coarse_mesh():
 
 @pytest.mark.parametrize("size", [128, 320])
 def test_how_many_rows_are_baked_at_a_time_does_not_matter(unwrapped, monkeypatch, size):
-    """Check that baking in chunks of 37 rows gives the same textures as baking all rows at once.
+    """Check that baking 37 rows of texels at a time gives the same textures as baking all rows at once.
 
-    A small texture is computed at every texel. A large one is computed at a lower resolution, then enlarged.
+    The small texture is computed at every texel. The large one is computed at a lower resolution, then enlarged.
     """
     splats, found = sphere_of_splats(300), []
     for rows in (37, size):

@@ -34,7 +34,7 @@ def test_what_is_convex_stays_as_it_is():
 
 
 def test_the_dark_is_not_made_white():
-    """Check that base colours between two plates that nearly touch are brightened by at most 1 / LEAST, the correction's limit."""
+    """Check that base colours between two plates that nearly touch are multiplied by at most 1 / LEAST, the correction's limit."""
     low, high = (trimesh.creation.box((2, 2, 0.1)).apply_translation([0, 0, z]) for z in (-0.05, 0.11))
     seen = surfels(np.zeros((4, 3)), np.tile([0.0, 0.0, 1.0], (4, 1)), 0.1)
     found = unshadowed(to_splats(seen), seen, as_occluder(low, high.subdivide()).mesh, even())

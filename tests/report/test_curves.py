@@ -1,4 +1,6 @@
-"""Test the report's curves of error over time: Pareto fronts, knees, and the time to reach an error.
+"""Test the report's curves of error over time: their Pareto front, their knee, and the time until a given error is reached.
+
+After a curve's knee, more training improves little.
 
 Test also the names that the report gives to runs.
 """

@@ -112,13 +112,17 @@ def charts(html):
 
 
 def places(svg, gid):
-    """Read the lines of an SVG that are in groups named `gid`. Each is an array of points (n, 2); y points down."""
+    """Read the curves drawn in an SVG's groups named `gid`. Return the points (n, 2) of each curve; y points down."""
     paths = re.findall(rf'<g id="{gid}">\s*<path d="([^"]+)"', svg)
     return [np.array(re.findall(r"[ML] (\S+) (\S+)", path), float) for path in paths]
 
 
 def test_the_charts_draw_the_history(run):
-    """Check the charts: an error that is a power of time is drawn as a straight line, and bars are proportional to seconds."""
+    """Check the charts of error over time and of the seconds that each part of the training takes.
+
+    Both axes of the error chart are logarithmic, so the test's power law is drawn as a straight line. The bars of the other chart have
+    lengths proportional to the seconds.
+    """
     page = reported(run)
     errors, parts = charts(page.html)
     for words in ("held-out views: RMS error", "training views: RMS error", "training loss", "seconds of training"):

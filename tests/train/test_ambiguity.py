@@ -23,7 +23,8 @@ def ball(ball_capture, tmp_path_factory):
 def test_what_is_left_is_what_both_changes_leave(ball):
     """Check the reported value `left`: how much two changes that nearly cancel still alter the pictures.
 
-    It must agree to 30 % with a direct measurement, which renders both changes together at a tenth of their size.
+    It must agree to 30 % with a direct measurement. The measurement makes both changes together, reduced to a tenth, and renders the
+    result. It multiplies the difference of the pictures by ten.
     """
     found = ambiguities(ball)
     now = ball.surfels(), ball.environment().radiance

@@ -106,9 +106,10 @@ def backward(loss: Tensor) -> None:
 
 @pytest.mark.parametrize("indirect", [False, True])
 def test_an_iteration_stays_on_the_card(ball_capture, tmp_path, monkeypatch, indirect):
-    """Check that a training step keeps all its tensors on the GPU, and reads a value back only once, in the rasteriser's `how_many`.
+    """Check that a training step keeps all its tensors on the GPU, and that the CPU reads no value back, except in `how_many`.
 
-    The tensors are fake. Reading a value of one is an error, and so is making a tensor whose size depends on a value.
+    The tensors are fake: reading a value is an error, and so is making a tensor whose size depends on a value. The rasteriser's `how_many`
+    must read a value, so the test replaces it by a function that returns a constant.
     """
     ball = as_occluder(trimesh.creation.icosphere(2))
     tree = ball.tree(torch.device("cpu"))

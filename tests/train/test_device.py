@@ -71,7 +71,7 @@ def test_a_driver_that_refuses(monkeypatch):
 
 
 def trainer_from(capture, folder, start: int, report=lambda *event: None) -> Trainer:
-    """Make a trainer that begins with `start` surfels. It may grow to far more."""
+    """Make a trainer that begins with `start` surfels. Its budget is 24,000 surfels."""
     changes = f"surfels.start={start}", "surfels.budget=24000", "surfels.inside=0.0", "surfels.opacity=0.73"
     return trainer(capture, folder / "run", "surfels.hull=48", *changes, total=12, report=report)
 

@@ -39,7 +39,8 @@ def test_a_disk_that_is_taken_out(ball_capture, tmp_path):
 def test_a_disk_that_is_full(ball_capture, small_disk):
     """Check that a training on a full disk ends with a one-line error, and can be resumed once there is space.
 
-    Here the file that cannot be written is not a checkpoint. test_checkpoint.py tests checkpoints.
+    The disk is full from iteration 99, between two checkpoints, so another file cannot be written. test_checkpoint.py tests a checkpoint
+    that cannot be written.
     """
     filler = small_disk / "filler"
 

@@ -27,9 +27,10 @@ def test_it_lies_between_the_presets():
 
 @pytest.mark.parametrize("part, factor", [(0.25, 2), (0.5, 2**0.5), (1.01, 1), (1.99, 1), (4, 0.5**0.5)])
 def test_rates_change_only_beyond_the_presets(part, factor):
-    """Check the learning rates of a schedule with `part` times the iterations of the preset `quick`.
+    """Check that `part` times the iterations of the preset `quick` gives `factor` times its learning rates.
 
-    The preset `standard` has twice as many iterations, at the same rates. Shorter schedules have higher rates, and longer ones lower rates.
+    The preset `standard` has twice the iterations of `quick`. From `quick` to `standard`, the rates do not change. With fewer iterations
+    than `quick`, they are higher. With more iterations than `standard`, they are lower.
     """
     assert STANDARD.train.iterations == 2 * QUICK.train.iterations
     rates = _scheduled(QUICK, part * QUICK.train.iterations, QUICK, STANDARD).rates

@@ -69,7 +69,7 @@ def test_what_is_matte_goes_without_specular(chalk):
 def test_what_is_matte_ends_sooner(chalk, matte, tmp_path):
     """Check that training on a matte scene skips a fifth of its remaining iterations.
 
-    None are skipped if the setting needs.iterations is on, or if the user gave a duration.
+    The setting needs.iterations=on keeps all iterations. A duration given by the user keeps all of them too.
     """
     found = chalk.state.needs["iterations"]
     assert not found["needed"] and found["seconds"] > 0

@@ -28,8 +28,8 @@ def _train(
 ) -> tuple[int, float]:
     """Simulate a training that follows the plan `made`. Return the number of iterations and the seconds, without pauses.
 
-    `pace` gives the seconds of an iteration. Iterations begin at `first`, after `start` seconds. At iteration 100 the training pauses for
-    `paused` seconds. Writing the result at the end counts too.
+    Preparing takes `start` seconds. Then iterations are counted from `first`, and `pace(iteration)` is the seconds that an iteration takes.
+    At iteration 100 the training pauses for `paused` seconds. Writing the result at the end counts too.
 
     The plan expects the last iteration to take `growth` times as long as the first.
     """

@@ -1,6 +1,6 @@
-"""Test the stages of a training, from its initial shading per splat to its end.
+"""Test the stages of a training: the initial stage, which shades each splat, and the deferred stage, which shades each pixel.
 
-Test also three regular steps: resets of opacity, the growth of mirror-like surfels, and the diffusion of the environment's light.
+Test also how a training resets opacities, enlarges mirror-like surfels, and diffuses the environment's light.
 """
 
 import pytest
@@ -102,7 +102,8 @@ def test_the_light_diffuses_as_heat_does(ball_capture, tmp_path, waves):
     """Check one step of diffusion of the environment's light against the heat equation.
 
     A cosine across a cubemap face is an eigenvector of the discrete Laplacian with insulated borders. So a step multiplies the cosine
-    by 1 − 4 c sin²(θ / 2), with c = 0.5 · 6.4 · (16 / 64)². θ is the phase between neighbouring texels.
+    by 1 − 4 c sin²(θ / 2). θ is the phase between neighbouring texels. c is the product of the light's learning rate 0.5, the setting
+    environment.diffusion = 6.4, and (16 / 64)², where 16 is the side of a face in texels.
     """
     changes = "needs.initial=on", "environment.diffusion=6.4", "rates.environment=0.5"
     made = trainer(ball_capture, tmp_path / "run", *changes, total=10)

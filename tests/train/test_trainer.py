@@ -60,9 +60,9 @@ def test_the_asset_renders_as_the_training_did(ball):
 
 
 def test_the_asset_keeps_surfels_as_they_were_learned(ball_capture, tmp_path):
-    """Check that writing the trained model turns its normals outward, but keeps the surfels' rotations as they were learned.
+    """Check that the written normals point outward, although the surfels' rotations are written as they were learned.
 
-    A surfel's rotation tells its front from its back. Turning it over would change the shading near the horizon.
+    The test first flips every other surfel. If writing turned surfels over to fit their normals, the model would render differently.
     """
     made = trainer(ball_capture, tmp_path / "run", total=10)
     made.run()

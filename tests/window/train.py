@@ -24,9 +24,10 @@ def tell(command):
 
 
 def artist():
-    """Press the buttons of a whole session.
+    """Install the extension, then press its buttons: check a capture, train, pause, stop, resume, finish, import and use the result.
 
-    After each, yield a function that returns true once the button's work is done, and the name of a screenshot to take, or None.
+    After each step, yield a function and the name of a screenshot, or None for no screenshot. The function returns true once the step's
+    work is done. The screenshot is taken then.
     """
     install()
     area().spaces.active.show_region_ui = True
@@ -146,7 +147,7 @@ steps, waiting, due, longest = artist(), None, time.perf_counter() + 3.0, 0.0
 def tick() -> float | None:
     """Run the session's next step once the function that it waits for returns true. Blender calls this ten times a second.
 
-    A call that comes late shows how long the window was busy.
+    If the window is busy, the call is delayed. The longest delay of each step is recorded.
     """
     global waiting, due, longest, ours
     now = time.perf_counter()
