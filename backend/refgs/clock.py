@@ -54,9 +54,8 @@ class Clock:
     def part(self, name: str) -> Iterator[None]:
         """Time a `with` block as the part `name`.
 
-        Use it for work that is not done in every iteration. The block is timed whenever it runs, on a GPU too. The time of other `part`
-        blocks inside it is subtracted. The clock does not wait for the GPU, so the block itself must: for example, by copying its results
-        to the CPU.
+        Use it for work that is not done in every iteration. The time of other `part` blocks inside it is subtracted. A
+        block that uses the GPU must wait for its results before it ends, for example by copying them to the CPU: the clock does not wait.
         """
         begun, known = time.perf_counter(), sum(self.seconds.values())
         before, self._within = self._within, True

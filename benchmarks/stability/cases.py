@@ -1,4 +1,4 @@
-"""Define a stability case, and format its outcome as a row of a table."""
+"""Define a stability case: a numerically hard input, and a check that the program survives it. Format its outcome as a row of a table."""
 
 from collections.abc import Callable
 from typing import NamedTuple

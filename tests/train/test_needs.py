@@ -23,8 +23,9 @@ from refgs.train.densify import RESET, SEEN, faint_now
 from refgs.train.losses import Photo, objective
 from refgs.train.measures import held_out_psnr
 from refgs.train.needs import lighting, photos, schedule
+from refgs.train.needs.materials import CHANGES
 from refgs.train.plan import Plan
-from refgs.train.trace import why_not_traced
+from refgs.train.state import why_not_traced
 from tests.makers.occluders import as_occluder, plate
 from tests.makers.training import asset_error, check_equal, put
 from tests.makers.training import trainer as small
@@ -166,6 +167,48 @@ def test_a_training_that_goes_back_keeps_its_decisions(matte, tmp_path):
     assert made.state.iteration == 96 and made.state.needs == decided and "metallic" not in made.state.parameters
     assert made.state.total == decided["iterations"]["total"] < 200
     made.step()
+
+
+def test_a_scene_that_was_taken_for_matte_gets_its_gloss_back(matte, ball_capture, tmp_path):
+    """Check that specular shading comes back if photos change with the view halfway through, and with it what had been left out.
+
+    The photos of a matte ball are replaced by those of a mirror. A training that is resumed afterwards, or that goes back to an older
+    checkpoint, learns metallic too.
+    """
+    options = [*DULL, "needs.reflections=on", "train.light_first=0"]
+    made = trainer(matte, tmp_path / "run", *options, total=300)
+    state = made.state
+    made.run(stop=lambda: "specular" in state.needs)
+    assert not state.needs["specular"]["needed"] and "metallic" not in state.parameters
+    assert state.total == state.needs["iterations"]["total"] < 300
+    while 2 * state.iteration < state.total - 2:
+        made.step()
+    made.save()
+    assert "again" not in state.needs["specular"]
+    state.photos = [Photo.of(view) for view in small(ball_capture, tmp_path / "mirror").state.views]
+    for _ in range(3):
+        made.step()
+    found = state.needs["specular"]
+    assert found["needed"] and found["statistic"] >= found["threshold"] and "halfway" in state.decided["specular"]
+    assert {"metallic", "roughness", "received"} <= {*state.parameters} and state.total == 300
+    assert state.settings.render.reflection == "microfacet" and "iterations" not in state.needs
+    assert state.effective.rows()["train.iterations"]["became"] == 300
+    before = state.parameters["roughness"].detach().clone()
+    for _ in range(5):
+        made.step()
+    assert (state.parameters["roughness"] - before).abs().max() > 0 and len(before) == len(state.parameters["position"])
+    made.resume()  # the checkpoint before it was taken back
+    assert 2 * state.iteration < state.total and {"metallic", "roughness"} <= {*state.parameters}
+    made.step()
+    made.save()
+    again = trainer(matte, tmp_path / "run", *options, total=300)
+    again.resume()
+    assert again.state.needs == state.needs and "metallic" in again.state.parameters and again.state.total == 300
+
+
+def test_a_matte_scene_is_looked_at_twice(chalk):
+    found = chalk.state.needs["specular"]
+    assert not found["needed"] and found["again"] < CHANGES
 
 
 def test_reflections_by_what_they_could_be_worth(ball_capture, tmp_path):

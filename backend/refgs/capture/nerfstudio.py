@@ -43,8 +43,8 @@ def _without_deleted(shared: dict, frames: list[Frame], file: Path) -> tuple[lis
     """Drop frames whose photos are missing, but only from instant-ngp's files. Return the frames that are left, and warnings.
 
     Users of instant-ngp delete blurred photos and leave their frames in the file; instant-ngp ignores these frames. Its files have the key
-    `aabb_scale`. For other files, all frames are returned. They are also returned if more than half of the photos are missing. If any of
-    their photos are missing, the caller raises an error.
+    `aabb_scale`. All frames are returned if the file is another program's, or if more than half of the photos are missing; the caller then
+    raises an error that names a missing photo.
     """
     missing = [frame.path for frame in frames if find_image(file.parent / frame.path) is None]
     if "aabb_scale" not in shared or not missing or 2 * len(missing) > len(frames):

@@ -273,7 +273,7 @@ def lights_error(environment: np.ndarray, reference: np.ndarray) -> tuple[float,
     - A true light is used if it has at least twice the panorama's mean brightness, and at least a quarter of the brightest light's. If
       there are more than MOST_LIGHTS, only the brightest MOST_LIGHTS are used.
     - If N true lights are used, the 2N brightest recovered lights are used.
-    - Each true light is matched to at most one recovered light, and no two to the same one. The sum of the angles is as small as possible.
+    - True and recovered lights are matched one to one, such that the sum of the angles is as small as possible.
     - A true light without a match within LOST_LIGHT degrees has the error LOST_LIGHT.
     - The mean is weighted by the true lights' brightness. It does not depend on the overall brightness of a panorama.
     """

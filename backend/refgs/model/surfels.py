@@ -149,6 +149,12 @@ def quaternions_towards(normals: np.ndarray) -> np.ndarray:
     return q / np.linalg.norm(q, axis=1, keepdims=True)
 
 
+def raw_metallic(metallic: float) -> float:
+    """Return the raw parameter that the activation function turns into this metallic, which is between 0 and 1."""
+    s = 0.5 - math.sin(math.asin(1 - 2 * metallic) / 3)  # 3 s² − 2 s³ = metallic
+    return math.log(s / (1 - s))
+
+
 def initial_parameters(
     positions: np.ndarray,
     normals: np.ndarray,
@@ -185,7 +191,7 @@ def initial_parameters(
         "sh_dc": ((colour - 0.5) / harmonics.DC)[:, None].contiguous(),
         "sh_rest": torch.zeros(n, rest, 3),
         "albedo": logit(albedo, n, 3),
-        "metallic": logit(0.5 - math.sin(math.asin(1 - 2 * metallic) / 3), n),  # the smoothstep's inverse
+        "metallic": torch.full((n,), raw_metallic(metallic)),
         "roughness": logit(roughness, n),
         "received": torch.ones(n, 3),
         "indirect_dc": torch.zeros(n, 1, 3),

@@ -50,7 +50,7 @@ def _foreground(
 ) -> tuple[np.ndarray, float]:
     """Find the foreground as `extract` defines it: a mask (N,) of `points` (N, 3), and half the side of a cube about `centre`.
 
-    The cube holds 99 % of the points in the mask, and the ball of `radius`.
+    The cube contains 99 % of the points in the mask, and also the ball of `radius` about `centre`.
     """
     distance = np.linalg.norm(points - centre, axis=1)
     shows = np.mean([inside(camera, *project(camera, points)) for camera in cameras], axis=0)

@@ -19,8 +19,7 @@ from refgs.render.volume import with_normals_last
 from refgs.run import OCCLUDER
 from refgs.train import needs
 from refgs.train.probe import blended_shares
-from refgs.train.state import State
-from refgs.train.trace import why_not_traced
+from refgs.train.state import State, why_not_traced
 
 
 def write_asset(state: State) -> None:

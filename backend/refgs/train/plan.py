@@ -47,7 +47,7 @@ class Plan:
         return self.before + time.perf_counter() - self._begun
 
     def wait(self, seconds: float) -> None:
-        """Exclude the seconds of a pause from the time spent."""
+        """Record that the training has paused for `seconds`, which then do not count as time spent. This method does not wait."""
         self._begun += seconds
 
     def begin(self, iteration: int, growth: float) -> None:

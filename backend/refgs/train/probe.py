@@ -59,7 +59,7 @@ def decibels_lost(errors: list[float], without: list[float]) -> float:
 
 
 def spread_views(state: State, most: int = VIEWS) -> list[int]:
-    """Choose at most `most` training views, evenly spaced."""
+    """Choose at most `most` training views, evenly spaced in the order of the photos."""
     return [*spread(range(len(state.photos)), most)]
 
 

@@ -18,8 +18,7 @@ from refgs.train.light_frame import light_frame
 from refgs.train.losses import Photo
 from refgs.train.plan import Plan
 from refgs.train.start import start_appearance, start_parameters
-from refgs.train.state import State
-from refgs.train.trace import why_not_traced
+from refgs.train.state import State, why_not_traced
 
 
 def set_up(capture: Capture, effective: Effective, folder: Path, report: Report, plan: Plan, device: str) -> State:

@@ -7,8 +7,7 @@ from refgs.errors import InputError
 from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
 from refgs.train import checkpoint, needs
-from refgs.train.state import State
-from refgs.train.trace import why_not_traced
+from refgs.train.state import State, why_not_traced
 
 
 def save(state: State) -> None:
@@ -33,7 +32,7 @@ def save(state: State) -> None:
         tensors |= {f"adam.{group['name']}.{key}": torch.as_tensor(value) for key, value in moments.items()}
     facts = {"seconds": state.seconds, "total": state.total, "initial": state.initial, "decided": state.decided}
     facts |= {"parts": state.clock.seconds, "spent": state.plan.spent}
-    facts |= {"processor_seconds": state.processor_seconds, "needs": state.needs}
+    facts |= {"processor_seconds": state.processor_seconds, "needs": state.needs, "metals_set": state.metals_set}
     checkpoint.save(state.folder / "checkpoints", state.iteration, tensors, facts)
 
 
@@ -45,6 +44,11 @@ def restore(state: State) -> None:
     for name in state.constant:  # left out after this checkpoint, where the training goes back to it
         if f"parameter.{name}" in tensors:
             tensors[f"constant.{name}"] = tensors[f"parameter.{name}"][:1]
+    count = len(tensors["parameter.position"])
+    for name in state.parameters:  # left out at this checkpoint, and learned again after it
+        if f"parameter.{name}" not in tensors and f"constant.{name}" in tensors:
+            row = tensors[f"constant.{name}"]
+            tensors[f"parameter.{name}"] = row.expand(count, *row.shape[1:]).clone()
     needed = {f"parameter.{name}" for name in state.parameters} | {f"constant.{name}" for name in state.constant}
     if not needed <= tensors.keys():
         raise InputError(f"{state.folder} was begun by another release of RefGS: train again into a new folder")
@@ -54,7 +58,7 @@ def restore(state: State) -> None:
     state.clock.resume(facts.get("parts", {}))
     state.plan.before = facts.get("spent", state.seconds)
     state.processor_seconds = facts.get("processor_seconds", 0.0)
-    state.initial = facts.get("initial", state.initial)
+    state.initial, state.metals_set = facts.get("initial", state.initial), facts.get("metals_set", True)
     for about, what in facts.get("decided", {}).items():
         state.announce(about, what)
     state.motion.total, state.motion.views = tensors["motion.total"], tensors["motion.views"]

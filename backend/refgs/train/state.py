@@ -67,6 +67,7 @@ class State:
         self.decided: dict[str, str] = {}  # lines for the artist, by what was decided
         self.needs: dict[str, dict[str, Any]] = {}  # the decisions of `train/needs`, by the need's name
         self.initial = self.method.deferred and self.settings.initial.until > 0  # its stage is not over
+        self.metals_set = False  # whether `metals.set_metals_due` has set them
         self.parameters: Parameters = {}  # one row a surfel
         self.constant: Parameters = {}  # parameters that do not learn: one row for all surfels
         self.light = torch.empty(0, 3)  # raw texels; `environment` makes radiance of them
@@ -214,3 +215,21 @@ class State:
         """Drop the last backward pass's gradients."""
         for group in self.optimizer.param_groups:
             group["params"][0].grad = None
+
+
+def why_not_traced(state: State) -> str:
+    """Return the reason why this run does not trace inter-reflection, or "" if it does."""
+    settings = state.settings
+    if not state.method.deferred:
+        return f"shading = {settings.render.shading}"
+    if settings.indirect.start >= 1:
+        return "its setting leaves it out (indirect.start = 1)"
+    if not state.needs.get("reflections", {}).get("needed", True):
+        return state.needs["reflections"]["why"]
+    if settings.render.reflection == "none":
+        return "nothing is mirrored"
+    if not state.from_hull:  # the mesh would be of the surroundings too
+        return "not every photo has a mask of the object"
+    if settings.light.frame == "camera":  # surfels have no light of their own to show others
+        return "the light turns with the camera: what the object mirrors of itself changes from photo to photo"
+    return ""

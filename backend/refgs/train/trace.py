@@ -12,27 +12,9 @@ from refgs.render.relight import received
 from refgs.render.volume import with_normals_last
 from refgs.train import needs
 from refgs.train.densify import faint_now
-from refgs.train.state import State
+from refgs.train.state import State, why_not_traced
 
 VIEWS = 24  # at least, that the mesh is fused from; all where there are fewer
-
-
-def why_not_traced(state: State) -> str:
-    """Return the reason why this run does not trace inter-reflection, or "" if it does."""
-    settings = state.settings
-    if not state.method.deferred:
-        return f"shading = {settings.render.shading}"
-    if settings.indirect.start >= 1:
-        return "its setting leaves it out (indirect.start = 1)"
-    if not state.needs.get("reflections", {}).get("needed", True):
-        return state.needs["reflections"]["why"]
-    if settings.render.reflection == "none":
-        return "nothing is mirrored"
-    if not state.from_hull:  # the mesh would be of the surroundings too
-        return "not every photo has a mask of the object"
-    if settings.light.frame == "camera":  # surfels have no light of their own to show others
-        return "the light turns with the camera: what the object mirrors of itself changes from photo to photo"
-    return ""
 
 
 def trace_due(state: State, progress: float) -> None:

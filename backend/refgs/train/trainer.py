@@ -11,7 +11,7 @@ from refgs.capture import Capture
 from refgs.compare.metrics import decibels
 from refgs.events import Report
 from refgs.settings import Settings
-from refgs.train import densify, exposures, history, light, needs, snapshot
+from refgs.train import densify, exposures, history, light, metals, needs, snapshot
 from refgs.train.effective import Effective
 from refgs.train.guard import Guard, running, warn
 from refgs.train.losses import departure, objective
@@ -74,6 +74,7 @@ class Trainer:
         trace_due(state, progress)  # meshes and decisions come before an opacity reset makes all surfels faint
         with state.clock.part("deciding"):
             needs.evaluate_iteration(state, progress)
+        metals.set_metals_due(state, progress)
         densify.densify_due(state, progress)
         densify.reshape_due(state)
         exposures.leave_out_alike(state, progress)

@@ -15,10 +15,10 @@ from refgs.train.needs.photos import WHOLE_EVERY, Outside, Views, time_crops
 from refgs.train.needs.schedule import Initial, Iterations
 from refgs.train.state import State
 
-CONSTANTS = Constants()
+CONSTANTS, SPECULAR = Constants(), Specular()
 NEEDS: tuple[Need, ...] = (
     Views(),
-    Specular(),
+    SPECULAR,
     Reflections(),
     Initial(),
     Iterations(),
@@ -66,6 +66,7 @@ def evaluate_iteration(state: State, progress: float) -> None:
     if state.initial or not state.method.deferred or state.settings.render.diffuse != "irradiance" or faint_now(state):
         return
     time_crops(state)
+    SPECULAR.look_again(state)
     evaluate_due(state, "iteration", progress=progress)
 
 
@@ -97,6 +98,9 @@ def restore(state: State, recorded: dict[str, dict[str, Any]]) -> None:
 
     `recorded` are the checkpoint's decisions by name. If the training goes back to an earlier checkpoint, later decisions stay.
     """
+    if SPECULAR.taken_back(state, recorded):
+        recorded = {name: found for name, found in recorded.items() if name not in SPECULAR.FOLLOWING}
+        state.total = state.settings.train.iterations
     state.needs = recorded | state.needs
     for name, found in state.needs.items():
         if not found["needed"]:

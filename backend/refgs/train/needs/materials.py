@@ -6,11 +6,16 @@ import torch
 from torch import Tensor
 
 from refgs.model.surfels import Surfels
-from refgs.train import probe
+from refgs.train import probe, view_dependence
+from refgs.train.guard import limits
 from refgs.train.needs.need import ASKED, MEGA, Decision, Moment, Need, megabytes
-from refgs.train.state import RenderInputs, State
+from refgs.train.start import start_appearance
+from refgs.train.state import RenderInputs, State, why_not_traced
 
 KNOWN = 0.05  # part of the training after which it is known what mirrors: materials learn faster than shapes
+CHANGES = (
+    0.042  # of 1; matte clay on its visual hull has 0.037, an embossed gold cape in flat light 0.056, a mirror 0.2
+)
 SOONEST = 100  # iterations: a mirror that has learned for fewer looks dull
 RARE = 1e-3  # part of the pictures, at either end, whose surfels do not count for a common value
 INDIRECT = "indirect_dc", "indirect_rest", "received"
@@ -25,6 +30,7 @@ class Specular(Need):
         "at a twentieth of a training matte clay has none; a polished plate has 0.8 dB, glossy paint 2.6, a mirror 5.6"
     )
     moments = ("start", "iteration")
+    FOLLOWING = "iterations", "light"  # needs whose decisions rest on this one, and are taken back with it
 
     def due(self, state: State, moment: Moment, progress: float) -> bool:
         settings = state.settings
@@ -41,6 +47,11 @@ class Specular(Need):
         why = f"what is mirrored explains {explained:.2f} dB of the photos beyond one colour a surfel"
         if explained >= self.threshold:
             return Decision(True, why, statistic=explained)
+        # Normals are not right yet, and an embossed metal has no sharp reflections: it explains nothing, and yet it shines.
+        change = view_dependence.change_seen(view_dependence.observe(state), state.wanted())
+        why += f"; colours change with the view by {change:.3f} of 1"
+        if change >= CHANGES:
+            return Decision(True, why, statistic=change, threshold=CHANGES)
         saved = probe.seconds_saved(state, probe.without_specular)
         size = megabytes(state, ("metallic", "roughness", *INDIRECT))
         return Decision(False, why, {"seconds": saved, "megabytes": size, "decibels": explained}, explained)
@@ -49,6 +60,48 @@ class Specular(Need):
         state.change("render.reflection", "none", "needs", found["why"])
         state.occluder = None
         state.leave_out("metallic", "roughness", *INDIRECT)
+
+    def look_again(self, state: State) -> bool:
+        """Look at a matte scene once more, halfway through the training. Take the decision back if colours change with the view.
+
+        By then the surfels lie on the surface. If the decision is taken back, so is what followed from it: the training has all of its
+        iterations again, and the light its resolution. Returns whether it was taken back.
+        """
+        found = state.needs.get(self.name, {"needed": True})
+        if found["needed"] or "statistic" not in found or "again" in found or 2 * state.iteration < state.total:
+            return False
+        change = found["again"] = view_dependence.change_seen(view_dependence.observe(state), state.wanted())
+        if change < CHANGES:
+            return False
+        why = f"halfway, colours change with the view by {change:.3f} of 1: it was taken for matte before"
+        state.needs[self.name] = {"needed": True, "why": why, "statistic": change, "threshold": CHANGES}
+        asked = state.effective.asked
+        state.change("render.reflection", asked.render.reflection, "needs", why)
+        if state.needs.pop("iterations", None):
+            state.total = state.settings.train.iterations
+            state.effective = state.effective.noted("train.iterations", state.total, "needs", why)
+        if state.needs.pop("light", None):
+            state.change("environment.resolution", asked.environment.resolution, "needs", why)
+        _learn_again(state, ["metallic", "roughness", *(() if why_not_traced(state) else INDIRECT)])
+        state.metals_set = False
+        state.announce(self.name, f"with {self.what}: {why}")
+        return True
+
+    def taken_back(self, state: State, recorded: dict[str, Any]) -> bool:
+        """Tell whether the decisions `recorded` in a checkpoint call a scene matte, and this was taken back since."""
+        before, now = recorded.get(self.name, {"needed": True}), state.needs.get(self.name, {"needed": False})
+        return now["needed"] and not before["needed"]
+
+
+def _learn_again(state: State, names: list[str]) -> None:
+    """Learn parameters that were left out. All surfels start with the settings' values."""
+    start, count = start_appearance(state.effective.asked), len(state.parameters["position"])
+    for name in names:
+        del state.constant[name]
+        row = start[name].to(state.device)
+        value = state.parameters[name] = row.expand(count, *row.shape[1:]).clone().requires_grad_()
+        within = limits(name, state.capture.radius, state.method.light.brightest)
+        state.optimizer.param_groups.append({"params": [value], "name": name, "lr": 0.0, "limits": within})
 
 
 class Constants(Need):

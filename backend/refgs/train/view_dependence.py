@@ -1,0 +1,214 @@
+"""Measure how the object's radiance changes with the viewing direction, and whether it changes as a metal's does.
+
+Nothing here needs normals that are right: an embossed metal has no sharp reflections, yet the radiance of each of its points changes from
+photo to photo. A matte surface under a light that stands still looks the same from everywhere.
+"""
+
+from typing import NamedTuple
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from refgs.color import srgb_decode, srgb_encode
+from refgs.model import harmonics
+from refgs.model.environment import turn_between
+from refgs.model.surfels import Surfels
+from refgs.render.rasterize import rasterize
+from refgs.render.volume import discs
+from refgs.train.losses import Photo
+from refgs.train.state import State, spread
+
+VIEWS = 24  # photos that are looked at, at the most
+SWEEPS = 2  # steps in which surfels' radiance is fitted to the photos
+OVERSHOOT = 1.5  # of the later steps: surfels share pixels, so that plain steps are too short
+FACING = 0.4  # least cosine between a surfel's normal and the camera; nearer to grazing even matte surfaces change, by Fresnel
+LEAST_PIXELS = 0.5  # of a surfel in a photo; a smaller part of it tells more of its neighbours
+LEAST_VIEWS = 6  # of a surfel
+CLIPPED = 254  # of 255: codes from which a channel may have been brighter
+LEAST_CLIPPED = 0.05  # of a surfel's pixels in a photo; then its highlights look whiter than they are
+DARK = 0.03  # linear radiance below which a surfel does not count for a photo's exposure
+NEIGHBOURS = 64  # surfels whose changes are pooled, as one alone has too few photos
+SATURATED = 0.08  # distance of a chromaticity from grey, below which metals and dielectrics change alike
+CHANGES = 0.15  # change relative to the mean radiance, below which it may be texture that is slightly out of place
+METAL, DIELECTRIC = (
+    0.6,
+    0.35,
+)  # tints of the change (0: grey as a dielectric's reflection; 1: of the surface's own colour)
+
+
+class Observations(NamedTuple):
+    """Hold what some photos show of each of N surfels.
+
+    - `mean` (N, 3): linear radiance, the same in all V photos, that explains them best.
+    - `change` (N, V, 3): how far the radiance in a photo is from `mean`.
+    - `pixels` (N, V): the surfel's blending weights in a photo, summed over its pixels; 0 where it is not usable.
+    - `clipped` (N, V): the part of `pixels` where the photo is clipped, so that its colour is not known.
+    """
+
+    mean: Tensor
+    change: Tensor
+    pixels: Tensor
+    clipped: Tensor
+
+    @property
+    def usable(self) -> Tensor:
+        """Tell which photos of which surfels count (N, V): none of a surfel that too few photos show."""
+        shown = self.pixels > LEAST_PIXELS
+        return shown & (shown.sum(dim=1, keepdim=True) >= LEAST_VIEWS)
+
+
+@torch.no_grad()
+def observe(state: State) -> Observations:
+    """Compare some training photos with a model in which each surfel looks the same from everywhere.
+
+    The model's radiance is fitted to the photos, with an exposure for each photo. If the light turns with the camera, the diffuse light on
+    a matte surface changes from photo to photo, too: then the model also has spherical harmonics of degree 2 of the normal in the camera's
+    frame, as irradiance has (Ramamoorthi and Hanrahan 2001). What occludes a surfel, and what it shares pixels with, is part of the model.
+    """
+    surfels = Surfels(*(value.detach() for value in state.surfels()))
+    photos = [state.photo(view) for view in spread(range(len(state.photos)), VIEWS)]
+    targets = [_linear(photo) for photo in photos]
+    clipped = [(photo.image >= CLIPPED).any(dim=-1, keepdim=True).float() for photo in photos]
+    towards = [_towards(surfels, photo) for photo in photos]
+    normals = surfels.normals()
+    cosines = torch.stack([(normals * direction).sum(dim=-1) for direction in towards], dim=1)
+    light = None
+    if state.settings.light.frame == "camera":
+        turns = [torch.from_numpy(turn_between(photo.camera, state.views[0].camera)).to(normals) for photo in photos]
+        facing = [cosine.sign()[:, None] * normals for cosine in cosines.unbind(dim=1)]
+        light = torch.stack([harmonics.basis(n @ turn.T, 2) for n, turn in zip(facing, turns, strict=True)], dim=1)
+    mean = torch.zeros_like(normals)
+    factor = torch.ones_like(cosines)  # of the mean in a photo: its exposure and its diffuse light
+    for sweep in range(SWEEPS + 1):
+        totals, pixels, burnt = _residuals(surfels, photos, targets, clipped, mean, factor, state.near)
+        if sweep == SWEEPS:
+            break
+        step = (totals.sum(dim=1) / pixels.sum(dim=1).clamp_min(1e-6)[:, None]) * (OVERSHOOT if sweep else 1.0)
+        mean = (mean + step).clamp_min(0)
+        if sweep:
+            factor = _fitted(factor, totals, pixels, mean, light)
+    usable = pixels * (cosines.abs() > FACING)
+    some = pixels.clamp_min(1e-6)
+    return Observations(mean, totals / some[..., None], usable, burnt / some)
+
+
+def _linear(photo: Photo) -> Tensor:
+    """Return a photo's linear radiance (H, W, 3) over black."""
+    image = srgb_decode(photo.image.float() / 255)
+    return image if photo.mask is None else image * (photo.mask.float() / 255)[..., None]
+
+
+def _towards(surfels: Surfels, photo: Photo) -> Tensor:
+    position = torch.from_numpy(photo.camera.position).to(surfels.positions)
+    return torch.nn.functional.normalize(position - surfels.positions, dim=-1)
+
+
+def _residuals(
+    surfels: Surfels,
+    photos: list[Photo],
+    targets: list[Tensor],
+    clipped: list[Tensor],
+    mean: Tensor,
+    factor: Tensor,
+    near: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Sum what the photos show beyond the model over each surfel's pixels, with its blending weights.
+
+    `targets` (H, W, 3) are the photos' radiance, and `clipped` (H, W, 1) is 1 where they are clipped. Returns the sums (N, V, 3), the sums
+    of the weights (N, V), and those of clipped pixels (N, V). All are gradients of blended features.
+    """
+    sums = []
+    for number, (photo, target, lost) in enumerate(zip(photos, targets, clipped, strict=True)):
+        radiance = mean * factor[:, number, None]
+        features = torch.cat([radiance, torch.ones_like(mean[:, :2])], dim=1).requires_grad_()
+        with torch.enable_grad():
+            blended = rasterize(*discs(surfels, photo.camera), features, photo.camera, near=near).features
+            residual = target - blended[..., :3].detach()
+            (blended * torch.cat([residual, torch.ones_like(lost), lost], dim=-1)).sum().backward()
+        sums.append(features.grad)
+    totals, pixels, burnt = torch.stack(sums, dim=1).split([3, 1, 1], dim=2)
+    return totals, pixels[..., 0], burnt[..., 0]
+
+
+def _fitted(factor: Tensor, totals: Tensor, pixels: Tensor, mean: Tensor, light: Tensor | None) -> Tensor:
+    """Fit the factor of each surfel in each photo (N, V) to the residuals.
+
+    `light` (N, V, 9) are harmonics of the diffuse light. Without it, a factor depends on the photo alone. A photo's factor is a median,
+    which highlights hardly move.
+    """
+    brightness = mean.mean(dim=1)
+    known = (pixels > LEAST_PIXELS) & (brightness > DARK)[:, None]
+    wrong = totals.mean(dim=2) / (pixels * factor * brightness[:, None]).clamp_min(1e-6)
+    if light is not None:
+        rows, values = light[known], wrong[known].clamp(-1, 1)
+        square = rows.T @ rows + 1e-3 * len(rows) * torch.eye(rows.shape[1], device=rows.device)
+        more = light @ torch.linalg.solve(square, rows.T @ values)
+        factor, wrong = factor * (1 + more.clamp(-0.5, 0.5)), wrong - more
+    of_photo = [wrong[which, v].median() if which.any() else wrong.new_zeros(()) for v, which in enumerate(known.T)]
+    factor = factor * (1 + torch.stack(of_photo))
+    return factor / factor.mean()
+
+
+@torch.no_grad()
+def change_seen(observations: Observations, wanted: Tensor) -> float:
+    """Measure how much the surface changes with the viewing direction: a cubic mean over the surfels `wanted` (N,).
+
+    A surfel's change is the standard deviation of its sRGB-encoded colour over the photos. Each surfel counts with its pixels. A cubic mean
+    lets a small part that changes much, such as a chrome handle, count more than a plain mean would. 0 if no surfel is usable.
+    """
+    usable = observations.usable
+    count = usable.sum(dim=1).clamp_min(2)
+    mean = observations.mean[:, None]
+    colour = srgb_encode((mean + observations.change).clamp(0, 1)) * usable[..., None]
+    centre = colour.sum(dim=1, keepdim=True) / count[:, None, None]
+    square = ((colour - centre).square().mean(dim=2) * usable).sum(dim=1) / (count - 1)
+    weight = (observations.pixels * usable).sum(dim=1) * wanted
+    return float(((square.pow(1.5) * weight).sum() / weight.sum().clamp_min(1e-6)) ** (1 / 3))
+
+
+@torch.no_grad()
+def metal_or_dielectric(observations: Observations, positions: Tensor) -> tuple[Tensor, Tensor]:
+    """Find surfels (N,) that change with the view as a metal does, and those that change as a dielectric does.
+
+    A metal tints what it reflects: its radiance changes along its own colour. A dielectric's reflection has the light's colour, grey on the
+    average, whatever the colour below. The direction of change is the first principal axis of the linear radiance over the photos. Radiance
+    is averaged over neighbours first: texture that is slightly out of place then cancels, and highlights do not. Surfels near grey, and
+    those that hardly change, are in neither result.
+    """
+    weight = observations.pixels * (observations.clipped < LEAST_CLIPPED) * (observations.pixels > LEAST_PIXELS)
+    near = _neighbours(positions)
+    pixels = _pooled(weight, near)
+    known = pixels > LEAST_PIXELS
+    change = _pooled((observations.change * weight[..., None]).flatten(1), near).view_as(observations.change)
+    change = torch.where(known[..., None], change / pixels.clamp_min(1e-6)[..., None], 0)
+    count = known.sum(dim=1).clamp_min(1)[:, None, None]
+    change = (change - change.sum(dim=1, keepdim=True) / count) * known[..., None]
+    seen = observations.pixels.sum(dim=1, keepdim=True)
+    mean = (_pooled(observations.mean * seen, near) / _pooled(seen, near).clamp_min(1e-6)).clamp_min(1e-4)
+    relative = change / mean.mean(dim=1)[:, None, None].clamp_min(1e-2)
+    covariance = relative.transpose(1, 2) @ relative / count
+    axis = torch.linalg.eigh(covariance).eigenvectors[:, :, 2]
+    axis = axis * torch.sign(axis.sum(dim=1, keepdim=True))
+    axis = axis / axis.sum(dim=1, keepdim=True).clamp_min(0.2)
+    from_grey = mean / mean.sum(dim=1, keepdim=True) - 1 / 3
+    saturation = from_grey.norm(dim=1)
+    tint = ((axis - 1 / 3) * from_grey).sum(dim=1) / saturation.square().clamp_min(1e-6)
+    size = covariance.diagonal(dim1=1, dim2=2).mean(dim=1).sqrt()
+    told = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation > SATURATED) & (size > CHANGES)
+    return told & (tint > METAL), told & (tint < DIELECTRIC)
+
+
+def _neighbours(positions: Tensor) -> Tensor:
+    """Return the indices (N, NEIGHBOURS) of each surfel's nearest surfels, itself among them; of all surfels if there are fewer."""
+    points = positions.numpy(force=True)
+    count = min(NEIGHBOURS, len(points))
+    return torch.from_numpy(cKDTree(points).query(points, k=[*range(1, count + 1)])[1]).to(positions.device)
+
+
+def _pooled(values: Tensor, near: Tensor) -> Tensor:
+    """Sum the rows of `values` (N, K) over each surfel's neighbours."""
+    total = torch.zeros_like(values)
+    for column in near.T:
+        total += values[column]
+    return total

@@ -1,0 +1,129 @@
+"""Test how changes with the viewing direction are measured, and how they tell metals from dielectrics.
+
+The photos are renderings of the model itself, whose materials are known.
+"""
+
+import math
+
+import pytest
+import torch
+
+from benchmarks.scenes.analytic import write_ball_capture
+from refgs.color import srgb_encode
+from refgs.model import cubemap
+from refgs.model.surfels import activate
+from refgs.train import metals, view_dependence
+from refgs.train.needs.materials import CHANGES
+from tests.makers.training import put
+from tests.makers.training import trainer as small
+
+LAMPS = torch.nn.functional.normalize(
+    torch.tensor([[1.0, 0.2, 0.5], [-1.0, 0.5, 0.3], [0.1, -1.0, 0.6], [-0.3, -0.4, -1.0], [0.3, 1.0, -0.4]]), dim=1
+)  # the directions of round lamps, each 64° wide
+ORANGE = [2.0, 0.0, -2.0]  # logits: 0.88, 0.5, 0.12
+ALL = ["surfels.sh_degree=0", "needs.specular=on", "needs.outside=off"]
+
+
+@pytest.fixture(scope="module")
+def large_ball(tmp_path_factory):
+    """Write a capture whose photos have several pixels for each surfel."""
+    folder = tmp_path_factory.mktemp("ball")
+    write_ball_capture(folder, 96, samples=1)
+    return folder
+
+
+@pytest.fixture
+def made(large_ball, tmp_path):
+    return small(large_ball, tmp_path / "run", *ALL, total=400)
+
+
+def show(made, *, metallic, roughness, albedo=ORANGE, exposure=(1.0,), turn=False):
+    """Replace all photos by renderings of the ball with one material, under a light of random texels.
+
+    Photos are scaled by the factors `exposure`, in turn. With `turn`, the light turns with the camera.
+    """
+    state = made.state
+    put(made, metallic=metallic, roughness=roughness, albedo=albedo, opacity=4.0)
+    if turn:
+        state.change("light.frame", "camera", "photos", "the test turns it")
+    with torch.no_grad():
+        directions = cubemap.texel_directions(math.isqrt(len(state.light) // 6)).float()
+        lamps = (directions @ LAMPS.T > 0.85).any(dim=1, keepdim=True)
+        state.light.copy_(torch.where(lamps, 3.0, -1.5).expand(-1, 3))
+        inputs = state.inputs()
+        for view, photo in enumerate(state.photos):
+            factor = 0.5 * exposure[view % len(exposure)]
+            seen = state.picture(inputs, photo.camera)
+            image = (srgb_encode(factor * seen.radiance).clamp(0, 1) * 255).round().byte()
+            alpha = (seen.alpha * 255).round().byte()
+            state.photos[view] = photo._replace(image=image, mask=alpha)
+
+
+def told(made):
+    """Return which parts of the usable surface are told to be metal, and dielectric, and how much it changes with the view."""
+    state = made.state
+    found = view_dependence.observe(state)
+    usable = found.usable.any(dim=1)
+    metal, dielectric = view_dependence.metal_or_dielectric(found, state.parameters["position"].detach())
+    change = view_dependence.change_seen(found, state.wanted())
+    return float(metal[usable].float().mean()), float(dielectric[usable].float().mean()), change
+
+
+@pytest.mark.parametrize("turn", [False, True])
+@pytest.mark.parametrize("exposure", [(1.0,), (1.0, 0.8, 1.2)])
+def test_a_tinted_change_is_a_metals(made, exposure, turn):
+    show(made, metallic=6.0, roughness=-1.0, exposure=exposure, turn=turn)
+    metal, dielectric, change = told(made)
+    assert metal > 0.8 and dielectric < 0.02 and change > 2 * CHANGES
+
+
+def test_a_grey_change_is_a_dielectrics(made):
+    show(made, metallic=-6.0, roughness=-2.5, albedo=[-1.0, -2.5, -4.0])
+    metal, dielectric, change = told(made)
+    assert dielectric > 0.5 and metal < 0.02 and change > CHANGES
+
+
+@pytest.mark.parametrize("turn", [False, True])
+@pytest.mark.parametrize("exposure", [(1.0,), (1.0, 0.8, 1.2)])
+def test_what_is_matte_does_not_change(made, exposure, turn):
+    """Check a matte surface whose photos differ in exposure, and one that is lit from another side in each photo."""
+    made.state.change("render.reflection", "none", "needs", "the test has a matte ball")
+    show(made, metallic=-6.0, roughness=6.0, exposure=exposure, turn=turn)
+    metal, dielectric, change = told(made)
+    assert change < 0.75 * CHANGES and metal < 0.05 and dielectric < 0.05
+
+
+def test_a_grey_surface_tells_nothing(made):
+    show(made, metallic=6.0, roughness=-1.0, albedo=[1.0, 1.0, 1.0])
+    metal, dielectric, change = told(made)
+    assert metal < 0.02 and dielectric < 0.02 and change > 2 * CHANGES
+
+
+def test_a_small_part_that_shines_counts(made):
+    """Check that a patch of chrome, 4 % of a matte surface, changes the surface's figure by more than the threshold."""
+    state = made.state
+    show(made, metallic=6.0, roughness=-4.0, albedo=[3.0, 3.0, 3.0])
+    found = view_dependence.observe(state)
+    still = found._replace(change=0.02 * torch.randn(found.change.shape, generator=torch.Generator().manual_seed(2)))
+    assert view_dependence.change_seen(still, state.wanted()) < CHANGES
+    usable = found.usable.any(dim=1).nonzero()[:, 0]
+    patch = usable[::25]
+    still.change[patch] = found.change[patch]
+    assert view_dependence.change_seen(still, state.wanted()) > CHANGES
+
+
+def test_metals_are_set_once(made):
+    show(made, metallic=6.0, roughness=-1.0)
+    state = made.state
+    put(made, metallic=0.0)
+    metals.set_metals_due(state, 0.05)
+    state.iteration = metals.SOONEST
+    metals.set_metals_due(state, 0.05)
+    assert not state.metals_set and "metals" not in state.decided
+    metals.set_metals_due(state, 0.25)
+    metallic = activate({**state.constant, **state.parameters} | {"metallic": state.parameters["metallic"]}).metallic
+    assert state.metals_set and float((metallic - metals.METAL).abs().lt(1e-3).float().mean()) > 0.5
+    assert "as metals do" in state.decided["metals"]
+    put(made, metallic=0.0)
+    metals.set_metals_due(state, 0.3)
+    assert (state.parameters["metallic"] == 0).all()
