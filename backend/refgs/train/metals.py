@@ -1,7 +1,7 @@
 """Give surfels a first metallic by how they change with the viewing direction.
 
-Photos of a rough or embossed metal are explained about as well by paint. Training would keep what it starts with, and it starts between
-the two. Whether the changing part of the light is tinted tells them apart before normals and light are known.
+Photos of a rough or embossed metal are explained about as well by paint, and training starts near paint: it would stay there. The tint of
+what changes with the view tells them apart before normals and light are known.
 """
 
 import torch
@@ -9,17 +9,17 @@ import torch
 from refgs.model.surfels import raw_metallic
 from refgs.train.densify import faint_now
 from refgs.train.state import State
-from refgs.train.view_dependence import metal_or_dielectric, observe
+from refgs.train.view_dependence import observe, shines_as_metal
 
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
 SOONEST = 100  # iterations
-METAL, DIELECTRIC = 0.9, 0.1  # metallic: training can still change both
+METAL = 0.9  # metallic; training can still change it
 
 
 def set_metals_due(state: State, progress: float) -> None:
-    """Once, early in the training, set the metallic of the surfels that change as metals or as dielectrics do.
+    """Once, early in the training, raise the metallic of the surfels that shine as coloured metals do (see `shines_as_metal`).
 
-    See `view_dependence.metal_or_dielectric`. The other surfels keep the metallic that they have learned.
+    The other surfels keep the metallic that they have learned: it started low, as that of a dielectric.
     """
     settings = state.settings
     if state.metals_set or state.initial or not state.method.deferred or "metallic" not in state.parameters:
@@ -31,15 +31,13 @@ def set_metals_due(state: State, progress: float) -> None:
         return
     with state.clock.part("deciding"):
         observations, metallic = observe(state), state.parameters["metallic"]
-        metal, dielectric = metal_or_dielectric(observations, state.parameters["position"].detach())
+        metal = shines_as_metal(observations, state.parameters["position"].detach())
         with torch.no_grad():
-            metallic[metal], metallic[dielectric] = raw_metallic(METAL), raw_metallic(DIELECTRIC)
+            metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
         moments = state.optimizer.state.get(metallic, {})
         for name in ("exp_avg", "exp_avg_sq") if moments else ():
-            moments[name][metal | dielectric] = 0
+            moments[name][metal] = 0
     state.metals_set = True
     weight = observations.pixels.sum(dim=1) * state.wanted()
-    parts = [float(weight[which].sum() / weight.sum().clamp_min(1e-6)) for which in (metal, dielectric)]
-    state.announce(
-        "metals", f"{parts[0]:.0%} of the surface shines in its own colour, as metals do; {parts[1]:.0%} in the light's"
-    )
+    part = float(weight[metal].sum() / weight.sum().clamp_min(1e-6))
+    state.announce("metals", f"{part:.0%} of the surface shines in its own colour, as metals do")

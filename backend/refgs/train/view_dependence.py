@@ -31,10 +31,9 @@ DARK = 0.03  # linear radiance below which a surfel does not count for a photo's
 NEIGHBOURS = 64  # surfels whose changes are pooled, as one alone has too few photos
 SATURATED = 0.08  # distance of a chromaticity from grey, below which metals and dielectrics change alike
 CHANGES = 0.15  # change relative to the mean radiance, below which it may be texture that is slightly out of place
-METAL, DIELECTRIC = (
-    0.6,
-    0.35,
-)  # tints of the change (0: grey as a dielectric's reflection; 1: of the surface's own colour)
+FAINT_CHANGES = 0.08  # enough where neighbours change clearly, and alike
+GROWTH = 8  # steps from neighbours to neighbours
+METAL = 0.6  # tint of the change (0: grey as a dielectric's reflection; 1: of the surface's own colour)
 
 
 class Observations(NamedTuple):
@@ -168,13 +167,13 @@ def change_seen(observations: Observations, wanted: Tensor) -> float:
 
 
 @torch.no_grad()
-def metal_or_dielectric(observations: Observations, positions: Tensor) -> tuple[Tensor, Tensor]:
-    """Find surfels (N,) that change with the view as a metal does, and those that change as a dielectric does.
+def shines_as_metal(observations: Observations, positions: Tensor) -> Tensor:
+    """Find the surfels (N,) that change with the view as a coloured metal does.
 
     A metal tints what it reflects: its radiance changes along its own colour. A dielectric's reflection has the light's colour, grey on the
     average, whatever the colour below. The direction of change is the first principal axis of the linear radiance over the photos. Radiance
-    is averaged over neighbours first: texture that is slightly out of place then cancels, and highlights do not. Surfels near grey, and
-    those that hardly change, are in neither result.
+    is averaged over neighbours first: texture that is slightly out of place then cancels, and highlights do not. A smaller
+    change is enough beside surfels that change clearly. Surfels near grey tell nothing.
     """
     weight = observations.pixels * (observations.clipped < LEAST_CLIPPED) * (observations.pixels > LEAST_PIXELS)
     near = _neighbours(positions)
@@ -195,8 +194,11 @@ def metal_or_dielectric(observations: Observations, positions: Tensor) -> tuple[
     saturation = from_grey.norm(dim=1)
     tint = ((axis - 1 / 3) * from_grey).sum(dim=1) / saturation.square().clamp_min(1e-6)
     size = covariance.diagonal(dim1=1, dim2=2).mean(dim=1).sqrt()
-    told = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation > SATURATED) & (size > CHANGES)
-    return told & (tint > METAL), told & (tint < DIELECTRIC)
+    told = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation > SATURATED) & (tint > METAL) & (size > FAINT_CHANGES)
+    metal = told & (size > CHANGES)
+    for _ in range(GROWTH):
+        metal = metal | told & (_pooled(metal.float()[:, None], near)[:, 0] > near.shape[1] / 4)
+    return metal
 
 
 def _neighbours(positions: Tensor) -> Tensor:
