@@ -67,6 +67,20 @@ class Camera:
         """Return the camera for a crop of its image: `width` × `height` pixels from column `left` and row `top`."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
+    def turned(self) -> "Camera":
+        """Return the camera for its image turned clockwise by a quarter turn. It stands in the same place, rolled by 90°."""
+        roll = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        return replace(
+            self,
+            width=self.height,
+            height=self.width,
+            fx=self.fy,
+            fy=self.fx,
+            cx=self.height - self.cy,
+            cy=self.cx,
+            world_to_camera=roll @ self.world_to_camera,
+        )
+
     def fitted(self, max_side: int) -> "Camera":
         """Return the camera for its image scaled down to at most `max_side` pixels on the longer side. A smaller image is left as it is."""
         scale = max_side / max(self.width, self.height)

@@ -1,15 +1,17 @@
 """Test the loading of photos: broken files are refused; masks, undistortion and resizing add no colours of their own."""
 
+import json
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 
 from refgs.capture import load_view, read_capture
-from refgs.capture.images import read_image
+from refgs.capture.images import read_focal_length, read_header, read_image
 from refgs.errors import InputError
-from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, write
+from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, write, write_as_phone
 
 OPENCV = (4, "OPENCV", [60.0, 61.0, 31.0, 25.0, -0.2, 0.05, 0.003, -0.002])
 
@@ -46,6 +48,108 @@ def test_truncated_images_are_refused_by_name(tmp_path, suffix, kept):
     with pytest.raises(InputError, match=f"photo{suffix}") as error:
         read_image(path)
     assert "\n" not in str(error.value)
+
+
+def smooth(height: int, width: int) -> np.ndarray:
+    """Draw soft blots of random colours: RGB (height, width, 3) uint8."""
+    blots = np.random.default_rng(0).integers(0, 256, (6, 8, 3)).astype(np.uint8)
+    return cv2.resize(blots, (width, height), interpolation=cv2.INTER_LINEAR)
+
+
+@pytest.mark.parametrize("turns", range(4))
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif", ".heic", ".HEIF"])
+def test_photos_of_phones_are_read_upright(tmp_path, suffix, turns):
+    path, upright = tmp_path / f"IMG{suffix}", smooth(48, 64)
+    write_as_phone(path, upright, turns)
+    image, alpha = read_image(path)
+    assert alpha is None and read_header(path).upright == (64, 48)
+    assert image.shape == upright.shape and np.abs(image.astype(int) - upright).mean() < 6
+
+
+def test_truncated_heic_is_refused(tmp_path):
+    path = tmp_path / "photo.heic"
+    write_as_phone(path, np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8))
+    data = path.read_bytes()
+    for kept in (0.02, 0.3, 0.97):
+        path.write_bytes(data[: int(kept * len(data))])
+        with pytest.raises(InputError, match=r"photo\.heic"):
+            read_image(path)
+
+
+def test_broken_exif_is_ignored(tmp_path):
+    path = tmp_path / "a.jpg"
+    Image.fromarray(smooth(48, 64)).save(path, exif=b"Exif\0\0II*\0 garbage")
+    assert read_header(path) == (64, 48, False, 0) and read_focal_length(path) is None
+
+
+@pytest.mark.parametrize(("turns", "as_stored"), [(1, True), (2, True), (3, True), (1, False), (3, False)])
+def test_cameras_and_masks_turn_with_their_photo(tmp_path, turns, as_stored):
+    """Check that a photo stored sideways is loaded like the upright one, with its camera, its lens and its mask.
+
+    The transforms JSON has the camera of the photo as stored, or of the upright photo.
+    """
+    photo, mask = smooth(48, 64), np.tri(48, 64, dtype=np.uint8) * 255
+    own = {"w": 64, "h": 48, "fl_x": 60.0, "fl_y": 61.0, "cx": 31.0, "cy": 25.0, "k1": -0.1, "p1": 0.004, "p2": -0.002}
+
+    def loaded(folder, turns, mask):
+        write_as_phone(folder / "images" / "0001.png", photo, turns)
+        write(folder / "masks" / "0001.png", mask)
+        (view,) = (view for view in read_capture(folder).views if view.camera.name == "0001")
+        return load_view(view, 40)
+
+    upright, sideways = nerfstudio(tmp_path / "upright"), nerfstudio(tmp_path / "sideways")
+    edit(upright / "transforms.json", lambda data: data["frames"][1].update(own))
+    pose = np.array(json.loads((upright / "transforms.json").read_text())["frames"][1]["transform_matrix"])
+    if as_stored:
+        for _ in range(turns):  # counter-clockwise: what was up is at the left, what was right is up
+            pose = pose @ np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+            own = {
+                "w": own["h"], "h": own["w"], "fl_x": own["fl_y"], "fl_y": own["fl_x"],
+                "cx": own["cy"], "cy": own["w"] - own["cx"], "k1": own["k1"], "p1": -own["p2"], "p2": own["p1"],
+            }  # fmt: skip
+    edit(sideways / "transforms.json", lambda data: data["frames"][1].update(own, transform_matrix=pose.tolist()))
+    expected = loaded(upright, 0, mask)
+    for drawn in (mask,) if turns == 2 else (mask, np.rot90(mask, turns)):
+        found = loaded(sideways, turns, drawn)
+        np.testing.assert_allclose(found.camera.projection, expected.camera.projection, atol=1e-9)
+        np.testing.assert_allclose(found.image.astype(int), expected.image, atol=1)
+        np.testing.assert_allclose(found.alpha.astype(int), expected.alpha, atol=1)
+
+
+@pytest.mark.parametrize("orientation", [2, 4, 5, 7])
+def test_mirrored_photos_stay_as_they_are_stored(tmp_path, orientation):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(smooth(48, 64)).save(tmp_path / "a.png", exif=exif)
+    assert np.array_equal(read_image(tmp_path / "a.png")[0], smooth(48, 64))
+
+
+def test_a_capture_of_heic_photos(tmp_path):
+    folder = nerfstudio(tmp_path)
+    for path in (folder / "images").iterdir():
+        write_as_phone(path.with_suffix(".HEIC"), read_image(path)[0])
+        path.unlink()
+    (folder / "transforms.json").write_text((folder / "transforms.json").read_text().replace(".png", ".HEIC"))
+    capture = read_capture(folder)
+    assert len(capture.views) == 16 and {view.camera.name for view in capture.views} >= {"0000", "0015"}
+    assert load_view(capture.views[0]).image[24, 32].max() > 150  # the ball
+
+
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({"FocalLengthIn35mmFilm": 26}, 26 / 43.267 * 800),
+        ({"FocalLength": 5.0, "FocalPlaneXResolution": 2540.0, "FocalPlaneResolutionUnit": 2}, 5 * 100 / 2),
+        ({"FocalLength": 5.0}, None),  # of which sensor?
+        ({"FocalLengthIn35mmFilm": 0}, None),
+    ],
+)
+def test_focal_length_by_exif(tmp_path, tags, expected):
+    exif = Image.Exif()
+    tags = {**tags, "ExifImageWidth": 1280, "ExifImageHeight": 960}  # halved since
+    exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base[name]: value for name, value in tags.items()})
+    Image.new("RGB", (640, 480)).save(tmp_path / "a.jpg", exif=exif)
+    assert read_focal_length(tmp_path / "a.jpg") == pytest.approx(expected, rel=1e-4)
 
 
 def test_downsizing_averages_linear_light_and_does_not_bleed(tmp_path):

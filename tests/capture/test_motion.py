@@ -1,17 +1,18 @@
 """Test structure from motion: compare the poses found from photos alone with known poses."""
 
 import multiprocessing
+import sqlite3
 from itertools import product
 
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from refgs.capture import read_capture
+from refgs.capture import load_view, read_capture
 from refgs.capture.motion import ALL_PAIRS, CONTRADICTED, MATCH_TOLERANCE, epipolar_distance, find_cameras, pairs
 from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.errors import InputError, NoCameras
-from tests.makers.captures import look_at, write
+from tests.makers.captures import look_at, write, write_as_phone
 
 WIDTH, HEIGHT, FOCAL = 256, 192, 280.0
 POSES = [
@@ -111,6 +112,52 @@ def test_one_that_is_interrupted_goes_on(photos):
     assert len(read_capture(photos).views) == 10
 
 
+def test_photos_of_a_phone(tmp_path, pictures):
+    """Check photos in HEIC and photos held sideways.
+
+    They get upright cameras under their own names. COLMAP starts with the focal length in EXIF, and nothing is left behind.
+    """
+    for number, picture in enumerate(pictures):
+        film, suffix = round(FOCAL / np.hypot(WIDTH, HEIGHT) * np.hypot(36, 24)), (".HEIC", ".png")[number % 2]
+        write_as_phone(tmp_path / f"IMG {number}{suffix}", picture, number % 4, film)
+    photos = {path.name for path in tmp_path.iterdir()}
+
+    def interrupt(event: str, facts: dict) -> None:
+        if facts.get("stage") == "matching":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        find_cameras(tmp_path, interrupt)
+    assert not [path for path in (tmp_path / "sparse.tmp").iterdir() if path.is_dir()]
+    (file,) = (tmp_path / "sparse.tmp").glob("*.db")
+    database = sqlite3.connect(file)
+    cameras = database.execute("SELECT width, height, prior_focal_length, params FROM cameras").fetchall()
+    database.close()
+    assert {camera[:3] for camera in cameras} == {(WIDTH, HEIGHT, 1), (HEIGHT, WIDTH, 1)}
+    for *_, parameters in cameras:
+        assert np.frombuffer(parameters)[0] == pytest.approx(FOCAL, rel=0.02)
+
+    assert find_cameras(tmp_path, quiet)["placed"] == len(pictures)
+    assert {path.name for path in tmp_path.iterdir()} == photos | {"sparse"}
+    assert {path.name for path in (tmp_path / "sparse").iterdir()} == {"0"}
+    capture = read_capture(tmp_path)
+    views = sorted(capture.views, key=lambda view: view.camera.name)
+    assert {view.image_path.name for view in views} == photos
+    true = np.array(POSES)
+    positions, rotation = aligned(np.array([view.camera.position for view in views]), true[:, :3, 3])
+    assert np.linalg.norm(positions - true[:, :3, 3], axis=1).max() < 0.05
+    for view, pose, picture in zip(views, POSES, pictures, strict=True):
+        turned = view.camera.world_to_camera[:3, :3] @ rotation.T @ (pose @ OPENGL_TO_OPENCV)[:3, :3]
+        assert np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1))) < 2
+        loaded = load_view(view)
+        assert loaded.image.shape == picture.shape
+        x, y, depth = loaded.camera.projection @ np.column_stack([capture.points, np.ones(len(capture.points))]).T
+        u, v = (x / depth).astype(int), (y / depth).astype(int)
+        inside = (depth > 0) & (u >= 0) & (u < WIDTH) & (v >= 0) & (v < HEIGHT)
+        seen = loaded.image[v[inside], u[inside]] / 255
+        assert np.median(np.abs(seen - capture.point_colors[inside])) < 0.1
+
+
 def test_photos_that_have_nothing_in_common(tmp_path):
     rng = np.random.default_rng(0)
     for number in range(4):
@@ -118,6 +165,16 @@ def test_photos_that_have_nothing_in_common(tmp_path):
     with pytest.raises(InputError, match=r"only 0 of 4 photos could be placed.*newspaper"):
         find_cameras(tmp_path, quiet)
     assert [path.name for path in tmp_path.iterdir()] == ["images"]
+
+
+def test_a_photo_that_is_broken(tmp_path):
+    """Check that the process that runs COLMAP names a photo that it cannot decode."""
+    for number in range(3):
+        write_as_phone(tmp_path / f"{number}.tif", np.full((96, 128, 3), number, np.uint8), turns=1)
+    photo = tmp_path / "1.tif"
+    photo.write_bytes(photo.read_bytes()[:-3000])
+    with pytest.raises(InputError, match=r"1\.tif: the image is truncated"):
+        find_cameras(tmp_path, quiet)
 
 
 def test_no_photos(tmp_path):

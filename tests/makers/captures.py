@@ -8,6 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
+from PIL import ExifTags, Image
+from pillow_heif import register_heif_opener
 from scipy.spatial.transform import Rotation
 
 CENTRE = np.array([1.0, 2.0, 3.0])
@@ -69,6 +71,21 @@ def write(path: Path, image: np.ndarray) -> None:
     if image.ndim == 3:
         image = image[..., [2, 1, 0, 3][: image.shape[2]]]
     cv2.imencode(path.suffix, image, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tofile(path)
+
+
+def write_as_phone(path: Path, image: np.ndarray, turns: int = 0, film: int | None = None) -> None:
+    """Write an RGB image as a phone does that is held sideways, in the format of the path's suffix, HEIC too.
+
+    The pixels are stored turned, and EXIF says that `turns` clockwise quarter turns (0 to 3) make them upright. `film` is the focal length
+    for 35 mm film in mm, for EXIF.
+    """
+    register_heif_opener()
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = (1, 6, 3, 8)[turns]
+    if film:
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = film
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.rot90(image, turns)).save(path, exif=exif.tobytes(), quality=98)
 
 
 def edit(file: Path, change) -> None:

@@ -9,7 +9,7 @@ from refgs.capture.lens import Lens
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".heic", ".heif", ".hif", ".tif", ".tiff", ".webp", ".bmp")
 
 
 def find_image(path: Path, any_suffix: bool = False) -> Path | None:
@@ -96,12 +96,18 @@ def photo_view(
 ) -> View:
     """Combine a photo, its camera and its mask in a View.
 
-    `as_given` is the camera and lens from the capture's file. They are scaled if they are for another resolution than the photo's.
-    `mask_below` is given if the mask is a depth map (see `View`). Raises InputError if the photo's aspect ratio differs from the camera's,
-    or the mask's size from the photo's. `where` is a name for the camera in error messages.
+    `as_given` is the camera and lens from the capture's file. They are scaled if they are for another resolution than the photo's. They are
+    turned upright with the photo if it has an EXIF orientation, because COLMAP and nerfstudio make cameras for photos as stored. A camera
+    whose size only fits the upright photo is not turned. `mask_below` is given if the mask is a depth map (see `View`).
+
+    Raises InputError if the photo's aspect ratio differs from the camera's, or the mask's size from the photo's. `where` is a name for the
+    camera in error messages.
     """
-    width, height, has_alpha = read_header(image)
+    header = read_header(image)
+    width, height, has_alpha, turns = header
     camera, lens = as_given
+    if turns % 2 and (camera.width - camera.height) * (height - width) > 0:
+        width, height, turns = height, width, 0
     if (camera.width, camera.height) != (width, height):
         sx, sy = width / camera.width, height / camera.height
         if abs(sx / sy - 1) > 0.01:
@@ -112,13 +118,16 @@ def photo_view(
         camera = camera.resized(width, height)
         if lens is not None:
             lens = replace(lens, fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy)
+    for _ in range(turns):
+        lens = lens and lens.turned(camera.height)
+        camera = camera.turned()
     if lens is not None:
         camera = lens.pinhole(camera, where)
     if mask is not None:
-        mask_size = read_header(mask)[:2]
-        if mask_size != (width, height):
+        mask_size = read_header(mask).upright
+        if mask_size not in (header.upright, header[:2]):
             raise InputError(
                 f"{mask}: the mask has {mask_size[0]}×{mask_size[1]} pixels but its photo {image.name} "
-                f"{width}×{height}. Make the mask the photo's size."
+                f"{camera.width}×{camera.height}. Make the mask the photo's size."
             )
     return View(camera, image, mask, split, lens, has_alpha and mask is None, mask_below)

@@ -1,17 +1,26 @@
 """Load photos and masks for training: decode, undistort and reduce them. The results are 8-bit sRGB with straight alpha."""
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
+from pillow_heif import register_heif_opener
 
 from refgs.camera import Camera
 from refgs.capture.types import View
 from refgs.color import srgb_decode, srgb_encode
 from refgs.errors import InputError
+
+register_heif_opener()  # Pillow opens HEIC then
+
+# Clockwise quarter turns that make a photo upright, by EXIF orientation. The mirrored orientations 2, 4, 5 and 7 are ignored: no camera
+# sees a mirrored world.
+_TURNS = {6: 1, 3: 2, 8: 3}
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,21 +36,68 @@ class LoadedView:
     camera: Camera
 
 
-def read_header(path: Path) -> tuple[int, int, bool]:
-    """Return an image file's width, its height, and whether it has alpha. No pixels are decoded. Raises InputError naming the file."""
+class Header(NamedTuple):
+    """Size of an image as stored, in pixels; whether it has alpha; and the clockwise quarter turns that make it upright (EXIF)."""
+
+    width: int
+    height: int
+    has_alpha: bool
+    turns: int
+
+    @property
+    def upright(self) -> tuple[int, int]:
+        """Return the width and height of the upright image. `read_image` returns it in this size."""
+        return (self.height, self.width) if self.turns % 2 else (self.width, self.height)
+
+
+def read_header(path: Path) -> Header:
+    """Read an image file's header. No pixels are decoded. Raises InputError naming the file."""
     with _open(path) as picture:
-        return *picture.size, picture.has_transparency_data
+        return Header(*picture.size, picture.has_transparency_data, _turns(picture))
+
+
+def read_focal_length(path: Path) -> float | None:
+    """Return a photo's focal length in pixels by its EXIF: that for 35 mm film, else in mm with the pixels per mm of the sensor.
+
+    Return None if EXIF has neither. Raises InputError naming the file.
+    """
+    with _open(path) as picture:
+        try:
+            tags = Image.Image.getexif(picture).get_ifd(ExifTags.IFD.Exif)
+            if film := float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)):
+                return film / math.hypot(36, 24) * math.hypot(*picture.size)
+            unit = {2: 25.4, 3: 10.0, 4: 1.0}[tags[ExifTags.Base.FocalPlaneResolutionUnit]]  # mm
+            density = float(tags[ExifTags.Base.FocalPlaneXResolution]) / unit
+            # The density is that of the photo as taken; it may have been scaled since.
+            scale = max(picture.size) / max(tags[ExifTags.Base.ExifImageWidth], tags[ExifTags.Base.ExifImageHeight])
+            return float(tags[ExifTags.Base.FocalLength]) * density * scale or None
+        except Exception:  # absent or broken
+            return None
 
 
 def read_image(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Decode an image file to RGB (H, W, 3) uint8 and alpha (H, W) uint8, None without alpha.
 
-    16-bit and greyscale files are converted to 8-bit RGB. The EXIF rotation is ignored, as in COLMAP and nerfstudio. Raises InputError
-    naming the file if it is truncated or unreadable.
+    The image is turned upright by its EXIF orientation. 16-bit and greyscale files are converted to 8-bit RGB. Raises InputError naming the
+    file if it is truncated or unreadable.
     """
     with _open(path) as picture:
-        pixels = np.asarray(_decode(picture, path))
+        turns = _turns(picture)
+        pixels = np.rot90(np.asarray(_decode(picture, path)), -turns)
     return pixels[..., :3].copy(), (pixels[..., 3].copy() if pixels.shape[2] == 4 else None)
+
+
+def write_for_colmap(path: Path, out: Path) -> bool:
+    """Write a photo's pixels to the JPEG `out` if COLMAP cannot read them: HEIC, WebP, and TIFF that has to be turned upright.
+
+    Return whether it was written. The pixels are turned as `Header` says that they are stored. Raises InputError naming the file.
+    """
+    with _open(path) as picture:
+        turned = picture.format == "TIFF" and Image.Image.getexif(picture).get(ExifTags.Base.Orientation, 1) != 1
+        if picture.format not in ("HEIF", "WEBP") and not turned:
+            return False
+        _decode(picture, path).convert("RGB").save(out, "JPEG", quality=95, subsampling=0)
+    return True
 
 
 def read_mask(path: Path, below: float | None = None) -> np.ndarray:
@@ -60,10 +116,16 @@ def read_mask(path: Path, below: float | None = None) -> np.ndarray:
 
 
 def read_alpha(view: View) -> np.ndarray | None:
-    """Return a photo's mask (H, W) uint8, None if it has none. It is not undistorted and has the size of the file."""
-    if view.mask_path is not None:
-        return read_mask(view.mask_path, view.mask_below)
-    return read_image(view.image_path)[1] if view.has_alpha else None
+    """Return a photo's mask (H, W) uint8, None if it has none. It is upright, not undistorted, and has the photo's full size.
+
+    A mask file without an EXIF orientation may lie as its photo is stored. If only that fits the photo's size, it is turned with the photo.
+    """
+    if view.mask_path is None:
+        return read_image(view.image_path)[1] if view.has_alpha else None
+    mask = read_mask(view.mask_path, view.mask_below)
+    if mask.shape != (view.camera.height, view.camera.width):
+        mask = np.rot90(mask, -read_header(view.image_path).turns).copy()  # torch takes no negative strides
+    return mask
 
 
 def load_view(view: View, max_side: int | None = None) -> LoadedView:
@@ -75,7 +137,7 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
     image, own_alpha = read_image(view.image_path)
     alpha = own_alpha if view.has_alpha else None
     if view.mask_path is not None:
-        alpha = read_mask(view.mask_path, view.mask_below)
+        alpha = read_alpha(view)
     camera = view.camera
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(f"{view.image_path}: the photo changed its size since the capture was read. Start again.")
@@ -112,6 +174,17 @@ def _open(path: Path) -> Image.Image:
         raise InputError(f"{path}: the image is missing. Put it back, or remove it from the capture.") from None
     except Exception as error:
         raise InputError(f"{path}: this is not an image that can be read ({_reason(error)}). Replace it.") from error
+
+
+def _turns(picture: Image.Image) -> int:
+    """Return the clockwise quarter turns that make an opened picture upright. Pillow itself turns TIFF, and libheif HEIC."""
+    if picture.format in ("TIFF", "HEIF"):
+        return 0
+    try:
+        # Not picture.getexif(), which decodes a PNG to look behind its pixels.
+        return _TURNS.get(Image.Image.getexif(picture).get(ExifTags.Base.Orientation), 0)
+    except Exception:  # broken EXIF: the pixels are still good
+        return 0
 
 
 def _decode(picture: Image.Image, path: Path) -> Image.Image:

@@ -44,6 +44,11 @@ class Lens:
             y * factor + p1 * (r2 + 2 * y * y) + p2 * xy,
         )
 
+    def turned(self, height: int) -> "Lens":
+        """Return the lens for its photo turned clockwise by a quarter turn. `height` is the photo's height before, in pixels."""
+        p1, p2 = self.tangential
+        return Lens(self.fy, self.fx, height - self.cy, self.cx, self.radial, (p2, -p1))
+
     def pinhole(self, camera: Camera, where: str) -> Camera:
         """Return the pinhole camera of the undistorted photo. It has the pose and the size of `camera`.
 

@@ -28,7 +28,7 @@ import numpy as np
 from refgs import CORES
 from refgs.capture import find_layout
 from refgs.capture.files import find_photos
-from refgs.capture.images import read_header
+from refgs.capture.images import read_focal_length, read_header, read_image, write_for_colmap
 from refgs.errors import InputError
 
 SIDE = 1600  # pixels on the longer side for finding features; presets train on fewer
@@ -132,17 +132,19 @@ def _run_colmap_in_child(
 ) -> tuple[set[str], float, float]:
     """Run `_run_colmap` in a child process and return its result. The process is ended even if this call is interrupted.
 
-    `report("progress", facts)` is called with the progress that the process sends.
+    `report("progress", facts)` is called with the progress that the process sends. Raises InputError if a photo cannot be read.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_run_colmap, args=(photos, database, model, theirs), daemon=True)
+    process = context.Process(target=_child, args=(photos, database, model, theirs), daemon=True)
     process.start()
     theirs.close()
     try:
         while True:
             if ours.poll(0.2):  # short, because an interrupt does not wake it
                 event = ours.recv()
+                if isinstance(event, InputError):
+                    raise event
                 if isinstance(event, tuple):
                     return event
                 report("progress", event)
@@ -152,6 +154,14 @@ def _run_colmap_in_child(
     finally:
         process.kill()
         process.join()
+
+
+def _child(photos: list[Path], database: Path, model: Path, events: Connection) -> None:
+    """Run `_run_colmap`, and send an InputError to the pipe `events`."""
+    try:
+        _run_colmap(photos, database, model, events)
+    except InputError as error:
+        events.send(error)
 
 
 def _run_colmap(photos: list[Path], database: Path, model: Path, events: Connection) -> None:
@@ -170,7 +180,8 @@ def _run_colmap(photos: list[Path], database: Path, model: Path, events: Connect
         events.send({"stage": stage, "done": done, "total": total})
 
     with pycolmap.Database.open(database) as known:
-        extracted = known.num_images() > 0 and not any(known.exists_image(photo.name) for photo in photos)
+        names = [image.name for image in known.read_all_images()]
+        extracted = bool(names) and all(name.isdigit() for name in names)  # the last step of `_extract`
     if not extracted:
         _extract(photos, database, progress)
     _match(len(photos), database, progress)
@@ -178,9 +189,9 @@ def _run_colmap(photos: list[Path], database: Path, model: Path, events: Connect
     if found is None:
         events.send((set(), 0.0, 0.0))
         return
+    _color_points(found, photos)
     for number in found.reg_image_ids():
         found.image(number).name = photos[int(found.image(number).name)].name
-    found.extract_colors_for_all_images(photos[0].parent)
     model.mkdir()
     found.write_binary(model)
     placed = {found.image(number).name for number in found.reg_image_ids()}
@@ -190,8 +201,8 @@ def _run_colmap(photos: list[Path], database: Path, model: Path, events: Connect
 def _extract(photos: list[Path], database: Path, progress: Callable) -> None:
     """Extract image features of all photos into COLMAP's database.
 
-    Photos with the same size and focal length (EXIF) share their intrinsics. At the end the photos in the database are renamed to their
-    indices, because names in COLMAP's file of pairs cannot have spaces.
+    Photos with the same size and focal length (EXIF) share their intrinsics. COLMAP gets a temporary JPEG of a photo that it cannot read.
+    At the end the photos in the database are renamed to their indices, because names in COLMAP's file of pairs cannot have spaces.
     """
     import pycolmap
 
@@ -199,29 +210,57 @@ def _extract(photos: list[Path], database: Path, progress: Callable) -> None:
     reading.camera_model = CAMERA_MODEL
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = SIDE
-    shared: dict[tuple, list[str]] = {}
     with pycolmap.Database.open(database) as known:
         cameras = {_lens(camera): camera.camera_id for camera in known.read_all_cameras()}
-        for photo in photos:
-            camera = pycolmap.infer_camera_from_image(photo, reading)
-            shared.setdefault(_lens(camera), []).append(photo.name)
+    readable = database.with_name(f"{database.name}.photos")
+    readable.mkdir(exist_ok=True)
+    numbers: dict[str, str] = {}
+    for start in range(0, len(photos), 2 * CORES):
+        progress("features", start, len(photos))
+        shared: dict[tuple[int, Path], list[str]] = {}
+        for number, photo in list(enumerate(photos))[start : start + 2 * CORES]:
+            folder, name = photo.parent, photo.name
+            if write_for_colmap(photo, readable / f"{number}.jpg"):
+                folder, name = (
+                    database.parent,
+                    f"{readable.name}/{number}.jpg",
+                )  # the folder, because a photo may be named 0.jpg
+            numbers[name] = str(number)
+            camera = pycolmap.infer_camera_from_image(folder / name, reading)
+            if focal := read_focal_length(photo):  # COLMAP knows only that for 35 mm film, in JPEG and PNG
+                camera.focal_length, camera.has_prior_focal_length = focal, True
             if _lens(camera) not in cameras:
-                cameras[_lens(camera)] = known.write_camera(camera)
-    done = 0
-    for lens, names in shared.items():
-        reading.existing_camera_id = cameras[lens]
-        for start in range(0, len(names), 2 * CORES):
-            progress("features", done, len(photos))
-            some = names[start : start + 2 * CORES]
+                with pycolmap.Database.open(database) as known:
+                    cameras[_lens(camera)] = known.write_camera(camera)
+            shared.setdefault((cameras[_lens(camera)], folder), []).append(name)
+        for (reading.existing_camera_id, folder), names in shared.items():
             pycolmap.extract_features(
-                database, photos[0].parent, some, pycolmap.CameraMode.SINGLE, reading, extraction
+                database, folder, names, pycolmap.CameraMode.SINGLE, reading, extraction
             )  # skips photos that have features already
-            done += len(some)
-    numbers = {photo.name: str(number) for number, photo in enumerate(photos)}
+        for path in readable.iterdir():
+            path.unlink()
+    readable.rmdir()
     with pycolmap.Database.open(database) as known, pycolmap.DatabaseTransaction(known):
         for image in known.read_all_images():
             image.name = numbers[image.name]
             known.update_image(image)
+
+
+def _color_points(model: Any, photos: list[Path]) -> None:
+    """Give each point of a model (a pycolmap.Reconstruction) the mean sRGB colour of the pixels that it was seen at.
+
+    The images in the model are named by the photos' indices. COLMAP does the same, but not for HEIC.
+    """
+    sums = {number: np.zeros(4) for number in model.points3D}  # red, green, blue, count
+    for number in model.reg_image_ids():
+        photo = photos[int(model.image(number).name)]
+        pixels = np.rot90(read_image(photo)[0], read_header(photo).turns)  # as stored, like COLMAP's features
+        height, width = pixels.shape[:2]
+        for seen in model.image(number).get_observation_points2D():
+            x, y = np.clip(seen.xy.astype(int), 0, (width - 1, height - 1))
+            sums[seen.point3D_id] += (*pixels[y, x], 1)
+    for number, (*color, count) in sums.items():
+        model.point3D(number).color = np.rint(np.divide(color, count)).astype(np.uint8)
 
 
 def _lens(camera) -> tuple[int, int, float]:

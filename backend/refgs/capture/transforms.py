@@ -127,7 +127,7 @@ def camera_name(path: str) -> str:
 
 
 _NOT_PERSPECTIVE = {"OPENCV_FISHEYE", "FISHEYE", "FISHEYE624", "EQUIRECTANGULAR", "ORTHOPHOTO"}
-_IMAGE_SUFFIXES = {"png", "jpg", "jpeg", "tif", "tiff", "webp", "bmp", "exr"}
+_IMAGE_SUFFIXES = {"png", "jpg", "jpeg", "heic", "heif", "hif", "tif", "tiff", "webp", "bmp", "exr"}
 
 
 def _focal(frame: Frame, focal: str, angle: str, size: float) -> float | None:
