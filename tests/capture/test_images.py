@@ -152,6 +152,32 @@ def test_focal_length_by_exif(tmp_path, tags, expected):
     assert read_focal_length(tmp_path / "a.jpg") == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.parametrize("masked", [True, False])
+def test_large_jpegs_are_reduced_by_their_decoder(tmp_path, masked):
+    """Check that the decoder reduces a JPEG whose sides divide, with the same result as reducing a PNG, and its camera and lens."""
+    folder, photo, jpeg, png = nerfstudio(tmp_path), smooth(960, 1280), tmp_path / "images/a.jpg", tmp_path / "a.png"
+    write_as_phone(jpeg, photo)
+    write(png, photo)
+    if masked:
+        write(folder / "masks" / "a.png", np.tri(960, 1280, dtype=np.uint8) * 255)
+    own = {"w": 1280, "h": 960, "fl_x": 1200.0, "fl_y": 1200.0, "cx": 630.0, "cy": 490.0, "k1": -0.1, "p1": 0.01}
+    edit(folder / "transforms.json", lambda data: data["frames"][1].update(own, file_path="images/a.jpg"))
+    assert read_image(jpeg, 4)[0].shape == (240, 320, 3)
+    (view,) = (view for view in read_capture(folder).views if view.image_path == jpeg)
+    jpg, png = load_view(view, 160), load_view(replace(view, image_path=png), 160)
+    visible = slice(None) if png.alpha is None else png.alpha > 20
+    difference = np.abs(jpg.image.astype(int) - png.image)[visible]
+    assert difference.mean() < 1 and difference.max() < 6
+    assert not masked or np.abs(jpg.alpha.astype(int) - png.alpha).max() <= 16  # undistortion blurs its edge
+    write_as_phone(jpeg, photo[:-2])
+    assert read_image(jpeg, 4)[0].shape == (479, 640, 3)
+    write_as_phone(jpeg, photo[:-1])
+    assert read_image(jpeg, 4)[0].shape == (959, 1280, 3)  # a quarter would be no exact one
+    jpeg.write_bytes(jpeg.read_bytes()[:-2000])
+    with pytest.raises(InputError, match="truncated"):
+        read_image(jpeg, 4)
+
+
 def test_downsizing_averages_linear_light_and_does_not_bleed(tmp_path):
     folder = nerf_blender(tmp_path)
     image = np.zeros((48, 64, 4), np.uint8)
