@@ -43,6 +43,8 @@ def refgs(tmp_path, *words) -> tuple[int, str, set[str]]:
         (WRONG, "train photos --out run --resume", "run is not a run folder"),
         (WRONG, "train photos --out stopped --resume", "photos: there is no such folder"),
         (WRONG, "check photos", "photos: there is no such folder"),
+        (WRONG, "frames film.mp4", "Missing option"),
+        (WRONG, "frames film.mp4 --out capture", "film.mp4: there is no such file"),
         (WRONG, "render stopped --cameras a.json --out out --format gif", "--format gif"),
         (WRONG, "render stopped --cameras a.json --out out --passes colour", "--passes colour"),
         (WRONG, "render stopped --cameras a.json --out out", "stopped: the training has not ended"),

@@ -27,6 +27,18 @@ def check(capture: Annotated[Path, typer.Argument(help="folder with photos and c
 
 
 @app.command()
+def frames(
+    video: Annotated[Path, typer.Argument(help="video by a phone or camera: MP4, MOV …")],
+    out: Annotated[Path, typer.Option(help="folder for the photos: OUT/images/frame_0001.jpg …")],
+    count: Annotated[int, typer.Option(min=3, max=1000, help="number of photos, less those that are left out")] = 100,
+) -> None:
+    """Choose sharp photos from a video, evenly over its time. Leave out blurred ones, and those between which the camera stood still."""
+    from refgs import commands
+
+    commands.frames(video, out, count)
+
+
+@app.command()
 def poses(photos: Annotated[Path, typer.Argument(help="folder with photos, in it or in its folder images")]) -> None:
     """Find the cameras of the photos in a folder, and write them to PHOTOS/sparse/0. Then the folder is a capture."""
     from refgs import commands

@@ -59,6 +59,18 @@ def job_report(what: str):
         yield report
 
 
+def frames(video: Path, out: Path, count: int) -> None:
+    """Choose up to `count` photos from a video and write them to OUT/images."""
+    from refgs.capture.video import extract_photos
+
+    with progress_bar("reading frames", 1) as bar:
+        found = extract_photos(video, out, count, bar)
+    console.print(
+        f"{found['frames']} frames read, {found['photos']} photos kept, {found['blurred']} left out as blurred, "
+        f"{found['duplicates']} as duplicates: {out / 'images'}"
+    )
+
+
 def poses(folder: Path) -> None:
     """Find the cameras of the photos in a folder. If the search is interrupted, running the command again resumes it."""
     from refgs.capture.motion import find_cameras

@@ -1,0 +1,240 @@
+"""Test the choice of photos from videos. The videos are made here, of a window that moves over a texture."""
+
+import struct
+from itertools import pairwise
+
+import av
+import cv2
+import numpy as np
+import pytest
+from av.video.reformatter import Colorspace
+
+from refgs.capture.files import find_photos
+from refgs.capture.images import read_image
+from refgs.capture.video import SIDE, extract_photos, movement, sharpness
+from refgs.errors import InputError
+
+WIDTH, HEIGHT = 192, 128
+LENGTH = 60  # frames
+STRETCHES = 12  # of five frames each
+REMUXED = {"movflags": "faststart"}  # the header first, so that a truncated file still opens
+
+
+def texture(size: int = 512, seed: int = 0) -> np.ndarray:
+    """Make an orange texture like those in photos, with the power spectrum 1/f²: RGB (size, size, 3) uint8."""
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)) + 1 / size
+    waves = np.fft.irfft2(np.fft.rfft2(np.random.default_rng(seed).normal(size=(size, size))) / frequency)
+    grey = (128 + 40 * waves / waves.std()).clip(0, 255)
+    return (grey[..., None] * [1.0, 0.8, 0.6]).astype(np.uint8)
+
+
+def window(step: float) -> np.ndarray:
+    """Return the frame after `step` steps of four pixels."""
+    x = round(4 * step)
+    return TEXTURE[100 : 100 + HEIGHT, x : x + WIDTH]
+
+
+def blurred(frame: np.ndarray, pixels: int) -> np.ndarray:
+    """Blur a frame as a camera does that moves by `pixels` sideways while the shutter is open."""
+    return cv2.blur(frame, (pixels, 1))
+
+
+def write_video(path, frames, codec="libx264", pixels="yuv420p", options=None, **color) -> None:
+    """Write frames (H, W, 3) uint8 as a video of 30 frames a second. `color` are properties of the codec, such as color_trc."""
+    with av.open(str(path), "w", options=options or {}) as container:
+        options = {"crf": "12", "preset": "ultrafast", "x265-params": "log-level=none"}
+        stream = container.add_stream(codec, rate=30, options=options)
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = pixels
+        for name, value in color.items():
+            setattr(stream.codec_context, name, value)
+        for number, picture in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+            frame = frame.reformat(format=pixels, dst_colorspace=color.get("colorspace"))
+            frame.pts = number
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+def track_matrix(a: int, b: int, c: int, d: int) -> bytes:
+    """Return the matrix of a track header as 36 bytes, without a shift."""
+    return struct.pack(">9i", a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30)
+
+
+TEXTURE = texture()
+WALK = [window(step) for step in range(LENGTH)]
+
+
+def refused(says: str, video, out, count: int = STRETCHES) -> None:
+    """Assert that the video is refused with one line that holds `says`, and that no file or folder is left."""
+    before = sorted(out.parent.rglob("*"))
+    with pytest.raises(InputError) as error:
+        extract_photos(video, out, count)
+    message = str(error.value)
+    assert says in message and "\n" not in message, message
+    assert sorted(out.parent.rglob("*")) == before
+
+
+def source(file) -> int:
+    """Return the number of the frame in WALK that a photo is most like."""
+    photo = read_image(file)[0].astype(int)
+    return int(np.argmin([np.abs(photo - frame).mean() for frame in WALK]))
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.MOV"])
+def test_the_sharpest_frame_of_each_stretch(tmp_path, name):
+    sharp = {5 * stretch + (3 * stretch) % 5 for stretch in range(STRETCHES)}
+    shaky = [frame if number in sharp else blurred(frame, 3) for number, frame in enumerate(WALK)]
+    for number in range(20, 25):
+        shaky[number] = blurred(WALK[number], 15)
+    write_video(tmp_path / name, shaky)
+    said = []
+    found = extract_photos(tmp_path / name, tmp_path / "out", STRETCHES, lambda *facts: said.append(facts))
+    assert found == {"frames": LENGTH, "photos": STRETCHES - 1, "blurred": 1, "duplicates": 0}
+    photos = find_photos(tmp_path / "out")
+    assert [photo.name for photo in photos] == [f"frame_{n:04d}.jpg" for n in range(1, STRETCHES)]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["images"]
+    assert [source(photo) for photo in photos] == sorted(sharp - set(range(20, 25)))
+    assert np.abs(read_image(photos[0])[0].astype(int) - WALK[0]).mean() < 6
+    assert [done for done, _, _ in said] == list(range(1, LENGTH + 1))
+    assert said[-1] == (LENGTH, f"{STRETCHES} photos", LENGTH)
+
+
+def test_stretches_in_which_the_camera_stands_are_left_out(tmp_path):
+    steps = [*range(20), *[20] * 20, *range(20, 40)]
+    noise = np.random.default_rng(0)
+    frames = [(window(step) + noise.normal(0, 2, (HEIGHT, WIDTH, 3))).clip(0, 255).astype(np.uint8) for step in steps]
+    write_video(tmp_path / "pause.mp4", frames)
+    found = extract_photos(tmp_path / "pause.mp4", tmp_path / "out", STRETCHES)
+    assert found["duplicates"] in (3, 4) and found["blurred"] == 0
+    sources = [source(photo) for photo in find_photos(tmp_path / "out")]
+    assert len(sources) == found["photos"] == STRETCHES - found["duplicates"]
+    assert all(a < b for a, b in pairwise(sources))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "turns"),
+    [((0, 1, -1, 0), -1), ((0, -1, 1, 0), 1), ((-1, 0, 0, -1), 2)],
+    ids=["portrait", "portrait upside down", "upside down"],
+)
+def test_photos_are_upright(tmp_path, matrix, turns):
+    """Check the matrix in an MP4's track header (ISO/IEC 14496-12): x' = ax + cy, y' = bx + dy, with y down. `turns` are to the left."""
+    write_video(tmp_path / "film.mp4", WALK[:30])
+    film = (tmp_path / "film.mp4").read_bytes()
+    header = film.index(b"tkhd")
+    place = film.index(track_matrix(1, 0, 0, 1), header)
+    (tmp_path / "film.mp4").write_bytes(film[:place] + track_matrix(*matrix) + film[place + 36 :])
+    extract_photos(tmp_path / "film.mp4", tmp_path / "out", 3)
+    photo = read_image(find_photos(tmp_path / "out")[0])[0].astype(int)
+    assert min(np.abs(np.rot90(frame, turns) - photo).mean() for frame in WALK[:10]) < 4
+
+
+def test_hdr_becomes_srgb(tmp_path):
+    """Check that white of HLG, at 75 % of the signal, becomes white of sRGB."""
+    patch = [frame.copy() for frame in WALK]
+    for frame in patch:
+        frame[:40, :40] = round(0.75 * 255)
+    hlg = {"color_trc": 18, "color_primaries": 9, "colorspace": Colorspace.BT2020}
+    write_video(tmp_path / "hdr.mov", patch, "libx265", "yuv420p10le", **hlg)
+    extract_photos(tmp_path / "hdr.mov", tmp_path / "out", STRETCHES)
+    photo = read_image(find_photos(tmp_path / "out")[0])[0]
+    assert photo[5:30, 5:30].min() > 235
+
+
+def test_a_large_video_is_kept_in_full_size(tmp_path):
+    large = cv2.resize(TEXTURE, (1600, 1600))
+    write_video(tmp_path / "large.mp4", [large[:SIDE, x : x + 2 * SIDE - 200] for x in range(0, 200, 20)])
+    found = extract_photos(tmp_path / "large.mp4", tmp_path / "out", 5)
+    assert found["photos"] == 5
+    assert read_image(find_photos(tmp_path / "out")[0])[0].shape == (SIDE, 2 * SIDE - 200, 3)
+
+
+def test_sharpness():
+    """Check that blur in any direction lowers the sharpness, and that contrast does not change it."""
+    grey = cv2.cvtColor(TEXTURE, cv2.COLOR_RGB2GRAY)
+    sharp = sharpness(grey)
+    assert sharpness(grey // 2 + 60) == pytest.approx(sharp, rel=0.02) and 0.3 < sharp < 0.5
+    gaussian = [sharpness(cv2.GaussianBlur(grey, (0, 0), sigma)) / sharp for sigma in (1, 2, 3)]
+    assert gaussian == pytest.approx([0.67, 0.34, 0.18], abs=0.03)
+    for kernel in (np.ones((1, 9)), np.ones((9, 1)), np.eye(9), np.eye(9)[::-1]):
+        assert sharpness(cv2.filter2D(grey, -1, kernel / kernel.sum())) < 0.4 * sharp
+    assert sharpness(np.full((32, 32), 100, np.uint8)) == 0
+
+
+def test_movement():
+    grey = cv2.cvtColor(TEXTURE, cv2.COLOR_RGB2GRAY)
+    assert movement(grey[:200, :400], grey[:200, 8:408]) == pytest.approx(8 / 400, rel=0.05)
+    assert movement(grey[:200, :400], grey[:200, :400]) < 1e-4
+    turntable = grey[:200, :400].copy()
+    turntable[60:140, 100:250] = grey[60:140, 105:255]
+    assert movement(grey[:200, :400], turntable) > 0.01
+    assert movement(grey[:200, :400], grey[300:500, :400]) > 0.05
+    assert movement(np.zeros((50, 50), np.uint8), np.zeros((50, 50), np.uint8)) == np.inf
+
+
+def test_what_is_no_video(tmp_path):
+    (tmp_path / "notes.mp4").write_text("no video " * 100)
+    refused("notes.mp4: this is not a video", tmp_path / "notes.mp4", tmp_path / "out")
+    (tmp_path / "empty.mp4").touch()
+    refused("empty.mp4: this is not a video", tmp_path / "empty.mp4", tmp_path / "out")
+    refused("no such file", tmp_path / "nowhere.mp4", tmp_path / "out")
+    refused("no such file", tmp_path, tmp_path / "out")
+    cv2.imwrite(str(tmp_path / "photo.jpg"), TEXTURE)
+    refused("too few frames in it (1)", tmp_path / "photo.jpg", tmp_path / "out")
+    with av.open(str(tmp_path / "sound.m4a"), "w") as container:
+        stream = container.add_stream("aac", rate=44100, layout="mono")
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 44100), np.float32), format="fltp", layout="mono")
+        sound.sample_rate = 44100
+        container.mux(stream.encode(sound))
+        container.mux(stream.encode())
+    refused("there is no film in it", tmp_path / "sound.m4a", tmp_path / "out")
+
+
+def test_a_truncated_video(tmp_path):
+    write_video(tmp_path / "film.mp4", WALK, options=REMUXED)
+    whole = (tmp_path / "film.mp4").read_bytes()
+    assert extract_photos(tmp_path / "film.mp4", tmp_path / "whole", STRETCHES)["photos"] == STRETCHES
+    (tmp_path / "half.mp4").write_bytes(whole[: len(whole) // 2])
+    refused("of 2.0 seconds are there", tmp_path / "half.mp4", tmp_path / "out")
+    (tmp_path / "start.mp4").write_bytes(whole[: whole.index(b"mdat") + 4])
+    refused("start.mp4: ", tmp_path / "start.mp4", tmp_path / "out")
+    write_video(tmp_path / "film.mov", WALK)  # the header last, as phones write it
+    (tmp_path / "half.mov").write_bytes((tmp_path / "film.mov").read_bytes()[:20000])
+    refused("half.mov: this is not a video", tmp_path / "half.mov", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("frames", "says"),
+    [
+        ([WALK[0]] * LENGTH, "the camera hardly moves, 1 of 60 frames differ"),
+        (WALK[:2], "too few frames in it (2)"),
+        ([cv2.GaussianBlur(frame, (0, 0), 6) for frame in WALK], "its 60 frames are blurred"),
+        ([np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * LENGTH, "its 60 frames are blurred"),
+    ],
+    ids=["still", "two frames", "blurred", "black"],
+)
+def test_videos_of_which_no_photos_remain(tmp_path, frames, says):
+    write_video(tmp_path / "film.mp4", frames)
+    refused(says, tmp_path / "film.mp4", tmp_path / "new")
+    (tmp_path / "mine").mkdir()
+    refused(says, tmp_path / "film.mp4", tmp_path / "mine")
+
+
+def test_what_exists_is_not_overwritten(tmp_path):
+    write_video(tmp_path / "film.mp4", WALK)
+    (tmp_path / "out" / "images").mkdir(parents=True)
+    refused("images exists", tmp_path / "film.mp4", tmp_path / "out")
+    refused("no folder can be made there", tmp_path / "film.mp4", tmp_path / "film.mp4")
+
+
+def test_an_interrupted_choice_leaves_nothing(tmp_path):
+    write_video(tmp_path / "film.mp4", WALK)
+
+    def interrupt(frames, *_) -> None:
+        if frames == 30:
+            assert any((tmp_path / "out" / "images.tmp").iterdir())
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        extract_photos(tmp_path / "film.mp4", tmp_path / "out", STRETCHES, interrupt)
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
