@@ -100,6 +100,13 @@ def test_the_sharpest_frame_of_each_stretch(tmp_path, name):
     assert said[-1] == (LENGTH, f"{STRETCHES} photos", LENGTH)
 
 
+def test_photos_are_evenly_spaced_where_all_frames_are_as_sharp(tmp_path):
+    write_video(tmp_path / "film.mp4", WALK)
+    extract_photos(tmp_path / "film.mp4", tmp_path / "out", STRETCHES)
+    sources = [source(photo) for photo in find_photos(tmp_path / "out")]
+    assert len(sources) == STRETCHES and np.ptp(np.diff(sources)) <= 3
+
+
 def test_stretches_in_which_the_camera_stands_are_left_out(tmp_path):
     steps = [*range(20), *[20] * 20, *range(20, 40)]
     noise = np.random.default_rng(0)

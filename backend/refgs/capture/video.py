@@ -16,11 +16,10 @@ from refgs.paths import disk_errors_named
 
 SIDE = 800  # pixels on the longer side of the grey pictures that are measured; `standard` trains on as many
 FLOW_SIDE = 400  # pixels on the longer side of the pictures between which movement is measured
-BLURRED = 0.4  # part of the neighbours' median sharpness; motion blur over 5 pixels of 800 is below it
+BLURRED = 0.4  # part of the neighbours' median sharpness; motion blur over 7 pixels of 800 is below it
 FORMLESS = 0.04  # sharpness of edges that are blurred by 3 pixels of 800 (standard deviation), and of fine texture blurred by 4
-MOVED = (
-    0.005  # part of the picture's longer side. Of 100 photos around an object, the next one has moved by 0.02 and more
-)
+OFF_CENTRE = 0.1  # part of the sharpness taken off at a stretch's ends, so that equally sharp photos are evenly spaced
+MOVED = 0.005  # part of the picture's longer side. Between neighbours of 100 photos around an object it is 0.02 or more
 MIN_PHOTOS = 3  # `find_cameras` needs as many
 WHOLE = 0.95  # part of the length in the header that must be there, else the file is truncated; the last frame may stay for long
 HDR = (ColorTrc.ARIB_STD_B67, ColorTrc.SMPTE2084)  # HLG and PQ
@@ -184,11 +183,9 @@ def _sharpest(
     length = _length(container)
     rate = float(container.streams.video[0].average_rate or 0)
     frames, candidates = 0, []
-    current, best = -1, None
-    to_grey, to_color = (
-        VideoReformatter(),
-        VideoReformatter(),
-    )  # each keeps its tables; those for HDR take seconds to compute
+    current, best, most = -1, None, 0.0
+    # Each converter keeps its tables. Those for HDR take seconds to compute.
+    to_grey, to_color = VideoReformatter(), VideoReformatter()
 
     def write() -> None:
         measured, grey, frame = best
@@ -199,15 +196,17 @@ def _sharpest(
         candidates.append(_Candidate(measured, cv2.resize(grey, size, interpolation=cv2.INTER_AREA), file))
 
     for time, frame in _frames(video, container):
-        stretch = min(int(time / length * count), count - 1)
+        place = time / length * count
+        stretch = min(int(place), count - 1)
         if stretch != current:
             if best is not None:
                 write()
             current, best = stretch, None
         grey = _grey(frame, to_grey)
         measured = sharpness(grey)
-        if best is None or measured > best[0]:
-            best = measured, grey, frame
+        value = measured * (1 - OFF_CENTRE * abs(2 * (place - stretch) - 1))
+        if best is None or value > most:
+            best, most = (measured, grey, frame), value
         frames += 1
         progress(frames, f"{len(candidates) + 1} photos", max(frames, round(length * rate)))
     write()
