@@ -303,8 +303,7 @@ def _number(text: str) -> float | str:
 
 
 def write(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows into a CSV file. A row of the file with the same benchmark, scene, variant and name of the measured number
-    is replaced."""
+    """Write rows into a CSV file. They replace rows with the same benchmark, scene, variant and name of the measured value."""
     merged = {row[:4]: row for row in ([*read(path), *rows] if path.exists() else rows)}
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:

@@ -206,6 +206,14 @@ def test_a_scene_that_was_taken_for_matte_gets_its_gloss_back(matte, ball_captur
     assert again.state.needs == state.needs and "metallic" in again.state.parameters and again.state.total == 300
 
 
+def test_what_a_setting_leaves_out_stays_out_when_gloss_comes_back(matte, tmp_path):
+    state = trainer(matte, tmp_path / "run", "needs.iterations=off", total=150).state
+    recorded = {"specular": {"needed": False, "why": ""}, "iterations": dict(state.needs["iterations"])}
+    state.needs["specular"] = {"needed": True, "why": "taken back"}
+    needs.restore(state, recorded)
+    assert state.total == state.needs["iterations"]["total"] < 150
+
+
 def test_a_matte_scene_is_looked_at_twice(chalk):
     found = chalk.state.needs["specular"]
     assert not found["needed"] and found["again"] < CHANGES

@@ -1,4 +1,4 @@
-"""Test how changes with the viewing direction are measured, and how they tell metals from dielectrics.
+"""Test how changes with the viewing direction are measured, and how they tell coloured metals.
 
 The photos are renderings of the model itself, whose materials are known.
 """

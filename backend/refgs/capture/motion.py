@@ -221,10 +221,8 @@ def _extract(photos: list[Path], database: Path, progress: Callable) -> None:
         for number, photo in list(enumerate(photos))[start : start + 2 * CORES]:
             folder, name = photo.parent, photo.name
             if write_for_colmap(photo, readable / f"{number}.jpg"):
-                folder, name = (
-                    database.parent,
-                    f"{readable.name}/{number}.jpg",
-                )  # the folder, because a photo may be named 0.jpg
+                # In a folder of its own, because a photo may be named 0.jpg.
+                folder, name = database.parent, f"{readable.name}/{number}.jpg"
             numbers[name] = str(number)
             camera = pycolmap.infer_camera_from_image(folder / name, reading)
             if focal := read_focal_length(photo):  # COLMAP knows only that for 35 mm film, in JPEG and PNG

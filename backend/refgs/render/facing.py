@@ -1,4 +1,4 @@
-"""Compute the normals of surfels, flipped towards a camera."""
+"""Compute the normals of surfels, flipped towards a camera, and how much they face it."""
 
 import torch
 from torch import Tensor
@@ -45,3 +45,9 @@ def facing_normals(rotations: Tensor, positions: Tensor, camera: Camera) -> Tens
     """
     check(rotations=(rotations, (len(positions), 4)), positions=(positions, (len(positions), 3)))
     return _Facing.apply(rotations, positions.detach(), camera)
+
+
+def facing_cosine(positions: Tensor, normals: Tensor, camera: Camera) -> Tensor:
+    """Compute the cosine (N,) between each surfel's unit normal and its direction to the camera. `positions` and `normals` are (N, 3)."""
+    towards = torch.from_numpy(camera.position).to(positions) - positions
+    return (torch.nn.functional.normalize(towards, dim=-1) * normals).sum(dim=-1)

@@ -15,6 +15,7 @@ from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, to_splats
 from refgs.paths import write_text
+from refgs.render.facing import facing_cosine
 from refgs.render.volume import with_normals_last
 from refgs.run import OCCLUDER
 from refgs.train import needs
@@ -103,8 +104,7 @@ def _irradiance(surfels: Surfels, environment: Environment, state: State) -> Ten
         return (surfels.received * environment.diffuse(normals)).clamp_min(1e-6)
     total, weights = torch.zeros_like(normals), torch.full_like(normals[:, :1], 1e-6)
     for camera in (view.camera for view in state.views):
-        towards = torch.from_numpy(camera.position).to(normals) - surfels.positions
-        cosine = (torch.nn.functional.normalize(towards, dim=-1) * normals).sum(dim=-1, keepdim=True)
+        cosine = facing_cosine(surfels.positions, normals, camera)[:, None]
         turn = torch.from_numpy(environment.turn(camera)).to(normals)
         total += cosine.abs() * environment.diffuse(cosine.sign() * normals @ turn.T)
         weights += cosine.abs()
@@ -122,8 +122,7 @@ def _seen_side(surfels: Surfels, state: State) -> Tensor:
     side = seen = torch.zeros(len(normals), device=state.device)
     for photo in state.photos:
         weight = blended_shares(surfels, [photo], state.near)[0]
-        towards = torch.from_numpy(photo.camera.position).float().to(state.device) - surfels.positions
-        side = side + weight * torch.sign((normals * towards).sum(dim=-1))
+        side = side + weight * facing_cosine(surfels.positions, normals, photo.camera).sign()
         seen = seen + weight
     known = seen > 0 if (seen > 0).any() else torch.ones_like(seen, dtype=torch.bool)
     return torch.where(side < 0, -1.0, 1.0) * known

@@ -7,12 +7,12 @@ what changes with the view tells them apart before normals and light are known.
 import torch
 
 from refgs.model.surfels import raw_metallic
-from refgs.train.densify import faint_now
+from refgs.train import needs
+from refgs.train.needs.materials import SOONEST
 from refgs.train.state import State
 from refgs.train.view_dependence import observe, shines_as_metal
 
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
-SOONEST = 100  # iterations
 METAL = 0.9  # metallic; training can still change it
 
 
@@ -22,21 +22,18 @@ def set_metals_due(state: State, progress: float) -> None:
     The other surfels keep the metallic that they have learned: it started low, as that of a dielectric.
     """
     settings = state.settings
-    if state.metals_set or state.initial or not state.method.deferred or "metallic" not in state.parameters:
-        return
-    if settings.render.reflection != "microfacet" or settings.render.diffuse != "irradiance":
-        return
     early = progress - settings.initial.until < KNOWN or state.iteration < SOONEST
-    if early or progress >= state.residual_start or faint_now(state):
+    if state.metals_set or early or progress >= state.residual_start:
         return
-    with state.clock.part("deciding"):
-        observations, metallic = observe(state), state.parameters["metallic"]
-        metal = shines_as_metal(observations, state.parameters["position"].detach())
-        with torch.no_grad():
-            metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
-        moments = state.optimizer.state.get(metallic, {})
-        for name in ("exp_avg", "exp_avg_sq") if moments else ():
-            moments[name][metal] = 0
+    if settings.render.reflection != "microfacet" or not needs.decidable(state):
+        return
+    observations, metallic = observe(state), state.parameters["metallic"]
+    metal = shines_as_metal(observations, state.parameters["position"].detach())
+    with torch.no_grad():
+        metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
+    moments = state.optimizer.state.get(metallic, {})
+    for name in ("exp_avg", "exp_avg_sq") if moments else ():
+        moments[name][metal] = 0
     state.metals_set = True
     weight = observations.pixels.sum(dim=1) * state.wanted()
     part = float(weight[metal].sum() / weight.sum().clamp_min(1e-6))

@@ -103,24 +103,38 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
     return max(fastest[0] - fastest[1], 0.0) * max(state.total - state.iteration, 0)
 
 
+def pixel_sums(
+    surfels: Surfels, photo: Photo, near: float, features: Tensor, weigh: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Sum an image over each surfel's pixels, weighted by the surfel's blending weights. Returns the sums (N, C).
+
+    The image (H, W, C) is made by `weigh` from the picture (H, W, C) of the surfels' `features` (N, C). The sums are computed as the
+    gradient of the features. Surfels nearer to the camera than `near` are not drawn.
+    """
+    features = features.detach().clone().requires_grad_()
+    with torch.enable_grad():
+        blended = rasterize(*discs(surfels, photo.camera), features, photo.camera, near=near).features
+        (
+            blended * weigh(blended.detach())
+        ).sum().backward()  # without a gradient argument: with one, torch imports sympy (0.5 s)
+    return features.grad
+
+
 @torch.no_grad()
 def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: list[Tensor] | None = None) -> Tensor:
     """Compute how much each surfel contributes to each of V photos (V, N): the sum of its blending weights over all pixels.
 
     If `maps` holds an image (H, W, C) for each photo, return instead the mean of these images for each surfel (N, C), weighted by its
-    blending weights. The weights are computed as gradients: all surfels are rendered with a feature of 1, whose gradient is the sum of the
-    weights. Surfels nearer to a camera than `near` are not drawn.
+    blending weights. Surfels nearer to a camera than `near` are not drawn.
     """
-    surfels, count, rows = Surfels(*(value.detach() for value in surfels)), len(surfels.positions), []
-    width = 1 if maps is None else maps[0].shape[-1] + 1
+    surfels, rows = Surfels(*(value.detach() for value in surfels)), []
+    one = torch.ones_like(surfels.positions[:, :1])
     for number, photo in enumerate(photos):
-        feature = torch.ones(count, width, device=surfels.positions.device, requires_grad=True)
-        with torch.enable_grad():
-            blended = rasterize(*discs(surfels, photo.camera), feature, photo.camera, near=near).features
-            if maps is not None:
-                blended = blended * torch.cat([maps[number], torch.ones_like(blended[..., :1])], dim=-1)
-            blended.sum().backward()  # without a gradient argument: with one, torch imports sympy (0.5 s)
-        rows.append(feature.grad if maps is not None else feature.grad[:, 0])
+        if maps is None:
+            rows.append(pixel_sums(surfels, photo, near, one, torch.ones_like)[:, 0])
+        else:
+            image = torch.cat([maps[number], torch.ones_like(maps[number][..., :1])], dim=-1)
+            rows.append(pixel_sums(surfels, photo, near, one.expand(-1, image.shape[-1]), lambda _, image=image: image))
     if maps is None:
         return torch.stack(rows)
     total = torch.stack(rows).sum(dim=0)

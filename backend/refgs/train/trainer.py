@@ -74,7 +74,7 @@ class Trainer:
         trace_due(state, progress)  # meshes and decisions come before an opacity reset makes all surfels faint
         with state.clock.part("deciding"):
             needs.evaluate_iteration(state, progress)
-        metals.set_metals_due(state, progress)
+            metals.set_metals_due(state, progress)
         densify.densify_due(state, progress)
         densify.reshape_due(state)
         exposures.leave_out_alike(state, progress)
@@ -128,8 +128,10 @@ class Trainer:
         history.record(self.state, self.measures, float(means["loss"]), decibels(float(means["square"])))
 
     def _should_stop(self, stop: Callable[[], bool]) -> bool:
-        """Call `stop` and return its answer. While `stop` does not return, the training is paused; a time limit
-        does not count that time."""
+        """Call `stop` and return its answer.
+
+        While `stop` does not return, the training is paused. A time limit does not count that time.
+        """
         begun = time.perf_counter()
         stopped = stop()
         self.state.plan.wait(time.perf_counter() - begun)

@@ -14,10 +14,10 @@ from refgs.color import srgb_decode, srgb_encode
 from refgs.model import harmonics
 from refgs.model.environment import turn_between
 from refgs.model.surfels import Surfels
-from refgs.render.rasterize import rasterize
-from refgs.render.volume import discs
+from refgs.render.facing import facing_cosine
+from refgs.train import probe
 from refgs.train.losses import Photo
-from refgs.train.state import State, spread
+from refgs.train.state import State
 
 VIEWS = 24  # photos that are looked at, at the most
 SWEEPS = 2  # steps in which surfels' radiance is fitted to the photos
@@ -66,12 +66,11 @@ def observe(state: State) -> Observations:
     frame, as irradiance has (Ramamoorthi and Hanrahan 2001). What occludes a surfel, and what it shares pixels with, is part of the model.
     """
     surfels = Surfels(*(value.detach() for value in state.surfels()))
-    photos = [state.photo(view) for view in spread(range(len(state.photos)), VIEWS)]
+    photos = [state.photo(view) for view in probe.spread_views(state, VIEWS)]
     targets = [_linear(photo) for photo in photos]
     clipped = [(photo.image >= CLIPPED).any(dim=-1, keepdim=True).float() for photo in photos]
-    towards = [_towards(surfels, photo) for photo in photos]
     normals = surfels.normals()
-    cosines = torch.stack([(normals * direction).sum(dim=-1) for direction in towards], dim=1)
+    cosines = torch.stack([facing_cosine(surfels.positions, normals, photo.camera) for photo in photos], dim=1)
     light = None
     if state.settings.light.frame == "camera":
         turns = [torch.from_numpy(turn_between(photo.camera, state.views[0].camera)).to(normals) for photo in photos]
@@ -79,14 +78,13 @@ def observe(state: State) -> Observations:
         light = torch.stack([harmonics.basis(n @ turn.T, 2) for n, turn in zip(facing, turns, strict=True)], dim=1)
     mean = torch.zeros_like(normals)
     factor = torch.ones_like(cosines)  # of the mean in a photo: its exposure and its diffuse light
-    for sweep in range(SWEEPS + 1):
-        totals, pixels, burnt = _residuals(surfels, photos, targets, clipped, mean, factor, state.near)
-        if sweep == SWEEPS:
-            break
+    for sweep in range(SWEEPS):
+        totals, pixels, _ = _residuals(surfels, photos, targets, clipped, mean, factor, state.near)
         step = (totals.sum(dim=1) / pixels.sum(dim=1).clamp_min(1e-6)[:, None]) * (OVERSHOOT if sweep else 1.0)
         mean = (mean + step).clamp_min(0)
         if sweep:
             factor = _fitted(factor, totals, pixels, mean, light)
+    totals, pixels, burnt = _residuals(surfels, photos, targets, clipped, mean, factor, state.near)
     usable = pixels * (cosines.abs() > FACING)
     some = pixels.clamp_min(1e-6)
     return Observations(mean, totals / some[..., None], usable, burnt / some)
@@ -96,11 +94,6 @@ def _linear(photo: Photo) -> Tensor:
     """Return a photo's linear radiance (H, W, 3) over black."""
     image = srgb_decode(photo.image.float() / 255)
     return image if photo.mask is None else image * (photo.mask.float() / 255)[..., None]
-
-
-def _towards(surfels: Surfels, photo: Photo) -> Tensor:
-    position = torch.from_numpy(photo.camera.position).to(surfels.positions)
-    return torch.nn.functional.normalize(position - surfels.positions, dim=-1)
 
 
 def _residuals(
@@ -115,17 +108,16 @@ def _residuals(
     """Sum what the photos show beyond the model over each surfel's pixels, with its blending weights.
 
     `targets` (H, W, 3) are the photos' radiance, and `clipped` (H, W, 1) is 1 where they are clipped. Returns the sums (N, V, 3), the sums
-    of the weights (N, V), and those of clipped pixels (N, V). All are gradients of blended features.
+    of the weights (N, V), and those of clipped pixels (N, V).
     """
     sums = []
     for number, (photo, target, lost) in enumerate(zip(photos, targets, clipped, strict=True)):
-        radiance = mean * factor[:, number, None]
-        features = torch.cat([radiance, torch.ones_like(mean[:, :2])], dim=1).requires_grad_()
-        with torch.enable_grad():
-            blended = rasterize(*discs(surfels, photo.camera), features, photo.camera, near=near).features
-            residual = target - blended[..., :3].detach()
-            (blended * torch.cat([residual, torch.ones_like(lost), lost], dim=-1)).sum().backward()
-        sums.append(features.grad)
+        features = torch.cat([mean * factor[:, number, None], torch.ones_like(mean[:, :2])], dim=1)
+
+        def residual(shown: Tensor, target: Tensor = target, lost: Tensor = lost) -> Tensor:
+            return torch.cat([target - shown[..., :3], torch.ones_like(lost), lost], dim=-1)
+
+        sums.append(probe.pixel_sums(surfels, photo, near, features, residual))
     totals, pixels, burnt = torch.stack(sums, dim=1).split([3, 1, 1], dim=2)
     return totals, pixels[..., 0], burnt[..., 0]
 

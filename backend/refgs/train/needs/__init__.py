@@ -36,6 +36,7 @@ __all__ = [
     "CONSTANTS",
     "NEEDS",
     "WHOLE_EVERY",
+    "decidable",
     "evaluate_due",
     "evaluate_iteration",
     "evaluate_mesh",
@@ -63,11 +64,35 @@ def evaluate_due(state: State, moment: Moment, *given: Any, progress: float = 0.
 
 def evaluate_iteration(state: State, progress: float) -> None:
     """After an iteration, decide about the optional parts of the training (needs) that are due."""
-    if state.initial or not state.method.deferred or state.settings.render.diffuse != "irradiance" or faint_now(state):
-        return
-    time_crops(state)
-    SPECULAR.look_again(state)
-    evaluate_due(state, "iteration", progress=progress)
+    if decidable(state):
+        time_crops(state)
+        _look_again(state)
+        evaluate_due(state, "iteration", progress=progress)
+
+
+def decidable(state: State) -> bool:
+    """Tell whether surfels, materials and light can be judged now.
+
+    They cannot in the initial stage, while surfels are faint after an opacity reset, and in a method without materials of pixels.
+    """
+    by_pixels = state.method.deferred and state.settings.render.diffuse == "irradiance"
+    return by_pixels and not state.initial and not faint_now(state)
+
+
+def _look_again(state: State) -> None:
+    """Bring specular shading back if it is found halfway that a scene is not matte, and all that was left out with it."""
+    if decision := SPECULAR.look_again(state):
+        _record(state, SPECULAR, decision)
+        SPECULAR.undo(state, decision.why)
+        _undo_following(state, state.needs, decision.why)
+
+
+def _undo_following(state: State, decisions: dict[str, dict[str, Any]], why: str) -> None:
+    """Take back those of the `decisions` that followed from the one on specular shading, if no setting asked for them."""
+    for need in NEEDS:
+        if need.follows == SPECULAR.name and need.name in decisions and need.asked(state) == "auto":
+            del decisions[need.name]
+            need.undo(state, why)
 
 
 def evaluate_mesh(state: State, hidden: float) -> None:
@@ -98,9 +123,9 @@ def restore(state: State, recorded: dict[str, dict[str, Any]]) -> None:
 
     `recorded` are the checkpoint's decisions by name. If the training goes back to an earlier checkpoint, later decisions stay.
     """
-    if SPECULAR.taken_back(state, recorded):
-        recorded = {name: found for name, found in recorded.items() if name not in SPECULAR.FOLLOWING}
-        state.total = state.settings.train.iterations
+    before, now = (decisions.get(SPECULAR.name) for decisions in (recorded, state.needs))
+    if before and now and now["needed"] and not before["needed"]:  # taken back after this checkpoint
+        _undo_following(state, recorded, now["why"])
     state.needs = recorded | state.needs
     for name, found in state.needs.items():
         if not found["needed"]:

@@ -65,7 +65,7 @@ class Light(Need):
 
     name, what = "light", "all of the light's texels"
     threshold, reason = 0.01, "dB; a coarser light that costs more is not taken, whatever the roughness"
-    moments = ("iteration",)
+    moments, follows = ("iteration",), "specular"
     SETTLED = 0.19  # part of the training after which roughness hardly changes; before the light has all its texels
     GLOSSIEST = 0.05  # part of the picture that may be glossier than the roughness that texels are chosen for
     LOBE = 0.5  # part of a lobe's width that a texel may take
@@ -106,6 +106,9 @@ class Light(Need):
 
     def apply(self, state: State, found: dict[str, Any]) -> None:
         state.change("environment.resolution", int(found["side"]), "needs", found["why"])
+
+    def undo(self, state: State, why: str) -> None:
+        state.change("environment.resolution", state.effective.asked.environment.resolution, "needs", why)
 
 
 def resolvable(roughness: float, part: float, finest: int, coarsest: int) -> int:

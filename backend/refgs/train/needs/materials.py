@@ -13,9 +13,7 @@ from refgs.train.start import start_appearance
 from refgs.train.state import RenderInputs, State, why_not_traced
 
 KNOWN = 0.05  # part of the training after which it is known what mirrors: materials learn faster than shapes
-CHANGES = (
-    0.042  # of 1; matte clay on its visual hull has 0.037, an embossed gold cape in flat light 0.056, a mirror 0.2
-)
+CHANGES = 0.042  # of 1; matte clay has 0.037, an embossed gold cape in flat light 0.056, a mirror 0.2
 SOONEST = 100  # iterations: a mirror that has learned for fewer looks dull
 RARE = 1e-3  # part of the pictures, at either end, whose surfels do not count for a common value
 INDIRECT = "indirect_dc", "indirect_rest", "received"
@@ -30,7 +28,6 @@ class Specular(Need):
         "at a twentieth of a training matte clay has none; a polished plate has 0.8 dB, glossy paint 2.6, a mirror 5.6"
     )
     moments = ("start", "iteration")
-    FOLLOWING = "iterations", "light"  # needs whose decisions rest on this one, and are taken back with it
 
     def due(self, state: State, moment: Moment, progress: float) -> bool:
         settings = state.settings
@@ -61,36 +58,22 @@ class Specular(Need):
         state.occluder = None
         state.leave_out("metallic", "roughness", *INDIRECT)
 
-    def look_again(self, state: State) -> bool:
-        """Look at a matte scene once more, halfway through the training. Take the decision back if colours change with the view.
+    def undo(self, state: State, why: str) -> None:
+        state.change("render.reflection", state.effective.asked.render.reflection, "needs", why)
+        _learn_again(state, ["metallic", "roughness", *(() if why_not_traced(state) else INDIRECT)])
+        state.metals_set = False
 
-        By then the surfels lie on the surface. If the decision is taken back, so is what followed from it: the training has all of its
-        iterations again, and the light its resolution. Returns whether it was taken back.
+    def look_again(self, state: State) -> Decision | None:
+        """Look at a matte scene once more, halfway through the training: by then the surfels lie on the surface.
+
+        Returns the decision to bring specular shading back if colours change with the view after all.
         """
         found = state.needs.get(self.name, {"needed": True})
         if found["needed"] or "statistic" not in found or "again" in found or 2 * state.iteration < state.total:
-            return False
+            return None
         change = found["again"] = view_dependence.change_seen(view_dependence.observe(state), state.wanted())
-        if change < CHANGES:
-            return False
         why = f"halfway, colours change with the view by {change:.3f} of 1: it was taken for matte before"
-        state.needs[self.name] = {"needed": True, "why": why, "statistic": change, "threshold": CHANGES}
-        asked = state.effective.asked
-        state.change("render.reflection", asked.render.reflection, "needs", why)
-        if state.needs.pop("iterations", None):
-            state.total = state.settings.train.iterations
-            state.effective = state.effective.noted("train.iterations", state.total, "needs", why)
-        if state.needs.pop("light", None):
-            state.change("environment.resolution", asked.environment.resolution, "needs", why)
-        _learn_again(state, ["metallic", "roughness", *(() if why_not_traced(state) else INDIRECT)])
-        state.metals_set = False
-        state.announce(self.name, f"with {self.what}: {why}")
-        return True
-
-    def taken_back(self, state: State, recorded: dict[str, Any]) -> bool:
-        """Tell whether the decisions `recorded` in a checkpoint call a scene matte, and this was taken back since."""
-        before, now = recorded.get(self.name, {"needed": True}), state.needs.get(self.name, {"needed": False})
-        return now["needed"] and not before["needed"]
+        return Decision(True, why, statistic=change, threshold=CHANGES) if change >= CHANGES else None
 
 
 def _learn_again(state: State, names: list[str]) -> None:

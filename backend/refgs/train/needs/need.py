@@ -43,7 +43,7 @@ class Need:
     threshold: ClassVar[float | None] = None
     reason: ClassVar[str] = ""  # for the threshold
     moments: ClassVar[tuple[Moment, ...]]
-    follows: ClassVar[str] = ""  # a need after whose decision this one is asked, too
+    follows: ClassVar[str] = ""  # a need after whose decision this one is asked, too, and with which it is taken back
 
     def due(self, state: State, moment: Moment, progress: float) -> bool:
         """Tell whether to decide about this optional part now, at this moment of the training.
@@ -64,6 +64,13 @@ class Need:
 
         It is called once after the decision, and again when a run is resumed. `found` is the recorded decision.
         """
+
+    def undo(self, state: State, why: str) -> None:
+        """Bring this optional part of the training back, after `apply` has left it out. `why` is the reason, for the record.
+
+        Only parts whose decision can be taken back have this method. It may be called again.
+        """
+        raise NotImplementedError
 
     def asked(self, state: State) -> str:
         """Return the user's setting for this optional part of the training: "auto", "on" or "off"."""

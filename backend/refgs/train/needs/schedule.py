@@ -62,3 +62,7 @@ class Iterations(Need):
     def apply(self, state: State, found: dict[str, Any]) -> None:
         state.total = min(state.total, int(found["total"]))
         state.effective = state.effective.noted("train.iterations", state.total, "needs", found["why"])
+
+    def undo(self, state: State, why: str) -> None:
+        state.total = state.settings.train.iterations
+        state.effective = state.effective.noted("train.iterations", state.total, "needs", why)
