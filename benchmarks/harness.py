@@ -142,8 +142,12 @@ class Bench:
             if value is not None:
                 self.rows.append(Row(self.name, scene, variant, figure, value, unit, *self.where))
 
-    def runs(self, variants: dict[str, Variant]) -> Iterator[tuple[str, dict[str, Path]]]:
+    def runs(
+        self, variants: dict[str, Variant], captures: list[Path] | None = None
+    ) -> Iterator[tuple[str, dict[str, Path]]]:
         """Train and evaluate the variants on each scene. A run's folder is OUT/[PRESET/]VARIANT/SCENE.
+
+        The scenes are those in the folder of the option `--scenes`, or `captures` if they are given.
 
         Yield for each scene its name, and a dict from the names of variants to the folders of the runs that succeeded.
 
@@ -162,7 +166,7 @@ class Bench:
         if preset:
             load_settings(preset)  # report a wrong preset before anything is trained
         out = (options.out or clone_root() / "demo" / self.name) / Path(preset).stem
-        for capture in find_scenes(options.scenes, options.only):
+        for capture in captures or find_scenes(options.scenes, options.only):
             done: dict[str, Path] = {}
             for name, (words, minutes) in variants.items():
                 if name not in chosen:
@@ -172,7 +176,8 @@ class Bench:
                         continue
                     minutes = figures(done[minutes])["total_seconds"] / 60
                 run = out / name.replace(" ", "_") / capture.name
-                if train(capture, run, words, minutes, capture / "ground_truth"):
+                truth = capture / "ground_truth"
+                if train(capture, run, words, minutes, truth if truth.is_dir() else None):
                     done[name] = run
                 else:
                     self.failed.append(run)
