@@ -80,6 +80,8 @@ def poses(folder: Path) -> None:
     console.print(
         f"{found['placed']} of {found['photos']} photos placed, to {found['error']:.2f} pixels: {folder / 'sparse' / '0'}"
     )
+    if found["inside"]:
+        console.print("The object turned in front of still surroundings: only the pixels inside the masks were used.")
 
 
 def train(

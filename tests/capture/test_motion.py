@@ -9,7 +9,16 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from refgs.capture import load_view, read_capture
-from refgs.capture.motion import ALL_PAIRS, CONTRADICTED, MATCH_TOLERANCE, epipolar_distance, find_cameras, pairs
+from refgs.capture.images import read_header, read_image
+from refgs.capture.motion import (
+    ALL_PAIRS,
+    CONTRADICTED,
+    MATCH_TOLERANCE,
+    _write_mask,
+    epipolar_distance,
+    find_cameras,
+    pairs,
+)
 from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.errors import InputError, NoCameras
 from tests.makers.captures import look_at, write, write_as_phone
@@ -25,25 +34,31 @@ def quiet(event: str, facts: dict) -> None:
     pass
 
 
-def speckled(pose: np.ndarray) -> np.ndarray:
-    """Ray-cast a block on a floor, both with random speckles: RGB (H, W, 3) uint8. `pose` is the camera-to-world matrix."""
+def speckled(pose: np.ndarray, turn: float = 0.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Ray-cast a block on a floor, both with random speckles: RGB (H, W, 3) uint8, and the block's mask (H, W) uint8.
+
+    `pose` is the camera-to-world matrix. The block is turned by `turn` radians about the vertical; the floor is not.
+    """
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     rays = np.stack([u / FOCAL, -v / FOCAL, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
     eye, half, middle = pose[:3, 3], np.array([0.6, 0.5, 0.4]), np.array([0, 0, 0.4])
-    ends = np.stack([(middle - half - eye) / rays, (middle + half - eye) / rays])
+    turned = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    at, way = eye @ turned, rays @ turned  # in the block's own coordinates
+    ends = np.stack([(middle - half - at) / way, (middle + half - at) / way])
     near, far = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
+    block = near < far
     floor = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], 1e3)
-    points = eye + rays * np.where(near < far, near, floor)[..., None]
-    lattice = np.random.default_rng(0).random((32, 32, 32, 3))
+    points = np.where(block[..., None], at + way * near[..., None], eye + rays * floor[..., None])
+    lattice = np.random.default_rng(seed).random((32, 32, 32, 3))
     grains = np.zeros((HEIGHT, WIDTH, 3))
     for size, c in product((4.0, 13.0), range(3)):
         grains[..., c] += map_coordinates(lattice[..., c], size * points.transpose(2, 0, 1), order=1, mode="wrap")
-    return (127 * grains).astype(np.uint8)
+    return (127 * grains).astype(np.uint8), (255 * block).astype(np.uint8)
 
 
 @pytest.fixture(scope="module")
 def pictures():
-    return [speckled(pose) for pose in POSES]
+    return [speckled(pose)[0] for pose in POSES]
 
 
 @pytest.fixture
@@ -110,6 +125,40 @@ def test_one_that_is_interrupted_goes_on(photos):
     find_cameras(photos, lambda event, facts: stages.append(facts.get("stage")))
     assert "features" not in stages and "mapping" in stages
     assert len(read_capture(photos).views) == 10
+
+
+def test_masks_lie_as_their_photos_are_stored(tmp_path, pictures):
+    """Check that a mask is turned with a photo held sideways, as COLMAP reads photos without their EXIF orientation."""
+    write_as_phone(tmp_path / "photo.png", pictures[0], 1, 30)
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:10, :20] = 200
+    write(tmp_path / "mask.png", mask)
+    _write_mask(tmp_path / "photo.png", tmp_path / "mask.png", tmp_path / "masks" / "photo.png.png")
+    stored = read_image(tmp_path / "masks" / "photo.png.png")[0][..., 0]
+    header = read_header(tmp_path / "photo.png")
+    assert stored.shape == (header.height, header.width) == (WIDTH, HEIGHT)
+    assert (np.rot90(stored, -header.turns) == np.where(mask, 255, 0)).all()
+
+
+def test_a_mask_of_another_size(tmp_path, pictures):
+    for number, picture in enumerate(pictures[:3]):
+        write(tmp_path / "images" / f"{number}.png", picture)
+        write(tmp_path / "masks" / f"{number}.png", np.zeros((HEIGHT, WIDTH - number), np.uint8))
+    with pytest.raises(InputError, match=r"1\.png: the mask has 255×192 pixels but its photo 1\.png 256×192"):
+        find_cameras(tmp_path, quiet)
+    assert {path.name for path in tmp_path.iterdir()} == {"images", "masks"}
+
+
+def test_photos_of_two_sessions(tmp_path, pictures):
+    for number, pose in enumerate(POSES[:8]):
+        write(tmp_path / f"monday {number}.png", pictures[number])
+        if number < 6:
+            write(tmp_path / f"tuesday {number}.png", speckled(pose, seed=1)[0])
+    photos = {path.name for path in tmp_path.iterdir()}
+    match = r"two sessions: 8 from monday 0\.png on and 6 from tuesday 0\.png on share nothing"
+    with pytest.raises(InputError, match=match):
+        find_cameras(tmp_path, quiet)
+    assert {path.name for path in tmp_path.iterdir()} == photos
 
 
 def test_photos_of_a_phone(tmp_path, pictures):

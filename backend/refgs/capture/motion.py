@@ -3,14 +3,14 @@
 COLMAP runs in a child process, for three reasons: its OpenMP conflicts with torch's on some systems, it cannot be interrupted, and it ends
 its process when it aborts.
 
-Masks are not used. If the camera moves around an object that stands still, the surroundings help to find the cameras. A shiny object alone
-gives poor cameras: with only the pixels inside the masks, 5 of 66 photos of a polished head got a camera.
+If the camera moves around an object that stands still, the surroundings help to find the cameras. Therefore the whole photos are used
+first, with or without masks.
 
 If the object stands on a turntable instead, the surroundings do not turn with it and lead to wrong cameras. Therefore matches at the same
 pixel in both photos are dropped. This does not help if the camera also moved a little: some cameras then follow the turntable and others
-the surroundings (all 66 photos of the head got cameras, 19° wrong on average). Such cameras disagree with many feature matches, and the
-user gets a warning. Dropping features that hardly move over many photos was tried: only 8 of the 66 photos then got cameras, though correct
-ones.
+the surroundings (all 66 photos of a bronze head got cameras, 19° wrong on average). Such cameras disagree with many feature matches. If
+there are masks, the cameras are then found anew from the pixels inside them, and kept if they disagree with less. A shiny object has few
+strong features, so weaker ones count there. Without masks, the user gets a warning.
 """
 
 import hashlib
@@ -21,14 +21,15 @@ from collections.abc import Callable
 from itertools import combinations
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from refgs import CORES
 from refgs.capture import find_layout
-from refgs.capture.files import find_photos
-from refgs.capture.images import read_focal_length, read_header, read_image, write_for_colmap
+from refgs.capture.files import Masks, find_photos
+from refgs.capture.images import read_focal_length, read_header, read_image, read_mask, write_for_colmap
 from refgs.errors import InputError
 
 SIDE = 1600  # pixels on the longer side for finding features; presets train on fewer
@@ -37,22 +38,49 @@ CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential 
 SEED = 1
 MATCH_TOLERANCE = 8.0  # pixels from its epipolar line, above which a match contradicts the cameras; COLMAP allows 4
 CONTRADICTED = 0.2  # part of the matches, above which the cameras are not trusted
+INSIDE_CAMERA_MODEL = (
+    "SIMPLE_RADIAL"  # an object fills little of the photos: with RADIAL 5 of 66 photos of a head are placed, not 66
+)
+FAINT = 0.002  # contrast of the weakest features inside masks; COLMAP's is 0.0067, which places 60 of 66 photos of a dark bronze, not all
+INSIDE_FEATURES = (
+    16384  # COLMAP takes the largest 8192 of a photo before it looks at the mask; the surroundings may use these up
+)
 DOUBTED = (
     "as happens if an object turns in front of still surroundings: look at the cameras before you train (Show Cameras in Blender). If they "
-    "are wrong, put something plain behind the object, or walk around it, and take the photos again"
+    "are wrong, put masks of the object in the folder masks, remove sparse and search again; or put something plain behind the object, or "
+    "walk around it, and take the photos again"
 )
+
+
+class _Found(NamedTuple):
+    """Hold what COLMAP found: names of the photos that got a camera, the mean reprojection error (pixels), and what casts doubt on them.
+
+    `contradicted` is the fraction of feature matches that disagree with the cameras. `apart` are the names of photos that fit together but
+    share nothing with those placed. `inside` says that only the pixels inside the masks were used.
+    """
+
+    placed: set[str]
+    error: float
+    contradicted: float
+    apart: set[str]
+    inside: bool
 
 
 def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) -> dict[str, Any]:
     """Find the cameras of the photos in a folder, or in its subfolder `images`. Write them to the subfolder `sparse/0` as a COLMAP model.
 
-    Returns a dict: `photos` is their number, `placed` is how many got a camera, and `error` is the mean reprojection error in pixels.
+    If these cameras contradict the photos or there are hardly any, and all photos have masks, cameras are found anew from the pixels inside
+    the masks. This is the way for an object on a turntable.
+
+    Returns a dict: `photos` is their number, `placed` is how many got a camera, `error` is the mean reprojection error in pixels, and
+    `inside` is whether only the pixels inside the masks were used.
 
     `report(event, facts)` is called with "progress" and a dict of `stage` ("features", "matching" or "mapping"), `done` and `total`, or
     with "warning" and a dict with the text `what`.
 
     An interrupted call leaves `sparse.tmp`. The next call for the same photos resumes from it. Raises InputError if there are fewer than
-    three photos, if there are cameras already, or if fewer than half of the photos got a camera.
+    three photos, if there are cameras already, if fewer than half of the photos got a camera, or if the photos fall into two large groups
+    that share nothing.
     """
     folder = Path(folder)
     photos = find_photos(folder)
@@ -62,15 +90,23 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
         raise InputError(f"{folder}: it has cameras already; to find them anew remove them (sparse, transforms*.json)")
     for photo in photos:
         read_header(photo)
+    masks = _find_masks(folder, photos)
     work = folder / "sparse.tmp"
     work.mkdir(exist_ok=True)
-    database = work / f"{_hash_of_photos(photos)}.db"
+    database = work / f"{_hash_of_files([*photos, *masks])}.db"
     for path in list(work.iterdir()):  # from other photos, or half written
         if not path.name.startswith(database.name):
             _remove(path)
     model = work / "0"
-    placed, error, contradicted = _run_colmap_in_child(photos, database, model, report)
-    if len(placed) < max(3, len(photos) / 2):
+    found = _run_colmap_in_child(photos, masks, database, model, report)
+    placed = found.placed
+    if found.apart and len(found.apart) >= len(placed) / 2 and len(placed | found.apart) >= 0.75 * len(photos):
+        shutil.rmtree(work)
+        raise InputError(
+            f"{folder}: the photos are of two sessions: {len(placed)} from {min(placed)} on and {len(found.apart)} from {min(found.apart)} "
+            "on share nothing. Put each session in a folder of its own, or add photos that show what both show."
+        )
+    if not _enough(placed, photos):
         shutil.rmtree(work)
         raise InputError(
             f"{folder}: only {len(placed)} of {len(photos)} photos could be placed. Take more, each showing most of what the one "
@@ -80,13 +116,13 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
         names = ", ".join(missing[:5]) + (" …" if len(missing) > 5 else "")
         what = f"{len(missing)} of {len(photos)} photos could not be placed and are left out: {names}; more photos between them help"
         report("warning", {"what": what})
-    if contradicted > CONTRADICTED:
-        what = f"the cameras contradict {contradicted:.0%} of what the photos have in common, {DOUBTED}"
+    if found.contradicted > CONTRADICTED:
+        what = f"the cameras contradict {found.contradicted:.0%} of what the photos have in common, {DOUBTED}"
         report("warning", {"what": what})
     for path in list(work.glob(f"{database.name}*")):
         _remove(path)
     work.rename(folder / "sparse")
-    return {"placed": len(placed), "photos": len(photos), "error": error}
+    return {"placed": len(placed), "photos": len(photos), "error": found.error, "inside": found.inside}
 
 
 def pairs(count: int) -> list[tuple[int, int]]:
@@ -121,22 +157,43 @@ def _remove(path: Path) -> None:
     shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-def _hash_of_photos(photos: list[Path]) -> str:
-    """Return a hash of the photos' names, sizes and dates. It changes if a photo is edited."""
-    facts = [(photo.name, photo.stat().st_size, photo.stat().st_mtime_ns) for photo in photos]
+def _enough(placed: set[str], photos: list[Path]) -> bool:
+    """Return whether enough photos got a camera to make a capture of them."""
+    return len(placed) >= max(3, len(photos) / 2)
+
+
+def _find_masks(folder: Path, photos: list[Path]) -> list[Path]:
+    """Return the mask file of each photo. Return an empty list unless all photos have one. Raise InputError if one has another size."""
+    known = Masks(folder)
+    masks = [known.find(photo, None, "") for photo in photos]
+    if not all(masks):
+        return []
+    for photo, mask in zip(photos, masks, strict=True):
+        header, size = read_header(photo), read_header(mask).upright
+        if size not in (header.upright, header[:2]):
+            raise InputError(
+                f"{mask}: the mask has {size[0]}×{size[1]} pixels but its photo {photo.name} {header.upright[0]}×{header.upright[1]}. "
+                "Make the mask the photo's size."
+            )
+    return masks
+
+
+def _hash_of_files(files: list[Path]) -> str:
+    """Return a hash of the files' names, sizes and dates. It changes if a photo or mask is edited."""
+    facts = [(file.name, file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
 
 
 def _run_colmap_in_child(
-    photos: list[Path], database: Path, model: Path, report: Callable
-) -> tuple[set[str], float, float]:
+    photos: list[Path], masks: list[Path], database: Path, model: Path, report: Callable
+) -> _Found:
     """Run `_run_colmap` in a child process and return its result. The process is ended even if this call is interrupted.
 
     `report("progress", facts)` is called with the progress that the process sends. Raises InputError if a photo cannot be read.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(photos, database, model, theirs), daemon=True)
+    process = context.Process(target=_child, args=(photos, masks, database, model, theirs), daemon=True)
     process.start()
     theirs.close()
     try:
@@ -145,7 +202,7 @@ def _run_colmap_in_child(
                 event = ours.recv()
                 if isinstance(event, InputError):
                     raise event
-                if isinstance(event, tuple):
+                if isinstance(event, _Found):
                     return event
                 report("progress", event)
     except EOFError:
@@ -156,19 +213,18 @@ def _run_colmap_in_child(
         process.join()
 
 
-def _child(photos: list[Path], database: Path, model: Path, events: Connection) -> None:
+def _child(photos: list[Path], masks: list[Path], database: Path, model: Path, events: Connection) -> None:
     """Run `_run_colmap`, and send an InputError to the pipe `events`."""
     try:
-        _run_colmap(photos, database, model, events)
+        _run_colmap(photos, masks, database, model, events)
     except InputError as error:
         events.send(error)
 
 
-def _run_colmap(photos: list[Path], database: Path, model: Path, events: Connection) -> None:
-    """Run COLMAP on the photos and write its model to the folder `model`. Send progress, and at the end the result, to the pipe `events`.
+def _run_colmap(photos: list[Path], masks: list[Path], database: Path, model: Path, events: Connection) -> None:
+    """Run COLMAP on the photos and write its model to the folder `model`. Send progress, and at the end a _Found, to the pipe `events`.
 
-    The result is a tuple: the names of the photos that got a camera, the mean reprojection error in pixels, and the fraction of feature
-    matches that disagree with the cameras.
+    The whole photos are used first. If that fails or its cameras are doubtful, the pixels inside the masks are tried.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
     import pycolmap
@@ -179,27 +235,58 @@ def _run_colmap(photos: list[Path], database: Path, model: Path, events: Connect
     def progress(stage: str, done: int, total: int) -> None:
         events.send({"stage": stage, "done": done, "total": total})
 
+    best, found = _search(photos, [], database, progress)
+    if masks and (not _enough(found.placed, photos) or found.contradicted > CONTRADICTED):
+        other, inside = _search(photos, masks, database.with_name(f"{database.name}.inside"), progress)
+        better = not _enough(found.placed, photos) or inside.contradicted < found.contradicted
+        if _enough(inside.placed, photos) and better:
+            best, found = other, inside
+    if best is not None:
+        _color_points(best, photos)
+        for number in best.reg_image_ids():
+            best.image(number).name = photos[int(best.image(number).name)].name
+        model.mkdir()
+        best.write_binary(model)
+    events.send(found)
+
+
+def _search(photos: list[Path], masks: list[Path], database: Path, progress: Callable) -> tuple[Any, _Found]:
+    """Find cameras from the whole photos, or from the pixels inside the masks if there are any.
+
+    Returns the largest model (a pycolmap.Reconstruction, whose images are named by the photos' indices) and what there is to say about it.
+    The model is None if no photo got a camera.
+    """
+    import pycolmap
+
     with pycolmap.Database.open(database) as known:
         names = [image.name for image in known.read_all_images()]
         extracted = bool(names) and all(name.isdigit() for name in names)  # the last step of `_extract`
     if not extracted:
-        _extract(photos, database, progress)
+        _extract(photos, masks, database, progress)
     _match(len(photos), database, progress)
-    found = _map(photos, database, progress)
-    if found is None:
-        events.send((set(), 0.0, 0.0))
-        return
-    _color_points(found, photos)
-    for number in found.reg_image_ids():
-        found.image(number).name = photos[int(found.image(number).name)].name
-    model.mkdir()
-    found.write_binary(model)
-    placed = {found.image(number).name for number in found.reg_image_ids()}
-    events.send((placed, found.compute_mean_reprojection_error(), _contradicted(found, database)))
+    models = _map(photos, database, progress)
+    best, found = _describe(models, photos, database, bool(masks))
+    if len(found.placed) < len(photos):
+        other, at_once = _describe(_map_at_once(photos, database), photos, database, bool(masks))
+        if len(at_once.placed) > len(found.placed) and at_once.contradicted <= CONTRADICTED:
+            best, found = other, at_once
+    return best, found
 
 
-def _extract(photos: list[Path], database: Path, progress: Callable) -> None:
-    """Extract image features of all photos into COLMAP's database.
+def _describe(models: list[Any], photos: list[Path], database: Path, inside: bool) -> tuple[Any, _Found]:
+    """Return the largest model and what there is to say about it. `models` are sorted, the largest first. There may be none."""
+    if not models:
+        return None, _Found(set(), 0.0, 0.0, set(), inside)
+    best = models[0]
+    placed, *groups = (
+        {photos[int(model.image(number).name)].name for number in model.reg_image_ids()} for model in models
+    )
+    apart = max((group for group in groups if group.isdisjoint(placed)), key=len, default=set())
+    return best, _Found(placed, best.compute_mean_reprojection_error(), _contradicted(best, database), apart, inside)
+
+
+def _extract(photos: list[Path], masks: list[Path], database: Path, progress: Callable) -> None:
+    """Extract image features of all photos into COLMAP's database. If there are masks, only features inside them are kept.
 
     Photos with the same size and focal length (EXIF) share their intrinsics. COLMAP gets a temporary JPEG of a photo that it cannot read.
     At the end the photos in the database are renamed to their indices, because names in COLMAP's file of pairs cannot have spaces.
@@ -210,6 +297,12 @@ def _extract(photos: list[Path], database: Path, progress: Callable) -> None:
     reading.camera_model = CAMERA_MODEL
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = SIDE
+    written = database.with_name(f"{database.name}.masks")
+    if masks:
+        reading.camera_model = INSIDE_CAMERA_MODEL
+        reading.mask_path = written
+        extraction.sift.peak_threshold = FAINT
+        extraction.sift.max_num_features = INSIDE_FEATURES
     with pycolmap.Database.open(database) as known:
         cameras = {_lens(camera): camera.camera_id for camera in known.read_all_cameras()}
     readable = database.with_name(f"{database.name}.photos")
@@ -224,6 +317,8 @@ def _extract(photos: list[Path], database: Path, progress: Callable) -> None:
                 # In a folder of its own, because a photo may be named 0.jpg.
                 folder, name = database.parent, f"{readable.name}/{number}.jpg"
             numbers[name] = str(number)
+            if masks:
+                _write_mask(photo, masks[number], written / f"{name}.png")
             camera = pycolmap.infer_camera_from_image(folder / name, reading)
             if focal := read_focal_length(photo):  # COLMAP knows only that for 35 mm film, in JPEG and PNG
                 camera.focal_length, camera.has_prior_focal_length = focal, True
@@ -237,11 +332,21 @@ def _extract(photos: list[Path], database: Path, progress: Callable) -> None:
             )  # skips photos that have features already
         for path in readable.iterdir():
             path.unlink()
+        shutil.rmtree(written, ignore_errors=True)
     readable.rmdir()
     with pycolmap.Database.open(database) as known, pycolmap.DatabaseTransaction(known):
         for image in known.read_all_images():
             image.name = numbers[image.name]
             known.update_image(image)
+
+
+def _write_mask(photo: Path, mask: Path, out: Path) -> None:
+    """Write a photo's mask as COLMAP reads it: black and white, and lying as the photo is stored."""
+    header, pixels = read_header(photo), read_mask(mask)
+    if pixels.shape == header.upright[::-1]:
+        pixels = np.rot90(pixels, header.turns)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.where(pixels > 127, 255, 0).astype(np.uint8)).save(out)
 
 
 def _color_points(model: Any, photos: list[Path]) -> None:
@@ -310,10 +415,10 @@ def _contradicted(model: Any, database: Path) -> float:
     return wrong / max(total, 1)
 
 
-def _map(photos: list[Path], database: Path, progress: Callable) -> Any:
-    """Compute cameras from the feature matches.
+def _map(photos: list[Path], database: Path, progress: Callable) -> list[Any]:
+    """Compute cameras from the feature matches, one photo after the other.
 
-    COLMAP may return several separate models. Return the one with the most photos (a pycolmap.Reconstruction), None if there is none.
+    COLMAP may return several models that share few photos or none. Return them (pycolmap.Reconstruction), the one with most photos first.
     """
     import pycolmap
 
@@ -336,4 +441,18 @@ def _map(photos: list[Path], database: Path, progress: Callable) -> Any:
     written = database.with_name(database.name + ".models")  # COLMAP writes all models here, the small ones too
     written.mkdir(exist_ok=True)
     models = pycolmap.incremental_mapping(database, photos[0].parent, written, options, "", first, another)
-    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+
+
+def _map_at_once(photos: list[Path], database: Path) -> list[Any]:
+    """Compute all cameras together (GLOMAP). Return the models as `_map` does.
+
+    This links photos that share too little to be placed one after the other: all 23 photos of a statue, where that places three.
+    """
+    import pycolmap
+
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = SEED
+    written = database.with_name(database.name + ".models")
+    models = pycolmap.global_mapping(database, photos[0].parent, written, options)
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
