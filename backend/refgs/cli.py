@@ -150,7 +150,9 @@ def bench(
     context: typer.Context,
     what: Annotated[
         str,
-        typer.Argument(help="kernels, truth, real, cameras, paper, needs, minutes, gpu or page; another word lists them"),
+        typer.Argument(
+            help="kernels, truth, real, cameras, paper, needs, minutes, gpu or page; another word lists them"
+        ),
     ] = "kernels",
 ) -> None:
     """Run a benchmark: time the program's parts in milliseconds, or train on scenes and measure errors. `--csv FILE` writes the results."""

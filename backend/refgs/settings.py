@@ -93,6 +93,11 @@ class EnvironmentSettings(_Section):
         description="smoothing per iteration, a part of rates.environment: how much of a texel flows into its neighbours, at 64 texels "
         "a side; scaled at other resolutions. Suppresses noise where photos hardly show the light",
     )
+    grey: float = Field(
+        ge=0,
+        description="fading per iteration, a part of rates.environment: how much of a texel's colour turns to grey. Light that photos "
+        "hardly show then has no colour",
+    )
 
 
 class LightSettings(_Section):

@@ -1,12 +1,18 @@
 """Test the stages of a training: the initial stage, which shades each splat, and the deferred stage, which shades each pixel.
 
-Test also how a training resets opacities, enlarges mirror-like surfels, and diffuses the environment's light.
+Test also how a training resets opacities, enlarges mirror-like surfels, and smooths the environment's light.
 """
 
+import numpy as np
 import pytest
 import torch
 
-from refgs.train.light import diffuse
+from refgs.camera import Camera
+from refgs.model import cubemap
+from refgs.model.environment import Environment
+from refgs.model.surfels import activate, initial_parameters
+from refgs.settings import load_settings
+from refgs.train.light import diffuse, mirrored
 from refgs.train.measures import held_out_psnr
 from refgs.train.rates import set_rates
 from refgs.train.setup import start_deferred
@@ -117,3 +123,33 @@ def test_the_light_diffuses_as_heat_does(ball_capture, tmp_path, waves):
     faded = 0.7 + (1 - 4 * 0.2 * torch.sin(torch.tensor(angle / 2)) ** 2) * wave
     for face, expected in ((0, faded[:, None, None]), (1, faded[:, None])):
         assert torch.allclose(texels[face], expected.expand(16, 16, 3), atol=1e-6)
+
+
+def test_the_light_fades_to_grey(ball_capture, tmp_path):
+    """Check one step: of a texel's colour 0.5 · 0.2 goes, the product of the learning rate and the setting. Its mean stays."""
+    changes = "needs.initial=on", "environment.diffusion=0", "environment.grey=0.2", "rates.environment=0.5"
+    made = trainer(ball_capture, tmp_path / "run", *changes, total=10)
+    set_rates(made.state, 0.0)
+    made.state.light.data[:] = torch.tensor([0.2, 0.5, 1.1])
+    diffuse(made.state)
+    assert torch.allclose(made.state.light.data, torch.tensor([0.24, 0.51, 1.05]).expand(6 * 16**2, 3), atol=1e-6)
+
+
+def test_the_mean_light_counts_each_pixel_alike():
+    """Check that a direction that few pixels mirror hardly counts: a large disc faces the camera, and a small one beside it is tilted."""
+    tilted = np.array([0.6, 0.0, 0.8])
+    options = {"opacity": 0.99, "sh_degree": 0, "albedo": 0.5, "metallic": 0.5, "roughness": 0.3}
+    positions, normals = np.array([[0.0, 0, 0], [0.6, 0, 0]]), np.array([[0.0, 0, 1], tilted])
+    surfels = activate(initial_parameters(positions, normals, np.array([0.15, 0.03]), None, **options))
+    from_above = np.array([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]])
+    camera = Camera("above", 64, 64, 64.0, 64.0, 32.0, 32.0, from_above)
+    ones = Environment(torch.ones(6 * 16**2, 3))
+    with torch.no_grad():
+        weights = mirrored(surfels, [camera], ones, load_settings("quick").render, 0.01)
+    directions = cubemap.texel_directions(16).float()
+    towards = torch.from_numpy(
+        2 * tilted[2] * tilted - [0, 0, 1]
+    ).float()  # what the tilted disc mirrors, from straight above
+    by_large, by_small = (float(weights[directions @ d > 0.9].sum()) for d in (torch.tensor([0.0, 0, 1]), towards))
+    assert by_large + by_small == pytest.approx(1, abs=0.02)
+    assert 0 < by_small < 0.1

@@ -72,15 +72,17 @@ def _replace(state: State, texels: Tensor) -> None:
 @timed("optimiser")
 @torch.no_grad()
 def diffuse(state: State) -> None:
-    """Smooth the light a little: let neighbouring texels of a cubemap face flow into each other.
+    """Smooth the light a little: let neighbouring texels of a cubemap face flow into each other, and let each texel fade to grey.
 
-    How much they flow is proportional to the light's learning rate. This is a step of its own beside the optimiser's, like decoupled weight
-    decay (Loshchilov and Hutter 2019). Where the photos agree on a texel, the optimiser moves it faster than diffusion, and details stay
-    sharp. Where only noise moves the texels, they become alike. The mean over all texels does not change.
+    How much they do is proportional to the light's learning rate. This is a step of its own beside the optimiser's, like decoupled weight
+    decay (Loshchilov and Hutter 2019). Where the photos agree on a texel, the optimiser moves it faster than this step, and details and
+    colours stay. Where only noise moves the texels, they become alike and grey. The mean over all texels and channels does not change.
     """
     side = math.isqrt(len(state.light) // 6)
-    rate = state.group("environment")["lr"]
-    part = min(rate * state.settings.environment.diffusion * (side / DIFFUSED) ** 2, 0.25)
+    rate, settings = state.group("environment")["lr"], state.settings.environment
+    if grey := min(rate * settings.grey, 1.0):
+        state.light.lerp_(state.light.mean(dim=1, keepdim=True), grey)
+    part = min(rate * settings.diffusion * (side / DIFFUSED) ** 2, 0.25)
     if part == 0:
         return
     texels = state.light.view(6, side, side, 3)
@@ -91,7 +93,7 @@ def diffuse(state: State) -> None:
 
 
 def mean_radiance(state: State, light: Environment | None) -> Tensor | None:
-    """Average the light's radiance (3,) over the directions that the object mirrors towards the cameras.
+    """Average the light's radiance (3,) over what the object mirrors towards the cameras, each pixel alike.
 
     Returns None if the scene has no light, or if no term of the loss uses this mean.
     """
@@ -109,19 +111,22 @@ def mirrored(
 ) -> Tensor:
     """Return a weight for each texel of the light (6·R²,), where R is the cubemap's side. The weights sum to one.
 
-    The weight is proportional to the texel's solid angle if a camera sees the texel mirrored in the object, else zero. If no texel is
-    mirrored, all texels are weighted by their solid angles. Surfels nearer to a camera than `near` are not drawn.
+    The weight is proportional to the number of pixels in which the cameras see the texel's surroundings mirrored in the object. A direction
+    that a few pixels mirror could otherwise take any colour to make the mean grey. If no texel is mirrored, all texels are weighted by
+    their solid angles. Surfels nearer to a camera than `near` are not drawn.
     """
-    seen = torch.zeros(6 * PART * PART, dtype=torch.bool)
+    pixels = torch.zeros(6 * PART * PART)
     settings = settings.model_copy(update={"reflection": "microfacet"})  # treat matte surfaces as reflective here
     for camera in cameras:
         lit = stack(channels(surfels, camera, settings, indirect=True))
         features, _, alpha = rasterize(*discs(surfels, camera), lit, camera, near=near)
         turn = torch.from_numpy(light.turn(camera)).float().T
-        seen[_texels_at(mirror_directions(features, alpha, camera)[alpha > SOLID].cpu() @ turn)] = True
-    weights = cubemap.texel_solid_angles(light.resolution).float()
-    part = seen[_texels_at(cubemap.texel_directions(light.resolution).float())]
-    weights = weights * part if part.any() else weights
+        mirrored = _texels_at(mirror_directions(features, alpha, camera)[alpha > SOLID].cpu() @ turn)
+        pixels += torch.bincount(mirrored, minlength=len(pixels))
+    part = _texels_at(cubemap.texel_directions(light.resolution).float())
+    weights = (pixels / torch.bincount(part, minlength=len(pixels)).clamp_min(1))[part]
+    if not pixels.any():
+        weights = cubemap.texel_solid_angles(light.resolution).float()
     return (weights / weights.sum()).to(light.radiance.device)
 
 
