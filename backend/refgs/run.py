@@ -50,6 +50,7 @@ class Run:
     cameras: list[Camera]
     splits: list[str]
     to_capture: np.ndarray
+    refined: bool  # the training refined the poses of its photos
     exposed: bool  # at least one photo has an exposure of its own
     splats: Splats
     environment: Environment | None
@@ -159,7 +160,7 @@ def record_changes(folder: Path, rows: dict[str, dict]) -> None:
 def open_run(folder: Path) -> Run:
     """Open the run folder of a finished training. Raise InputError naming what is missing."""
     facts, settings = check_finished(folder)
-    cameras, splits, to_capture, exposures = read_run_cameras(folder / "cameras.json")
+    cameras, splits, to_capture, exposures, refined = read_run_cameras(folder / "cameras.json")
     splats, environment = read_splats(folder / "splats.ply"), None
     method = method_of(settings.render)
     if not method.mirror:  # edits may have added or removed specular shading: the splats know
@@ -181,6 +182,7 @@ def open_run(folder: Path) -> Run:
         cameras=cameras,
         splits=splits,
         to_capture=to_capture,
+        refined=refined,
         exposed=any(exposure != 1 for exposure in exposures),
         splats=splats,
         environment=environment,

@@ -109,6 +109,12 @@ class LightSettings(_Section):
     exposure: Need = Field(description="exposure per photo; auto: off if the photos agree")
 
 
+class CameraSettings(_Section):
+    """Cameras."""
+
+    poses: Need = Field(description="refine the photos' poses; auto: given up if that hardly moves the photos")
+
+
 class TrainSettings(_Section):
     """Length and seed of a training."""
 
@@ -246,6 +252,7 @@ class Settings(_Section):
     surfels: SurfelSettings
     environment: EnvironmentSettings
     light: LightSettings
+    cameras: CameraSettings
     train: TrainSettings
     initial: InitialSettings
     indirect: IndirectSettings
@@ -300,6 +307,7 @@ def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
     """Complete the settings recorded by a run. Keys that its release did not have yet get the standard preset's values."""
     # Before these keys existed, light was fixed to the world, there were no exposures and no residual, and nothing was left out.
     still = {"light": {"frame": "world", "exposure": "off"}, "residual": {"start": 1.0}}
+    still["cameras"] = {"poses": "off"}
     still["needs"] = dict.fromkeys(NeedsSettings.model_fields, "on")
     return validate(_merge(_merge(_read_preset("standard"), still), tables), source)
 

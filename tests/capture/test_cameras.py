@@ -21,7 +21,7 @@ def test_run_cameras_round_trip(tmp_path, make):
     given = {capture.train_views[1].camera.name: 1.25}
     write_cameras(file, capture, exposures=given)
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["cameras.json"]
-    cameras, splits, to_capture, exposures = read_run_cameras(file)
+    cameras, splits, to_capture, exposures, _ = read_run_cameras(file)
     assert splits == [view.split for view in capture.views]
     # A held-out view of the same name has no exposure.
     known = [given.get(view.camera.name, 1.0) if view.split == "train" else 1.0 for view in capture.views]

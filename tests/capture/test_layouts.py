@@ -325,7 +325,7 @@ def test_glossy_synthetic_with_its_split(tmp_path):
     assert [view.camera.name for view in capture.test_views] == ["1", "3", "12"]
     assert len(capture.train_views) == 13 and capture.masked and not capture.warnings
     write_cameras(tmp_path / "cameras.json", capture)
-    cameras, splits, to_capture, _ = read_run_cameras(tmp_path / "cameras.json")
+    cameras, splits, to_capture, _, _ = read_run_cameras(tmp_path / "cameras.json")
     assert splits.count("test") == 3 and np.allclose(to_capture, capture.to_capture)
     assert [camera.fx for camera in cameras] == [60] * 16
 

@@ -38,19 +38,26 @@ def read_cameras(file: Path) -> list[Camera]:
 
 
 def write_cameras(
-    file: Path, capture: Capture, light: str = "world", exposures: dict[str, float] | None = None
+    file: Path,
+    capture: Capture,
+    light: str = "world",
+    exposures: dict[str, float] | None = None,
+    refined: bool = False,
 ) -> None:
     """Write the run folder's cameras.json: the undistorted cameras in the run's frame, with OpenGL axes.
 
     `light` is "world" if the light stands still, or "camera" if it turns with the camera, as on a turntable. In the second case
     environment.exr shows the light at the first training photo, and the key `light_of` names that photo. `exposures` maps names of training
     photos to exposure factors: the scene's radiance times this factor gives the photo's brightness.
+    `refined` tells that the training photos' poses were refined: a training view then has the key `refined`.
     """
     frames = []
     for view in capture.views:
         camera = view.camera
         known = exposures is not None and view.split == "train" and camera.name in exposures
         frame = {"exposure": exposures[camera.name]} if known else {}
+        if refined and view.split == "train":
+            frame["refined"] = True
         frames.append(
             frame
             | {
@@ -76,11 +83,11 @@ def _from(folder: Path, file: Path) -> Path:
     return file.relative_to(folder) if file.is_relative_to(folder) else file
 
 
-def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float]]:
+def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float], bool]:
     """Read a run folder's cameras.json.
 
     Return the cameras in the run's frame, the split of each ("train" or "test"), the similarity transform (4, 4) from the run's frame to
-    the capture's, and the exposure factor of each (1 if the file has none).
+    the capture's, and the exposure factor of each (1 if the file has none), and whether the training refined poses.
     """
     file = Path(file)
     shared, frames = read_frames(file)
@@ -90,6 +97,7 @@ def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, l
         [frame.values.get("split", "train") for frame in frames],
         _similarity(shared.get("to_capture"), file),
         [frame.values.get("exposure", 1.0) for frame in frames],
+        any(frame.values.get("refined", False) for frame in frames),
     )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.capture import LoadedView, View, load_view
@@ -20,6 +21,7 @@ from refgs.formats.panorama import read_environment
 from refgs.kernels import cuda
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
+from refgs.render.align import fitted
 from refgs.render.baselines import method_of
 from refgs.render.renderer import render
 from refgs.run import Run
@@ -51,6 +53,9 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
     without_lpips = metrics.lpips_missing()
     for view in views:
         loaded = load_view(view, run.settings.image.max_side)
+        if run.refined and split == "train":
+            own = next(c for c in run.training_cameras() if c.name == loaded.camera.name)
+            loaded = replace(loaded, camera=own)
         figures = _measure_view(run, view, loaded, truth, pictures / split, without_lpips is None)
         for name, value in figures.items():
             rows.setdefault(name, []).append(value)
@@ -89,6 +94,9 @@ def _measure_view(
         exposure = metrics.fitted_exposure(rendering.radiance.numpy(), rendering.alpha.numpy(), photo)
         fitted = run.render(camera, exposure=exposure).color.numpy()
         figures["psnr_exposure_fitted"] = metrics.psnr(np.clip(fitted, 0, 1), photo)
+    if run.refined and view.split == "test":  # its pose was not refined: fit it, for a second figure
+        moved = _fitted(run, camera, torch.from_numpy(photo))
+        figures["psnr_pose_fitted"] = metrics.psnr(np.clip(run.render(moved).color.numpy(), 0, 1), photo)
     if with_lpips:
         figures["lpips"] = metrics.lpips(color, photo)
     images = maps(rendering)
@@ -109,6 +117,11 @@ def _measure_view(
     if "normal_mae_degrees" in figures:
         figures["normal_ssim"] = metrics.normal_ssim(images["normal"], known["normal"], alpha, true_alpha)
     return figures
+
+
+def _fitted(run: Run, camera: Camera, photo: Tensor) -> Camera:
+    """Move a camera so that the run's picture fits a photo."""
+    return fitted(run.render, camera, photo, run.centre, run.radius)
 
 
 def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dict[str, float]]:

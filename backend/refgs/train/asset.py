@@ -18,7 +18,7 @@ from refgs.paths import write_text
 from refgs.render.facing import facing_cosine
 from refgs.render.volume import with_normals_last
 from refgs.run import OCCLUDER
-from refgs.train import needs
+from refgs.train import needs, poses
 from refgs.train.probe import blended_shares
 from refgs.train.state import State, why_not_traced
 
@@ -27,7 +27,7 @@ def write_asset(state: State) -> None:
     """Write the results of a training into its run folder.
 
     These are the surfels (splats.ply), the light (environment.exr), and what the training left out (needs.json). With inter-reflection, the
-    object's mesh is written to occluder.ply. With learned exposures, cameras.json is written again to include them.
+    object's mesh is written to occluder.ply. With learned exposures or poses, cameras.json is written again to include them.
     """
     folder, settings = state.folder, state.settings
     with torch.no_grad():
@@ -56,10 +56,12 @@ def write_asset(state: State) -> None:
     splats.constants = constants
     splats.normals *= side[kept].numpy(force=True)[:, None]
     write_splats(folder / "splats.ply", splats)
-    if state.exposures is not None:
-        factors = state.exposures.detach().exp().tolist()
-        exposures = {view.camera.name: factor for view, factor in zip(state.views, factors, strict=True)}
-        write_cameras(folder / "cameras.json", state.capture, settings.light.frame, exposures)
+    if state.exposures is not None or state.poses is not None:
+        factors = [] if state.exposures is None else state.exposures.detach().exp().tolist()
+        exposures = {view.camera.name: factor for view, factor in zip(state.views, factors, strict=False)}
+        write_cameras(
+            folder / "cameras.json", poses.refined(state), settings.light.frame, exposures, state.poses is not None
+        )
     write_text(folder / "needs.json", json.dumps(_needs_rows(state, surfels, side, wanted), indent=1))
 
 

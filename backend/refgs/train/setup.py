@@ -11,7 +11,7 @@ from refgs.capture import Capture
 from refgs.events import Report
 from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters, activate
-from refgs.train import light, needs
+from refgs.train import light, needs, poses
 from refgs.train.effective import Effective
 from refgs.train.guard import limits
 from refgs.train.light_frame import light_frame
@@ -25,6 +25,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     """Read a capture's photos, and make all parameters and the optimiser, so that the first iteration can start."""
     state = State(capture, effective, folder, report, plan, device)
     needs.evaluate_due(state, "photos")
+    state.given = [view.camera for view in state.views]
     state.photos = [Photo.of(view, state.device) for view in state.views]
     with state.clock.part("start"):
         start, on_hull, source = start_parameters(capture, state.views, state.settings)
@@ -32,6 +33,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     state.parameters = {name: value.detach().to(state.device).requires_grad_() for name, value in start.items()}
     report("stage", {"what": source})
     _start_learning(state)
+    poses.start(state)
     needs.evaluate_due(state, "start")
     return state
 

@@ -6,7 +6,7 @@ import torch
 from refgs.errors import InputError
 from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
-from refgs.train import checkpoint, needs
+from refgs.train import checkpoint, needs, poses
 from refgs.train.state import State, why_not_traced
 
 
@@ -21,6 +21,8 @@ def save(state: State) -> None:
     }
     if state.exposures is not None:
         tensors |= {"exposure": state.exposures}
+    if state.poses is not None:
+        tensors |= {"poses": state.poses}
     if state.light_shown is not None:
         tensors |= {"mirrored": state.light_shown}
     if state.occluder is not None:
@@ -81,6 +83,7 @@ def restore(state: State) -> None:
         if moments:
             state.optimizer.state[value] = moments | {"step": int(moments["step"])}
     state.light_shown = tensors.get("mirrored")
+    poses.restore(state, tensors["poses"].cpu() if "poses" in tensors else None)
     state.constant = {name: tensors[f"constant.{name}"] for name in state.constant}
     state.occluder = None
     if mesh and not why_not_traced(state):

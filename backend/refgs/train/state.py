@@ -75,6 +75,8 @@ class State:
         self.exposures: Tensor | None = (
             None  # natural logarithms, one a view; None: photos have no exposures of their own
         )
+        self.given: list[Camera] = []  # the views' cameras in the capture
+        self.poses: Tensor | None = None  # (views, 6), see `train/poses.py`; None: cameras are the capture's own
         self.optimizer = Adam([])
         self.motion = ScreenGradient(0, self.device)
         self.occluder: Occluder | None = None

@@ -11,7 +11,7 @@ from refgs.capture import Capture
 from refgs.compare.metrics import decibels
 from refgs.events import Report
 from refgs.settings import Settings
-from refgs.train import densify, exposures, history, light, metals, needs, snapshot
+from refgs.train import densify, exposures, history, light, metals, needs, poses, snapshot
 from refgs.train.effective import Effective
 from refgs.train.guard import Guard, running, warn
 from refgs.train.losses import departure, objective
@@ -66,6 +66,7 @@ class Trainer:
         accepted, position = self.guard.judge(loss, state.optimizer), state.parameters["position"]
         state.motion.add(position.detach(), position.grad, state.photos[view].camera, accepted)
         state.optimizer.step(accepted)
+        poses.refine_due(state, view, rendering, photo, progress)
         if inputs.environment is not None:
             light.diffuse(state)
         state.forget_gradients()
@@ -78,6 +79,7 @@ class Trainer:
         densify.densify_due(state, progress)
         densify.reshape_due(state)
         exposures.leave_out_alike(state, progress)
+        poses.leave_out_exact(state, progress)
         return {"loss": loss.detach(), "square": square}
 
     def _next_view(self) -> int:

@@ -1,0 +1,102 @@
+"""Find the pose of a camera that makes a rendering fit its photo, by Gauss-Newton steps on the pixels' colours.
+
+A pose is six numbers (6,): a rotation vector about the scene's centre, in radians, and a translation in scene radii. It moves the scene,
+not the camera; it is the identity at zero. If the scene moves a little, the picture moves with the surface that each pixel shows: from its
+depth follows by how many pixels (Baker and Matthews 2004, Engel et al. 2018). Colours are taken to move along. Mirror images do not quite,
+but on a curved surface they move mostly with it.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from refgs.camera import Camera
+from refgs.render.rendering import COVERED, Rendering
+
+REDUCTIONS = 4, 2, 1  # of pictures, from the first steps to the last
+STEPS = 5  # of fitting a pose, for each of these
+SOLID = 0.5  # alpha from which a pixel shows the surface
+ODD = 0.1  # of 1: a difference of colours from which a pixel counts less; it has another cause than the pose
+DAMPING = 1e-3  # of the mean diagonal
+
+
+def posed(camera: Camera, pose: Tensor, centre: np.ndarray, radius: float) -> Camera:
+    """Return the camera that sees the resting scene as `camera` sees the scene moved by `pose` (6,)."""
+    turn, shift = pose.double().numpy(force=True).reshape(2, 3)
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+    motion[:3, 3] = centre - motion[:3, :3] @ centre + radius * shift
+    return replace(camera, world_to_camera=camera.world_to_camera @ motion)
+
+
+@torch.no_grad()
+def pose_step(
+    rendering: Rendering, photo: Tensor, camera: Camera, centre: np.ndarray, radius: float, reduction: int = 1
+) -> Tensor:
+    """Compute the pose (6,) that moves the rendering of `camera` towards the photo (H, W, 3), sRGB-encoded. Zero if nothing is shown.
+
+    It minimises Σ w |photo − picture + ∇picture · motion(pose)|² over the pixels and channels. ∇ takes central differences; it is the mean
+    of the picture's and the photo's, which converges faster (Benhimane and Malis 2004). w falls where the two differ much.
+    Pictures are first made smaller by the factor `reduction`, so that larger motions are found.
+    """
+    maps = [rendering.color.clamp(0, 1), photo, rendering.blended_depth[..., None], rendering.alpha[..., None]]
+    color, photo, depths, alpha = (_reduced(value, reduction) for value in maps)
+    height, width = alpha.shape[:2]
+    camera = camera.cropped(0, 0, reduction * width, reduction * height).resized(width, height)
+    apart = photo - color
+    mean = (color + photo) / 2
+    across, down = torch.zeros_like(mean), torch.zeros_like(mean)
+    across[:, 1:-1] = (mean[:, 2:] - mean[:, :-2]) / 2
+    down[1:-1] = (mean[2:] - mean[:-2]) / 2
+
+    rows, columns = torch.nonzero(alpha[..., 0] > SOLID, as_tuple=True)
+    if len(rows) == 0:
+        return torch.zeros(6)
+    across, down, apart = (value[rows, columns].double() for value in (across, down, apart))
+    depth = (depths / alpha.clamp_min(COVERED))[rows, columns, 0].double()
+    x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
+    to_camera = torch.from_numpy(camera.world_to_camera).to(depth)
+    turn = to_camera[:3, :3]
+    from_centre = torch.stack([x * depth, y * depth, depth], dim=1) - (
+        turn @ torch.from_numpy(centre).to(depth) + to_camera[:3, 3]
+    )
+    # How a pixel moves with its point: fx (dX − x dZ) / Z to the right, fy (dY − y dZ) / Z down.
+    slope = torch.stack(
+        [camera.fx * across, camera.fy * down, -(camera.fx * x[:, None] * across + camera.fy * y[:, None] * down)],
+        dim=2,
+    )
+    slope = slope / depth[:, None, None]
+    # The point moves by ω × p + radius · t, in the camera's axes.
+    by_turn = torch.linalg.cross(from_centre[:, None].expand_as(slope), slope)
+    jacobian = -torch.cat([by_turn @ turn, radius * slope @ turn], dim=2)
+    weight = 1 / (1 + (apart / ODD).square())
+    square = torch.einsum("pci,pc,pcj->ij", jacobian, weight, jacobian)
+    towards = torch.einsum("pci,pc,pc->i", jacobian, weight, apart)
+    square += (DAMPING * square.diagonal().mean() + 1e-12) * torch.eye(6).to(square)
+    return torch.linalg.solve(square, towards).float().cpu()
+
+
+def fitted(
+    picture: Callable[[Camera], Rendering], camera: Camera, photo: Tensor, centre: np.ndarray, radius: float
+) -> Camera:
+    """Move a camera by a few steps so that its picture fits the photo better. Nothing else changes.
+
+    Returns the camera with the smallest squared error found, which may be `camera` itself.
+    """
+    best, least, now = camera, np.inf, camera
+    for reduction in [*np.repeat(REDUCTIONS, STEPS).tolist(), 1]:
+        rendering = picture(now)
+        error = float((rendering.color.clamp(0, 1) - photo).square().mean())
+        if error < least:
+            best, least = now, error
+        now = posed(now, pose_step(rendering, photo, now, centre, radius, reduction), centre, radius)
+    return best
+
+
+def _reduced(value: Tensor, factor: int) -> Tensor:
+    """Average a picture (H, W, C) over squares of `factor` pixels. Pixels beyond the last whole square are left out."""
+    return torch.nn.functional.avg_pool2d(value.permute(2, 0, 1), factor).permute(1, 2, 0)
