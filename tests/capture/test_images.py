@@ -1,17 +1,27 @@
 """Test the loading of photos: broken files are refused; masks, undistortion and resizing add no colours of their own."""
 
 import json
+import struct
+import zlib
 from dataclasses import replace
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
+import tifffile
 from PIL import ExifTags, Image
 
-from refgs.capture import load_view, read_capture
-from refgs.capture.images import read_focal_length, read_header, read_image
+from refgs.camera import Camera
+from refgs.capture import View, load_view, read_capture
+from refgs.capture.check import check
+from refgs.capture.files import find_photos
+from refgs.capture.images import read_focal_length, read_header, read_image, write_for_colmap
+from refgs.color import srgb_decode
 from refgs.errors import InputError
+from refgs.formats.exr import write_exr
 from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, write, write_as_phone
+from tests.makers.dng import write_dng
 
 OPENCV = (4, "OPENCV", [60.0, 61.0, 31.0, 25.0, -0.2, 0.05, 0.003, -0.002])
 
@@ -287,3 +297,214 @@ def test_masks_are_undistorted_with_their_photo(tmp_path):
     assert (loaded.image[inside].max(axis=1) > 150).all()
     assert not loaded.image[loaded.alpha == 0].any()
     assert (loaded.alpha != plain.alpha).any()
+
+
+def check_codes(path, image, white, alpha=None):
+    """Check that a photo's 16-bit codes come into the training as they are, and that other users get 8-bit ones."""
+    camera = Camera("a", *image.shape[1::-1], 60, 60, 32, 24, np.eye(4))
+    loaded = load_view(View(camera, path, None, "train", None, alpha is not None, None))
+    assert loaded.image.dtype == np.uint16 and loaded.white == white
+    np.testing.assert_array_equal(loaded.image, image)
+    np.testing.assert_allclose(loaded.encoded, image / np.float64(white), rtol=1e-6)
+    assert loaded.bytes.dtype == np.uint8
+    np.testing.assert_allclose(loaded.bytes, np.minimum(image / white, 1) * 255, atol=0.5001)
+    if alpha is not None:
+        np.testing.assert_array_equal(loaded.alpha, alpha)
+    return loaded
+
+
+@pytest.mark.parametrize("turns", range(4))
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_16_bits_are_kept_in_training(tmp_path, suffix, channels, turns):
+    values = np.random.default_rng(0).integers(0, 65536, (48, 64, channels)).astype(np.uint16)
+    path, stored = tmp_path / f"ö{suffix}", np.ascontiguousarray(np.rot90(values, turns))
+    if suffix == ".tif":
+        orientation = (274, "H", 1, (1, 6, 3, 8)[turns], False)
+        options = {"extrasamples": [2]} if channels == 4 else {}
+        kind = "minisblack" if channels == 1 else "rgb"
+        tifffile.imwrite(path, np.squeeze(stored), photometric=kind, metadata=None, extratags=[orientation], **options)
+    else:
+        write(path, np.squeeze(stored))
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = (1, 6, 3, 8)[turns]
+        chunk = b"eXIf" + exif.tobytes().removeprefix(b"Exif\0\0")
+        data = path.read_bytes()
+        added = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        path.write_bytes(data[:33] + added + data[33:])  # behind the first chunk
+    alpha = np.rint(values[..., 3] / 257) if channels == 4 else None
+    colors = values[..., :3] if channels > 1 else np.repeat(values, 3, axis=2)
+    assert read_header(path).upright == (64, 48)
+    check_codes(path, colors, 65535, alpha)
+    assert np.abs(read_image(path)[0] - colors / 257.0).max() < 1
+
+
+def test_8_bits_stay_8_bits(tmp_path):
+    values = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    for suffix in (".png", ".tif", ".bmp"):
+        write(tmp_path / f"a{suffix}", values)
+        view = View(
+            Camera("a", 64, 48, 60, 60, 32, 24, np.eye(4)), tmp_path / f"a{suffix}", None, "train", None, False, None
+        )
+        loaded = load_view(view)
+        assert loaded.image.dtype == np.uint8 and loaded.white == 255
+        np.testing.assert_array_equal(loaded.image, values)
+        assert load_view(view, 32).image.dtype == np.uint8
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_truncated_16_bit_photos_are_refused(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    write(path, np.random.default_rng(0).integers(0, 65536, (48, 64, 3)).astype(np.uint16))
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    view = View(Camera("a", 64, 48, 60, 60, 32, 24, np.eye(4)), path, None, "train", None, False, None)
+    with pytest.raises(InputError, match=f"a{suffix}"):
+        load_view(view)
+
+
+@pytest.mark.parametrize("turns", range(4))
+@pytest.mark.parametrize("side", [None, 16])
+def test_raw_is_linear_radiance_with_the_cameras_white_balance(tmp_path, side, turns):
+    linear = np.full((48, 64, 3), (0.2, 0.4, 0.1))
+    linear[:24] = 0.5, 0.25, 0.3
+    linear[:, 32:] /= 8
+    write_dng(tmp_path / "ö.DNG", linear, (0.5, 1, 0.7), turns, film=26)
+    header = read_header(tmp_path / "ö.DNG")
+    assert header.upright == (64, 48) and header[:2] == ((64, 48), (48, 64))[turns % 2]
+    assert read_focal_length(tmp_path / "ö.DNG") == pytest.approx(26 / 43.267 * 80, rel=1e-4)
+    view = View(Camera("a", 64, 48, 60, 60, 32, 24, np.eye(4)), tmp_path / "ö.DNG", None, "train", None, False, None)
+    loaded = load_view(view, side)
+    found, true = srgb_decode(loaded.encoded), linear if side is None else linear[::4, ::4]
+    ends = 8 if side is None else 2  # pixels beside an edge are interpolated
+    flat = np.zeros(true.shape[:2], bool)
+    for half in (slice(ends, true.shape[0] // 2 - ends), slice(true.shape[0] // 2 + ends, -ends)):
+        flat[half, ends : true.shape[1] // 2 - ends] = flat[half, true.shape[1] // 2 + ends : -ends] = True
+    assert flat.sum() > 20
+    # The darkest value is 13 of 16,383 levels a hundredth.
+    np.testing.assert_allclose(found[flat], true[flat], rtol=0.01)
+
+
+def test_raw_of_all_exposures_has_one_scale(tmp_path):
+    """Check that a dark photo stays dark: LibRaw by itself would stretch it to white."""
+    write_dng(tmp_path / "dark.dng", np.full((48, 64, 3), 0.03))
+    view = View(Camera("a", 64, 48, 60, 60, 32, 24, np.eye(4)), tmp_path / "dark.dng", None, "train", None, False, None)
+    np.testing.assert_allclose(srgb_decode(load_view(view).encoded), 0.03, rtol=0.01)
+
+
+def test_raw_is_clipped_where_the_sensor_is_saturated(tmp_path):
+    linear = np.full((48, 64, 3), 0.3)
+    linear[:, 32:] = 3.0
+    linear[:, 48:] *= 0.3, 0.1, 0.1  # red alone saturates
+    write_dng(tmp_path / "a.dng", linear, (1, 1, 1))
+    view = View(Camera("a", 64, 48, 60, 60, 32, 24, np.eye(4)), tmp_path / "a.dng", None, "train", None, False, None)
+    image = load_view(view).image
+    assert image[:, :24].max() < 65535 and (image[:, 36:44] == 65535).all()
+    assert image[:, 52:, 1:].max() < 65535
+
+
+def test_raw_that_cannot_be_read(tmp_path):
+    write_dng(tmp_path / "whole.dng", np.full((480, 640, 3), 0.3))
+    data = (tmp_path / "whole.dng").read_bytes()
+    for name, content, says in (
+        ("other.cr3", b"something else" * 100, "does not know this camera's RAW"),
+        ("empty.nef", b"", "broken"),
+        ("cut.dng", data[: len(data) // 2], "truncated or broken"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        view = View(
+            Camera("a", 640, 480, 60, 60, 320, 240, np.eye(4)), tmp_path / name, None, "train", None, False, None
+        )
+        for read in (lambda view=view: load_view(view), lambda path=tmp_path / name: read_image(path)):
+            with pytest.raises(InputError, match=name.replace(".", r"\.")) as error:
+                read()
+            assert says in str(error.value) and "\n" not in str(error.value)
+    with pytest.raises(InputError, match="missing"):
+        read_header(tmp_path / "none.dng")
+
+
+@pytest.mark.parametrize("channels", ["Y", "RGB", "RGBA"])
+def test_exr_is_linear_radiance_without_an_end(tmp_path, channels):
+    rng = np.random.default_rng(0)
+    linear = np.exp(rng.uniform(np.log(0.001), np.log(500), (48, 64, 3))).astype(np.float32)
+    alpha = rng.integers(1, 256, (48, 64)).astype(np.float32) / 255 if channels == "RGBA" else None
+    if alpha is not None:
+        alpha[:4] = 0
+    pixels = {"Y": linear[..., 0], "RGB": linear, "RGBA": np.dstack([linear, np.ones((48, 64), np.float32)])}[channels]
+    write_exr(tmp_path / "a.exr", pixels if alpha is None else pixels * alpha[..., None])
+    assert read_header(tmp_path / "a.exr") == (64, 48, channels == "RGBA", 0)
+    assert read_focal_length(tmp_path / "a.exr") is None
+    camera = Camera("a", 64, 48, 60, 60, 32, 24, np.eye(4))
+    loaded = load_view(View(camera, tmp_path / "a.exr", None, "train", None, channels == "RGBA", None))
+    true = np.repeat(linear[..., :1], 3, axis=2) if channels == "Y" else linear
+    seen = np.ones((48, 64), bool) if alpha is None else alpha > 0
+    np.testing.assert_allclose(srgb_decode(loaded.encoded)[seen], true[seen], rtol=0.01, atol=1e-5)
+    assert not loaded.clipped.any() and loaded.bytes.max() == 255
+    if alpha is not None:
+        np.testing.assert_array_equal(loaded.alpha, np.rint(alpha * 255))
+    small = load_view(View(camera, tmp_path / "a.exr", None, "train", None, False, None), 16)
+    blocks = true.reshape(12, 4, 16, 4, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(srgb_decode(small.encoded)[1:], blocks[1:], rtol=0.01)
+
+
+def test_exr_with_odd_values(tmp_path):
+    """Check that what is not a number or negative is black, and that what is brighter than any code is clipped."""
+    values = np.full((48, 64, 3), 0.5, np.float32)
+    values[0, :4] = [[np.nan] * 3, [-1] * 3, [np.inf] * 3, [1000] * 3]
+    write_exr(tmp_path / "a.exr", values)
+    view = View(Camera("a", 64, 48, 60, 60, 32, 24, np.eye(4)), tmp_path / "a.exr", None, "train", None, False, None)
+    loaded = load_view(view)
+    assert not loaded.image[0, :2].any() and (loaded.image[0, 2:4] == 65535).all() and loaded.clipped.sum() == 6
+
+
+def test_exr_that_cannot_be_read(tmp_path):
+    write_exr(tmp_path / "whole.exr", np.random.default_rng(0).uniform(size=(48, 64, 3)))
+    data = (tmp_path / "whole.exr").read_bytes()
+    (tmp_path / "cut.exr").write_bytes(data[: len(data) // 2])
+    header = {"dataWindow": ((2, 0), (5, 3)), "displayWindow": ((0, 0), (7, 7))}
+    OpenEXR.File(header, {"RGB": np.ones((4, 4, 3), np.float32)}).write(str(tmp_path / "part.exr"))
+    for name, says in (("cut.exr", "whole"), ("part.exr", "crop"), ("none.exr", "missing")):
+        with pytest.raises(InputError, match=name) as error:
+            read_header(tmp_path / name), read_image(tmp_path / name)
+        assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_photos_for_colmap(tmp_path):
+    """Check that COLMAP gets RAW and EXR as JPEG, as they are stored, and 16-bit PNG as it is."""
+    upright = srgb_decode(smooth(48, 64) / 255)
+    write_dng(tmp_path / "a.dng", upright, turns=1)
+    write_exr(tmp_path / "a.exr", upright)
+    write(tmp_path / "a.png", smooth(48, 64).astype(np.uint16) * 257)
+    for name, turns in (("a.dng", 1), ("a.exr", 0)):
+        assert write_for_colmap(tmp_path / name, tmp_path / "out.jpg")
+        stored = np.asarray(Image.open(tmp_path / "out.jpg")).astype(int)
+        assert np.abs(np.rot90(stored, -turns) - smooth(48, 64)).mean() < 8
+    assert not write_for_colmap(tmp_path / "a.png", tmp_path / "b.jpg") and not (tmp_path / "b.jpg").exists()
+
+
+def test_photos_that_are_there_as_raw_and_jpeg(tmp_path):
+    for name in ("a.dng", "a.JPG", "b.CR3", "c.exr", "c.png", "d.exr"):
+        (tmp_path / name).touch()
+    assert [path.name for path in find_photos(tmp_path)] == ["a.JPG", "b.CR3", "c.png", "d.exr"]
+
+
+@pytest.mark.parametrize("suffix", [".dng", ".exr", ".png"])
+def test_a_capture_of_photos_with_more_than_8_bits(tmp_path, suffix):
+    """Check that such a capture is read and checked like one of 8-bit photos."""
+    folder = nerfstudio(tmp_path / "capture", 8)
+    for path in sorted((folder / "images").iterdir()):
+        photo = read_image(path)[0]
+        path.unlink()
+        if suffix == ".png":
+            write(path, photo.astype(np.uint16) * 257)
+        else:
+            (write_dng if suffix == ".dng" else write_exr)(path.with_suffix(suffix), srgb_decode(photo / 255))
+    edit(
+        folder / "transforms.json",
+        lambda data: [f.update(file_path=f["file_path"].replace(".png", suffix)) for f in data["frames"]],
+    )
+    capture = read_capture(folder)
+    assert {view.camera.name for view in capture.views} == {f"{i:04d}" for i in range(8)}
+    facts = check(capture, tmp_path / "out")
+    assert all(Image.open(path).mode == "RGB" for path in facts["thumbnails"])
+    assert not [line for line in facts["lines"] if "greyscale" in line or "clipped" in line]

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from refgs.color import srgb_decode, srgb_encode
 from refgs.render import reference as oracle
 from refgs.render.reference import unit
 from refgs.render.renderer import COVERED, Rendering
@@ -29,11 +30,12 @@ def huber(difference: Tensor) -> Tensor:
 
 def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress: float) -> dict[str, Tensor]:
     """Compute every weighted term of the training's loss in float64, by name. The tests compare the program with these values."""
-    photo = view.image.double() / 255
+    photo, bound = view.image.double() / view.white, view.image.int() == torch.iinfo(view.image.dtype).max
     mask = None if view.mask is None else view.mask.double() / 255
     if mask is not None:
         photo = photo * mask[..., None] + BACKGROUND.double() * (1 - mask[..., None])
-    color = torch.where(photo >= 0.998, rendering.color.clamp_max(1), rendering.color)
+        bound &= mask[..., None] >= 0.5
+    color = torch.where(bound, rendering.color.minimum(photo), rendering.color)
     terms = {"l1": (1 - weights.dssim) * (color - photo).abs().mean()}
     terms["dssim"] = weights.dssim * oracle.dssim(color, photo)
 
@@ -72,7 +74,7 @@ def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress
 def pictures(width: int, height: int, masked: bool, material: bool) -> tuple[Rendering, Photo]:
     """Make a rendering of a bumpy, partly transparent surface, and a random photo of the same size.
 
-    Some colours of the rendering are above 1, and some of the photo are saturated.
+    Some colours of the rendering are above 1, and some of the photo are clipped.
     """
     rng, camera = np.random.default_rng([width, height]), scenes.camera(width, height)
 
@@ -89,6 +91,13 @@ def pictures(width: int, height: int, masked: bool, material: bool) -> tuple[Ren
     maps = [1.2 * random(*size, 3), alpha, depth * alpha, normal, materials if material else None]
     photo, mask = (torch.tensor((300 * rng.uniform(size=s)).clip(0, 255)).byte() for s in ((*size, 3), size))
     return Rendering(*maps), Photo(photo, mask if masked else None, camera)
+
+
+def with_16_bits(view: Photo, white: int) -> Photo:
+    """Give a photo 16-bit codes between those that it has. `white` is the code of white, and some brighter codes are the largest."""
+    between = torch.randint(257, view.image.shape, generator=torch.Generator().manual_seed(0))
+    codes = torch.where(view.image == 255, 65535, view.image * (white // 255) + between * (white // 255) // 257)
+    return view._replace(image=codes.to(torch.uint16), white=white)
 
 
 def moved(view: Photo, device: torch.device) -> Photo:
@@ -129,11 +138,25 @@ def check(rendering: Rendering, view: Photo, weights: LossSettings, progress: fl
 def test_matches_float64(size, material, masked, device):
     rendering, view = pictures(*size, masked, material)
     square = check(rendering, view, ALL, 0.7, 3, device)
-    photo = view.image.double() / 255
-    if masked:
+    check_square(square, rendering, view)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("white", [4080, 65535])
+def test_16_bit_codes_match_float64(white, masked, device):
+    rendering, view = pictures(61, 40, masked, material=True)
+    view = with_16_bits(view, white)
+    if white < 65535:
+        rendering.color[::2] *= 20  # brighter than the largest code
+    check_square(check(rendering, view, ALL, 0.7, 1, device), rendering, view)
+
+
+def check_square(square: Tensor, rendering: Rendering, view: Photo) -> None:
+    photo = view.image.double() / view.white
+    if view.mask is not None:
         mask = view.mask.double()[..., None] / 255
         photo = photo * mask + BACKGROUND.double() * (1 - mask)
-    error = ((rendering.color.clamp(0, 1) - photo) ** 2).mean()
+    error = ((rendering.color.clamp(0, 1) - photo.clamp(0, 1)) ** 2).mean()
     assert float(square) == pytest.approx(float(error), rel=1e-5)
 
 
@@ -195,6 +218,49 @@ def test_other_photos_are_refused():
     for other in {"image": view.image[:, 1:]}, {"mask": view.mask[:10]}, {"mask": view.mask.float()}:
         with pytest.raises(ValueError, match=said):
             objective(leaves(rendering, torch.float32), None, view._replace(**other), BACKGROUND, ALL, 1.0)
+
+
+@pytest.mark.parametrize("term", [0.0, 0.2, 1.0], ids=["l1", "both", "dssim"])
+@pytest.mark.parametrize(("code", "white"), [(255, 255), (65535, 65535), (65535, 4080)])
+def test_a_clipped_photo_is_a_lower_bound(code, white, term, device):
+    """Check that a clipped pixel pulls a darker rendering up, and a brighter one not at all, whatever the photo's exposure.
+
+    A photo one code below the largest is not clipped and pulls from above, too.
+    """
+    only = LossSettings(dssim=term, normal=0, smooth=0, even=0, alpha=0, metallic=0, matte=0, light=0, exposure=0)
+    camera, bound = scenes.camera(16, 16), code / white
+    dtype = torch.uint8 if white == 255 else torch.uint16
+
+    def by_radiance(codes: int, factor: float, exposure: float) -> tuple[Tensor, Tensor]:
+        radiance = torch.full((16, 16, 3), factor * srgb_decode(bound) / exposure, device=device, requires_grad=True)
+        exposed = torch.tensor(exposure, device=device, requires_grad=True)
+        texture = 1 + 0.05 * torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0)).to(device)
+        one = torch.ones(16, 16, device=device)
+        color = srgb_encode(radiance * texture * exposed)
+        rendering = Rendering(color, one, one, torch.zeros(16, 16, 3, device=device))
+        image = torch.full((16, 16, 3), codes, dtype=torch.int32).to(dtype).to(device)
+        photo = Photo(image, torch.full((16, 16), 255, dtype=torch.uint8, device=device), camera, white=white)
+        loss, _ = objective(rendering, None, photo, BACKGROUND.to(device), only, 1.0)
+        return torch.autograd.grad(loss, (radiance, exposed))
+
+    for exposure in (1.0, 0.25, 3.0):
+        assert not any(gradient.any() for gradient in by_radiance(code, 1.5, exposure))
+        radiance, exposed = by_radiance(code, 0.5, exposure)
+        assert radiance.sum() < 0 and exposed < 0
+        if term < 1:
+            radiance, exposed = by_radiance(code - 1, 1.5, exposure)
+            assert radiance.sum() > 0 and exposed > 0
+
+
+def test_the_background_is_no_lower_bound(device):
+    """Check that a photo that is white where the mask is black pulls a bright rendering down, to the background."""
+    rendering, view = pictures(8, 8, masked=True, material=False)
+    rendering.color[:] = 1.5
+    view.image[:], view.mask[:] = 255, 0
+    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, matte=0, light=0, exposure=0)
+    found = leaves(rendering, torch.float32, device)
+    loss = objective(found, None, moved(view, device), torch.ones(3, device=device), only, 1.0).loss
+    assert (gradients(loss, found)["color"] > 0).all()
 
 
 def test_normals_of_a_plane_agree_with_its_depth():

@@ -75,12 +75,13 @@ class _Statistics:
 
     def __init__(self, loaded: LoadedView):
         inside = np.ones(loaded.image.shape[:2], bool) if loaded.alpha is None else loaded.alpha > 127
-        pixels = loaded.image[inside] if inside.any() else np.zeros((1, 3), np.uint8)
+        shown = loaded.bytes
+        pixels = shown[inside] if inside.any() else np.zeros((1, 3), np.uint8)
         self.coverage = None if loaded.alpha is None else float(inside.mean())
-        self.clipped = float((pixels.max(axis=1) >= 254).mean())
+        self.clipped = float(loaded.clipped.any(axis=2)[inside].mean()) if inside.any() else 0.0
         self.brightness = float(pixels.mean())
         self.grey = bool((pixels.max(axis=1) == pixels.min(axis=1)).all())
-        self.sharpness = _sharpness(loaded.image, inside)
+        self.sharpness = _sharpness(shown, inside)
 
 
 def _sharpness(image: np.ndarray, inside: np.ndarray) -> float:
@@ -105,7 +106,7 @@ def _thumbnail(folder: Path, number: int) -> Path:
 
 
 def _write_thumbnail(file: Path, loaded: LoadedView) -> None:
-    pixels = loaded.image if loaded.alpha is None else np.dstack([loaded.image, loaded.alpha])
+    pixels = loaded.bytes if loaded.alpha is None else np.dstack([loaded.bytes, loaded.alpha])
     picture = Image.fromarray(pixels)
     picture.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
     with whole(file) as temporary:

@@ -6,10 +6,12 @@ from pathlib import Path
 from refgs.camera import Camera
 from refgs.capture.images import read_header
 from refgs.capture.lens import Lens
+from refgs.capture.raw import SUFFIXES as RAW_SUFFIXES
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".heic", ".heif", ".hif", ".tif", ".tiff", ".webp", ".bmp")
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".heic", ".heif", ".hif", ".tif", ".tiff", ".webp", ".bmp")
+IMAGE_SUFFIXES = (*PICTURE_SUFFIXES, ".exr", *RAW_SUFFIXES)
 
 
 def find_image(path: Path, any_suffix: bool = False) -> Path | None:
@@ -28,12 +30,18 @@ def find_image(path: Path, any_suffix: bool = False) -> Path | None:
 def find_photos(folder: Path) -> list[Path]:
     """List the photos in the subfolder `images`, or in the folder itself if it has no such subfolder. They are sorted by name.
 
-    A file NAME_alpha.png beside a photo NAME is its mask and is not listed.
+    A file NAME_alpha.png beside a photo NAME is its mask and is not listed. RAW or EXR is not listed if another image has the same name:
+    many cameras write a photo as RAW and as JPEG.
     """
     top = folder / "images" if (folder / "images").is_dir() else folder
     found = {path.name: path for path in sorted(top.iterdir()) if path.suffix.lower() in IMAGE_SUFFIXES}
     masks = {f"{path.stem}_alpha.png" for path in found.values()}
-    return [path for name, path in found.items() if name not in masks]
+    pictures = {path.stem for path in found.values() if path.suffix.lower() in PICTURE_SUFFIXES}
+    return [
+        path
+        for name, path in found.items()
+        if name not in masks and (path.suffix.lower() in PICTURE_SUFFIXES or path.stem not in pictures)
+    ]
 
 
 def report_missing(source: Path, missing: list[str], total: int) -> None:

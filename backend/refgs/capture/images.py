@@ -1,4 +1,8 @@
-"""Load photos and masks for training: decode, undistort and reduce them. The results are 8-bit sRGB with straight alpha."""
+"""Load photos and masks for training: decode, undistort and reduce them. The results are sRGB codes with straight alpha.
+
+Most photos have 8-bit codes, and keep them. Photos with more (16-bit PNG and TIFF, camera RAW, EXR) have 16-bit codes. In an EXR the code
+of white is not the largest, so that brighter radiance can be told apart.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -12,9 +16,11 @@ from PIL import ExifTags, Image
 from pillow_heif import register_heif_opener
 
 from refgs.camera import Camera
+from refgs.capture import raw
 from refgs.capture.types import View
 from refgs.color import srgb_decode, srgb_encode
 from refgs.errors import InputError
+from refgs.formats.exr import read_exr, read_exr_header
 
 register_heif_opener()  # Pillow opens HEIC then
 
@@ -26,18 +32,39 @@ SPARE = 2
 # sees a mirrored world.
 _TURNS = {6: 1, 3: 2, 8: 3}
 
+EXR_WHITE = (
+    4080  # white's 16-bit code in an EXR: 16 steps a step of 8 bits. The largest code is 694 times as bright as white.
+)
+
 
 @dataclass(frozen=True, eq=False)
 class LoadedView:
-    """Pixels of a photo as loaded for training: `image` (H, W, 3) uint8, sRGB-encoded, and `alpha` (H, W) uint8, None without a mask.
+    """Pixels of a photo as loaded for training: `image` (H, W, 3), sRGB-encoded, and `alpha` (H, W) uint8, None without a mask.
 
-    Colours are not premultiplied by alpha. `camera` is the pinhole camera for this image size. If the photo was reduced or undistorted, its
-    fully transparent pixels are black.
+    `image` has the dtype uint8 or uint16, and `white` is the code of white in it. A pixel with the dtype's largest code is clipped: its
+    true radiance may be higher. Colours are not premultiplied by alpha. `camera` is the pinhole camera for this image size. If the photo
+    was reduced or undistorted, its fully transparent pixels are black.
     """
 
     image: np.ndarray
     alpha: np.ndarray | None
     camera: Camera
+    white: int = 255
+
+    @property
+    def encoded(self) -> np.ndarray:
+        """Return the sRGB-encoded photo as float32 (H, W, 3): 1 is white, and an EXR may be brighter."""
+        return self.image.astype(np.float32) / self.white
+
+    @property
+    def bytes(self) -> np.ndarray:
+        """Return the photo as 8-bit sRGB (H, W, 3), clipped to white."""
+        return _as_bytes(self.image, self.white)
+
+    @property
+    def clipped(self) -> np.ndarray:
+        """Return where each channel (H, W, 3) is clipped, or nearly so: JPEG does not keep the largest code exactly."""
+        return self.image >= np.iinfo(self.image.dtype).max // 255 * 254
 
 
 class Header(NamedTuple):
@@ -56,6 +83,11 @@ class Header(NamedTuple):
 
 def read_header(path: Path) -> Header:
     """Read an image file's header. No pixels are decoded. Raises InputError naming the file."""
+    if _is_raw(path):
+        width, height, turns = raw.read_raw_header(path)
+        return Header(width, height, False, turns)
+    if _is_exr(path):
+        return Header(*read_exr_header(path), 0)
     with _open(path) as picture:
         return Header(*picture.size, picture.has_transparency_data, _turns(picture))
 
@@ -65,43 +97,81 @@ def read_focal_length(path: Path) -> float | None:
 
     Return None if EXIF has neither. Raises InputError naming the file.
     """
-    with _open(path) as picture:
-        try:
-            tags = Image.Image.getexif(picture).get_ifd(ExifTags.IFD.Exif)
-            if film := float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)):
-                return film / math.hypot(36, 24) * math.hypot(*picture.size)
-            unit = {2: 25.4, 3: 10.0, 4: 1.0}[tags[ExifTags.Base.FocalPlaneResolutionUnit]]  # mm
-            density = float(tags[ExifTags.Base.FocalPlaneXResolution]) / unit
-            # The density is that of the photo as taken; it may have been scaled since.
-            scale = max(picture.size) / max(tags[ExifTags.Base.ExifImageWidth], tags[ExifTags.Base.ExifImageHeight])
-            return float(tags[ExifTags.Base.FocalLength]) * density * scale or None
-        except Exception:  # absent or broken
-            return None
+    size = read_header(path)[:2]
+    try:
+        if _is_raw(path):
+            tags = raw.read_exif(path)
+        else:
+            with _open(path) as picture:
+                tags = Image.Image.getexif(picture).get_ifd(ExifTags.IFD.Exif)
+        if film := float(tags.get(ExifTags.Base.FocalLengthIn35mmFilm, 0)):
+            return film / math.hypot(36, 24) * math.hypot(*size)
+        unit = {2: 25.4, 3: 10.0, 4: 1.0}[tags[ExifTags.Base.FocalPlaneResolutionUnit]]  # mm
+        density = float(tags[ExifTags.Base.FocalPlaneXResolution]) / unit
+        # The density is that of the photo as taken; it may have been scaled since.
+        scale = max(size) / max(tags[ExifTags.Base.ExifImageWidth], tags[ExifTags.Base.ExifImageHeight])
+        return float(tags[ExifTags.Base.FocalLength]) * density * scale or None
+    except Exception:  # absent or broken
+        return None
 
 
 def read_image(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | None]:
     """Decode an image file to RGB (H, W, 3) uint8 and alpha (H, W) uint8, None without alpha.
 
-    The image is turned upright by its EXIF orientation. 16-bit and greyscale files are converted to 8-bit RGB. `shrink` may be 2, 4 or 8: a
-    JPEG is decoded at that fraction of its size, or a larger one that divides its sides. Raises InputError naming the file if it is
-    truncated or unreadable.
+    The image is turned upright by its EXIF orientation. Greyscale files and those with more than 8 bits are converted to 8-bit RGB.
+    `shrink` may be 2, 4 or 8: a JPEG is decoded at that fraction of its size, or a larger one that divides its sides, and RAW at half its
+    size. Raises InputError naming the file if it is truncated or unreadable.
     """
+    image, alpha, white = _read_codes(path, shrink)
+    return _as_bytes(image, white), alpha
+
+
+def _read_codes(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | None, int]:
+    """Decode an image file to RGB codes (H, W, 3), uint8 or uint16 as the file has them, alpha (H, W) uint8 or None, and white's code.
+
+    The arguments and errors are those of `read_image`.
+    """
+    if _is_raw(path):
+        width, height, turns = raw.read_raw_header(path)
+        linear = raw.read_raw(path, half=_divisor(shrink, width, height) > 1)
+        return np.rot90(_encoding_table()[linear], -turns).copy(), None, raw.WHITE
+    if _is_exr(path):
+        return *_exr_codes(path), EXR_WHITE
     with _open(path) as picture:
         turns = _turns(picture)
-        width, height = picture.size
-        while width % shrink or height % shrink:
-            shrink //= 2
-        if picture.format in ("JPEG", "MPO"):
-            picture.draft(picture.mode, (width // shrink, height // shrink))
-        pixels = np.rot90(np.asarray(_decode(picture, path)), -turns)
-    return pixels[..., :3].copy(), (pixels[..., 3].copy() if pixels.shape[2] == 4 else None)
+        pixels = _decode_16_bit(picture, path)
+        white = 255 if pixels is None else 65535
+        if pixels is None:
+            width, height = picture.size
+            shrink = _divisor(shrink, width, height)
+            if picture.format in ("JPEG", "MPO"):
+                picture.draft(picture.mode, (width // shrink, height // shrink))
+            pixels = np.asarray(_decode(picture, path))
+        pixels = np.rot90(pixels, -turns)
+    return pixels[..., :3].copy(), (_as_bytes(pixels[..., 3], white).copy() if pixels.shape[2] == 4 else None), white
+
+
+def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Decode an EXR to 16-bit codes (H, W, 3) and alpha (H, W) uint8 or None. What is not a number is black."""
+    pixels = np.nan_to_num(read_exr(path))
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[..., None], 3, axis=2)
+    if pixels.shape[2] == 3:
+        return _encode(pixels, EXR_WHITE), None
+    alpha = np.clip(pixels[..., 3:], 0, 1)  # premultiplied
+    image = np.where(alpha > 0, pixels[..., :3] / np.maximum(alpha, 1e-6), 0)
+    return _encode(image, EXR_WHITE), np.rint(alpha[..., 0] * 255).astype(np.uint8)
 
 
 def write_for_colmap(path: Path, out: Path) -> bool:
-    """Write a photo's pixels to the JPEG `out` if COLMAP cannot read them: HEIC, WebP, and TIFF that has to be turned upright.
+    """Write a photo's pixels to the JPEG `out` if COLMAP cannot read them: HEIC, WebP, RAW, EXR, and TIFF that has to be turned upright.
 
     Return whether it was written. The pixels are turned as `Header` says that they are stored. Raises InputError naming the file.
     """
+    if _is_raw(path) or _is_exr(path):
+        stored = np.rot90(read_image(path)[0], read_header(path).turns)
+        Image.fromarray(np.ascontiguousarray(stored)).save(out, "JPEG", quality=95, subsampling=0)
+        return True
     with _open(path) as picture:
         turned = picture.format == "TIFF" and Image.Image.getexif(picture).get(ExifTags.Base.Orientation, 1) != 1
         if picture.format not in ("HEIF", "WEBP") and not turned:
@@ -152,14 +222,14 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
         raise InputError(f"{view.image_path}: the photo changed its size since the capture was read. Start again.")
     fitted = camera.fitted(max_side) if max_side else camera
     shrink = next(n for n in (8, 4, 2, 1) if n == 1 or n * SPARE * fitted.width <= camera.width)
-    image, own_alpha = read_image(view.image_path, shrink)
+    image, own_alpha, white = _read_codes(view.image_path, shrink)
     alpha = own_alpha if view.has_alpha else None
     if view.mask_path is not None:
         alpha = read_alpha(view)
         if alpha.shape != (camera.height, camera.width):
             raise InputError(f"{view.mask_path}: the mask changed its size since the capture was read. Start again.")
     if lens is None and fitted is camera:
-        return LoadedView(image, alpha, camera)
+        return LoadedView(image, alpha, camera, white)
     height, width = image.shape[:2]
     if width < camera.width:
         shrink = camera.width // width
@@ -168,7 +238,7 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
             lens = replace(lens, fx=lens.fx / shrink, fy=lens.fy / shrink, cx=lens.cx / shrink, cy=lens.cy / shrink)
         alpha = alpha if alpha is None else cv2.resize(alpha, (width, height), interpolation=cv2.INTER_AREA)
 
-    linear = _decoding_table()[image]
+    linear = _decoding_table(np.iinfo(image.dtype).max, white)[image]
     if alpha is not None:
         weight = alpha.astype(np.float32) / 255
         premultiplied = np.empty((*weight.shape, 4), np.float32)
@@ -185,7 +255,22 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
         linear = linear[..., :3] / np.maximum(weight, 1e-6)[..., None]
         alpha = np.rint(np.clip(weight, 0, 1) * 255).astype(np.uint8)
         linear[alpha == 0] = 0
-    return LoadedView(_encode(linear), alpha, fitted)
+    return LoadedView(_encode(linear, white), alpha, fitted, white)
+
+
+def _is_raw(path: Path) -> bool:
+    return path.suffix.lower() in raw.SUFFIXES
+
+
+def _is_exr(path: Path) -> bool:
+    return path.suffix.lower() == ".exr"
+
+
+def _divisor(shrink: int, width: int, height: int) -> int:
+    """Halve `shrink`, a power of two, until it divides both sides."""
+    while width % shrink or height % shrink:
+        shrink //= 2
+    return shrink
 
 
 def _open(path: Path) -> Image.Image:
@@ -215,7 +300,7 @@ def _decode(picture: Image.Image, path: Path) -> Image.Image:
             values = np.asarray(picture, dtype=np.float64) / 257
             picture = Image.fromarray(np.rint(values).astype(np.uint8))
         elif picture.mode in ("I", "F"):
-            raise InputError(f"{path}: the image holds 32-bit numbers; save it as 8- or 16-bit PNG, sRGB-encoded.")
+            raise InputError(f"{path}: the image holds 32-bit numbers; save it as EXR, or as 16-bit PNG, sRGB-encoded.")
         return picture.convert("RGBA" if picture.has_transparency_data else "RGB")
     except InputError:
         raise
@@ -223,15 +308,49 @@ def _decode(picture: Image.Image, path: Path) -> Image.Image:
         raise InputError(f"{path}: the image is truncated or broken ({_reason(error)}). Replace it.") from error
 
 
+def _decode_16_bit(picture: Image.Image, path: Path) -> np.ndarray | None:
+    """Decode a PNG or TIFF with 16 bits a channel to RGB or RGBA uint16 (H, W, 3 | 4). Return None for other pictures.
+
+    Pillow keeps the upper 8 bits of colours, so OpenCV decodes them. It does not detect a truncated file, but Pillow does.
+    """
+    if picture.format not in ("PNG", "TIFF") or ";16" not in str(picture.tile) or "transparency" in picture.info:
+        return None
+    size = picture.size
+    _decode(picture, path)
+    pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype != np.uint16 or pixels.shape[1::-1] != size:
+        return None
+    channels = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
+    return cv2.cvtColor(pixels, channels[pixels.ndim if pixels.ndim == 2 else pixels.shape[2]])
+
+
 def _reason(error: Exception) -> str:
     return " ".join(str(error).split())[:120] or type(error).__name__
 
 
+def _as_bytes(codes: np.ndarray, white: int) -> np.ndarray:
+    return (
+        codes
+        if codes.dtype == np.uint8
+        else np.rint(np.minimum(codes.astype(np.float32) / white, 1) * 255).astype(np.uint8)
+    )
+
+
 @cache
-def _decoding_table() -> np.ndarray:
-    """Return a table from 8-bit sRGB values to linear radiance, float32 (256,)."""
-    return srgb_decode(np.arange(256) / 255).astype(np.float32)
+def _decoding_table(largest: int, white: int) -> np.ndarray:
+    """Return a table from the sRGB codes 0 to `largest` to linear radiance, float32. `white` is the code of 1."""
+    return srgb_decode(np.arange(largest + 1) / white).astype(np.float32)
 
 
-def _encode(linear: np.ndarray) -> np.ndarray:
-    return np.rint(srgb_encode(np.clip(linear, 0, 1)) * 255).astype(np.uint8)
+@cache
+def _encoding_table() -> np.ndarray:
+    """Return a table from 16-bit linear values to 16-bit sRGB codes, uint16 (65536,)."""
+    return _encode(np.arange(65536) / 65535, 65535)
+
+
+def _encode(linear: np.ndarray, white: int) -> np.ndarray:
+    """Encode linear radiance to sRGB codes: 8-bit if `white`, the code of 1, is 255, else 16-bit."""
+    if white == 255:
+        return np.rint(srgb_encode(np.clip(linear, 0, 1)) * 255).astype(np.uint8)
+    bounded = np.clip(linear, 0, 1000)  # which is beyond every code
+    return np.minimum(np.rint(srgb_encode(bounded) * white), 65535).astype(np.uint16)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from refgs.camera import Camera
-from refgs.capture.files import Masks, find_image, photo_view, report_missing
+from refgs.capture.files import IMAGE_SUFFIXES, Masks, find_image, photo_view, report_missing
 from refgs.capture.images import read_header
 from refgs.capture.lens import Lens
 from refgs.capture.poses import OPENGL_TO_OPENCV, world_to_camera
@@ -123,11 +123,10 @@ def camera_name(path: str) -> str:
     """Return the name of a frame's camera: the last part of its `file_path`, without an image suffix."""
     name = path.replace("\\", "/").rsplit("/", 1)[-1]
     stem, dot, suffix = name.rpartition(".")
-    return stem if dot and suffix.lower() in _IMAGE_SUFFIXES else name
+    return stem if dot and f".{suffix.lower()}" in IMAGE_SUFFIXES else name
 
 
 _NOT_PERSPECTIVE = {"OPENCV_FISHEYE", "FISHEYE", "FISHEYE624", "EQUIRECTANGULAR", "ORTHOPHOTO"}
-_IMAGE_SUFFIXES = {"png", "jpg", "jpeg", "heic", "heif", "hif", "tif", "tiff", "webp", "bmp", "exr"}
 
 
 def _focal(frame: Frame, focal: str, angle: str, size: float) -> float | None:

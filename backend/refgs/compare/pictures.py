@@ -16,9 +16,9 @@ from refgs.render.renderer import Rendering
 def composite(view: LoadedView, background: Tensor) -> Tensor:
     """Composite a photo over a background colour (3,). Return sRGB-encoded floats (H, W, 3) in 0..1.
 
-    A photo without alpha is returned unchanged.
+    What is brighter than white is clipped. A photo without alpha is not changed otherwise.
     """
-    image = torch.from_numpy(view.image).to(background.device).float() / 255
+    image = torch.from_numpy(view.encoded).to(background.device).clamp_max(1)
     if view.alpha is None:
         return image
     alpha = torch.from_numpy(view.alpha).to(background.device).float()[..., None] / 255

@@ -36,6 +36,28 @@ def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
             raise OSError(code, os.strerror(code), str(path)) from None
 
 
+def read_exr_header(path: str | os.PathLike) -> tuple[int, int, bool]:
+    """Read the width, the height, and whether there is alpha, of the part that `read_exr` reads. No pixels are decoded.
+
+    Raises InputError if the file is missing or broken, or if it holds less or more than the whole picture.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path} is missing")
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            headers = [part.header for part in file.parts]
+            names = [{channel.name for channel in header["channels"]} for header in headers]
+            part = next((i for i, found in enumerate(names) if set("RGB") <= found), 0)
+            data, display = (np.array(headers[part][name]) for name in ("dataWindow", "displayWindow"))
+    except Exception:
+        raise _broken(path) from None
+    if not np.array_equal(data, display):
+        raise InputError(f"{path} holds a part of the picture: save it without a crop or overscan")
+    width, height = (data[1] - data[0] + 1).tolist()
+    return width, height, "A" in names[part]
+
+
 def read_exr(path: str | os.PathLike) -> np.ndarray:
     """Read an EXR file as float32: (H, W, 4) for RGBA, (H, W, 3) for RGB, or (H, W) for a single channel.
 
@@ -51,7 +73,7 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
             part = next((part for part in parts if {"R", "G", "B"} <= part.keys()), parts[0])
             channels = {name: channel.pixels for name, channel in part.items()}
     except Exception:  # the binding raises RuntimeError, ValueError or its own errors
-        raise InputError(f"{path} is not a whole OpenEXR file: write or copy it again") from None
+        raise _broken(path) from None
     if {"R", "G", "B"} <= channels.keys():
         names = [name for name in "RGBA" if name in channels]
         return np.stack([channels[name] for name in names], axis=-1).astype(np.float32)
@@ -60,3 +82,7 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
     raise InputError(
         f"{path} has the channels {', '.join(sorted(channels))}: save it as plain RGB, RGBA or one channel"
     )
+
+
+def _broken(path: Path) -> InputError:
+    return InputError(f"{path} is not a whole OpenEXR file: write or copy it again")

@@ -1,6 +1,6 @@
 // The loss of a view except D-SSIM, and its derivatives by the rendered maps, in two passes over the pixels.
 //
-// Colour: |C - C_gt|, with C clipped only where the photo is saturated.
+// Colour: |C - C_gt|, with C clipped to C_gt only where the photo is clipped: there C_gt is a lower bound.
 // Normals: 1 - N.n, N being the normal of the depth map and n the blended normal.
 // Smoothness: |grad n| exp(-|grad C_gt|); with the `even` weights also of metallic and roughness.
 // Mask: |alpha - mask|.
@@ -15,8 +15,10 @@ namespace {
 struct Losses {
   int64_t width, height;
   const float *color, *normal, *depth, *alpha, *material;  // (H, W, 3), (H, W, 3), (H, W) blended sum of depths, (H, W), (H, W, 5) or null
-  const uint8_t *image, *mask;                             // (H, W, 3), (H, W) or null: 8-bit as on disk, 255 is 1
+  const uint8_t *image, *mask;                             // (H, W, 3) or null, (H, W) or null: 8-bit codes, of which 255 is 1
+  const uint16_t* fine;                                    // (H, W, 3) or null: 16-bit codes instead of `image`
   const float* background;                                 // (3)
+  float white, largest;                                    // codes: of 1; of a clipped pixel
   float rotation[9], across, down, left, top;              // world to camera; at depth 1: a pixel's size, the first pixel's position
   float color_weight, normal_weight, smooth_x_weight, smooth_y_weight, even_x_weight, even_y_weight, alpha_weight, metallic_weight, dark_weight, matte_weight;
   float *photo, *clipped;   // (H, W, 3) the photo over the background; the clipped C, for D-SSIM
@@ -33,7 +35,6 @@ struct Losses {
 };
 
 enum { LOSS, SURFACES, SQUARES, SUMS };  // sum of weighted terms; number of pixels with a surface; sum of squared errors
-constexpr float SATURATED = 0.998f;  // photo values above this are saturated: the true radiance is unknown
 constexpr float SOLID = 0.5f, COVERED = 1 / 255.0f;  // least alpha of an opaque pixel, and of one that is not background
 constexpr int MATERIAL = 5, METAL = 3, ROUGH = 4;    // channels of a material; the index of metallic, and of roughness
 constexpr float FLAT = 0.01f;                        // Huber threshold: smaller differences of metallic or roughness cost quadratically
@@ -107,17 +108,20 @@ struct Row {
 // Compose the photo over the background, and compute the colour and mask terms.
 INLINE void pixel_terms(const Row& r, Sum (&sums)[SUMS]) {
   const Losses& l = r.l;
-  Vector opaque = Vector() + 1.0f, photo[3], color[3], loss = {}, squares = {};
+  Vector opaque = Vector() + 1.0f, code[3], photo[3], color[3], loss = {}, squares = {};
   if (l.mask) opaque = r.at.get(l.mask + r.y * l.width, 1) / 255.0f;
   for (int c = 0; c < 3; c++) {
-    photo[c] = r.at.get(l.image + r.y * l.width * 3 + c, 3) / 255.0f * opaque + (1.0f - opaque) * l.background[c];
+    int64_t first = r.y * l.width * 3 + c;
+    code[c] = l.fine ? r.at.get(l.fine + first, 3) : r.at.get(l.image + first, 3);
+    photo[c] = code[c] / l.white * opaque + (1.0f - opaque) * l.background[c];
     color[c] = r.at.get(r.of(l.color, 3) + c, 3);
   }
   Vector alpha = r.get(l.alpha), by_alpha = {};
   for (int c = 0; c < 3; c++) {
-    Vector seen = clamp(color[c], 0, 1) - photo[c];
-    Mask open = (photo[c] < SATURATED) | (color[c] <= 1.0f);
-    Vector clipped = select(open, color[c], Vector() + 1.0f), error = clipped - photo[c];
+    Vector seen = clamp(color[c], 0, 1) - clamp(photo[c], 0, 1);
+    // A clipped pixel is no bound where it is mostly background.
+    Mask open = (code[c] < l.largest) | (opaque < SOLID) | (color[c] <= photo[c]);
+    Vector clipped = select(open, color[c], photo[c]), error = clipped - photo[c];
     squares += seen * seen;
     loss += l.color_weight * magnitude(error);
     r.at.put(r.of(l.photo, 3) + c, 3, photo[c]);

@@ -63,7 +63,7 @@ def _observations(views: list[LoadedView], positions: np.ndarray, normals: np.nd
     for number, view in enumerate(views):
         camera = view.camera.fitted(SIDE)
         shown = cv2.resize(view.image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        radiance = srgb_decode(shown.astype(np.float32) / 255).mean(axis=-1)
+        radiance = srgb_decode(shown.astype(np.float32) / view.white).mean(axis=-1)
         ahead, behind = _visibility(camera.fitted(coarse), positions, some)
         towards = camera.position - positions[some]
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)

@@ -22,7 +22,9 @@ SUMS = 3  # of a row or a block: of the loss, of the pixels with a surface, of s
 
 
 class Photo(NamedTuple):
-    """Hold a view's photo on the training's device: `image` (H, W, 3) uint8, sRGB-encoded, and `mask` (H, W) uint8 or None.
+    """Hold a view's photo on the training's device: `image` (H, W, 3), sRGB codes, and `mask` (H, W) uint8 or None.
+
+    `image` has the dtype uint8 or uint16, and `white` is the code of 1. The dtype's largest code means that or brighter.
 
     The photo may be a crop of a photo of the size `whole` (H, W). Beyond the crop, the whole photo is background.
     """
@@ -31,25 +33,36 @@ class Photo(NamedTuple):
     mask: Tensor | None
     camera: Camera
     whole: tuple[int, int] | None = None
+    white: int = 255
 
     @classmethod
     def of(cls, view: LoadedView, device: torch.device | str = "cpu") -> "Photo":
         mask = None if view.alpha is None else torch.from_numpy(view.alpha).to(device)
-        return cls(torch.from_numpy(view.image).to(device), mask, view.camera)
+        return cls(torch.from_numpy(view.image).to(device), mask, view.camera, white=view.white)
 
     def part(self, rows: slice, columns: slice) -> "Photo":
         """Return this photo cropped to ranges of rows and columns."""
         image = self.image[rows, columns].contiguous()
         mask = None if self.mask is None else self.mask[rows, columns].contiguous()
         camera = self.camera.cropped(columns.start, rows.start, image.shape[1], image.shape[0])
-        return Photo(image, mask, camera, self.whole or self.image.shape[:2])
+        return Photo(image, mask, camera, self.whole or self.image.shape[:2], self.white)
+
+    @property
+    def encoded(self) -> Tensor:
+        """Return the sRGB-encoded photo as float32 (H, W, 3): 1 is white, and an EXR may be brighter."""
+        return self.image.float() / self.white
+
+    @property
+    def clipped(self) -> Tensor:
+        """Return where each channel (H, W, 3) is clipped, or nearly so: JPEG does not keep the largest code exactly."""
+        return self.image.float() >= torch.iinfo(self.image.dtype).max // 255 * 254
 
 
 class Objective(NamedTuple):
     """Hold the training loss of one view, and the mean squared error of its picture.
 
-    `loss` is a differentiable scalar. `square` is the mean squared error, of the picture clipped to 0..1. If the photo is a crop, both are
-    averaged over the whole photo, as if pixels outside the crop had no error.
+    `loss` is a differentiable scalar. `square` is the mean squared error, of the picture and the photo clipped to 0..1. If the photo is a
+    crop, both are averaged over the whole photo, as if pixels outside the crop had no error.
     """
 
     loss: Tensor
@@ -79,12 +92,14 @@ class _Objective(torch.autograd.Function):
         check(**{name: (value, shapes[name]) for name, value in inputs.items()})
         inputs = {name: value.contiguous() for name, value in inputs.items()}
         color = inputs["color"]
-        codes = {"image": photo.image} | ({} if photo.mask is None else {"mask": photo.mask})
-        for value in codes.values():
-            if value.shape[:2] != alpha.shape or value.dtype != torch.uint8 or value.device != color.device:
+        codes = {"fine" if photo.image.dtype == torch.uint16 else "image": photo.image}
+        codes |= {} if photo.mask is None else {"mask": photo.mask}
+        for name, value in codes.items():
+            kept = value.dtype == (torch.uint16 if name == "fine" else torch.uint8)
+            if value.shape[:2] != alpha.shape or not kept or value.device != color.device:
                 raise ValueError(
                     f"{camera.name}: the photo and its mask must be uint8 on {color.device}, of the rendering's size, "
-                    f"{width}×{height}; got {value.dtype} {tuple(value.shape)} on {value.device}"
+                    f"{width}×{height} (the photo also uint16); got {value.dtype} {tuple(value.shape)} on {value.device}"
                 )
         gradients = {name: torch.empty_like(value) for name, value in inputs.items() if name != "background"}
         buffers = {"photo": torch.empty_like(color), "clipped": torch.empty_like(color)}
@@ -92,7 +107,7 @@ class _Objective(torch.autograd.Function):
         blocks = -(-width // TILE[0]) * -(-height // TILE[1])
         sums = color.new_empty(2, blocks if load.on_gpu(color) else height, SUMS, dtype=torch.float64)
 
-        work = _Work(width=width, height=height)
+        work = _Work(width=width, height=height, white=photo.white, largest=torch.iinfo(photo.image.dtype).max)
         work.rotation[:] = camera.world_to_camera[:3, :3].reshape(-1).tolist()
         work.across, work.left = 1 / camera.fx, (0.5 - camera.cx) / camera.fx
         work.down, work.top = 1 / camera.fy, (0.5 - camera.cy) / camera.fy
@@ -160,8 +175,9 @@ def objective(
 
     The loss is the sum of these terms, each with a weight in `weights`:
 
-    - Colour: (1 − λ) L1 + λ D-SSIM of sRGB pictures. The photo is composited over `background`. The rendering is clipped only where the
-      photo is clipped, so that other pixels that are too bright still have a gradient.
+    - Colour: (1 − λ) L1 + λ D-SSIM of sRGB pictures. The photo is composited over `background`. Where a channel of the photo is clipped
+      and the mask is at least one half, the photo is a lower bound: a brighter rendering has neither loss nor gradient. Elsewhere the
+      rendering is not clipped, so that pixels that are too bright have a gradient.
     - Normals: 1 − ÑᵀN where the surface is opaque around the pixel. N is the rendered normal. Ñ is the normal of the depth map, by central
       differences.
     - Smoothness: ‖∇N‖ exp(−‖∇C‖) where the surface is opaque. C is the photo's colour, and ∇ takes forward differences. Metallic and

@@ -45,8 +45,11 @@ def picture(state: State, view: int, inputs: RenderInputs, whole: bool = False) 
 
 
 def squared_error(color: Tensor, photo: Photo, background: Tensor) -> float:
-    """Compute the mean squared error of an encoded picture (H, W, 3) against a photo that is composited over the background."""
-    image = photo.image.float() / 255
+    """Compute the mean squared error of an encoded picture (H, W, 3) against a photo that is composited over the background.
+
+    Both are clipped to 0..1.
+    """
+    image = photo.encoded.clamp_max(1)
     if photo.mask is not None:
         opaque = photo.mask.float()[..., None] / 255
         image = image * opaque + background * (1 - opaque)

@@ -25,7 +25,6 @@ OVERSHOOT = 1.5  # of the later steps: surfels share pixels, so that plain steps
 FACING = 0.4  # least cosine between a surfel's normal and the camera; nearer to grazing even matte surfaces change, by Fresnel
 LEAST_PIXELS = 0.5  # of a surfel in a photo; a smaller part of it tells more of its neighbours
 LEAST_VIEWS = 6  # of a surfel
-CLIPPED = 254  # of 255: codes from which a channel may have been brighter
 LEAST_CLIPPED = 0.05  # of a surfel's pixels in a photo; then its highlights look whiter than they are
 DARK = 0.03  # linear radiance below which a surfel does not count for a photo's exposure
 NEIGHBOURS = 64  # surfels whose changes are pooled, as one alone has too few photos
@@ -68,7 +67,7 @@ def observe(state: State) -> Observations:
     surfels = Surfels(*(value.detach() for value in state.surfels()))
     photos = [state.photo(view) for view in probe.spread_views(state, VIEWS)]
     targets = [_linear(photo) for photo in photos]
-    clipped = [(photo.image >= CLIPPED).any(dim=-1, keepdim=True).float() for photo in photos]
+    clipped = [photo.clipped.any(dim=-1, keepdim=True).float() for photo in photos]
     normals = surfels.normals()
     cosines = torch.stack([facing_cosine(surfels.positions, normals, photo.camera) for photo in photos], dim=1)
     light = None
@@ -92,7 +91,7 @@ def observe(state: State) -> Observations:
 
 def _linear(photo: Photo) -> Tensor:
     """Return a photo's linear radiance (H, W, 3) over black."""
-    image = srgb_decode(photo.image.float() / 255)
+    image = srgb_decode(photo.encoded)
     return image if photo.mask is None else image * (photo.mask.float() / 255)[..., None]
 
 

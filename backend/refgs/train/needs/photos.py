@@ -113,5 +113,5 @@ def motion(one: LoadedView, other: LoadedView, radius: float) -> float:
 
 
 def _agreement(one: LoadedView, other: LoadedView) -> float:
-    """Compute the PSNR in dB between two photos of the same size."""
-    return psnr(one.image / np.float32(255), other.image / np.float32(255))
+    """Compute the PSNR in dB between two photos of the same size, clipped to white."""
+    return psnr(*(np.minimum(view.encoded, 1) for view in (one, other)))
