@@ -507,4 +507,16 @@ def test_a_capture_of_photos_with_more_than_8_bits(tmp_path, suffix):
     assert {view.camera.name for view in capture.views} == {f"{i:04d}" for i in range(8)}
     facts = check(capture, tmp_path / "out")
     assert all(Image.open(path).mode == "RGB" for path in facts["thumbnails"])
-    assert not [line for line in facts["lines"] if "greyscale" in line or "clipped" in line]
+    assert not [line for line in facts["lines"] if any(word in line for word in ("greyscale", "clipped", "EXR"))]
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1e-4, "almost black"), (1e3, "almost white")])
+def test_exr_photos_in_another_unit(tmp_path, factor, said):
+    folder = nerfstudio(tmp_path / "capture", 8)
+    for path in sorted((folder / "images").iterdir()):
+        write_exr(path.with_suffix(".exr"), factor * (0.1 + srgb_decode(read_image(path)[0] / 255)))
+        path.unlink()
+    text = (folder / "transforms.json").read_text().replace(".png", ".exr")
+    (folder / "transforms.json").write_text(text)
+    (line,) = (line for line in check(read_capture(folder), tmp_path / "out")["lines"] if "EXR" in line)
+    assert said in line and "factor" in line

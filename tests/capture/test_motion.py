@@ -20,8 +20,10 @@ from refgs.capture.motion import (
     pairs,
 )
 from refgs.capture.poses import OPENGL_TO_OPENCV
+from refgs.color import srgb_decode
 from refgs.errors import InputError, NoCameras
 from tests.makers.captures import look_at, write, write_as_phone
+from tests.makers.dng import write_dng
 
 WIDTH, HEIGHT, FOCAL = 256, 192, 280.0
 POSES = [
@@ -162,13 +164,16 @@ def test_photos_of_two_sessions(tmp_path, pictures):
 
 
 def test_photos_of_a_phone(tmp_path, pictures):
-    """Check photos in HEIC and photos held sideways.
+    """Check photos in HEIC and RAW, and photos held sideways.
 
     They get upright cameras under their own names. COLMAP starts with the focal length in EXIF, and nothing is left behind.
     """
     for number, picture in enumerate(pictures):
-        film, suffix = round(FOCAL / np.hypot(WIDTH, HEIGHT) * np.hypot(36, 24)), (".HEIC", ".png")[number % 2]
-        write_as_phone(tmp_path / f"IMG {number}{suffix}", picture, number % 4, film)
+        film, suffix = round(FOCAL / np.hypot(WIDTH, HEIGHT) * np.hypot(36, 24)), (".HEIC", ".png", ".dng")[number % 3]
+        if suffix == ".dng":
+            write_dng(tmp_path / f"IMG {number}.dng", srgb_decode(picture / 255), turns=number % 4, film=film)
+        else:
+            write_as_phone(tmp_path / f"IMG {number}{suffix}", picture, number % 4, film)
     photos = {path.name for path in tmp_path.iterdir()}
 
     def interrupt(event: str, facts: dict) -> None:
@@ -203,7 +208,7 @@ def test_photos_of_a_phone(tmp_path, pictures):
         x, y, depth = loaded.camera.projection @ np.column_stack([capture.points, np.ones(len(capture.points))]).T
         u, v = (x / depth).astype(int), (y / depth).astype(int)
         inside = (depth > 0) & (u >= 0) & (u < WIDTH) & (v >= 0) & (v < HEIGHT)
-        seen = loaded.image[v[inside], u[inside]] / 255
+        seen = loaded.encoded[v[inside], u[inside]]
         assert np.median(np.abs(seen - capture.point_colors[inside])) < 0.1
 
 

@@ -17,6 +17,7 @@ from refgs.paths import whole
 
 THUMBNAILS, THUMBNAIL_SIDE = 12, 128  # maximum number; pixels
 BLURRED = 0.4  # part of the capture's median sharpness. Sharp photos reach at least 0.6; blurred by 2 pixels of 512, at most 0.2
+BLACK, WHITE = 8, 235  # of 255: brightness of photos whose radiance has another unit, at the most and on the average
 
 LAYOUTS = {
     "nerf-blender": "NeRF-Blender",
@@ -69,8 +70,9 @@ def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
 class _Statistics:
     """Statistics of one photo. If it has a mask, only pixels inside the mask are measured.
 
-    `coverage` is the fraction of pixels inside the mask, None without a mask. `clipped` is the fraction of white pixels. `brightness` is
-    the mean 8-bit value. `grey` is True if the photo has no colour. `sharpness` comes from `_sharpness`.
+    `coverage` is the fraction of pixels inside the mask, None without a mask. `clipped` is the fraction of clipped pixels. `brightness` is
+    the mean 8-bit value, and `brightest` the value that 99 % do not exceed. `grey` is True if the photo has no colour. `sharpness` comes
+    from `_sharpness`.
     """
 
     def __init__(self, loaded: LoadedView):
@@ -79,7 +81,7 @@ class _Statistics:
         pixels = shown[inside] if inside.any() else np.zeros((1, 3), np.uint8)
         self.coverage = None if loaded.alpha is None else float(inside.mean())
         self.clipped = float(loaded.clipped.any(axis=2)[inside].mean()) if inside.any() else 0.0
-        self.brightness = float(pixels.mean())
+        self.brightness, self.brightest = float(pixels.mean()), float(np.percentile(pixels, 99))
         self.grey = bool((pixels.max(axis=1) == pixels.min(axis=1)).all())
         self.sharpness = _sharpness(shown, inside)
 
@@ -203,6 +205,11 @@ def _warnings(capture: Capture, statistics: list[_Statistics]) -> list[str]:
         brightest = max(pairs, key=lambda pair: pair[1].brightness)[0].image_path.name
         what = f"exposure varies: {brightest} is more than twice as bright as most"
         warnings.append(f"{what}: the training allows for it, but photos with the exposure locked are better")
+    linear = [s for view, s in pairs if view.image_path.suffix.lower() == ".exr" and s.coverage != 0]
+    black = bool(linear) and np.median([s.brightest for s in linear]) < BLACK
+    if black or (linear and np.median([s.brightness for s in linear]) > WHITE):
+        what = f"EXR photos are almost {'black' if black else 'white'}"
+        warnings.append(f"{what}: multiply all of them by the same factor, so that a white surface is about 1")
     if not capture.masked and capture.bounded:
         what = "no masks: the surroundings will be reconstructed with the object"
         warnings.append(f"{what}; an alpha channel, or a folder masks with files of the photos' names, leaves them out")
