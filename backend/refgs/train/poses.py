@@ -51,7 +51,7 @@ def refine_due(state: State, view: int, rendering: Rendering, photo: Photo, prog
 
 def composited(photo: Photo, background: Tensor) -> Tensor:
     """Composite a photo over a background colour (3,). Returns sRGB-encoded floats (H, W, 3)."""
-    image = photo.image.float() / 255
+    image = photo.encoded.clamp_max(1)
     if photo.mask is None:
         return image
     return torch.lerp(background.expand_as(image), image, photo.mask.float()[..., None] / 255)
