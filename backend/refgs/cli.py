@@ -47,6 +47,20 @@ def poses(photos: Annotated[Path, typer.Argument(help="folder with photos, in it
 
 
 @app.command()
+def masks(
+    capture: Annotated[Path, typer.Argument(help="folder with photos and cameras")],
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="region.key=value, a box about the object, e.g. region.size=[1,1,2]"),
+    ] = None,
+) -> None:
+    """Make masks of the photos and write them to CAPTURE/masks. Strokes in CAPTURE/strokes correct them; your own masks are kept."""
+    from refgs import commands
+
+    commands.masks(capture, changes or [])
+
+
+@app.command()
 def train(
     capture: Annotated[Path, typer.Argument(help="folder with photos and cameras")],
     out: Annotated[Path, typer.Option(help="run folder to create")],

@@ -18,10 +18,12 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from refgs import __version__, train_job
 from refgs.capture import read_capture
 from refgs.capture.check import check, describe
+from refgs.capture.masks import make_masks
 from refgs.capture.motion import find_cameras
 from refgs.errors import InputError, NoCameras
 from refgs.export.export_job import export as export_run
 from refgs.kernels import cuda
+from refgs.settings import load_settings
 from refgs.train.live_view import write_preview
 from refgs.train.state import State
 
@@ -41,6 +43,12 @@ class Check(_Command):
 class Poses(_Command):
     command: Literal["poses"]
     capture: str
+
+
+class Masks(_Command):
+    command: Literal["masks"]
+    capture: str
+    settings: list[str] = []
 
 
 class Train(_Command):
@@ -80,12 +88,14 @@ class Keep(_Command):
     on: bool
 
 
-COMMANDS = TypeAdapter(Annotated[Check | Poses | Train | Export | During | Keep, Field(discriminator="command")])
+COMMANDS = TypeAdapter(
+    Annotated[Check | Poses | Masks | Train | Export | During | Keep, Field(discriminator="command")]
+)
 CLOSED = None  # queued in place of a command: the input has ended
 
 
 class Worker:
-    """Run jobs (check, poses, train, export) one after another, as commands ask for them.
+    """Run jobs (check, poses, masks, train, export) one after another, as commands ask for them.
 
     Each job sends the event `started`, and at its end `done`, `cancelled` or `failed`.
     """
@@ -149,7 +159,7 @@ class Worker:
         why = cuda.unusable()
         card = torch.cuda.get_device_name() if why is None else None
         self.send("ready", {"protocol": PROTOCOL, "refgs": __version__, "card": card, "no_card": why})
-        jobs_of = {Check: self._check, Poses: self._poses, Train: self._train, Export: self._export}
+        jobs_of = {Check: self._check, Poses: self._poses, Masks: self._masks, Train: self._train, Export: self._export}
         while self._open or (self._keep and self._waiting):
             if self._waiting and self._closed and not self._keep:
                 break  # the input has ended: drop the jobs that came during the training
@@ -183,6 +193,10 @@ class Worker:
 
     def _poses(self, command: Poses) -> tuple[str, dict]:
         return "done", find_cameras(Path(command.capture), self.send)
+
+    def _masks(self, command: Masks) -> tuple[str, dict]:
+        region = load_settings("standard", command.settings).region
+        return "done", make_masks(Path(command.capture), region, self.send)
 
     def _train(self, command: Train) -> tuple[str, dict]:
         out = Path(command.out)

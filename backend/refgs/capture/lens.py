@@ -66,6 +66,21 @@ class Lens:
         """
         return _maps(self, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
+    def maps_back(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Return the maps that `cv2.remap` needs to distort a picture of the pinhole `camera`: columns and rows, each (H, W) float32.
+
+        They say, for each pixel of the distorted photo, where it lies in the undistorted one.
+        """
+        x_seen = ((np.arange(camera.width) + 0.5 - self.cx) / self.fx)[None, :]
+        y_seen = ((np.arange(camera.height) + 0.5 - self.cy) / self.fy)[:, None]
+        x, y = np.broadcast_arrays(x_seen, y_seen)
+        for _ in range(10):  # fixed point: converges, because photos are only read through lenses that do not fold
+            x_now, y_now = self.distort(x, y)
+            x, y = x + x_seen - x_now, y + y_seen - y_now
+        return (camera.fx * x + camera.cx - 0.5).astype(np.float32), (camera.fy * y + camera.cy - 0.5).astype(
+            np.float32
+        )
+
 
 @lru_cache(maxsize=64)
 def _focal_factor(lens: Lens, width: int, height: int) -> float | None:

@@ -1,0 +1,245 @@
+"""Make masks for a capture that has cameras but no masks, and remake them when an artist's strokes change.
+
+Strokes are pictures CAPTURE/strokes/NAME.png with transparency, drawn on the upright photo: white is the object, black is not, and
+transparent says nothing. Masks that the program made are known by their hashes in masks/made.json. All other masks are the artist's: they are kept, and
+are evidence for the other photos.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from refgs.capture import View, load_view, read_capture
+from refgs.capture.box import Box
+from refgs.capture.colmap import find_model
+from refgs.capture.images import read_image
+from refgs.capture.region import find_region, up_direction
+from refgs.capture.silhouettes import Photo, carve_object, cut_out, find_floor
+from refgs.capture.types import Capture
+from refgs.errors import InputError
+from refgs.paths import write_text
+from refgs.settings import RegionSettings
+
+SIDE, FINE = 256, 400  # pixels on the longer side: for carving, for the edges
+CARVED_BY = 40  # photos at most
+MADE = "made.json"
+
+
+def make_masks(
+    folder: Path, wanted: RegionSettings | None, report: Callable[[str, dict[str, Any]], None]
+) -> dict[str, Any]:
+    """Make the masks of a capture's photos, and write them to its folder `masks`.
+
+    `wanted` may set a box about the object, as for `read_capture`. Without one, the object is guessed (`guess_box`). Returns a dict:
+    `photos`, `made` and `kept` are numbers of masks, `objects` is the number of separate objects, and `region` is the box about them, as
+    settings for training. They are in the frame of the capture as it was before. `report(event, facts)` is called with "progress" and
+    "warning".
+
+    All masks are written together at the end; an interrupted call leaves those of before. Raises InputError if all photos have masks by the
+    artist, if strokes do not fit, or if nothing is found.
+    """
+    folder = Path(folder)
+    capture = read_capture(folder, wanted)
+    root = _root(capture)
+    made = _hashes(root)
+    views = [replace(v, mask_path=None) if v.mask_path and _hash(v.mask_path) in made else v for v in capture.views]
+    if all(view.masked for view in views):
+        raise InputError(f"{folder}: every photo has a mask that was not made here. Remove those that you want made.")
+    targets = _targets(root, views)
+    box, fill, floor = (capture.box, 0.9, _floor(capture)) if capture.box else guess_box(capture, views)
+    chosen = _choose(views, root)
+    photos = []
+    for view in chosen:
+        photos.append(_load(view, root, SIDE))
+        report("progress", {"stage": "reading", "done": len(photos), "total": len(chosen)})
+
+    def carving(done: int, total: int) -> None:
+        report("progress", {"stage": "carving", "done": done, "total": total})
+
+    shape = carve_object(photos, box, fill, floor, carving)
+    if shape is None:
+        raise InputError(
+            f"{folder}: no object was found. Set a box about it (region.size), or draw strokes on some photos."
+        )
+    if shape.objects > 1:
+        report("warning", {"what": f"{shape.objects} separate objects are in the box: all of them are in the masks"})
+    work = root / "masks.tmp"
+    shutil.rmtree(work, ignore_errors=True)
+    try:
+        files = {}
+        for view, target in targets.items():
+            mask = _to_photo(view, cut_out(_load(view, root, FINE), shape))
+            path = work / target.relative_to(root)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(mask).save(path)
+            files[path] = target
+            report("progress", {"stage": "edges", "done": len(files), "total": len(targets)})
+        _put(files, root, made)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return {
+        "photos": len(views),
+        "made": len(targets),
+        "kept": len(views) - len(targets),
+        "objects": shape.objects,
+        "region": region_settings(shape.bounds()),
+    }
+
+
+def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, tuple[np.ndarray, float] | None]:
+    """Guess a box about the object: a cube about where the cameras look, above the plane that the object stands on.
+
+    Return the box, the part of it that the object is likely to fill, and the plane of `find_floor`. `views` are the capture's, without
+    masks that should not count.
+    """
+    found = find_region(views, up_direction(views), capture.points, [])
+    matrix = np.eye(4)
+    matrix[:3, :3] *= 1.25 * found.radius
+    matrix[:3, 3] = found.centre
+    return Box(matrix), 0.8, _floor(capture, found.centre, found.radius)
+
+
+def region_settings(box: Box) -> list[str]:
+    """Return a box whose edges are parallel to the axes as settings of a training: region.centre and region.size."""
+    size = 2 * np.linalg.norm(box.matrix[:3, :3], axis=0)
+    return [
+        f"region.{key}={[round(float(x), 4) for x in values]}"
+        for key, values in (("centre", box.centre), ("size", size))
+    ]
+
+
+def _floor(capture: Capture, centre: np.ndarray | None = None, radius: float | None = None):
+    if capture.points is None:
+        return None
+    centre, radius = (capture.box.centre, capture.box.radius / 3**0.5) if centre is None else (centre, radius)
+    return find_floor(capture.points, centre, radius, up_direction(capture.views))
+
+
+def _root(capture: Capture) -> Path:
+    """Return the folder in which `masks` lies."""
+    if capture.layout == "nerf-blender":
+        raise InputError(
+            f"{capture.folder}: the masks of a NeRF-Blender capture are its photos' alpha channels. Cut them out there."
+        )
+    if capture.layout != "colmap":
+        return capture.folder
+    photos = find_model(capture.folder)[0]
+    return photos if (photos / "sparse").is_dir() else photos.parent
+
+
+def _inner(view: View, root: Path) -> Path:
+    """Return a photo's path in the folder of photos, which is also that of its mask in `masks`."""
+    if not view.image_path.is_relative_to(root):
+        raise InputError(f"{view.image_path}: the photo is not in the capture's folder {root}. Move it there.")
+    path = view.image_path.relative_to(root)
+    return Path(*path.parts[1:]) if len(path.parts) > 1 else path
+
+
+def _targets(root: Path, views: list[View]) -> dict[View, Path]:
+    """Return the mask file of each photo that has none yet. Photos that differ only in their suffix keep it, as in 1.jpg.png."""
+    names = [_inner(view, root) for view in views]
+    stems = Counter(name.with_suffix("") for name in names)
+    files = (
+        name.with_suffix(".png") if stems[name.with_suffix("")] == 1 else name.with_name(name.name + ".png")
+        for name in names
+    )
+    return {view: root / "masks" / file for view, file in zip(views, files, strict=True) if not view.masked}
+
+
+def _hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _hashes(root: Path) -> set[str]:
+    try:
+        return set(json.loads((root / "masks" / MADE).read_text(encoding="utf-8")))
+    except (OSError, ValueError):  # without it, every mask is the artist's
+        return set()
+
+
+def _choose(views: list[View], root: Path) -> list[View]:
+    """Choose the photos to carve by: evenly, and all that the artist said something about."""
+    every = max(1, -(-len(views) // CARVED_BY))
+    return [view for i, view in enumerate(views) if i % every == 0 or view.masked or _stroke_file(view, root)]
+
+
+def _stroke_file(view: View, root: Path) -> Path | None:
+    name = _inner(view, root)
+    files = (root / "strokes" / name.with_suffix(".png"), root / "strokes" / name.with_name(name.name + ".png"))
+    return next((file for file in files if file.is_file()), None)
+
+
+def _load(view: View, root: Path, side: int) -> Photo:
+    """Load a photo, undistorted and reduced, with what the artist's mask or strokes say about its pixels."""
+    loaded = load_view(view, side)
+    known = np.zeros(loaded.image.shape[:2], np.int8)
+    if loaded.alpha is not None:
+        known = np.where(loaded.alpha > 127, np.int8(1), np.int8(-1))
+    elif (file := _stroke_file(view, root)) is not None:
+        known = _read_strokes(file, view, loaded.camera)
+    return Photo(loaded.image, loaded.camera, known)
+
+
+def _read_strokes(file: Path, view: View, camera) -> np.ndarray:
+    """Read an artist's strokes as int8 (H, W), on the undistorted photo of the size of `camera`: 1 object, −1 not, 0 nothing."""
+    color, alpha = read_image(file)
+    height, width = color.shape[:2]
+    if abs(width / height * view.camera.height / view.camera.width - 1) > 0.02:
+        raise InputError(
+            f"{file}: the strokes have {width}×{height} pixels, which is not the shape of the photo "
+            f"({view.camera.width}×{view.camera.height}). Draw them on the photo."
+        )
+    if alpha is None:
+        raise InputError(
+            f"{file}: the strokes have no transparency. Save them with it: transparent where nothing is said."
+        )
+    sides = [((color.mean(axis=2) > 127) == white) & (alpha > 127) for white in (True, False)]
+    drawn = []
+    for side in sides:
+        part = cv2.resize(side.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        if view.lens is not None:
+            x, y = camera.width / view.camera.width, camera.height / view.camera.height
+            lens = replace(
+                view.lens, fx=view.lens.fx * x, fy=view.lens.fy * y, cx=view.lens.cx * x, cy=view.lens.cy * y
+            )
+            part = cv2.remap(part, *lens.maps(camera), cv2.INTER_LINEAR)
+        drawn.append(part)
+    ours, theirs = drawn
+    return np.where(np.maximum(ours, theirs) < 0.3, 0, np.where(ours >= theirs, 1, -1)).astype(np.int8)
+
+
+def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
+    """Bring a mask of the undistorted, reduced photo to the photo as it is: upright, distorted, at full size."""
+    width, height = view.camera.width, view.camera.height
+    # A step at a reduced pixel becomes a smooth edge, cut in its middle and soft over a pixel.
+    smooth = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)
+    if view.lens is None:
+        large = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_CUBIC)
+    else:
+        x, y = view.lens.maps_back(view.camera)
+        sx, sy = mask.shape[1] / width, mask.shape[0] / height
+        columns, rows = ((x + 0.5) * sx - 0.5).astype(np.float32), ((y + 0.5) * sy - 0.5).astype(np.float32)
+        large = cv2.remap(smooth, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    sharpness = max(1.0, max(width, height) / max(mask.shape))
+    return np.rint(np.clip((large - 127.5) * sharpness + 127.5, 0, 255)).astype(np.uint8)
+
+
+def _put(files: dict[Path, Path], root: Path, before: set[str]) -> None:
+    """Move the new masks to their places, and note their hashes. They are noted first, so that no mask is ever taken for the artist's."""
+    (root / "masks").mkdir(exist_ok=True)
+    now = {_hash(path) for path in files}
+    write_text(root / "masks" / MADE, json.dumps(sorted(before | now)))
+    for path, target in files.items():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(path, target)
+    write_text(root / "masks" / MADE, json.dumps(sorted(now)))
