@@ -1,8 +1,8 @@
 """Make masks for a capture that has cameras but no masks, and remake them when an artist's strokes change.
 
 Strokes are pictures CAPTURE/strokes/NAME.png with transparency, drawn on the upright photo: white is the object, black is not, and
-transparent says nothing. Masks that the program made are known by their hashes in masks/made.json. All other masks are the artist's: they are kept, and
-are evidence for the other photos.
+transparent says nothing. Masks that the program made are known by their hashes in masks/made.json. All other masks are the artist's. They are
+kept, and are evidence for the other photos.
 """
 
 import hashlib
@@ -113,7 +113,7 @@ def region_settings(box: Box) -> list[str]:
     """Return a box whose edges are parallel to the axes as settings of a training: region.centre and region.size."""
     size = 2 * np.linalg.norm(box.matrix[:3, :3], axis=0)
     return [
-        f"region.{key}={[round(float(x), 4) for x in values]}"
+        f"region.{key}={[round(float(x), 4) + 0.0 for x in values]}"
         for key, values in (("centre", box.centre), ("size", size))
     ]
 
