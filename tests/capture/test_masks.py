@@ -15,7 +15,7 @@ from refgs.settings import load_settings
 from tests.makers.captures import CENTRE, ball, edit, nerfstudio, ring, write
 
 SIZE, FOCAL, COUNT = (96, 72), 110.0, 12
-ASIDE = CENTRE + (0.0, 1.1, 0.0)
+ASIDE = CENTRE + np.array([0.0, 1.1, 0.0])
 LENS = {"k1": 0.1, "k2": -0.02, "p1": 0.002, "p2": -0.001}
 
 

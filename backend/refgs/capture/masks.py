@@ -1,8 +1,8 @@
 """Make masks for a capture that has cameras but no masks, and remake them when an artist's strokes change.
 
 Strokes are pictures CAPTURE/strokes/NAME.png with transparency, drawn on the upright photo: white is the object, black is not, and
-transparent says nothing. Masks that the program made are known by their hashes in masks/made.json. All other masks are the artist's. They are
-kept, and are evidence for the other photos.
+transparent says nothing. Masks that the program made are known by their hashes in masks/made.json. All other masks are the artist's.
+They are kept, and are evidence for the other photos.
 """
 
 import hashlib
