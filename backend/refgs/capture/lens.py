@@ -77,9 +77,12 @@ class Lens:
         for _ in range(10):  # fixed point: converges, because photos are only read through lenses that do not fold
             x_now, y_now = self.distort(x, y)
             x, y = x + x_seen - x_now, y + y_seen - y_now
-        return (camera.fx * x + camera.cx - 0.5).astype(np.float32), (camera.fy * y + camera.cy - 0.5).astype(
-            np.float32
-        )
+        columns, rows = camera.fx * x + camera.cx - 0.5, camera.fy * y + camera.cy - 0.5
+        return columns.astype(np.float32), rows.astype(np.float32)
+
+    def resized(self, x: float, y: float) -> "Lens":
+        """Return the lens for its photo made `x` times as wide and `y` times as high."""
+        return replace(self, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
 
 @lru_cache(maxsize=64)

@@ -19,10 +19,12 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from refgs.camera import Camera
 from refgs.capture import View, load_view, read_capture
 from refgs.capture.box import Box
 from refgs.capture.colmap import find_model
 from refgs.capture.images import read_image
+from refgs.capture.lens import Lens
 from refgs.capture.region import find_region, up_direction
 from refgs.capture.silhouettes import Photo, carve_object, cut_out, find_floor
 from refgs.capture.types import Capture
@@ -190,7 +192,7 @@ def _load(view: View, root: Path, side: int) -> Photo:
     return Photo(loaded.image, loaded.camera, known)
 
 
-def _read_strokes(file: Path, view: View, camera) -> np.ndarray:
+def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:
     """Read an artist's strokes as int8 (H, W), on the undistorted photo of the size of `camera`: 1 object, −1 not, 0 nothing."""
     color, alpha = read_image(file)
     height, width = color.shape[:2]
@@ -208,14 +210,15 @@ def _read_strokes(file: Path, view: View, camera) -> np.ndarray:
     for side in sides:
         part = cv2.resize(side.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         if view.lens is not None:
-            x, y = camera.width / view.camera.width, camera.height / view.camera.height
-            lens = replace(
-                view.lens, fx=view.lens.fx * x, fy=view.lens.fy * y, cx=view.lens.cx * x, cy=view.lens.cy * y
-            )
-            part = cv2.remap(part, *lens.maps(camera), cv2.INTER_LINEAR)
+            part = cv2.remap(part, *_small_lens(view, camera).maps(camera), cv2.INTER_LINEAR)
         drawn.append(part)
     ours, theirs = drawn
     return np.where(np.maximum(ours, theirs) < 0.3, 0, np.where(ours >= theirs, 1, -1)).astype(np.int8)
+
+
+def _small_lens(view: View, camera: Camera) -> Lens:
+    """Return the lens of a photo that was reduced to the size of `camera`."""
+    return view.lens.resized(camera.width / view.camera.width, camera.height / view.camera.height)
 
 
 def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
@@ -223,13 +226,12 @@ def _to_photo(view: View, mask: np.ndarray) -> np.ndarray:
     width, height = view.camera.width, view.camera.height
     # A step at a reduced pixel becomes a smooth edge, cut in its middle and soft over a pixel.
     smooth = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)
-    if view.lens is None:
-        large = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_CUBIC)
-    else:
-        x, y = view.lens.maps_back(view.camera)
-        sx, sy = mask.shape[1] / width, mask.shape[0] / height
-        columns, rows = ((x + 0.5) * sx - 0.5).astype(np.float32), ((y + 0.5) * sy - 0.5).astype(np.float32)
-        large = cv2.remap(smooth, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    if view.lens is not None:
+        # Distorted before it is enlarged: a lens bends little within a reduced pixel, and full size takes seconds.
+        small = view.camera.resized(mask.shape[1], mask.shape[0])
+        maps = _small_lens(view, small).maps_back(small)
+        smooth = cv2.remap(smooth, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    large = cv2.resize(smooth, (width, height), interpolation=cv2.INTER_CUBIC)
     sharpness = max(1.0, max(width, height) / max(mask.shape))
     return np.rint(np.clip((large - 127.5) * sharpness + 127.5, 0, 255)).astype(np.uint8)
 
