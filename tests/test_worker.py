@@ -15,6 +15,7 @@ import pytest
 from refgs import train_job
 from refgs.errors import InputError
 from refgs.lock import LOCK, PROGRESS, STOP, RunLock
+from tests.makers.captures import nerfstudio
 from tests.makers.waiting import until
 
 SMALL = [
@@ -156,6 +157,16 @@ def test_photos_without_cameras(talk, tmp_path):
     talk.until("progress")
     talk.end()
     assert not (tmp_path / "sparse").exists()
+
+
+def test_masks_are_made_and_their_box_is_told(talk, tmp_path):
+    nerfstudio(tmp_path)
+    talk.tell("masks", capture=str(tmp_path))
+    assert talk.until("region")["region"][0].startswith("region.centre=")
+    assert talk.until("progress")["stage"] == "reading"
+    done = talk.until("done")
+    assert done["job"] == "masks" and done["made"] == 16 and done["objects"] == 1
+    assert [line.split("=")[0] for line in done["region"]] == ["region.centre", "region.size"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")

@@ -1,45 +1,74 @@
-"""Tests of making masks: against the true silhouettes of rendered balls, with strokes, boxes, and masks by the artist."""
+"""Tests of making masks: against the true silhouettes of rendered balls and of a ring, with strokes, boxes, and masks by the artist."""
 
+import hashlib
 import json
+import struct
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from refgs import commands
 from refgs.capture import masks as making
-from refgs.capture import read_capture
+from refgs.capture import read_capture, silhouettes
 from refgs.capture.masks import make_masks, region_settings
 from refgs.capture.silhouettes import find_floor
 from refgs.errors import InputError
 from refgs.settings import load_settings
-from tests.makers.captures import CENTRE, ball, edit, nerfstudio, ring, write
+from tests.makers.captures import CENTRE, ball, colmap, edit, look_at, nerfstudio, ring, write, write_as_phone
 
-SIZE, FOCAL, COUNT = (96, 72), 110.0, 12
+SIZE, FOCAL, COUNT = (96, 72), 110.0, 10
 ASIDE = CENTRE + np.array([0.0, 1.1, 0.0])
 LENS = {"k1": 0.1, "k2": -0.02, "p1": 0.002, "p2": -0.001}
 
 
-def photograph(folder, beside=False):
-    """Write photos of a ball before a mottled blue ground. With `beside`, a second ball lies beside it. Return the true masks."""
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch):
+    """Carve a coarse grid in few rounds, which is enough for balls of 30 pixels."""
+    monkeypatch.setattr(silhouettes, "GRID", 24)
+    monkeypatch.setattr(silhouettes, "ROUNDS", 3)
+
+
+def colored(shown, random):
+    """Put RGBA pixels before a mottled blue ground. Return the RGB photo."""
+    ground = np.array([60, 70, 150]) + random.normal(0, 12, (*shown.shape[:2], 3))
+    photo = np.where(shown[..., 3:] > 0, shown[..., :3] + random.normal(0, 8, ground.shape), ground)
+    return np.clip(photo, 0, 255).astype(np.uint8)
+
+
+def photograph(folder, beside=False, poses=None, show=ball):
+    """Write photos of a ball before a mottled blue ground. With `beside`, a second ball lies beside it. Return the true masks.
+
+    `show(pose, width, height, focal)` renders another object as RGBA.
+    """
     random = np.random.default_rng(0)
-    poses, truths = ring(COUNT), []
+    poses, truths = poses or ring(COUNT), []
     nerfstudio(folder, poses=poses)
     for i, pose in enumerate(poses):
-        shown = ball(pose, *SIZE, FOCAL)
+        shown = show(pose, *SIZE, FOCAL)
         if beside:
             other = ball(pose, *SIZE, FOCAL, ASIDE)
             shown = np.where(shown[..., 3:] > 0, shown, other)
-        ground = np.array([60, 70, 150]) + random.normal(0, 12, (SIZE[1], SIZE[0], 3))
-        photo = np.where(shown[..., 3:] > 0, shown[..., :3] + random.normal(0, 8, ground.shape), ground)
-        write(folder / "images" / f"{i:04d}.png", np.clip(photo, 0, 255).astype(np.uint8))
+        write(folder / "images" / f"{i:04d}.png", colored(shown, random))
         truths.append(shown[..., 3] > 0)
     intrinsics = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": SIZE[0] / 2, "cy": SIZE[1] / 2, "w": SIZE[0], "h": SIZE[1]}
     edit(folder / "transforms.json", lambda data: data.update(intrinsics))
     return truths
 
 
-def read_masks(folder):
-    return [np.asarray(Image.open(folder / "masks" / f"{i:04d}.png")) > 127 for i in range(COUNT)]
+def washer(pose, width, height, focal):
+    """Render a flat red ring about CENTRE as RGBA, by steps along each ray."""
+    u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    rays = np.stack([u / focal, -v / focal, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
+    hit = np.zeros(u.shape, bool)
+    for depth in np.linspace(2.2, 3.8, 81):
+        x, y, z = np.moveaxis(pose[:3, 3] + depth * rays - CENTRE, -1, 0)
+        hit |= (np.abs(z) < 0.08) & (np.hypot(x, y) < 0.65) & (np.hypot(x, y) > 0.35)
+    return np.where(hit[..., None], np.uint8([220, 0, 0, 255]), np.uint8(0))
+
+
+def read_masks(folder, count=COUNT):
+    return [np.asarray(Image.open(folder / "masks" / f"{i:04d}.png")) > 127 for i in range(count)]
 
 
 def overlap(ours, truths):
@@ -58,11 +87,11 @@ def silent(event, facts):
 def test_masks_are_the_silhouettes_and_the_capture_has_them(tmp_path):
     truths = photograph(tmp_path)
     heard = []
-    found = make_masks(tmp_path, None, lambda event, facts: heard.append(facts["stage"]))
+    found = make_masks(tmp_path, None, lambda event, facts: heard.append(facts.get("stage", event)))
     assert (found["made"], found["kept"], found["objects"]) == (COUNT, 0, 1)
     assert min(overlap(read_masks(tmp_path), truths)) > 0.9
     assert read_capture(tmp_path).masked
-    assert set(heard) == {"reading", "carving", "edges"}
+    assert set(heard) == {"region", "reading", "carving", "edges"}
     assert not (tmp_path / "masks.tmp").exists()
 
 
@@ -84,7 +113,8 @@ def test_masks_fit_the_distorted_photo(tmp_path):
     assert min(overlap(read_masks(tmp_path), truths)) > 0.85
 
 
-def test_box_chooses_the_object_and_two_in_it_are_both_taken(tmp_path):
+def test_box_chooses_the_object_and_two_in_it_are_both_taken(tmp_path, monkeypatch):
+    monkeypatch.setattr(silhouettes, "GRID", 44)  # a voxel must fit between the balls
     photograph(tmp_path, beside=True)
     frame = np.linalg.inv(read_capture(tmp_path).to_capture)
     unit = np.linalg.norm(frame[:3, 0])
@@ -181,18 +211,23 @@ def test_interrupted_call_leaves_the_masks_of_before(tmp_path, monkeypatch):
     assert make_masks(tmp_path, None, silent)["made"] == COUNT
 
 
-def test_region_settings_are_read_as_the_same_box(tmp_path):
+def test_box_is_in_the_frame_of_the_capture_with_its_masks(tmp_path):
     photograph(tmp_path)
-    found = make_masks(tmp_path, None, silent)
-    box = region(*found["region"])
-    # The ball has radius 0.5 of the capture, and the frame is the run's of before the masks.
+    heard = []
+    found = make_masks(tmp_path, None, lambda event, facts: heard.append((event, facts)))
+    capture = read_capture(tmp_path, region(*found["region"]))
+    unit = np.linalg.norm(capture.to_capture[:3, 0])
+    to_capture = capture.box.moved(capture.to_capture)
+    assert to_capture.centre == pytest.approx(CENTRE, abs=0.1)
+    assert 2 * np.linalg.norm(to_capture.matrix[:3, :3], axis=0) == pytest.approx(1.1, abs=0.25)
+    assert unit == pytest.approx(0.5, abs=0.15) and region_settings(capture.box) == found["region"]
+    # The guess comes before anything is read, and contains the ball.
+    event, facts = heard[0]
+    assert event == "region" and " ".join(facts["region"]) in facts["what"]
     for file in (tmp_path / "masks").iterdir():
         file.unlink()
-    capture = read_capture(tmp_path, box)
-    unit = np.linalg.norm(capture.to_capture[:3, 0])
-    assert np.array(box.size) * unit == pytest.approx(1.1, abs=0.25)
-    assert capture.to_capture[:3, :3] @ box.centre + capture.to_capture[:3, 3] == pytest.approx(CENTRE, abs=0.1)
-    assert region_settings(capture.box) == found["region"]
+    capture = read_capture(tmp_path, region(*facts["region"]))
+    assert capture.box.moved(capture.to_capture).contains(CENTRE + 0.5 * np.vstack([np.eye(3), -np.eye(3)])).all()
 
 
 def test_floor_is_the_plane_below_the_object():
@@ -208,4 +243,77 @@ def test_floor_is_the_plane_below_the_object():
 def test_made_masks_are_noted(tmp_path):
     photograph(tmp_path)
     make_masks(tmp_path, None, silent)
-    assert len(json.loads((tmp_path / "masks" / "made.json").read_text())) == COUNT
+    files = (tmp_path / "masks").glob("*.png")
+    noted = json.loads((tmp_path / "masks" / "made.json").read_text())
+    assert {hashlib.sha256(file.read_bytes()).hexdigest() for file in files} == set(noted)
+
+
+def test_a_ring_is_seen_through_and_highlights_are_not(tmp_path):
+    away = [(np.cos(a), np.sin(a), t) for t in (0.6, 2.0) for a in np.arange(8) * np.pi / 4]
+    truths = photograph(
+        tmp_path, poses=[look_at(CENTRE + 3 * np.array(x) / np.linalg.norm(x), CENTRE) for x in away], show=washer
+    )
+    make_masks(tmp_path, None, silent)
+    for truth, mask in zip(truths[8:], read_masks(tmp_path, 16)[8:], strict=True):
+        assert (truth & mask).sum() / (truth | mask).sum() > 0.75 and not mask[34:38, 46:50].any()
+
+    photograph(tmp_path / "ball")
+    photo = tmp_path / "ball" / "images" / "0000.png"
+    pixels = np.asarray(Image.open(photo)).copy()
+    pixels[30:40, 42:52] = pixels[:10, :10]
+    write(photo, pixels)
+    make_masks(tmp_path / "ball", None, silent)
+    assert read_masks(tmp_path / "ball")[0][30:40, 42:52].all()
+
+
+def test_masks_of_a_phones_photos_are_upright(tmp_path):
+    truths = photograph(tmp_path)
+    for photo in sorted((tmp_path / "images").iterdir()):
+        write_as_phone(photo.with_suffix(".jpg"), np.asarray(Image.open(photo)), turns=1)
+        photo.unlink()
+    edit(
+        tmp_path / "transforms.json",
+        lambda data: [f.update(file_path=f["file_path"].replace("png", "jpg")) for f in data["frames"]],
+    )
+    make_masks(tmp_path, None, silent)
+    assert min(overlap(read_masks(tmp_path), truths)) > 0.85
+
+
+def test_points_of_colmap_tell_the_table_from_what_stands_on_it(tmp_path):
+    random = np.random.default_rng(0)
+    colmap(tmp_path)
+    truths = []
+    for i, pose in enumerate(ring(16)):
+        shown = ball(pose, 64, 48, 60.0)
+        truths.append(shown[..., 3] > 0)
+        # A mat of the ball's lower colour lies under it.
+        u, v = np.meshgrid(np.arange(64) + 0.5 - 32, np.arange(48) + 0.5 - 24)
+        rays = np.stack([u / 60, -v / 60, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
+        depth = (CENTRE[2] - 0.5 - pose[2, 3]) / np.where(rays[..., 2] < 0, rays[..., 2], np.nan)
+        mat = np.linalg.norm((pose[:3, 3] + depth[..., None] * rays - CENTRE)[..., :2], axis=-1) < 0.7
+        shown[mat & ~truths[-1]] = (20, 200, 0, 255)
+        write(tmp_path / "images" / f"{i:04d}.png", colored(shown, random))
+    on_ball = random.normal(size=(200, 3))
+    on_ball = CENTRE + 0.5 * on_ball / np.linalg.norm(on_ball, axis=1, keepdims=True)
+    on_table = CENTRE + np.column_stack([random.uniform(-2.5, 2.5, (300, 2)), np.full(300, -0.5)])
+    points = np.vstack([on_ball, on_table])
+    data = struct.pack("<Q", len(points))
+    for i, point in enumerate(points):
+        data += struct.pack("<Q3d3BdQ", i, *point, 255, 128, 0, 0.5, 2) + struct.pack("<iiii", 1, 0, 2, 1)
+    (tmp_path / "sparse" / "0" / "points3D.bin").write_bytes(data)
+
+    def width():
+        """Return how wide the found object is, in diameters of the ball, from its box in the frame with its masks."""
+        capture = read_capture(tmp_path, region(*make_masks(tmp_path, None, silent)["region"]))
+        return 2 * np.linalg.norm(capture.box.moved(capture.to_capture).matrix[:3, 0])
+
+    with_points = width()
+    (tmp_path / "sparse" / "0" / "points3D.bin").write_bytes(struct.pack("<Q", 0))
+    assert with_points < 1.15 < 1.2 < width()
+
+
+def test_command_prints_where_the_masks_and_the_object_are(tmp_path, capsys):
+    photograph(tmp_path)
+    commands.masks(tmp_path, [])
+    printed = capsys.readouterr().out
+    assert f"{COUNT} masks made: {tmp_path / 'masks'}" in printed and printed.count("region.size=") == 2

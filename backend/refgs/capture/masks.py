@@ -33,7 +33,7 @@ from refgs.paths import write_text
 from refgs.settings import RegionSettings
 
 SIDE, FINE = 256, 400  # pixels on the longer side: for carving, for the edges
-CARVED_BY = 40  # photos at most
+CARVED_BY = 60  # photos at most
 MADE = "made.json"
 
 
@@ -42,23 +42,29 @@ def make_masks(
 ) -> dict[str, Any]:
     """Make the masks of a capture's photos, and write them to its folder `masks`.
 
-    `wanted` may set a box about the object, as for `read_capture`. Without one, the object is guessed (`guess_box`). Returns a dict:
-    `photos`, `made` and `kept` are numbers of masks, `objects` is the number of separate objects, and `region` is the box about them, as
-    settings for training. They are in the frame of the capture as it was before. `report(event, facts)` is called with "progress" and
-    "warning".
+    `wanted` may set a box about the object, as for `read_capture`; its up direction is not used. Without a box, the object is guessed
+    (`guess_box`), and the guess is reported as the event "region". `report(event, facts)` is also called with "progress" and "warning".
+
+    Returns a dict: `photos`, `made` and `kept` are numbers of masks, `objects` is the number of separate objects, and `region` is the box
+    about them, as settings for a training of the capture with its new masks. These masks may move its frame.
 
     All masks are written together at the end; an interrupted call leaves those of before. Raises InputError if all photos have masks by the
     artist, if strokes do not fit, or if nothing is found.
     """
     folder = Path(folder)
-    capture = read_capture(folder, wanted)
+    capture = read_capture(folder, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
     root = _root(capture)
     made = _hashes(root)
     views = [replace(v, mask_path=None) if v.mask_path and _hash(v.mask_path) in made else v for v in capture.views]
     if all(view.masked for view in views):
         raise InputError(f"{folder}: every photo has a mask that was not made here. Remove those that you want made.")
     targets = _targets(root, views)
-    box, fill, floor = (capture.box, 0.9, _floor(capture)) if capture.box else guess_box(capture, views)
+    if capture.box:
+        box, fill, floor = capture.box, 0.9, _floor(capture)
+    else:
+        box, fill, floor = guess_box(capture, views)
+        guessed = region_settings(box)
+        report("region", {"region": guessed, "what": f"looking for the object in the box {' '.join(guessed)}"})
     chosen = _choose(views, root)
     photos = []
     for view in chosen:
@@ -68,33 +74,38 @@ def make_masks(
     def carving(done: int, total: int) -> None:
         report("progress", {"stage": "carving", "done": done, "total": total})
 
+    nothing = InputError(
+        f"{folder}: no object was found. Set a box about it (region.size), or draw strokes on some photos."
+    )
     shape = carve_object(photos, box, fill, floor, carving)
     if shape is None:
-        raise InputError(
-            f"{folder}: no object was found. Set a box about it (region.size), or draw strokes on some photos."
-        )
+        raise nothing
     if shape.objects > 1:
         report("warning", {"what": f"{shape.objects} separate objects are in the box: all of them are in the masks"})
     work = root / "masks.tmp"
     shutil.rmtree(work, ignore_errors=True)
     try:
-        files = {}
+        files, found = {}, False
         for view, target in targets.items():
             mask = _to_photo(view, cut_out(_load(view, root, FINE), shape))
+            found |= bool(mask.any())
             path = work / target.relative_to(root)
             path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray(mask).save(path)
             files[path] = target
             report("progress", {"stage": "edges", "done": len(files), "total": len(targets)})
+        if not found and len(targets) == len(views):
+            raise nothing
         _put(files, root, made)
     finally:
         shutil.rmtree(work, ignore_errors=True)
+    to_frame = np.linalg.inv(read_capture(folder).to_capture) @ capture.to_capture
     return {
         "photos": len(views),
         "made": len(targets),
         "kept": len(views) - len(targets),
         "objects": shape.objects,
-        "region": region_settings(shape.bounds()),
+        "region": region_settings(shape.bounds(to_frame)),
     }
 
 

@@ -3,6 +3,7 @@
 Photos are segmented together (after Campbell et al. 2010, "Automatic 3D object segmentation in multiple views").
 A grid of voxels holds the probability that the object is there. In turns, colour histograms of object and surroundings are learned from the
 voxels' projection, and voxels are kept where nearly all photos show the object's colours. GrabCut (OpenCV) then finds the exact edges.
+What is seen through a hole looks like the surroundings from neighbouring places, too. A highlight does not: it wanders over the surface.
 """
 
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ from refgs.geometry.project import inside, project
 GRID = 48  # voxels along an edge of the box
 ROUNDS = 6  # of colours and carving; a real head's shape changes by less than 1 % in the last one
 DISAGREE = 0.12  # part of the photos that may contradict a voxel: colours are ambiguous in some
+OPEN = 0.2  # probability below which two neighbouring photos see through a voxel, as through a ring, whatever the others say
+NEAR = 0.2  # probability from which a pixel may be object, so that thin parts, which few voxels hold, are not lost
 SEEN = 0.3  # part of the photos that must show a voxel
 COUNTED = 0.1  # part of the largest object's volume, from which on another one is an object too
 LEVELS = (20, 32, 32)  # bins of the histograms, in Lab
@@ -49,9 +52,12 @@ class Shape:
     objects: int
     colors: tuple[np.ndarray, np.ndarray]
 
-    def bounds(self) -> Box:
-        """Return the box, parallel to the axes, about the shape, with a margin of a twentieth."""
-        points = self.box.grid(GRID)[self.occupied > 0.5]
+    def bounds(self, to_frame: np.ndarray) -> Box:
+        """Return the box, parallel to the axes, about the shape in other coordinates, with a margin of a twentieth.
+
+        `to_frame` (4, 4) is p_new = to_frame @ p.
+        """
+        points = self.box.grid(GRID)[self.occupied > 0.5] @ to_frame[:3, :3].T + to_frame[:3, 3]
         low, high = points.min(axis=0), points.max(axis=0)
         matrix = np.diag([*((high - low) / 2 * 1.1 + 1e-9), 1.0])
         matrix[:3, 3] = (low + high) / 2
@@ -78,16 +84,19 @@ def carve_object(
     pixels = [_pixels(points, photo.camera) for photo in photos]
     seen = sum((at >= 0).astype(int) for at in pixels)
     allowed &= seen >= max(2, SEEN * len(photos))
+    pairs = _neighbours(photos, box.centre)
     objects, colors = 0, None
     for turn in range(ROUNDS):
         priors = [_project_voxels(occupied, box, photo.camera, at) for photo, at in zip(photos, pixels, strict=True)]
-        colors = _learn_colors(photos, priors)
+        colors = _learn_colors(photos, priors, colors)
         votes = np.full((len(photos), len(points)), 255, np.uint8)  # bytes sort fast
         struck = np.zeros(len(points), bool)
         for vote, photo, prior, at in zip(votes, photos, priors, pixels, strict=True):
             shown = at >= 0
             vote[shown] = (255 * _posterior(photo, prior, colors)).astype(np.uint8).ravel()[at[shown]]
             struck[shown] |= (photo.known.ravel()[at[shown]] < 0) & (vote[shown] < 128)
+        for pair in pairs:
+            struck |= votes[pair].max(axis=0) < 255 * OPEN
         ordered = np.sort(np.ascontiguousarray(votes.T), axis=1)
         kept = ordered[np.arange(len(points)), (DISAGREE * seen).astype(int)] / np.float32(255)
         kept[~allowed | struck] = 0
@@ -112,7 +121,7 @@ def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (margin, margin))
     solid = (prior > 0.5).astype(np.uint8)
     core = cv2.erode(solid, kernel, borderValue=1) > 0
-    around = cv2.dilate(solid | (photo.known > 0).astype(np.uint8), kernel) > 0
+    around = cv2.dilate(((prior > NEAR) | (photo.known > 0)).astype(np.uint8), kernel) > 0
     labels = np.where(likely, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_PR_BGD))
     labels[core & likely] = cv2.GC_FGD
     labels[~around] = cv2.GC_BGD
@@ -130,7 +139,21 @@ def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
             image = np.ascontiguousarray(photo.image[part][..., ::-1])
             cv2.grabCut(image, inner, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
             labels[part] = inner
-    return np.where(labels & 1, np.uint8(255), np.uint8(0))
+    mask = _only_connected(labels & 1, solid > 0, photo.known)
+    return np.where(mask, np.uint8(255), np.uint8(0))
+
+
+def _only_connected(mask: np.ndarray, solid: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Drop the parts of a mask that do not touch the shape's projection `solid`, and close the holes that the shape does not have.
+
+    Such holes are highlights. What strokes say (`known`) stays.
+    """
+    _, parts = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    kept = np.isin(parts, np.unique(parts[(mask > 0) & (solid | (known > 0))])) & (mask > 0)
+    _, holes = cv2.connectedComponents((~kept).astype(np.uint8), connectivity=4)
+    edge = np.concatenate([holes[0], holes[-1], holes[:, 0], holes[:, -1]])
+    opened = np.isin(holes, np.unique([*edge, *holes[~kept & (~solid | (known < 0))]]))
+    return kept | ~opened
 
 
 def find_floor(
@@ -168,6 +191,16 @@ def find_floor(
     return found
 
 
+def _neighbours(photos: list[Photo], centre: np.ndarray) -> np.ndarray:
+    """Return the pairs (N, 2) of each photo and the nearest one that looks at `centre` from another direction: by 5° to 40°."""
+    away = np.array([photo.camera.position for photo in photos]) - centre
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    angle = np.degrees(np.arccos(np.clip(away @ away.T, -1, 1)))
+    angle[(angle < 5) | (angle > 40)] = np.inf
+    pairs = np.column_stack([np.arange(len(photos)), angle.argmin(axis=1)])[np.isfinite(angle.min(axis=1))]
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
 def _pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the index of the pixel that shows each point (N,), −1 if the photo does not show it."""
     at, depth = project(camera, points)
@@ -201,13 +234,17 @@ def _histogram(bins: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return (counts / max(counts.sum(), 1e-9)).ravel()
 
 
-def _weights(photo: Photo, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _weights(
+    photo: Photo, prior: np.ndarray, colors: tuple[np.ndarray, np.ndarray] | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return each pixel's weight (H, W) in the colours of the object, and in those of the surroundings.
 
-    A band about the shape belongs to neither. A part of the object that is not in the shape yet must not make its colours the
-    surroundings'.
+    Where `colors` are known, pixels of the surroundings' colours count less as the object's: the shape may close a hole. A band about the
+    shape belongs to neither. A part of the object that is not in the shape yet must not make its colours the surroundings'.
     """
     ours = prior * (prior > 0.5)
+    if colors is not None:
+        ours = ours * (colors[0] / (colors[0] + colors[1] + 1e-9))[photo.bins]
     band = max(3, round(0.06 * max(prior.shape))) | 1
     near = cv2.dilate((prior > 0.25).astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (band, band)))
     theirs = np.where(near > 0, 0.0, 1.0)
@@ -217,17 +254,20 @@ def _weights(photo: Photo, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _learn_colors(photos: list[Photo], priors: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the histograms of the object's and of the surroundings' colours, the mean over the photos."""
+def _learn_colors(
+    photos: list[Photo], priors: list[np.ndarray], before: tuple[np.ndarray, np.ndarray] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the histograms of the object's and of the surroundings' colours, the mean over the photos. `before` are the last round's."""
     pairs = [
-        [_histogram(photo.bins, w) for w in _weights(photo, prior)] for photo, prior in zip(photos, priors, strict=True)
+        [_histogram(photo.bins, weight) for weight in _weights(photo, prior, before)]
+        for photo, prior in zip(photos, priors, strict=True)
     ]
     return tuple(np.mean(side, axis=0) for side in zip(*pairs, strict=True))
 
 
 def _posterior(photo: Photo, prior: np.ndarray, colors: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Return the probability that each pixel shows the object, by the colours of all photos, of this one, and by the shape's projection."""
-    ours, theirs = (_histogram(photo.bins, weight) for weight in _weights(photo, prior))
+    ours, theirs = (_histogram(photo.bins, weight) for weight in _weights(photo, prior, colors))
     ours = 0.5 * colors[0] + 0.5 * ours
     theirs = 0.3 * colors[1] + 0.7 * theirs if theirs.any() else colors[1]
     evidence = np.log((ours[photo.bins] + 1e-6) / (theirs[photo.bins] + 1e-6)).astype(np.float32)
