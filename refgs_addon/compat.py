@@ -80,6 +80,11 @@ def get_modifier_input(modifier: bpy.types.NodesModifier, name: str):
     return value
 
 
+def paint_colors(settings: bpy.types.ToolSettings) -> bpy.types.UnifiedPaintSettings:
+    """Return the settings that hold the colours of the brushes that paint on images."""
+    return getattr(settings.image_paint, "unified_paint_settings", None) or settings.unified_paint_settings  # from 5.0
+
+
 def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
     """List an object's animation curves."""
     animation = item.animation_data

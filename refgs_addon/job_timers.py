@@ -56,7 +56,7 @@ def redraw() -> None:
     manager = bpy.context.window_manager
     for window in manager.windows if manager else ():
         for area in window.screen.areas:
-            if area.type in ("VIEW_3D", "PREFERENCES"):
+            if area.type in ("VIEW_3D", "IMAGE_EDITOR", "PREFERENCES"):
                 area.tag_redraw()
         window.workspace.status_text_set_internal(None)  # the status bar is no area that could be tagged
 

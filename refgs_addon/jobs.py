@@ -14,7 +14,7 @@ import queue
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -62,6 +62,7 @@ class Job:
     held_out: list[tuple[float, float]] = field(default_factory=list)  # seconds, PSNR of the held-out views
     serial: int = field(default_factory=count().__next__)  # unique
     kept: bool = False  # finishes even if Blender closes
+    then: Callable[["Job"], None] | None = None  # called once, when the job is done
     _stopped: bool = False
     _output_closed: bool = False
     _query_only: bool = False
@@ -135,6 +136,12 @@ class Job:
         if self._output_closed and (status := self._process.poll()) is not None:
             heard, self._output_closed = True, False
             self._process_ended(status)
+        if self.state == "done" and self.then is not None:
+            then, self.then = self.then, None
+            try:
+                then(self)
+            except InputError as error:
+                self.warnings.append(str(error))
         return heard
 
     def _handle(self, event: dict) -> None:
@@ -233,9 +240,36 @@ def check(python: Path, capture: Path, out: Path, log: Path) -> Job:
     return _add(Job(capture.name, python, [_check(capture, out)], log))
 
 
+def extract_photos(python: Path, video: Path, out: Path, count: int, log: Path) -> Job:
+    """Start a job that writes up to `count` photos from a video into the folder `out`/images. It does not wait for other jobs.
+
+    Raises InputError if `out`/images exists.
+    """
+    if (out / "images").exists():
+        raise InputError(f"{out / 'images'} exists: choose another folder for the photos")
+    command = {"command": "frames", "video": str(video), "out": str(out), "count": count}
+    return _add(Job(out.name, python, [command], log))
+
+
+def make_masks(python: Path, capture: Path, out: Path, log: Path, settings: Mapping[str, object]) -> Job:
+    """Start a job that makes masks for a capture's photos, then does the same as `check`. It does not wait for other jobs.
+
+    `settings` may have a box about the object, as for `train`. Raises InputError if such a job is running already.
+    """
+    kind = {"command": "masks", "capture": str(capture)}
+    if any(not job.ended and job.commands and kind.items() <= job.commands[0].items() for job in JOBS):
+        raise InputError(f"the masks of {capture.name} are being made already: wait for them, or stop that")
+    command = kind | {"settings": _words(settings)}
+    return _add(Job(capture.name, python, [command, _check(capture, out)], log))
+
+
 def find_cameras(python: Path, capture: Path, out: Path, log: Path) -> Job:
     """Start a job that computes the cameras from the photos in a folder, then does the same as `check`. It does not wait for other jobs."""
     return _add(Job(capture.name, python, [{"command": "poses", "capture": str(capture)}, _check(capture, out)], log))
+
+
+def _words(settings: Mapping[str, object]) -> list[str]:
+    return [f"{key}={value}" for key, value in settings.items()]
 
 
 def _check(capture: Path, out: Path) -> dict:
@@ -297,7 +331,7 @@ def train(
         raise InputError(f"{out} is not empty: choose another folder for the run")
     if any(job.run == out and not job.ended for job in JOBS):
         raise InputError(f"{out} is being trained already")
-    arguments = {"preset": preset, "minutes": minutes, "settings": [f"{k}={v}" for k, v in (settings or {}).items()]}
+    arguments = {"preset": preset, "minutes": minutes, "settings": _words(settings or {})}
     if resume:
         arguments = {"minutes": minutes, "resume": True}
     commands = [{"command": "train", "capture": str(capture), "out": str(out)} | arguments]

@@ -64,7 +64,11 @@ def frames(video: Path, out: Path, count: int) -> None:
     from refgs.capture.video import extract_photos
 
     with progress_bar("reading frames", 1) as bar:
-        found = extract_photos(video, out, count, bar)
+
+        def report(event: str, facts: dict) -> None:
+            bar(facts["done"], f"{facts['kept']} kept, {facts['blurred']} blurred", facts["total"])
+
+        found = extract_photos(video, out, count, report)
     console.print(
         f"{found['frames']} frames read, {found['photos']} photos kept, {found['blurred']} left out as blurred, "
         f"{found['duplicates']} as duplicates: {out / 'images'}"

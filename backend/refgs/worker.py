@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Annotated, Any, Literal
 
+import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -20,6 +21,7 @@ from refgs.capture import read_capture
 from refgs.capture.check import check, describe
 from refgs.capture.masks import make_masks
 from refgs.capture.motion import find_cameras
+from refgs.capture.video import extract_photos
 from refgs.errors import InputError, NoCameras
 from refgs.export.export_job import export as export_run
 from refgs.kernels import cuda
@@ -38,6 +40,13 @@ class Check(_Command):
     command: Literal["check"]
     capture: str
     out: str | None = None
+
+
+class Frames(_Command):
+    command: Literal["frames"]
+    video: str
+    out: str
+    count: Annotated[int, Field(ge=3, le=1000)] = 100
 
 
 class Poses(_Command):
@@ -89,13 +98,13 @@ class Keep(_Command):
 
 
 COMMANDS = TypeAdapter(
-    Annotated[Check | Poses | Masks | Train | Export | During | Keep, Field(discriminator="command")]
+    Annotated[Check | Frames | Poses | Masks | Train | Export | During | Keep, Field(discriminator="command")]
 )
 CLOSED = None  # queued in place of a command: the input has ended
 
 
 class Worker:
-    """Run jobs (check, poses, masks, train, export) one after another, as commands ask for them.
+    """Run jobs (check, frames, poses, masks, train, export) one after another, as commands ask for them.
 
     Each job sends the event `started`, and at its end `done`, `cancelled` or `failed`.
     """
@@ -159,7 +168,14 @@ class Worker:
         why = cuda.unusable()
         card = torch.cuda.get_device_name() if why is None else None
         self.send("ready", {"protocol": PROTOCOL, "refgs": __version__, "card": card, "no_card": why})
-        jobs_of = {Check: self._check, Poses: self._poses, Masks: self._masks, Train: self._train, Export: self._export}
+        jobs_of = {
+            Check: self._check,
+            Frames: self._frames,
+            Poses: self._poses,
+            Masks: self._masks,
+            Train: self._train,
+            Export: self._export,
+        }
         while self._open or (self._keep and self._waiting):
             if self._waiting and self._closed and not self._keep:
                 break  # the input has ended: drop the jobs that came during the training
@@ -191,12 +207,21 @@ class Worker:
             return "done", {"lines": describe(capture)}
         return "done", check(capture, Path(command.out))
 
+    def _frames(self, command: Frames) -> tuple[str, dict]:
+        out = Path(command.out)
+        found = extract_photos(Path(command.video), out, command.count, self.send)
+        return "done", found | {"capture": str(out.resolve())}
+
     def _poses(self, command: Poses) -> tuple[str, dict]:
         return "done", find_cameras(Path(command.capture), self.send)
 
     def _masks(self, command: Masks) -> tuple[str, dict]:
         region = load_settings("standard", command.settings).region
-        return "done", make_masks(Path(command.capture), region, self.send)
+        folder = Path(command.capture)
+        before = read_capture(folder, region).to_capture
+        found = make_masks(folder, region, self.send)
+        moved = np.linalg.inv(read_capture(folder).to_capture) @ before
+        return "done", found | {"capture": str(folder.resolve()), "moved": moved.tolist()}
 
     def _train(self, command: Train) -> tuple[str, dict]:
         out = Path(command.out)

@@ -1,5 +1,6 @@
 """Add and read regions: Empties that mark a part of space. They mark what to edit, what to draw, or what to train."""
 
+import json
 import math
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from .. import compat, jobs
 from ..errors import InputError
 from ..nodes.splats_tree import NAME
 
+FOUND = "refgs_found"  # custom property of the training box: its matrix when the program placed it
+ROOM = 1.15  # factor on a found box: thin parts may reach out of what was carved
 REGION = "refgs_region"  # custom property of an object that marks a region
 
 
@@ -64,14 +67,54 @@ def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
     """
     box = training_region(scene)
     if box is None:
-        box = bpy.data.objects.new("RefGS Region", None)
-        box.empty_display_type = "CUBE"
+        box = _new_training_region(scene)
         centre, radius = _looked_at(scene)
         box.matrix_world = Matrix.LocRotScale(centre, None, Vector((radius,) * 3))
-        scene.collection.objects.link(box)
-        scene.refgs.region = box
     box.hide_viewport = False
     return box
+
+
+def show_found_region(scene: bpy.types.Scene, settings: list[str], moved: Matrix) -> bpy.types.Object:
+    """Make the training box the box in which masks found the object, or move it there, with some room around it.
+
+    `settings` are the trainer's, as "region.size=[1, 1, 2]". `moved` brings their coordinates to the present ones. The box counts as found
+    by the program (`artists_region`) until the artist changes it.
+    """
+    values = {key: json.loads(value) for key, value in (word.split("=", 1) for word in settings)}
+    box = training_region(scene) or _new_training_region(scene)
+    box.empty_display_size, box.hide_viewport = 1.0, False
+    half = Vector(values["region.size"]) / 2 * ROOM
+    box.matrix_world = moved @ Matrix.LocRotScale(Vector(values["region.centre"]), None, half)
+    box[FOUND] = [x for row in _world_matrix(scene, box) for x in row]
+    return box
+
+
+def artists_region(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """Find the training box if an artist made, moved or scaled it. Returns None if there is none, or if it is as the program placed it."""
+    box = training_region(scene)
+    if box is None or FOUND not in box:
+        return box
+    now = [x for row in _world_matrix(scene, box) for x in row]
+    same = all(math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-6) for a, b in zip(now, box[FOUND], strict=True))
+    return None if same else box
+
+
+def _new_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
+    box = bpy.data.objects.new("RefGS Region", None)
+    box.empty_display_type = "CUBE"
+    scene.collection.objects.link(box)
+    scene.refgs.region = box
+    return box
+
+
+def _world_matrix(scene: bpy.types.Scene, box: bpy.types.Object) -> Matrix:
+    """Return an object's present matrix, even if it was moved or hidden just before."""
+    hidden, box.hide_viewport = box.hide_viewport, False  # Blender does not evaluate hidden objects
+    for layer in scene.view_layers:
+        layer.update()
+    matrix = box.matrix_world.copy()
+    box.hide_viewport = hidden
+    return matrix
 
 
 def _looked_at(scene: bpy.types.Scene) -> tuple[Vector, float]:
@@ -91,11 +134,7 @@ def region_settings(scene: bpy.types.Scene) -> dict[str, list[float]]:
     box = training_region(scene)
     if box is None:
         return {}
-    hidden, box.hide_viewport = box.hide_viewport, False  # Blender does not evaluate hidden objects
-    for layer in scene.view_layers:
-        layer.update()  # the box may have just been moved
-    matrix = box.matrix_world.copy()
-    box.hide_viewport = hidden
+    matrix = _world_matrix(scene, box)
     centre, turn, scale = matrix.decompose()
     size = [2 * abs(x) * box.empty_display_size for x in scale]
     if min(size) < 1e-6 * max(size) or not max(size):

@@ -4,12 +4,15 @@ import tempfile
 from pathlib import Path
 
 import bpy
+from mathutils import Matrix
 
 from .. import jobs
 from ..errors import InputError
 from ..job_timers import follow_jobs
 from ..preferences import capture_folder, log_file, python, set_up
-from .regions import region_settings
+from . import strokes
+from .capture_cameras import show_cameras
+from .regions import artists_region, region_settings, show_found_region
 
 
 def check(scene: bpy.types.Scene) -> jobs.Job:
@@ -33,6 +36,69 @@ def find_cameras(scene: bpy.types.Scene) -> jobs.Job:
     jobs.JOBS[:] = [known for known in jobs.JOBS if not known.no_cameras]
     follow_jobs()
     return job
+
+
+def extract_photos(scene: bpy.types.Scene, video: Path, out: Path | None, count: int) -> jobs.Job:
+    """Start a job that writes up to `count` photos from a video into `out`/images. Then the folder `out` is the scene's capture.
+
+    If `out` is None, it is a new folder beside the video. Raises InputError if there is no trainer or no video, or if `out`/images exists.
+    """
+    if not video.is_file():
+        raise InputError(f"{video} is not a file: choose a video, such as .mp4 or .mov")
+    if out is None:
+        coming = {Path(job.commands[0]["out"]) for job in jobs.JOBS if job.commands and "video" in job.commands[0]}
+        out = _free(video.with_suffix(""), coming)
+    job = jobs.extract_photos(python(), video, out, count, log_file(f"frames {out.name}"))
+    number = scene.session_uid
+
+    def choose(job: jobs.Job) -> None:
+        if known := _scene(number):
+            known.refgs.capture = str(out)
+
+    job.then = choose
+    follow_jobs()
+    return job
+
+
+def make_masks(scene: bpy.types.Scene) -> jobs.Job:
+    """Start a job that makes masks for the scene's capture, and then checks the capture.
+
+    The trainer looks for the object in the box that limits the training, if the artist placed one; otherwise in the middle of what the
+    cameras look at. When the job is done, the capture's cameras are shown, with the box around the object among them: masks change the
+    frame of both. Canvases of strokes show the new masks.
+    """
+    capture, mine = _capture(scene), artists_region(scene) is not None
+    settings = region_settings(scene) if mine else {}
+    settings.pop("region.up", None)  # turns the frame of a training, not that of the cameras
+    job = jobs.make_masks(python(), capture, capture_folder(capture), log_file(f"masks {capture.name}"), settings)
+    jobs.JOBS[:] = [other for other in jobs.JOBS if other is job or not (other.ended and "masks" in other.results)]
+    number = scene.session_uid
+
+    def show(job: jobs.Job) -> None:
+        strokes.show_masks(capture)
+        if known := _scene(number):
+            found, moved = job.results["masks"], Matrix(job.results["masks"]["moved"])
+            box = artists_region(known)
+            if box is None:
+                show_found_region(known, found["region"], moved)
+            else:
+                box.matrix_world = moved @ box.matrix_world
+            checked = job.results["check"]
+            show_cameras(known, Path(checked["capture"]), Path(checked["cameras"]))
+
+    job.then = show
+    follow_jobs()
+    return job
+
+
+def save_strokes(scene: bpy.types.Scene) -> jobs.Job:
+    """Write the strokes that were painted on photos of the scene's capture, and make its masks anew.
+
+    Raises InputError if nothing was painted, or if there is no trainer.
+    """
+    python()  # say that there is none before anything is written
+    strokes.save(_capture(scene))
+    return make_masks(scene)
 
 
 def train(scene: bpy.types.Scene) -> jobs.Job:
@@ -143,11 +209,20 @@ def _capture(scene: bpy.types.Scene) -> Path:
     return capture
 
 
+def _scene(number: int) -> bpy.types.Scene | None:
+    """Find a scene by its `session_uid`. Returns None if another file was opened meanwhile."""
+    return next((scene for scene in bpy.data.scenes if scene.session_uid == number), None)
+
+
 def _free_folder(capture: Path, scene: bpy.types.Scene) -> Path:
     """Return a path for a new run folder beside the capture. Nothing exists there, and no run of the scene's list uses it."""
-    taken = {Path(known.folder) for known in scene.refgs.runs}
-    number, out = 1, capture.with_name(f"{capture.name} RefGS")
+    return _free(capture.with_name(f"{capture.name} RefGS"), {Path(known.folder) for known in scene.refgs.runs})
+
+
+def _free(wanted: Path, taken: set[Path]) -> Path:
+    """Return the path `wanted`, with a number after it if something exists there or it is `taken`."""
+    number, out = 1, wanted
     while out in taken or out.exists():
         number += 1
-        out = capture.with_name(f"{capture.name} RefGS {number}")
+        out = wanted.with_name(f"{wanted.name} {number}")
     return out

@@ -13,11 +13,25 @@ from . import (
     materials_panel,
     operators,
     panels,
+    photo_buttons,
+    strokes_panel,
     train_panel,
     trainer_buttons,
 )
 
-_MODULES = (preferences, properties, operators, trainer_buttons, icons, checked_capture, train_panel, closing, panels)
+_MODULES = (
+    preferences,
+    properties,
+    operators,
+    trainer_buttons,
+    icons,
+    checked_capture,
+    photo_buttons,
+    train_panel,
+    strokes_panel,
+    closing,
+    panels,
+)
 _MODULES += (materials_panel, light_panel, export_menu, drop)
 CLASSES = [cls for module in _MODULES for cls in getattr(module, "CLASSES", ())]
 

@@ -51,6 +51,20 @@ class OnJob(ReportsErrors):
         return jobs.JOBS[self.number]
 
 
+class OnCapture(ReportsErrors):
+    """Disable the operator's button without a capture or a trainer; its tooltip then says what to do.
+
+    Base class of the operators on the scene's capture, the folder with the photos.
+    """
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not has_trainer(cls):
+            return False
+        cls.poll_message_set("Choose the capture's folder first")
+        return bool(context.scene.refgs.capture)
+
+
 class OnRun(ReportsErrors):
     """Disable the operator's button while no run is imported; its tooltip then says so. Base class of the operators on the active run."""
 

@@ -11,28 +11,16 @@ from ..job_timers import follow_other_processes
 from ..preferences import wrapped_text
 from ..scene import live_splats, training
 from ..scene.regions import add_training_region, training_region
+from ..scene.strokes import canvases, masks_root
 from .checked_capture import draw_capture
 from .closing import KeepTraining, StopRun
 from .icons import curve_icon, preview_icon
-from .operators import OnJob, OnRunFolder, ReportsErrors, has_trainer, import_run_folder, select_only
+from .operators import OnCapture, OnJob, OnRunFolder, ReportsErrors, import_run_folder, select_only
 from .panels import Tab
+from .photo_buttons import MakeMasks, PaintStrokes, PhotosFromVideo, SaveStrokes
 
 
-class _OnCapture(ReportsErrors):
-    """Disable the operator's button without a capture or a trainer; its tooltip then says what to do.
-
-    Base class of the operators on the scene's capture, the folder with the photos.
-    """
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        if not has_trainer(cls):
-            return False
-        cls.poll_message_set("Choose the capture's folder first")
-        return bool(context.scene.refgs.capture)
-
-
-class CheckCapture(_OnCapture, bpy.types.Operator):
+class CheckCapture(OnCapture, bpy.types.Operator):
     bl_idname = "refgs.check_capture"
     bl_label = "Check"
     bl_description = "Read all photos and cameras of the capture, and report problems"
@@ -64,7 +52,7 @@ class AddTrainingRegion(ReportsErrors, bpy.types.Operator):
         select_only(context, add_training_region(context.scene))
 
 
-class Train(_OnCapture, bpy.types.Operator):
+class Train(OnCapture, bpy.types.Operator):
     bl_idname = "refgs.train"
     bl_label = "Train"
     bl_description = "Learn surfels, materials and light from the photos, in a separate process: Blender stays free"
@@ -160,6 +148,13 @@ class TrainPanel(Tab, bpy.types.Panel):
         column = layout.column()
         column.use_property_split, column.use_property_decorate = True, False
         column.prop(settings, "capture")
+        row = column.row(align=True)
+        row.operator(PhotosFromVideo.bl_idname, icon="FILE_MOVIE")
+        row = column.row(align=True)
+        row.operator(MakeMasks.bl_idname, icon="MOD_MASK")
+        row.operator(PaintStrokes.bl_idname, icon="BRUSH_DATA")
+        if canvases():
+            column.operator(SaveStrokes.bl_idname, icon="FILE_TICK")
         sub = column.row()
         sub.active = not settings.limited  # the minutes choose everything
         sub.prop(settings, "preset")
@@ -186,13 +181,14 @@ class TrainPanel(Tab, bpy.types.Panel):
         row.operator(Train.bl_idname, icon="PLAY")
         for number, job in enumerate(jobs.JOBS):
             if job.program == jobs.TRAINER and job not in preferences.own_jobs():
-                _draw_job(layout.box(), context.scene, number, job, width)
+                draw_job(layout.box(), context.scene, number, job, width)
         for known in settings.runs:
             if not any(job.run == Path(known.folder) for job in jobs.JOBS):
                 _draw_run(layout.box(), Path(known.folder))
 
 
-def _draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job, width: int) -> None:
+def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job, width: int) -> None:
+    """Draw a job of the trainer: its progress, what it found, and its buttons. `width` is how many letters fit into a line."""
     head = box.row()
     icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE", "paused": "PAUSE"}.get(job.state, "SORTTIME")
     head.label(text=job.name, icon=icon)
@@ -202,6 +198,7 @@ def _draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job:
         box.progress(factor=_fraction(job), text=_status(job).capitalize())
     if job.line:
         wrapped_text(box, job.line[0].upper() + job.line[1:], width)
+    _draw_photos(box, scene, job, width)
     for warning in job.warnings:
         wrapped_text(box, warning[0].upper() + warning[1:], width, "ERROR")
     for line in job.results.get("check", {}).get("lines", ()):
@@ -245,6 +242,19 @@ def _draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job:
         _draw_run(box, job.run)
 
 
+def _draw_photos(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, width: int) -> None:
+    """Draw how many photos or masks a job has made, and where they are."""
+    if found := job.results.get("frames"):
+        out = f"{found['blurred']} were blurred, {found['duplicates']} showed what the one before did"
+        wrapped_text(box, f"{found['photos']} photos of {found['frames']} frames; {out}", width)
+        wrapped_text(box, str(Path(found["capture"], "images")), width)
+        if scene.refgs.capture and Path(bpy.path.abspath(scene.refgs.capture)) == Path(found["capture"]):
+            box.operator(FindCameras.bl_idname, icon="OUTLINER_OB_CAMERA")
+    if found := job.results.get("masks"):
+        kept = f", {found['kept']} of yours kept" if found["kept"] else ""
+        wrapped_text(box, f"{found['made']} masks made{kept}: {masks_root(Path(found['capture'])) / 'masks'}", width)
+
+
 def draw_status(self, context: bpy.types.Context) -> None:
     """Draw a training's progress in the status bar."""
     job = next((job for job in jobs.JOBS if job.run and job.active), None)
@@ -270,6 +280,10 @@ def _status(job: jobs.Job) -> str:
         return "waiting" if job.state == "waiting" else "starting"
     if "stage" in job.progress:
         stage = job.progress["stage"]
+        if stage == "frames":
+            return "{done} frames read, {kept} kept, {blurred} blurred".format(**job.progress)
+        if job.commands[0]["command"] == "masks":
+            return f"making masks: {stage}"
         return {"colours": "learning colours", "baking": "baking textures"}.get(stage, f"finding cameras: {stage}")
     return f"{_duration(job.progress['seconds_left'])} left"
 

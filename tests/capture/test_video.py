@@ -96,8 +96,9 @@ def test_the_sharpest_frame_of_each_stretch(tmp_path, name):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["images"]
     assert [source(photo) for photo in photos] == sorted(sharp - set(range(20, 25)))
     assert np.abs(read_image(photos[0])[0].astype(int) - WALK[0]).mean() < 6
-    assert [done for done, _, _ in said] == list(range(1, LENGTH + 1))
-    assert said[-1] == (LENGTH, f"{STRETCHES} photos", LENGTH)
+    assert [facts["done"] for _, facts in said] == list(range(1, LENGTH + 1))
+    last = {"stage": "frames", "done": LENGTH, "total": LENGTH, "kept": STRETCHES - 2, "blurred": 1}
+    assert said[-1] == ("progress", last)  # the last stretch is not over yet
 
 
 def test_photos_are_evenly_spaced_where_all_frames_are_as_sharp(tmp_path):
@@ -237,8 +238,8 @@ def test_what_exists_is_not_overwritten(tmp_path):
 def test_an_interrupted_choice_leaves_nothing(tmp_path):
     write_video(tmp_path / "film.mp4", WALK)
 
-    def interrupt(frames, *_) -> None:
-        if frames == 30:
+    def interrupt(event, facts) -> None:
+        if facts["done"] == 30:
             assert any((tmp_path / "out" / "images.tmp").iterdir())
             raise KeyboardInterrupt
 

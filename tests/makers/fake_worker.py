@@ -72,6 +72,13 @@ def learn(command, asked, out):
     say("done", job="train", run=str(out), iteration=1000, seconds=10.0, psnr=30.0, left_out=[])
 
 
+def hold(asked):
+    """Wait until the input has ended."""
+    while None not in (heard := asked()):
+        time.sleep(0.002)
+    return heard
+
+
 def png(grey):
     """Make a PNG of one grey pixel."""
     chunks = (b"IHDR", b"\0\0\0\1\0\0\0\1\x08\0\0\0\0"), (b"IDAT", zlib.compress(bytes([0, grey]))), (b"IEND", b"")
@@ -134,6 +141,22 @@ def main():
                 if "noise" in command["capture"]:
                     print('this is no JSON\n5\n{"event": "progress"}', flush=True)
                 train(command, asked)
+            elif command["command"] == "frames":
+                for done in range(3):
+                    say("progress", stage="frames", done=done, total=3, kept=done, blurred=1)
+                if "slow" in command["video"]:
+                    waiting.extend(hold(asked))
+                    continue
+                (Path(command["out"]) / "images").mkdir(parents=True)
+                counts = {"frames": 3, "photos": command["count"], "blurred": 1, "duplicates": 2}
+                say("done", job="frames", capture=command["out"], **counts)
+            elif command["command"] == "masks":
+                (Path(command["capture"]) / "asked").write_text(json.dumps(command["settings"]))
+                say("progress", stage="carving", done=1, total=3)
+                box = ["region.centre=[1.0, 0.0, 0.0]", "region.size=[1.0, 2.0, 4.0]"]
+                moved = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 1], [0, 0, 0, 1]]
+                facts = {"capture": command["capture"], "region": box, "moved": moved}
+                say("done", job="masks", photos=3, made=2, kept=1, objects=1, **facts)
             elif command["command"] == "poses":
                 for done in range(3):
                     say("progress", stage="matching", done=done, total=3)

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -36,7 +37,7 @@ class _Candidate:
 
 
 def extract_photos(
-    video: Path, out: Path, count: int, progress: Callable[[int, str, int], None] = lambda *_: None
+    video: Path, out: Path, count: int, report: Callable[[str, dict[str, Any]], None] = lambda *_: None
 ) -> dict[str, int]:
     """Choose up to `count` frames of a video and write them to `out`/images as JPEG files frame_0001.jpg, frame_0002.jpg …
 
@@ -44,8 +45,9 @@ def extract_photos(
     beside those of the neighbouring stretches, or if the camera has not moved since the last photo. Photos are upright, as players show the
     video. HDR is converted to sRGB.
 
-    One frame in full size is kept in memory, and a small grey picture a stretch. `progress(frames, note, total)` is called while frames
-    are read. Returns the counts `frames`, `photos`, `blurred` and `duplicates`.
+    One frame in full size is kept in memory, and a small grey picture a stretch. `report("progress", facts)` is called after each frame:
+    `done` of `total` frames are read, and of the stretches so far `kept` and `blurred`. Returns the counts `frames`, `photos`, `blurred`
+    and `duplicates`.
 
     Raises InputError, and leaves nothing behind, if `out`/images exists, if the file is not a video or is truncated, or if fewer than
     three photos remain.
@@ -66,7 +68,7 @@ def extract_photos(
             raise InputError(f"{out}: no folder can be made there ({error.strerror}). Name another one.") from error
         try:
             with disk_errors_named([work], "run the command again"):
-                frames, candidates = _sharpest(video, container, work, count, progress)
+                frames, candidates = _sharpest(video, container, work, count, report)
                 kept, blurred, duplicates = _choose(video, frames, candidates)
                 for number, candidate in enumerate(kept, 1):
                     candidate.file.rename(work / f"frame_{number:04d}.jpg")
@@ -174,7 +176,7 @@ def _frames(video: Path, container: av.container.InputContainer) -> Iterator[tup
 
 
 def _sharpest(
-    video: Path, container: av.container.InputContainer, work: Path, count: int, progress: Callable
+    video: Path, container: av.container.InputContainer, work: Path, count: int, report: Callable
 ) -> tuple[int, list[_Candidate]]:
     """Find the sharpest frame of each of `count` stretches, and write it to the folder `work`. Stretches without frames are skipped.
 
@@ -184,6 +186,7 @@ def _sharpest(
     rate = float(container.streams.video[0].average_rate or 0)
     frames, candidates = 0, []
     current, best, most = -1, None, 0.0
+    so_far = {"kept": 0, "blurred": 0}  # the neighbours to come may change them
     # Each converter keeps its tables. Those for HDR take seconds to compute.
     to_grey, to_color = VideoReformatter(), VideoReformatter()
 
@@ -194,6 +197,8 @@ def _sharpest(
         scale = min(1.0, FLOW_SIDE / max(grey.shape))
         size = [max(1, round(side * scale)) for side in grey.shape[::-1]]
         candidates.append(_Candidate(measured, cv2.resize(grey, size, interpolation=cv2.INTER_AREA), file))
+        so_far["kept"] = len(_sharp(candidates))
+        so_far["blurred"] = len(candidates) - so_far["kept"]
 
     for time, frame in _frames(video, container):
         place = time / length * count
@@ -208,9 +213,22 @@ def _sharpest(
         if best is None or value > most:
             best, most = (measured, grey, frame), value
         frames += 1
-        progress(frames, f"{len(candidates) + 1} photos", max(frames, round(length * rate)))
+        facts = {"stage": "frames", "done": frames, "total": max(frames, round(length * rate))}
+        report("progress", facts | so_far)
     write()
     return frames, candidates
+
+
+def _sharp(candidates: list[_Candidate]) -> list[_Candidate]:
+    """Leave out the candidates that are blurred beside those of the neighbouring stretches."""
+    measured = np.array([candidate.sharpness for candidate in candidates])
+    reach = max(2, len(candidates) // 10)
+    usual = [np.median(measured[max(0, i - reach) : i + reach + 1]) for i in range(len(measured))]
+    return [
+        candidate
+        for candidate, near in zip(candidates, usual, strict=True)
+        if candidate.sharpness >= max(FORMLESS, BLURRED * near)
+    ]
 
 
 def _choose(video: Path, frames: int, candidates: list[_Candidate]) -> tuple[list[_Candidate], int, int]:
@@ -218,16 +236,9 @@ def _choose(video: Path, frames: int, candidates: list[_Candidate]) -> tuple[lis
 
     Returns the others, the number of blurred ones and the number of duplicates. Raises InputError if fewer than MIN_PHOTOS are left.
     """
-    measured = np.array([candidate.sharpness for candidate in candidates])
-    reach = max(2, len(candidates) // 10)
-    usual = [np.median(measured[max(0, i - reach) : i + reach + 1]) for i in range(len(measured))]
     if len(candidates) < MIN_PHOTOS:
         raise InputError(f"{video}: too few frames in it ({frames}). {REFILM}.")
-    sharp = [
-        candidate
-        for candidate, near in zip(candidates, usual, strict=True)
-        if candidate.sharpness >= max(FORMLESS, BLURRED * near)
-    ]
+    sharp = _sharp(candidates)
     if len(sharp) < MIN_PHOTOS:
         raise InputError(f"{video}: its {frames} frames are blurred. {REFILM}, in more light and in focus.")
     kept = sharp[:1]

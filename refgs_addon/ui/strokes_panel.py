@@ -1,0 +1,36 @@
+"""Draw the tab RefGS in the image editor's sidebar, where strokes that correct masks are painted."""
+
+import bpy
+
+from .. import jobs
+from ..scene.strokes import STROKES
+from .photo_buttons import ChooseBrush, SaveStrokes
+from .train_panel import draw_job
+
+
+class StrokesPanel(bpy.types.Panel):
+    bl_idname = "REFGS_PT_strokes"
+    bl_label = "Mask"
+    bl_space_type = "IMAGE_EDITOR"
+    bl_region_type = "UI"
+    bl_category = "RefGS"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.space_data.image is not None and STROKES in context.space_data.image
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = self.layout
+        width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
+        column = layout.column(align=True)
+        for paints, icon in (("object", "MESH_CIRCLE"), ("rest", "SHADING_SOLID"), ("nothing", "X")):
+            name = ChooseBrush.bl_rna.properties["paints"].enum_items[paints].name
+            column.operator(ChooseBrush.bl_idname, text=name, icon=icon).paints = paints
+        layout.label(text="The mask leaves out what is red")
+        layout.operator(SaveStrokes.bl_idname, icon="FILE_TICK")
+        for number, job in enumerate(jobs.JOBS):
+            if job.commands and job.commands[0]["command"] == "masks":
+                draw_job(layout.box(), context.scene, number, job, width)
+
+
+CLASSES = (StrokesPanel,)
