@@ -16,6 +16,7 @@ from refgs import train_job
 from refgs.errors import InputError
 from refgs.lock import LOCK, PROGRESS, STOP, RunLock
 from tests.makers.captures import nerfstudio
+from tests.makers.films import write_video
 from tests.makers.waiting import until
 
 SMALL = [
@@ -167,6 +168,46 @@ def test_masks_are_made_and_their_box_is_told(talk, tmp_path):
     done = talk.until("done")
     assert done["job"] == "masks" and done["made"] == 16 and done["objects"] == 1
     assert [line.split("=")[0] for line in done["region"]] == ["region.centre", "region.size"]
+
+
+def write_film(path, seconds):
+    """Write a video of a patterned wall that moves to the left, and is blurred from 0.8 to 1.2 seconds."""
+    noise = np.random.default_rng(0).normal(0, 30, (96, 1200, 3))
+    wall = 128 + sum(size * cv2.GaussianBlur(noise, (0, 0), size) for size in (1, 2, 4, 8, 16))  # detail of all sizes
+    wall = np.clip(wall, 0, 255).astype(np.uint8)
+    frames = [wall[:, 3 * number : 3 * number + 128] for number in range(30 * seconds)]
+    write_video(path, [cv2.blur(frame, (15, 1)) if 24 <= number < 36 else frame for number, frame in enumerate(frames)])
+
+
+def test_photos_of_a_video(talk, tmp_path):
+    """Check that photos are chosen with a running count. An interrupted choice leaves nothing."""
+    write_film(tmp_path / "film.mp4", 4)
+    talk.tell("frames", video=str(tmp_path / "film.mp4"), out=str(tmp_path / "out"), count=10)
+    found = talk.until("done")
+    counts = {"frames": 120, "photos": 9, "blurred": 1, "duplicates": 0}
+    assert found == {"event": "done", "job": "frames", "capture": str(tmp_path / "out")} | counts
+    assert len(list((tmp_path / "out" / "images").iterdir())) == 9
+    said = [event for event in talk.heard if event["event"] == "progress"]
+    assert said[-1] == {"event": "progress", "stage": "frames", "done": 120, "total": 120, "kept": 8, "blurred": 1}
+    talk.tell("frames", video=str(tmp_path / "film.mp4"), out=str(tmp_path / "out"))
+    assert "images exists" in talk.until("failed")["what"]
+    write_film(tmp_path / "long.mp4", 10)
+    talk.tell("frames", video=str(tmp_path / "long.mp4"), out=str(tmp_path / "long"))
+    talk.until("progress")
+    talk.end()
+    assert not (tmp_path / "long").exists()
+
+
+def test_masks_and_the_box_in_their_frame(talk, tmp_path):
+    """Check that the object's box is in the frame of the masked capture, about its origin, and that `moved` tells of the change."""
+    nerfstudio(tmp_path)
+    talk.tell("masks", capture=str(tmp_path))
+    found = talk.until("done")
+    assert found["made"] == len(list((tmp_path / "masks").glob("*.png"))) == 16
+    values = {key: json.loads(value) for key, value in (word.split("=") for word in found["region"])}
+    moved = np.array(found["moved"])
+    assert not np.allclose(moved, np.eye(4), atol=0.05)
+    np.testing.assert_allclose(values["region.centre"], 0, atol=0.15)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")

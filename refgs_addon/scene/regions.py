@@ -74,17 +74,17 @@ def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
     return box
 
 
-def show_found_region(scene: bpy.types.Scene, settings: list[str], moved: Matrix) -> bpy.types.Object:
+def show_found_region(scene: bpy.types.Scene, settings: list[str]) -> bpy.types.Object:
     """Make the training box the box in which masks found the object, or move it there, with some room around it.
 
-    `settings` are the trainer's, as "region.size=[1, 1, 2]". `moved` brings their coordinates to the present ones. The box counts as found
-    by the program (`artists_region`) until the artist changes it.
+    `settings` are the trainer's, as "region.size=[1, 1, 2]". The box counts as found by the program (`artists_region`) until the artist
+    changes it.
     """
     values = {key: json.loads(value) for key, value in (word.split("=", 1) for word in settings)}
     box = training_region(scene) or _new_training_region(scene)
     box.empty_display_size, box.hide_viewport = 1.0, False
     half = Vector(values["region.size"]) / 2 * ROOM
-    box.matrix_world = moved @ Matrix.LocRotScale(Vector(values["region.centre"]), None, half)
+    box.matrix_world = Matrix.LocRotScale(Vector(values["region.centre"]), None, half)
     box[FOUND] = [x for row in _world_matrix(scene, box) for x in row]
     return box
 

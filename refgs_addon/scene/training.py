@@ -80,7 +80,7 @@ def make_masks(scene: bpy.types.Scene) -> jobs.Job:
             found, moved = job.results["masks"], Matrix(job.results["masks"]["moved"])
             box = artists_region(known)
             if box is None:
-                show_found_region(known, found["region"], moved)
+                show_found_region(known, found["region"])
             else:
                 box.matrix_world = moved @ box.matrix_world
             checked = job.results["check"]

@@ -98,11 +98,11 @@ def test_masks_show_the_box_among_the_cameras(addon, capture):
         bpy.ops.refgs.make_masks()
     assert final_state(job) == "done" and json.loads((capture / "asked").read_text()) == []
     assert [item.name for item in cameras_of(addon, capture).objects] == ["0", "1"]
-    # The box is in the frame of the masked capture, with room.
+    # The box is in the frame of the masked capture already, and has room.
     box = regions.training_region(addon)
     settings = regions.region_settings(addon)
-    assert settings["region.centre"] == pytest.approx([2, 0, 1])
-    assert settings["region.size"] == pytest.approx([2 * regions.ROOM * edge for edge in (1, 2, 4)])
+    assert settings["region.centre"] == pytest.approx([1, 0, 0])
+    assert settings["region.size"] == pytest.approx([regions.ROOM * edge for edge in (1, 2, 4)])
     # As long as nobody touches it, it does not limit masks: strokes may add what is outside.
     assert regions.artists_region(addon) is None
     assert final_state(training.make_masks(addon)) == "done" and json.loads((capture / "asked").read_text()) == []
