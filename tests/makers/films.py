@@ -1,7 +1,12 @@
 """Write videos."""
 
+from pathlib import Path
+
 import av
 import numpy as np
+from scipy.ndimage import map_coordinates
+
+from tests.makers.captures import CENTRE, ball_normals, ring
 
 
 def write_video(path, frames, codec="libx264", pixels="yuv420p", options=None, **color) -> None:
@@ -19,3 +24,23 @@ def write_video(path, frames, codec="libx264", pixels="yuv420p", options=None, *
             frame.pts = number
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+
+
+def film_ball(path: Path, count: int = 48, width: int = 320, height: int = 240) -> None:
+    """Write a video of one round about a red ball on a blue floor, both with random speckles."""
+    focal, lattice = 1.1 * width, np.random.default_rng(0).random((32, 32, 32))
+    u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    local = np.stack([u / focal, -v / focal, -np.ones_like(u)], axis=-1)
+    frames = []
+    for pose in ring(2 * count, distance=3.5)[::2]:  # those at the same height
+        normals = ball_normals(pose, width, height, focal)
+        ball, rays = np.isfinite(normals[..., 0]), local @ pose[:3, :3].T
+        depth = (CENTRE[2] - 0.5 - pose[2, 3]) / np.minimum(rays[..., 2], -1e-3)
+        points = np.where(ball[..., None], CENTRE + 0.5 * normals, pose[:3, 3] + rays * depth[..., None])
+        grains = sum(
+            map_coordinates(lattice, size * points.transpose(2, 0, 1) + 3 * size, order=1, mode="wrap")
+            for size in (5.0, 17.0)
+        )
+        colors = np.where(ball[..., None], [110, 40, 30], [30, 50, 110])
+        frames.append((grains[..., None] * colors).astype(np.uint8))
+    write_video(path, frames)

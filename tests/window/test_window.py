@@ -18,6 +18,7 @@ import cv2
 import pytest
 
 from refgs_addon import jobs
+from tests.makers.films import film_ball
 from tests.makers.runs import write_run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -108,6 +109,25 @@ def test_an_artist_trains(tmp_path, ball_capture):
     print("longest that the window was busy, in seconds:", report["longest"])
     print("of that for the add-on's timer and panels:", report["ours"])
     print("what buttons took:", report["clicks"])
+
+
+@pytest.mark.window
+def test_a_film_becomes_a_run(tmp_path):
+    """Check the way from a film to an imported run with the real trainer: photos, cameras, masks, a painted stroke, training."""
+    film_ball(tmp_path / "ball.mp4")
+    report = in_window("film.py", tmp_path, sys.executable, tmp_path / "ball.mp4")
+    assert report["capture"] == str(tmp_path / "ball") and report["line"] == ""
+    assert report["placed"] == report["masks"] == report["cameras"] == 24
+    assert min(report["box"]) > 0.5 and max(report["box"]) < 2
+    if not report["numpy"]:
+        pytest.skip("Blender's Python lacks numpy: strokes cannot be painted")
+    assert report["editor"][0] == "PAINT"
+    strokes = cv2.imread(report["strokes"], cv2.IMREAD_UNCHANGED)
+    drawn = strokes[..., 3] > 0
+    assert 0.001 < drawn.mean() < 0.2 and not strokes[drawn, :3].any()
+    mask = cv2.imread(str(tmp_path / "ball" / "masks" / Path(report["strokes"]).name), cv2.IMREAD_GRAYSCALE)
+    assert (mask[drawn] > 127).mean() < 0.1 and (mask > 127).mean() > 0.02
+    assert report["corrected"] == report["trained"] == "done" and report["imported"] == ["FINISHED"]
 
 
 @pytest.mark.window

@@ -1,0 +1,118 @@
+"""Act as an artist in a Blender window: make a capture of a film, mask it, paint a stroke, train and import the run.
+
+Arguments: the Python with the trainer, and the film. stage.py shows the command line.
+"""
+
+import importlib.util
+from pathlib import Path
+
+import bpy
+from stage import MODULE, WORDS, act, after, area, choose_tab, install, jobs, photograph, report, view
+
+PYTHON, FILM = WORDS
+
+
+def ended():
+    return bool(jobs()) and jobs()[-1].ended
+
+
+def drag(window, places):
+    """Paint a stroke with the left mouse button through places (x, y) in a window's pixels."""
+    x, y = places[0]
+    window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=x, y=y)
+    window.event_simulate(type="LEFTMOUSE", value="PRESS", x=x, y=y)
+    for x, y in places[1:]:
+        window.event_simulate(type="MOUSEMOVE", value="NOTHING", x=x, y=y)
+    window.event_simulate(type="LEFTMOUSE", value="RELEASE", x=x, y=y)
+
+
+def stroke(canvas):
+    """Paint on a canvas in its window, from the middle of the photo to the right. Yields as `artist` does."""
+    window, editor = next(
+        (window, area)
+        for window in bpy.context.window_manager.windows
+        for area in window.screen.areas
+        if area.type == "IMAGE_EDITOR"
+    )
+    report["editor"] = editor.spaces.active.ui_mode, editor.spaces.active.image.name
+    sidebar = next(region for region in editor.regions if region.type == "UI")
+    sidebar.active_panel_category = "RefGS"
+    picture = next(region for region in editor.regions if region.type == "WINDOW")
+    bpy.ops.refgs.choose_brush(paints="rest")
+    yield after(2.0)
+    ends = [picture.view2d.view_to_region(x, 0.5, clip=False) for x in (0.5, 0.7)]
+    places = [
+        (picture.x + round(a + (b - a) * i / 8), picture.y + ends[0][1])
+        for i in range(9)
+        for a, b in [(ends[0][0], ends[1][0])]
+    ]
+    with bpy.context.temp_override(window=window, area=editor, region=picture):
+        drag(window, places)
+    yield after(3.0)
+    photograph("stroke")
+    yield lambda: True
+
+
+def artist():
+    """Press the buttons from a film to an imported run.
+
+    Each `yield` gives a function; the next step waits until this function returns true.
+    """
+    install()
+    area().spaces.active.show_region_ui = True
+    bpy.data.objects.remove(bpy.data.objects["Cube"])
+    bpy.context.preferences.addons[MODULE].preferences.python = PYTHON
+    settings = bpy.context.scene.refgs
+    yield after(1.0)
+    choose_tab()
+    yield ended
+    bpy.ops.refgs.photos_from_video(filepath=FILM, count=24)
+    yield lambda: jobs()[-1].progress
+    yield ended
+    yield after(1.0)
+    photograph("photos")
+    report["capture"], report["line"] = settings.capture, jobs()[-1].line
+    bpy.ops.refgs.find_cameras()
+    yield ended
+    report["placed"] = jobs()[-1].results["poses"]["placed"]
+    for _ in range(len(jobs()) - 1):
+        bpy.ops.refgs.put_away(number=1)
+    bpy.ops.refgs.make_masks()
+    yield ended
+    report["masks"] = jobs()[-1].results["masks"]["made"]
+    report["cameras"] = sum(item.type == "CAMERA" for item in bpy.data.objects) - 1  # without Blender's default camera
+    report["box"] = list(settings.region.scale)
+    with view():
+        bpy.ops.view3d.view_all()
+    yield after(3.0)
+    photograph("masks")
+    report["numpy"] = importlib.util.find_spec("numpy") is not None
+    if not report["numpy"]:
+        return
+    bpy.context.view_layer.objects.active = next(
+        item for item in bpy.data.objects if item.data and "refgs_photo" in item.data
+    )
+    bpy.ops.refgs.paint_strokes()
+    yield after(3.0)
+    canvas = next(image for image in bpy.data.images if "refgs_strokes" in image)
+    yield from stroke(canvas)
+    bpy.ops.refgs.save_strokes()
+    report["strokes"] = canvas["refgs_strokes"]
+    yield ended
+    yield after(3.0)
+    photograph("corrected")
+    report["corrected"] = jobs()[-1].line or jobs()[-1].state
+    settings.limited, settings.minutes = True, 0.3
+    bpy.ops.refgs.train()
+    yield ended
+    report["trained"], run = jobs()[-1].state, Path(jobs()[-1].run)
+    report["run"] = str(run)
+    report["imported"] = list(bpy.ops.refgs.import_trained(folder=str(run)))
+    area().spaces.active.shading.type = "MATERIAL"
+    with view():
+        bpy.ops.view3d.view_all()
+    yield after(10.0)
+    photograph("imported")
+
+
+act(artist())
