@@ -1,5 +1,6 @@
 """Define the operators that prepare a capture: photos from a video, masks, and strokes that correct masks."""
 
+import contextlib
 from pathlib import Path
 from typing import ClassVar
 
@@ -10,6 +11,8 @@ from .. import compat
 from ..scene import training
 from ..scene.strokes import add_canvas, camera_with_photo
 from .operators import OnCapture, ReportsErrors, has_trainer
+
+HARD_BRUSH = "brushes/essentials_brushes-mesh_texture.blend/Brush/Paint Hard"
 
 
 class PhotosFromVideo(ReportsErrors, bpy.types.Operator):
@@ -141,12 +144,17 @@ def show_in_editor(context: bpy.types.Context, canvas: bpy.types.Image) -> None:
     space.image, space.ui_mode, space.show_region_ui = canvas, "PAINT", True
     region = next(region for region in area.regions if region.type == "WINDOW")
     with context.temp_override(window=window, area=area, region=region):
-        bpy.ops.brush.asset_activate(
-            asset_library_type="ESSENTIALS",
-            relative_asset_identifier="brushes/essentials_brushes-mesh_texture.blend/Brush/Paint Hard",
-        )
+        with contextlib.suppress(RuntimeError):  # some builds of Blender come without its brushes
+            bpy.ops.brush.asset_activate(asset_library_type="ESSENTIALS", relative_asset_identifier=HARD_BRUSH)
         bpy.ops.image.view_all(fit_view=True)
     choose_brush(context.scene.tool_settings, "object")
+    sidebar = next(region for region in area.regions if region.type == "UI")
+
+    def choose_tab() -> None:
+        with contextlib.suppress(ReferenceError, TypeError):  # the window was closed, or its tabs are not drawn yet
+            sidebar.active_panel_category = "RefGS"
+
+    bpy.app.timers.register(choose_tab, first_interval=0.5)
 
 
 CLASSES = (PhotosFromVideo, MakeMasks, PaintStrokes, SaveStrokes, ChooseBrush)
