@@ -13,6 +13,11 @@ from ..scene.strokes import add_canvas, camera_with_photo
 from .operators import OnCapture, ReportsErrors, has_trainer
 
 HARD_BRUSH = "brushes/essentials_brushes-mesh_texture.blend/Brush/Paint Hard"
+PAINTS = {
+    "object": ("Object", "Paint white: this is the object"),
+    "rest": ("Not the Object", "Paint black: this is not the object"),
+    "nothing": ("Erase", "Take strokes away"),
+}
 
 
 class PhotosFromVideo(ReportsErrors, bpy.types.Operator):
@@ -99,17 +104,12 @@ class ChooseBrush(ReportsErrors, bpy.types.Operator):
 
     paints: EnumProperty(
         name="Paints",
-        items=[
-            ("object", "Object", "Paint white: this is the object"),
-            ("rest", "Not the Object", "Paint black: this is not the object"),
-            ("nothing", "Erase", "Take strokes away"),
-        ],
+        items=[(paints, *words) for paints, words in PAINTS.items()],
     )
 
     @classmethod
     def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        items = cls.bl_rna.properties["paints"].enum_items
-        return items[properties.paints].description
+        return PAINTS[properties.paints][1]
 
     def work(self, context: bpy.types.Context) -> None:
         choose_brush(context.tool_settings, self.paints)

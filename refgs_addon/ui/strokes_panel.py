@@ -4,7 +4,7 @@ import bpy
 
 from .. import jobs
 from ..scene.strokes import STROKES
-from .photo_buttons import ChooseBrush, SaveStrokes
+from .photo_buttons import PAINTS, ChooseBrush, SaveStrokes
 from .train_panel import draw_job
 
 
@@ -24,8 +24,7 @@ class StrokesPanel(bpy.types.Panel):
         width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
         column = layout.column(align=True)
         for paints, icon in (("object", "MESH_CIRCLE"), ("rest", "SHADING_SOLID"), ("nothing", "X")):
-            name = ChooseBrush.bl_rna.properties["paints"].enum_items[paints].name
-            column.operator(ChooseBrush.bl_idname, text=name, icon=icon).paints = paints
+            column.operator(ChooseBrush.bl_idname, text=PAINTS[paints][0], icon=icon).paints = paints
         layout.label(text="The mask leaves out what is red")
         layout.operator(SaveStrokes.bl_idname, icon="FILE_TICK")
         for number, job in enumerate(jobs.JOBS):
