@@ -51,7 +51,7 @@ HEAD = """# Real captures
 Machine: {machine}. Date: {date}. `refgs bench real --captures DIR` trains on each capture in a folder and writes this page.
 
 PSNR and SSIM are means over held-out views, every eighth photo. A held-out photo's exposure is unknown: "exposure fitted" is the PSNR with
-the exposure that fits best, if photos have exposures of their own. Metal is the part of the object's pixels in these views with a
+the exposure and white balance that fit best, if photos have their own. Metal is the part of the object's pixels in these views with a
 metallic of at least {metal}. Seconds are those of the whole command on the clock; CPU seconds are the processor's.
 
 {table}

@@ -77,9 +77,13 @@ class Training(bpy.types.PropertyGroup):
     exposures: EnumProperty(
         name="Exposure",
         items=[
-            ("auto", "Auto", "Learn each photo's exposure, unless they agree. Paper assumes one for all"),
-            ("on", "Each Photo's", "The camera chose an exposure for each photo"),
-            ("off", "One for All", "The exposure was locked"),
+            (
+                "auto",
+                "Auto",
+                "Learn each photo's exposure and white balance, unless they agree. Paper assumes one for all",
+            ),
+            ("on", "Each Photo's", "The camera chose an exposure, and perhaps a white balance, for each photo"),
+            ("off", "One for All", "Exposure and white balance were locked"),
         ],
     )
     specular: EnumProperty(

@@ -90,8 +90,10 @@ class Run:
                 self._traced.update(light=light, surfels=found)
         return self._traced["surfels"]
 
-    def render(self, camera: Camera, environment: Environment | None = None, exposure: float = 1.0) -> Rendering:
-        """Render an image from a camera in the run's frame. Radiance is multiplied by `exposure`.
+    def render(
+        self, camera: Camera, environment: Environment | None = None, exposure: float | np.ndarray = 1.0
+    ) -> Rendering:
+        """Render an image from a camera in the run's frame. Radiance is multiplied by `exposure`, one factor or (3,).
 
         If `environment` is given, the surfels are relit by it; otherwise the light recovered in training is used.
         """
@@ -103,9 +105,8 @@ class Run:
             settings = settings.model_copy(update={"diffuse": diffuse, "reflection": reflection})
         light, background = environment or self.environment, torch.tensor(self.settings.image.background)
         with torch.no_grad():
-            return render(
-                surfels, light, camera, background, settings, self.near, self.occluder, torch.tensor(exposure)
-            )
+            factors = torch.tensor(np.broadcast_to(exposure, 3), dtype=torch.float32)
+            return render(surfels, light, camera, background, settings, self.near, self.occluder, factors)
 
 
 def create_run(

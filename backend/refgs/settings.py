@@ -106,7 +106,7 @@ class LightSettings(_Section):
     frame: Literal["auto", "world", "camera"] = Field(
         description="light fixed to the world, or to the camera as on a turntable; auto: found from the photos"
     )
-    exposure: Need = Field(description="exposure per photo; auto: off if the photos agree")
+    exposure: Need = Field(description="exposure and white balance per photo; auto: each is off if the photos agree")
 
 
 class CameraSettings(_Section):
@@ -165,7 +165,7 @@ class RateSettings(_Section):
     indirect_dc: float = Field(ge=0, description="indirect light, SH degree 0")
     indirect_rest: float = Field(ge=0, description="indirect light, SH degrees above 0")
     environment: float = Field(ge=0, description="texels of the light")
-    exposure: float = Field(ge=0, description="logarithm of a photo's exposure")
+    exposure: float = Field(ge=0, description="logarithm of a photo's exposure and white balance")
     decay: float = Field(gt=0, le=1, description="factor on every rate but position's at the end of the training")
     position_decay: float = Field(gt=0, le=1, description="factor on position's rate at position_until")
     position_until: float = Field(
@@ -191,7 +191,7 @@ class LossSettings(_Section):
     )
     matte: float = Field(ge=0, description="penalty of roughness above 0.3")
     light: float = Field(ge=0, description="penalty of a coloured mean of the light")
-    exposure: float = Field(ge=0, description="penalty of a photo's exposure that differs from most")
+    exposure: float = Field(ge=0, description="penalty of a photo's exposure or white balance that differs from most")
 
 
 class NeedsSettings(_Section):

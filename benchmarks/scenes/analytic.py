@@ -120,7 +120,7 @@ def photo(
     balls: np.ndarray = ONE,
     samples: int = 4,
     turning: bool = False,
-    stops: float = 0.0,
+    stops: float | tuple[float, float, float] = 0.0,
     bands: bool = False,
     angle: float = ANGLE,
     matte: bool = False,
@@ -130,8 +130,8 @@ def photo(
     By default, balls are mirrors with Schlick's Fresnel. If `bands` is set, they have three horizontal bands of materials (BANDS). If
     `matte` is set, they are matte with a pattern.
 
-    `matrix` is the camera-to-world matrix, `angle` the field of view in radians, and `stops` the exposure in powers of two. Each pixel is
-    the mean of `samples`² rays. If `turning` is set, the sky turns about z together with the camera.
+    `matrix` is the camera-to-world matrix, `angle` the field of view in radians, and `stops` the exposure in powers of two, which may
+    differ between channels. Each pixel is the mean of `samples`² rays. If `turning` is set, the sky turns about z together with the camera.
     """
     focal = 0.5 * size / np.tan(angle / 2)
     grid = (np.arange(size * samples) + 0.5) / samples
@@ -149,7 +149,7 @@ def photo(
     azimuth = np.arctan2(matrix[1, 0], matrix[0, 0]) if turning else 0.0
     cosine, sine = np.cos(azimuth), np.sin(azimuth)
     ray = ray @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
-    color = np.where(seen[:, None], 2**stops * share * sky(ray), 0)
+    color = np.where(seen[:, None], 2.0 ** np.asarray(stops) * share * sky(ray), 0)
     if matte:  # a sky linear in the direction, a + b·d, has irradiance / π = a + 2/3 b·n
         color = np.where(seen[:, None], (0.5 + 0.3 * np.sin(6 * first_normal)) * sky(2 / 3 * first_normal), 0)
     blocks = (size, samples, size, samples)
@@ -186,7 +186,7 @@ def write_ball_capture(
     balls: np.ndarray = ONE,
     samples: int = 4,
     turning: bool = False,
-    stops: tuple[float, ...] = (0.0,),
+    stops: tuple[float | tuple[float, float, float], ...] = (0.0,),
     bands: bool = False,
     distance: float = DISTANCE,
     matte: bool = False,

@@ -18,14 +18,15 @@ def assert_same(a, b):
 def test_run_cameras_round_trip(tmp_path, make):
     capture = read_capture(make(tmp_path / "capture"))
     file = tmp_path / "cameras.json"
-    given = {capture.train_views[1].camera.name: 1.25}
+    names = [view.camera.name for view in capture.train_views]
+    given = {names[1]: [1.25, 1.25, 1.25], names[2]: [1.0, 1.25, 0.75]}
     write_cameras(file, capture, exposures=given)
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["cameras.json"]
     cameras, splits, to_capture, exposures, _ = read_run_cameras(file)
     assert splits == [view.split for view in capture.views]
     # A held-out view of the same name has no exposure.
-    known = [given.get(view.camera.name, 1.0) if view.split == "train" else 1.0 for view in capture.views]
-    assert exposures == known and known.count(1.25) == 1
+    known = {names[1]: 1.25, names[2]: [1.0, 1.25, 0.75]}  # one number stands for three equal ones
+    assert exposures == [known.get(view.camera.name, 1.0) if view.split == "train" else 1.0 for view in capture.views]
     np.testing.assert_array_equal(to_capture, capture.to_capture)
     for camera, view in zip(cameras, capture.views, strict=True):
         assert_same(camera, view.camera)

@@ -132,13 +132,14 @@ def test_one_scale_for_all_views_is_found_and_a_sun_does_not_decide_it():
     assert metrics.relit(lambda: zip(images, truth, strict=True))["psnr_aligned"] < 30
 
 
-def test_an_exposure_is_fitted_where_the_photo_tells():
+def test_exposures_are_fitted_where_the_photo_tells():
     radiance, alpha = RANDOM.uniform(0, 1, (8, 9, 3)), np.ones((8, 9))
-    photo = srgb_encode(1.5 * radiance)
+    factors = [1.5, 1.2, 0.9]
+    photo = srgb_encode(factors * radiance)
     alpha[:2], photo[:2] = 0, 0.3
     assert (photo > 1).any()
-    assert metrics.fitted_exposure(radiance, alpha, photo.clip(0, 1)) == pytest.approx(1.5)
-    assert metrics.fitted_exposure(radiance, 0 * alpha, photo) == 1
+    assert metrics.fitted_exposure(radiance, alpha, photo.clip(0, 1)) == pytest.approx(factors)
+    assert (metrics.fitted_exposure(radiance, 0 * alpha, photo) == 1).all()
 
 
 def test_uncovered_pixels_are_white_on_both_sides():

@@ -19,7 +19,7 @@ NAMES = ("features", "alpha", "levels", "exposure")
 MARGIN = 1e-4
 FORWARD, GRADIENT = 1e-5, 1e-4
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
-EXPOSURE = 0.7
+EXPOSURE = [0.7, 0.9, 0.6]
 TURN = reference.rotation_matrices(torch.tensor([[0.8, 0.3, -0.4, 0.5]], dtype=torch.float64))[0]
 
 

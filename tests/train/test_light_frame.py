@@ -112,12 +112,31 @@ def test_exposures_are_learned_where_photos_differ(tmp_path):
     assert held_out_psnr(with_them.state) > held_out_psnr(without.state) + 1
     index = [int(view.camera.name.partition("_")[2].partition(".")[0]) for view in with_them.state.views]
     truth = np.array([STOPS[i % len(STOPS)] for i in index])
-    found = with_them.state.exposures.detach().numpy() / np.log(2)
+    assert with_them.state.exposures.shape[1] == 1 and "not in white" in with_them.state.decided["exposures"]
+    found = with_them.state.exposures.detach().numpy()[:, 0] / np.log(2)
     assert np.abs(found - truth).max() < 0.2
     frames = json.loads((tmp_path / "auto" / "cameras.json").read_text())["frames"]
     factors = [frame.get("exposure") for frame in frames if frame["split"] == "train"]
     np.testing.assert_allclose(factors, 2**found, rtol=1e-5)
     assert not any("exposure" in frame for frame in frames if frame["split"] == "test")
+
+
+BALANCES = ((0.0, 0.0, 0.0), (0.3, 0.0, -0.3), (0.2, 0.0, -0.1), (-0.3, 0.0, 0.4), (0.0, 0.2, 0.0))
+
+
+def test_white_balances_are_learned_where_photos_differ(tmp_path):
+    """Check that white balances are told apart, to 5 % in the root mean square, and that they are neutral in the mean."""
+    write_ball_capture(tmp_path / "capture", 48, stops=BALANCES)
+    made = trained(tmp_path / "capture", tmp_path / "run", METAL, total=600)
+    index = [int(view.camera.name.partition("_")[2].partition(".")[0]) for view in made.state.views]
+    truth = np.array([BALANCES[i % len(BALANCES)] for i in index])
+    found = made.state.exposure(slice(None)).detach().log2().numpy()
+    found_tint, tint = (value - value.mean(axis=1, keepdims=True) for value in (found, truth))
+    np.testing.assert_allclose(found_tint.mean(axis=0), 0, atol=1e-5)
+    error = found_tint - (tint - tint.mean(axis=0))
+    assert np.sqrt((error**2).mean()) < np.log2(1.05) < 0.5 * tint.std()
+    frames = json.loads((tmp_path / "run" / "cameras.json").read_text())["frames"]
+    np.testing.assert_allclose([f["exposure"] for f in frames if f["split"] == "train"], 2**found, rtol=1e-5)
 
 
 def test_exposures_cost_nothing_where_photos_agree(ball_capture, tmp_path):

@@ -41,21 +41,23 @@ def write_cameras(
     file: Path,
     capture: Capture,
     light: str = "world",
-    exposures: dict[str, float] | None = None,
+    exposures: dict[str, list[float]] | None = None,
     refined: bool = False,
 ) -> None:
     """Write the run folder's cameras.json: the undistorted cameras in the run's frame, with OpenGL axes.
 
     `light` is "world" if the light stands still, or "camera" if it turns with the camera, as on a turntable. In the second case
     environment.exr shows the light at the first training photo, and the key `light_of` names that photo. `exposures` maps names of training
-    photos to exposure factors: the scene's radiance times this factor gives the photo's brightness.
+    photos to factors of red, green and blue: the scene's radiance times these factors gives the photo's. If the three are equal, one is
+    written.
     `refined` tells that the training photos' poses were refined: a training view then has the key `refined`.
     """
     frames = []
     for view in capture.views:
         camera = view.camera
         known = exposures is not None and view.split == "train" and camera.name in exposures
-        frame = {"exposure": exposures[camera.name]} if known else {}
+        factors = exposures[camera.name] if known else []
+        frame = {"exposure": factors if len(set(factors)) > 1 else factors[0]} if known else {}
         if refined and view.split == "train":
             frame["refined"] = True
         frames.append(
@@ -83,11 +85,12 @@ def _from(folder: Path, file: Path) -> Path:
     return file.relative_to(folder) if file.is_relative_to(folder) else file
 
 
-def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float], bool]:
+def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, list[float | list[float]], bool]:
     """Read a run folder's cameras.json.
 
     Return the cameras in the run's frame, the split of each ("train" or "test"), the similarity transform (4, 4) from the run's frame to
-    the capture's, and the exposure factor of each (1 if the file has none), and whether the training refined poses.
+    the capture's, the exposure of each, and whether the training refined poses. An exposure is one factor, or one for each of red, green
+    and blue (1 if the file has none).
     """
     file = Path(file)
     shared, frames = read_frames(file)

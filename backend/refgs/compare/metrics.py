@@ -44,16 +44,16 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
     return decibels(float(((np.asarray(image, np.float64) - reference) ** 2).mean()))
 
 
-def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) -> float:
-    """Compute a photo's exposure: the factor that brings linear `radiance` (h, w, 3) closest to the sRGB-encoded `photo`.
+def fitted_exposure(radiance: np.ndarray, alpha: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """Compute a photo's exposure (3,): the factors that bring linear `radiance` (h, w, 3) closest to the sRGB-encoded `photo`.
 
-    It is fitted by least squares, in linear colours. Pixels are used if `alpha` (h, w) is above 0.5 and the photo is not overexposed there.
-    If no pixel can be used, the factor is 1.
+    Each channel has one, by least squares in linear colours. Pixels are used if `alpha` (h, w) is above 0.5 and the photo is not clipped
+    there. The factor of a channel that has nothing to compare is 1.
     """
     seen = (alpha > 0.5) & (photo.max(axis=-1) < 0.98)
     rendered, taken = radiance[seen].astype(np.float64), srgb_decode(photo[seen].astype(np.float64))
-    square = (rendered * rendered).sum()
-    return float((rendered * taken).sum() / square) if square > 0 else 1.0
+    square, product = (rendered * rendered).sum(axis=0), (rendered * taken).sum(axis=0)
+    return np.where(square > 0, product / np.where(square > 0, square, 1), 1)
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:

@@ -17,7 +17,7 @@ struct Shade {
   float turn[9];   // world to the light's frame, a rotation, row-major
   float fx, fy, cx, cy;
   const float* background;        // (3)
-  const float* exposure;          // (1): factor of radiance before it is encoded
+  const float* exposure;          // (3): factors of radiance before it is encoded
   int64_t harmonics;              // whether there are channels of directional colour
   int64_t splats, display;        // whether pixels are surfels; whether colours are blended without sRGB encoding
   int64_t mirror;                 // whether reflections are sharp mirror reflections weighted by metallic, as in 3DGS-DR
@@ -36,7 +36,7 @@ struct Shade {
   float *color, *normal, *material, *radiance;            // (height, width, 3 | 3 | 5 | 3)
   const float *by_color, *by_normal, *by_material;
   float *by_features, *by_alpha;
-  float *by_light, *by_exposure;    // (texels, 3), (chunks, or blocks on CUDA): partial sums
+  float *by_light, *by_exposure;    // (texels, 3), (chunks, or blocks on CUDA; 3): partial sums
   float* near;                      // (chunks, chunk_rows + 2 HALO, width, 4): a chunk's derivatives by displaced normals and their alpha
   float* by_cells;                  // (chunks + 1, cells, 4): each chunk's derivatives by cells, then their sum
   uint8_t* touched;                 // (chunks, chunk_rows + 2 HALO + lines): rows of `near` and lines of `by_cells` that a chunk wrote

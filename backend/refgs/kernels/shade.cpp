@@ -66,7 +66,7 @@ struct Shaded {
   Lookup<1, DERIVATIVES> irradiance;
   ReflectanceTable table;
   Vector light[3], received[3], radiance[3], encoded[3], slope[3];
-  float exposure;
+  float exposure[3];
 
   MEMBER Shaded(const Shade& s, const Pixels& pixels)
       : map(s, pixels),
@@ -76,7 +76,7 @@ struct Shaded {
         lookup(s.levels, mirrored(), s.mirror ? Vector() : map.value[ROUGHNESS]),
         irradiance(s.levels, normal),
         table(s.reflectance, s.reflectance_side, n_dot_v, map.value[ROUGHNESS]),
-        exposure(s.exposure[0]) {
+        exposure{s.exposure[0], s.exposure[1], s.exposure[2]} {
     const auto& v = map.value;
     Vector metallic = v[METALLIC];
     visibility = Vector() + 1.0f;
@@ -95,7 +95,7 @@ struct Shaded {
       Vector diffuse = (1.0f - metallic) * received[c];
       if (!HARMONICS) diffuse *= (1.0f - dielectric) * v[ALBEDO + c];
       radiance[c] = light[c] * reflected(s, Metal(table, v[ALBEDO + c])) + diffuse;
-      encode<SPLATS>(s, exposure * radiance[c], encoded[c], slope[c]);
+      encode<SPLATS>(s, exposure[c] * radiance[c], encoded[c], slope[c]);
     }
   }
 
@@ -106,7 +106,7 @@ struct Shaded {
 
   template <class Sums>
   MEMBER void backward(const Shade& s, Sums& sums) const {
-    Vector by_color[3], by_normal[3] = {}, by_material[5] = {}, by_alpha = {}, by_exposure = {};
+    Vector by_color[3], by_normal[3] = {}, by_material[5] = {}, by_alpha = {}, by_exposure[3];
     gather<3>(s.by_color, map.pixels, by_color);
     if (!SPLATS) gather<3>(s.by_normal, map.pixels, by_normal), gather<5>(s.by_material, map.pixels, by_material);
 
@@ -119,8 +119,8 @@ struct Shaded {
     for (int c = 0; c < 3; c++) {
       Metal metal(table, v[ALBEDO + c]);
       if (!SPLATS) by_alpha += by_color[c] * (encoded[c] - s.background[c]);
-      Vector by_exposed = by_color[c] * map.alpha * slope[c], by_radiance = exposure * by_exposed;
-      by_exposure += by_exposed * radiance[c];
+      Vector by_exposed = by_color[c] * map.alpha * slope[c], by_radiance = exposure[c] * by_exposed;
+      by_exposure[c] = by_exposed * radiance[c];
       by_light[c] = by_radiance * reflected(s, metal);
       if (INDIRECT) {
         by[FROM_OBJECT + c] = (1.0f - visibility) * by_light[c];
@@ -203,18 +203,18 @@ struct Matte {
   Vectors normal;
   Lookup<1, DERIVATIVES> irradiance;
   Vector radiance[3], encoded[3], slope[3];
-  float exposure;
+  float exposure[3];
 
   MEMBER Matte(const Shade& s, const Pixels& pixels)
       : map(s, pixels),
         inverse_length(inverse_norm({map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
         normal(inverse_length * turned(s.turn, {map.value[NORMAL], map.value[NORMAL + 1], map.value[NORMAL + 2]})),
         irradiance(s.levels, normal),
-        exposure(s.exposure[0]) {
+        exposure{s.exposure[0], s.exposure[1], s.exposure[2]} {
 #pragma unroll
     for (int c = 0; c < 3; c++) {
       radiance[c] = map.value[ALBEDO + c] * irradiance.light[c];
-      encode<SPLATS>(s, exposure * radiance[c], encoded[c], slope[c]);
+      encode<SPLATS>(s, exposure[c] * radiance[c], encoded[c], slope[c]);
     }
   }
 
@@ -225,14 +225,14 @@ struct Matte {
 
   template <class Sums>
   MEMBER void backward(const Shade& s, Sums& sums) const {
-    Vector by_color[3], by_normal[3] = {}, by_material[5] = {}, by_alpha = {}, by_exposure = {}, by[C] = {}, by_irradiance[3];
+    Vector by_color[3], by_normal[3] = {}, by_material[5] = {}, by_alpha = {}, by_exposure[3], by[C] = {}, by_irradiance[3];
     gather<3>(s.by_color, map.pixels, by_color);
     if (!SPLATS) gather<3>(s.by_normal, map.pixels, by_normal), gather<5>(s.by_material, map.pixels, by_material);
 #pragma unroll
     for (int c = 0; c < 3; c++) {
       if (!SPLATS) by_alpha += by_color[c] * (encoded[c] - s.background[c]);
-      Vector by_exposed = by_color[c] * map.alpha * slope[c], by_radiance = exposure * by_exposed;
-      by_exposure += by_exposed * radiance[c];
+      Vector by_exposed = by_color[c] * map.alpha * slope[c], by_radiance = exposure[c] * by_exposed;
+      by_exposure[c] = by_exposed * radiance[c];
       by[ALBEDO + c] = by_material[c] + by_radiance * irradiance.light[c];
       by_irradiance[c] = by_radiance * map.value[ALBEDO + c];
     }
@@ -324,21 +324,24 @@ void backward_block(const Shade& s) {
     for (int64_t c = 0; c < s.channels; c++) s.by_features[i * s.channels + c] = 0;
     s.by_alpha[i] = 0;
   }
-  __shared__ float by_warp[32];
-  float sum = sums.by_exposure;
-  for (int step = 16; step; step /= 2) sum += __shfl_xor_sync(~0u, sum, step);
-  if (lane == 0) by_warp[warp] = sum;
+  __shared__ float by_warp[3][32];
+  for (int c = 0; c < 3; c++) {
+    float sum = sums.by_exposure[c];
+    for (int step = 16; step; step /= 2) sum += __shfl_xor_sync(~0u, sum, step);
+    if (lane == 0) by_warp[c][warp] = sum;
+  }
   __syncthreads();
-  if (threadIdx.x == 0) {
-    for (int w = 1; w < warps; w++) sum += by_warp[w];
-    s.by_exposure[blockIdx.x] = sum;
+  if (threadIdx.x < 3) {
+    float sum = 0;
+    for (int w = 0; w < warps; w++) sum += by_warp[threadIdx.x][w];
+    s.by_exposure[3 * (int64_t)blockIdx.x + threadIdx.x] = sum;
   }
 }
 #else
 void backward_chunk(const Shade& s, int64_t index) {
   Chunk chunk(s, index);
   by_kind(s, [&](auto kind) { kind.backward(s, chunk.first, chunk.end, chunk); });
-  s.by_exposure[index] = total(chunk.by_exposure);
+  for (int c = 0; c < 3; c++) s.by_exposure[3 * index + c] = total(chunk.by_exposure[c]);
 }
 #endif
 

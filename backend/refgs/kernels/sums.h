@@ -35,7 +35,7 @@ struct Contributions {
   const Shade& s;
   float map_scale, cell_scale;
   int32_t largest_map = 0, largest_cell = 0;
-  float by_exposure = 0;
+  float by_exposure[3] = {};
 
   Contributions(const Shade& s) : s(s) {
     if (!LARGEST) map_scale = Unit(s.largest[0], SOURCES).per, cell_scale = Unit(s.largest[1], adders(s)).per;
@@ -62,7 +62,9 @@ struct Contributions {
     }
   }
 
-  void add_exposure(Vector by) { by_exposure = by.value; }
+  void add_exposure(const Vector (&by)[3]) {
+    for (int c = 0; c < 3; c++) by_exposure[c] = by[c].value;
+  }
 
   template <int N>
   void add_light(const Lookup<N, true>& l, int, const Vector (&by_light)[3]) {
@@ -101,7 +103,7 @@ struct Chunk {
   int64_t first, end;         // pixels
   float *near, *cells;        // `near` is offset so that the image's pixel indices apply
   uint8_t *rows, *lines;      // `touched` flags of the image's rows, and of lines of cells
-  Vector by_exposure = {};
+  Vector by_exposure[3] = {};
 
   Chunk(const Shade& s, int64_t index) : s(s), first(index * s.chunk_rows * s.width) {
     int64_t left = s.height - index * s.chunk_rows;
@@ -137,7 +139,9 @@ struct Chunk {
     }
   }
 
-  MEMBER void add_exposure(Vector by) { by_exposure += by; }
+  MEMBER void add_exposure(const Vector (&by)[3]) {
+    for (int c = 0; c < 3; c++) by_exposure[c] += by[c];
+  }
 
   // Add to the cells that were looked up.
   template <int N>

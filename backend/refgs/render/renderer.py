@@ -64,8 +64,8 @@ def render(
 ) -> Rendering:
     """Render surfels for a camera: blend their features, then shade each pixel by the split sum (Ref-Gaussian paper, Eq. 5–8).
 
-    `background` (3,) is sRGB-encoded. `near`, the smallest depth that is drawn, is in world units. `exposure`, a scalar, multiplies the
-    radiance before it is encoded.
+    `background` (3,) is sRGB-encoded. `near`, the smallest depth that is drawn, is in world units. `exposure` (3,) multiplies
+    red, green and blue radiance before it is encoded.
 
     `occluder` is the object's mesh, for reflections of the object in itself. Where it blocks a pixel's mirror direction, the pixel reflects
     the radiance that the surfels store for this (Ref-Gaussian paper, Eq. 9). Otherwise it reflects `environment`.

@@ -21,7 +21,7 @@ class Rendering:
     - `material` (H, W, 5): albedo (linear), metallic, roughness; None without a light
     - `visibility` (H, W): 0 where the object occludes the mirror direction, else 1; None without inter-reflection
 
-    `background` (3,) and `exposure`, a scalar, are the arguments of `render`.
+    `background` (3,) and `exposure` (3,) are the arguments of `render`.
     """
 
     color: Tensor

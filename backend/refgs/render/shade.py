@@ -87,7 +87,7 @@ def _reflectance(device: torch.device) -> Tensor:
 
 @lru_cache(maxsize=4)
 def _one(device: torch.device) -> Tensor:
-    return torch.ones((), device=device)
+    return torch.ones(3, device=device)
 
 
 @timed("shading")
@@ -137,14 +137,14 @@ class _Shade(torch.autograd.Function):
         work.attach(**given, by_features=by_features, by_alpha=by_alpha, by_light=by_light)
         if load.on_gpu(features):
             blocks = -(-alpha.numel() // cuda.BLOCK)
-            by_exposure = new(blocks)
+            by_exposure = new(blocks, 3)
             sizes = 4 * alpha.numel(), 3 * work.cells, 1
             map_sums, cell_sums, largest = new(sum(sizes), dtype=torch.int64).zero_().split(sizes)
             work.attach(by_exposure=by_exposure, map_sums=map_sums, cell_sums=cell_sums, largest=largest)
             cuda.launch("refgs_shade_largest", work, features.device, blocks)
             cuda.launch("refgs_shade_backward", work, features.device, blocks)
         else:
-            by_exposure, rows = new(work.chunks), work.chunk_rows + load.kernels().refgs_shade_halo()
+            by_exposure, rows = new(work.chunks, 3), work.chunk_rows + load.kernels().refgs_shade_halo()
             buffers = {
                 "near": new(work.chunks, rows, work.width, 4),
                 "by_cells": new(work.chunks + 1, work.cells, 4),
@@ -154,7 +154,7 @@ class _Shade(torch.autograd.Function):
             load.parallel(load.kernels().refgs_shade_backward, work)
         load.run("refgs_shade_gather", work, features, items=alpha.numel())
         load.run("refgs_shade_unpad", work, features, items=work.texels)
-        return by_features, by_alpha, by_light, by_exposure.sum(), *[None] * 10
+        return by_features, by_alpha, by_light, by_exposure.sum(dim=0), *[None] * 10
 
 
 def mirror_directions(features: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
@@ -198,7 +198,7 @@ def shade(
     The other arguments change the shading:
 
     - `visibility` (H, W): 0 where the object occludes the mirror direction, else 1; values between are allowed
-    - `exposure`, a scalar, default 1: multiplies radiance before it is encoded
+    - `exposure` (3,), default 1: factors of red, green and blue radiance, before it is encoded
     - `display`: light and materials are display values in 0..1, so nothing is encoded
     - `mirror`: reflections are a sharp mirror image of the light, weighted by metallic (Ye et al., 3DGS-DR, 2024)
     - `matte`: `features` are normal and albedo only. The picture is albedo · irradiance / π, and its material has metallic 0, roughness 1.
@@ -250,7 +250,7 @@ def _shade(
 ) -> Shaded:
     texels = sum(6 * side * side for side in light.sides)
     exposure = _one(features.device) if exposure is None else exposure
-    given = {"features": (features, features.shape), "alpha": (alpha, alpha.shape), "exposure": (exposure, ())}
+    given = {"features": (features, features.shape), "alpha": (alpha, alpha.shape), "exposure": (exposure, (3,))}
     given |= {"levels": (light.levels, (texels, 3))}
     load.check(**given, **({} if visibility is None else {"visibility": (visibility, alpha.shape)}))
     maps = features, alpha, light.levels, exposure

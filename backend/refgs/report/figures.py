@@ -46,7 +46,7 @@ HEADLINE = [
 
 DETAILS = [
     Quantity("psnr_pose_fitted", "PSNR, each photo's pose fitted", "{:.2f} dB".format, max),
-    Quantity("psnr_exposure_fitted", "PSNR, each photo's exposure fitted", "{:.2f} dB".format, max),
+    Quantity("psnr_exposure_fitted", "PSNR, each photo's exposure and white balance fitted", "{:.2f} dB".format, max),
     Quantity("lpips", "LPIPS, VGG", "{:.4f}".format, min),
     Quantity("normal_ssim", "normals: SSIM", "{:.4f}".format, max),
     Quantity("albedo.psnr_raw", "base colour: PSNR", "{:.2f} dB".format, max),

@@ -57,7 +57,7 @@ def write_asset(state: State) -> None:
     splats.normals *= side[kept].numpy(force=True)[:, None]
     write_splats(folder / "splats.ply", splats)
     if state.exposures is not None or state.poses is not None:
-        factors = [] if state.exposures is None else state.exposures.detach().exp().tolist()
+        factors = [] if state.exposures is None else state.exposure(slice(None)).tolist()
         exposures = {view.camera.name: factor for view, factor in zip(state.views, factors, strict=False)}
         write_cameras(
             folder / "cameras.json", poses.refined(state), settings.light.frame, exposures, state.poses is not None
@@ -148,7 +148,9 @@ def _needs_rows(state: State, surfels: Surfels, side: Tensor, wanted: Tensor) ->
         why = why_not_traced(state) or _why_no_mesh(state)
         add("inter-reflection", why, "tracing rays, and harmonics of light from the object")
     if settings.light.exposure == "auto" and method.lit and state.exposures is None:
-        add("exposures", "those of the photos agree within a third of a stop", "one number a photo")
+        add("exposures", "those of the photos agree within a third of a stop", "three numbers a photo")
+    if state.exposures is not None and state.exposures.shape[1] == 1:
+        add("white balances", "those of the photos agree within a tenth", "two numbers a photo")
     if any(view.alpha is None for view in state.views):
         add("the mask loss", "not every photo has a mask", "one term of the loss")
     for why, which in (

@@ -1,4 +1,4 @@
-"""Stop learning the photos' exposures, if all of them turn out to be about the same."""
+"""Keep the photos' white balances neutral in the mean, and stop learning exposures or white balances that turn out to be about the same."""
 
 import math
 
@@ -10,17 +10,34 @@ from refgs.train.state import State
 KNOWN = 0.3  # part of the training after which exposures are known well enough to judge
 # A third of a stop, the step of a camera's dial: smaller differences may be errors of the shading.
 ALIKE = math.log(2) / 3
+BALANCED = 0.1  # largest difference of a channel's logarithm that may be an error of the shading, too
+
+
+@torch.no_grad()
+def balance(state: State) -> None:
+    """Make the photos' white balances neutral in the mean. Without this, a coloured light in all photos could not be told from theirs."""
+    if state.exposures is not None and state.exposures.shape[1] > 1:
+        state.exposures[:, 1:] -= state.exposures[:, 1:].mean(dim=0)
 
 
 @torch.no_grad()
 def leave_out_alike(state: State, progress: float) -> None:
-    """Stop learning exposures if the learned ones are nearly equal and the setting `light.exposure` is "auto"."""
+    """Stop learning exposures, or only white balances, if the learned ones are nearly equal and `light.exposure` is "auto"."""
     settings = state.settings
     if state.exposures is None or settings.light.exposure != "auto" or state.initial:
         return
     if state.iteration % settings.densify.every or progress < KNOWN or faint_now(state):
         return
-    spread = float((state.exposures - state.exposures.median()).abs().max())  # a card waits here, once in a while
-    if spread < ALIKE:
+    logarithms = state.exposure(slice(None)).log()
+    brightness = logarithms.mean(dim=1)
+    tint = logarithms - brightness[:, None]
+    apart = [(value - value.median(dim=0).values).abs().max() for value in (brightness, tint)]
+    brightness, tint = torch.stack(apart).tolist()  # a card waits here, once in a while
+    if tint >= BALANCED:
+        return
+    if brightness < ALIKE:
         state.without_exposures()
         state.announce("exposures", "the photos have no exposures of their own: they agree within a third of a stop")
+    elif state.exposures.shape[1] > 1:
+        state.without_white_balance()
+        state.announce("exposures", "the photos differ in exposure, but not in white balance")

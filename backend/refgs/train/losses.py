@@ -155,12 +155,12 @@ class _Objective(torch.autograd.Function):
 
 
 def departure(exposure: Tensor) -> Tensor:
-    """Compute a loss that keeps a photo's exposure near one. `exposure` is the exposure's natural logarithm.
+    """Compute a loss that keeps a photo's exposure near one. `exposure` (K,) is a row of `State.exposures`.
 
-    Without this loss, a brighter light with shorter exposures would fit the photos as well. The loss is the absolute value of the
-    logarithm, smoothed near zero. Unlike a square, it lets a few photos differ strongly without moving the others.
+    Without this loss, a brighter light with shorter exposures would fit the photos as well. The loss is the sum of the absolute values,
+    smoothed near zero. Unlike squares, they let a few photos differ strongly without moving the others.
     """
-    return torch.sqrt(exposure * exposure + ROUND_OFF**2) - ROUND_OFF
+    return (torch.sqrt(exposure * exposure + ROUND_OFF**2) - ROUND_OFF).sum()
 
 
 def objective(

@@ -18,7 +18,7 @@ from refgs.train.light_frame import light_frame
 from refgs.train.losses import Photo
 from refgs.train.plan import Plan
 from refgs.train.start import start_appearance, start_parameters
-from refgs.train.state import State, why_not_traced
+from refgs.train.state import EXPOSURE, State, why_not_traced
 
 
 def set_up(capture: Capture, effective: Effective, folder: Path, report: Report, plan: Plan, device: str) -> State:
@@ -71,7 +71,8 @@ def _start_learning(state: State) -> None:
     if method.lit:
         learned["environment"] = state.light
         if settings.light.exposure != "off":
-            learned["exposure"] = state.exposures = torch.zeros(len(state.views), device=state.device).requires_grad_()
+            exposures = torch.zeros(len(state.views), len(EXPOSURE), device=state.device)
+            learned["exposure"] = state.exposures = exposures.requires_grad_()
     radius, brightest = state.capture.radius, method.light.brightest
     groups = [{"params": [value], "name": name} for name, value in learned.items()]
     state.optimizer = Adam([group | {"limits": limits(group["name"], radius, brightest)} for group in groups])

@@ -23,6 +23,10 @@ from refgs.train.losses import Photo
 from refgs.train.motion import ScreenGradient
 from refgs.train.plan import Plan
 
+# Changes of a photo's response, as logarithms of factors of red, green and blue: brightness, then temperature and tint, which are its white
+# balance. The latter two are scaled down so that they learn more slowly: photos differ less in them.
+EXPOSURE = (1.0, 1.0, 1.0), (0.5, 0.0, -0.5), (-0.25, 0.5, -0.25)
+
 
 def spread(items: Sequence, most: int) -> Sequence:
     """Choose at most `most` items, evenly spaced."""
@@ -72,9 +76,8 @@ class State:
         self.constant: Parameters = {}  # parameters that do not learn: one row for all surfels
         self.light = torch.empty(0, 3)  # raw texels; `environment` makes radiance of them
         self.light_shown: Tensor | None = None  # the weight of each texel in the light's mean
-        self.exposures: Tensor | None = (
-            None  # natural logarithms, one a view; None: photos have no exposures of their own
-        )
+        self.exposures: Tensor | None = None  # one row a view; None: photos have no exposures of their own (`exposure`)
+        self.exposure_basis = torch.tensor(EXPOSURE, device=self.device)
         self.given: list[Camera] = []  # the views' cameras in the capture
         self.poses: Tensor | None = None  # (views, 6), see `train/poses.py`; None: cameras are the capture's own
         self.optimizer = Adam([])
@@ -150,9 +153,15 @@ class State:
         """Return the crop of a view's photo that the training uses, or the whole photo if `whole` is true."""
         return self.photos[view] if whole or self.crops is None else self.photos[view].part(*self.crops[view])
 
-    def exposure(self, view: int) -> Tensor | None:
-        """Return a view's exposure, by which its rendered radiance is multiplied. Return None if exposures are not learned."""
-        return None if self.exposures is None else self.exposures[view].exp()
+    def exposure(self, view: int | slice) -> Tensor | None:
+        """Compute a view's exposure (3,): factors of its rendered red, green and blue. Return None if exposures are not learned.
+
+        `exposures` are the weights of the rows of EXPOSURE in the factors' natural logarithms. If they have only one column, the photos
+        have the same white balance, and a view's three factors are equal. A slice of views gives the exposures of all of them (V, 3).
+        """
+        if self.exposures is None:
+            return None
+        return (self.exposures[view] @ self.exposure_basis[: self.exposures.shape[1]]).exp()
 
     def spread_cameras(self, least: int) -> list[Camera]:
         """Return the cameras of at least `least` training views, evenly spaced. If there are fewer views, return all cameras."""
@@ -196,12 +205,20 @@ class State:
 
     def shorten(self, name: str, count: int) -> None:
         """Keep only the first `count` spherical harmonic coefficients of the parameter `name`. Adam's moments are shortened, too."""
-        old, new = self.parameters[name], self.parameters[name].detach()[:, :count].contiguous().requires_grad_()
-        state = self.optimizer.state.pop(old, {})
-        self.group(name)["params"][0] = self.parameters[name] = new
+        self.parameters[name] = self._first_columns(name, self.parameters[name], count)
+
+    def _first_columns(self, name: str, old: Tensor, count: int) -> Tensor:
+        """Return the first `count` columns of a learned tensor, and let the optimiser's group `name` learn these in place of `old`."""
+        new, state = old.detach()[:, :count].contiguous().requires_grad_(), self.optimizer.state.pop(old, {})
+        self.group(name)["params"][0] = new
         if state:
             moments = {key: state[key][:, :count].contiguous() for key in ("exp_avg", "exp_avg_sq")}
             self.optimizer.state[new] = state | moments
+        return new
+
+    def without_white_balance(self) -> None:
+        """Stop learning a white balance for each photo. Its exposure is one factor from then on."""
+        self.exposures = self._first_columns("exposure", self.exposures, 1)
 
     def without_exposures(self) -> None:
         """Stop learning exposures. Each photo's exposure is then one."""

@@ -69,6 +69,7 @@ class Trainer:
         poses.refine_due(state, view, rendering, photo, progress)
         if inputs.environment is not None:
             light.diffuse(state)
+        exposures.balance(state)
         state.forget_gradients()
         state.iteration += 1
 
