@@ -11,6 +11,7 @@ from PIL import Image
 from refgs import commands
 from refgs.capture import masks as making
 from refgs.capture import read_capture, silhouettes
+from refgs.capture.images import read_image
 from refgs.capture.masks import make_masks, region_settings
 from refgs.capture.silhouettes import find_floor
 from refgs.errors import InputError
@@ -93,6 +94,14 @@ def test_masks_are_the_silhouettes_and_the_capture_has_them(tmp_path):
     assert read_capture(tmp_path).masked
     assert set(heard) == {"region", "reading", "carving", "edges"}
     assert not (tmp_path / "masks.tmp").exists()
+
+
+def test_masks_of_photos_with_16_bits(tmp_path):
+    truths = photograph(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        write(path, read_image(path)[0].astype(np.uint16) * 257)
+    make_masks(tmp_path, None, silent)
+    assert min(overlap(read_masks(tmp_path), truths)) > 0.9
 
 
 def test_masks_fit_the_distorted_photo(tmp_path):

@@ -200,7 +200,7 @@ def _load(view: View, root: Path, side: int) -> Photo:
         known = np.where(loaded.alpha > 127, np.int8(1), np.int8(-1))
     elif (file := _stroke_file(view, root)) is not None:
         known = _read_strokes(file, view, loaded.camera)
-    return Photo(loaded.image, loaded.camera, known)
+    return Photo(loaded.bytes, loaded.camera, known)
 
 
 def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:
