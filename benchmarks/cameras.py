@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from refgs.capture import find_layout, read_capture
+from benchmarks.harness import find_captures
+from refgs.capture import read_capture
 from refgs.capture.motion import find_cameras
 from refgs.errors import InputError
 
@@ -45,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     row = "{:<12} {:>6} {:>6} {:>7} {:>8} {:>9} {:>9} {:>10} {:>5}".format
     print(row("capture", "photos", "placed", "mean °", "median °", "largest °", "within 1°", "masks only", "s"))
-    for folder in sorted(path for path in options.captures.iterdir() if path.is_dir() and find_layout(path)):
+    for folder in find_captures(options.captures):
         given = rotations(folder)
         with tempfile.TemporaryDirectory() as scratch:
             copy = Path(scratch) / folder.name
@@ -69,7 +70,3 @@ def main(arguments: Sequence[str] | None = None) -> None:
             row(folder.name, result["photos"], result["placed"], *figures, within, masks_only, f"{seconds:.0f}"),
             flush=True,
         )
-
-
-if __name__ == "__main__":
-    main()

@@ -21,6 +21,7 @@ from rich.table import Table as Printed
 
 from benchmarks.scenes import NAMES
 from refgs import CORES
+from refgs.capture import find_layout
 from refgs.errors import InputError
 from refgs.kernels.load import supported
 from refgs.paths import clone_root, whole
@@ -104,6 +105,12 @@ def _cell(value: float | str | None, kept: float | str | None, form: str) -> str
         return "–"
     now, *before = [v if isinstance(v, str) else format(v, form) for v in (value, kept) if v is not None]
     return f"{now} ({before[0]})" if before else now
+
+
+def markdown_table(lines: Sequence[Sequence[str]]) -> str:
+    """Make a Markdown table of the lines that `Table.lines` returns."""
+    headings, *others = lines
+    return "\n".join(f"| {' | '.join(line)} |" for line in (headings, ["---"] * len(headings), *others))
 
 
 def mean(values: Sequence[float | str | None]) -> float | None:
@@ -229,6 +236,22 @@ def find_scenes(folder: Path, only: list[str] | None = None) -> list[Path]:
     chosen = [scene for scene in found if not only or scene.name in only]
     if not chosen:
         raise InputError(f"{folder} has none of {', '.join(only)}")
+    return chosen
+
+
+def find_captures(folder: Path, only: Sequence[str] = ()) -> list[Path]:
+    """Find the captures with cameras in a folder: its subfolders. If `only` is given, return only captures with these names.
+
+    Raise InputError if none is found.
+    """
+    found = (
+        [path for path in sorted(folder.iterdir()) if path.is_dir() and find_layout(path)] if folder.is_dir() else []
+    )
+    chosen = [path for path in found if not only or path.name in only]
+    if not chosen:
+        raise InputError(
+            f"{folder}: no capture with cameras is in this folder: name the folder that holds the captures"
+        )
     return chosen
 
 

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Sequence
 
 from benchmarks import kernels, minutes, needs, truth
-from benchmarks.harness import KEPT, Row, read
+from benchmarks.harness import KEPT, Row, markdown_table, read
 from refgs.paths import whole
 
 PAGE = KEPT.with_suffix(".md")
@@ -53,9 +53,7 @@ def markdown(rows: Sequence[Row]) -> str:
     for title, text, tables in SECTIONS:
         found = [lines for table in tables if len(lines := table.lines(rows)) > 1]
         parts += [f"## {title}\n\n{text}\n"] if found else []
-        for headings, *lines in found:
-            cells = [headings, ["---"] * len(headings), *lines]
-            parts.append("\n".join(f"| {' | '.join(line)} |" for line in cells) + "\n")
+        parts += [markdown_table(lines) + "\n" for lines in found]
     return "\n".join(parts)
 
 

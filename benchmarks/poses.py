@@ -89,7 +89,3 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 state.decided.get("poses", ""),
                 flush=True,
             )
-
-
-if __name__ == "__main__":
-    main()

@@ -13,12 +13,13 @@ import numpy as np
 import torch
 import trimesh
 
-from benchmarks.harness import Bench, Column, Table, Variant, call, figures
+from benchmarks.harness import Bench, Column, Table, Variant, call, figures, find_captures, markdown_table
 from refgs.camera import Camera
-from refgs.capture import find_layout, load_view, read_capture
+from refgs.capture import load_view, read_capture
 from refgs.compare.pictures import as_bytes, composite, maps, picture
 from refgs.errors import InputError
 from refgs.formats.gltf import read_glb
+from refgs.geometry.mesh import parts
 from refgs.paths import clone_root, whole, write_text
 from refgs.run import Run, open_run
 from scripts.demo.light import read_light
@@ -60,22 +61,6 @@ The pictures show a held-out view: {passes}. It is relit by Blender's `{light}`.
 """
 
 
-def find_captures(folder: Path, only: Sequence[str] = ()) -> list[Path]:
-    """Find the captures with cameras in a folder: its subfolders. If `only` is given, return only captures with these names.
-
-    Raise InputError if none is found.
-    """
-    found = (
-        [path for path in sorted(folder.iterdir()) if path.is_dir() and find_layout(path)] if folder.is_dir() else []
-    )
-    chosen = [path for path in found if not only or path.name in only]
-    if not chosen:
-        raise InputError(
-            f"{folder}: no capture with cameras is in this folder: name the folder that holds the captures"
-        )
-    return chosen
-
-
 def metal_part(run: Run) -> float | None:
     """Measure which part of the object's pixels in the held-out views has a metallic of at least METAL.
 
@@ -98,7 +83,7 @@ def count_pieces(mesh_file: Path) -> int:
     """Count the connected pieces of a mesh. Vertices at the same place count as one: textures have seams."""
     mesh = read_glb(mesh_file)
     welded = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
-    return len(np.unique(trimesh.graph.connected_component_labels(welded.face_adjacency, len(welded.faces))))
+    return len(parts(welded)[1])
 
 
 def strip(run: Run) -> np.ndarray:
@@ -185,9 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _page(bench: Bench, sections: Sequence[str]) -> str:
     """Make the text of the page: how it was measured, the table, and a section for each capture."""
-    headings, *lines = TABLES[0].lines(bench.rows)
-    cells = [headings, ["---"] * len(headings), *lines]
-    table = "\n".join(f"| {' | '.join(line)} |" for line in cells)
+    table = markdown_table(TABLES[0].lines(bench.rows))
     machine, date, _ = bench.where
     head = HEAD.format(machine=machine, date=date, metal=METAL, table=table, passes=", ".join(PASSES), light=LIGHT)
     return "\n".join([head, *sections])

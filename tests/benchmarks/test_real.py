@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks import real
+from benchmarks import harness, real
 from refgs.errors import InputError
 from tests.makers.captures import nerfstudio
 
@@ -41,7 +41,7 @@ def test_captures_are_trained_and_shown_on_a_page(tmp_path, capsys):
 
 def test_a_folder_without_captures_is_named(tmp_path):
     with pytest.raises(InputError, match="no capture with cameras"):
-        real.find_captures(tmp_path)
+        harness.find_captures(tmp_path)
 
 
 def test_pieces_are_counted_across_the_seams_of_textures(tmp_path):

@@ -440,8 +440,9 @@ def _map(photos: list[Path], database: Path, progress: Callable) -> list[Any]:
 
     written = database.with_name(database.name + ".models")  # COLMAP writes all models here, the small ones too
     written.mkdir(exist_ok=True)
-    models = pycolmap.incremental_mapping(database, photos[0].parent, written, options, "", first, another)
-    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+    return _largest_first(
+        pycolmap.incremental_mapping(database, photos[0].parent, written, options, "", first, another)
+    )
 
 
 def _map_at_once(photos: list[Path], database: Path) -> list[Any]:
@@ -454,5 +455,8 @@ def _map_at_once(photos: list[Path], database: Path) -> list[Any]:
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = SEED
     written = database.with_name(database.name + ".models")
-    models = pycolmap.global_mapping(database, photos[0].parent, written, options)
+    return _largest_first(pycolmap.global_mapping(database, photos[0].parent, written, options))
+
+
+def _largest_first(models: dict[int, Any]) -> list[Any]:
     return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)

@@ -25,7 +25,7 @@ def clean(mesh: Mesh, triangles: int, keep: float = 0.05) -> Mesh:
             "the depth maps have no surface in common, so there is no mesh: check that the renderings show the object "
             "and that it lies in the region of interest"
         )
-    part, areas = _parts(work)
+    part, areas = parts(work)
     work.update_faces((areas >= keep * areas.max())[part])
     if len(work.faces) > triangles:
         # Take the gentlest setting that reaches the budget. On a sphere, normals are off by 0.1° with 3, and by 0.5° with 7, the
@@ -62,11 +62,11 @@ def _manifold(mesh: trimesh.Trimesh) -> np.ndarray:
 
 def is_crumbs(mesh: Mesh, many: int = 5) -> bool:
     """Tell whether a mesh is in pieces: more than `many` connected parts, and none has half of the area."""
-    _, areas = _parts(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
+    _, areas = parts(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
     return len(areas) > many and areas.max() < areas.sum() / 2
 
 
-def _parts(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+def parts(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
     """Find the connected parts of a mesh. Returns each face's part number (F,), and each part's area."""
     part = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
     return part, np.bincount(part, mesh.area_faces)

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.capture import LoadedView, View, load_view
@@ -51,11 +50,11 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
 
     rows: dict[str, list] = {}
     without_lpips = metrics.lpips_missing()
+    refined = {camera.name: camera for camera in run.training_cameras()} if run.refined else {}
     for view in views:
         loaded = load_view(view, run.settings.image.max_side)
-        if run.refined and split == "train":
-            own = next(c for c in run.training_cameras() if c.name == loaded.camera.name)
-            loaded = replace(loaded, camera=own)
+        if split == "train" and run.refined:
+            loaded = replace(loaded, camera=refined[loaded.camera.name])
         figures = _measure_view(run, view, loaded, truth, pictures / split, without_lpips is None)
         for name, value in figures.items():
             rows.setdefault(name, []).append(value)
@@ -92,10 +91,10 @@ def _measure_view(
     if run.exposed and not method_of(run.settings.render).light.display:
         # A held-out photo's exposure is unknown: fit it, in linear radiance, for a second figure.
         exposure = metrics.fitted_exposure(rendering.radiance.numpy(), rendering.alpha.numpy(), photo)
-        fitted = run.render(camera, exposure=exposure).color.numpy()
-        figures["psnr_exposure_fitted"] = metrics.psnr(np.clip(fitted, 0, 1), photo)
+        exposed = run.render(camera, exposure=exposure).color.numpy()
+        figures["psnr_exposure_fitted"] = metrics.psnr(np.clip(exposed, 0, 1), photo)
     if run.refined and view.split == "test":  # its pose was not refined: fit it, for a second figure
-        moved = _fitted(run, camera, torch.from_numpy(photo))
+        moved = fitted(run.render, camera, torch.from_numpy(photo), run.centre, run.radius)
         figures["psnr_pose_fitted"] = metrics.psnr(np.clip(run.render(moved).color.numpy(), 0, 1), photo)
     if with_lpips:
         figures["lpips"] = metrics.lpips(color, photo)
@@ -117,11 +116,6 @@ def _measure_view(
     if "normal_mae_degrees" in figures:
         figures["normal_ssim"] = metrics.normal_ssim(images["normal"], known["normal"], alpha, true_alpha)
     return figures
-
-
-def _fitted(run: Run, camera: Camera, photo: Tensor) -> Camera:
-    """Move a camera so that the run's picture fits a photo."""
-    return fitted(run.render, camera, photo, run.centre, run.radius)
 
 
 def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dict[str, float]]:

@@ -57,8 +57,10 @@ def write_asset(state: State) -> None:
     splats.normals *= side[kept].numpy(force=True)[:, None]
     write_splats(folder / "splats.ply", splats)
     if state.exposures is not None or state.poses is not None:
-        factors = [] if state.exposures is None else state.exposure(slice(None)).tolist()
-        exposures = {view.camera.name: factor for view, factor in zip(state.views, factors, strict=False)}
+        exposures = None
+        if state.exposures is not None:
+            factors = state.exposure(slice(None)).tolist()
+            exposures = {view.camera.name: factor for view, factor in zip(state.views, factors, strict=True)}
         write_cameras(
             folder / "cameras.json", poses.refined(state), settings.light.frame, exposures, state.poses is not None
         )

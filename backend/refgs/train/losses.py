@@ -52,6 +52,14 @@ class Photo(NamedTuple):
         """Return the sRGB-encoded photo as float32 (H, W, 3): 1 is white, and an EXR may be brighter."""
         return self.image.float() / self.white
 
+    def over(self, background: Tensor) -> Tensor:
+        """Composite the photo over a background colour (3,). Returns sRGB-encoded floats (H, W, 3), clipped to white."""
+        image = self.encoded.clamp_max(1)
+        if self.mask is None:
+            return image
+        opaque = self.mask.float()[..., None] / 255
+        return image * opaque + background * (1 - opaque)
+
     @property
     def clipped(self) -> Tensor:
         """Return where each channel (H, W, 3) is clipped, or nearly so: JPEG does not keep the largest code exactly."""

@@ -39,7 +39,7 @@ def refine_due(state: State, view: int, rendering: Rendering, photo: Photo, prog
     centre, radius = state.capture.centre, state.capture.radius
     level = int((progress - FROM) / (KNOWN - FROM) * len(REDUCTIONS))
     reduction = REDUCTIONS[min(level, len(REDUCTIONS) - 1)]
-    step = pose_step(rendering, composited(photo, state.background), photo.camera, centre, radius, reduction)
+    step = pose_step(rendering, photo.over(state.background), photo.camera, centre, radius, reduction)
     if step.isfinite().all():
         state.poses[view] += step.clamp(-MOST, MOST)
         _move(state, view)
@@ -47,14 +47,6 @@ def refine_due(state: State, view: int, rendering: Rendering, photo: Photo, prog
         state.poses = _without_common(state)
         for index in range(len(state.views)):
             _move(state, index)
-
-
-def composited(photo: Photo, background: Tensor) -> Tensor:
-    """Composite a photo over a background colour (3,). Returns sRGB-encoded floats (H, W, 3)."""
-    image = photo.encoded.clamp_max(1)
-    if photo.mask is None:
-        return image
-    return torch.lerp(background.expand_as(image), image, photo.mask.float()[..., None] / 255)
 
 
 def restore(state: State, poses: Tensor | None) -> None:

@@ -49,11 +49,7 @@ def squared_error(color: Tensor, photo: Photo, background: Tensor) -> float:
 
     Both are clipped to 0..1.
     """
-    image = photo.encoded.clamp_max(1)
-    if photo.mask is not None:
-        opaque = photo.mask.float()[..., None] / 255
-        image = image * opaque + background * (1 - opaque)
-    return float((color.clamp(0, 1) - image).square().mean())
+    return float((color.clamp(0, 1) - photo.over(background)).square().mean())
 
 
 def decibels_lost(errors: list[float], without: list[float]) -> float:
