@@ -112,7 +112,9 @@ class LightSettings(_Section):
 class CameraSettings(_Section):
     """Cameras."""
 
-    poses: Need = Field(description="refine the photos' poses; auto: given up if that hardly moves the photos")
+    poses: Need = Field(
+        description="refine the photos' poses; auto: only if features that photos share tell that they are not exact"
+    )
 
 
 class TrainSettings(_Section):

@@ -26,21 +26,27 @@ def write_video(path, frames, codec="libx264", pixels="yuv420p", options=None, *
         container.mux(stream.encode())
 
 
-def film_ball(path: Path, count: int = 48, width: int = 320, height: int = 240) -> None:
-    """Write a video of one round about a red ball on a blue floor, both with random speckles."""
+def speckled_ball(pose: np.ndarray, width: int = 320, height: int = 240) -> tuple[np.ndarray, np.ndarray]:
+    """Render a red ball on a blue floor, both with random speckles. Returns the picture (H, W, 3) uint8, and where the ball is (H, W).
+
+    `pose` is the camera-to-world matrix. The focal length is 1.1 times the width.
+    """
     focal, lattice = 1.1 * width, np.random.default_rng(0).random((32, 32, 32))
     u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     local = np.stack([u / focal, -v / focal, -np.ones_like(u)], axis=-1)
-    frames = []
-    for pose in ring(2 * count, distance=3.5)[::2]:  # those at the same height
-        normals = ball_normals(pose, width, height, focal)
-        ball, rays = np.isfinite(normals[..., 0]), local @ pose[:3, :3].T
-        depth = (CENTRE[2] - 0.5 - pose[2, 3]) / np.minimum(rays[..., 2], -1e-3)
-        points = np.where(ball[..., None], CENTRE + 0.5 * normals, pose[:3, 3] + rays * depth[..., None])
-        grains = sum(
-            map_coordinates(lattice, size * points.transpose(2, 0, 1) + 3 * size, order=1, mode="wrap")
-            for size in (5.0, 17.0)
-        )
-        colors = np.where(ball[..., None], [110, 40, 30], [30, 50, 110])
-        frames.append((grains[..., None] * colors).astype(np.uint8))
-    write_video(path, frames)
+    normals = ball_normals(pose, width, height, focal)
+    ball, rays = np.isfinite(normals[..., 0]), local @ pose[:3, :3].T
+    depth = (CENTRE[2] - 0.5 - pose[2, 3]) / np.minimum(rays[..., 2], -1e-3)
+    points = np.where(ball[..., None], CENTRE + 0.5 * normals, pose[:3, 3] + rays * depth[..., None])
+    grains = sum(
+        map_coordinates(lattice, size * points.transpose(2, 0, 1) + 3 * size, order=1, mode="wrap")
+        for size in (5.0, 17.0)
+    )
+    colors = np.where(ball[..., None], [110, 40, 30], [30, 50, 110])
+    return (grains[..., None] * colors).astype(np.uint8), ball
+
+
+def film_ball(path: Path, count: int = 48, width: int = 320, height: int = 240) -> None:
+    """Write a video of one round about the ball of `speckled_ball`."""
+    poses = ring(2 * count, distance=3.5)[::2]  # those at the same height
+    write_video(path, [speckled_ball(pose, width, height)[0] for pose in poses])

@@ -8,6 +8,7 @@ import torch
 
 from benchmarks.poses import disturbed
 from refgs.capture import read_capture
+from refgs.capture.matches import Matches
 from refgs.run import open_run
 from refgs.settings import load_settings
 from refgs.train import poses
@@ -35,18 +36,40 @@ def test_nothing_moves_before_poses_learn_nor_in_the_last_third(ball_capture, tm
     assert torch.equal(made.state.poses, before)
 
 
-@pytest.mark.parametrize(("turn", "kept"), [(0.0, False), (0.05, True)])
-def test_poses_that_hardly_moved_are_put_back(ball_capture, tmp_path, turn, kept):
-    """Check that all cameras are the capture's own again if refining moved the photos by less than `poses.EXACT` pixels."""
-    made = trainer(ball_capture, tmp_path / "run", "cameras.poses=auto", total=60)
-    state = made.state
-    poses.restore(state, torch.tensor([turn, 0, 0, 0, 0, 0]).repeat(len(state.views), 1))
-    poses.leave_out_exact(state, 0.29)
+def shared_points(state, count=40):
+    """Make matches without noise: what exact cameras see of some points, for each view and the next."""
+    points = np.random.default_rng(0).normal(size=(count, 3)) * 0.5 * state.capture.radius + state.capture.centre
+    pixels = []
+    for camera in state.given:
+        seen = np.c_[points, np.ones(count)] @ camera.projection.T
+        pixels.append(seen[:, :2] / seen[:, 2:])
+    return [Matches(i, i + 1, pixels[i], pixels[i + 1]) for i in range(len(pixels) - 1)]
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_poses_are_kept_only_if_features_fit_them_better(ball_capture, tmp_path, monkeypatch, exact):
+    """Check refined poses that made exact cameras worse, and poses that made disturbed cameras exact."""
+    state = trainer(ball_capture, tmp_path / "run", "cameras.poses=auto", total=60).state
+    pairs, off = shared_points(state), torch.zeros(len(state.views), 6)
+    off[::2, 0] = 0.05
+    monkeypatch.setattr(poses, "match_neighbours", lambda views: pairs)
+    if not exact:
+        poses.restore(state, off)
+        state.given = [view.camera for view in state.views]
+    poses.restore(state, off if exact else -off)
+    poses.put_back_if_worse(state, 0.29)
     assert "poses" not in state.decided
-    poses.leave_out_exact(state, 0.31)
-    assert (state.poses is not None) == kept and ("exact" in state.decided["poses"]) != kept
+    poses.put_back_if_worse(state, 0.31)
+    assert (state.poses is None) == exact and ("are kept" in state.decided["poses"]) == exact
     own = [view.camera is given for view, given in zip(state.views, state.given, strict=True)]
-    assert not any(own) if kept else all(own)
+    assert all(own) if exact else not any(own)
+
+
+@pytest.mark.parametrize(("apart", "refined"), [(None, False), (0.1, False), (1.5, True)])
+def test_poses_are_refined_if_features_contradict_the_cameras(ball_capture, tmp_path, monkeypatch, apart, refined):
+    monkeypatch.setattr(poses, "pixels_apart", lambda matches, cameras: apart)
+    state = trainer(ball_capture, tmp_path / "run", "cameras.poses=auto", total=60).state
+    assert (state.poses is not None) == refined == ("poses" in state.decided)
 
 
 def test_refined_poses_are_written(ball_capture, moved, tmp_path):

@@ -2,6 +2,9 @@
 
 Each view has a pose (see `render.align`), which moves the scene before its camera sees it. Whenever a view is trained on, its pose takes a
 Gauss-Newton step towards the photo, first in reduced pictures, so that a camera that is off by some pixels finds back.
+
+Features that photos have in common tell whether poses need that, and whether it has made them better. The photos' own errors cannot: poses
+also move where a mirror's image, which is not at rest on the mirror, is not explained yet.
 """
 
 from dataclasses import replace
@@ -11,6 +14,7 @@ import torch
 from torch import Tensor
 
 from refgs.capture import Capture
+from refgs.capture.matches import match_neighbours, pixels_apart
 from refgs.render.align import REDUCTIONS, pose_step, posed
 from refgs.render.rendering import Rendering
 from refgs.train.losses import Photo
@@ -19,12 +23,20 @@ from refgs.train.state import State
 FROM, KNOWN, UNTIL = 0.05, 0.3, 2 / 3  # parts of the training: poses start to learn, are judged, and are frozen
 MOST = 0.02  # of a step: radians, and scene radii
 SAMPLE = 1000  # surfels whose shift in the photos is measured
-EXACT = 0.3  # pixels: poses whose photos shift by less are taken to be exact
+EXACT = 0.3  # pixels between features and their epipolar lines: poses with less are exact; four real captures have 0.1
+BETTER = 0.5  # of the given poses' distance, below which the refined ones must come
 
 
 def start(state: State) -> None:
-    """Give every view a pose, zero, unless the setting `cameras.poses` is "off"."""
-    if state.settings.cameras.poses != "off":
+    """Give every view a pose, zero, if the setting `cameras.poses` is "on", or if it is "auto" and features contradict the given poses."""
+    wanted = state.settings.cameras.poses
+    if wanted == "auto":
+        with state.clock.part("deciding"):
+            apart = pixels_apart(match_neighbours(state.views), state.given)
+        wanted = "off" if apart is None or apart < EXACT else "on"
+        if wanted == "on":
+            state.announce("poses", f"the cameras' poses are refined: features are {apart:.1f} pixels off")
+    if wanted == "on":
         state.poses = torch.zeros(len(state.views), 6)
 
 
@@ -56,16 +68,19 @@ def restore(state: State, poses: Tensor | None) -> None:
         _move(state, index)
 
 
-def leave_out_exact(state: State, progress: float) -> None:
-    """Go back to the capture's own poses if the refined ones hardly differ and the setting `cameras.poses` is "auto"."""
-    if state.poses is None or state.settings.cameras.poses != "auto" or "poses" in state.decided or progress < KNOWN:
+def put_back_if_worse(state: State, progress: float) -> None:
+    """Once, go back to the given poses if the setting `cameras.poses` is "auto" and features do not fit the refined ones far better."""
+    if state.poses is None or state.settings.cameras.poses != "auto" or state.poses_judged or progress < KNOWN:
         return
-    moved = float(np.median(shifts(state)))
-    if moved < EXACT:
-        restore(state, None)
-        state.announce("poses", f"the cameras' poses are exact: refining them moved the photos by {moved:.2f} pixels")
+    state.poses_judged = True
+    matches = match_neighbours(state.views)
+    given, found = (pixels_apart(matches, cameras) for cameras in (state.given, [view.camera for view in state.views]))
+    if found < BETTER * given:
+        what = f"the cameras' poses are refined: features are {found:.1f} pixels off, and were {given:.1f}"
     else:
-        state.announce("poses", f"the cameras' poses are refined: so far, the photos moved by {moved:.1f} pixels")
+        restore(state, None)
+        what = f"the cameras' poses are kept: features are {given:.1f} pixels off, and {found:.1f} with refined ones"
+    state.announce("poses", what)
 
 
 @torch.no_grad()

@@ -35,6 +35,7 @@ def save(state: State) -> None:
     facts = {"seconds": state.seconds, "total": state.total, "initial": state.initial, "decided": state.decided}
     facts |= {"parts": state.clock.seconds, "spent": state.plan.spent}
     facts |= {"processor_seconds": state.processor_seconds, "needs": state.needs, "metals_set": state.metals_set}
+    facts |= {"poses_judged": state.poses_judged}
     checkpoint.save(state.folder / "checkpoints", state.iteration, tensors, facts)
 
 
@@ -61,6 +62,7 @@ def restore(state: State) -> None:
     state.plan.before = facts.get("spent", state.seconds)
     state.processor_seconds = facts.get("processor_seconds", 0.0)
     state.initial, state.metals_set = facts.get("initial", state.initial), facts.get("metals_set", True)
+    state.poses_judged = facts.get("poses_judged", True)
     for about, what in facts.get("decided", {}).items():
         state.announce(about, what)
     state.motion.total, state.motion.views = tensors["motion.total"], tensors["motion.views"]

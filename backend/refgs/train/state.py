@@ -80,6 +80,7 @@ class State:
         self.exposure_basis = torch.tensor(EXPOSURE, device=self.device)
         self.given: list[Camera] = []  # the views' cameras in the capture
         self.poses: Tensor | None = None  # (views, 6), see `train/poses.py`; None: cameras are the capture's own
+        self.poses_judged = False  # whether `poses.put_back_if_worse` has
         self.optimizer = Adam([])
         self.motion = ScreenGradient(0, self.device)
         self.occluder: Occluder | None = None

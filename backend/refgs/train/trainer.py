@@ -80,7 +80,7 @@ class Trainer:
         densify.densify_due(state, progress)
         densify.reshape_due(state)
         exposures.leave_out_alike(state, progress)
-        poses.leave_out_exact(state, progress)
+        poses.put_back_if_worse(state, progress)
         return {"loss": loss.detach(), "square": square}
 
     def _next_view(self) -> int:

@@ -1,0 +1,96 @@
+"""Match features between photos, and measure how far the given cameras are from agreeing with them."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from refgs.camera import Camera
+from refgs.capture.images import LoadedView
+from refgs.capture.motion import epipolar_distance
+
+SOME = 24  # photos that are matched
+FEATURES = 2000  # of a photo
+DISTINCT = 0.8  # of the second-best match's distance, below which a match counts (Lowe 2004, §7.1)
+TOLERANCE = 1.0  # pixels from the epipolar geometry that fits a pair best; other matches are wrong
+LEAST = 16  # matches of a pair of photos; fewer say little about its epipolar geometry, which has 7 degrees of freedom
+LEAST_PAIRS = 8
+
+
+class Matches(NamedTuple):
+    """Hold the pixels (M, 2) of points that the photos of two views, given by their indices, have in common."""
+
+    first: int
+    second: int
+    ours: np.ndarray
+    theirs: np.ndarray
+
+
+def match_neighbours(views: list[LoadedView]) -> list[Matches]:
+    """Match some photos, spread over all, each with that of the nearest camera. Only pixels inside the masks are matched.
+
+    The matches of a pair fit some epipolar geometry, whatever the cameras are. Pairs with hardly any are left out. A mirror's image is not
+    at rest on the mirror, so what a mirror shows may be among the matches.
+    """
+    if len(views) < 2:
+        return []
+    positions = np.stack([view.camera.position for view in views])
+    pairs = set()
+    for first in np.unique(np.linspace(0, len(views) - 1, SOME).round().astype(int)).tolist():
+        distance = np.linalg.norm(positions - positions[first], axis=1)
+        distance[first] = np.inf
+        second = int(distance.argmin())
+        pairs.add((min(first, second), max(first, second)))
+    features = {index: _features(views[index]) for index in sorted({index for pair in pairs for index in pair})}
+    found = (Matches(*pair, *_match(*(features[index] for index in pair))) for pair in sorted(pairs))
+    return [matches for matches in found if len(matches.ours) >= LEAST]
+
+
+def pixels_apart(matches: list[Matches], cameras: list[Camera]) -> float | None:
+    """Return how far matches are from their epipolar lines in pixels: the lower quartile of the pairs' medians.
+
+    The lower quartile, as a mirror's images contradict cameras that are right. Returns None if there are fewer than LEAST_PAIRS pairs.
+    `cameras` are those of the views that were matched, in their order.
+    """
+    medians = []
+    for pair in matches:
+        first, second = cameras[pair.first], cameras[pair.second]
+        pose = (second.world_to_camera @ np.linalg.inv(first.world_to_camera))[:3]
+        distance = epipolar_distance(_rays(pair.ours, first), _rays(pair.theirs, second), pose)
+        medians.append(np.median(distance) * (first.fx + second.fx) / 2)
+    return float(np.quantile(medians, 0.25)) if len(medians) >= LEAST_PAIRS else None
+
+
+def _rays(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return pixels (M, 2) as points on the image plane at depth 1."""
+    return (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+
+
+def _features(view: LoadedView) -> tuple[np.ndarray, np.ndarray | None]:
+    """Detect features inside a photo's mask. Returns their pixels (M, 2) and descriptors (M, 128), None if there are none."""
+    inside = None if view.alpha is None else cv2.erode((view.alpha > 127).astype(np.uint8), np.ones((5, 5), np.uint8))
+    points, descriptors = cv2.SIFT_create(FEATURES, contrastThreshold=0.01).detectAndCompute(
+        cv2.cvtColor(view.bytes, cv2.COLOR_RGB2GRAY), inside
+    )
+    # OpenCV counts pixels from the centre of the first one, cameras from its corner.
+    return np.array([point.pt for point in points]).reshape(-1, 2) + 0.5, descriptors
+
+
+def _match(
+    ours: tuple[np.ndarray, np.ndarray | None], theirs: tuple[np.ndarray, np.ndarray | None]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Match the features of two photos. Returns the pixels (M, 2) in both, of distinct matches that fit one epipolar geometry."""
+    nothing = np.zeros((0, 2)), np.zeros((0, 2))
+    if any(descriptors is None or len(descriptors) < LEAST for _, descriptors in (ours, theirs)):
+        return nothing
+    nearest = cv2.BFMatcher().knnMatch(ours[1], theirs[1], k=2)
+    kept = [best for best, other in nearest if best.distance < DISTINCT * other.distance]
+    first, second = ours[0][[m.queryIdx for m in kept]], theirs[0][[m.trainIdx for m in kept]]
+    if len(kept) < LEAST:
+        return nothing
+    cv2.setRNGSeed(0)
+    _, fits = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, TOLERANCE, 0.999, 10_000)
+    if fits is None:
+        return nothing
+    fits = fits[:, 0].astype(bool)
+    return first[fits], second[fits]
