@@ -2,6 +2,9 @@
 
 Photos of a rough or embossed metal are explained about as well by paint, and training starts near paint: it would stay there. The tint of
 what changes with the view tells them apart before normals and light are known.
+
+Where nearly all of a large part of the surface shines as metals do, its metallic no longer learns: photos alone would turn some of it into
+paint again, since roughness, light and base colour explain rough metal and paint about as well.
 """
 
 import torch
@@ -10,16 +13,20 @@ from refgs.model.surfels import raw_metallic
 from refgs.train import needs
 from refgs.train.needs.materials import SOONEST
 from refgs.train.state import State
-from refgs.train.view_dependence import observe, shines_as_metal
+from refgs.train.view_dependence import observe, parts_of_metal, shines_as_metal
 
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
 METAL = 0.9  # metallic; training can still change it
+HELD = torch.tensor(
+    raw_metallic(0.98)
+)  # raw metallic that is held; surfels that have exactly this value are known by it
 
 
 def set_metals_due(state: State, progress: float) -> None:
     """Once, early in the training, raise the metallic of the surfels that shine as coloured metals do (see `shines_as_metal`).
 
-    The other surfels keep the metallic that they have learned: it started low, as that of a dielectric.
+    Those in a part of the surface that is metal for certain (see `parts_of_metal`) stay metal from then on (see `hold`). The others keep
+    the metallic that they have learned: it started low, as that of a dielectric.
     """
     settings = state.settings
     early = progress - settings.initial.until < KNOWN or state.iteration < SOONEST
@@ -28,13 +35,23 @@ def set_metals_due(state: State, progress: float) -> None:
     if settings.render.reflection != "microfacet" or not needs.decidable(state):
         return
     observations, metallic = observe(state), state.parameters["metallic"]
-    metal = shines_as_metal(observations, state.parameters["position"].detach())
+    positions, weight = state.parameters["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
+    metal = shines_as_metal(observations, positions)
+    held = parts_of_metal(metal, positions, weight)
     with torch.no_grad():
         metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
+        metallic[held] = HELD.to(metallic)
+    metal = metal | held
     moments = state.optimizer.state.get(metallic, {})
     for name in ("exp_avg", "exp_avg_sq") if moments else ():
         moments[name][metal] = 0
     state.metals_set = True
-    weight = observations.pixels.sum(dim=1) * state.wanted()
     part = float(weight[metal].sum() / weight.sum().clamp_min(1e-6))
     state.announce("metals", f"{part:.0%} of the surface shines in its own colour, as metals do")
+
+
+def hold(state: State) -> None:
+    """Remove the gradient of the metallic of surfels that are held, so that it stays. Halves of a divided surfel are held, too."""
+    metallic = state.parameters.get("metallic")
+    if state.metals_set and metallic is not None and metallic.grad is not None:
+        metallic.grad.masked_fill_(metallic.detach() == HELD.to(metallic), 0)

@@ -63,6 +63,7 @@ class Trainer:
         if state.exposures is not None:
             loss = loss + state.settings.loss.exposure * departure(state.exposures[view])
         loss.backward()
+        metals.hold(state)
         accepted, position = self.guard.judge(loss, state.optimizer), state.parameters["position"]
         state.motion.add(position.detach(), position.grad, state.photos[view].camera, accepted)
         state.optimizer.step(accepted)
