@@ -5,7 +5,7 @@ of white is not the largest, so that brighter radiance can be told apart.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -17,8 +17,8 @@ from pillow_heif import register_heif_opener
 
 from refgs.camera import Camera
 from refgs.capture import raw
+from refgs.capture.reduce import encode, reduced
 from refgs.capture.types import View
-from refgs.color import srgb_decode, srgb_encode
 from refgs.errors import InputError
 from refgs.formats.exr import read_exr, read_exr_header
 
@@ -27,6 +27,8 @@ register_heif_opener()  # Pillow opens HEIC then
 # The JPEG decoder leaves a photo at least this many times as large as wanted. It averages encoded values, which darkens highlights: at 2,
 # a photo differs by 0.6 of 255 on average from one reduced in linear light (49 dB); at 1, by 1.7 (41 dB).
 SPARE = 2
+
+ROWS = 128  # that are copied from a decoded picture at a time
 
 # Clockwise quarter turns that make a photo upright, by EXIF orientation. The mirrored orientations 2, 4, 5 and 7 are ignored: no camera
 # sees a mirrored world.
@@ -134,7 +136,8 @@ def _read_codes(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | N
     if _is_raw(path):
         width, height, turns = raw.read_raw_header(path)
         linear = raw.read_raw(path, half=_divisor(shrink, width, height) > 1)
-        return np.rot90(_encoding_table()[linear], -turns).copy(), None, raw.WHITE
+        np.take(_encoding_table(), linear, out=linear, mode="clip")  # the other modes make a copy
+        return np.ascontiguousarray(np.rot90(linear, -turns)), None, raw.WHITE
     if _is_exr(path):
         return *_exr_codes(path), EXR_WHITE
     with _open(path) as picture:
@@ -146,9 +149,11 @@ def _read_codes(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | N
             shrink = _divisor(shrink, width, height)
             if picture.format in ("JPEG", "MPO"):
                 picture.draft(picture.mode, (width // shrink, height // shrink))
-            pixels = np.asarray(_decode(picture, path))
-        pixels = np.rot90(pixels, -turns)
-    return pixels[..., :3].copy(), (_as_bytes(pixels[..., 3], white).copy() if pixels.shape[2] == 4 else None), white
+            pixels = _as_array(_decode(picture, path))
+        picture.close()  # its pixels take as much memory as their copy
+    pixels = np.rot90(pixels, -turns)
+    alpha = np.ascontiguousarray(_as_bytes(pixels[..., 3], white)) if pixels.shape[2] == 4 else None
+    return np.ascontiguousarray(pixels[..., :3]), alpha, white
 
 
 def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -157,10 +162,10 @@ def _exr_codes(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=2)
     if pixels.shape[2] == 3:
-        return _encode(pixels, EXR_WHITE), None
+        return encode(pixels, EXR_WHITE), None
     alpha = np.clip(pixels[..., 3:], 0, 1)  # premultiplied
     image = np.where(alpha > 0, pixels[..., :3] / np.maximum(alpha, 1e-6), 0)
-    return _encode(image, EXR_WHITE), np.rint(alpha[..., 0] * 255).astype(np.uint8)
+    return encode(image, EXR_WHITE), np.rint(alpha[..., 0] * 255).astype(np.uint8)
 
 
 def write_for_colmap(path: Path, out: Path) -> bool:
@@ -232,30 +237,11 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
         return LoadedView(image, alpha, camera, white)
     height, width = image.shape[:2]
     if width < camera.width:
-        shrink = camera.width // width
+        part = width / camera.width
         camera = camera.resized(width, height)
-        if lens is not None:
-            lens = replace(lens, fx=lens.fx / shrink, fy=lens.fy / shrink, cx=lens.cx / shrink, cy=lens.cy / shrink)
+        lens = lens and lens.resized(part, part)
         alpha = alpha if alpha is None else cv2.resize(alpha, (width, height), interpolation=cv2.INTER_AREA)
-
-    linear = _decoding_table(np.iinfo(image.dtype).max, white)[image]
-    if alpha is not None:
-        weight = alpha.astype(np.float32) / 255
-        premultiplied = np.empty((*weight.shape, 4), np.float32)
-        np.multiply(linear, weight[..., None], out=premultiplied[..., :3])
-        premultiplied[..., 3] = weight
-        linear = premultiplied
-    if lens is not None:
-        # Linear, because wider kernels overshoot at highlights.
-        linear = cv2.remap(linear, *lens.maps(camera), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    if fitted is not camera:
-        linear = cv2.resize(linear, (fitted.width, fitted.height), interpolation=cv2.INTER_AREA)
-    if alpha is not None:
-        weight = linear[..., 3]
-        linear = linear[..., :3] / np.maximum(weight, 1e-6)[..., None]
-        alpha = np.rint(np.clip(weight, 0, 1) * 255).astype(np.uint8)
-        linear[alpha == 0] = 0
-    return LoadedView(_encode(linear, white), alpha, fitted, white)
+    return LoadedView(*reduced(image, alpha, white, camera, fitted, lens), fitted, white)
 
 
 def _is_raw(path: Path) -> bool:
@@ -301,11 +287,22 @@ def _decode(picture: Image.Image, path: Path) -> Image.Image:
             picture = Image.fromarray(np.rint(values).astype(np.uint8))
         elif picture.mode in ("I", "F"):
             raise InputError(f"{path}: the image holds 32-bit numbers; save it as EXR, or as 16-bit PNG, sRGB-encoded.")
-        return picture.convert("RGBA" if picture.has_transparency_data else "RGB")
+        mode = "RGBA" if picture.has_transparency_data else "RGB"
+        picture.load()
+        return picture if picture.mode == mode else picture.convert(mode)
     except InputError:
         raise
     except Exception as error:
         raise InputError(f"{path}: the image is truncated or broken ({_reason(error)}). Replace it.") from error
+
+
+def _as_array(picture: Image.Image) -> np.ndarray:
+    """Copy a picture to an array (H, W, C) uint8, in strips: Pillow makes a second copy of what it hands over."""
+    pixels = np.empty((picture.height, picture.width, len(picture.getbands())), np.uint8)
+    for top in range(0, picture.height, ROWS):
+        bottom = min(top + ROWS, picture.height)
+        pixels[top:bottom] = np.asarray(picture.crop((0, top, picture.width, bottom)))
+    return pixels
 
 
 def _decode_16_bit(picture: Image.Image, path: Path) -> np.ndarray | None:
@@ -337,20 +334,6 @@ def _as_bytes(codes: np.ndarray, white: int) -> np.ndarray:
 
 
 @cache
-def _decoding_table(largest: int, white: int) -> np.ndarray:
-    """Return a table from the sRGB codes 0 to `largest` to linear radiance, float32. `white` is the code of 1."""
-    return srgb_decode(np.arange(largest + 1) / white).astype(np.float32)
-
-
-@cache
 def _encoding_table() -> np.ndarray:
     """Return a table from 16-bit linear values to 16-bit sRGB codes, uint16 (65536,)."""
-    return _encode(np.arange(65536) / 65535, 65535)
-
-
-def _encode(linear: np.ndarray, white: int) -> np.ndarray:
-    """Encode linear radiance to sRGB codes: 8-bit if `white`, the code of 1, is 255, else 16-bit."""
-    if white == 255:
-        return np.rint(srgb_encode(np.clip(linear, 0, 1)) * 255).astype(np.uint8)
-    bounded = np.clip(linear, 0, 1000)  # which is beyond every code
-    return np.minimum(np.rint(srgb_encode(bounded) * white), 65535).astype(np.uint16)
+    return encode(np.arange(65536) / 65535, 65535)

@@ -17,6 +17,8 @@ import numpy as np
 from refgs.camera import Camera
 from refgs.errors import InputError
 
+ALL = slice(None)
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -59,12 +61,16 @@ class Lens:
             raise InputError(f"{where}: the distortion is too strong for a perspective photo. Undistort it first.")
         return replace(camera, fx=self.fx * factor, fy=self.fy * factor, cx=self.cx, cy=self.cy)
 
-    def maps(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the maps that `cv2.remap` needs to undistort the photo: columns and rows, each (H, W) float32.
+    def maps(self, camera: Camera, rows: slice = ALL) -> tuple[np.ndarray, np.ndarray]:
+        """Return the maps that `cv2.remap` needs to undistort the photo: columns and rows, each (R, W) float32.
 
-        They say, for each pixel of the pinhole `camera`, where it lies in the distorted photo.
+        They say, for each pixel in these `rows` of the pinhole `camera`, where it lies in the distorted photo.
         """
-        return _maps(self, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+        y = (np.arange(camera.height)[rows] + 0.5 - camera.cy) / camera.fy
+        x, y = self.distort(x[None, :], y[:, None])
+        # The first pixel's centre is at 0 in OpenCV, at 0.5 in a Camera.
+        return (self.fx * x + self.cx - 0.5).astype(np.float32), (self.fy * y + self.cy - 0.5).astype(np.float32)
 
     def maps_back(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
         """Return the maps that `cv2.remap` needs to distort a picture of the pinhole `camera`: columns and rows, each (H, W) float32.
@@ -110,12 +116,3 @@ def _focal_factor(lens: Lens, width: int, height: int) -> float | None:
         middle = (low + high) / 2
         low, high = (low, middle) if fits(middle) else (middle, high)
     return high
-
-
-@lru_cache(maxsize=2)
-def _maps(lens: Lens, width: int, height: int, fx: float, fy: float, cx: float, cy: float):
-    x = (np.arange(width) + 0.5 - cx) / fx
-    y = (np.arange(height) + 0.5 - cy) / fy
-    x, y = lens.distort(x[None, :], y[:, None])
-    # The first pixel's centre is at 0 in OpenCV, at 0.5 in a Camera.
-    return (lens.fx * x + lens.cx - 0.5).astype(np.float32), (lens.fy * y + lens.cy - 0.5).astype(np.float32)
