@@ -31,7 +31,7 @@ def expected(masks, cameras, low, high, resolution):
     points, values, border = low + grid * (high - low), [], np.full(3 * (resolution,), np.inf)
     seen = np.zeros(border.shape, int)
     for alpha, camera in zip(masks, cameras, strict=True):
-        height, width = alpha.shape
+        alpha, (height, width) = alpha / 255.0, alpha.shape
         camera = camera.resized(width, height)
         local = points @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         x = camera.fx * local[..., 0] / local[..., 2] + camera.cx
@@ -63,7 +63,7 @@ def test_carving_matches_float64(isa, monkeypatch):
     monkeypatch.setenv("REFGS_ISA", isa)
     rng = np.random.default_rng(0)
     cameras = [look_at(view.position * (0.2 if i % 5 == 0 else 0.7), 64, view.name) for i, view in enumerate(VIEWS)]
-    masks = [rng.uniform(0, 1, (40 + 3 * i, 50)).astype(np.float32) ** 0.1 for i in range(len(cameras))]
+    masks = [np.rint(255 * rng.uniform(0, 1, (40 + 3 * i, 50)) ** 0.1).astype(np.uint8) for i in range(len(cameras))]
     for alpha in masks[3::10]:
         alpha[[0, -1]], alpha[:, [0, -1]], alpha[10:20, 5:30] = 0, 0, 0
     masks[4] = masks[4][:, :1]

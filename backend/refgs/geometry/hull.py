@@ -18,6 +18,7 @@ from refgs.kernels.load import kernels, parallel
 # and a torus remove at most 0.04 among 8 views, 0.015 among 12, 0.005 among 40.
 _LONE_CARVER = 0.15
 _FEWEST_VIEWS_TO_JUDGE = 8
+_HALF = 128  # of 255: a mask shows the object from there
 
 
 def visual_hull_points(
@@ -38,14 +39,14 @@ def visual_hull_points(
     - outward unit normals (count, 3). A point inside has the normal of the nearest point on the hull.
     - spacing (count,): the mean distance to the three nearest other points
 
-    `alphas` are the masks (H, W), one for each camera, floats in 0..1 or unsigned integers. The hull is carved twice, on a grid of
+    `alphas` are the masks (H, W), one for each camera, floats in 0..1 or uint8. The hull is carved twice, on a grid of
     `resolution`³ voxels: first in the cube of half-side `radius` about `centre`, then in the bounding box of the result. A view is left
     out, with a warning, if its mask is empty or contradicts all other masks. Raises InputError if no hull is left.
     """
     masks, views = [], []
     for alpha, camera in zip(alphas, cameras, strict=True):
-        mask = _as_float(alpha)
-        if mask.max() >= 0.5:
+        mask = _as_bytes(alpha)
+        if mask.max() >= _HALF:
             masks.append(mask)
             views.append(camera)
     if len(views) < len(alphas):
@@ -106,12 +107,10 @@ def visual_hull_points(
     return positions.astype(np.float32), normals.astype(np.float32), spacing.astype(np.float32)
 
 
-def _as_float(alpha: np.ndarray) -> np.ndarray:
-    """Convert a mask of floats or integers to float32 in 0..1."""
+def _as_bytes(alpha: np.ndarray) -> np.ndarray:
+    """Convert a mask of floats in 0..1 to uint8. One of uint8 is not copied: masks of many photos take gigabytes."""
     alpha = np.asarray(alpha)
-    if np.issubdtype(alpha.dtype, np.integer):
-        return alpha.astype(np.float32) / np.iinfo(alpha.dtype).max
-    return alpha.astype(np.float32)
+    return alpha if alpha.dtype == np.uint8 else np.rint(255 * alpha).astype(np.uint8)
 
 
 _Silhouette = struct("Silhouette", "carve.cpp")
@@ -122,20 +121,20 @@ def _silhouette(mask: np.ndarray, camera: Camera, low: np.ndarray, voxel: np.nda
     height, width = mask.shape
     matrix = camera.resized(width, height).projection
     # A mask clear of the picture's border shows the whole object: space outside the picture is empty. Otherwise it is unknown.
-    whole = max(mask[0].max(), mask[-1].max(), mask[:, 0].max(), mask[:, -1].max()) < 0.5
+    whole = max(mask[0].max(), mask[-1].max(), mask[:, 0].max(), mask[:, -1].max()) < _HALF
     first, step = matrix[:, :3] @ (low + 0.5 * voxel) + matrix[:, 3], matrix[:, :3] * voxel
     size = {"width": width, "height": height, "whole": int(whole)}
     return _Silhouette(first=tuple(first), step=tuple(step.ravel()), mask=mask.ctypes.data, **size)
 
 
 def _carve(masks, cameras, low, high, resolution):
-    """Look up the alpha of each voxel in all masks. The voxels fill the box from `low` to `high`.
+    """Look up the alpha of each voxel in all masks (H, W) uint8. The voxels fill the box from `low` to `high`.
 
     Returns three arrays (resolution, resolution, resolution). For each voxel they have the smallest alpha in any view, the second smallest,
     and the index of the view that has the smallest. Voxels seen by fewer than two views, or by fewer than an eighth of all views, have the
     alpha 0.
     """
-    masks, voxel = [np.ascontiguousarray(mask, np.float32) for mask in masks], (high - low) / resolution
+    masks, voxel = [np.ascontiguousarray(mask) for mask in masks], (high - low) / resolution
     views = [_silhouette(mask, camera, low, voxel) for mask, camera in zip(masks, cameras, strict=True)]
     least, second = (np.empty(3 * (resolution,), np.float32) for _ in range(2))
     carver, seen = (np.empty(3 * (resolution,), np.int32) for _ in range(2))

@@ -8,7 +8,7 @@ constexpr float EMPTY = 0.01f;
 
 struct Silhouette {
   double first[3], step[9];  // (column × depth, row × depth, depth) of voxel 0, 0, 0; its change by a voxel along x, y, z (3, 3)
-  const float* mask;         // (height, width)
+  const uint8_t* mask;       // (height, width), of which 255 is 1
   int64_t width, height, whole;  // whole: the mask keeps clear of the border
 };
 
@@ -28,13 +28,13 @@ INLINE Vector sample(const Silhouette& s, Vector x, Vector y, Mask lanes) {
   Vector corners[4] = {};
   for (int i = 0; i < LANES; i++) {
     if (!lanes[i]) continue;
-    const float* p = s.mask + row[i] * s.width + column[i];
+    const uint8_t* p = s.mask + row[i] * s.width + column[i];
     int64_t right = column[i] + 1 < s.width, below = row[i] + 1 < s.height ? s.width : 0;
     corners[0][i] = p[0], corners[1][i] = p[right], corners[2][i] = p[below], corners[3][i] = p[below + right];
   }
   x -= left, y -= top;
   Vector upper = corners[0] + x * (corners[1] - corners[0]), lower = corners[2] + x * (corners[3] - corners[2]);
-  return upper + y * (lower - upper);
+  return (upper + y * (lower - upper)) * (1.0f / 255);
 }
 
 }  // namespace
