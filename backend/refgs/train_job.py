@@ -55,6 +55,8 @@ def train(
             held.enter_context(lock)
             _check_unfinished(out)
         capture = _read_capture(capture_folder, settings, out, facts)
+        for what in capture.warnings:
+            report("warning", {"what": what})
         device = choose_device(device, report)
         held.enter_context(_logged(out))
         with _card_memory():

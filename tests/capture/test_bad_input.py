@@ -200,7 +200,24 @@ def test_masks_all_empty(tmp_path):
     folder = nerfstudio(tmp_path)
     for i in range(16):
         write(folder / "masks" / f"{i:04d}.png", np.zeros((48, 64), np.uint8))
-    refused(lambda: read_capture(folder), "all 16 masks are empty")
+    refused(lambda: read_capture(folder), "/masks: all 16 masks are empty", "0000.png", "Remove them")
+
+
+def test_masks_all_white(tmp_path):
+    folder = nerfstudio(tmp_path)
+    for i in range(16):
+        write(folder / "masks" / f"{i:04d}.png", np.full((48, 64), 255, np.uint8))
+    capture = read_capture(folder)
+    assert not any(view.masked for view in capture.views)
+    assert [warning for warning in capture.warnings if "white (opaque) everywhere" in warning]
+
+
+def test_raw_of_an_unknown_camera(tmp_path):
+    folder = nerfstudio(tmp_path)
+    (folder / "images" / "0003.png").unlink()
+    (folder / "images" / "0003.cr3").write_bytes(b"something else" * 100)
+    edit(folder / "transforms.json", lambda data: data["frames"][3].update(file_path="images/0003.cr3"))
+    refused(lambda: read_capture(folder), "0003.cr3", "LibRaw does not know", "DNG")
 
 
 def test_image_truncated_since(tmp_path):

@@ -2,11 +2,9 @@
 
 import multiprocessing
 import sqlite3
-from itertools import product
 
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
 
 from refgs.capture import load_view, read_capture
 from refgs.capture.images import read_header, read_image
@@ -24,8 +22,8 @@ from refgs.color import srgb_decode
 from refgs.errors import InputError, NoCameras
 from tests.makers.captures import look_at, write, write_as_phone
 from tests.makers.dng import write_dng
+from tests.makers.speckled import FOCAL, HEIGHT, WIDTH, pose_errors, speckled
 
-WIDTH, HEIGHT, FOCAL = 256, 192, 280.0
 POSES = [
     look_at(np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.8 + 0.5 * np.sin(3 * angle)]), np.array([0, 0, 0.4]))
     for angle in np.linspace(0, 1.4, 10)
@@ -34,28 +32,6 @@ POSES = [
 
 def quiet(event: str, facts: dict) -> None:
     pass
-
-
-def speckled(pose: np.ndarray, turn: float = 0.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Ray-cast a block on a floor, both with random speckles: RGB (H, W, 3) uint8, and the block's mask (H, W) uint8.
-
-    `pose` is the camera-to-world matrix. The block is turned by `turn` radians about the vertical; the floor is not.
-    """
-    u, v = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
-    rays = np.stack([u / FOCAL, -v / FOCAL, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
-    eye, half, middle = pose[:3, 3], np.array([0.6, 0.5, 0.4]), np.array([0, 0, 0.4])
-    turned = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
-    at, way = eye @ turned, rays @ turned  # in the block's own coordinates
-    ends = np.stack([(middle - half - at) / way, (middle + half - at) / way])
-    near, far = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
-    block = near < far
-    floor = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], 1e3)
-    points = np.where(block[..., None], at + way * near[..., None], eye + rays * floor[..., None])
-    lattice = np.random.default_rng(seed).random((32, 32, 32, 3))
-    grains = np.zeros((HEIGHT, WIDTH, 3))
-    for size, c in product((4.0, 13.0), range(3)):
-        grains[..., c] += map_coordinates(lattice[..., c], size * points.transpose(2, 0, 1), order=1, mode="wrap")
-    return (127 * grains).astype(np.uint8), (255 * block).astype(np.uint8)
 
 
 @pytest.fixture(scope="module")
@@ -69,18 +45,6 @@ def photos(tmp_path, pictures):
     for number, picture in enumerate(pictures):
         write(tmp_path / f"stone {number:02d}.png", picture)
     return tmp_path
-
-
-def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Align points `found` (N, 3) with `true` by the best similarity transform (Umeyama 1991).
-
-    Returns the aligned points and the rotation (3, 3).
-    """
-    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
-    u, stretch, vt = np.linalg.svd(b.T @ a)
-    flip = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    rotation = u * flip @ vt
-    return true.mean(axis=0) + (stretch @ flip) / (a**2).sum() * a @ rotation.T, rotation
 
 
 def test_photos_become_a_capture(photos):
@@ -102,11 +66,8 @@ def test_photos_become_a_capture(photos):
     assert capture.layout == "colmap" and len(capture.points) > 100 and np.ptp(capture.point_colors) > 0.1
     views = sorted(capture.views, key=lambda view: view.camera.name)
     assert views[0].masked and not views[1].masked
-    positions, rotation = aligned(np.array([view.camera.position for view in views]), np.array(POSES)[:, :3, 3])
-    assert np.linalg.norm(positions - np.array(POSES)[:, :3, 3], axis=1).max() < 0.02
-    for view, pose in zip(views, POSES, strict=True):
-        turned = view.camera.world_to_camera[:3, :3] @ rotation.T @ (pose @ OPENGL_TO_OPENCV)[:3, :3]
-        assert np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1))) < 1
+    distances, angles = pose_errors(views, POSES)
+    assert distances.max() < 0.02 and angles.max() < 1
     with pytest.raises(InputError, match="cameras already"):
         find_cameras(photos, quiet)
 
@@ -149,6 +110,43 @@ def test_a_mask_of_another_size(tmp_path, pictures):
     with pytest.raises(InputError, match=r"1\.png: the mask has 255×192 pixels but its photo 1\.png 256×192"):
         find_cameras(tmp_path, quiet)
     assert {path.name for path in tmp_path.iterdir()} == {"images", "masks"}
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_masks_that_say_nothing(tmp_path, value):
+    """Check that masks that are all empty are refused before the search, and masks that are all white are not used."""
+    random, warnings = np.random.default_rng(0), []
+    for number in range(4):
+        write(tmp_path / "images" / f"{number}.png", random.integers(0, 255, (96, 128, 3), np.uint8))
+        write(tmp_path / "masks" / f"{number}.png", np.full((96, 128), value, np.uint8))
+    match = "only 0 of 4 photos" if value else r"/masks: all 4 masks are empty, 0\.png too"
+    with pytest.raises(InputError, match=match):
+        find_cameras(tmp_path, lambda event, facts: warnings.append(facts) if event == "warning" else None)
+    assert len(warnings) == (1 if value else 0)
+    assert all("white (opaque) everywhere" in facts["what"] for facts in warnings)
+    assert {path.name for path in tmp_path.iterdir()} == {"images", "masks"}
+
+
+def test_raw_of_an_unknown_camera(tmp_path, pictures):
+    for number, picture in enumerate(pictures[:3]):
+        write(tmp_path / f"{number}.png", picture)
+    (tmp_path / "3.cr3").write_bytes(b"something else" * 100)
+    with pytest.raises(InputError, match=r"3\.cr3: LibRaw does not know"):
+        find_cameras(tmp_path, quiet)
+    assert {path.name for path in tmp_path.iterdir()} == {"0.png", "1.png", "2.png", "3.cr3"}
+
+
+def test_lenses_of_few_photos_are_simple(tmp_path, pictures):
+    """Check that photos of many sizes, three of each, are all placed: their lenses have one parameter of distortion."""
+    for number, picture in enumerate(pictures[:9]):
+        write(tmp_path / f"{number}.png", picture[: HEIGHT - 2 * (number // 3)])
+    assert find_cameras(tmp_path, quiet)["placed"] == 9
+    capture = read_capture(tmp_path)
+    assert len({view.camera.height for view in capture.views}) == 3
+    import pycolmap
+
+    cameras = pycolmap.Reconstruction(tmp_path / "sparse" / "0").cameras.values()
+    assert {camera.model_name for camera in cameras} == {"SIMPLE_RADIAL"}
 
 
 def test_photos_of_two_sessions(tmp_path, pictures):
@@ -197,12 +195,9 @@ def test_photos_of_a_phone(tmp_path, pictures):
     capture = read_capture(tmp_path)
     views = sorted(capture.views, key=lambda view: view.camera.name)
     assert {view.image_path.name for view in views} == photos
-    true = np.array(POSES)
-    positions, rotation = aligned(np.array([view.camera.position for view in views]), true[:, :3, 3])
-    assert np.linalg.norm(positions - true[:, :3, 3], axis=1).max() < 0.05
-    for view, pose, picture in zip(views, POSES, pictures, strict=True):
-        turned = view.camera.world_to_camera[:3, :3] @ rotation.T @ (pose @ OPENGL_TO_OPENCV)[:3, :3]
-        assert np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1))) < 2
+    distances, angles = pose_errors(views, POSES)
+    assert distances.max() < 0.05 and angles.max() < 2
+    for view, picture in zip(views, pictures, strict=True):
         loaded = load_view(view)
         assert loaded.image.shape == picture.shape
         x, y, depth = loaded.camera.projection @ np.column_stack([capture.points, np.ones(len(capture.points))]).T

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from av.video.reformatter import Colorspace
+from PIL import Image
 
 from refgs.capture.files import find_photos
 from refgs.capture.images import read_image
@@ -173,6 +174,14 @@ def test_what_is_no_video(tmp_path):
     refused("no such file", tmp_path, tmp_path / "out")
     cv2.imwrite(str(tmp_path / "photo.jpg"), TEXTURE)
     refused("too few frames in it (1)", tmp_path / "photo.jpg", tmp_path / "out")
+    Image.fromarray(TEXTURE).save(tmp_path / "still.gif")
+    refused("there is no film in it", tmp_path / "still.gif", tmp_path / "out")
+    for name, says in (("header.mp4", "there is no film in it"), ("header.mkv", "not a video that can be read")):
+        with av.open(str(tmp_path / name), "w") as container:
+            stream = container.add_stream("libx264", rate=30)
+            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+            container.start_encoding()
+        refused(says, tmp_path / name, tmp_path / "out")
     with av.open(str(tmp_path / "sound.m4a"), "w") as container:
         stream = container.add_stream("aac", rate=44100, layout="mono")
         sound = av.AudioFrame.from_ndarray(np.zeros((1, 44100), np.float32), format="fltp", layout="mono")

@@ -17,7 +17,16 @@ from refgs.capture.nerf_blender import published_normals, read_nerf_blender
 from refgs.capture.nerfstudio import read_nerfstudio
 from refgs.capture.nero import read_nero
 from refgs.capture.poses import in_frame
-from refgs.capture.region import Region, find_region, is_near, region_in, run_frame, sample_silhouettes, up_direction
+from refgs.capture.region import (
+    WHITE_MASKS,
+    Region,
+    find_region,
+    is_near,
+    region_in,
+    run_frame,
+    sample_silhouettes,
+    up_direction,
+)
 from refgs.capture.types import Capture, View
 from refgs.errors import InputError, NoCameras
 from refgs.paths import check_folder
@@ -193,9 +202,8 @@ def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.nda
     silhouettes = sample_silhouettes(views)
     if silhouettes or not any(view.masked for view in views):
         return views, silhouettes, []
-    what = "the masks are white (opaque) everywhere, so they are not used"
     views = [replace(view, mask_path=None, has_alpha=False) for view in views]
-    return views, [], [f"{what}: make them anew, the object white on black"]
+    return views, [], [WHITE_MASKS]
 
 
 def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray, float]:

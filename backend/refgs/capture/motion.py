@@ -17,6 +17,7 @@ import hashlib
 import multiprocessing
 import shutil
 import signal
+from collections import Counter
 from collections.abc import Callable
 from itertools import combinations
 from multiprocessing.connection import Connection
@@ -30,25 +31,31 @@ from refgs import CORES
 from refgs.capture import find_layout
 from refgs.capture.files import Masks, find_photos
 from refgs.capture.images import read_focal_length, read_header, read_image, read_mask, write_for_colmap
+from refgs.capture.region import WHITE_MASKS, empty_masks
 from refgs.errors import InputError
 
 SIDE = 1600  # pixels on the longer side for finding features; presets train on fewer
 ALL_PAIRS = 150  # photos; up to this many, every pair is matched
 CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential distortion only fit noise
 SEED = 1
+TIED = 3  # points that a photo must share with others; COLMAP asks for 30 where it places one photo after the other
 MATCH_TOLERANCE = 8.0  # pixels from its epipolar line, above which a match contradicts the cameras; COLMAP allows 4
 CONTRADICTED = 0.2  # part of the matches, above which the cameras are not trusted
-INSIDE_CAMERA_MODEL = (
-    "SIMPLE_RADIAL"  # an object fills little of the photos: with RADIAL 5 of 66 photos of a head are placed, not 66
-)
+FEW_CAMERA_MODEL = "SIMPLE_RADIAL"  # of what tells little about the lens: see the next two
+WELL_SEEN = 10  # photos of one lens and size. 23 of a statue, cropped to 7 sizes, are all placed; with RADIAL, 3 are
+INSIDE_CAMERA_MODEL = FEW_CAMERA_MODEL  # an object fills little of the photos: with RADIAL 5 of 66 of a head are placed
 FAINT = 0.002  # contrast of the weakest features inside masks; COLMAP's is 0.0067, which places 60 of 66 photos of a dark bronze, not all
 INSIDE_FEATURES = (
     16384  # COLMAP takes the largest 8192 of a photo before it looks at the mask; the surroundings may use these up
 )
-DOUBTED = (
-    "as happens if an object turns in front of still surroundings: look at the cameras before you train (Show Cameras in Blender). If they "
-    "are wrong, put masks of the object in the folder masks, remove sparse and search again; or put something plain behind the object, or "
-    "walk around it, and take the photos again"
+DOUBTED = "as happens if an object turns in front of still surroundings: look at the cameras before you train (Show Cameras in Blender)"
+AGAIN = "or put something plain behind the object, or walk around it, and take the photos again"
+WITHOUT_MASKS = (
+    f"If they are wrong, put masks of the object in the folder masks, remove sparse and search again; {AGAIN}"
+)
+WITH_MASKS = (
+    "If they are wrong, see that the masks are white on what turns and nothing else, remove sparse and search again; "
+    f"{AGAIN}"
 )
 
 
@@ -79,8 +86,8 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
     with "warning" and a dict with the text `what`.
 
     An interrupted call leaves `sparse.tmp`. The next call for the same photos resumes from it. Raises InputError if there are fewer than
-    three photos, if there are cameras already, if fewer than half of the photos got a camera, or if the photos fall into two large groups
-    that share nothing.
+    three photos, if all masks are empty, if there are cameras already, if fewer than half of the photos got a camera, or if the photos fall
+    into two large groups that share nothing.
     """
     folder = Path(folder)
     photos = find_photos(folder)
@@ -91,6 +98,9 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
     for photo in photos:
         read_header(photo)
     masks = _find_masks(folder, photos)
+    if masks and _uniform(masks):
+        report("warning", {"what": WHITE_MASKS})
+        masks = []
     work = folder / "sparse.tmp"
     work.mkdir(exist_ok=True)
     database = work / f"{_hash_of_files([*photos, *masks])}.db"
@@ -118,7 +128,7 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
         report("warning", {"what": what})
     if found.contradicted > CONTRADICTED:
         what = f"the cameras contradict {found.contradicted:.0%} of what the photos have in common, {DOUBTED}"
-        report("warning", {"what": what})
+        report("warning", {"what": f"{what}. {WITH_MASKS if masks else WITHOUT_MASKS}"})
     for path in list(work.glob(f"{database.name}*")):
         _remove(path)
     work.rename(folder / "sparse")
@@ -176,6 +186,19 @@ def _find_masks(folder: Path, photos: list[Path]) -> list[Path]:
                 "Make the mask the photo's size."
             )
     return masks
+
+
+def _uniform(masks: list[Path]) -> bool:
+    """Return whether all masks are white everywhere. Raise InputError if all are empty. Few are read where masks show an object."""
+    empty = white = True
+    for mask in masks:
+        inside = read_mask(mask) > 127
+        empty, white = empty and not inside.any(), white and inside.all()
+        if not (empty or white):
+            return False
+    if empty:
+        raise empty_masks(masks)
+    return True
 
 
 def _hash_of_files(files: list[Path]) -> str:
@@ -335,9 +358,26 @@ def _extract(photos: list[Path], masks: list[Path], database: Path, progress: Ca
         shutil.rmtree(written, ignore_errors=True)
     readable.rmdir()
     with pycolmap.Database.open(database) as known, pycolmap.DatabaseTransaction(known):
-        for image in known.read_all_images():
+        images = known.read_all_images()
+        counts = Counter(image.camera_id for image in images)
+        for camera in known.read_all_cameras():
+            if counts[camera.camera_id] < WELL_SEEN:
+                _simplify(camera)
+                known.update_camera(camera)
+        for image in images:
             image.name = numbers[image.name]
             known.update_image(image)
+
+
+def _simplify(camera) -> None:
+    """Give a camera (pycolmap.Camera) the model FEW_CAMERA_MODEL. Its focal length stays."""
+    import pycolmap
+
+    focal = camera.mean_focal_length()
+    simple = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, FEW_CAMERA_MODEL, focal, camera.width, camera.height
+    )
+    camera.model, camera.params = simple.model, simple.params
 
 
 def _write_mask(photo: Path, mask: Path, out: Path) -> None:
@@ -448,14 +488,40 @@ def _map(photos: list[Path], database: Path, progress: Callable) -> list[Any]:
 def _map_at_once(photos: list[Path], database: Path) -> list[Any]:
     """Compute all cameras together (GLOMAP). Return the models as `_map` does.
 
-    This links photos that share too little to be placed one after the other: all 23 photos of a statue, where that places three.
+    This links photos that share too little to be placed one after the other. Photos that it places by their direction alone, and not by
+    points that several of them show, lose their cameras: how far apart they are was not known.
     """
     import pycolmap
 
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = SEED
     written = database.with_name(database.name + ".models")
-    return _largest_first(pycolmap.global_mapping(database, photos[0].parent, written, options))
+    models = pycolmap.global_mapping(database, photos[0].parent, written, options)
+    for model in models.values():
+        tied = _tied(model)
+        for number in set(model.reg_image_ids()) - tied:
+            model.deregister_frame(model.image(number).frame_id)
+    return _largest_first({number: model for number, model in models.items() if model.num_reg_images()})
+
+
+def _tied(model: Any) -> set[int]:
+    """Return the largest set of a model's images that common points hold together, grown from the two that share most points.
+
+    An image is tied if it shows TIED points that two tied images show. Otherwise nothing says how far away it is: relative poses of two
+    photos have no scale.
+    """
+    shown = {
+        number: {seen.point3D_id for seen in model.image(number).get_observation_points2D()}
+        for number in model.reg_image_ids()
+    }
+    first = max(combinations(shown, 2), key=lambda pair: len(shown[pair[0]] & shown[pair[1]]), default=())
+    tied, added, views = set(), set(first), Counter()
+    while added:
+        views.update(point for number in added for point in shown[number])
+        tied |= added
+        known = {point for point, count in views.items() if count > 1}
+        added = {number for number in shown.keys() - tied if len(shown[number] & known) >= TIED}
+    return tied
 
 
 def _largest_first(models: dict[int, Any]) -> list[Any]:

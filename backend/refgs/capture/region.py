@@ -1,6 +1,7 @@
 """Find a capture's region of interest: a ball around the object or place that the cameras look at. Also define the run's frame."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,6 +13,8 @@ from refgs.errors import InputError
 from refgs.geometry.project import inside, project
 
 NEAR = 100.0  # largest distance from the origin in radii; largest radius, and inverse of the smallest
+
+WHITE_MASKS = "the masks are white (opaque) everywhere, so they are not used: make them anew, the object white on black"
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,13 +144,18 @@ def sample_silhouettes(views: list[View], count: int = 24) -> list[tuple[View, n
     chosen = masked[:: max(1, len(masked) // count)]
     masks = [_small(read_alpha(view)) for view in chosen]
     if masks and not any(mask.any() for mask in masks) and not any(read_alpha(view).any() for view in masked):
-        name = (masked[0].mask_path or masked[0].image_path).name
-        raise InputError(
-            f"{masked[0].image_path.parent}: all {len(masked)} masks are empty, {name} too. Make them anew."
-        )
+        raise empty_masks([view.mask_path or view.image_path for view in masked])
     if all(mask.all() for mask in masks):
         return []
     return list(zip(chosen, masks, strict=True))
+
+
+def empty_masks(files: list[Path]) -> InputError:
+    """Return the error that all these masks are empty: mask files, or photos with transparency."""
+    first = files[0]
+    return InputError(
+        f"{first.parent}: all {len(files)} masks are empty, {first.name} too. Remove them, or make them anew, the object white on black."
+    )
 
 
 def _small(alpha: np.ndarray) -> np.ndarray:

@@ -1,0 +1,145 @@
+"""Test the ways to find cameras that are taken where the first one fails, and that of many photos, against the true angles."""
+
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from refgs.capture import motion, read_capture
+from refgs.capture.files import find_photos
+from refgs.capture.motion import find_cameras
+from refgs.errors import InputError
+from tests.makers.captures import look_at, write
+from tests.makers.speckled import about_z, pose_errors, speckled
+
+TURNTABLE = 18  # photos
+
+
+def orbit(azimuths, distance: float = 3.2, height: float = 1.8) -> list[np.ndarray]:
+    """Return the poses of a camera that walks around the block. `azimuths` are in degrees."""
+    angles = np.radians(azimuths)
+    return [
+        look_at((distance * np.cos(a), distance * np.sin(a), height + 0.2 * np.sin(3 * a)), (0, 0, 0.4)) for a in angles
+    ]
+
+
+def photograph(folder: Path, poses: list[np.ndarray]) -> None:
+    for number, pose in enumerate(poses):
+        write(folder / "images" / f"{number:03d}.png", speckled(pose)[0])
+
+
+def warnings_of(folder: Path) -> tuple[dict, list[str]]:
+    """Find the cameras of photos. Return the facts, and the warnings."""
+    warnings = []
+    found = find_cameras(folder, lambda event, facts: warnings.append(facts["what"]) if event == "warning" else None)
+    return found, warnings
+
+
+def turntable(folder: Path) -> list[np.ndarray]:
+    """Photograph the block as it turns on a floor that does not, from a tripod that is nudged.
+
+    Write photos and masks. Return the true poses in the block's own frame.
+    """
+    random, poses = np.random.default_rng(0), []
+    for number in range(TURNTABLE):
+        turn = 2 * np.pi * number / TURNTABLE
+        pose = look_at(np.array([0, -2.6, 1.3]) + random.normal(0, 0.03, 3), (0, 0, 0.4))
+        photo, mask = speckled(pose, turn, room=True, width=320, height=240)
+        write(folder / "images" / f"{number:03d}.png", photo)
+        write(folder / "masks" / f"{number:03d}.png", mask)
+        poses.append(about_z(-turn) @ pose)
+    return poses
+
+
+def test_an_object_on_a_turntable(tmp_path):
+    """Check that cameras about an object that turns before a still room are found from the pixels in its masks.
+
+    Without masks, cameras follow the object in part and the room in part: they are wrong, and a warning says so.
+    """
+    poses = turntable(tmp_path)
+    found, warnings = warnings_of(tmp_path)
+    assert found["inside"] and found["placed"] == TURNTABLE and not warnings
+    distances, angles = pose_errors(read_capture(tmp_path).views, poses)
+    assert distances.max() < 0.15 and angles.max() < 3
+
+    for mask in (tmp_path / "masks").iterdir():
+        mask.unlink()
+    (tmp_path / "sparse").rename(tmp_path / "before")
+    try:
+        found, warnings = warnings_of(tmp_path)
+    except InputError as error:
+        assert "could be placed" in str(error)
+    else:
+        assert not found["inside"] and any("put masks of the object in the folder masks" in line for line in warnings)
+
+
+@pytest.fixture(scope="module")
+def two_sides(tmp_path_factory):
+    """Photograph two sides of the block that hardly anything links. Return the folder and the true poses."""
+    folder = tmp_path_factory.mktemp("two sides")
+    azimuths = np.arange(0, 70, 10)
+    poses = orbit([*azimuths, *(azimuths + 180)], distance=3.0, height=1.5)
+    photograph(folder, poses)
+    return folder, poses
+
+
+def test_photos_that_share_little_are_placed_together(two_sides):
+    """Check that all photos are placed where too little links them to be placed one after the other."""
+    folder, poses = two_sides
+    one_by_one = in_child(placed_one_by_one, folder)
+    found, warnings = warnings_of(folder)
+    assert one_by_one < found["placed"] == len(poses) and not warnings
+    distances, angles = pose_errors(read_capture(folder).views, poses)
+    assert distances.max() < 0.1 and angles.max() < 2
+
+
+def in_child(work, folder: Path):
+    """Return `work(folder)`, called in a process of its own, because COLMAP's OpenMP conflicts with torch's on some systems."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(work, folder).result()
+
+
+def placed_one_by_one(folder: Path) -> int:
+    """Return how many photos COLMAP places one after the other."""
+    import pycolmap
+
+    pycolmap.set_random_seed(motion.SEED)
+    photos, database = find_photos(folder), folder / "apart" / "apart.db"
+    database.parent.mkdir()
+    motion._extract(photos, [], database, lambda *_: None)
+    motion._match(len(photos), database, lambda *_: None)
+    return motion._map(photos, database, lambda *_: None)[0].num_reg_images()
+
+
+def test_two_rounds_of_a_film_are_linked(tmp_path):
+    """Check that photos of a film are matched with their neighbours and with some further away, where these are too many for all pairs.
+
+    The second round begins opposite to the end of the first: only photos 16 places apart show the same.
+    """
+    count = 32
+    azimuths = np.linspace(0, 360, count, endpoint=False)
+    poses = orbit(azimuths) + orbit(azimuths + 180, height=2.3)
+    photograph(tmp_path, poses)
+    pairs = in_child(search_a_film, tmp_path)
+    assert (16, 32) in pairs and (16, 44) not in pairs and len(pairs) < 64 * 63 / 2 / 2
+    distances, angles = pose_errors(read_capture(tmp_path).views, poses)
+    assert len(angles) == 64 and distances.max() < 0.1 and angles.max() < 2
+
+
+def search_a_film(folder: Path) -> set[tuple[int, int]]:
+    """Find cameras as if ALL_PAIRS photos were few, and write them. Return the pairs of photos that have matches."""
+    import pycolmap
+
+    motion.ALL_PAIRS = 32
+    photos, database = find_photos(folder), folder / "film.db"
+    best, _ = motion._search(photos, [], database, lambda *_: None)
+    for number in best.reg_image_ids():
+        best.image(number).name = photos[int(best.image(number).name)].name
+    (folder / "sparse" / "0").mkdir(parents=True)
+    best.write_binary(folder / "sparse" / "0")
+    with pycolmap.Database.open(database) as known:
+        names = {image.image_id: int(image.name) for image in known.read_all_images()}
+        found = [pycolmap.pair_id_to_image_pair(pair) for pair in known.read_two_view_geometries()[0]]
+    return {tuple(sorted(names[number] for number in pair)) for pair in found}
