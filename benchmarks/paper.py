@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     out = (bench.options.out or clone_root() / "demo" / "paper") / Path(preset).stem
     for scene in find_scenes(bench.options.data):
         run = out / scene.data_set / scene.name
-        if train(scene.capture, run, ("--preset", preset, "--set", "image.max_side=8192")):
+        if train(scene.capture, run, ("--preset", preset, "--set", "image.max_side=8192", "--set", "image.masks=off")):
             record(bench, scene, figures(run))
         else:
             bench.failed.append(run)

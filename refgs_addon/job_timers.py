@@ -27,7 +27,7 @@ def _poll_jobs() -> float | None:
     if _since_preview >= PREVIEW_SECONDS:
         _since_preview = 0.0
         for job in jobs.JOBS:
-            if job.run and job.state == "running" and job.progress and "train" not in job.results:
+            if job.run and job.state == "running" and job.curve and "train" not in job.results:
                 job.tell("preview")
     live_splats.update()
     if changed:

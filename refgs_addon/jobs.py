@@ -53,6 +53,7 @@ class Job:
     fraction: float = 0.0  # of the current step, where a stage event has it
     warnings: list[str] = field(default_factory=list)
     decided: dict[str, str] = field(default_factory=dict)  # result and reason of each automatic setting
+    masked: Callable[[dict], None] | None = None  # called with the event that tells that a training has made masks
     progress: dict = field(default_factory=dict)  # newest event; so are the next two
     preview: dict = field(default_factory=dict)
     ready: dict = field(default_factory=dict)
@@ -159,6 +160,10 @@ class Job:
                 self.warnings.append(event["what"])
             case "decided":
                 self.decided[event["about"]] = event["what"]
+            case "masks":  # that a training made before it began
+                self.decided["masks"], self.progress = event["what"], {}
+                if self.masked is not None:
+                    self.masked(event)
             case "progress" if self.curve and "stage" in event:  # of the mesh: keep the training's figures
                 self.line = ""
             case "progress":

@@ -17,6 +17,7 @@ from refgs.errors import InputError
 from refgs.lock import LOCK, PROGRESS, STOP, RunLock
 from tests.makers.captures import nerfstudio
 from tests.makers.films import write_video
+from tests.makers.unmasked import photograph
 from tests.makers.waiting import until
 
 SMALL = [
@@ -138,6 +139,20 @@ def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture
     assert talk.end() == 0
     ended = talk.until("cancelled")
     assert (run / "checkpoints" / f"{ended['iteration']:08d}.toml").exists(), list((run / "checkpoints").iterdir())
+
+
+def test_a_training_is_cancelled_while_it_makes_masks(talk, tmp_path):
+    photograph(tmp_path / "photos")
+    talk.tell("train", **train(tmp_path / "photos", tmp_path / "run"))
+    assert talk.until("progress")["stage"] == "reading"
+    talk.tell("cancel")
+    ended = talk.until("cancelled")
+    assert ended["iteration"] == 0 and ended["run"] == str(tmp_path / "run")
+    assert not (tmp_path / "run").exists() and not (tmp_path / "photos" / "masks").exists()
+    assert not (tmp_path / "photos" / "masks.tmp").exists()
+    # The next job runs.
+    talk.tell("check", capture=str(tmp_path / "photos"))
+    assert any(line.startswith("Object") for line in talk.until("done")["lines"])
 
 
 def test_photos_without_cameras(talk, tmp_path):

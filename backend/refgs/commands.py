@@ -117,7 +117,11 @@ def train(
     with progress_bar("training", 1) as bar:
 
         def report(event: str, facts: dict) -> None:
-            if event == "progress":
+            if event == "progress" and "stage" in facts:  # of masks
+                if stopped:
+                    raise KeyboardInterrupt
+                bar(facts["done"], f"making masks: {facts['stage']}", facts["total"])
+            elif event == "progress":
                 note = f"loss {facts['loss']:.4f}  {facts['psnr']:.2f} dB  {facts['splats']:,} surfels"
                 bar(facts["iteration"], note, facts["total"])
             elif event != "measured":

@@ -47,6 +47,10 @@ class ImageSettings(_Section):
 
     max_side: int = Field(ge=16, le=8192, description="pixels on the longer side; larger photos are reduced to it")
     background: tuple[Part, Part, Part] = Field(description="sRGB colour behind masked objects")
+    masks: Literal["auto", "off"] = Field(
+        description="auto: if no photo has a mask, make masks of the object first, in the capture's folder masks; off: make none, and "
+        "learn all that photos without masks show"
+    )
 
 
 class RenderSettings(_Section):

@@ -7,6 +7,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from refgs.lock import RunLock
 from refgs.paths import check_folder, disk_errors_named
 from refgs.run_folder import check_free, read_run_facts, update_metrics
 from refgs.settings import Settings, load_settings
+from refgs.train.effective import Change
 from refgs.train.plan import Plan
 
 if TYPE_CHECKING:
@@ -55,6 +57,9 @@ def train(
             held.enter_context(lock)
             _check_unfinished(out)
         capture = _read_capture(capture_folder, settings, out, facts)
+        masked: dict[str, Change] = {}
+        if not resume and settings.image.masks == "auto" and not any(view.masked for view in capture.views):
+            capture, settings, changes, masked = _with_masks(capture, settings, preset, changes, report)
         for what in capture.warnings:
             report("warning", {"what": what})
         device = choose_device(device, report)
@@ -63,7 +68,7 @@ def train(
             if resume:
                 trainer = _resume(capture, settings, out, plan, device, report)
             else:
-                trainer = _start(capture, settings, preset, changes, out, plan, device, report)
+                trainer = _start(capture, settings, preset, changes, masked, out, plan, device, report)
                 held.enter_context(lock)  # its folder exists only now
             held.enter_context(disk_errors_named([out], "resume with --resume"))
             state = trainer.state
@@ -122,17 +127,60 @@ def _read_capture(folder: Path, settings: Settings, out: Path, facts: dict | Non
     return capture
 
 
+def _with_masks(
+    capture: "Capture", settings: Settings, preset: str | None, changes: list[str], report: Report
+) -> "tuple[Capture, Settings, list[str], dict[str, Change]]":
+    """Make masks of a capture that has none, so that the object is trained alone.
+
+    Return the capture with its masks, the settings, the changes that lead to them, and records of what was changed. A box in the settings
+    is moved with the capture's frame. If no masks can be made, report a warning and return what was given.
+    """
+    from refgs.capture import read_capture
+    from refgs.capture.masks import make_masks, masks_folder
+
+    try:
+        found = make_masks(capture.folder, settings.region, report)
+    except (InputError, OSError) as error:
+        report("warning", {"what": f"training on all that the photos show, for no masks were made: {error}"})
+        return capture, settings, changes, {}
+    where = masks_folder(capture)
+    what = f"made {found['made']} masks of the object, in {where}: look at them"
+    report("masks", found | {"capture": str(capture.folder.resolve()), "what": what})
+    records = {
+        "image.masks": Change("auto", "made", "photos", f"no photo had a mask; {found['made']} are in {where} now")
+    }
+    if capture.box is not None:
+        moved, why = found["moved"], "the masks moved the capture's frame"
+        scale = sum(row[0] ** 2 for row in moved[:3]) ** 0.5
+        centre = [sum(a * b for a, b in zip(row, (*settings.region.centre, 1.0), strict=True)) for row in moved[:3]]
+        box = {"region.centre": centre, "region.size": [scale * edge for edge in settings.region.size]}
+        changes = [*changes, *(f"{key}={value}" for key, value in box.items())]
+        asked = {"region.centre": list(settings.region.centre), "region.size": list(settings.region.size)}
+        records |= {key: Change(asked[key], value, "photos", why) for key, value in box.items()}
+        settings = load_settings(preset or "standard", changes)
+        report("stage", {"what": f"{why}: the box is {' '.join(f'{k}={_rounded(v)}' for k, v in box.items())} in it"})
+    return read_capture(capture.folder, settings.region), settings, changes, records
+
+
+def _rounded(values: list[float]) -> list[float]:
+    return [round(value, 4) + 0.0 for value in values]
+
+
 def _start(
     capture: "Capture",
     settings: Settings,
     preset: str | None,
     changes: list[str],
+    masked: dict[str, Change],
     out: Path,
     plan: Plan,
     device: str,
     report: Report,
 ) -> "Trainer":
-    """Make the trainer of a new training, create its run folder, and return the trainer."""
+    """Make the trainer of a new training, create its run folder, and return the trainer.
+
+    `masked` are changes that are recorded with those of the training: what the making of masks changed.
+    """
     from refgs.run import create_run, record_changes
     from refgs.train.fit import fitting
     from refgs.train.trainer import Trainer
@@ -141,8 +189,10 @@ def _start(
         trainer, preset = fitting(capture, changes, out, plan, device, report), f"{plan.minutes:g} minutes"
     else:
         trainer = Trainer(capture, settings, out, report, plan, device)
+    state = trainer.state
+    state.effective = replace(state.effective, changes=masked | state.effective.changes)
     with disk_errors_named([out], "train again"):
-        effective = trainer.state.effective
+        effective = state.effective
         create_run(out, capture, effective.settings, preset or "standard", device, effective.chosen())
         record_changes(out, effective.rows())
     return trainer

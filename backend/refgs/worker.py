@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Annotated, Any, Literal
 
-import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -101,6 +100,10 @@ COMMANDS = TypeAdapter(
     Annotated[Check | Frames | Poses | Masks | Train | Export | During | Keep, Field(discriminator="command")]
 )
 CLOSED = None  # queued in place of a command: the input has ended
+
+
+class _Ended(Exception):
+    """Raised to end a training before its first iteration, while it makes masks."""
 
 
 class Worker:
@@ -218,13 +221,16 @@ class Worker:
     def _masks(self, command: Masks) -> tuple[str, dict]:
         region = load_settings("standard", command.settings).region
         folder = Path(command.capture)
-        before = read_capture(folder, region).to_capture
-        found = make_masks(folder, region, self.send)
-        moved = np.linalg.inv(read_capture(folder).to_capture) @ before
-        return "done", found | {"capture": str(folder.resolve()), "moved": moved.tolist()}
+        return "done", make_masks(folder, region, self.send) | {"capture": str(folder.resolve())}
 
     def _train(self, command: Train) -> tuple[str, dict]:
         out = Path(command.out)
+        try:
+            return self._train_into(out, command)
+        except _Ended:
+            return "cancelled", {"run": str(out.resolve()), "iteration": 0, "seconds": 0.0}
+
+    def _train_into(self, out: Path, command: Train) -> tuple[str, dict]:
         state, quality = train_job.train(
             Path(command.capture),
             out,
@@ -233,7 +239,7 @@ class Worker:
             command.minutes,
             command.settings,
             command.resume,
-            self.send,
+            self._hear_training,
             self._attend,
         )
         facts = {"run": str(out.resolve()), "iteration": state.iteration, "seconds": state.seconds}
@@ -242,6 +248,21 @@ class Worker:
         needs = json.loads((out / "needs.json").read_text(encoding="utf-8"))
         left_out = [need for need in needs if not need.get("needed", False)]
         return "done", facts | {"psnr": quality, "left_out": left_out}
+
+    def _hear_training(self, event: str, facts: dict[str, Any]) -> None:
+        """Send an event of a training. While it makes masks, also handle commands: it has no iterations yet that could."""
+        self.send(event, facts)
+        while event == "progress" and "stage" in facts and not self._commands.empty():
+            command = self._commands.get()
+            if command is CLOSED:
+                self._open = False
+                if not self._keep:
+                    raise _Ended
+            elif isinstance(command, During):
+                if command.command in ("stop", "cancel"):
+                    raise _Ended
+            else:
+                self._waiting.append(command)
 
     def _attend(self, state: State) -> bool:
         """Handle commands that came during a training; called before each iteration. Return True if the training must stop.

@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..job_timers import follow_jobs
 from ..preferences import capture_folder, log_file, python, set_up
 from . import strokes
-from .capture_cameras import show_cameras
+from .capture_cameras import cameras_of, show_cameras
 from .regions import artists_region, region_settings, show_found_region
 
 
@@ -75,20 +75,28 @@ def make_masks(scene: bpy.types.Scene) -> jobs.Job:
     number = scene.session_uid
 
     def show(job: jobs.Job) -> None:
-        strokes.show_masks(capture)
+        _show_masks(number, capture, job.results["masks"])
         if known := _scene(number):
-            found, moved = job.results["masks"], Matrix(job.results["masks"]["moved"])
-            box = artists_region(known)
-            if box is None:
-                show_found_region(known, found["region"])
-            else:
-                box.matrix_world = moved @ box.matrix_world
             checked = job.results["check"]
             show_cameras(known, Path(checked["capture"]), Path(checked["cameras"]))
 
     job.then = show
     follow_jobs()
     return job
+
+
+def _show_masks(number: int, capture: Path, found: dict) -> None:
+    """Show masks that were just made: on canvases of strokes, and as the box around the object, or the artist's box where it is now.
+
+    `found` is the trainer's result of making them. `number` is the scene's `session_uid`.
+    """
+    strokes.show_masks(capture)
+    if known := _scene(number):
+        box = artists_region(known)
+        if box is None:
+            show_found_region(known, found["region"])
+        else:
+            box.matrix_world = Matrix(found["moved"]) @ box.matrix_world
 
 
 def save_strokes(scene: bpy.types.Scene) -> jobs.Job:
@@ -116,6 +124,15 @@ def train(scene: bpy.types.Scene) -> jobs.Job:
         "settings": region_settings(scene) | _choices(settings),
     }
     job = jobs.train(python(), capture, out, log_file(out.name), **words)
+    number = scene.session_uid
+
+    def masked(found: dict) -> None:
+        _show_masks(number, capture, found)
+        if (known := _scene(number)) and (cameras := cameras_of(known, capture)):
+            for camera in cameras.all_objects:
+                camera.location = Matrix(found["moved"]) @ camera.location
+
+    job.masked = masked
     _remember(scene, out, capture)
     follow_jobs()
     return job

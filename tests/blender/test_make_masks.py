@@ -1,6 +1,7 @@
 """Test what prepares a capture in Blender, with a fake trainer: photos from a video, masks, and strokes that correct masks."""
 
 import json
+from pathlib import Path
 
 import bpy
 import cv2
@@ -11,7 +12,7 @@ from PIL import Image
 from refgs_addon import jobs, preferences
 from refgs_addon.errors import InputError
 from refgs_addon.scene import regions, strokes, training
-from refgs_addon.scene.capture_cameras import cameras_of
+from refgs_addon.scene.capture_cameras import cameras_of, show_cameras
 from refgs_addon.ui.train_panel import _status
 from tests.makers.waiting import final_state, until
 
@@ -115,6 +116,27 @@ def test_masks_show_the_box_among_the_cameras(addon, capture):
     assert json.loads(sent[0].split("=")[1]) == [1, 2, 3]
     # The masks changed the frame, and the box with it.
     assert regions.region_settings(addon)["region.centre"] == pytest.approx([2, 4, 7])
+
+
+def test_a_training_that_makes_masks_moves_the_frame(addon, tmp_path):
+    folder = tmp_path / "unmasked photos"
+    (folder / "images").mkdir(parents=True)
+    addon.refgs.capture, addon.refgs.mesh = f"{folder}/", False
+    checked = training.check(addon)
+    assert final_state(checked) == "done"
+    found = checked.results["check"]
+    shown = show_cameras(addon, Path(found["capture"]), Path(found["cameras"]))
+    before = [camera.location.copy() for camera in shown.objects]
+    box = regions.add_training_region(addon)
+    box.location = 1, 2, 3
+    job = training.train(addon)
+    until(lambda: job.curve)
+    assert job.decided["masks"] == "made 3 masks"
+    assert regions.region_settings(addon)["region.centre"] == pytest.approx([2, 4, 7])
+    for old, camera in zip(before, shown.objects, strict=True):
+        assert list(camera.location) == pytest.approx([2 * old[0], 2 * old[1], 2 * old[2] + 1])
+    job.stop()
+    assert final_state(job) == "cancelled"
 
 
 def test_strokes_are_painted_saved_and_seen(addon, capture):

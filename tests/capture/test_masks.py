@@ -16,10 +16,9 @@ from refgs.capture.masks import make_masks, region_settings
 from refgs.capture.silhouettes import find_floor
 from refgs.errors import InputError
 from refgs.settings import load_settings
-from tests.makers.captures import CENTRE, ball, colmap, edit, look_at, nerfstudio, ring, write, write_as_phone
+from tests.makers.captures import CENTRE, ball, colmap, edit, look_at, ring, write, write_as_phone
+from tests.makers.unmasked import ASIDE, COUNT, SIZE, colored, photograph
 
-SIZE, FOCAL, COUNT = (96, 72), 110.0, 10
-ASIDE = CENTRE + np.array([0.0, 1.1, 0.0])
 LENS = {"k1": 0.1, "k2": -0.02, "p1": 0.002, "p2": -0.001}
 
 
@@ -28,33 +27,6 @@ def coarse(monkeypatch):
     """Carve a coarse grid in few rounds, which is enough for balls of 30 pixels."""
     monkeypatch.setattr(silhouettes, "GRID", 24)
     monkeypatch.setattr(silhouettes, "ROUNDS", 3)
-
-
-def colored(shown, random):
-    """Put RGBA pixels before a mottled blue ground. Return the RGB photo."""
-    ground = np.array([60, 70, 150]) + random.normal(0, 12, (*shown.shape[:2], 3))
-    photo = np.where(shown[..., 3:] > 0, shown[..., :3] + random.normal(0, 8, ground.shape), ground)
-    return np.clip(photo, 0, 255).astype(np.uint8)
-
-
-def photograph(folder, beside=False, poses=None, show=ball):
-    """Write photos of a ball before a mottled blue ground. With `beside`, a second ball lies beside it. Return the true masks.
-
-    `show(pose, width, height, focal)` renders another object as RGBA.
-    """
-    random = np.random.default_rng(0)
-    poses, truths = poses or ring(COUNT), []
-    nerfstudio(folder, poses=poses)
-    for i, pose in enumerate(poses):
-        shown = show(pose, *SIZE, FOCAL)
-        if beside:
-            other = ball(pose, *SIZE, FOCAL, ASIDE)
-            shown = np.where(shown[..., 3:] > 0, shown, other)
-        write(folder / "images" / f"{i:04d}.png", colored(shown, random))
-        truths.append(shown[..., 3] > 0)
-    intrinsics = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": SIZE[0] / 2, "cy": SIZE[1] / 2, "w": SIZE[0], "h": SIZE[1]}
-    edit(folder / "transforms.json", lambda data: data.update(intrinsics))
-    return truths
 
 
 def washer(pose, width, height, focal):

@@ -1,8 +1,8 @@
 """Imitate the trainer's process for tests of the add-on: read commands and answer with events, without training.
 
 A word in the path of the photos chooses the behaviour: "crash" (end in the middle of the training), "noise" (also print lines that are no
-events), "bare" (report photos without cameras), "slow", or "good" for none of them. If the environment variable FAKE contains "newer", the
-trainer reports a newer version of the protocol.
+events), "bare" (report photos without cameras), "unmasked" (make masks before a training), "slow", or "good" for none of them. If the
+environment variable FAKE contains "newer", the trainer reports a newer version of the protocol.
 """
 
 import json
@@ -36,6 +36,9 @@ def train(command, asked):
 
 def learn(command, asked, out):
     paused, iteration = False, 0
+    if "unmasked" in command["capture"]:
+        say("progress", stage="carving", done=1, total=3)
+        say("masks", what="made 3 masks", photos=3, made=3, kept=0, objects=1, **made_masks(command))
     say("decided", about="light", what="the light stands still: it brightens so")
     while iteration < 1000:
         time.sleep(0.05 if "slow" in command["capture"] else 0.002)
@@ -70,6 +73,13 @@ def learn(command, asked, out):
     (out / "progress.json").unlink()
     (out / "splats.ply").touch()
     say("done", job="train", run=str(out), iteration=1000, seconds=10.0, psnr=30.0, left_out=[])
+
+
+def made_masks(command):
+    """Describe where the object is, and how masks move the frame."""
+    box = ["region.centre=[1.0, 0.0, 0.0]", "region.size=[1.0, 2.0, 4.0]"]
+    moved = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 1], [0, 0, 0, 1]]
+    return {"capture": command["capture"], "region": box, "moved": moved}
 
 
 def hold(asked):
@@ -153,10 +163,7 @@ def main():
             elif command["command"] == "masks":
                 (Path(command["capture"]) / "asked").write_text(json.dumps(command["settings"]))
                 say("progress", stage="carving", done=1, total=3)
-                box = ["region.centre=[1.0, 0.0, 0.0]", "region.size=[1.0, 2.0, 4.0]"]
-                moved = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 1], [0, 0, 0, 1]]
-                facts = {"capture": command["capture"], "region": box, "moved": moved}
-                say("done", job="masks", photos=3, made=2, kept=1, objects=1, **facts)
+                say("done", job="masks", photos=3, made=2, kept=1, objects=1, **made_masks(command))
             elif command["command"] == "poses":
                 for done in range(3):
                     say("progress", stage="matching", done=done, total=3)

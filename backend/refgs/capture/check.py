@@ -11,6 +11,7 @@ from PIL import Image
 
 from refgs.capture.cameras import write_cameras
 from refgs.capture.images import LoadedView, load_view
+from refgs.capture.masks import guess_box, region_settings
 from refgs.capture.types import Capture, View
 from refgs.errors import InputError
 from refgs.paths import whole
@@ -60,6 +61,7 @@ def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
         _sizes(capture),
         _lenses(capture),
         _masks(capture, statistics),
+        *_guessed_object(capture),
         _poses(capture),
         _extent(capture),
         f"Taken for {'an object' if capture.bounded else 'a room or open scene'}: {capture.bounded_because}",
@@ -157,6 +159,18 @@ def _masks(capture: Capture, statistics: list[_Statistics]) -> str:
     )
 
 
+def _guessed_object(capture: Capture) -> list[str]:
+    """Say where a training of a capture without masks looks for the object. Return no line if there are masks, or if it makes none."""
+    if any(view.masked for view in capture.views) or capture.layout == "nerf-blender" or capture.box is not None:
+        return []
+    try:
+        box = guess_box(capture, capture.views)[0]
+    except InputError:  # the cameras look outwards
+        return []
+    where = " ".join(region_settings(box))
+    return [f"Object: not masked. refgs train and refgs masks look for it in the box {where}, a guess"]
+
+
 def _poses(capture: Capture) -> str:
     offset = np.array([view.camera.position for view in capture.views]) - capture.centre
     distance = np.linalg.norm(offset, axis=1)
@@ -210,9 +224,9 @@ def _warnings(capture: Capture, statistics: list[_Statistics]) -> list[str]:
     if black or (linear and np.median([s.brightness for s in linear]) > WHITE):
         what = f"EXR photos are almost {'black' if black else 'white'}"
         warnings.append(f"{what}: multiply all of them by the same factor, so that a white surface is about 1")
-    if not capture.masked and capture.bounded:
+    if not capture.masked and capture.bounded and capture.layout == "nerf-blender":  # others get masks first
         what = "no masks: the surroundings will be reconstructed with the object"
-        warnings.append(f"{what}; an alpha channel, or a folder masks with files of the photos' names, leaves them out")
+        warnings.append(f"{what}; an alpha channel leaves them out")
     if len(capture.train_views) < 20:
         warnings.append(f"{len(capture.train_views)} training views are few: take more, thirty or more are good")
     return warnings

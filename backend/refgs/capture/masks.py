@@ -25,7 +25,7 @@ from refgs.capture.box import Box
 from refgs.capture.colmap import find_model
 from refgs.capture.images import read_image
 from refgs.capture.lens import Lens
-from refgs.capture.region import find_region, up_direction
+from refgs.capture.region import LOOK_OUT, find_region, sample_silhouettes, up_direction
 from refgs.capture.silhouettes import Photo, carve_object, cut_out, find_floor
 from refgs.capture.types import Capture
 from refgs.errors import InputError
@@ -46,19 +46,24 @@ def make_masks(
     (`guess_box`), and the guess is reported as the event "region". `report(event, facts)` is also called with "progress" and "warning".
 
     Returns a dict: `photos`, `made` and `kept` are numbers of masks, `objects` is the number of separate objects, and `region` is the box
-    about them, as settings for a training of the capture with its new masks. These masks may move its frame.
+    about them, as settings for a training of the capture with its new masks. These masks may move the capture's frame: `moved` (4, 4), a
+    list, is p_new = moved @ p.
 
     All masks are written together at the end; an interrupted call leaves those of before. Raises InputError if all photos have masks by the
-    artist, if strokes do not fit, or if nothing is found.
+    artist, if strokes do not fit, if nothing is found, or if the folder cannot be written to.
     """
     folder = Path(folder)
     capture = read_capture(folder, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
     root = _root(capture)
+    _check_writable(root)
     made = _hashes(root)
     views = [replace(v, mask_path=None) if v.mask_path and _hash(v.mask_path) in made else v for v in capture.views]
     if all(view.masked for view in views):
         raise InputError(f"{folder}: every photo has a mask that was not made here. Remove those that you want made.")
     targets = _targets(root, views)
+    for target in targets.values():
+        if target.exists() and _hash(target) not in made:
+            raise InputError(f"{target} was not made here, and the photos' masks are not used: remove them")
     if capture.box:
         box, fill, floor = capture.box, 0.9, _floor(capture)
     else:
@@ -96,6 +101,10 @@ def make_masks(
             report("progress", {"stage": "edges", "done": len(files), "total": len(targets)})
         if not found and len(targets) == len(views):
             raise nothing
+        masked = {target: path for path, target in files.items()}
+        final = [replace(v, mask_path=masked[targets[v]]) if v in targets else v for v in views]
+        if not find_region(final, up_direction(final), None, sample_silhouettes(final)).bounded:
+            raise nothing  # the masks do not agree on a solid object
         _put(files, root, made)
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -106,6 +115,7 @@ def make_masks(
         "kept": len(views) - len(targets),
         "objects": shape.objects,
         "region": region_settings(shape.bounds(to_frame)),
+        "moved": to_frame.tolist(),
     }
 
 
@@ -113,9 +123,13 @@ def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, tuple[np
     """Guess a box about the object: a cube about where the cameras look, above the plane that the object stands on.
 
     Return the box, the part of it that the object is likely to fill, and the plane of `find_floor`. `views` are the capture's, without
-    masks that should not count.
+    masks that should not count. Raises InputError if the cameras look outwards, as in a room.
     """
     found = find_region(views, up_direction(views), capture.points, [])
+    if found.because == LOOK_OUT:
+        raise InputError(
+            f"{capture.folder}: the cameras look outwards, not at an object. Set a box about one (region.size)."
+        )
     matrix = np.eye(4)
     matrix[:3, :3] *= 1.25 * found.radius
     matrix[:3, 3] = found.centre
@@ -136,6 +150,17 @@ def _floor(capture: Capture, centre: np.ndarray | None = None, radius: float | N
         return None
     centre, radius = (capture.box.centre, capture.box.radius / 3**0.5) if centre is None else (centre, radius)
     return find_floor(capture.points, centre, radius, up_direction(capture.views))
+
+
+def masks_folder(capture: Capture) -> Path:
+    """Return the folder into which a capture's masks are made. Raises InputError if its masks can only be in its photos."""
+    return _root(capture) / "masks"
+
+
+def _check_writable(root: Path) -> None:
+    # A folder whose owner took away the right to write is left alone, even where this process could write to it.
+    if not os.access(root, os.W_OK) or not root.stat().st_mode & 0o222:
+        raise InputError(f"{root} is read-only: masks cannot be written to it. Copy the capture.")
 
 
 def _root(capture: Capture) -> Path:

@@ -12,6 +12,7 @@ from refgs.capture.types import View
 from refgs.errors import InputError
 from refgs.geometry.project import inside, project
 
+LOOK_OUT = "the cameras look outwards"
 NEAR = 100.0  # largest distance from the origin in radii; largest radius, and inverse of the smallest
 
 WHITE_MASKS = "the masks are white (opaque) everywhere, so they are not used: make them anew, the object white on black"
@@ -48,7 +49,7 @@ def find_region(
         positions = np.array([view.camera.position for view in views])
         centre = positions.mean(axis=0)
         spread = float(np.linalg.norm(positions - centre, axis=1).max())
-        return Region(centre, spread, False, "the cameras look outwards")
+        return Region(centre, spread, False, LOOK_OUT)
     seen = np.abs(distances) * np.array([_half_view(view) for view in views])
     radius = float(np.median(seen))
     if silhouettes:
