@@ -144,7 +144,7 @@ def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture
 def test_a_training_is_cancelled_while_it_makes_masks(talk, tmp_path):
     photograph(tmp_path / "photos")
     talk.tell("train", **train(tmp_path / "photos", tmp_path / "run"))
-    assert talk.until("progress")["stage"] == "reading"
+    assert talk.until("progress")["stage"] == "points"
     talk.tell("cancel")
     ended = talk.until("cancelled")
     assert ended["iteration"] == 0 and ended["run"] == str(tmp_path / "run")
@@ -179,7 +179,7 @@ def test_masks_are_made_and_their_box_is_told(talk, tmp_path):
     nerfstudio(tmp_path)
     talk.tell("masks", capture=str(tmp_path))
     assert talk.until("region")["region"][0].startswith("region.centre=")
-    assert talk.until("progress")["stage"] == "reading"
+    assert talk.until("progress")["stage"] == "points"
     done = talk.until("done")
     assert done["job"] == "masks" and done["made"] == 16 and done["objects"] == 1
     assert [line.split("=")[0] for line in done["region"]] == ["region.centre", "region.size"]

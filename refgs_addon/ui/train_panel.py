@@ -282,7 +282,7 @@ def _status(job: jobs.Job) -> str:
         stage = job.progress["stage"]
         if stage == "frames":
             return "{done} frames read, {kept} kept, {blurred} blurred".format(**job.progress)
-        if stage in ("reading", "carving", "edges"):
+        if stage in ("points", "reading", "carving", "edges"):
             return f"making masks: {stage}"
         return {"colours": "learning colours", "baking": "baking textures"}.get(stage, f"finding cameras: {stage}")
     return f"{_duration(job.progress['seconds_left'])} left"

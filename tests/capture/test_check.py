@@ -36,7 +36,8 @@ def test_distortion_points_and_a_guess(tmp_path):
     said = text(colmap(tmp_path, model=(2, "SIMPLE_RADIAL", [60.0, 32.0, 24.0, -0.1])))
     assert "COLMAP" in said and "distortion removed from 16 views" in said and "50 structure-from-motion" in said
     assert "Masks: none" in said and "a guess" in said
-    assert "Warning: no masks" in said and "Warning: 14 training views are few" in said
+    assert "Object: not masked. refgs train and refgs masks look for it in the box region.centre=[" in said
+    assert "Warning: no masks" not in said and "Warning: 14 training views are few" in said
 
 
 def test_warnings_name_the_first_view(tmp_path):

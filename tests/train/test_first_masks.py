@@ -49,6 +49,7 @@ def test_the_object_is_trained_alone_and_a_resumed_training_keeps_its_masks(tmp_
     (made,) = events(heard, "masks")
     assert made["made"] == COUNT and str(capture / "masks") in made["what"] and "look at them" in made["what"]
     assert {facts["stage"] for facts in events(heard, "progress") if "stage" in facts} == {
+        "points",
         "reading",
         "carving",
         "edges",

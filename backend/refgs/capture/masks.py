@@ -27,6 +27,7 @@ from refgs.capture.images import read_image
 from refgs.capture.lens import Lens
 from refgs.capture.region import LOOK_OUT, find_region, sample_silhouettes, up_direction
 from refgs.capture.silhouettes import Photo, carve_object, cut_out, find_floor
+from refgs.capture.triangulate import triangulate
 from refgs.capture.types import Capture
 from refgs.errors import InputError
 from refgs.paths import write_text
@@ -64,13 +65,19 @@ def make_masks(
     for target in targets.values():
         if target.exists() and _hash(target) not in made:
             raise InputError(f"{target} was not made here, and the photos' masks are not used: remove them")
+    chosen = _choose(views, root)
+
+    def reading(done: int, total: int) -> None:
+        report("progress", {"stage": "points", "done": done, "total": total})
+
     if capture.box:
-        box, fill, floor = capture.box, 0.9, _floor(capture)
+        box, fill, size = capture.box, 0.9, capture.box.radius / 3**0.5
     else:
-        box, fill, floor = guess_box(capture, views)
+        box, fill, size = guess_box(capture, views)
         guessed = region_settings(box)
         report("region", {"region": guessed, "what": f"looking for the object in the box {' '.join(guessed)}"})
-    chosen = _choose(views, root)
+    points = triangulate(chosen, reading) if capture.points is None else capture.points
+    floor = find_floor(points, box.centre, size, up_direction(views))
     photos = []
     for view in chosen:
         photos.append(_load(view, root, SIDE))
@@ -119,11 +126,11 @@ def make_masks(
     }
 
 
-def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, tuple[np.ndarray, float] | None]:
-    """Guess a box about the object: a cube about where the cameras look, above the plane that the object stands on.
+def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, float]:
+    """Guess a box about the object: a cube about where the cameras look.
 
-    Return the box, the part of it that the object is likely to fill, and the plane of `find_floor`. `views` are the capture's, without
-    masks that should not count. Raises InputError if the cameras look outwards, as in a room.
+    Return the box, the part of it that the object is likely to fill, and the radius of the region of interest. `views` are the capture's,
+    without masks that should not count. Raises InputError if the cameras look outwards, as in a room.
     """
     found = find_region(views, up_direction(views), capture.points, [])
     if found.because == LOOK_OUT:
@@ -133,7 +140,7 @@ def guess_box(capture: Capture, views: list[View]) -> tuple[Box, float, tuple[np
     matrix = np.eye(4)
     matrix[:3, :3] *= 1.25 * found.radius
     matrix[:3, 3] = found.centre
-    return Box(matrix), 0.8, _floor(capture, found.centre, found.radius)
+    return Box(matrix), 0.8, found.radius
 
 
 def region_settings(box: Box) -> list[str]:
@@ -143,13 +150,6 @@ def region_settings(box: Box) -> list[str]:
         f"region.{key}={[round(float(x), 4) + 0.0 for x in values]}"
         for key, values in (("centre", box.centre), ("size", size))
     ]
-
-
-def _floor(capture: Capture, centre: np.ndarray | None = None, radius: float | None = None):
-    if capture.points is None:
-        return None
-    centre, radius = (capture.box.centre, capture.box.radius / 3**0.5) if centre is None else (centre, radius)
-    return find_floor(capture.points, centre, radius, up_direction(capture.views))
 
 
 def masks_folder(capture: Capture) -> Path:
