@@ -1,7 +1,7 @@
 """Render test scenes whose true shape, materials and light are known: `python -m benchmarks.scenes NAME --out DIR`.
 
 Each scene is a module with a function `build()`, and is rendered by Blender's Cycles. `solids` helps to model the meshes. `scripts.demo`
-places cameras and renders the photos. `analytic` makes simpler captures without Blender.
+places cameras and renders the photos. `lights` makes soft lights. `analytic` makes simpler captures without Blender.
 """
 
 import importlib
@@ -10,8 +10,10 @@ from scripts.demo import jar
 from scripts.demo.shapes import Scene
 
 REFLECTIVE = ("ball", "car", "figure", "helmet", "jar", "plate", "rings", "teapot", "toaster")
+DULL = ("brushed", "embossed", "part", "tarnished")
+"""Metals that look matte, or are a small part of something matte."""
 MATTE = ("matte",)
-NAMES = REFLECTIVE + MATTE
+NAMES = REFLECTIVE + DULL + MATTE
 
 
 def build(name: str) -> Scene:

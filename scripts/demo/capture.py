@@ -53,7 +53,7 @@ def write_capture(
     """
     if out.exists():
         raise InputError(f"{out} exists: choose another folder, or remove it")
-    light = read_light(scene.light)
+    light = read_light(scene.light) if isinstance(scene.light, str) else scene.light
     panoramas = {name: read_light(name) for name in relight}
     # The object's bounding sphere fits with a margin: no silhouette touches the edge of a photo.
     distance = 1.04 * np.linalg.norm(scene.mesh.vertices, axis=1).max() / np.sin(FIELD_OF_VIEW / 2)

@@ -13,6 +13,13 @@ from scripts.demo.shapes import Material, Mesh
 FIELD_OF_VIEW = np.radians(40.0)
 # Passes that are rendered with the picture, by the same camera rays. Each is the mean over the covered part of a pixel.
 VECTORS, SCALARS = ("normal", "albedo"), ("roughness", "metallic", "depth")
+INPUTS = {
+    "base_color": ("Base Color", "albedo"),
+    "metallic": ("Metallic", "metallic"),
+    "roughness": ("Roughness", "roughness"),
+    "brushed": ("Anisotropic", None),
+}
+"""A material's values: the Principled BSDF's input and the pass of each."""
 
 
 class Renderer:
@@ -119,44 +126,49 @@ class Renderer:
         data.polygons.foreach_set("material_index", mesh.material.astype(np.int32))
         data.polygons.foreach_set("use_smooth", np.ones(len(mesh.triangles), bool))
         for index, material in enumerate(materials):
-            if callable(material.base_color):
-                color = np.ones((len(mesh.vertices), 4), np.float32)
-                color[:, :3] = material.base_color(mesh.vertices)
-                data.attributes.new(f"color{index}", "FLOAT_COLOR", "POINT").data.foreach_set("color", color.ravel())
-            data.materials.append(_material(material, f"color{index}"))
+            for name in INPUTS:
+                if callable(texture := getattr(material, name)):
+                    value = np.ones((len(mesh.vertices), 4), np.float32)
+                    value[:, :3] = texture(mesh.vertices).reshape(len(value), -1)
+                    layer = data.attributes.new(f"{name}{index}", "FLOAT_COLOR", "POINT")
+                    layer.data.foreach_set("color", value.ravel())
+            data.materials.append(_material(material, index))
         data.update()
         self.scene.collection.objects.link(bpy.data.objects.new("Object", data))
 
 
-def _material(values: Material, attribute: str) -> bpy.types.Material:
+def _material(values: Material, index: int) -> bpy.types.Material:
     """Make a Principled BSDF with these values. It also writes render passes: albedo, metallic, roughness, normal and depth.
 
-    If the base colour is a texture, it is read from the mesh's colour attribute named `attribute`.
+    A texture is read from the mesh's colour attribute that is named after the value and the material's `index`.
     """
     material = bpy.data.materials.new("Material")
     material.use_nodes = True
     nodes, links = material.node_tree.nodes, material.node_tree.links
     shader = nodes["Principled BSDF"]
-    shader.inputs["Metallic"].default_value = values.metallic
-    shader.inputs["Roughness"].default_value = values.roughness
 
     def output(name: str):
         node = nodes.new("ShaderNodeOutputAOV")
         node.aov_name = name
         return node.inputs["Color" if name in VECTORS else "Value"]
 
-    if callable(values.base_color):
-        texture = nodes.new("ShaderNodeAttribute")
-        texture.attribute_name = attribute
-        color = texture.outputs["Color"]
-    else:
-        constant = nodes.new("ShaderNodeRGB")
-        color = constant.outputs["Color"]
-        color.default_value = (*values.base_color, 1.0)
-    links.new(color, shader.inputs["Base Color"])
-    links.new(color, output("albedo"))
-    output("metallic").default_value = values.metallic
-    output("roughness").default_value = values.roughness
+    for name, (socket, aov) in INPUTS.items():
+        value, inputs = getattr(values, name), [shader.inputs[socket], *([output(aov)] if aov else [])]
+        if callable(value):
+            texture = nodes.new("ShaderNodeAttribute")
+            texture.attribute_name = f"{name}{index}"
+            for to in inputs:
+                links.new(texture.outputs["Color" if to.type == "RGBA" else "Fac"], to)
+        else:
+            for to in inputs:
+                to.default_value = (*value, 1.0) if to.type == "RGBA" else value
+    if callable(values.brushed) or values.brushed > 0:
+        tangent = nodes.new(
+            "ShaderNodeTangent"
+        )  # along circles about z; highlights are stretched a quarter turn from there
+        tangent.direction_type, tangent.axis = "RADIAL", "Z"
+        links.new(tangent.outputs["Tangent"], shader.inputs["Tangent"])
+        shader.inputs["Anisotropic Rotation"].default_value = 0.25
     links.new(nodes.new("ShaderNodeNewGeometry").outputs["Normal"], output("normal"))
     links.new(nodes.new("ShaderNodeCameraData").outputs["View Z Depth"], output("depth"))
     return material

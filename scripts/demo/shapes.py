@@ -6,18 +6,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
+Texture = Callable[[np.ndarray], np.ndarray]
+"""From points (n, 3) to colours (n, 3) or numbers (n,). It is evaluated at the vertices and interpolated linearly between them."""
+
 
 @dataclass(frozen=True)
 class Material:
-    """Hold values of a Principled BSDF: linear Rec.709 base colour, metallic 0..1, perceptual roughness 0..1.
+    """Hold values of a Principled BSDF: linear Rec.709 base colour, metallic 0..1, perceptual roughness 0..1. Each may be a texture.
 
-    The base colour may be a texture: a function from points (n, 3) to colours (n, 3). It is evaluated at the vertices and interpolated
-    linearly between them.
+    `brushed` is the anisotropy 0..1 of a surface that is brushed along circles about z: its highlights are stretched across these circles.
     """
 
-    base_color: tuple[float, float, float] | Callable[[np.ndarray], np.ndarray]
-    metallic: float
-    roughness: float
+    base_color: tuple[float, float, float] | Texture
+    metallic: float | Texture
+    roughness: float | Texture
+    brushed: float | Texture = 0.0
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,13 @@ class Mesh:
 class Scene:
     """Hold an object around the origin, with Z up, its light, and how low cameras may stand.
 
-    `light` names one of Blender's HDRIs. The cameras stand on a sphere around the origin. None stands below the height `lowest`, given as a
-    fraction of the sphere's radius (-1..1).
+    `light` names one of Blender's HDRIs, or is a panorama (H, 2·H, 3) of linear radiance in Blender's orientation. The cameras stand on a
+    sphere around the origin. None stands below the height `lowest`, given as a fraction of the sphere's radius (-1..1).
     """
 
     mesh: Mesh
     materials: tuple[Material, ...]
-    light: str
+    light: str | np.ndarray
     lowest: float = -0.3
 
 

@@ -21,6 +21,7 @@ from scripts.demo.shapes import lathe
 ROOT = Path(__file__).parents[2]
 SIZE = 48
 SCALARS = ("roughness", "metallic", "depth", "alpha", "visibility")
+TEXTURES = ("metallic", "roughness", "brushed")
 
 
 def run(*arguments, check=True):
@@ -256,28 +257,76 @@ def test_all_makes_what_is_not_there_yet(rings):
     assert all(not list((out.parent / name).iterdir()) for name in set(NAMES) - {"rings"})
 
 
-def test_the_albedo_pass_shows_the_textures(tmp_path):
+@pytest.mark.parametrize("name", ["matte", "brushed"])
+def test_the_passes_show_the_textures(name, tmp_path):
     pytest.importorskip("bpy")
-    out, per_side = tmp_path / "matte", 4
-    run("matte", "--out", out, "--size", SIZE, "--train", 1, "--test", 1)
-    scene = build("matte")
+    out, per_side = tmp_path / name, 4
+    run(name, "--out", out, "--size", SIZE, "--train", 1, "--test", 1)
+    scene = build(name)
     origin, directions, _ = camera_rays([out], per_side)
     rays = directions.reshape(-1, 3)
     solid = trimesh.Trimesh(scene.mesh.vertices, scene.mesh.triangles, process=False)
     points, ray, triangle = first_hits(solid, origin, rays)
-    colors = np.zeros((len(rays), 3))
-    for index, material in enumerate(scene.materials):
-        here = scene.mesh.material[triangle] == index
-        color = material.base_color
-        colors[ray[here]] = color(points[here]) if callable(color) else color
     hit = np.zeros(len(rays))
     hit[ray] = 1
-    inner = pixel_means(hit, per_side) == 1
-    expected = np.stack([pixel_means(channel, per_side) for channel in colors.T], -1)[inner]
-    found = passes([out])["albedo"][inner]
-    assert np.abs(found - expected).mean() < 0.01
-    assert np.percentile(np.abs(found - expected).max(-1), 80) < 0.01
-    assert np.abs(found - np.median(found, axis=0)).mean() > 0.05
+    inner = pixel_means(hit.reshape(SIZE * per_side, -1), per_side) == 1
+    images = passes([out])
+    for kind in ("base_color", "metallic", "roughness"):
+        values = np.zeros((len(rays), 3))
+        for index, material in enumerate(scene.materials):
+            here = scene.mesh.material[triangle] == index
+            value = getattr(material, kind)
+            value = value(points[here]) if callable(value) else np.asarray(value)
+            values[ray[here]] = value if value.shape[-1:] == (3,) else value[..., None]
+        expected = pixel_means(values.reshape(SIZE * per_side, -1, 3), per_side)[inner]
+        found = images["albedo"][inner] if kind == "base_color" else images[kind][inner][:, None]
+        assert np.abs(found - expected).mean() < 0.012
+        assert np.percentile(np.abs(found - expected).max(-1), 80) < 0.02
+        if name == "brushed" or kind == "base_color":
+            assert np.abs(found - np.median(found, axis=0)).mean() > 0.005
+
+
+def test_a_small_part_of_the_pig_is_chrome(tmp_path):
+    """Check that the bell takes about a fiftieth of the pixels, in the mean over views, and that nothing else is metal."""
+    pytest.importorskip("bpy")
+    run("part", "--out", tmp_path / "part", "--size", SIZE, "--train", 1, "--test", 12, "--samples", 4)
+    truth = tmp_path / "part/ground_truth"
+    metal, shown = (
+        np.stack([read(path)[1] for path in sorted((truth / kind).glob("*.exr"))]) for kind in ("metallic", "alpha")
+    )
+    assert 0.01 < (metal * shown).sum() / shown.sum() < 0.03
+    assert set(np.unique(metal[shown > 0.999]).round(3)) >= {0, 1}
+
+
+CYLINDER = """
+import json, os, sys
+from pathlib import Path
+import numpy as np
+from refgs.formats.exr import write_exr
+from refgs.formats.panorama import directions
+from scripts.demo.capture import sphere_cameras
+from scripts.demo.cycles import Renderer
+from scripts.demo.shapes import Material, lathe
+folder, found = Path(sys.argv[1]), []
+lamp = np.where(directions(256, 512) @ [-0.8, -0.6, 0] > 0.99, 20, 0)
+write_exr(folder / "lamp.exr", np.repeat(lamp[..., None], 3, axis=2).astype(np.float32))
+sides = lathe([(0, [(0.0, -1.0), (0.5, -1.0)]), (0, [(0.5, 1.0), (0.0, 1.0)])], rows=80, columns=180)
+for brushed in (0.0, 0.9):
+    renderer = Renderer(sides, (Material((0.9, 0.9, 0.9), 1.0, 0.3, brushed),), 48, 32)
+    renderer.set_light(folder / "lamp.exr")
+    color = renderer.render(sphere_cameras(1, 4.0, -1.0, np.pi)[0], seed=0)["color"][..., 0]
+    found.append([np.sqrt(np.cov(i.ravel(), aweights=color.ravel())).item() for i in np.indices(color.shape)])
+(folder / "found.json").write_text(json.dumps(found))
+os._exit(0)  # Blender sometimes hangs when it cleans up
+"""
+
+
+def test_highlights_are_stretched_across_the_brushing(tmp_path):
+    """Check a lamp's highlight on an upright cylinder: brushing around it makes the highlight higher, and narrower."""
+    pytest.importorskip("bpy")
+    subprocess.run([sys.executable, "-c", CYLINDER, tmp_path], cwd=ROOT, capture_output=True, check=True)
+    (height, width), (brushed_height, brushed_width) = json.loads((tmp_path / "found.json").read_text())
+    assert brushed_height > 1.1 * height and brushed_width < 0.9 * width
 
 
 def test_every_scene_is_listed():
@@ -303,9 +352,10 @@ def test_meshes_face_outward_and_stand_about_the_origin(name):
     assert set(scene.mesh.material) == set(range(len(scene.materials)))
     assert len(scene.mesh.material) == len(triangles)
     for material in scene.materials:
-        if callable(material.base_color):
-            colors = material.base_color(vertices)
-            assert colors.shape == vertices.shape and colors.min() >= 0 and colors.max() <= 1
+        for kind, shape in (("base_color", vertices.shape), *((kind, (count,)) for kind in TEXTURES)):
+            if callable(texture := getattr(material, kind)):
+                values = texture(vertices)
+                assert values.shape == shape and values.min() >= 0 and values.max() <= 1
 
 
 def test_a_sculpted_solid_is_closed_and_lies_on_the_surface():

@@ -1,0 +1,39 @@
+"""Make soft lights: panoramas (H, 2·H, 3) of linear radiance in Blender's orientation, without a small bright lamp."""
+
+import numpy as np
+
+from benchmarks.scenes.textures import clouds
+from refgs.formats.panorama import directions
+from scripts.demo.shapes import mix, step
+
+HEIGHT = 512
+
+
+def overcast() -> np.ndarray:
+    """Make an overcast sky over gravel with trees along the horizon. The zenith is three times as bright as the horizon (CIE)."""
+    way = directions(HEIGHT, 2 * HEIGHT).reshape(-1, 3).astype(float)
+    up = way[:, 2]
+    sky = (1 + 2 * up.clip(0)) / 3 * (1 + 0.25 * clouds(way * [1, 1, 2], 0.7, seed=1))
+    ground = mix((0.16, 0.155, 0.14), (0.27, 0.26, 0.24), step(-0.8, 0.8, clouds(way, 0.5, seed=2)))
+    radiance = 1.1 * sky[:, None] * np.array([0.95, 1.0, 1.06])
+    level = way * [1, 1, 0]
+    trees = step(-0.02, 0.02, 0.10 + 0.07 * clouds(level, 0.25, seed=3) + 0.02 * clouds(level, 0.05, seed=4) - up)
+    radiance = mix(radiance, (0.05, 0.07, 0.035), trees)
+    return mix(radiance, ground, step(-0.02, 0.0, -up)).reshape(HEIGHT, 2 * HEIGHT, 3)
+
+
+def museum() -> np.ndarray:
+    """Make a room of pale walls with four broad panels of frosted glass in its ceiling, a doorway and a wooden floor."""
+    way = directions(HEIGHT, 2 * HEIGHT).reshape(-1, 3).astype(float)
+    wall = np.array([3.0, 3.0, 2.0])  # half the room's size; the object is in its middle
+    along = (wall / np.abs(way).clip(1e-9)).min(axis=1)
+    x, y, z = (way * along[:, None]).T
+    radiance = mix((0.30, 0.28, 0.25), (0.52, 0.50, 0.46), step(-2.0, 2.0, z))
+    door = step(0.9, 0.6, np.abs(y - 0.6)) * step(0.7, 0.4, z) * (x > 2.9)
+    radiance = mix(radiance, (0.06, 0.055, 0.05), door)
+    picture = step(1.1, 0.9, np.abs(x + 0.5)) * step(0.6, 0.45, np.abs(z - 0.3)) * (y > 2.9)
+    radiance = mix(radiance, (0.16, 0.07, 0.05), picture)
+    floor = mix((0.15, 0.10, 0.06), (0.22, 0.15, 0.09), step(-0.5, 0.5, np.sin(9 * y)))
+    radiance = mix(radiance, floor, z < -1.99)
+    panel = step(1.1, 0.6, np.abs(np.abs(x) - 1.4)) * step(0.9, 0.5, np.abs(np.abs(y) - 1.4)) * (z > 1.99)
+    return mix(radiance, (2.6, 2.5, 2.3), panel).reshape(HEIGHT, 2 * HEIGHT, 3)
