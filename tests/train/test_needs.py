@@ -384,7 +384,53 @@ def test_specular_on_synthetic_surfels(ball_capture, tmp_path):
             made.state.light.copy_(light)
             for view, photo in enumerate(made.state.photos):
                 made.state.photos[view] = with_rendering(made.state, photo, noise=0.01)
-        assert least < probe.specular_explains(made.state) < most
+        assert least < probe.specular_explains(made.state).whole < most
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_what_a_small_part_loses_is_told_apart(ball_capture, tmp_path, mask):
+    """Check that a patch of surfels, a hundredth of the object's pixels or so, is not hidden by the rest, nor by what is not the object.
+
+    The patch turns from black to white. Photos are the model's renderings, with noise that is much larger beyond the mask.
+    """
+    made = trainer(ball_capture, tmp_path / "run", total=10)
+    state = made.state
+    put(made, albedo=-3.0, opacity=4.0)
+    shares = probe.blended_shares(
+        state.surfels(), [state.photo(view) for view in probe.spread_views(state)], state.near
+    )
+    seen = shares.sum(dim=0)
+    nearest = (state.parameters["position"] - state.parameters["position"][seen.argmax()]).norm(dim=1).argsort()
+    patch = nearest[: 1 + int((seen[nearest].cumsum(dim=0) < 0.008 * seen.sum()).sum())]
+    for view, photo in enumerate(state.photos):
+        clean = with_rendering(state, photo, noise=0.1)
+        outside = 255 * torch.rand(clean.image.shape, generator=torch.Generator().manual_seed(view))
+        image = torch.where((photo.mask > 127)[..., None], clean.image, outside.byte())
+        state.photos[view] = photo._replace(image=image, mask=photo.mask if mask else None)
+
+    def whiter(inputs):
+        albedo = inputs.surfels.albedo.clone()
+        albedo[patch] = 1.0
+        return inputs._replace(surfels=inputs.surfels._replace(albedo=albedo))
+
+    lost = probe.psnr_loss(state, whiter)
+    assert lost.part > 3 > 1 > lost.whole > 0
+    assert lost.part > 5 * lost.whole
+    same = probe.psnr_loss(state, lambda inputs: inputs)
+    assert same == (0, 0)
+    if mask:
+        shown = probe.on_object(state, state.surfels(), 0)
+        torch.testing.assert_close(shown, state.photo(0).mask > 127)
+
+
+def test_chance_loses_nothing():
+    """Check that two pictures with the same noise are equally near the photo, and so are their pixels that differ most."""
+    truth = torch.full((20000, 3), 0.5)
+    one, other = (
+        truth + 0.05 * torch.randn(20000, 3, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1)
+    )
+    lost = probe.lost([one], [other], [truth])
+    assert abs(lost.whole) < 0.1 and abs(lost.part) < 0.3
 
 
 def test_shares_are_weights(ball_capture, tmp_path):

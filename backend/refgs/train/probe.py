@@ -1,12 +1,13 @@
 """Measure how much worse pictures get, and how much faster an iteration gets, if a part of the training is left out.
 
 `refgs.train.needs` uses these measurements for its decisions. They are made on training views, with the surfels and the light as they are
-now. PSNR is computed from the mean squared error over all measured views.
+now, and only on pixels that show the object. PSNR is computed from the mean squared error over these pixels of all measured views.
 """
 
 import math
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ from refgs.train.state import RenderInputs, State, spread
 
 VIEWS = 8  # that are looked at, at the most
 SEVERAL = 12  # where a surfel has to be seen from several sides
+PART = 0.01  # part of the object's pixels that counts by itself: a chrome bell may be no larger
 REPEATS = 2  # iterations that are timed with and without; the fastest of each counts
 
 Change = Callable[[RenderInputs], RenderInputs]
@@ -44,17 +46,33 @@ def picture(state: State, view: int, inputs: RenderInputs, whole: bool = False) 
     return state.picture(inputs, state.photo(view, whole).camera, state.exposure(view))
 
 
-def squared_error(color: Tensor, photo: Photo, background: Tensor) -> float:
-    """Compute the mean squared error of an encoded picture (H, W, 3) against a photo that is composited over the background.
+class Lost(NamedTuple):
+    """Hold how many dB of PSNR the training views lose by a change of what is rendered.
 
-    Both are clipped to 0..1.
+    `whole` is of all of the object's pixels. `part` is of a hundredth of them (PART), where the pictures change most: a small part of the
+    object may need what the rest of it does not.
     """
-    return float((color.clamp(0, 1) - photo.over(background)).square().mean())
+
+    whole: float
+    part: float
 
 
-def decibels_lost(errors: list[float], without: list[float]) -> float:
-    """Compute by how many dB the PSNR falls if the views' mean squared errors rise from `errors` to `without`."""
-    return 10 * math.log10(max(sum(without), 1e-12) / max(sum(errors), 1e-12))
+def decibels_lost(errors: Tensor, without: Tensor) -> float:
+    """Compute by how many dB the PSNR falls if pixels' squared errors rise from `errors` (P,) to `without` (P,)."""
+    return 10 * math.log10(max(float(without.sum()), 1e-12) / max(float(errors.sum()), 1e-12))
+
+
+def lost(pictures: list[Tensor], changed: list[Tensor], truths: list[Tensor]) -> Lost:
+    """Compute what is lost between two pictures of each view. They and the photos, `truths`, are (P, 3): the object's pixels, encoded.
+
+    The pixels of `Lost.part` are chosen by how far the two pictures are apart, whichever of them is nearer to the photo: so chance favours
+    neither.
+    """
+    picture, other, truth = (torch.cat(images) for images in (pictures, changed, truths))
+    picture, other = picture.clamp(0, 1), other.clamp(0, 1)
+    errors, without = ((image - truth).square().mean(dim=1) for image in (picture, other))
+    most = (picture - other).square().mean(dim=1).topk(math.ceil(PART * len(truth))).indices
+    return Lost(decibels_lost(errors, without), decibels_lost(errors[most], without[most]))
 
 
 def spread_views(state: State, most: int = VIEWS) -> list[int]:
@@ -63,22 +81,35 @@ def spread_views(state: State, most: int = VIEWS) -> list[int]:
 
 
 @torch.no_grad()
-def squared_errors(state: State, inputs: RenderInputs) -> list[float]:
-    """Compute the mean squared error against the photo in each of a few training views."""
-    found = []
-    for view in spread_views(state):
-        found.append(squared_error(picture(state, view, inputs).color, state.photo(view), state.background))
-    return found
+def on_object(state: State, surfels: Surfels, view: int) -> Tensor:
+    """Tell which pixels (H, W) of a training view's crop show the object: those in the mask and in the region to train.
+
+    If there is neither a mask nor a region, all do.
+    """
+    photo = state.photo(view)
+    shown = torch.ones(photo.image.shape[:2], dtype=torch.bool, device=state.device)
+    if photo.mask is not None:
+        shown &= photo.mask > 127
+    if state.capture.box is not None:
+        wanted = state.wanted().float()[:, None]
+        shown &= rasterize(*discs(surfels, photo.camera), wanted, photo.camera, near=state.near).features[..., 0] > 0.5
+    return shown
 
 
 @torch.no_grad()
-def psnr_loss(state: State, change: Change) -> float:
+def psnr_loss(state: State, change: Change, inputs: RenderInputs | None = None) -> Lost:
     """Compute how many dB of PSNR the training views lose by a change of what is rendered.
 
-    `change` is a function that takes the inputs of a rendering and returns the changed inputs.
+    `change` is a function that takes the inputs of a rendering and returns the changed inputs. `inputs` are the state's if not given.
     """
-    inputs = state.inputs()
-    return decibels_lost(squared_errors(state, inputs), squared_errors(state, change(inputs)))
+    inputs = state.inputs() if inputs is None else inputs
+    pictures, changed, truths = [], [], []
+    for view in spread_views(state):
+        shown = on_object(state, inputs.surfels, view)
+        pictures.append(picture(state, view, inputs).color[shown])
+        changed.append(picture(state, view, change(inputs)).color[shown])
+        truths.append(state.photo(view).over(state.background)[shown])
+    return lost(pictures, changed, truths)
 
 
 @torch.enable_grad()
@@ -141,7 +172,7 @@ def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: lis
 
 
 @torch.no_grad()
-def specular_explains(state: State) -> float:
+def specular_explains(state: State) -> Lost:
     """Compute how many dB of PSNR the training views lose if reflections no longer change with the view.
 
     For the comparison, each surfel's specular colour is replaced by its mean over the photos. A matte surface could learn this mean as
@@ -152,39 +183,43 @@ def specular_explains(state: State) -> float:
     shown, matte = ([picture(state, view, how) for view in some] for how in (inputs, dull))
     over = [a.radiance - b.radiance for a, b in zip(shown, matte, strict=True)]
     mean = blended_shares(inputs.surfels, photos, state.near, over)
-    errors = [], []
-    for photo, rendering, base in zip(photos, shown, matte, strict=True):
+    pictures, flat, truths = [], [], []
+    for view, photo, rendering, base in zip(some, photos, shown, matte, strict=True):
         feature = rasterize(*discs(inputs.surfels, photo.camera), mean, photo.camera, near=state.near).features
         alpha = rendering.alpha[..., None]
         radiance = base.radiance + feature / alpha.clamp_min(COVERED)
         exposed = radiance if rendering.exposure is None else radiance * rendering.exposure
         encoded = state.method.light.encode(exposed)
-        flat = torch.where(alpha > COVERED, encoded * alpha, 0) + (1 - alpha) * state.background
-        for found, image in zip(errors, (rendering.color, flat), strict=True):
-            found.append(squared_error(image, photo, state.background))
-    return decibels_lost(*errors)
+        here = on_object(state, inputs.surfels, view)
+        pictures.append(rendering.color[here])
+        flat.append((torch.where(alpha > COVERED, encoded * alpha, 0) + (1 - alpha) * state.background)[here])
+        truths.append(photo.over(state.background)[here])
+    return lost(pictures, flat, truths)
 
 
 @torch.no_grad()
-def reflections_explain(state: State) -> float:
+def reflections_explain(state: State) -> Lost:
     """Estimate how many dB of PSNR the training views can gain from inter-reflection at most.
 
     Two pictures are compared. Where the object mirrors itself, one picture shows black there, and the other shows the environment's light.
     The correct picture lies between the two, so that their difference limits the gain. The result is how many dB the PSNR falls if this
     difference is added to the error against the photos.
     """
-    inputs, wrong, apart = state.inputs(), 0.0, 0.0
+    inputs, wrong, apart = state.inputs(), [], []
     black = inputs.surfels._replace(
         indirect_dc=torch.zeros_like(inputs.surfels.indirect_dc),
         indirect_rest=torch.zeros_like(inputs.surfels.indirect_rest),
         received=torch.ones_like(inputs.surfels.received),
     )
     for view in spread_views(state):
-        free = picture(state, view, inputs._replace(occluder=None)).color
-        hidden = picture(state, view, inputs._replace(surfels=black)).color
-        wrong += squared_error(free, state.photo(view), state.background)
-        apart += float((free.clamp(0, 1) - hidden.clamp(0, 1)).square().mean())
-    return 10 * math.log10(1 + apart / max(wrong, 1e-12))
+        shown = on_object(state, inputs.surfels, view)
+        free = picture(state, view, inputs._replace(occluder=None)).color[shown].clamp(0, 1)
+        hidden = picture(state, view, inputs._replace(surfels=black)).color[shown].clamp(0, 1)
+        wrong.append((free - state.photo(view).over(state.background)[shown]).square().mean(dim=1))
+        apart.append((free - hidden).square().mean(dim=1))
+    errors, more = torch.cat(wrong), torch.cat(apart)
+    most = more.topk(math.ceil(PART * len(more))).indices
+    return Lost(decibels_lost(errors, errors + more), decibels_lost(errors[most], (errors + more)[most]))
 
 
 @torch.no_grad()

@@ -11,6 +11,8 @@ from refgs.train.needs.materials import INDIRECT
 from refgs.train.needs.need import ASKED, MEGA, NUMBER, Decision, Moment, Need, megabytes
 from refgs.train.state import RenderInputs, State
 
+VISIBLE = 0.1  # dB of a small part of the object (`probe.PART`), where the rest hides it in the mean
+
 
 class Reflections(Need):
     """Decide whether the scene needs inter-reflection: whether the object visibly mirrors itself."""
@@ -35,7 +37,7 @@ class Reflections(Need):
         why, least = share_hidden(hidden), state.settings.indirect.least
         if hidden < least:
             return Decision(False, why, self._saved(state), hidden, least)
-        explained = probe.reflections_explain(state)
+        explained = probe.reflections_explain(state).whole
         why += f", where mirroring black would change the pictures by {explained:.2f} dB"
         needed = explained >= self.threshold
         return Decision(needed, why, {} if needed else self._saved(state), explained)
@@ -45,7 +47,7 @@ class Reflections(Need):
             return inputs._replace(occluder=None)
 
         seconds, size = probe.seconds_saved(state, without), megabytes(state, INDIRECT)
-        return {"seconds": seconds, "decibels": probe.psnr_loss(state, without), "megabytes": size}
+        return {"seconds": seconds, "decibels": probe.psnr_loss(state, without).whole, "megabytes": size}
 
     def apply(self, state: State, found: dict[str, Any]) -> None:
         state.occluder = None
@@ -67,7 +69,7 @@ class Light(Need):
     threshold, reason = 0.01, "dB; a coarser light that costs more is not taken, whatever the roughness"
     moments, follows = ("iteration",), "specular"
     SETTLED = 0.19  # part of the training after which roughness hardly changes; before the light has all its texels
-    GLOSSIEST = 0.05  # part of the picture that may be glossier than the roughness that texels are chosen for
+    GLOSSIEST = probe.PART / 2  # part of the picture that may be glossier than the roughness that texels are chosen for
     LOBE = 0.5  # part of a lobe's width that a texel may take
 
     def due(self, state: State, moment: Moment, progress: float) -> bool:
@@ -85,7 +87,7 @@ class Light(Need):
             weight = probe.blended_shares(inputs.surfels, photos, state.near).sum(dim=0)
             roughness = probe.quantile(inputs.surfels.roughness, weight, self.GLOSSIEST)
             side = resolvable(roughness, self.LOBE, finest, coarsest)
-            rougher = f"{1 - self.GLOSSIEST:.0%} of the pictures are rougher than {roughness:.2f}"
+            rougher = f"{1 - self.GLOSSIEST:.1%} of the pictures are rougher than {roughness:.2f}"
             why = f"{rougher}, whose lobe {side} texels along a side show"
             least = math.sqrt(math.pi / 2 / (finest // 2) / self.LOBE)
         if side >= finest:
@@ -96,12 +98,11 @@ class Light(Need):
             return inputs._replace(environment=probe.pooled(inputs.environment, side))
 
         loss = probe.psnr_loss(state, coarse)
-        if loss > self.threshold and self.asked(state) == "auto":
-            return Decision(
-                True, f"{why}, and yet the photos know {loss:.2f} dB of the finer ones", {}, roughness, least
-            )
+        if (loss.whole > self.threshold or loss.part > VISIBLE) and self.asked(state) == "auto":
+            why = f"{why}, and yet the photos know {loss.whole:.2f} dB of the finer ones, {loss.part:.2f} where they show most"
+            return Decision(True, why, {}, roughness, least)
         figures = {"side": side, "seconds": probe.seconds_saved(state, coarse)}
-        figures |= {"megabytes": 6 * (finest**2 - side**2) * 3 * NUMBER / MEGA, "decibels": loss}
+        figures |= {"megabytes": 6 * (finest**2 - side**2) * 3 * NUMBER / MEGA, "decibels": loss.whole}
         return Decision(False, why, figures, roughness, least, lambda: light.coarsen(state, side))
 
     def apply(self, state: State, found: dict[str, Any]) -> None:
@@ -146,14 +147,14 @@ class Degrees(Need):
         for field, name in (("sh_rest", "what is left over"), ("indirect_rest", "inter-reflection")):
             if field not in state.parameters:
                 continue
-            whole, errors = state.parameters[field].shape[1], probe.squared_errors(state, inputs)
+            whole = state.parameters[field].shape[1]
             count, loss, shorter = whole, 0.0, inputs
             for degree in reversed(range(math.isqrt(whole + 1) - 1)):
                 fewer = _shortened(inputs, field, (degree + 1) ** 2 - 1)
-                worse = probe.decibels_lost(errors, probe.squared_errors(state, fewer))
-                if worse > self.threshold:
+                worse = probe.psnr_loss(state, lambda _, fewer=fewer: fewer, inputs)
+                if worse.whole > self.threshold or worse.part > VISIBLE:
                     break
-                count, loss, shorter, last = (degree + 1) ** 2 - 1, worse, fewer, degree
+                count, loss, shorter, last = (degree + 1) ** 2 - 1, worse.whole, fewer, degree
             if count == whole:
                 continue
             inputs, counts[field] = shorter, count
