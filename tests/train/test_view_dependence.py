@@ -91,13 +91,32 @@ def test_what_is_matte_does_not_change(made, exposure, turn):
     made.state.change("render.reflection", "none", "needs", "the test has a matte ball")
     show(made, metallic=-6.0, roughness=6.0, exposure=exposure, turn=turn)
     metal, change = told(made)
-    assert change < 0.75 * CHANGES and metal < 0.05
+    assert change < 0.75 * CHANGES and metal < 0.05 and falls(made) < 0.02
 
 
 def test_a_grey_surface_tells_nothing(made):
     show(made, metallic=6.0, roughness=-1.0, albedo=[1.0, 1.0, 1.0])
     metal, change = told(made)
     assert metal < 0.02 and change > 2 * CHANGES
+
+
+def falls(made):
+    """Return which part of the usable surface falls as far below its median as only metals do."""
+    state = made.state
+    found = view_dependence.observe(state)
+    light = float(state.environment().radiance.detach().mean())
+    metal = view_dependence.falls_as_metal(found, state.parameters["position"].detach(), light)
+    return float(metal[found.usable.any(dim=1)].float().mean())
+
+
+@pytest.mark.parametrize("exposure", [(1.0,), (1.0, 0.8, 1.2)])
+def test_only_a_metal_falls_far_below_its_median(made, exposure):
+    """Check grey metal against grey, orange and black glaze, under lamps that are much brighter than what is around them."""
+    show(made, metallic=6.0, roughness=-1.0, albedo=[1.0, 1.0, 1.0], exposure=exposure)
+    assert falls(made) > 0.25
+    for color in ([1.0, 1.0, 1.0], ORANGE, [-4.0, -4.0, -4.0]):
+        show(made, metallic=-6.0, roughness=-1.0, albedo=color, exposure=exposure)
+        assert falls(made) < 0.02
 
 
 def test_a_small_part_that_shines_counts(made):

@@ -13,7 +13,7 @@ from refgs.model.surfels import raw_metallic
 from refgs.train import needs
 from refgs.train.needs.materials import SOONEST
 from refgs.train.state import State
-from refgs.train.view_dependence import observe, parts_of_metal, shines_as_metal
+from refgs.train.view_dependence import falls_as_metal, observe, parts_of_metal, shines_as_metal
 
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
 METAL = 0.9  # metallic; training can still change it
@@ -23,7 +23,9 @@ HELD = torch.tensor(
 
 
 def set_metals_due(state: State, progress: float) -> None:
-    """Once, early in the training, raise the metallic of the surfels that shine as coloured metals do (see `shines_as_metal`).
+    """Once, early in the training, raise the metallic of the surfels that change with the view as only metals do.
+
+    See `shines_as_metal` for coloured metals, `falls_as_metal` for all.
 
     Those in a part of the surface that is metal for certain (see `parts_of_metal`) stay metal from then on (see `hold`). The others keep
     the metallic that they have learned: it started low, as that of a dielectric.
@@ -36,7 +38,8 @@ def set_metals_due(state: State, progress: float) -> None:
         return
     observations, metallic = observe(state), state.parameters["metallic"]
     positions, weight = state.parameters["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
-    metal = shines_as_metal(observations, positions)
+    light = float(state.environment().radiance.detach().mean())
+    metal = shines_as_metal(observations, positions) | falls_as_metal(observations, positions, light)
     held = parts_of_metal(metal, positions, weight)
     with torch.no_grad():
         metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
@@ -47,7 +50,7 @@ def set_metals_due(state: State, progress: float) -> None:
         moments[name][metal] = 0
     state.metals_set = True
     part = float(weight[metal].sum() / weight.sum().clamp_min(1e-6))
-    state.announce("metals", f"{part:.0%} of the surface shines in its own colour, as metals do")
+    state.announce("metals", f"{part:.0%} of the surface shines as metals do")
 
 
 def hold(state: State) -> None:

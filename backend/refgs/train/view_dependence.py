@@ -4,6 +4,7 @@ Nothing here needs normals that are right: an embossed metal has no sharp reflec
 photo to photo. A matte surface under a light that stands still looks the same from everywhere.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -28,10 +29,14 @@ LEAST_VIEWS = 6  # of a surfel
 LEAST_CLIPPED = 0.05  # of a surfel's pixels in a photo; then its highlights look whiter than they are
 DARK = 0.03  # linear radiance below which a surfel does not count for a photo's exposure
 NEIGHBOURS = 64  # surfels whose changes are pooled, as one alone has too few photos
+FEW = 32  # of them, where the size of the change is asked and not its colour: pooling evens it out
 SATURATED = 0.08  # distance of a chromaticity from grey, below which metals and dielectrics change alike
 CHANGES = 0.15  # change relative to the mean radiance, below which it may be texture that is slightly out of place
 FAINT_CHANGES = 0.08  # enough where neighbours change clearly, and alike
 GROWTH = 8  # steps from neighbours to neighbours
+LOW = 0.15  # part of the photos in which a surfel is darker than where its drop is measured; fewer may be shadows or outlines
+DROP = 0.08  # of the light's mean radiance; a dielectric mirrors 0.04 of the light, and so cannot fall by much more below its median
+FALLS = 0.88  # part of its median to which a metal falls, which has no diffuse light; paint falls to 0.94 or less far
 WIDE, SAMPLE = 0.1, 4000  # the part of the surface that is a surfel's wide surroundings; surfels that stand for all
 CERTAIN = 0.7  # of them that are told to be metal: a gold cape has 0.9 all over, paint at most 0.5, where texture is out of place
 METAL = 0.6  # tint of the change (0: grey as a dielectric's reflection; 1: of the surface's own colour)
@@ -168,16 +173,10 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Tensor:
     is averaged over neighbours first: texture that is slightly out of place then cancels, and highlights do not. A smaller
     change is enough beside surfels that change clearly. Surfels near grey tell nothing.
     """
-    weight = observations.pixels * (observations.clipped < LEAST_CLIPPED) * (observations.pixels > LEAST_PIXELS)
-    near = _neighbours(positions)
-    pixels = _pooled(weight, near)
-    known = pixels > LEAST_PIXELS
-    change = _pooled((observations.change * weight[..., None]).flatten(1), near).view_as(observations.change)
-    change = torch.where(known[..., None], change / pixels.clamp_min(1e-6)[..., None], 0)
+    near = _neighbours(positions, NEIGHBOURS)
+    mean, change, known = _averaged(observations, near)
     count = known.sum(dim=1).clamp_min(1)[:, None, None]
     change = (change - change.sum(dim=1, keepdim=True) / count) * known[..., None]
-    seen = observations.pixels.sum(dim=1, keepdim=True)
-    mean = (_pooled(observations.mean * seen, near) / _pooled(seen, near).clamp_min(1e-6)).clamp_min(1e-4)
     relative = change / mean.mean(dim=1)[:, None, None].clamp_min(1e-2)
     covariance = relative.transpose(1, 2) @ relative / count
     axis = torch.linalg.eigh(covariance).eigenvectors[:, :, 2]
@@ -198,8 +197,8 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Tensor:
 def parts_of_metal(metal: Tensor, positions: Tensor, weight: Tensor) -> Tensor:
     """Find the surfels (N,) whose wide surroundings, a tenth of the surface, shine as metals do almost everywhere.
 
-    `metal` (N,) is the result of `shines_as_metal`, `weight` (N,) how much of the photos each surfel shows. Single surfels are also told to
-    be metal where texture is out of place; but then others around them are not.
+    `metal` (N,) tells which surfels change with the view as metals do, `weight` (N,) how much of the photos each surfel shows. Single surfels
+    are also told to be metal where texture is out of place; but then others around them are not.
     """
     seen = torch.nonzero(weight > LEAST_PIXELS)[:, 0]
     if len(seen) < NEIGHBOURS:
@@ -213,10 +212,41 @@ def parts_of_metal(metal: Tensor, positions: Tensor, weight: Tensor) -> Tensor:
     return told[nearest] > CERTAIN
 
 
-def _neighbours(positions: Tensor) -> Tensor:
-    """Return the indices (N, NEIGHBOURS) of each surfel's nearest surfels, itself among them; of all surfels if there are fewer."""
+@torch.no_grad()
+def falls_as_metal(observations: Observations, positions: Tensor, light: float) -> Tensor:
+    """Find the surfels (N,) that fall so far below their median in some photos that only a metal does, grey or not.
+
+    A dielectric's diffuse radiance is the same in all photos, and it mirrors only a twenty-fifth of the light: its highlights may rise far,
+    but without them it is hardly darker than in the median. A metal is as dark as what it mirrors. `light` is the light's mean radiance.
+    Radiance is averaged over a few neighbours, so that texture that is slightly out of place hardly counts.
+    """
+    near = _neighbours(positions, FEW)
+    mean, change, known = _averaged(observations, near)
+    radiance = (mean[:, None] + change).mean(dim=2).clamp_min(0).masked_fill(~known, math.nan)
+    median, low = radiance.nanquantile(0.5, dim=1), radiance.nanquantile(LOW, dim=1)
+    usable = known.sum(dim=1) >= LEAST_VIEWS
+    return usable & (median - low > DROP * light) & (low < FALLS * median)
+
+
+def _averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Average observations over each surfel's neighbours, as listed in `near` (N, K).
+
+    Returns the mean radiance (N, 3), the changes (N, V, 3), and which photos show them unclipped (N, V).
+    """
+    weight = observations.pixels * (observations.clipped < LEAST_CLIPPED) * (observations.pixels > LEAST_PIXELS)
+    pixels = _pooled(weight, near)
+    known = pixels > LEAST_PIXELS
+    change = _pooled((observations.change * weight[..., None]).flatten(1), near).view_as(observations.change)
+    change = torch.where(known[..., None], change / pixels.clamp_min(1e-6)[..., None], 0)
+    seen = observations.pixels.sum(dim=1, keepdim=True)
+    mean = (_pooled(observations.mean * seen, near) / _pooled(seen, near).clamp_min(1e-6)).clamp_min(1e-4)
+    return mean, change, known
+
+
+def _neighbours(positions: Tensor, most: int) -> Tensor:
+    """Return the indices (N, K) of each surfel's nearest surfels, itself among them: K is `most`, or N if there are fewer."""
     points = positions.numpy(force=True)
-    count = min(NEIGHBOURS, len(points))
+    count = min(most, len(points))
     return torch.from_numpy(cKDTree(points).query(points, k=[*range(1, count + 1)])[1]).to(positions.device)
 
 
