@@ -197,8 +197,8 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Tensor:
 def parts_of_metal(metal: Tensor, positions: Tensor, weight: Tensor) -> Tensor:
     """Find the surfels (N,) whose wide surroundings, a tenth of the surface, shine as metals do almost everywhere.
 
-    `metal` (N,) tells which surfels change with the view as metals do, `weight` (N,) how much of the photos each surfel shows. Single surfels
-    are also told to be metal where texture is out of place; but then others around them are not.
+    `metal` (N,) tells which surfels change with the view as metals do, `weight` (N,) how much of the photos each surfel shows. Single
+    surfels are also told to be metal where texture is out of place; but then others around them are not.
     """
     seen = torch.nonzero(weight > LEAST_PIXELS)[:, 0]
     if len(seen) < NEIGHBOURS:
