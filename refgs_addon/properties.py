@@ -17,6 +17,7 @@ class KnownRun(bpy.types.PropertyGroup):
 
     folder: StringProperty(subtype="DIR_PATH")
     capture: StringProperty(subtype="DIR_PATH")
+    confirmed: StringProperty(description="Decisions of the training that the artist keeps, as need=answer")
 
 
 class Training(bpy.types.PropertyGroup):

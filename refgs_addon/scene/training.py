@@ -12,7 +12,11 @@ from ..job_timers import follow_jobs
 from ..preferences import capture_folder, log_file, python, set_up
 from . import strokes
 from .capture_cameras import cameras_of, show_cameras
+from .decisions import find_decision
 from .regions import artists_region, region_settings, show_found_region
+from .run_toml import capture_of
+
+CHOSEN_NEEDS = ("specular", "reflections")  # needs that have a property in `refgs_addon.properties`
 
 
 def check(scene: bpy.types.Scene) -> jobs.Job:
@@ -109,19 +113,42 @@ def save_strokes(scene: bpy.types.Scene) -> jobs.Job:
     return make_masks(scene)
 
 
+def train_other_way(scene: bpy.types.Scene, folder: Path, need: str) -> jobs.Job:
+    """Start a job that trains as `train` does, but decides a need as the run in `folder` did not.
+
+    The result goes into a new folder beside that run. Where the scene has a property for the need, it gets the other answer. Raises
+    InputError as `train` does, and if the run's capture is not the scene's.
+    """
+    decision, settings = find_decision(folder, need), scene.refgs
+    trained = next((known.capture for known in settings.runs if Path(known.folder) == folder), "") or capture_of(folder)
+    if trained and Path(trained).resolve() != _capture(scene).resolve():
+        raise InputError(f"{folder.name} was trained on {trained}: choose that capture first")
+    job = _train(
+        scene, _free(folder, {Path(known.folder) for known in settings.runs}), {f"needs.{need}": decision.other}
+    )
+    if need in CHOSEN_NEEDS:
+        setattr(settings, need, decision.other)
+    return job
+
+
 def train(scene: bpy.types.Scene) -> jobs.Job:
     """Start a job that trains on the scene's capture with the scene's settings. Add the new run folder to the scene's list.
 
     The job waits until earlier trainings have ended. Raises InputError if there is no trainer or no capture, if the run folder is not
     empty, or if the training box is flat.
     """
+    out = scene.refgs.out
+    return _train(scene, Path(bpy.path.abspath(out)) if out else _free_folder(_capture(scene), scene), {})
+
+
+def _train(scene: bpy.types.Scene, out: Path, changes: dict[str, object]) -> jobs.Job:
+    """Start a job that trains into the folder `out` with the scene's settings and some `changes` of the trainer's settings."""
     settings, capture = scene.refgs, _capture(scene)
-    out = Path(bpy.path.abspath(settings.out)) if settings.out else _free_folder(capture, scene)
     words = {
         "preset": None if settings.limited else settings.preset,
         "minutes": settings.minutes if settings.limited else None,
         "mesh": settings.mesh,
-        "settings": region_settings(scene) | _choices(settings),
+        "settings": region_settings(scene) | _choices(settings) | changes,
     }
     job = jobs.train(python(), capture, out, log_file(out.name), **words)
     number = scene.session_uid

@@ -6,6 +6,7 @@ from .. import job_timers, preferences, properties
 from . import (
     checked_capture,
     closing,
+    decisions_box,
     drop,
     export_menu,
     icons,
@@ -27,6 +28,7 @@ _MODULES = (
     icons,
     checked_capture,
     photo_buttons,
+    decisions_box,
     train_panel,
     strokes_panel,
     closing,

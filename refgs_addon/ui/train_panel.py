@@ -14,6 +14,7 @@ from ..scene.regions import add_training_region, training_region
 from ..scene.strokes import canvases, masks_root
 from .checked_capture import draw_capture
 from .closing import KeepTraining, StopRun
+from .decisions_box import draw_decisions
 from .icons import curve_icon, preview_icon
 from .operators import OnCapture, OnJob, OnRunFolder, ReportsErrors, import_run_folder, select_only
 from .panels import Tab
@@ -184,7 +185,7 @@ class TrainPanel(Tab, bpy.types.Panel):
                 draw_job(layout.box(), context.scene, number, job, width)
         for known in settings.runs:
             if not any(job.run == Path(known.folder) for job in jobs.JOBS):
-                _draw_run(layout.box(), Path(known.folder))
+                _draw_run(layout.box(), context.scene, Path(known.folder), width)
 
 
 def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job, width: int) -> None:
@@ -239,7 +240,9 @@ def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: 
     for decision in job.decided.values():
         wrapped_text(box, decision[0].upper() + decision[1:], width, "DOT")
     if job.run and job.ended:
-        _draw_run(box, job.run)
+        _draw_run(box, scene, job.run, width)
+    elif job.run:
+        draw_decisions(box, scene, job.run, width)
 
 
 def _draw_photos(box: bpy.types.UILayout, scene: bpy.types.Scene, job: jobs.Job, width: int) -> None:
@@ -299,8 +302,11 @@ def _command_button(layout: bpy.types.UILayout, number: int, command: str, text:
     button.number, button.command = number, command
 
 
-def _draw_run(box: bpy.types.UILayout, folder: Path) -> None:
-    """Draw a run of the scene's list: a button that imports or resumes it, or the progress of its training."""
+def _draw_run(box: bpy.types.UILayout, scene: bpy.types.Scene, folder: Path, width: int) -> None:
+    """Draw a run of the scene's list: a button that imports or resumes it, or the progress of its training, and its decisions.
+
+    `width` is how many letters fit into a line.
+    """
     state = jobs.run_state(folder)
     row = box.row(align=True)
     if state == "finished":
@@ -319,6 +325,7 @@ def _draw_run(box: bpy.types.UILayout, folder: Path) -> None:
         row.progress(factor=part, text=text)
         if jobs.run_progress(folder) and not jobs.stop_requested(folder):
             row.operator(StopRun.bl_idname, icon="CANCEL").folder = str(folder)
+    draw_decisions(box, scene, folder, width)
 
 
 def other_process_status(folder: Path) -> tuple[float, str]:

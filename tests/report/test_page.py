@@ -12,6 +12,7 @@ import pytest
 
 from refgs.errors import InputError
 from refgs.report.page import write_report
+from tests.makers.captures import write
 
 VIEWS = [f"test_{i:03d}" for i in range(8)]
 
@@ -203,3 +204,21 @@ def test_a_folder_that_is_not_there_is_one_line(tmp_path):
     with pytest.raises(InputError, match="is not a folder"):
         write_report([tmp_path / "nowhere"], tmp_path / "report.html")
     assert not (tmp_path / "report.html").exists()
+
+
+def test_decisions_are_shown_with_pictures(tmp_path):
+    folder = tmp_path / "run"
+    for kind, value in (("on", 0), ("off", 100), ("photo", 200)):
+        write(folder / "needs" / f"specular_{kind}.png", np.full((8, 8, 3), value, np.uint8))
+    shown = {kind: f"needs/specular_{kind}.png" for kind in ("on", "off", "photo")}
+    shown |= {"view": "0003", "psnr_on": 31.24, "psnr_off": 28.1}
+    row = {"need": "specular", "what": "specular shading", "why": "it shines", "needed": True}
+    broken = row | {"what": "something else", "pictures": {"on": "needs/gone.png"}}
+    (folder / "needs.json").write_text(json.dumps([row | {"pictures": shown}, broken]))
+    write_report([folder], tmp_path / "report.html")
+    html = (tmp_path / "report.html").read_text()
+    assert "<h3>specular shading: kept</h3>" in html and "<h3>something else" not in html
+    assert "with 31.2 dB, without 28.1 dB, of photo 0003" in html
+    for kind in ("on", "off", "photo"):
+        data = base64.b64encode((folder / "needs" / f"specular_{kind}.png").read_bytes()).decode()
+        assert data in html

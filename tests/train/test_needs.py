@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -132,6 +133,24 @@ def test_needs_are_written_down(chalk):
         assert rows[name]["saved"] and rows[name]["cost"] and name in chalk.state.decided
     assert rows["light"]["side"] == 16
     assert "cost" not in rows["iterations"]  # has no cost: that could not be measured
+
+
+def test_decisions_are_shown(chalk, ball_capture, tmp_path):
+    """Check that the pictures of a decision show its two answers: mirrored or not, they are of one view, beside its photo."""
+    mirror = trainer(ball_capture, tmp_path / "mirror", total=300)
+    while "specular" not in mirror.state.needs:
+        mirror.iterate()
+    for made, needed in ((chalk, False), (mirror, True)):
+        (row,) = [row for row in needs.rows(made.state) if row["need"] == "specular"]
+        shown, folder = row["pictures"], made.state.folder
+        assert row["needed"] == needed and row in json.loads((folder / "needs.json").read_text())
+        on, off, photo = (cv2.imread(str(folder / shown[kind])).astype(float) / 255 for kind in ("on", "off", "photo"))
+        assert on.shape == off.shape == photo.shape and shown["view"] in {v.camera.name for v in made.state.views}
+        for picture, kind in ((on, "on"), (off, "off")):
+            assert -10 * np.log10(np.square(picture - photo).mean()) == pytest.approx(shown[f"psnr_{kind}"], abs=0.3)
+        # What is matte looks the same if what is mirrored does not change with the view.
+        assert (shown["psnr_on"] > shown["psnr_off"] + 0.5) == needed
+    assert "pictures" not in chalk.state.needs["iterations"]
 
 
 def test_a_resumed_run_keeps_its_decisions(matte, tmp_path):

@@ -5,7 +5,8 @@ It reads these files of a run folder. If a file is missing, its section is left 
     metrics.json     nested objects. Their numbers are metrics: those that `refgs.report.figures` names,
                      relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}, and any others. ambiguities.NAME.what is text.
     history.jsonl    one object a line: seconds, iteration, parts (seconds by kind of work), and the errors that `refgs.report.curves` names
-    needs.json       optional features that were kept or left out: a list of {"what", "why"}, with "saved", "cost", "needed" if known
+    needs.json       optional features that were kept or left out: a list of {"what", "why"}, with "saved", "cost", "needed" if known, and
+                     "pictures" of both answers in needs/
     run.toml         the settings, and the capture's folder
     pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png, and true_normal/VIEW.png … if known
     pictures/relight/{truth,refgs,splats,mesh}/HDRI_VIEW.png
@@ -57,6 +58,7 @@ class RunPage:
     figures: dict[str, float]
     history: list[dict]
     left_out: list[dict]
+    decisions: list[dict]
     ambiguities: list[str]
     settings: str
     facts: dict
@@ -129,6 +131,7 @@ def _read_run(folder: Path) -> RunPage:
     metrics = read("metrics.json", json.loads, "there are no figures") or {}
     lines = read("history.jsonl", _lines, "there is no chart of error against time") or []
     left_out = read("needs.json", json.loads, "what was left out of this scene is not known")
+    rows = [item for item in left_out if isinstance(item, dict)] if isinstance(left_out, list) else []
     pictures = folder / "pictures"
     name = "/".join(folder.resolve().parts[-2:]).lstrip("/")
     page = RunPage(
@@ -136,7 +139,8 @@ def _read_run(folder: Path) -> RunPage:
         label=name,
         figures=dict(flatten(metrics)),
         history=lines,
-        left_out=[item for item in left_out if isinstance(item, dict)] if isinstance(left_out, list) else [],
+        left_out=rows,
+        decisions=_decisions(folder, rows),
         ambiguities=_ambiguities(metrics),
         settings=settings,
         facts=facts,
@@ -160,6 +164,25 @@ def _ambiguities(metrics: dict) -> list[str]:
     found = metrics.get("ambiguities")
     known = found.values() if isinstance(found, dict) else ()
     return [facts["what"] for facts in known if isinstance(facts, dict) and "what" in facts]
+
+
+def _decisions(folder: Path, rows: list[dict]) -> list[dict]:
+    """Read the pictures of needs.json's decisions as data URLs, with a line of figures for each decision. Skip broken rows."""
+    found = []
+    for row in rows:
+        shown = row.get("pictures")
+        try:
+            pictures = [
+                (caption, _embed(folder / shown[kind]))
+                for kind, caption in (("on", "with"), ("off", "without"), ("photo", "photo"))
+            ]
+            figures = f"with {shown['psnr_on']:.1f} dB, without {shown['psnr_off']:.1f} dB, of photo {shown['view']}"
+        except (KeyError, TypeError, ValueError):
+            continue
+        if all(url for _, url in pictures):
+            answer = "kept" if row.get("needed") else "left out"
+            found.append({"what": f"{row.get('what', '')}: {answer}", "figures": figures, "pictures": pictures})
+    return found
 
 
 def _lines(text: str) -> list[dict]:

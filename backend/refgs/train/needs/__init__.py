@@ -5,13 +5,16 @@ parameters or photos are changed. The record says how much PSNR on training view
 iterations.
 """
 
+import json
 from typing import Any
 
+from refgs.paths import write_text
 from refgs.train.densify import faint_now
 from refgs.train.needs.lighting import Degrees, Light, Reflections, share_hidden
 from refgs.train.needs.materials import Constants, Specular
 from refgs.train.needs.need import Decision, Moment, Need
 from refgs.train.needs.photos import WHOLE_EVERY, Outside, Views, time_crops
+from refgs.train.needs.pictures import write_pictures
 from refgs.train.needs.schedule import Initial, Iterations
 from refgs.train.state import State
 
@@ -111,7 +114,12 @@ def _record(state: State, need: Need, decision: Decision) -> None:
     if decision.statistic is not None:
         found["statistic"] = float(decision.statistic)
         found["threshold"] = float(need.threshold if decision.threshold is None else decision.threshold)
-    state.needs[need.name] = found | {key: float(value) for key, value in decision.figures.items()}
+    found |= {key: float(value) for key, value in decision.figures.items()}
+    if decision.statistic is not None and (pictures := write_pictures(state, need.name, found)):
+        found["pictures"] = pictures
+    state.needs[need.name] = found
+    if "pictures" in found:
+        write_text(state.folder / "needs.json", json.dumps(rows(state), indent=1))
     state.announce(need.name, f"{'with' if decision.needed else 'without'} {need.what}: {decision.why}")
     if not decision.needed:
         decision.once()

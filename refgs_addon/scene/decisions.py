@@ -1,0 +1,89 @@
+"""Read what a training decided about a scene, with pictures of both answers, and train again the other way."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+
+from ..errors import InputError
+
+ON_OFF = ("on", "off")  # words of the trainer's settings [needs]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Store a decision that the trainer wrote to a run's needs.json, docs/run-folder.md.
+
+    `needed` is the answer. `pictures` maps "on", "off" and "photo" to files, all of the view `view`. `psnr` maps "on" and "off" to the PSNR
+    of the two pictures against the photo, in dB.
+    """
+
+    need: str
+    what: str
+    why: str
+    needed: bool
+    view: str
+    pictures: dict[str, Path]
+    psnr: dict[str, float]
+
+    @property
+    def answer(self) -> str:
+        return "on" if self.needed else "off"
+
+    @property
+    def other(self) -> str:
+        return "off" if self.needed else "on"
+
+
+_read: dict[Path, tuple[int, list[Decision]]] = {}  # by needs.json: when it was written, and what it holds
+
+
+def decisions(folder: Path) -> list[Decision]:
+    """List the decisions of a run that have pictures, also while it is trained. A file that is absent or broken has none."""
+    file = folder / "needs.json"
+    try:
+        written = file.stat().st_mtime_ns
+    except OSError:
+        return []
+    if file not in _read or _read[file][0] != written:  # a panel is drawn often
+        _read[file] = written, _parse(folder, file)
+    return _read[file][1]
+
+
+def _parse(folder: Path, file: Path) -> list[Decision]:
+    found = []
+    try:
+        for row in json.loads(file.read_text(encoding="utf-8")):
+            if shown := row.get("pictures"):
+                files = {kind: folder / shown[kind] for kind in (*ON_OFF, "photo")}
+                psnr = {kind: float(shown[f"psnr_{kind}"]) for kind in ON_OFF}
+                found.append(
+                    Decision(row["need"], row["what"], row["why"], bool(row["needed"]), shown["view"], files, psnr)
+                )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # of another release, or half copied
+        return []
+    return found
+
+
+def find_decision(folder: Path, need: str) -> Decision:
+    """Find a run's decision about a need. Raises InputError if it has none with pictures."""
+    for decision in decisions(folder):
+        if decision.need == need:
+            return decision
+    raise InputError(f"{folder} has no decision about {need}: import the run again")
+
+
+def open_decisions(scene: bpy.types.Scene, folder: Path) -> list[Decision]:
+    """List the decisions of a run in the scene's list that the artist has not confirmed."""
+    known = next((known for known in scene.refgs.runs if Path(known.folder) == folder), None)
+    confirmed = set(known.confirmed.split()) if known else set()
+    return [decision for decision in decisions(folder) if f"{decision.need}={decision.answer}" not in confirmed]
+
+
+def confirm(scene: bpy.types.Scene, folder: Path, need: str) -> None:
+    """Note that the artist keeps a decision of a run in the scene's list: `open_decisions` no longer lists it."""
+    decision = find_decision(folder, need)
+    for known in scene.refgs.runs:
+        if Path(known.folder) == folder:
+            known.confirmed = " ".join({*known.confirmed.split(), f"{need}={decision.answer}"})

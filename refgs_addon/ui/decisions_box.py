@@ -1,0 +1,80 @@
+"""Draw what a training decided about a scene as a choice, with pictures of both answers, in the Train panel."""
+
+from pathlib import Path
+
+import bpy
+from bpy.props import StringProperty
+
+from ..preferences import wrapped_text
+from ..scene import training
+from ..scene.decisions import Decision, confirm, open_decisions
+from .icons import thumbnail
+from .operators import OnRunFolder, has_trainer
+
+NAMES = {  # the question, and its two answers
+    "specular": ("Gloss", "Glossy", "Matte"),
+    "reflections": ("Reflections", "Of the Object Too", "Of the Light Only"),
+    "light": ("Light", "Sharp", "Soft"),
+}
+
+
+class _OnDecision(OnRunFolder):
+    """Store a run's folder and the name of a need. Base class of the operators on one decision."""
+
+    need: StringProperty(name="Need")
+
+
+class KeepDecision(_OnDecision, bpy.types.Operator):
+    bl_idname = "refgs.keep_decision"
+    bl_label = "Keep"
+    bl_description = "Keep what the training decided, and remove the question from the panel"
+
+    def work(self, context: bpy.types.Context) -> None:
+        confirm(context.scene, Path(self.folder), self.need)
+
+
+class TrainOtherWay(_OnDecision, bpy.types.Operator):
+    bl_idname = "refgs.train_other_way"
+    bl_label = "Train Again"
+    bl_description = (
+        "Train again into a new folder with the other answer, and the settings of this panel. This run stays"
+    )
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return has_trainer(cls)
+
+    def work(self, context: bpy.types.Context) -> None:
+        training.train_other_way(context.scene, Path(self.folder), self.need)
+
+
+def draw_decisions(box: bpy.types.UILayout, scene: bpy.types.Scene, folder: Path, width: int) -> None:
+    """Draw the decisions of a run that the artist has not confirmed. `width` is how many letters fit into a line."""
+    for decision in open_decisions(scene, folder):
+        _draw(box.box(), folder, decision, width)
+
+
+def _draw(box: bpy.types.UILayout, folder: Path, decision: Decision, width: int) -> None:
+    question, *answers = NAMES.get(decision.need, (decision.what, "With", "Without"))
+    names = dict(zip(("on", "off"), answers, strict=True))
+    box.label(text=f"{question}: {names[decision.answer]}", icon="QUESTION")
+    wrapped_text(box, decision.why[0].upper() + decision.why[1:], width)
+    row = box.row()
+    for kind, name in (*names.items(), ("photo", "Photo")):
+        column = row.column(align=True)
+        column.alert = kind == decision.answer
+        written = decision.pictures[kind].stat().st_mtime_ns if decision.pictures[kind].is_file() else 0
+        column.template_icon(icon_value=thumbnail(decision.pictures[kind], written) if written else 0, scale=5)
+        column.label(text=name, icon="CHECKMARK" if kind == decision.answer else "NONE")
+    figures = ", ".join(f"{names[kind]} {decision.psnr[kind]:.1f} dB" for kind in names)
+    box.label(text=f"{figures} of photo {decision.view}")
+    row = box.row(align=True)
+    for operator, text, icon in (
+        (KeepDecision, f"Keep {names[decision.answer]}", "CHECKMARK"),
+        (TrainOtherWay, f"Train {names[decision.other]}", "PLAY"),
+    ):
+        button = row.operator(operator.bl_idname, text=text, icon=icon)
+        button.folder, button.need = str(folder), decision.need
+
+
+CLASSES = (KeepDecision, TrainOtherWay)
