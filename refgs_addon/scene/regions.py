@@ -13,6 +13,8 @@ from ..nodes.splats_tree import NAME
 
 FOUND = "refgs_found"  # custom property of the training box: its matrix when the program placed it
 ROOM = 1.15  # factor on a found box: thin parts may reach out of what was carved
+GUESSED = "refgs_guessed"  # custom property of the training box: it was guessed from cameras alone
+GUESS = 1.25  # half an edge of a guessed box in radii of what the cameras look at, as in backend/refgs/capture/masks.py
 REGION = "refgs_region"  # custom property of an object that marks a region
 
 
@@ -70,8 +72,32 @@ def add_training_region(scene: bpy.types.Scene) -> bpy.types.Object:
         box = _new_training_region(scene)
         centre, radius = _looked_at(scene)
         box.matrix_world = Matrix.LocRotScale(centre, None, Vector((radius,) * 3))
+    elif GUESSED in box:  # asked for: it is the artist's now
+        del box[FOUND], box[GUESSED]
     box.hide_viewport = False
     return box
+
+
+def show_guessed_region(scene: bpy.types.Scene, centre: list[float], radius: float) -> None:
+    """Add the box in which masks will look for the object, unless the scene has a training box.
+
+    It limits no training until the artist changes it, or presses Add Region. `centre` and `radius` are what the cameras look at.
+    """
+    if training_region(scene) is None:
+        box = _new_training_region(scene)
+        box.matrix_world = Matrix.LocRotScale(Vector(centre), None, Vector((GUESS * radius,) * 3))
+        box[FOUND], box[GUESSED] = [x for row in _world_matrix(scene, box) for x in row], True
+
+
+def remove_guessed_region(scene: bpy.types.Scene) -> None:
+    """Remove the training box if it is a guess that the artist has not changed."""
+    box = training_region(scene)
+    if box is not None and _is_guess(scene, box):
+        bpy.data.objects.remove(box)
+
+
+def _is_guess(scene: bpy.types.Scene, box: bpy.types.Object) -> bool:
+    return GUESSED in box and artists_region(scene) is None
 
 
 def show_found_region(scene: bpy.types.Scene, settings: list[str]) -> bpy.types.Object:
@@ -86,6 +112,8 @@ def show_found_region(scene: bpy.types.Scene, settings: list[str]) -> bpy.types.
     half = Vector(values["region.size"]) / 2 * ROOM
     box.matrix_world = Matrix.LocRotScale(Vector(values["region.centre"]), None, half)
     box[FOUND] = [x for row in _world_matrix(scene, box) for x in row]
+    if GUESSED in box:
+        del box[GUESSED]
     return box
 
 
@@ -127,12 +155,12 @@ def _looked_at(scene: bpy.types.Scene) -> tuple[Vector, float]:
 
 
 def region_settings(scene: bpy.types.Scene) -> dict[str, list[float]]:
-    """Return the trainer's settings for the scene's training box, or {} if there is no box.
+    """Return the trainer's settings for the scene's training box, or {} if there is no box, or a guess only.
 
     Only what is inside the box is trained, and its Z axis becomes the result's up direction. Raises InputError if the box has no volume.
     """
     box = training_region(scene)
-    if box is None:
+    if box is None or _is_guess(scene, box):
         return {}
     matrix = _world_matrix(scene, box)
     centre, turn, scale = matrix.decompose()

@@ -7,6 +7,7 @@ import bpy
 
 from .. import jobs
 from ..scene.capture_cameras import cameras_of, remove_cameras, show_cameras
+from ..scene.regions import remove_guessed_region, show_guessed_region
 from .icons import thumbnail
 from .operators import OnJob, select_only
 
@@ -14,7 +15,10 @@ from .operators import OnJob, select_only
 class ShowCameras(OnJob, bpy.types.Operator):
     bl_idname = "refgs.show_cameras"
     bl_label = "Show Cameras"
-    bl_description = "Add the capture's cameras to the scene to check them, or remove them again"
+    bl_description = (
+        "Add the capture's cameras to the scene to check them, or remove them again. Without masks, "
+        "the box in which the object will be looked for is shown: move it if it is not about the object"
+    )
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
     def work(self, context: bpy.types.Context) -> None:
@@ -22,10 +26,13 @@ class ShowCameras(OnJob, bpy.types.Operator):
         capture = Path(checked["capture"])
         if cameras_of(context.scene, capture):
             remove_cameras(context.scene, capture)
+            remove_guessed_region(context.scene)
         else:
             cameras = show_cameras(context.scene, capture, Path(checked["cameras"])).objects
             if cameras:
                 select_only(context, cameras[0])
+            if "Masks: none" in checked["lines"]:
+                show_guessed_region(context.scene, checked["centre"], checked["radius"])
 
 
 def draw_capture(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: jobs.Job) -> None:

@@ -371,3 +371,24 @@ def test_a_run_that_another_process_trains(addon, capture, tmp_path):
     assert jobs.run_state(run) == "finished" and job_timers._poll_other_processes() is None
     with pytest.raises(RuntimeError, match="is not being trained"):
         bpy.ops.refgs.stop_run(folder=str(run))
+
+
+def test_the_guessed_box_is_among_the_cameras(addon, checked, capture):
+    """Check that the cameras of a capture without masks are shown with the guessed box, which limits nothing until it is changed."""
+    job, number = checked
+    job.results["check"] |= {"lines": ["Masks: none"], "centre": [0, 0, 1], "radius": 2.0}
+    bpy.ops.refgs.show_cameras(number=number)
+    box = addon.refgs.region
+    assert tuple(box.location) == (0, 0, 1) and tuple(box.scale) == (2.5, 2.5, 2.5)
+    assert regions.artists_region(addon) is None and regions.region_settings(addon) == {}
+    box.location.x = 1
+    assert regions.artists_region(addon) == box and regions.region_settings(addon)["region.centre"] == [1, 0, 1]
+    bpy.ops.refgs.show_cameras(number=number)
+    assert addon.refgs.region == box, "the artist's box stays"
+    box.location.x = 0
+    for _ in range(2):
+        bpy.ops.refgs.show_cameras(number=number)
+    assert regions.training_region(addon) is None, "an untouched guess goes with the cameras"
+    bpy.ops.refgs.show_cameras(number=number)
+    bpy.ops.refgs.add_training_region()
+    assert regions.artists_region(addon) == addon.refgs.region
