@@ -149,7 +149,7 @@ def test_metals_are_set_once(made):
     assert (state.parameters["metallic"] == 0).all()
 
 
-def test_a_part_that_is_metal_all_over_is_held(made):
+def test_what_is_metal_all_over_is_held(made):
     """Check that a ball of metal stays metal while everything else learns, and that halves of its surfels are held, too."""
     show(made, metallic=6.0, roughness=-1.0)
     state = made.state
@@ -171,13 +171,3 @@ def test_a_part_that_is_metal_all_over_is_held(made):
     made.step()
     assert divided > 0
     assert int((state.parameters["metallic"] == metals.HELD).sum()) > held + 0.9 * divided
-
-
-def test_a_part_is_metal_if_it_is_nearly_all_over():
-    """Check a plane whose one half is told to be metal, but for a tenth, and whose other half is told so here and there."""
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(3000, 3, generator=generator) * torch.tensor([2.0, 1.0, 0.0])
-    chance, left = torch.rand(3000, generator=generator), points[:, 0] < 1
-    found = view_dependence.parts_of_metal(torch.where(left, chance < 0.9, chance < 0.3), points, torch.ones(3000))
-    assert found[points[:, 0] < 0.8].all() and not found[points[:, 0] > 1.1].any()
-    assert not view_dependence.parts_of_metal(torch.ones(3000).bool(), points, torch.zeros(3000)).any()

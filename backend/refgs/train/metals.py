@@ -3,8 +3,8 @@
 Photos of a rough or embossed metal are explained about as well by paint, and training starts near paint: it would stay there. The tint of
 what changes with the view tells them apart before normals and light are known.
 
-Where nearly all of a large part of the surface shines as metals do, its metallic no longer learns: photos alone would turn some of it into
-paint again, since roughness, light and base colour explain rough metal and paint about as well.
+Where nearly all of the surface shines as coloured metals do, metallic no longer learns: photos alone would turn some of it into paint
+again, since roughness, light and base colour explain rough metal and paint about as well.
 """
 
 import torch
@@ -13,10 +13,11 @@ from refgs.model.surfels import raw_metallic
 from refgs.train import needs
 from refgs.train.needs.materials import SOONEST
 from refgs.train.state import State
-from refgs.train.view_dependence import falls_as_metal, observe, parts_of_metal, shines_as_metal
+from refgs.train.view_dependence import falls_as_metal, observe, shines_as_metal
 
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
 METAL = 0.9  # metallic; training can still change it
+CERTAIN = 0.85  # part of the surface that shines as coloured metals do, above which all is metal; a gold cape has 0.95, matte clay 0.71
 HELD = torch.tensor(
     raw_metallic(0.98)
 )  # raw metallic that is held; surfels that have exactly this value are known by it
@@ -27,8 +28,8 @@ def set_metals_due(state: State, progress: float) -> None:
 
     See `shines_as_metal` for coloured metals, `falls_as_metal` for all.
 
-    Those in a part of the surface that is metal for certain (see `parts_of_metal`) stay metal from then on (see `hold`). The others keep
-    the metallic that they have learned: it started low, as that of a dielectric.
+    If nearly all shine as coloured metals do, all are metal from then on (see `hold`). Otherwise the others keep the metallic that they
+    have learned: it started low, as that of a dielectric.
     """
     settings = state.settings
     early = progress - settings.initial.until < KNOWN or state.iteration < SOONEST
@@ -39,12 +40,14 @@ def set_metals_due(state: State, progress: float) -> None:
     observations, metallic = observe(state), state.parameters["metallic"]
     positions, weight = state.parameters["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
     light = float(state.environment().radiance.detach().mean())
-    metal = shines_as_metal(observations, positions) | falls_as_metal(observations, positions, light)
-    held = parts_of_metal(metal, positions, weight)
+    coloured = shines_as_metal(observations, positions)
+    metal = coloured | falls_as_metal(observations, positions, light)
     with torch.no_grad():
-        metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
-        metallic[held] = HELD.to(metallic)
-    metal = metal | held
+        if float(weight[coloured].sum()) > CERTAIN * float(weight.sum()):
+            metal = torch.ones_like(metal)
+            metallic.fill_(float(HELD))
+        else:
+            metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
     moments = state.optimizer.state.get(metallic, {})
     for name in ("exp_avg", "exp_avg_sq") if moments else ():
         moments[name][metal] = 0

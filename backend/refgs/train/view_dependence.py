@@ -37,8 +37,6 @@ GROWTH = 8  # steps from neighbours to neighbours
 LOW = 0.15  # part of the photos in which a surfel is darker than where its drop is measured; fewer may be shadows or outlines
 DROP = 0.08  # of the light's mean radiance; a dielectric mirrors 0.04 of the light, and so cannot fall by much more below its median
 FALLS = 0.88  # part of its median to which a metal falls, which has no diffuse light; paint falls to 0.94 or less far
-WIDE, SAMPLE = 0.1, 4000  # the part of the surface that is a surfel's wide surroundings; surfels that stand for all
-CERTAIN = 0.7  # of them that are told to be metal: a gold cape has 0.9 all over, paint at most 0.5, where texture is out of place
 METAL = 0.6  # tint of the change (0: grey as a dielectric's reflection; 1: of the surface's own colour)
 
 
@@ -191,25 +189,6 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Tensor:
     for _ in range(GROWTH):
         metal = metal | told & (_pooled(metal.float()[:, None], near)[:, 0] > near.shape[1] / 4)
     return metal
-
-
-@torch.no_grad()
-def parts_of_metal(metal: Tensor, positions: Tensor, weight: Tensor) -> Tensor:
-    """Find the surfels (N,) whose wide surroundings, a tenth of the surface, shine as metals do almost everywhere.
-
-    `metal` (N,) tells which surfels change with the view as metals do, `weight` (N,) how much of the photos each surfel shows. Single
-    surfels are also told to be metal where texture is out of place; but then others around them are not.
-    """
-    seen = torch.nonzero(weight > LEAST_PIXELS)[:, 0]
-    if len(seen) < NEIGHBOURS:
-        return torch.zeros_like(metal)
-    seen = seen[:: -(-len(seen) // SAMPLE)]
-    points, shown = positions[seen].numpy(force=True), weight[seen]
-    tree = cKDTree(points)
-    near = torch.from_numpy(tree.query(points, k=max(1, round(WIDE * len(points))))[1]).to(seen)
-    told = (shown * metal[seen])[near].sum(dim=1) / shown[near].sum(dim=1)
-    nearest = torch.from_numpy(tree.query(positions.numpy(force=True))[1]).to(seen)
-    return told[nearest] > CERTAIN
 
 
 @torch.no_grad()
