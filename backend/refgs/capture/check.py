@@ -11,7 +11,6 @@ from PIL import Image
 
 from refgs.capture.cameras import write_cameras
 from refgs.capture.images import LoadedView, load_view
-from refgs.capture.masks import guess_box, region_settings
 from refgs.capture.types import Capture, View
 from refgs.errors import InputError
 from refgs.paths import whole
@@ -163,6 +162,11 @@ def _guessed_object(capture: Capture) -> list[str]:
     """Say where a training of a capture without masks looks for the object. Return no line if there are masks, or if it makes none."""
     if any(view.masked for view in capture.views) or capture.layout == "nerf-blender" or capture.box is not None:
         return []
+    from refgs.capture.masks import (  # imports scipy, which a wrong folder should not wait for
+        guess_box,
+        region_settings,
+    )
+
     try:
         box = guess_box(capture, capture.views)[0]
     except InputError:  # the cameras look outwards
