@@ -31,7 +31,7 @@ def start(state: State) -> None:
     """Give every view a pose, zero, if the setting `cameras.poses` is "on", or if it is "auto" and features contradict the given poses."""
     wanted = state.settings.cameras.poses
     if wanted == "auto":
-        with state.clock.part("deciding"):
+        with state.clock.part("start"):
             apart = pixels_apart(match_neighbours(state.views), state.given)
         wanted = "off" if apart is None or apart < EXACT else "on"
         if wanted == "on":
