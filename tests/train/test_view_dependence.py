@@ -13,6 +13,7 @@ from refgs.color import srgb_encode
 from refgs.model import cubemap
 from refgs.model.surfels import activate
 from refgs.train import metals, view_dependence
+from refgs.train.changing_light import part_mirrored
 from refgs.train.densify import densify
 from refgs.train.needs.materials import CHANGES
 from tests.makers.training import put
@@ -38,10 +39,10 @@ def made(large_ball, tmp_path):
     return small(large_ball, tmp_path / "run", *ALL, total=400)
 
 
-def show(made, *, metallic, roughness, albedo=ORANGE, exposure=(1.0,), turn=False):
+def show(made, *, metallic, roughness, albedo=ORANGE, exposure=(1.0,), turn=False, lamps=LAMPS):
     """Replace all photos by renderings of the ball with one material, under a light of random texels.
 
-    Photos are scaled by the factors `exposure`, in turn. With `turn`, the light turns with the camera.
+    Photos are scaled by the factors `exposure`, in turn. With `turn`, the light turns with the camera. `lamps` (L, 3) are their directions.
     """
     state = made.state
     put(made, metallic=metallic, roughness=roughness, albedo=albedo, opacity=4.0)
@@ -49,8 +50,8 @@ def show(made, *, metallic, roughness, albedo=ORANGE, exposure=(1.0,), turn=Fals
         state.change("light.frame", "camera", "photos", "the test turns it")
     with torch.no_grad():
         directions = cubemap.texel_directions(math.isqrt(len(state.light) // 6)).float()
-        lamps = (directions @ LAMPS.T > 0.85).any(dim=1, keepdim=True)
-        state.light.copy_(torch.where(lamps, 3.0, -1.5).expand(-1, 3))
+        bright = (directions @ lamps.T > 0.85).any(dim=1, keepdim=True)
+        state.light.copy_(torch.where(bright, 3.0, -1.5).expand(-1, 3))
         inputs = state.inputs()
         for view, photo in enumerate(state.photos):
             factor = 0.5 * exposure[view % len(exposure)]
@@ -130,6 +131,34 @@ def test_a_small_part_that_shines_counts(made):
     patch = usable[::25]
     still.change[patch] = found.change[patch]
     assert view_dependence.change_seen(still, state.wanted()) > CHANGES
+
+
+def of_mirroring(made):
+    """Return which part of the surface's changes only mirroring explains."""
+    found, positions = view_dependence.observe(made.state), made.state.parameters["position"].detach()
+    return part_mirrored(found, positions, made.state.capture.radius, torch.ones(len(positions), dtype=torch.bool))
+
+
+def test_a_light_that_changes_does_not_make_metal(made):
+    """Check a matte ball that is lit from another side in each photo, taken as one under a light that stands still."""
+    state = made.state
+    state.change("render.reflection", "none", "needs", "the test has a matte ball")
+    show(made, metallic=-6.0, roughness=6.0, turn=True, lamps=LAMPS[:1])
+    state.change("light.frame", "world", "photos", "the photos do not tell")
+    state.change("render.reflection", "microfacet", "needs", "nor do they tell this")
+    assert told(made)[0] > 0.5, "its colours alone are a metal's"
+    assert of_mirroring(made) < 0.5 * metals.MIRRORED
+    put(made, metallic=0.0)
+    state.iteration = metals.SOONEST
+    metals.set_metals_due(state, 0.25)
+    assert (state.parameters["metallic"] == 0).all() and "0%" in state.decided["metals"]
+
+
+@pytest.mark.parametrize("roughness", [-3.0, -1.0, 0.5])
+@pytest.mark.parametrize("turn", [False, True])
+def test_metals_mirror(made, roughness, turn):
+    show(made, metallic=6.0, roughness=roughness, turn=turn)
+    assert of_mirroring(made) > 2 * metals.MIRRORED
 
 
 def test_metals_are_set_once(made):

@@ -47,12 +47,16 @@ class Observations(NamedTuple):
     - `change` (N, V, 3): how far the radiance in a photo is from `mean`.
     - `pixels` (N, V): the surfel's blending weights in a photo, summed over its pixels; 0 where it is not usable.
     - `clipped` (N, V): the part of `pixels` where the photo is clipped, so that its colour is not known.
+    - `normal` (N, V, 3): the surfel's normal towards the camera, in the frame in which the light stands still.
+    - `mirrored` (N, V, 3): the direction, in that frame, that a mirror there would show the camera.
     """
 
     mean: Tensor
     change: Tensor
     pixels: Tensor
     clipped: Tensor
+    normal: Tensor
+    mirrored: Tensor
 
     @property
     def usable(self) -> Tensor:
@@ -75,11 +79,15 @@ def observe(state: State) -> Observations:
     clipped = [photo.clipped.any(dim=-1, keepdim=True).float() for photo in photos]
     normals = surfels.normals()
     cosines = torch.stack([facing_cosine(surfels.positions, normals, photo.camera) for photo in photos], dim=1)
+    facing = cosines.sign()[..., None] * normals[:, None]
+    places = torch.stack([torch.from_numpy(photo.camera.position) for photo in photos]).to(normals)
+    towards = torch.nn.functional.normalize(places - surfels.positions[:, None], dim=2)
+    mirrored = 2 * cosines.abs()[..., None] * facing - towards
     light = None
     if state.settings.light.frame == "camera":
         turns = [torch.from_numpy(turn_between(photo.camera, state.views[0].camera)).to(normals) for photo in photos]
-        facing = [cosine.sign()[:, None] * normals for cosine in cosines.unbind(dim=1)]
-        light = torch.stack([harmonics.basis(n @ turn.T, 2) for n, turn in zip(facing, turns, strict=True)], dim=1)
+        facing, mirrored = (torch.einsum("vij,nvj->nvi", torch.stack(turns), each) for each in (facing, mirrored))
+        light = harmonics.basis(facing.flatten(0, 1), 2).unflatten(0, facing.shape[:2])
     mean = torch.zeros_like(normals)
     factor = torch.ones_like(cosines)  # of the mean in a photo: its exposure and its diffuse light
     for sweep in range(SWEEPS):
@@ -91,7 +99,7 @@ def observe(state: State) -> Observations:
     totals, pixels, burnt = _residuals(surfels, photos, targets, clipped, mean, factor, state.near)
     usable = pixels * (cosines.abs() > FACING)
     some = pixels.clamp_min(1e-6)
-    return Observations(mean, totals / some[..., None], usable, burnt / some)
+    return Observations(mean, totals / some[..., None], usable, burnt / some, facing, mirrored)
 
 
 def _linear(photo: Photo) -> Tensor:
