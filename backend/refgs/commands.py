@@ -144,7 +144,7 @@ def train(
             f"stopped at iteration {trainer.iteration}; resume with: refgs train {capture_folder} --out {out} --resume"
         )
         raise KeyboardInterrupt
-    held_out = "" if quality is None else f", {quality:.2f} dB on {len(trainer.test)} held-out views"
+    held_out = "" if quality is None else f", {quality:.2f} dB on {len(trainer.capture.test_views)} held-out views"
     console.print(f"trained {trainer.iteration} iterations in {trainer.seconds:.0f} s{held_out}: {out}")
 
 

@@ -10,10 +10,15 @@ from refgs.errors import InputError
 from refgs.paths import write_text
 from refgs.settings import Settings, recorded_settings
 
+PHOTOS = "photos"  # a folder of reduced photos, while they are trained on
+
 
 def check_free(folder: Path) -> None:
-    """Raise InputError if a new run cannot be created in the folder, because it is not empty or is a file."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    """Raise InputError if a new run cannot be created in the folder, because it is not empty or is a file.
+
+    Reduced photos do not count: a training that was killed while it read them leaves these, and the next one uses them.
+    """
+    if folder.exists() and (not folder.is_dir() or any(file.name != PHOTOS for file in folder.iterdir())):
         what = "holds another run" if (folder / "run.toml").exists() else "is not empty"
         raise InputError(f"{folder} {what}: choose another folder with --out, or resume that run with --resume")
 

@@ -15,7 +15,7 @@ from refgs.errors import InputError
 from refgs.events import Report
 from refgs.lock import RunLock
 from refgs.paths import check_folder, disk_errors_named
-from refgs.run_folder import check_free, read_run_facts, update_metrics
+from refgs.run_folder import PHOTOS, check_free, read_run_facts, update_metrics
 from refgs.settings import Settings, load_settings
 from refgs.train.effective import Change
 from refgs.train.plan import Plan
@@ -73,7 +73,12 @@ def train(
             held.enter_context(disk_errors_named([out], "resume with --resume"))
             state = trainer.state
             trainer.run(lambda: attend(state) or lock.attend(state.iteration, state.total, state.seconds))
-        return state, _finish(trainer, out, plan, report) if state.ended else None
+        if not state.ended:
+            return state, None  # its reduced photos stay, for it may be resumed
+        quality = _finish(trainer, out, plan, report)
+        trainer.release_photos()
+        _remove_photos(out)
+        return state, quality
 
 
 def choose_device(device: str, report: Report) -> str:
@@ -185,10 +190,14 @@ def _start(
     from refgs.train.fit import fitting
     from refgs.train.trainer import Trainer
 
-    if preset is None and plan.minutes is not None:
-        trainer, preset = fitting(capture, changes, out, plan, device, report), f"{plan.minutes:g} minutes"
-    else:
-        trainer = Trainer(capture, settings, out, report, plan, device)
+    try:
+        if preset is None and plan.minutes is not None:
+            trainer, preset = fitting(capture, changes, out, plan, device, report), f"{plan.minutes:g} minutes"
+        else:
+            trainer = Trainer(capture, settings, out, report, plan, device)
+    except BaseException:  # there is nothing to resume: leave nothing behind
+        _remove_photos(out)
+        raise
     state = trainer.state
     state.effective = replace(state.effective, changes=masked | state.effective.changes)
     with disk_errors_named([out], "train again"):
@@ -228,6 +237,13 @@ def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float 
         if "what" in facts:
             report("stage", {"what": facts["what"]})
     return quality
+
+
+def _remove_photos(out: Path) -> None:
+    """Remove the reduced photos from a run folder."""
+    from refgs.capture import remove_cached
+
+    remove_cached(out / PHOTOS)
 
 
 def _costs(trainer: "Trainer") -> dict[str, Any]:

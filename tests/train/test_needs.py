@@ -448,7 +448,7 @@ def test_chance_loses_nothing():
     one, other = (
         truth + 0.05 * torch.randn(20000, 3, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1)
     )
-    lost = probe.lost([one], [other], [truth])
+    lost = probe.lost([(one, other, truth)])
     assert abs(lost.whole) < 0.1 and abs(lost.part) < 0.3
 
 

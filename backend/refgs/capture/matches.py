@@ -10,6 +10,7 @@ from refgs.capture.images import LoadedView
 from refgs.capture.motion import epipolar_distance
 
 SOME = 24  # photos that are matched
+SIDE = 800  # pixels of the longer side that they are reduced to; SIFT takes 180 bytes for each of a photo's pixels
 FEATURES = 2000  # of a photo
 DISTINCT = 0.8  # of the second-best match's distance, below which a match counts (Lowe 2004, §7.1)
 TOLERANCE = 1.0  # pixels from the epipolar geometry that fits a pair best; other matches are wrong
@@ -18,7 +19,10 @@ LEAST_PAIRS = 8
 
 
 class Matches(NamedTuple):
-    """Hold the pixels (M, 2) of points that the photos of two views, given by their indices, have in common."""
+    """Hold the pixels (M, 2) of points that the photos of two views, given by their indices, have in common.
+
+    They are pixels of photos reduced to SIDE.
+    """
 
     first: int
     second: int
@@ -47,14 +51,14 @@ def match_neighbours(views: list[LoadedView]) -> list[Matches]:
 
 
 def pixels_apart(matches: list[Matches], cameras: list[Camera]) -> float | None:
-    """Return how far matches are from their epipolar lines in pixels: the lower quartile of the pairs' medians.
+    """Return how far matches are from their epipolar lines, in pixels of photos reduced to SIDE: the lower quartile of the pairs' medians.
 
     The lower quartile, as a mirror's images contradict cameras that are right. Returns None if there are fewer than LEAST_PAIRS pairs.
     `cameras` are those of the views that were matched, in their order.
     """
     medians = []
     for pair in matches:
-        first, second = cameras[pair.first], cameras[pair.second]
+        first, second = cameras[pair.first].fitted(SIDE), cameras[pair.second].fitted(SIDE)
         pose = (second.world_to_camera @ np.linalg.inv(first.world_to_camera))[:3]
         distance = epipolar_distance(_rays(pair.ours, first), _rays(pair.theirs, second), pose)
         medians.append(np.median(distance) * (first.fx + second.fx) / 2)
@@ -68,10 +72,14 @@ def _rays(pixels: np.ndarray, camera: Camera) -> np.ndarray:
 
 def _features(view: LoadedView) -> tuple[np.ndarray, np.ndarray | None]:
     """Detect features inside a photo's mask. Returns their pixels (M, 2) and descriptors (M, 128), None if there are none."""
-    inside = None if view.alpha is None else cv2.erode((view.alpha > 127).astype(np.uint8), np.ones((5, 5), np.uint8))
-    points, descriptors = cv2.SIFT_create(FEATURES, contrastThreshold=0.01).detectAndCompute(
-        cv2.cvtColor(view.bytes, cv2.COLOR_RGB2GRAY), inside
-    )
+    camera = view.camera.fitted(SIDE)
+    size = camera.width, camera.height
+    grey = cv2.resize(cv2.cvtColor(view.bytes, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+    inside = None
+    if view.alpha is not None:
+        alpha = cv2.resize(view.alpha, size, interpolation=cv2.INTER_AREA)
+        inside = cv2.erode((alpha > 127).astype(np.uint8), np.ones((5, 5), np.uint8))
+    points, descriptors = cv2.SIFT_create(FEATURES, contrastThreshold=0.01).detectAndCompute(grey, inside)
     # OpenCV counts pixels from the centre of the first one, cameras from its corner.
     return np.array([point.pt for point in points]).reshape(-1, 2) + 0.5, descriptors
 

@@ -6,7 +6,7 @@ now, and only on pixels that show the object. PSNR is computed from the mean squ
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -62,16 +62,18 @@ def decibels_lost(errors: Tensor, without: Tensor) -> float:
     return 10 * math.log10(max(float(without.sum()), 1e-12) / max(float(errors.sum()), 1e-12))
 
 
-def lost(pictures: list[Tensor], changed: list[Tensor], truths: list[Tensor]) -> Lost:
-    """Compute what is lost between two pictures of each view. They and the photos, `truths`, are (P, 3): the object's pixels, encoded.
+def lost(views: Iterable[tuple[Tensor, Tensor, Tensor]]) -> Lost:
+    """Compute what is lost between two pictures of each view: (picture, changed picture, photo), each (P, 3), encoded pixels of the object.
 
     The pixels of `Lost.part` are chosen by how far the two pictures are apart, whichever of them is nearer to the photo: so chance favours
-    neither.
+    neither. `views` may be a generator: only three numbers a pixel are kept.
     """
-    picture, other, truth = (torch.cat(images) for images in (pictures, changed, truths))
-    picture, other = picture.clamp(0, 1), other.clamp(0, 1)
-    errors, without = ((image - truth).square().mean(dim=1) for image in (picture, other))
-    most = (picture - other).square().mean(dim=1).topk(math.ceil(PART * len(truth))).indices
+    rows = []
+    for picture, other, truth in views:
+        picture, other = picture.clamp(0, 1), other.clamp(0, 1)
+        rows.append([(a - b).square().mean(dim=1) for a, b in ((picture, truth), (other, truth), (picture, other))])
+    errors, without, apart = (torch.cat(values) for values in zip(*rows, strict=True))
+    most = apart.topk(math.ceil(PART * len(apart))).indices
     return Lost(decibels_lost(errors, without), decibels_lost(errors[most], without[most]))
 
 
@@ -103,13 +105,19 @@ def psnr_loss(state: State, change: Change, inputs: RenderInputs | None = None) 
     `change` is a function that takes the inputs of a rendering and returns the changed inputs. `inputs` are the state's if not given.
     """
     inputs = state.inputs() if inputs is None else inputs
-    pictures, changed, truths = [], [], []
-    for view in spread_views(state):
+    ways = inputs, change(inputs)
+    views = spread_views(state)
+    pairs = ([picture(state, view, way).color for way in ways] for view in views)
+    return lost(_on_object(state, inputs, views, pairs))
+
+
+def _on_object(
+    state: State, inputs: RenderInputs, views: list[int], pairs: Iterable[Sequence[Tensor]]
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Cut the object's pixels (P, 3) out of pairs of pictures of the `views`. Yields them with those of the photos."""
+    for view, (one, other) in zip(views, pairs, strict=True):
         shown = on_object(state, inputs.surfels, view)
-        pictures.append(picture(state, view, inputs).color[shown])
-        changed.append(picture(state, view, change(inputs)).color[shown])
-        truths.append(state.photo(view).over(state.background)[shown])
-    return lost(pictures, changed, truths)
+        yield one[shown], other[shown], state.photo(view).over(state.background)[shown]
 
 
 @torch.enable_grad()
@@ -151,24 +159,41 @@ def pixel_sums(
 
 
 @torch.no_grad()
-def blended_shares(surfels: Surfels, photos: list[Photo], near: float, maps: list[Tensor] | None = None) -> Tensor:
+def blended_shares(
+    surfels: Surfels, photos: Iterable[Photo], near: float, maps: Iterable[Tensor] | None = None
+) -> Tensor:
     """Compute how much each surfel contributes to each of V photos (V, N): the sum of its blending weights over all pixels.
 
     If `maps` holds an image (H, W, C) for each photo, return instead the mean of these images for each surfel (N, C), weighted by its
-    blending weights. Surfels nearer to a camera than `near` are not drawn.
+    blending weights. Surfels nearer to a camera than `near` are not drawn. Photos and maps may be generators: one of each is held.
     """
-    surfels, rows = Surfels(*(value.detach() for value in surfels)), []
+    surfels = Surfels(*(value.detach() for value in surfels))
     one = torch.ones_like(surfels.positions[:, :1])
-    for number, photo in enumerate(photos):
-        if maps is None:
-            rows.append(pixel_sums(surfels, photo, near, one, torch.ones_like)[:, 0])
-        else:
-            image = torch.cat([maps[number], torch.ones_like(maps[number][..., :1])], dim=-1)
-            rows.append(pixel_sums(surfels, photo, near, one.expand(-1, image.shape[-1]), lambda _, image=image: image))
     if maps is None:
-        return torch.stack(rows)
+        return torch.stack([pixel_sums(surfels, photo, near, one, torch.ones_like)[:, 0] for photo in photos])
+    rows = []
+    for photo, values in zip(photos, maps, strict=True):
+        image = torch.cat([values, torch.ones_like(values[..., :1])], dim=-1)
+        rows.append(pixel_sums(surfels, photo, near, one.expand(-1, image.shape[-1]), lambda _, image=image: image))
     total = torch.stack(rows).sum(dim=0)
     return total[:, :-1] / total[:, -1:].clamp_min(1e-6)
+
+
+def mirrored_and_mean(state: State, inputs: RenderInputs, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
+    """Render `views` twice, encoded (H, W, 3): with reflections, and with reflections that do not change with the view.
+
+    In the second picture, each surfel's specular colour is its mean over the `views`. Call this without gradients.
+    """
+    dull = without_specular(inputs)
+    over = (picture(state, view, inputs).radiance - picture(state, view, dull).radiance for view in views)
+    mean = blended_shares(inputs.surfels, (state.photo(view) for view in views), state.near, over)
+    for view in views:
+        shown, base, camera = picture(state, view, inputs), picture(state, view, dull), state.photo(view).camera
+        feature = rasterize(*discs(inputs.surfels, camera), mean, camera, near=state.near).features
+        alpha = shown.alpha[..., None]
+        radiance = base.radiance + feature / alpha.clamp_min(COVERED)
+        encoded = state.method.light.encode(radiance if shown.exposure is None else radiance * shown.exposure)
+        yield shown.color, torch.where(alpha > COVERED, encoded * alpha, 0) + (1 - alpha) * state.background
 
 
 @torch.no_grad()
@@ -179,22 +204,7 @@ def specular_explains(state: State) -> Lost:
     albedo. The dB lost therefore show what only specular shading can explain.
     """
     inputs, some = state.inputs(), spread_views(state, SEVERAL)
-    photos, dull = [state.photo(view) for view in some], without_specular(inputs)
-    shown, matte = ([picture(state, view, how) for view in some] for how in (inputs, dull))
-    over = [a.radiance - b.radiance for a, b in zip(shown, matte, strict=True)]
-    mean = blended_shares(inputs.surfels, photos, state.near, over)
-    pictures, flat, truths = [], [], []
-    for view, photo, rendering, base in zip(some, photos, shown, matte, strict=True):
-        feature = rasterize(*discs(inputs.surfels, photo.camera), mean, photo.camera, near=state.near).features
-        alpha = rendering.alpha[..., None]
-        radiance = base.radiance + feature / alpha.clamp_min(COVERED)
-        exposed = radiance if rendering.exposure is None else radiance * rendering.exposure
-        encoded = state.method.light.encode(exposed)
-        here = on_object(state, inputs.surfels, view)
-        pictures.append(rendering.color[here])
-        flat.append((torch.where(alpha > COVERED, encoded * alpha, 0) + (1 - alpha) * state.background)[here])
-        truths.append(photo.over(state.background)[here])
-    return lost(pictures, flat, truths)
+    return lost(_on_object(state, inputs, some, mirrored_and_mean(state, inputs, some)))
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from refgs.camera import Camera
-from refgs.capture import Capture, load_view
+from refgs.capture import Capture, load_views
 from refgs.clock import Clock
 from refgs.events import Report
 from refgs.geometry.visibility import Occluder
@@ -17,6 +17,7 @@ from refgs.model.environment import Environment
 from refgs.model.surfels import Parameters, Surfels, activate
 from refgs.render.baselines import Method, initial_stage, method_of
 from refgs.render.renderer import Rendering, near_plane, render
+from refgs.run_folder import PHOTOS
 from refgs.settings import LossSettings, RenderSettings, Settings
 from refgs.train.effective import Effective
 from refgs.train.losses import Photo
@@ -57,9 +58,9 @@ class State:
         self.background = torch.tensor(self.settings.image.background, device=self.device)
         self.clock, self.plan = Clock(self.device), plan
         with self.clock.part("reading"):
-            side = self.settings.image.max_side
-            self.views = [load_view(view, side) for view in capture.train_views]
-            self.test = [load_view(view, side) for view in capture.test_views]
+            views = [*capture.train_views, *capture.test_views]
+            loaded = load_views(views, self.settings.image.max_side, folder / PHOTOS)
+            self.views, self.test = loaded[: len(capture.train_views)], loaded[len(capture.train_views) :]
         self.from_hull = all(view.alpha is not None for view in self.views)  # surfels start on the masks' hull
         self.photos: list[Photo] = []  # of the views
         self.crops: list[tuple[slice, slice]] | None = (

@@ -181,6 +181,11 @@ class Trainer:
             state.seconds, state.clock.seconds, state.plan.before = spent
             warn(state, why)
 
+    def release_photos(self) -> None:
+        """Drop all photos, when the training has ended: the files that they are mapped from can then be removed, on Windows, too."""
+        self.state.views, self.state.photos, self.state.test = [], [], []
+        del self.measures
+
     def resume(self) -> None:
         """Resume from the last complete checkpoint."""
         snapshot.restore(self.state)

@@ -75,8 +75,6 @@ def observe(state: State) -> Observations:
     """
     surfels = Surfels(*(value.detach() for value in state.surfels()))
     photos = [state.photo(view) for view in probe.spread_views(state, VIEWS)]
-    targets = [_linear(photo) for photo in photos]
-    clipped = [photo.clipped.any(dim=-1, keepdim=True).float() for photo in photos]
     normals = surfels.normals()
     cosines = torch.stack([facing_cosine(surfels.positions, normals, photo.camera) for photo in photos], dim=1)
     facing = cosines.sign()[..., None] * normals[:, None]
@@ -91,12 +89,12 @@ def observe(state: State) -> Observations:
     mean = torch.zeros_like(normals)
     factor = torch.ones_like(cosines)  # of the mean in a photo: its exposure and its diffuse light
     for sweep in range(SWEEPS):
-        totals, pixels, _ = _residuals(surfels, photos, targets, clipped, mean, factor, state.near)
+        totals, pixels, _ = _residuals(surfels, photos, mean, factor, state.near)
         step = (totals.sum(dim=1) / pixels.sum(dim=1).clamp_min(1e-6)[:, None]) * (OVERSHOOT if sweep else 1.0)
         mean = (mean + step).clamp_min(0)
         if sweep:
             factor = _fitted(factor, totals, pixels, mean, light)
-    totals, pixels, burnt = _residuals(surfels, photos, targets, clipped, mean, factor, state.near)
+    totals, pixels, burnt = _residuals(surfels, photos, mean, factor, state.near)
     usable = pixels * (cosines.abs() > FACING)
     some = pixels.clamp_min(1e-6)
     return Observations(mean, totals / some[..., None], usable, burnt / some, facing, mirrored)
@@ -109,21 +107,16 @@ def _linear(photo: Photo) -> Tensor:
 
 
 def _residuals(
-    surfels: Surfels,
-    photos: list[Photo],
-    targets: list[Tensor],
-    clipped: list[Tensor],
-    mean: Tensor,
-    factor: Tensor,
-    near: float,
+    surfels: Surfels, photos: list[Photo], mean: Tensor, factor: Tensor, near: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Sum what the photos show beyond the model over each surfel's pixels, with its blending weights.
 
-    `targets` (H, W, 3) are the photos' radiance, and `clipped` (H, W, 1) is 1 where they are clipped. Returns the sums (N, V, 3), the sums
-    of the weights (N, V), and those of clipped pixels (N, V).
+    Returns the sums (N, V, 3), the sums of the weights (N, V), and those of clipped pixels (N, V).
     """
     sums = []
-    for number, (photo, target, lost) in enumerate(zip(photos, targets, clipped, strict=True)):
+    for number, photo in enumerate(photos):
+        # Decoded anew each time: as floats, all photos together would take five times their memory.
+        target, lost = _linear(photo), photo.clipped.any(dim=-1, keepdim=True).float()
         features = torch.cat([mean * factor[:, number, None], torch.ones_like(mean[:, :2])], dim=1)
 
         def residual(shown: Tensor, target: Tensor = target, lost: Tensor = lost) -> Tensor:

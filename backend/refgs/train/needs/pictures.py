@@ -4,7 +4,7 @@ They show the artist what a decision of `refgs.train.needs` is about. They are w
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import cv2
@@ -13,16 +13,13 @@ import torch
 from torch import Tensor
 
 from refgs.compare.pictures import write_png
-from refgs.render.rasterize import rasterize
-from refgs.render.rendering import COVERED
-from refgs.render.volume import discs
 from refgs.train import probe
 from refgs.train.state import State
 
 FOLDER = "needs"  # in the run folder
 SIDE = 320  # pixels of a picture on its longer side: a panel shows no more
 
-Pair = Callable[[State, dict[str, Any], list[int]], list[tuple[Tensor, Tensor]]]
+Pair = Callable[[State, dict[str, Any], list[int]], Iterator[tuple[Tensor, Tensor]]]
 """Renders views with a part and without it: encoded pictures (H, W, 3). The second argument is the recorded decision."""
 
 
@@ -36,14 +33,17 @@ def write_pictures(state: State, name: str, found: dict[str, Any]) -> dict[str, 
     if name not in PAIRS:
         return None
     views = probe.spread_views(state)
-    pairs = [(on.clamp(0, 1), off.clamp(0, 1)) for on, off in PAIRS[name](state, found, views)]
-    if not pairs:
+    most, chosen, pair = -1.0, -1, ()
+    for view, (on, off) in zip(views, PAIRS[name](state, found, views), strict=False):  # all views or none
+        on, off = on.clamp(0, 1), off.clamp(0, 1)
+        if (apart := float((on - off).square().mean())) > most:
+            most, chosen, pair = apart, view, (on, off)
+    if not pair:
         return None
-    most = max(range(len(pairs)), key=lambda k: float((pairs[k][0] - pairs[k][1]).square().mean()))
-    photo = state.photo(views[most])
+    photo = state.photo(chosen)
     truth = photo.over(state.background)
     written: dict[str, Any] = {"view": photo.camera.name}
-    for kind, picture in zip(("on", "off", "photo"), (*pairs[most], truth), strict=True):
+    for kind, picture in zip(("on", "off", "photo"), (*pair, truth), strict=True):
         written[kind] = f"{FOLDER}/{name}_{kind}.png"
         write_png(state.folder / written[kind], _reduced(picture))
         if kind != "photo":
@@ -61,29 +61,14 @@ def _reduced(picture: Tensor) -> np.ndarray:
     return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
 
 
-def _specular(state: State, found: dict[str, Any], views: list[int]) -> list[tuple[Tensor, Tensor]]:
+def _specular(state: State, found: dict[str, Any], views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
     """Render what is mirrored, and the same as if it did not change with the view, as `probe.specular_explains` compares them."""
-    inputs, photos = state.inputs(), [state.photo(view) for view in views]
-    shown, matte = (
-        [probe.picture(state, view, how) for view in views] for how in (inputs, probe.without_specular(inputs))
-    )
-    mirrored = [on.radiance - off.radiance for on, off in zip(shown, matte, strict=True)]
-    mean = probe.blended_shares(inputs.surfels, photos, state.near, mirrored)
-    pairs = []
-    for photo, on, off in zip(photos, shown, matte, strict=True):
-        feature = rasterize(*discs(inputs.surfels, photo.camera), mean, photo.camera, near=state.near).features
-        alpha = on.alpha[..., None]
-        radiance = off.radiance + feature / alpha.clamp_min(COVERED)
-        encoded = state.method.light.encode(radiance if on.exposure is None else radiance * on.exposure)
-        pairs.append((on.color, torch.where(alpha > COVERED, encoded * alpha, 0) + (1 - alpha) * state.background))
-    return pairs
+    return probe.mirrored_and_mean(state, state.inputs(), views)
 
 
-def _reflections(state: State, found: dict[str, Any], views: list[int]) -> list[tuple[Tensor, Tensor]]:
+def _reflections(state: State, found: dict[str, Any], views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
     """Render black where the object hides the light from what mirrors it, which is more than it can mirror; and the light everywhere."""
     inputs = state.inputs()
-    if inputs.occluder is None:
-        return []
     surfels = inputs.surfels
     black = surfels._replace(
         indirect_dc=torch.zeros_like(surfels.indirect_dc),
@@ -91,16 +76,18 @@ def _reflections(state: State, found: dict[str, Any], views: list[int]) -> list[
         received=torch.ones_like(surfels.received),
     )
     ways = inputs._replace(surfels=black), inputs._replace(occluder=None)
-    return [tuple(probe.picture(state, view, way).color for way in ways) for view in views]
+    for view in views if inputs.occluder is not None else ():
+        yield tuple(probe.picture(state, view, way).color for way in ways)
 
 
-def _light(state: State, found: dict[str, Any], views: list[int]) -> list[tuple[Tensor, Tensor]]:
+def _light(state: State, found: dict[str, Any], views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
     """Render under the light, and under the coarser one that was chosen in its place."""
     inputs = state.inputs()
     if found["needed"] or inputs.settings.reflection == "none":
-        return []
+        return
     coarse = inputs._replace(environment=probe.pooled(inputs.environment, int(found["side"])))
-    return [tuple(probe.picture(state, view, way).color for way in (inputs, coarse)) for view in views]
+    for view in views:
+        yield tuple(probe.picture(state, view, way).color for way in (inputs, coarse))
 
 
 PAIRS: dict[str, Pair] = {"specular": _specular, "reflections": _reflections, "light": _light}

@@ -1,0 +1,92 @@
+"""Load a capture's photos for training. Many large ones are written into files and mapped: the system can then reclaim their memory.
+
+A photo's files are named after all that their pixels depend on. A resumed training finds those that still fit, and makes the others anew.
+"""
+
+import hashlib
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from refgs import __version__
+from refgs.capture.images import LoadedView, load_view
+from refgs.capture.types import View
+from refgs.paths import whole
+
+LARGE = 500e6  # bytes of all photos of a capture, from which on they are cached
+
+
+def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedView]:
+    """Load photos for training as `load_view` does. If they take more than LARGE bytes, cache them in `folder`.
+
+    The arrays of a cached photo are mapped from files, copy-on-write: a change of their values stays in memory. Where the disk has no room,
+    photos are held in memory. Raises InputError naming the photo that cannot be read.
+    """
+    cameras = [view.camera.fitted(max_side) for view in views]
+    if sum(4 * camera.width * camera.height for camera in cameras) <= LARGE:
+        return [load_view(view, max_side) for view in views]
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    loaded = []
+    for view in views:
+        name = _name(view, max_side)
+        found = _read(view, max_side, folder, name)
+        if found is None:
+            found = load_view(view, max_side)
+            with suppress(OSError):
+                _write(found, folder, name)
+                found = _read(view, max_side, folder, name)
+        loaded.append(found)
+    wanted = {_name(view, max_side) for view in views}
+    for file in folder.glob("*"):
+        if file.name.split(".")[0] not in wanted:
+            file.unlink(missing_ok=True)
+    return loaded
+
+
+def remove_cached(folder: Path) -> None:
+    """Remove the files of cached photos. On Windows, files that are still mapped stay."""
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _name(view: View, max_side: int) -> str:
+    """Return the name of a photo's files: a hash of all that its pixels depend on, except the code that loads them."""
+    camera, files = view.camera, []
+    for path in (view.image_path, view.mask_path):
+        if path is not None and path.exists():
+            files.append((str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns))
+    numbers = [camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]
+    what = (__version__, max_side, files, numbers, view.lens, view.has_alpha, view.mask_below)
+    return hashlib.sha256(repr(what).encode()).hexdigest()[:24]
+
+
+def _read(view: View, max_side: int, folder: Path, name: str) -> LoadedView | None:
+    """Map the files of a cached photo. Return None if there are none."""
+    image = next(folder.glob(f"{name}.image.*.npy"), None)
+    if image is None:
+        return None
+    alpha = folder / f"{name}.alpha.npy"
+    return LoadedView(
+        _mapped(image),
+        _mapped(alpha) if alpha.exists() else None,
+        view.camera.fitted(max_side),
+        int(image.name.split(".")[2]),
+    )
+
+
+def _mapped(file: Path) -> np.ndarray:
+    return np.asarray(np.load(file, mmap_mode="c"))  # not "r", as torch warns of arrays that it must not write
+
+
+def _write(view: LoadedView, folder: Path, name: str) -> None:
+    """Write a photo's files. The image comes last: if it is there, the photo is complete."""
+    if shutil.disk_usage(folder).free < 2 * view.image.nbytes:
+        raise OSError
+    files = [(f"{name}.image.{view.white}.npy", view.image)]
+    if view.alpha is not None:
+        files = [(f"{name}.alpha.npy", view.alpha), *files]
+    for file, values in files:
+        with whole(folder / file) as temporary, open(temporary, "wb") as handle:
+            np.save(handle, values)
