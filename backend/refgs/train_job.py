@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from refgs.errors import InputError
 from refgs.events import Report
 from refgs.lock import RunLock
+from refgs.memory import trim
 from refgs.paths import check_folder, disk_errors_named
 from refgs.run_folder import PHOTOS, check_free, read_run_facts, update_metrics
 from refgs.settings import Settings, load_settings
@@ -230,7 +231,9 @@ def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float 
     with _card_memory(f"the card's memory is full; nothing is lost, resume with: {again}"):
         write_asset(state)
         record_changes(out, state.effective.rows())
+        trim()
         quality = held_out_psnr(state, most=len(state.test))
+        trim()
         trades = ambiguities(state)
     update_metrics(out, {"ambiguities": trades, "total_seconds": plan.spent})
     for facts in trades.values():

@@ -30,12 +30,12 @@ def test_what_is_left_is_what_both_changes_leave(ball):
     now = ball.surfels(), ball.environment().radiance
     views = range(0, len(ball.views), 4)
     with torch.no_grad():
-        before = _pictures(ball, now, views)
+        before = torch.stack([*_pictures(ball, now, views)])
         for name, trade in TRADES.items():
             facts = found[name]
             assert 0 < facts["left"] <= facts["alone"]
             both = trade.made_up(trade.change(now, 0.1 * trade.size), 0.1 * facts["answer"])
-            change = (_pictures(ball, both, views) - before).square().mean().sqrt() / 0.1
+            change = (torch.stack([*_pictures(ball, both, views)]) - before).square().mean().sqrt() / 0.1
             assert float(change) == pytest.approx(facts["left"], rel=0.3), name
 
 

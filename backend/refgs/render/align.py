@@ -21,6 +21,7 @@ REDUCTIONS = 4, 2, 1  # of pictures, from the first steps to the last
 STEPS = 5  # of fitting a pose, for each of these
 SOLID = 0.5  # alpha from which a pixel shows the surface
 ODD = 0.1  # of 1: a difference of colours from which a pixel counts less; it has another cause than the pose
+CHUNK = 1 << 16  # pixels whose equations are held at a time; one takes 700 bytes
 DAMPING = 1e-3  # of the mean diagonal
 
 
@@ -56,8 +57,23 @@ def pose_step(
     rows, columns = torch.nonzero(alpha[..., 0] > SOLID, as_tuple=True)
     if len(rows) == 0:
         return torch.zeros(6)
-    across, down, apart = (value[rows, columns].double() for value in (across, down, apart))
-    depth = (depths / alpha.clamp_min(COVERED))[rows, columns, 0].double()
+    depths = (depths / alpha.clamp_min(COVERED))[..., 0]
+    square, towards = torch.zeros(6, 6).to(rows.device, torch.double), torch.zeros(6).to(rows.device, torch.double)
+    for pixels in zip(rows.split(CHUNK), columns.split(CHUNK), strict=True):
+        part = _normal_equations(*pixels, (across, down, apart, depths), camera, centre, radius)
+        square, towards = square + part[0], towards + part[1]
+    square += (DAMPING * square.diagonal().mean() + 1e-12) * torch.eye(6).to(square)
+    return torch.linalg.solve(square, towards).float().cpu()
+
+
+def _normal_equations(
+    rows: Tensor, columns: Tensor, maps: tuple[Tensor, ...], camera: Camera, centre: np.ndarray, radius: float
+) -> tuple[Tensor, Tensor]:
+    """Sum the normal equations of a pose (6, 6) and (6,), float64, over the pixels at these rows and columns.
+
+    `maps` are the slopes of the picture across and down (H, W, 3), how far the photo is apart (H, W, 3), and the depth (H, W).
+    """
+    across, down, apart, depth = (value[rows, columns].double() for value in maps)
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
     to_camera = torch.from_numpy(camera.world_to_camera).to(depth)
     turn = to_camera[:3, :3]
@@ -74,10 +90,9 @@ def pose_step(
     by_turn = torch.linalg.cross(from_centre[:, None].expand_as(slope), slope)
     jacobian = -torch.cat([by_turn @ turn, radius * slope @ turn], dim=2)
     weight = 1 / (1 + (apart / ODD).square())
-    square = torch.einsum("pci,pc,pcj->ij", jacobian, weight, jacobian)
-    towards = torch.einsum("pci,pc,pc->i", jacobian, weight, apart)
-    square += (DAMPING * square.diagonal().mean() + 1e-12) * torch.eye(6).to(square)
-    return torch.linalg.solve(square, towards).float().cpu()
+    return torch.einsum("pci,pc,pcj->ij", jacobian, weight, jacobian), torch.einsum(
+        "pci,pc,pc->i", jacobian, weight, apart
+    )
 
 
 def fitted(

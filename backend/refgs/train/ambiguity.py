@@ -1,6 +1,6 @@
 """Measure ambiguities: changes of light and materials that cancel in all pictures, so that photos cannot tell them apart."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -100,25 +100,32 @@ def ambiguities(state: State) -> dict[str, dict]:
     chosen = range(0, len(state.views), max(1, -(-len(state.views) // VIEWS)))
     with torch.no_grad():
         now = state.surfels(), light.radiance
-        before = _pictures(state, now, chosen)
-        photos = torch.cat([composite(state.views[i], state.background).flatten() for i in chosen])
-        error = float((before - photos).square().mean().sqrt())
+        before = [*_pictures(state, now, chosen)]
+        photos = (composite(state.views[i], state.background) for i in chosen)
+        count = sum(picture.numel() for picture in before)
+        error = (sum(float((a - b).square().sum()) for a, b in zip(before, photos, strict=True)) / count) ** 0.5
         found = {}
         for name, trade in TRADES.items():
-            alone = (_pictures(state, trade.change(now, SMALL * trade.size), chosen) - before) / SMALL
-            other = (_pictures(state, trade.made_up(now, SMALL), chosen) - before) / SMALL
-            answer = -float((alone * other).sum() / other.square().sum().clamp_min(1e-20))
-            left = float((alone + answer * other).square().mean().sqrt())
-            facts = {"alone": float(alone.square().mean().sqrt()), "left": left, "answer": answer, "error": error}
+            scenes = trade.change(now, SMALL * trade.size), trade.made_up(now, SMALL)
+            dots = torch.zeros(
+                2, 2, dtype=torch.double
+            )  # of the two changes' pictures, from view to view: photos may be large
+            for old, *pair in zip(before, *(_pictures(state, scene, chosen) for scene in scenes), strict=True):
+                changes = [((picture - old) / SMALL).double().flatten() for picture in pair]
+                dots += torch.tensor([[float(a @ b) for b in changes] for a in changes])
+            alone, both, other = (float(dots[i, j]) / count for i, j in ((0, 0), (0, 1), (1, 1)))
+            answer = -both / max(other, 1e-20 / count)
+            left = max(alone + answer * both, 0.0) ** 0.5
+            facts = {"alone": alone**0.5, "left": left, "answer": answer, "error": error}
             if left < UNSEEN * error:
                 facts["what"] = f"{trade.words}: {trade.answer} can make up for it, the photos do not tell"
             found[name] = facts
     return found
 
 
-def _pictures(state: State, scene: Explanation, chosen: range) -> Tensor:
-    """Render `scene` in the training views with the indices `chosen`. Return the colours of all pixels as one vector."""
+def _pictures(state: State, scene: Explanation, chosen: range) -> Iterator[Tensor]:
+    """Render `scene` in the training views with the indices `chosen`. Yield pictures (H, W, 3)."""
     light = Environment(scene[1].contiguous(), state.environment().reference)
     inputs = RenderInputs(scene[0], light, state.settings.render, state.occluder)
-    pictures = (state.picture(inputs, state.views[i].camera, state.exposure(i)) for i in chosen)
-    return torch.cat([picture.color.clamp(0, 1).flatten() for picture in pictures])
+    for view in chosen:
+        yield state.picture(inputs, state.views[view].camera, state.exposure(view)).color.clamp(0, 1)
