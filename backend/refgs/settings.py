@@ -46,6 +46,10 @@ class ImageSettings(_Section):
     """Photos as they are trained on."""
 
     max_side: int = Field(ge=16, le=8192, description="pixels on the longer side; larger photos are reduced to it")
+    coarse: Literal["auto", "off"] = Field(
+        description="auto: train on reduced photos first, if the object in them spans 200 pixels or more; off: on full photos from the "
+        "start"
+    )
     background: tuple[Part, Part, Part] = Field(description="sRGB colour behind masked objects")
     masks: Literal["auto", "off"] = Field(
         description="auto: if no photo has a mask, make masks of the object first, in the capture's folder masks; off: make none, and "
@@ -313,7 +317,7 @@ def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
     """Complete the settings recorded by a run. Keys that its release did not have yet get the standard preset's values."""
     # Before these keys existed, light was fixed to the world, there were no exposures and no residual, and nothing was left out.
     still = {"light": {"frame": "world", "exposure": "off"}, "residual": {"start": 1.0}}
-    still["cameras"] = {"poses": "off"}
+    still |= {"cameras": {"poses": "off"}, "image": {"coarse": "off"}}
     still["needs"] = dict.fromkeys(NeedsSettings.model_fields, "on")
     return validate(_merge(_merge(_read_preset("standard"), still), tables), source)
 

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from refgs import __version__
+from refgs.camera import Camera
 from refgs.capture.images import LoadedView, load_view
+from refgs.capture.reduce import reduced
 from refgs.capture.types import View
 from refgs.paths import whole
 
@@ -32,18 +34,24 @@ def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedVie
     loaded = []
     for view in views:
         name = _name(view, max_side)
-        found = _read(view, max_side, folder, name)
-        if found is None:
-            found = load_view(view, max_side)
-            with suppress(OSError):
-                _write(found, folder, name)
-                found = _read(view, max_side, folder, name)
-        loaded.append(found)
+        found = _read(view.camera.fitted(max_side), folder, name)
+        loaded.append(found or _cached(load_view(view, max_side), folder, name))
     wanted = {_name(view, max_side) for view in views}
     for file in folder.glob("*"):
         if file.name.split(".")[0] not in wanted:
             file.unlink(missing_ok=True)
     return loaded
+
+
+def reduced_views(views: list[LoadedView], factor: int, folder: Path) -> list[LoadedView]:
+    """Reduce the sides of loaded photos by a factor, in linear light as `load_view` does. If `folder` exists, cache them there, too."""
+    found = []
+    for number, view in enumerate(views):
+        width, height = (max(1, round(side / factor)) for side in (view.camera.width, view.camera.height))
+        camera = view.camera.resized(width, height)
+        small = LoadedView(*reduced(view.image, view.alpha, view.white, view.camera, camera), camera, view.white)
+        found.append(_cached(small, folder, f"{number:05}-{factor}") if folder.is_dir() else small)
+    return found
 
 
 def remove_cached(folder: Path) -> None:
@@ -62,22 +70,26 @@ def _name(view: View, max_side: int) -> str:
     return hashlib.sha256(repr(what).encode()).hexdigest()[:24]
 
 
-def _read(view: View, max_side: int, folder: Path, name: str) -> LoadedView | None:
-    """Map the files of a cached photo. Return None if there are none."""
+def _read(camera: Camera, folder: Path, name: str) -> LoadedView | None:
+    """Map the files of a cached photo, whose camera is `camera`. Return None if there are none."""
     image = next(folder.glob(f"{name}.image.*.npy"), None)
     if image is None:
         return None
     alpha = folder / f"{name}.alpha.npy"
-    return LoadedView(
-        _mapped(image),
-        _mapped(alpha) if alpha.exists() else None,
-        view.camera.fitted(max_side),
-        int(image.name.split(".")[2]),
-    )
+    return LoadedView(_mapped(image), _mapped(alpha) if alpha.exists() else None, camera, int(image.name.split(".")[2]))
 
 
 def _mapped(file: Path) -> np.ndarray:
     return np.asarray(np.load(file, mmap_mode="c"))  # not "r", as torch warns of arrays that it must not write
+
+
+def _cached(view: LoadedView, folder: Path, name: str) -> LoadedView:
+    """Write a photo's files and map them. Return `view` itself if they cannot be written."""
+    try:
+        _write(view, folder, name)
+    except OSError:
+        return view
+    return _read(view.camera, folder, name)
 
 
 def _write(view: LoadedView, folder: Path, name: str) -> None:

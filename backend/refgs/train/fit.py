@@ -6,12 +6,12 @@ from pathlib import Path
 from refgs.capture import Capture
 from refgs.events import Report
 from refgs.settings import RATES, Settings, load_settings, validate
+from refgs.train import coarse
 from refgs.train.effective import Effective
-from refgs.train.plan import END, END_A_VIEW, OTHERS, Plan, growth, iterations_time
+from refgs.train.plan import BY_PIXELS, END, END_A_VIEW, FULL, OTHERS, Plan, growth, iterations_time
 from refgs.train.trainer import Trainer
 
 WARM, REHEARSED = 5, 25  # iterations: the pace is that from the first to the second
-BY_PIXELS = 0.8  # an iteration's time grows as the photos' pixels do, to this power: 0.7 to 0.9 on three captures
 SCHEDULE = ("train", "light_first"), ("densify", "every"), ("indirect", "every")  # scaled with the iterations
 FASTEST = 2.0  # times a preset's rates
 STEPS, MOST = 64, 2.0  # steps in which settings richer than quick are tried, and how far: standard is at one
@@ -35,9 +35,9 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
     for _ in range(REHEARSED):
         float(trainer.iterate()["loss"])  # waits for a card
         marks.append(plan.spent)
-    pace = (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM)
+    pace = (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM) / trainer.state.stages[0].cost  # on full photos
     views, first = len(capture.train_views) + len(capture.test_views), len(trainer.state.parameters["position"])
-    pixels = _pixels(capture, quick)
+    pixels, spans = _pixels(capture, quick), coarse.extent(trainer.state)
 
     def iterations(settings: Settings) -> float:
         """Estimate how many iterations with these settings fit into the time that is left."""
@@ -49,7 +49,8 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
         if settings is not quick:
             left -= (started - begun) * larger  # for another start
         more = growth(start, settings.surfels.budget)
-        return (left / one - more * (END_A_VIEW * views + END)) / iterations_time(more, 1.0)
+        stages = FULL if settings.image.coarse == "off" else coarse.stages(spans * larger**0.5)
+        return (left / one - more * (END_A_VIEW * views + END)) / iterations_time(more, 1.0, stages)
 
     why = f"{plan.minutes:g} minutes were given"
     found, count = quick, iterations(quick)

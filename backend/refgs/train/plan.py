@@ -1,6 +1,7 @@
 """Plan how many iterations fit into a given time, which includes setting up the training and writing its asset."""
 
 import time
+from typing import NamedTuple
 
 EVERY = 50  # iterations
 FIRST = 10  # iterations after which the pace is known well enough to plan the total
@@ -9,19 +10,45 @@ END_A_VIEW, END = 0.5, 20
 # Iterations grow slower as surfels are divided and inter-reflection joins: linearly between these parts of a training.
 GROWS = 0.1, 0.3
 OTHERS = 16_000  # surfels that take as long as the rest of an iteration
+BY_PIXELS = 0.8  # an iteration's time grows as the photos' pixels do, to this power: 0.7 to 0.9 on three captures
 MIRRORED = 1.2  # factor of an iteration's time for inter-reflection: 1 without, 1.4 where much mirrors itself
 
 
-def iterations_time(growth: float, progress: float) -> float:
+class Stage(NamedTuple):
+    """Describe a stage of a training: `until` which part of it, and by what `factor` photos are reduced (see `train/coarse.py`)."""
+
+    until: float
+    factor: int
+
+    @property
+    def cost(self) -> float:
+        """Return how long an iteration takes, in iterations on full photos."""
+        return self.factor ** (-2 * BY_PIXELS)
+
+
+FULL = (Stage(1.0, 1),)
+
+
+def iterations_time(growth: float, progress: float, stages: tuple[Stage, ...] = FULL) -> float:
     """Compute how long all iterations up to a progress of 0..1 take together.
 
-    Iterations slow down: the last takes `growth` times as long as the first. If all were as fast as the first, the whole training would
-    take 1 unit of time. The result is in this unit, so that it is more than 1 for a progress of 1.
+    Iterations slow down: the last takes `growth` times as long as the first, if both are on full photos. If all were as fast as the first
+    on full photos, the whole training would take 1 unit of time. The result is in this unit, so that it is more than 1 for a progress of 1
+    if photos are not reduced.
     """
     first, last = GROWS
-    ramp = min(max(progress - first, 0.0), last - first)
-    more = ramp**2 / (2 * (last - first)) + max(progress - last, 0.0)
-    return progress + (growth - 1) * more
+
+    def full(progress: float) -> float:
+        ramp = min(max(progress - first, 0.0), last - first)
+        more = ramp**2 / (2 * (last - first)) + max(progress - last, 0.0)
+        return progress + (growth - 1) * more
+
+    total, begun = 0.0, 0.0
+    for stage in stages:
+        end = progress if stage.until == 1 else min(progress, stage.until)
+        total += stage.cost * (full(max(end, begun)) - full(begun))
+        begun = max(end, begun)
+    return total
 
 
 def growth(first: int, last: int) -> float:
@@ -39,7 +66,7 @@ class Plan:
         """Start the clock. Without `minutes` there is no limit."""
         self.minutes, self._begun = minutes, time.perf_counter()
         self.before = 0.0  # seconds spent before the run was resumed
-        self._growth, self._marks = 1.0, [(0, 0.0)]
+        self._growth, self._stages, self._marks = 1.0, FULL, [(0, 0.0)]
 
     @property
     def spent(self) -> float:
@@ -50,12 +77,12 @@ class Plan:
         """Record that the training has paused for `seconds`, which then do not count as time spent. This method does not wait."""
         self._begun += seconds
 
-    def begin(self, iteration: int, growth: float) -> None:
+    def begin(self, iteration: int, growth: float, stages: tuple[Stage, ...] = FULL) -> None:
         """Start measuring the pace of iterations.
 
-        An iteration at the end is expected to take `growth` times as long as one at the start.
+        An iteration at the end is expected to take `growth` times as long as one at the start on full photos. `stages` are the training's.
         """
-        self._growth, self._marks = growth, [(iteration, self.spent)]
+        self._growth, self._stages, self._marks = growth, stages, [(iteration, self.spent)]
 
     def total(self, iteration: int, views: int) -> int | None:
         """Choose the total number of iterations so that the training ends in time.
@@ -76,7 +103,7 @@ class Plan:
         def seconds_left(total: int) -> float:
             """Estimate the seconds from now to the end, including the asset, if the training has `total` iterations."""
             whole, by_now, by_half = (
-                iterations_time(self._growth, k / total) * total for k in (total, iteration, half)
+                iterations_time(self._growth, k / total, self._stages) * total for k in (total, iteration, half)
             )
             at_first = pace * (iteration - half) / (by_now - by_half)  # seconds that the first iterations took
             return at_first * (whole - by_now + self._growth * (END_A_VIEW * views + END))

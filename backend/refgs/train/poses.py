@@ -51,6 +51,7 @@ def refine_due(state: State, view: int, rendering: Rendering, photo: Photo, prog
     centre, radius = state.capture.centre, state.capture.radius
     level = int((progress - FROM) / (KNOWN - FROM) * len(REDUCTIONS))
     reduction = REDUCTIONS[min(level, len(REDUCTIONS) - 1)]
+    reduction = max(reduction // (state.reduced.factor if state.reduced else 1), 1)  # the photo may be reduced already
     step = pose_step(rendering, photo.over(state.background), photo.camera, centre, radius, reduction)
     if step.isfinite().all():
         state.poses[view] += step.clamp(-MOST, MOST)
@@ -117,8 +118,7 @@ def _move(state: State, index: int) -> None:
     camera = state.given[index]
     if state.poses is not None:
         camera = posed(camera, state.poses[index], state.capture.centre, state.capture.radius)
-    state.views[index] = replace(state.views[index], camera=camera)
-    state.photos[index] = state.photos[index]._replace(camera=camera)
+    state.move_camera(index, camera)
 
 
 def _without_common(state: State) -> Tensor:

@@ -126,6 +126,7 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
 
     Time two iterations: one without the change, and one with it. The optimiser's step is not timed. Both render only the crop of the photo
     that the training uses. If `whole` is true, the first one renders the whole photo, so that the result includes what cropping saves.
+    Photos are in full size; iterations on reduced photos count less.
     """
     fastest = [math.inf, math.inf]
     for _ in range(REPEATS):
@@ -138,7 +139,7 @@ def seconds_saved(state: State, change: Change = lambda inputs: inputs, whole: b
                 torch.cuda.synchronize()
             fastest[which] = min(fastest[which], time.perf_counter() - begun)
             state.forget_gradients()
-    return max(fastest[0] - fastest[1], 0.0) * max(state.total - state.iteration, 0)
+    return max(fastest[0] - fastest[1], 0.0) * max(state.cost(state.iteration, state.total), 0.0)
 
 
 def pixel_sums(

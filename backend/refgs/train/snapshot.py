@@ -6,7 +6,7 @@ import torch
 from refgs.errors import InputError
 from refgs.formats.mesh import Mesh
 from refgs.geometry.visibility import Occluder
-from refgs.train import checkpoint, needs, poses
+from refgs.train import checkpoint, coarse, needs, poses
 from refgs.train.state import State, why_not_traced
 
 
@@ -35,7 +35,7 @@ def save(state: State) -> None:
     facts = {"seconds": state.seconds, "total": state.total, "initial": state.initial, "decided": state.decided}
     facts |= {"parts": state.clock.seconds, "spent": state.plan.spent}
     facts |= {"processor_seconds": state.processor_seconds, "needs": state.needs, "metals_set": state.metals_set}
-    facts |= {"poses_judged": state.poses_judged}
+    facts |= {"poses_judged": state.poses_judged, "reduced": state.reduced.factor if state.reduced else 1}
     checkpoint.save(state.folder / "checkpoints", state.iteration, tensors, facts)
 
 
@@ -86,6 +86,7 @@ def restore(state: State) -> None:
             state.optimizer.state[value] = moments | {"step": int(moments["step"])}
     state.light_shown = tensors.get("mirrored")
     poses.restore(state, tensors["poses"].cpu() if "poses" in tensors else None)
+    coarse.set_factor(state, facts.get("reduced", 1))
     state.constant = {name: tensors[f"constant.{name}"] for name in state.constant}
     state.occluder = None
     if mesh and not why_not_traced(state):

@@ -1,6 +1,7 @@
 """Hold the state of a training: the capture, the parameters that it learns, and the decisions that it has made."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ from refgs.settings import LossSettings, RenderSettings, Settings
 from refgs.train.effective import Effective
 from refgs.train.losses import Photo
 from refgs.train.motion import ScreenGradient
-from refgs.train.plan import Plan
+from refgs.train.plan import FULL, Plan, Stage, iterations_time
 
 # Changes of a photo's response, as logarithms of factors of red, green and blue: brightness, then temperature and tint, which are its white
 # balance. The latter two are scaled down so that they learn more slowly: photos differ less in them.
@@ -41,6 +42,14 @@ class RenderInputs(NamedTuple):
     environment: Environment | None
     settings: RenderSettings
     occluder: Occluder | None
+
+
+class Reduced(NamedTuple):
+    """Hold the training views' photos, with their sides reduced by a `factor`, and the parts of them that are trained on (None: all)."""
+
+    factor: int
+    photos: list[Photo]
+    crops: list[tuple[slice, slice]] | None
 
 
 class State:
@@ -66,6 +75,9 @@ class State:
         self.crops: list[tuple[slice, slice]] | None = (
             None  # the parts of the photos that are trained on; None: all of them
         )
+
+        self.stages: tuple[Stage, ...] = FULL  # of the training, by its photos' sizes
+        self.reduced: Reduced | None = None  # photos that are trained on in an earlier stage; None: full photos
 
         self.iteration, self.total = 0, self.settings.train.iterations
         self.seconds, self.processor_seconds = 0.0, 0.0  # the latter of all threads, which other programs hardly change
@@ -151,9 +163,28 @@ class State:
         inputs = self.inputs()
         return self.picture(inputs if surfels is None else inputs._replace(surfels=surfels), camera)
 
-    def photo(self, view: int, whole: bool = False) -> Photo:
-        """Return the crop of a view's photo that the training uses, or the whole photo if `whole` is true."""
-        return self.photos[view] if whole or self.crops is None else self.photos[view].part(*self.crops[view])
+    def photo(self, view: int, whole: bool = False, reduced: bool = False) -> Photo:
+        """Return the crop of a view's photo that the training uses, or the whole photo if `whole` is true.
+
+        The photo is in full size, so that decisions see all of it. If `reduced` is true, it has the size that is trained on now.
+        """
+        photos, crops = self.photos, self.crops
+        if reduced and self.reduced is not None:
+            _, photos, crops = self.reduced
+        return photos[view] if whole or crops is None else photos[view].part(*crops[view])
+
+    def move_camera(self, view: int, camera: Camera) -> None:
+        """Replace a training view's camera. It is the camera of the full photo."""
+        self.views[view] = replace(self.views[view], camera=camera)
+        self.photos[view] = self.photos[view]._replace(camera=camera)
+        if self.reduced is not None:
+            photo = self.reduced.photos[view]
+            self.reduced.photos[view] = photo._replace(camera=camera.resized(photo.camera.width, photo.camera.height))
+
+    def cost(self, first: int, last: int) -> float:
+        """Estimate how long the iterations from `first` to `last` take together, in iterations on full photos."""
+        begun, ended = (iterations_time(1.0, k / self.total, self.stages) for k in (first, last))
+        return self.total * (ended - begun)
 
     def exposure(self, view: int | slice) -> Tensor | None:
         """Compute a view's exposure (3,): factors of its rendered red, green and blue. Return None if exposures are not learned.

@@ -10,8 +10,9 @@ from torch import Tensor
 from refgs.capture import Capture
 from refgs.compare.metrics import decibels
 from refgs.events import Report
+from refgs.memory import trim
 from refgs.settings import Settings
-from refgs.train import densify, exposures, history, light, metals, needs, poses, snapshot
+from refgs.train import coarse, densify, exposures, history, light, metals, needs, poses, snapshot
 from refgs.train.effective import Effective
 from refgs.train.guard import Guard, running, warn
 from refgs.train.losses import departure, objective
@@ -50,7 +51,8 @@ class Trainer:
         """
         state, view = self.state, self._next_view()
         progress = min(state.iteration / state.total, 1.0)
-        photo = state.photo(view, whole=state.iteration % needs.WHOLE_EVERY == 0)
+        coarse.refine_due(state, progress)
+        photo = state.photo(view, whole=state.iteration % needs.WHOLE_EVERY == 0, reduced=True)
         if state.initial and progress >= state.settings.initial.until:
             start_deferred(state)
         set_rates(state, progress)
@@ -102,7 +104,8 @@ class Trainer:
         """
         state, means = self.state, {}
         before, first = state.seconds, state.iteration
-        state.plan.begin(state.iteration, growth(len(state.parameters["position"]), state.settings.surfels.budget))
+        more = growth(len(state.parameters["position"]), state.settings.surfels.budget)
+        state.plan.begin(state.iteration, more, state.stages)
         while not state.ended and not self._should_stop(stop):
             figures = self.iterate()
             state.total = state.plan.total(state.iteration, len(state.views) + len(state.test)) or state.total
@@ -110,7 +113,7 @@ class Trainer:
             means = {name: running(means.get(name, figure), figure) for name, figure in figures.items()}
             if state.iteration % REPORT_EVERY == 0 or state.iteration == state.total:
                 self._check(whole=state.ended)
-                pace = (state.seconds - before) / max(state.iteration - first, 1)  # it may have gone back
+                pace = (state.seconds - before) / max(state.cost(first, state.iteration), 1e-9)  # it may have gone back
                 self._report_progress(means, pace)
             if history.due(state.iteration) and not state.ended:
                 self._record(means)
@@ -124,7 +127,7 @@ class Trainer:
     def _report_progress(self, means: dict[str, Tensor], pace: float) -> None:
         state = self.state
         facts = {"iteration": state.iteration, "total": state.total, "seconds": state.seconds}
-        facts |= {"seconds_left": pace * (state.total - state.iteration), "loss": float(means["loss"])}
+        facts |= {"seconds_left": pace * state.cost(state.iteration, state.total), "loss": float(means["loss"])}
         facts |= {"psnr": decibels(float(means["square"])), "splats": len(state.parameters["position"])}
         state.report("progress", facts)
 
@@ -168,6 +171,7 @@ class Trainer:
         self._check(whole=True)
         with self.state.clock.part("writing"):
             snapshot.save(self.state)
+            trim()  # what decisions took
 
     def _check(self, whole: bool) -> None:
         """Check that the training's numbers are finite. If the guard says so, go back to the last checkpoint.

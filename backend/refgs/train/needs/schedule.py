@@ -45,17 +45,13 @@ class Iterations(Need):
 
     def measure(self, state: State) -> Decision:
         specular = state.needs.get("specular", {})
-        total, left = (
-            state.iteration + round(self.ENOUGH * (state.total - state.iteration)),
-            state.total - state.iteration,
-        )
-        one, why = 0.0, ASKED  # seconds of an iteration
+        total = state.iteration + round(self.ENOUGH * (state.total - state.iteration))
+        left, why = 0.0, ASKED  # seconds
         if "statistic" in specular:
-            one, why = (
-                state.seconds / state.iteration - specular["seconds"] / max(left, 1),
-                "what mirrors nothing has less to learn",
-            )
-        figures = {"total": total, "seconds": max(one, 0.0) * (state.total - total)}
+            to_come = state.cost(state.iteration, state.total) / max(state.cost(0, state.iteration), 1e-9)
+            left = state.seconds * to_come - specular["seconds"]
+            why = "what mirrors nothing has less to learn"
+        figures = {"total": total, "seconds": max(left, 0.0) * (1 - self.ENOUGH)}
         why = f"{why}: {total:,} in place of {state.total:,}"
         return Decision(False, why, figures, specular.get("statistic"), specular.get("threshold"))
 
