@@ -33,16 +33,17 @@ def extract(
     """
     shown, half = _foreground(surfels.positions.numpy(force=True), cameras, centre, radius)
     surfels = surfels.chosen(torch.from_numpy(shown).to(surfels.positions.device))
-    maps = [trimmed_depth(*discs(surfels, camera), camera, near, UPPER, LOWER) for camera in cameras]
-    depths, alphas = zip(*maps, strict=True)
+    maps = (trimmed_depth(*discs(surfels, camera), camera, near, UPPER, LOWER) for camera in cameras)
+    # Keep a byte of each alpha: maps of all cameras of a large capture take gigabytes.
+    depths, solids = zip(*((depth, alpha >= 0.5) for depth, alpha in maps), strict=True)
     pixels = []
-    for depth, alpha, camera in zip(depths, alphas, cameras, strict=True):
+    for depth, opaque, camera in zip(depths, solids, cameras, strict=True):
         middle = float(camera.world_to_camera[2, :3] @ centre + camera.world_to_camera[2, 3])
-        solid = depth[(alpha > 0.5) & ((depth - middle).abs() < half)]
+        solid = depth[opaque & ((depth - middle).abs() < half)]
         if len(solid):
             pixels.append(float(solid.median()) / camera.fx)
     across = min(resolution, max(int(2 * half / float(np.median(pixels))), 1)) if pixels else resolution
-    return fuse(depths, alphas, cameras, centre, half, across), 2 * half / across
+    return fuse(depths, solids, cameras, centre, half, across), 2 * half / across
 
 
 def _foreground(

@@ -5,6 +5,7 @@ import torch
 from refgs.errors import InputError
 from refgs.geometry.mesh import clean
 from refgs.geometry.visibility import Occluder
+from refgs.memory import trim
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.extract import extract
@@ -37,6 +38,7 @@ def _trace(state: State) -> None:
     """
     capture, cameras = state.capture, state.spread_cameras(VIEWS)
     state.occluder = None
+    trim()  # before the depth maps of all cameras are held
     inputs = state.inputs()
     surfels, environment = inputs.surfels, inputs.environment
     inside = surfels.chosen(state.wanted())
