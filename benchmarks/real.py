@@ -37,11 +37,13 @@ TABLES = (
             Column("PSNR dB", "psnr", ".2f"),
             Column("exposure fitted", "psnr_exposure_fitted", ".2f"),
             Column("SSIM", "ssim", ".3f"),
+            Column("normals °", "normals", ".2f"),
             Column("metal, of the object", "metal", ".0%"),
             Column("surfels", "surfels", ",.0f"),
             Column("mesh's pieces", "pieces", ".0f"),
             Column("s", "seconds", ".0f"),
             Column("CPU s", "processor_seconds", ".0f"),
+            Column("GB", "memory", ".2f"),
         ),
         line="capture",
         variant="photos",
@@ -53,7 +55,8 @@ Machine: {machine}. Date: {date}. `refgs bench real --captures DIR` trains on ea
 
 PSNR and SSIM are means over held-out views, every eighth photo. A held-out photo's exposure is unknown: "exposure fitted" is the PSNR with
 the exposure and white balance that fit best, if photos have their own. Metal is the part of the object's pixels in these views with a
-metallic of at least {metal}. Seconds are those of the whole command on the clock; CPU seconds are the processor's.
+metallic of at least {metal}. Normals are compared where a capture has ground truth, as rendered ones have. Seconds are those of the whole
+command on the clock; CPU seconds are those of the iterations.
 
 {table}
 
@@ -138,13 +141,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, help="folder for the runs and the page (default: demo/real)")
     parser.add_argument("--only", nargs="+", default=[], metavar="CAPTURE", help="measure these captures")
     parser.add_argument("--preset", default="standard", help="a preset's name or a TOML file (standard)")
-    parser.add_argument("--side", type=int, default=640, help="pixels on the photos' longer side (640)")
+    parser.add_argument(
+        "--side",
+        type=int,
+        nargs="+",
+        default=[640],
+        metavar="PIXELS",
+        help="the photos' longer side (640); several to compare. Photos are not enlarged",
+    )
     parser.set_defaults(variants=[])
     bench = Bench("real", parser, arguments)
     options = bench.options
     out = options.out or clone_root() / "demo" / "real"
     captures = find_captures(options.captures, options.only)
-    variants = {f"{options.side} px": Variant(("--preset", options.preset, "--set", f"image.max_side={options.side}"))}
+    sides = sorted(set(options.side))
+    variants = {f"{n} px": Variant(("--preset", options.preset, "--set", f"image.max_side={n}")) for n in sides}
     sections = []
     for capture, runs in bench.runs(variants, captures):
         for variant, folder in runs.items():
@@ -155,10 +166,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
             fitted = found.get("psnr_exposure_fitted")
             bench.record(capture, variant, "dB", psnr=found["psnr"], psnr_exposure_fitted=fitted)
             bench.record(capture, variant, "", ssim=found["ssim"], surfels=found["splats"], metal=metal_part(run))
+            bench.record(capture, variant, "°", normals=found.get("normal_mae_degrees"))
             bench.record(capture, variant, "", pieces=count_pieces(folder / "mesh.glb"))
             bench.record(
                 capture, variant, "s", seconds=found["total_seconds"], processor_seconds=found["processor_seconds"]
             )
+            if "peak_memory_bytes" in found:
+                bench.record(capture, variant, "GB", memory=found["peak_memory_bytes"] / 1e9)
+            if variant != f"{sides[-1]} px":  # the page shows the largest photos
+                continue
             with whole(out / f"{capture}.jpg") as temporary:
                 temporary.write_bytes(cv2.imencode(".jpg", strip(run)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
             sections.append(f"## {capture}\n\n![{', '.join(PASSES)}]({capture}.jpg)\n")

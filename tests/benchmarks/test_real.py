@@ -30,9 +30,10 @@ def test_captures_are_trained_and_shown_on_a_page(tmp_path, capsys):
     (tmp_path / "small.toml").write_text(SMALL)
     out = tmp_path / "out"
     words = ["--captures", str(tmp_path / "captures"), "--out", str(out), "--preset", str(tmp_path / "small.toml")]
-    real.main([*words, "--side", "48"])
+    real.main([*words, "--side", "48", "32"])
     page = (out / "real-captures.md").read_text()
-    assert "| ball | 48 px |" in page and "## ball" in page and "notes" not in page
+    assert "| ball | 32 px |" in page and "| ball | 48 px |" in page
+    assert page.count("## ball") == 1 and "notes" not in page
     picture = cv2.imread(str(out / "ball.jpg"))
     assert picture.shape[0] == real.HEIGHT and picture.shape[1] > 4 * real.HEIGHT
     parts = np.array_split(picture, len(real.PASSES), axis=1)
