@@ -47,8 +47,8 @@ class ImageSettings(_Section):
 
     max_side: int = Field(ge=16, le=8192, description="pixels on the longer side; larger photos are reduced to it")
     coarse: Literal["auto", "off"] = Field(
-        description="auto: train on reduced photos first, if the object in them spans 200 pixels or more; off: on full photos from the "
-        "start"
+        description="auto: train on reduced photos first, if masks show that the object spans 200 pixels or more in them; off: on full "
+        "photos from the start"
     )
     background: tuple[Part, Part, Part] = Field(description="sRGB colour behind masked objects")
     masks: Literal["auto", "off"] = Field(

@@ -35,6 +35,16 @@ def test_a_small_object_is_trained_on_full_photos(ball_capture, tmp_path):
     assert 30 < coarse.extent(state) < 64
 
 
+def test_where_the_object_is_not_known_photos_are_full(ball_capture, tmp_path, large):
+    """Check that photos without masks are not reduced, and that a small region in a large object counts as small."""
+    state = trainer(ball_capture, tmp_path / "run").state
+    assert state.reduced is not None
+    state.from_hull = False
+    assert coarse.extent(state) == 0
+    small = ["region.centre=[0.0,0.0,0.9]", "region.size=[0.2,0.2,0.2]"]
+    assert 0 < coarse.extent(trainer(ball_capture, tmp_path / "part", *small).state) < 20
+
+
 def test_each_stage_has_its_photos_and_decisions_see_full_ones(ball_capture, tmp_path, large, monkeypatch):
     made = trainer(ball_capture, tmp_path / "run", *FEW, total=40)
     seen = []

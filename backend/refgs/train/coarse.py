@@ -3,7 +3,6 @@
 Small objects are trained on full photos from the start: of an object of 64 pixels, half the size loses 0.3 dB.
 """
 
-from collections.abc import Iterator
 from statistics import median
 
 from refgs.capture import LoadedView, reduced_views
@@ -22,18 +21,19 @@ VIEWS = 24  # that are looked at, at the most
 def extent(state: State) -> float:
     """Measure how many pixels the object spans in the full photos: the longer side of a mask's bounds, a median over views.
 
-    Without masks, it is the longer side of the photos.
+    With a region to train, it is at most the width of the ball around that. Without masks, the object is not known, and the extent is 0.
     """
-
-    def sides() -> Iterator[int]:
-        for view in spread(state.views, VIEWS):
-            height, width = view.image.shape[:2]
-            if state.from_hull:
-                rows, columns = bounds(view.alpha, 0)
-                height, width = rows.stop - rows.start, columns.stop - columns.start
-            yield max(height, width)
-
-    return median(sides())
+    if not state.from_hull:
+        return 0.0
+    found, capture = [], state.capture
+    for view in spread(state.views, VIEWS):
+        rows, columns = bounds(view.alpha, 0)
+        pixels = max(rows.stop - rows.start, columns.stop - columns.start)
+        if capture.box is not None:
+            depth = view.camera.world_to_camera[2] @ [*capture.centre, 1.0]
+            pixels = min(pixels, 2 * capture.radius * view.camera.fx / max(depth, capture.radius))
+        found.append(float(pixels))
+    return median(found)
 
 
 def stages(pixels: float) -> tuple[Stage, ...]:
