@@ -4,7 +4,7 @@ import trimesh
 
 from refgs.errors import InputError
 from refgs.formats.mesh import Mesh
-from refgs.geometry.mesh import clean, is_crumbs, smooth_normals
+from refgs.geometry.mesh import clean, is_crumbs, parts, smooth_normals
 
 
 def as_mesh(*parts):
@@ -16,11 +16,64 @@ def ball(radius=1.0, at=(0, 0, 0), level=4):
     return trimesh.creation.icosphere(level, radius).apply_translation(at)
 
 
-def test_floaters_go_and_large_parts_stay():
-    mesh = clean(as_mesh(ball(), ball(0.5, (3, 0, 0)), ball(0.1, (0, 3, 0))), 100000)
-    assert trimesh.Trimesh(mesh.vertices, mesh.faces).body_count == 2
-    assert mesh.vertices[:, 1].max() < 1.01 and mesh.vertices[:, 0].max() > 3.4
+def count_parts(mesh):
+    return len(parts(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))[1])
+
+
+def test_crumbs_go_and_small_objects_stay():
+    """Keep objects of a quarter and of a fiftieth of the largest one's area. Remove crumbs of a two-hundredth."""
+    crumbs = [ball(0.07, (0, 3 + i, 0), level=2) for i in range(5)]
+    mesh = clean(as_mesh(ball(), ball(0.5, (3, 0, 0)), ball(0.15, (0, 0, 3)), *crumbs), 100000)
+    assert count_parts(mesh) == 3
+    assert mesh.vertices[:, 1].max() < 1.01 and mesh.vertices[:, 0].max() > 3.4 and mesh.vertices[:, 2].max() > 3.1
     assert mesh.faces.max() == len(mesh.vertices) - 1
+
+
+def frayed(seed=0):
+    """Make a ball that is cut below: in a band of 0.3 its faces are missing at random, and no crumb is loose yet."""
+    whole = ball(level=6)
+    height = whole.triangles_center[:, 2] + 0.5
+    random = np.random.default_rng(seed)
+    whole.update_faces(height > 0.3 * random.random(len(height)))
+    part, areas = parts(whole)
+    whole.update_faces(part == areas.argmax())
+    return whole
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_frayed_border_leaves_no_crumbs(seed):
+    """Simplify a surface whose border frays, as where photos end. Without trimming, it falls into 44 to 53 parts."""
+    mesh = clean(as_mesh(frayed(seed)), 15000)
+    assert count_parts(mesh) == 1
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    assert area > 2 * np.pi * (1 + 0.2)  # the ball's as far down as its faces are there, 1.2 of its radius
+
+
+def test_small_holes_close_and_large_ones_and_thin_parts_stay():
+    """Close two holes near a large one without opening that, and keep a ring of wire. The large one may lose faces at its corners."""
+    ring = trimesh.creation.torus(1.5, 0.01, major_sections=256, minor_sections=4)
+    holes = ball(level=5)
+    for x, radius in ((0, 0.5), (0.6, 0.05), (-0.7, 0.06)):
+        x0, y, z = (holes.triangles_center - [x, 0, 0]).T
+        holes.update_faces((np.hypot(x0, y) > radius) | (z < 0))
+    mesh = clean(as_mesh(holes, ring), 100000)
+    both = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert both.is_winding_consistent
+    cut, whole = sorted(both.split(only_watertight=False), key=lambda part: part.is_watertight)
+    assert len(whole.faces) == len(ring.faces)
+    assert abs(cut.area - 2 * np.pi * (1 + np.sqrt(1 - 0.5**2))) < 0.02
+    edges, faces = np.unique(cut.edges_sorted, axis=0, return_counts=True)
+    x, y, z = cut.vertices[edges[faces == 1]].mean(axis=1).T
+    assert np.abs(np.hypot(x, y) - 0.5).max() < 0.04 and z.min() > 0
+
+
+def test_a_strip_that_is_all_border_stays():
+    x, y = np.meshgrid(np.arange(50.0), np.arange(2.0), indexing="ij")
+    corner = 2 * np.arange(49)[:, None]
+    faces = np.concatenate([corner + np.array(three) for three in ((0, 2, 1), (1, 2, 3))])
+    strip = Mesh(np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3), faces)
+    assert len(clean(strip, 1000).faces) == len(faces)
 
 
 def test_crumbs_are_known_from_things_of_several_parts():
