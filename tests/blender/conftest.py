@@ -42,3 +42,11 @@ def addon(scene):
     yield scene
     ui.unregister()
     bpy.context.preferences.addons.remove(enabled)
+
+
+@pytest.fixture
+def fake_trainer(addon, python):
+    """Select the fake trainer in the add-on's preferences."""
+    from refgs_addon import preferences
+
+    preferences.preferences().python = str(python)

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from refgs_addon import preferences
 from refgs_addon.errors import InputError
 from refgs_addon.scene import decisions, training
 from refgs_addon.ui import decisions_box
@@ -17,9 +16,8 @@ from tests.makers.waiting import until
 
 
 @pytest.fixture
-def run(addon, python, tmp_path):
+def run(addon, fake_trainer, tmp_path):
     """List a run in the scene that was taken for matte. Return its folder."""
-    preferences.preferences().python = str(python)
     capture, folder = tmp_path / "photos", tmp_path / "run"
     capture.mkdir()
     (folder / "needs").mkdir(parents=True)

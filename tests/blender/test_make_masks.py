@@ -9,21 +9,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from refgs_addon import jobs, preferences
+from refgs_addon import jobs
 from refgs_addon.errors import InputError
 from refgs_addon.scene import regions, strokes, training
 from refgs_addon.scene.capture_cameras import cameras_of, show_cameras
 from refgs_addon.ui.train_panel import _status
 from tests.makers.waiting import final_state, until
 
+pytestmark = pytest.mark.usefixtures("fake_trainer")
+
 WIDTH, HEIGHT = 64, 48
-
-
-@pytest.fixture
-def addon(addon, python):
-    """Select the fake trainer in the add-on's preferences. Returns the scene."""
-    preferences.preferences().python = str(python)
-    return addon
 
 
 @pytest.fixture

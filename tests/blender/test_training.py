@@ -26,12 +26,7 @@ from refgs_addon.ui.train_panel import other_process_status
 from tests.makers.captures import edit
 from tests.makers.waiting import final_state, until
 
-
-@pytest.fixture
-def addon(addon, python):
-    """Select the fake trainer in the add-on's preferences. Returns the scene."""
-    preferences.preferences().python = str(python)
-    return addon
+pytestmark = pytest.mark.usefixtures("fake_trainer")
 
 
 @pytest.fixture
