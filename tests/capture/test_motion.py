@@ -7,16 +7,9 @@ import numpy as np
 import pytest
 
 from refgs.capture import load_view, read_capture
+from refgs.capture.colmap_steps import ALL_PAIRS, MATCH_TOLERANCE, _write_mask, epipolar_distance, pairs
 from refgs.capture.images import read_header, read_image
-from refgs.capture.motion import (
-    ALL_PAIRS,
-    CONTRADICTED,
-    MATCH_TOLERANCE,
-    _write_mask,
-    epipolar_distance,
-    find_cameras,
-    pairs,
-)
+from refgs.capture.motion import CONTRADICTED, find_cameras
 from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.color import srgb_decode
 from refgs.errors import InputError, NoCameras

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from refgs.capture import motion, read_capture
+from refgs.capture import colmap_steps, motion, read_capture
 from refgs.capture.files import find_photos
 from refgs.capture.motion import find_cameras
 from refgs.errors import InputError
@@ -105,12 +105,12 @@ def placed_one_by_one(folder: Path) -> int:
     """Return how many photos COLMAP places one after the other."""
     import pycolmap
 
-    pycolmap.set_random_seed(motion.SEED)
+    pycolmap.set_random_seed(colmap_steps.SEED)
     photos, database = find_photos(folder), folder / "apart" / "apart.db"
     database.parent.mkdir()
-    motion._extract(photos, [], database, lambda *_: None)
-    motion._match(len(photos), database, lambda *_: None)
-    return motion._map(photos, database, lambda *_: None)[0].num_reg_images()
+    colmap_steps.extract_features(photos, [], database, lambda *_: None)
+    colmap_steps.match_features(len(photos), database, lambda *_: None)
+    return colmap_steps.map_one_by_one(photos, database, lambda *_: None)[0].num_reg_images()
 
 
 def test_two_rounds_of_a_film_are_linked(tmp_path):
@@ -132,7 +132,7 @@ def search_a_film(folder: Path) -> set[tuple[int, int]]:
     """Find cameras as if ALL_PAIRS photos were few, and write them. Return the pairs of photos that have matches."""
     import pycolmap
 
-    motion.ALL_PAIRS = 32
+    colmap_steps.ALL_PAIRS = 32
     photos, database = find_photos(folder), folder / "film.db"
     best, _ = motion._search(photos, [], database, lambda *_: None)
     for number in best.reg_image_ids():

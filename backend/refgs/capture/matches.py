@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from refgs.camera import Camera
+from refgs.capture.colmap_steps import epipolar_distance
 from refgs.capture.images import LoadedView
-from refgs.capture.motion import epipolar_distance
 
 SOME = 24  # photos that are matched
 SIDE = 800  # pixels of the longer side that they are reduced to; SIFT takes 180 bytes for each of a photo's pixels

@@ -1,0 +1,279 @@
+"""Call COLMAP (pycolmap) for each step of structure from motion: features, matches and cameras.
+
+`motion.find_cameras` decides which steps to take, and judges what they find.
+"""
+
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from refgs import CORES
+from refgs.capture.images import read_focal_length, read_header, read_image, read_mask, write_for_colmap
+
+SIDE = 1600  # pixels on the longer side for finding features; presets train on fewer
+ALL_PAIRS = 150  # photos; up to this many, every pair is matched
+CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential distortion only fit noise
+SEED = 1
+TIED = 3  # points that a photo must share with others; COLMAP asks for 30 where it places one photo after the other
+MATCH_TOLERANCE = 8.0  # pixels from its epipolar line, above which a match contradicts the cameras; COLMAP allows 4
+FEW_CAMERA_MODEL = "SIMPLE_RADIAL"  # of what tells little about the lens: see the next two
+WELL_SEEN = 10  # photos of one lens and size. 23 of a statue, cropped to 7 sizes, are all placed; with RADIAL, 3 are
+INSIDE_CAMERA_MODEL = FEW_CAMERA_MODEL  # an object fills little of the photos: with RADIAL 5 of 66 of a head are placed
+FAINT = 0.002  # contrast of the weakest features inside masks; COLMAP's is 0.0067, which places 60 of 66 photos of a dark bronze, not all
+INSIDE_FEATURES = (
+    16384  # COLMAP takes the largest 8192 of a photo before it looks at the mask; the surroundings may use these up
+)
+
+
+def pairs(count: int) -> list[tuple[int, int]]:
+    """Choose which pairs of photos to match. Return pairs of indices; photos are sorted by name.
+
+    With up to ALL_PAIRS photos, this is every pair. With more, each photo is matched with the next ten, and with those 16, 32, 64 … places
+    further on. The last photos are matched with the first, because photographers walk around an object. To link several rounds around the
+    object, the photos 0, 10, 20 … are also matched with one another.
+    """
+    if count <= ALL_PAIRS:
+        return list(combinations(range(count), 2))
+    steps = [*range(1, 11), *(2**k for k in range(4, count.bit_length() - 1))]
+    near = {tuple(sorted((i, (i + step) % count))) for i in range(count) for step in steps}
+    return sorted(near | set(combinations(range(0, count, 10), 2)))
+
+
+def extract_features(photos: list[Path], masks: list[Path], database: Path, progress: Callable) -> None:
+    """Extract image features of all photos into COLMAP's database. If there are masks, only features inside them are kept.
+
+    Photos with the same size and focal length (EXIF) share their intrinsics. COLMAP gets a temporary JPEG of a photo that it cannot read.
+    At the end the photos in the database are renamed to their indices, because names in COLMAP's file of pairs cannot have spaces.
+    """
+    import pycolmap
+
+    reading = pycolmap.ImageReaderOptions()
+    reading.camera_model = CAMERA_MODEL
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size = SIDE
+    written = database.with_name(f"{database.name}.masks")
+    if masks:
+        reading.camera_model = INSIDE_CAMERA_MODEL
+        reading.mask_path = written
+        extraction.sift.peak_threshold = FAINT
+        extraction.sift.max_num_features = INSIDE_FEATURES
+    with pycolmap.Database.open(database) as known:
+        cameras = {_lens(camera): camera.camera_id for camera in known.read_all_cameras()}
+    readable = database.with_name(f"{database.name}.photos")
+    readable.mkdir(exist_ok=True)
+    numbers: dict[str, str] = {}
+    for start in range(0, len(photos), 2 * CORES):
+        progress("features", start, len(photos))
+        shared: dict[tuple[int, Path], list[str]] = {}
+        for number, photo in list(enumerate(photos))[start : start + 2 * CORES]:
+            folder, name = photo.parent, photo.name
+            if write_for_colmap(photo, readable / f"{number}.jpg"):
+                # In a folder of its own, because a photo may be named 0.jpg.
+                folder, name = database.parent, f"{readable.name}/{number}.jpg"
+            numbers[name] = str(number)
+            if masks:
+                _write_mask(photo, masks[number], written / f"{name}.png")
+            camera = pycolmap.infer_camera_from_image(folder / name, reading)
+            if focal := read_focal_length(photo):  # COLMAP knows only that for 35 mm film, in JPEG and PNG
+                camera.focal_length, camera.has_prior_focal_length = focal, True
+            if _lens(camera) not in cameras:
+                with pycolmap.Database.open(database) as known:
+                    cameras[_lens(camera)] = known.write_camera(camera)
+            shared.setdefault((cameras[_lens(camera)], folder), []).append(name)
+        for (reading.existing_camera_id, folder), names in shared.items():
+            pycolmap.extract_features(
+                database, folder, names, pycolmap.CameraMode.SINGLE, reading, extraction
+            )  # skips photos that have features already
+        for path in readable.iterdir():
+            path.unlink()
+        shutil.rmtree(written, ignore_errors=True)
+    readable.rmdir()
+    with pycolmap.Database.open(database) as known, pycolmap.DatabaseTransaction(known):
+        images = known.read_all_images()
+        counts = Counter(image.camera_id for image in images)
+        for camera in known.read_all_cameras():
+            if counts[camera.camera_id] < WELL_SEEN:
+                _simplify(camera)
+                known.update_camera(camera)
+        for image in images:
+            image.name = numbers[image.name]
+            known.update_image(image)
+
+
+def _simplify(camera) -> None:
+    """Give a camera (pycolmap.Camera) the model FEW_CAMERA_MODEL. Its focal length stays."""
+    import pycolmap
+
+    focal = camera.mean_focal_length()
+    simple = pycolmap.Camera.create_from_model_name(
+        camera.camera_id, FEW_CAMERA_MODEL, focal, camera.width, camera.height
+    )
+    camera.model, camera.params = simple.model, simple.params
+
+
+def _write_mask(photo: Path, mask: Path, out: Path) -> None:
+    """Write a photo's mask as COLMAP reads it: black and white, and lying as the photo is stored."""
+    header, pixels = read_header(photo), read_mask(mask)
+    if pixels.shape == header.upright[::-1]:
+        pixels = np.rot90(pixels, header.turns)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.where(pixels > 127, 255, 0).astype(np.uint8)).save(out)
+
+
+def _lens(camera) -> tuple[int, int, float]:
+    return camera.width, camera.height, camera.mean_focal_length()
+
+
+def match_features(count: int, database: Path, progress: Callable) -> None:
+    """Match the features of `count` photos, in the pairs that `pairs(count)` chooses. Store the matches in COLMAP's database."""
+    import pycolmap
+
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.filter_stationary_matches = True
+    verification.ransac.random_seed = SEED
+    listed = database.with_name(database.name + ".pairs.txt")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = str(listed)
+    with pycolmap.Database.open(database) as known:
+        names = {image.name for image in known.read_all_images()}
+    all_pairs = [f"{a} {b}" for a, b in pairs(count) if str(a) in names and str(b) in names]
+    for start in range(0, len(all_pairs), 100):
+        progress("matching", start, len(all_pairs))
+        listed.write_text("\n".join(all_pairs[start : start + 100]), encoding="utf-8")
+        pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+
+
+def map_one_by_one(photos: list[Path], database: Path, progress: Callable) -> list[Any]:
+    """Compute cameras from the feature matches, one photo after the other.
+
+    COLMAP may return several models that share few photos or none. Return them (pycolmap.Reconstruction), the one with most photos first.
+    """
+    import pycolmap
+
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = SEED
+    options.min_model_size = 3
+    options.extract_colors = False
+    placed = 0
+
+    def first() -> None:
+        nonlocal placed
+        placed = 2
+        progress("mapping", placed, len(photos))
+
+    def another() -> None:
+        nonlocal placed
+        placed = min(placed + 1, len(photos))
+        progress("mapping", placed, len(photos))
+
+    written = database.with_name(database.name + ".models")  # COLMAP writes all models here, the small ones too
+    written.mkdir(exist_ok=True)
+    return _largest_first(
+        pycolmap.incremental_mapping(database, photos[0].parent, written, options, "", first, another)
+    )
+
+
+def map_at_once(photos: list[Path], database: Path) -> list[Any]:
+    """Compute all cameras together (GLOMAP). Return the models as `map_one_by_one` does.
+
+    This links photos that share too little to be placed one after the other. Photos that it places by their direction alone, and not by
+    points that several of them show, lose their cameras: how far apart they are was not known.
+    """
+    import pycolmap
+
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = SEED
+    written = database.with_name(database.name + ".models")
+    models = pycolmap.global_mapping(database, photos[0].parent, written, options)
+    for model in models.values():
+        tied = _tied(model)
+        for number in set(model.reg_image_ids()) - tied:
+            model.deregister_frame(model.image(number).frame_id)
+    return _largest_first({number: model for number, model in models.items() if model.num_reg_images()})
+
+
+def _tied(model: Any) -> set[int]:
+    """Return the largest set of a model's images that common points hold together, grown from the two that share most points.
+
+    An image is tied if it shows TIED points that two tied images show. Otherwise nothing says how far away it is: relative poses of two
+    photos have no scale.
+    """
+    shown = {
+        number: {seen.point3D_id for seen in model.image(number).get_observation_points2D()}
+        for number in model.reg_image_ids()
+    }
+    first = max(combinations(shown, 2), key=lambda pair: len(shown[pair[0]] & shown[pair[1]]), default=())
+    tied, added, views = set(), set(first), Counter()
+    while added:
+        views.update(point for number in added for point in shown[number])
+        tied |= added
+        known = {point for point, count in views.items() if count > 1}
+        added = {number for number in shown.keys() - tied if len(shown[number] & known) >= TIED}
+    return tied
+
+
+def _largest_first(models: dict[int, Any]) -> list[Any]:
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+
+
+def epipolar_distance(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return the Sampson distance (M,) of each match: how far two matched points are from each other's epipolar lines.
+
+    `ours` and `theirs` (M, 2) are the matched points in the two photos, on the image plane at depth 1. `pose` (3, 4) maps points from the
+    first camera's coordinates to the second's.
+    """
+    turn, shift = pose[:, :3], pose[:, 3]
+    x, y = (np.column_stack([rays, np.ones(len(rays))]) for rays in (ours, theirs))
+    essential = np.cross(shift / max(np.linalg.norm(shift), 1e-12), turn, axisb=0, axisc=0)
+    line, back = x @ essential.T, y @ essential
+    slope = (line[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
+    return np.abs((y * line).sum(axis=1)) / np.sqrt(np.maximum(slope, 1e-24))
+
+
+def contradicted_part(model: Any, database: Path) -> float:
+    """Return the fraction of feature matches that disagree with the cameras of a model (a pycolmap.Reconstruction).
+
+    A match disagrees if its points are more than MATCH_TOLERANCE pixels from their epipolar lines.
+    """
+    import pycolmap
+
+    placed = set(model.reg_image_ids())
+    with pycolmap.Database.open(database) as known:
+        places = {number: known.read_keypoints(number)[:, :2].astype(float) for number in placed}
+        verified = list(zip(*known.read_two_view_geometries(), strict=True))
+    rays = {number: model.image(number).camera.cam_from_img(places[number]) for number in placed}
+    wrong, total = 0, 0
+    for pair, geometry in verified:
+        (a, b), matches = pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches
+        if {a, b} <= placed:
+            ours, theirs = model.image(a), model.image(b)
+            pose = (theirs.cam_from_world() * ours.cam_from_world().inverse()).matrix()
+            far = (
+                epipolar_distance(rays[a][matches[:, 0]], rays[b][matches[:, 1]], pose)
+                * ours.camera.mean_focal_length()
+            )
+            wrong, total = wrong + int((far > MATCH_TOLERANCE).sum()), total + len(far)
+    return wrong / max(total, 1)
+
+
+def color_points(model: Any, photos: list[Path]) -> None:
+    """Give each point of a model (a pycolmap.Reconstruction) the mean sRGB colour of the pixels that it was seen at.
+
+    The images in the model are named by the photos' indices. COLMAP does the same, but not for HEIC.
+    """
+    sums = {number: np.zeros(4) for number in model.points3D}  # red, green, blue, count
+    for number in model.reg_image_ids():
+        photo = photos[int(model.image(number).name)]
+        pixels = np.rot90(read_image(photo)[0], read_header(photo).turns)  # as stored, like COLMAP's features
+        height, width = pixels.shape[:2]
+        for seen in model.image(number).get_observation_points2D():
+            x, y = np.clip(seen.xy.astype(int), 0, (width - 1, height - 1))
+            sums[seen.point3D_id] += (*pixels[y, x], 1)
+    for number, (*color, count) in sums.items():
+        model.point3D(number).color = np.rint(np.divide(color, count)).astype(np.uint8)
