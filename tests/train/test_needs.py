@@ -254,6 +254,31 @@ def test_reflections_by_what_they_could_be_worth(ball_capture, tmp_path):
     assert not made.state.needs["reflections"]["needed"]
 
 
+@pytest.mark.parametrize("hidden", [0.004, 0.2])
+def test_reflections_of_a_small_part_are_kept(ball_capture, tmp_path, hidden):
+    """Keep inter-reflection for a small part that is chrome, below a plate. The rest of the ball is rough, black and dielectric.
+
+    `hidden` is below or above the least for the whole object. Without the chrome, inter-reflection is left out.
+    """
+    made = trainer(ball_capture, tmp_path / "run", "surfels.metallic=0.9", total=150)
+    made.run(stop=lambda: made.state.iteration == 99)
+    state = made.state
+    top = state.parameters["position"][:, 2] > 0.97
+    for chrome in (True, False):
+        put(made, metallic=-10, albedo=0, roughness=5)
+        with torch.no_grad():
+            state.parameters["metallic"][top & chrome] = 5
+            state.parameters["roughness"][top & chrome] = -3
+            state.parameters["albedo"][top & chrome] = 3
+        state.occluder = None
+        state.photos = [with_rendering(state, p, noise=0.1)._replace(mask=p.mask) for p in state.photos]
+        state.occluder = as_occluder(plate(1.2, -1), scale=0.9)
+        needs.evaluate_mesh(state, hidden)
+        found = state.needs.pop("reflections")
+        assert found["needed"] == chrome
+        assert found["threshold"] == lighting.Reflections.SMALL_PART  # the whole decided nothing
+
+
 def test_views_that_show_the_same_from_the_same_place(ball_capture, tmp_path):
     made = trainer(ball_capture, tmp_path / "run", total=10)
     one = made.state.views[0]
