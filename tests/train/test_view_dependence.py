@@ -13,7 +13,7 @@ from refgs.color import srgb_encode
 from refgs.model import cubemap
 from refgs.model.surfels import activate
 from refgs.train import metals, view_dependence
-from refgs.train.changing_light import part_mirrored
+from refgs.train.changing_light import explained
 from refgs.train.densify import densify
 from refgs.train.needs.materials import CHANGES
 from tests.makers.training import put
@@ -133,10 +133,10 @@ def test_a_small_part_that_shines_counts(made):
     assert view_dependence.change_seen(still, state.wanted()) > CHANGES
 
 
-def of_mirroring(made):
-    """Return which part of the surface's changes only mirroring explains."""
+def explanations(made):
+    """Return how much of the surface's changes a light that changed explains, and how much of the rest mirroring explains."""
     found, positions = view_dependence.observe(made.state), made.state.parameters["position"].detach()
-    return part_mirrored(found, positions, made.state.capture.radius, torch.ones(len(positions), dtype=torch.bool))
+    return explained(found, positions, made.state.capture.radius, torch.ones(len(positions), dtype=torch.bool))
 
 
 def test_a_light_that_changes_does_not_make_metal(made):
@@ -147,18 +147,20 @@ def test_a_light_that_changes_does_not_make_metal(made):
     state.change("light.frame", "world", "photos", "the photos do not tell")
     state.change("render.reflection", "microfacet", "needs", "nor do they tell this")
     assert told(made)[0] > 0.5, "its colours alone are a metal's"
-    assert of_mirroring(made) < 0.5 * metals.MIRRORED
+    lit, mirrored = explanations(made)
+    assert lit > 1.5 * metals.LIT and mirrored < 0.5 * metals.MIRRORED
     put(made, metallic=0.0)
     state.iteration = metals.SOONEST
     metals.set_metals_due(state, 0.25)
     assert (state.parameters["metallic"] == 0).all() and "0%" in state.decided["metals"]
 
 
-@pytest.mark.parametrize("roughness", [-3.0, -1.0, 0.5])
+@pytest.mark.parametrize("roughness", [-1.0, 0.5])  # a sharp image of these lamps is clipped, which tells nothing
 @pytest.mark.parametrize("turn", [False, True])
 def test_metals_mirror(made, roughness, turn):
     show(made, metallic=6.0, roughness=roughness, turn=turn)
-    assert of_mirroring(made) > 2 * metals.MIRRORED
+    lit, mirrored = explanations(made)
+    assert lit < 0.6 * metals.LIT or mirrored > 2 * metals.MIRRORED
 
 
 def test_metals_are_set_once(made):

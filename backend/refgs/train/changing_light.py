@@ -9,49 +9,68 @@ import torch
 from torch import Tensor
 
 from refgs.render.relight import sphere
-from refgs.train.view_dependence import Observations
+from refgs.train.view_dependence import (
+    LEAST_PIXELS,
+    LEAST_VIEWS,
+    Observations,
+    averaged,
+    neighbours,
+    pooled,
+)
 
 SURFELS = 3000  # that are looked at, at the most
 LEAST_SURFELS = 100  # fewer tell nothing
+SMOOTHED = 32  # neighbours whose normals are averaged: those of single surfels are rough early in the training
 LOBES, SHARPNESS = 50, 10.0  # of the function of the mirrored direction: lobes 0.3 radians wide, which cover the sphere
 RIDGE = 1e-3  # of the columns' mean square
 CELL = 0.15  # scene radii: one half of the cells of a grid is fitted, and the other half tells how well
 
 
 @torch.no_grad()
-def part_mirrored(observations: Observations, positions: Tensor, radius: float, wanted: Tensor) -> float | None:
-    """Measure how much of the surface's changes is explained by what it mirrors, and by nothing else.
+def explained(observations: Observations, positions: Tensor, radius: float, wanted: Tensor) -> tuple[float, float]:
+    """Measure how much of the surface's changes a light that changed explains, and how much of the rest is explained by what it mirrors.
 
-    First each photo's exposure and a linear function of the normal explain what they can. The result is the part of the remaining variance
-    that a function of the mirrored direction explains on surfels that it was not fitted to, 0 to 1. Only the surfels `wanted` (N,) count;
-    if they are too few, the result is None. `radius` is the scene's.
+    The first result is the part of the variance that each photo's exposure and a linear function of the normal explain. The second is the
+    part of what they leave that a function of the mirrored direction explains. Both are measured on surfels that were not fitted to,
+    Changes and normals are averaged over neighbours. Only the surfels `wanted` (N,) count; if they are too few, both are 0. `radius` is the
+    scene's.
     """
-    known = observations.usable & wanted[:, None]
+    near = neighbours(positions, SMOOTHED)
+    mean, change, known = averaged(observations, near)
+    known &= wanted[:, None] & (known.sum(dim=1, keepdim=True) >= LEAST_VIEWS)
     chosen = known.any(dim=1).nonzero()[:, 0]
     if len(chosen) < LEAST_SURFELS:
-        return None
+        return 0.0, 0.0
     chosen = chosen[:: -(-len(chosen) // SURFELS)]
     surfel, photo = known[chosen].nonzero(as_tuple=True)
     at = chosen[surfel]
-    weight = observations.pixels[at, photo].double()
-    brightness = observations.mean[at].mean(dim=1).clamp_min(1e-2)
-    change = (observations.change[at, photo].mean(dim=1) / brightness).clamp(-1, 2).double()
+    weight = observations.pixels[at, photo].double().clamp_min(LEAST_PIXELS)
+    relative = (change[at, photo].mean(dim=1) / mean[at].mean(dim=1).clamp_min(1e-2)).clamp(-1, 2).double()
+    smooth = torch.nn.functional.normalize(
+        pooled(observations.normal.flatten(1), near).view_as(observations.normal), dim=2
+    )
+    normal, towards = smooth[at, photo].double(), observations.towards[at, photo].double()
+    mirrored = 2 * (normal * towards).sum(dim=1, keepdim=True) * normal - towards
     of_photo = torch.nn.functional.one_hot(photo, observations.pixels.shape[1]).double()
-    linear = torch.cat([torch.ones_like(weight)[:, None], observations.normal[at, photo].double()], dim=1)
-    mirrored = observations.mirrored[at, photo].double() @ torch.from_numpy(sphere(LOBES)).to(weight).T
+    linear = torch.cat([torch.ones_like(weight)[:, None], normal], dim=1)
+    lobes = (SHARPNESS * (mirrored @ torch.from_numpy(sphere(LOBES)).to(weight).T - 1)).exp()
     lit = (of_photo[:, :, None] * linear[:, None]).flatten(1)
-    columns = torch.cat([change[:, None], lit, (SHARPNESS * (mirrored - 1)).exp()], dim=1)
+    columns = torch.cat([relative[:, None], lit, lobes], dim=1)
     total = columns.new_zeros(len(chosen), columns.shape[1]).index_add_(0, surfel, weight[:, None] * columns)
     weights = weight.new_zeros(len(chosen)).index_add_(0, surfel, weight)
     columns = columns - (total / weights[:, None])[surfel]
     fitted = ((positions[at] / (CELL * radius)).floor().sum(dim=1) % 2) == 0
     target, columns = columns[:, 0], columns[:, 1:]
-    without, all_explain = (_left(target, part, weight, fitted) for part in (columns[:, : lit.shape[1]], columns))
-    return max(0.0, 1 - all_explain / max(without, 1e-12))
+    unlit, lit_left, left = (
+        _left(target, columns[:, :count], weight, fitted) for count in (0, lit.shape[1], columns.shape[1])
+    )
+    return tuple(max(0.0, 1 - after / max(before, 1e-12)) for before, after in ((unlit, lit_left), (lit_left, left)))
 
 
 def _left(target: Tensor, columns: Tensor, weight: Tensor, fitted: Tensor) -> float:
     """Return the mean square of `target` that `columns` leave where they are not `fitted`. The fit is a ridge regression."""
+    if columns.shape[1] == 0:
+        return float((weight * target.square())[~fitted].sum() / weight[~fitted].sum().clamp_min(1e-12))
     rows = columns[fitted] * weight[fitted, None]
     square = rows.T @ columns[fitted]
     ridge = RIDGE * square.diagonal().mean().clamp_min(1e-12) * torch.eye(len(square)).to(square)

@@ -11,7 +11,7 @@ import torch
 
 from refgs.model.surfels import raw_metallic
 from refgs.train import needs
-from refgs.train.changing_light import part_mirrored
+from refgs.train.changing_light import explained
 from refgs.train.needs.materials import SOONEST
 from refgs.train.state import State
 from refgs.train.view_dependence import falls_as_metal, observe, shines_as_metal
@@ -19,7 +19,8 @@ from refgs.train.view_dependence import falls_as_metal, observe, shines_as_metal
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
 METAL = 0.9  # metallic; training can still change it
 CERTAIN = 0.85  # part of the surface that shines as coloured metals do, above which all is metal; a gold cape has 0.95, matte clay 0.71
-MIRRORED = 0.055  # part of the changes that only mirroring explains, below which the light changed; a gold cape has 0.096, matte clay 0.030
+LIT = 0.25  # part of the changes that a light which changed explains, from which on it may be all; matte clay has 0.4
+MIRRORED = 0.05  # part of the changes that only mirroring explains, below which the light changed; a gold cape has 0.17, matte clay 0.00
 HELD = torch.tensor(
     raw_metallic(0.98)
 )  # raw metallic that is held; surfels that have exactly this value are known by it
@@ -44,8 +45,8 @@ def set_metals_due(state: State, progress: float) -> None:
     light = float(state.environment().radiance.detach().mean())
     coloured = shines_as_metal(observations, positions)
     metal = coloured | falls_as_metal(observations, positions, light)
-    mirrored = part_mirrored(observations, positions, state.capture.radius, metal)
-    if mirrored is not None and mirrored < MIRRORED:
+    lit, mirrored = explained(observations, positions, state.capture.radius, metal)
+    if lit > LIT and mirrored < MIRRORED:
         coloured, metal = torch.zeros_like(metal), torch.zeros_like(metal)
     with torch.no_grad():
         if float(weight[coloured].sum()) > CERTAIN * float(weight.sum()):

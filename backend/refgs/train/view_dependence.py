@@ -48,7 +48,7 @@ class Observations(NamedTuple):
     - `pixels` (N, V): the surfel's blending weights in a photo, summed over its pixels; 0 where it is not usable.
     - `clipped` (N, V): the part of `pixels` where the photo is clipped, so that its colour is not known.
     - `normal` (N, V, 3): the surfel's normal towards the camera, in the frame in which the light stands still.
-    - `mirrored` (N, V, 3): the direction, in that frame, that a mirror there would show the camera.
+    - `towards` (N, V, 3): the direction from the surfel to the camera, in that frame.
     """
 
     mean: Tensor
@@ -56,7 +56,7 @@ class Observations(NamedTuple):
     pixels: Tensor
     clipped: Tensor
     normal: Tensor
-    mirrored: Tensor
+    towards: Tensor
 
     @property
     def usable(self) -> Tensor:
@@ -80,11 +80,10 @@ def observe(state: State) -> Observations:
     facing = cosines.sign()[..., None] * normals[:, None]
     places = torch.stack([torch.from_numpy(photo.camera.position) for photo in photos]).to(normals)
     towards = torch.nn.functional.normalize(places - surfels.positions[:, None], dim=2)
-    mirrored = 2 * cosines.abs()[..., None] * facing - towards
     light = None
     if state.settings.light.frame == "camera":
         turns = [torch.from_numpy(turn_between(photo.camera, state.views[0].camera)).to(normals) for photo in photos]
-        facing, mirrored = (torch.einsum("vij,nvj->nvi", torch.stack(turns), each) for each in (facing, mirrored))
+        facing, towards = (torch.einsum("vij,nvj->nvi", torch.stack(turns), each) for each in (facing, towards))
         light = harmonics.basis(facing.flatten(0, 1), 2).unflatten(0, facing.shape[:2])
     mean = torch.zeros_like(normals)
     factor = torch.ones_like(cosines)  # of the mean in a photo: its exposure and its diffuse light
@@ -97,7 +96,7 @@ def observe(state: State) -> Observations:
     totals, pixels, burnt = _residuals(surfels, photos, mean, factor, state.near)
     usable = pixels * (cosines.abs() > FACING)
     some = pixels.clamp_min(1e-6)
-    return Observations(mean, totals / some[..., None], usable, burnt / some, facing, mirrored)
+    return Observations(mean, totals / some[..., None], usable, burnt / some, facing, towards)
 
 
 def _linear(photo: Photo) -> Tensor:
@@ -172,8 +171,8 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Tensor:
     is averaged over neighbours first: texture that is slightly out of place then cancels, and highlights do not. A smaller
     change is enough beside surfels that change clearly. Surfels near grey tell nothing.
     """
-    near = _neighbours(positions, NEIGHBOURS)
-    mean, change, known = _averaged(observations, near)
+    near = neighbours(positions, NEIGHBOURS)
+    mean, change, known = averaged(observations, near)
     count = known.sum(dim=1).clamp_min(1)[:, None, None]
     change = (change - change.sum(dim=1, keepdim=True) / count) * known[..., None]
     relative = change / mean.mean(dim=1)[:, None, None].clamp_min(1e-2)
@@ -188,7 +187,7 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Tensor:
     told = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation > SATURATED) & (tint > METAL) & (size > FAINT_CHANGES)
     metal = told & (size > CHANGES)
     for _ in range(GROWTH):
-        metal = metal | told & (_pooled(metal.float()[:, None], near)[:, 0] > near.shape[1] / 4)
+        metal = metal | told & (pooled(metal.float()[:, None], near)[:, 0] > near.shape[1] / 4)
     return metal
 
 
@@ -200,37 +199,37 @@ def falls_as_metal(observations: Observations, positions: Tensor, light: float) 
     but without them it is hardly darker than in the median. A metal is as dark as what it mirrors. `light` is the light's mean radiance.
     Radiance is averaged over a few neighbours, so that texture that is slightly out of place hardly counts.
     """
-    near = _neighbours(positions, FEW)
-    mean, change, known = _averaged(observations, near)
+    near = neighbours(positions, FEW)
+    mean, change, known = averaged(observations, near)
     radiance = (mean[:, None] + change).mean(dim=2).clamp_min(0).masked_fill(~known, math.nan)
     median, low = radiance.nanquantile(0.5, dim=1), radiance.nanquantile(LOW, dim=1)
     usable = known.sum(dim=1) >= LEAST_VIEWS
     return usable & (median - low > DROP * light) & (low < FALLS * median)
 
 
-def _averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Average observations over each surfel's neighbours, as listed in `near` (N, K).
 
     Returns the mean radiance (N, 3), the changes (N, V, 3), and which photos show them unclipped (N, V).
     """
     weight = observations.pixels * (observations.clipped < LEAST_CLIPPED) * (observations.pixels > LEAST_PIXELS)
-    pixels = _pooled(weight, near)
+    pixels = pooled(weight, near)
     known = pixels > LEAST_PIXELS
-    change = _pooled((observations.change * weight[..., None]).flatten(1), near).view_as(observations.change)
+    change = pooled((observations.change * weight[..., None]).flatten(1), near).view_as(observations.change)
     change = torch.where(known[..., None], change / pixels.clamp_min(1e-6)[..., None], 0)
     seen = observations.pixels.sum(dim=1, keepdim=True)
-    mean = (_pooled(observations.mean * seen, near) / _pooled(seen, near).clamp_min(1e-6)).clamp_min(1e-4)
+    mean = (pooled(observations.mean * seen, near) / pooled(seen, near).clamp_min(1e-6)).clamp_min(1e-4)
     return mean, change, known
 
 
-def _neighbours(positions: Tensor, most: int) -> Tensor:
+def neighbours(positions: Tensor, most: int) -> Tensor:
     """Return the indices (N, K) of each surfel's nearest surfels, itself among them: K is `most`, or N if there are fewer."""
     points = positions.numpy(force=True)
     count = min(most, len(points))
     return torch.from_numpy(cKDTree(points).query(points, k=[*range(1, count + 1)])[1]).to(positions.device)
 
 
-def _pooled(values: Tensor, near: Tensor) -> Tensor:
+def pooled(values: Tensor, near: Tensor) -> Tensor:
     """Sum the rows of `values` (N, K) over each surfel's neighbours."""
     total = torch.zeros_like(values)
     for column in near.T:
