@@ -31,7 +31,7 @@ def explained(observations: Observations, positions: Tensor, radius: float, want
     """Measure how much of the surface's changes a light that changed explains, and how much of the rest is explained by what it mirrors.
 
     The first result is the part of the variance that each photo's exposure and a linear function of the normal explain. The second is the
-    part of what they leave that a function of the mirrored direction explains. Both are measured on surfels that were not fitted to,
+    part of what they leave that a function of the mirrored direction explains. Both are measured on surfels that were not fitted to.
     Changes and normals are averaged over neighbours. Only the surfels `wanted` (N,) count; if they are too few, both are 0. `radius` is the
     scene's.
     """
