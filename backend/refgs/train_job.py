@@ -77,8 +77,9 @@ def train(
         if not state.ended:
             return state, None  # its reduced photos stay, for it may be resumed
         quality = _finish(trainer, out, plan, report)
-        trainer.release_photos()
-        _remove_photos(out)
+        if (out / PHOTOS).exists():
+            trainer.release_photos()
+            _remove_photos(out)
         return state, quality
 
 

@@ -187,7 +187,7 @@ class Trainer:
 
     def release_photos(self) -> None:
         """Drop all photos, when the training has ended: the files that they are mapped from can then be removed, on Windows, too."""
-        self.state.views, self.state.photos, self.state.test = [], [], []
+        self.state.views, self.state.photos, self.state.test, self.state.reduced = [], [], [], None
         del self.measures
 
     def resume(self) -> None:
