@@ -31,14 +31,13 @@ def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedVie
         return [load_view(view, max_side) for view in views]
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
-    loaded = []
-    for view in views:
-        name = _name(view, max_side)
-        found = _read(view.camera.fitted(max_side), folder, name)
-        loaded.append(found or _cached(load_view(view, max_side), folder, name))
-    wanted = {_name(view, max_side) for view in views}
+    names = [_name(view, max_side) for view in views]
+    loaded = [
+        _read(camera, folder, name) or _cached(load_view(view, max_side), folder, name)
+        for view, camera, name in zip(views, cameras, names, strict=True)
+    ]
     for file in folder.glob("*"):
-        if file.name.split(".")[0] not in wanted:
+        if file.name.split(".")[0] not in names:
             file.unlink(missing_ok=True)
     return loaded
 

@@ -51,7 +51,7 @@ def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30)
 
 
-def _mirror(directions, normals):
+def mirror(directions, normals):
     """Reflect directions (P, 3) at surfaces with unit normals (P, 3)."""
     return directions - 2 * (directions * normals).sum(-1)[:, None] * normals
 
@@ -115,7 +115,7 @@ class Transport:
             surfel, way = surfel[met], way[met]
             vertex = mesh.faces[face[met], weights[met].argmax(axis=1)]
             there = self.vertex_normals[vertex]
-            free = occluder.visible(mesh.vertices[vertex], there, _mirror(ways[way], there))
+            free = occluder.visible(mesh.vertices[vertex], there, mirror(ways[way], there))
             parts.append([torch.from_numpy(part) for part in (way.astype(np.int32), vertex.astype(np.int32), free)])
             seen = torch.zeros(len(points[at]), directions)
             seen[surfel, way] = 1
@@ -248,7 +248,7 @@ def _first(transport: Transport, rays: slice, levels: Tensor, sides: tuple[int, 
     first = torch.zeros_like(share)
     # Widths of successive lobes add as Gaussians' do: by their squares. A lobe's width is roughness².
     blurred = (roughness[free, 0] ** 4 + CONE**4) ** 0.25
-    first[free] = share[free] * _prefiltered(levels, sides, _mirror(ray, normals)[free], blurred)
+    first[free] = share[free] * _prefiltered(levels, sides, mirror(ray, normals)[free], blurred)
     share[free] = 0
     return first, share, matte
 

@@ -8,15 +8,8 @@ whatever it is in other photos. What is mirrored is one function of the mirrored
 import torch
 from torch import Tensor
 
-from refgs.render.relight import sphere
-from refgs.train.view_dependence import (
-    LEAST_PIXELS,
-    LEAST_VIEWS,
-    Observations,
-    averaged,
-    neighbours,
-    pooled,
-)
+from refgs.render.relight import mirror, sphere
+from refgs.train.view_dependence import LEAST_PIXELS, LEAST_VIEWS, Observations, averaged, neighbours, pooled
 
 SURFELS = 3000  # that are looked at, at the most
 LEAST_SURFELS = 100  # fewer tell nothing
@@ -50,7 +43,7 @@ def explained(observations: Observations, positions: Tensor, radius: float, want
         pooled(observations.normal.flatten(1), near).view_as(observations.normal), dim=2
     )
     normal, towards = smooth[at, photo].double(), observations.towards[at, photo].double()
-    mirrored = 2 * (normal * towards).sum(dim=1, keepdim=True) * normal - towards
+    mirrored = mirror(-towards, normal)
     of_photo = torch.nn.functional.one_hot(photo, observations.pixels.shape[1]).double()
     linear = torch.cat([torch.ones_like(weight)[:, None], normal], dim=1)
     lobes = (SHARPNESS * (mirrored @ torch.from_numpy(sphere(LOBES)).to(weight).T - 1)).exp()
@@ -61,18 +54,18 @@ def explained(observations: Observations, positions: Tensor, radius: float, want
     columns = columns - (total / weights[:, None])[surfel]
     fitted = ((positions[at] / (CELL * radius)).floor().sum(dim=1) % 2) == 0
     target, columns = columns[:, 0], columns[:, 1:]
-    unlit, lit_left, left = (
-        _left(target, columns[:, :count], weight, fitted) for count in (0, lit.shape[1], columns.shape[1])
-    )
+    lit_left, left = (_unexplained(target, part, weight, fitted) for part in (columns[:, : lit.shape[1]], columns))
+    unlit = _mean_square(target, weight, ~fitted)
     return tuple(max(0.0, 1 - after / max(before, 1e-12)) for before, after in ((unlit, lit_left), (lit_left, left)))
 
 
-def _left(target: Tensor, columns: Tensor, weight: Tensor, fitted: Tensor) -> float:
-    """Return the mean square of `target` that `columns` leave where they are not `fitted`. The fit is a ridge regression."""
-    if columns.shape[1] == 0:
-        return float((weight * target.square())[~fitted].sum() / weight[~fitted].sum().clamp_min(1e-12))
+def _unexplained(target: Tensor, columns: Tensor, weight: Tensor, fitted: Tensor) -> float:
+    """Return the mean square that `columns`, fitted to `target` by ridge regression, leave of it where they are not `fitted`."""
     rows = columns[fitted] * weight[fitted, None]
     square = rows.T @ columns[fitted]
     ridge = RIDGE * square.diagonal().mean().clamp_min(1e-12) * torch.eye(len(square)).to(square)
-    error = target - columns @ torch.linalg.solve(square + ridge, rows.T @ target[fitted])
-    return float((weight * error.square())[~fitted].sum() / weight[~fitted].sum().clamp_min(1e-12))
+    return _mean_square(target - columns @ torch.linalg.solve(square + ridge, rows.T @ target[fitted]), weight, ~fitted)
+
+
+def _mean_square(values: Tensor, weight: Tensor, chosen: Tensor) -> float:
+    return float((weight * values.square())[chosen].sum() / weight[chosen].sum().clamp_min(1e-12))

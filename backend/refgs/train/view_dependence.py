@@ -15,7 +15,6 @@ from refgs.color import srgb_decode, srgb_encode
 from refgs.model import harmonics
 from refgs.model.environment import turn_between
 from refgs.model.surfels import Surfels
-from refgs.render.facing import facing_cosine
 from refgs.train import probe
 from refgs.train.losses import Photo
 from refgs.train.state import State
@@ -76,10 +75,10 @@ def observe(state: State) -> Observations:
     surfels = Surfels(*(value.detach() for value in state.surfels()))
     photos = [state.photo(view) for view in probe.spread_views(state, VIEWS)]
     normals = surfels.normals()
-    cosines = torch.stack([facing_cosine(surfels.positions, normals, photo.camera) for photo in photos], dim=1)
-    facing = cosines.sign()[..., None] * normals[:, None]
     places = torch.stack([torch.from_numpy(photo.camera.position) for photo in photos]).to(normals)
     towards = torch.nn.functional.normalize(places - surfels.positions[:, None], dim=2)
+    cosines = (towards * normals[:, None]).sum(dim=2)
+    facing = cosines.sign()[..., None] * normals[:, None]
     light = None
     if state.settings.light.frame == "camera":
         turns = [torch.from_numpy(turn_between(photo.camera, state.views[0].camera)).to(normals) for photo in photos]
