@@ -115,6 +115,10 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
     if missing := [photo.name for photo in photos if photo.name not in placed]:
         names = ", ".join(missing[:5]) + (" …" if len(missing) > 5 else "")
         what = f"{len(missing)} of {len(photos)} photos could not be placed and are left out: {names}; more photos between them help"
+        if not masks:
+            what += (
+                "; if the object turned, put masks of the object in the folder masks, remove sparse and search again"
+            )
         report("warning", {"what": what})
     if found.contradicted > CONTRADICTED:
         what = f"the cameras contradict {found.contradicted:.0%} of what the photos have in common, {DOUBTED}"
