@@ -111,9 +111,11 @@ from refgs_addon import jobs
 python, capture, out, kept = sys.argv[1:]
 job = jobs.train(Path(python), Path(capture), Path(out), Path(out + ".txt"), mesh=False)
 job.keep(kept == "kept")
+asked = False  # once: an answer to a second request may find Blender gone, and would end the trainer before its checkpoint
 while job.state != "paused":
-    if job.progress:
+    if job.progress and not asked:
         job.tell("pause")
+        asked = True
     jobs.poll()
     time.sleep(0.05)
 print("paused", flush=True)
