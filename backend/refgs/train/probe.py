@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from refgs.model.environment import Environment
+from refgs.model.harmonics import DC
 from refgs.model.surfels import Surfels
 from refgs.render.rasterize import rasterize
 from refgs.render.rendering import COVERED, Rendering
@@ -183,7 +184,8 @@ def blended_shares(
 def mirrored_and_mean(state: State, inputs: RenderInputs, views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
     """Render `views` twice, encoded (H, W, 3): with reflections, and with reflections that do not change with the view.
 
-    In the second picture, each surfel's specular colour is its mean over the `views`. Call this without gradients.
+    In the second picture, each surfel's specular colour is its mean over the `views`, which a matte surface could learn as albedo. Call
+    this without gradients.
     """
     dull = without_specular(inputs)
     over = (picture(state, view, inputs).radiance - picture(state, view, dull).radiance for view in views)
@@ -201,11 +203,21 @@ def mirrored_and_mean(state: State, inputs: RenderInputs, views: list[int]) -> I
 def specular_explains(state: State) -> Lost:
     """Compute how many dB of PSNR the training views lose if reflections no longer change with the view.
 
-    For the comparison, each surfel's specular colour is replaced by its mean over the photos. A matte surface could learn this mean as
-    albedo. The dB lost therefore show what only specular shading can explain.
+    This is what only specular shading can explain (see `mirrored_and_mean`).
     """
     inputs, some = state.inputs(), spread_views(state, SEVERAL)
     return lost(_on_object(state, inputs, some, mirrored_and_mean(state, inputs, some)))
+
+
+def mirroring_itself(inputs: RenderInputs, radiance: Tensor) -> RenderInputs:
+    """Return inputs for rendering the linear `radiance` (3,) where the object hides the light from what mirrors it."""
+    surfels = inputs.surfels
+    constant = surfels._replace(
+        indirect_dc=(radiance / DC).expand_as(surfels.indirect_dc),
+        indirect_rest=torch.zeros_like(surfels.indirect_rest),
+        received=torch.ones_like(surfels.received),
+    )
+    return inputs._replace(surfels=constant)
 
 
 @torch.no_grad()
@@ -217,15 +229,11 @@ def reflections_explain(state: State) -> Lost:
     difference is added to the error against the photos.
     """
     inputs, wrong, apart = state.inputs(), [], []
-    black = inputs.surfels._replace(
-        indirect_dc=torch.zeros_like(inputs.surfels.indirect_dc),
-        indirect_rest=torch.zeros_like(inputs.surfels.indirect_rest),
-        received=torch.ones_like(inputs.surfels.received),
-    )
+    black = mirroring_itself(inputs, torch.zeros(3, device=state.device))
     for view in spread_views(state):
         shown = on_object(state, inputs.surfels, view)
         free = picture(state, view, inputs._replace(occluder=None)).color[shown].clamp(0, 1)
-        hidden = picture(state, view, inputs._replace(surfels=black)).color[shown].clamp(0, 1)
+        hidden = picture(state, view, black).color[shown].clamp(0, 1)
         wrong.append((free - state.photo(view).over(state.background)[shown]).square().mean(dim=1))
         apart.append((free - hidden).square().mean(dim=1))
     errors, more = torch.cat(wrong), torch.cat(apart)

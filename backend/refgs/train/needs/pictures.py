@@ -14,7 +14,7 @@ from torch import Tensor
 
 from refgs.compare.pictures import write_png
 from refgs.train import probe
-from refgs.train.state import State
+from refgs.train.state import RenderInputs, State
 
 FOLDER = "needs"  # in the run folder
 SIDE = 320  # pixels of a picture on its longer side: a panel shows no more
@@ -62,22 +62,29 @@ def _reduced(picture: Tensor) -> np.ndarray:
 
 
 def _specular(state: State, found: dict[str, Any], views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render what is mirrored, and the same as if it did not change with the view, as `probe.specular_explains` compares them."""
+    """Render what is mirrored, and the same as if it did not change with the view."""
     return probe.mirrored_and_mean(state, state.inputs(), views)
 
 
 def _reflections(state: State, found: dict[str, Any], views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
-    """Render black where the object hides the light from what mirrors it, which is more than it can mirror; and the light everywhere."""
+    """Render the object's mean radiance where it hides the light from what mirrors it, and the light everywhere.
+
+    What the object mirrors of itself is not known before it is traced.
+    """
     inputs = state.inputs()
-    surfels = inputs.surfels
-    black = surfels._replace(
-        indirect_dc=torch.zeros_like(surfels.indirect_dc),
-        indirect_rest=torch.zeros_like(surfels.indirect_rest),
-        received=torch.ones_like(surfels.received),
-    )
-    ways = inputs._replace(surfels=black), inputs._replace(occluder=None)
-    for view in views if inputs.occluder is not None else ():
+    if inputs.occluder is None:
+        return
+    ways = probe.mirroring_itself(inputs, _mean_radiance(state, inputs, views)), inputs._replace(occluder=None)
+    for view in views:
         yield tuple(probe.picture(state, view, way).color for way in ways)
+
+
+def _mean_radiance(state: State, inputs: RenderInputs, views: list[int]) -> Tensor:
+    """Return the mean linear radiance (3,) of the object's pixels in the views, as `inputs` render it."""
+    shown = (
+        probe.picture(state, view, inputs).radiance[probe.on_object(state, inputs.surfels, view)] for view in views
+    )
+    return torch.stack([radiance.mean(dim=0) for radiance in shown if len(radiance)]).mean(dim=0)
 
 
 def _light(state: State, found: dict[str, Any], views: list[int]) -> Iterator[tuple[Tensor, Tensor]]:
