@@ -101,8 +101,8 @@ class Training(bpy.types.PropertyGroup):
         description="Reflections of the object in itself",
         items=[
             ("auto", "Auto", "Leave them out where the object hardly reflects itself. Paper always traces them"),
-            ("on", "Of the Object Too", "Trace the object's reflections in itself, however faint"),
-            ("off", "Of the Light Only", "Do not trace the object's reflections in itself: faster"),
+            ("on", "Object Too", "Trace the object's reflections in itself, however faint"),
+            ("off", "Light Only", "Do not trace the object's reflections in itself: faster"),
         ],
     )
     region: PointerProperty(

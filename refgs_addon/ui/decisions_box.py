@@ -13,9 +13,10 @@ from .operators import OnRunFolder, has_trainer
 
 NAMES = {  # the question, and its two answers
     "specular": ("Gloss", "Glossy", "Matte"),
-    "reflections": ("Reflections", "Of the Object Too", "Of the Light Only"),
+    "reflections": ("Reflections", "Object Too", "Light Only"),
     "light": ("Light", "Sharp", "Soft"),
 }
+PICTURE = 0.11  # lines of height for each letter of width: pictures fill a third of the sidebar
 
 
 class _OnDecision(OnRunFolder):
@@ -62,18 +63,17 @@ def _draw(box: bpy.types.UILayout, folder: Path, decision: Decision, width: int)
     row = box.row()
     for kind, name in (*names.items(), ("photo", "Photo")):
         column = row.column(align=True)
-        column.alert = kind == decision.answer
         written = decision.pictures[kind].stat().st_mtime_ns if decision.pictures[kind].is_file() else 0
-        column.template_icon(icon_value=thumbnail(decision.pictures[kind], written) if written else 0, scale=5)
-        column.label(text=name, icon="CHECKMARK" if kind == decision.answer else "NONE")
-    figures = ", ".join(f"{names[kind]} {decision.psnr[kind]:.1f} dB" for kind in names)
-    box.label(text=f"{figures} of photo {decision.view}")
-    row = box.row(align=True)
+        icon = thumbnail(decision.pictures[kind], written) if written else 0
+        column.template_icon(icon_value=icon, scale=max(3.0, PICTURE * width))
+        column.label(text=name)
+        column.label(text=f"{decision.psnr[kind]:.2f} dB" if kind in decision.psnr else decision.view)
+    column = box.column(align=True)
     for operator, text, icon in (
         (KeepDecision, f"Keep {names[decision.answer]}", "CHECKMARK"),
         (TrainOtherWay, f"Train {names[decision.other]}", "PLAY"),
     ):
-        button = row.operator(operator.bl_idname, text=text, icon=icon)
+        button = column.operator(operator.bl_idname, text=text, icon=icon)
         button.folder, button.need = str(folder), decision.need
 
 

@@ -52,7 +52,7 @@ def test_a_decision_is_a_choice_with_pictures(addon, run, monkeypatch):
     monkeypatch.setattr(decisions_box, "thumbnail", pictures)  # Blender has no icons without a window
     labels, icons, buttons = draw(addon, run)
     assert labels[0] == "Gloss: Matte" and "It explains 0.10 dB" in labels
-    assert labels[-1] == "Glossy 31.2 dB, Matte 31.1 dB of photo 0003"
+    assert labels[-6:] == ["Glossy", "31.24 dB", "Matte", "31.10 dB", "Photo", "0003"]
     assert [icon.kwargs["icon_value"] for icon in icons] == [1, 2, 3]
     assert [Path(call.args[0]).name for call in pictures.call_args_list] == [
         "specular_on.png",
