@@ -140,13 +140,16 @@ def _with_masks(
     """Make masks of a capture that has none, so that the object is trained alone.
 
     Return the capture with its masks, the settings, the changes that lead to them, and records of what was changed. A box in the settings
-    is moved with the capture's frame. If no masks can be made, report a warning and return what was given.
+    is moved with the capture's frame. If no object is found, report a warning and return what was given. Raises InputError if masks cannot
+    be written: learnt with its surroundings, the object would be worth little.
     """
     from refgs.capture import read_capture
-    from refgs.capture.masks import make_masks, masks_folder
+    from refgs.capture.masks import ReadOnlyError, make_masks, masks_folder
 
     try:
         found = make_masks(capture.folder, settings.region, report)
+    except ReadOnlyError as error:
+        raise InputError(f"{error} Or train on all that the photos show: --set image.masks=off") from None
     except (InputError, OSError) as error:
         report("warning", {"what": f"training on all that the photos show, for no masks were made: {error}"})
         return capture, settings, changes, {}

@@ -38,6 +38,10 @@ CARVED_BY = 60  # photos at most
 MADE = "made.json"
 
 
+class ReadOnlyError(InputError):
+    """Masks cannot be made, because the capture's folder cannot be written to."""
+
+
 def make_masks(
     folder: Path, wanted: RegionSettings | None, report: Callable[[str, dict[str, Any]], None]
 ) -> dict[str, Any]:
@@ -51,7 +55,7 @@ def make_masks(
     list, is p_new = moved @ p.
 
     All masks are written together at the end; an interrupted call leaves those of before. Raises InputError if all photos have masks by the
-    artist, if strokes do not fit, if nothing is found, or if the folder cannot be written to.
+    artist, if strokes do not fit, or if nothing is found, and ReadOnlyError if the folder cannot be written to.
     """
     folder = Path(folder)
     capture = read_capture(folder, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
@@ -160,7 +164,7 @@ def masks_folder(capture: Capture) -> Path:
 def _check_writable(root: Path) -> None:
     # A folder whose owner took away the right to write is left alone, even where this process could write to it.
     if not os.access(root, os.W_OK) or not root.stat().st_mode & 0o222:
-        raise InputError(f"{root} is read-only: masks cannot be written to it. Copy the capture.")
+        raise ReadOnlyError(f"{root} is read-only: masks cannot be written to it. Copy the capture.")
 
 
 def _root(capture: Capture) -> Path:
