@@ -80,6 +80,11 @@ class SurfelSettings(_Section):
     primitive: Literal["2dgs", "3dgs"] = Field(description="2dgs: flat discs")
     start: int = Field(ge=1, le=10_000_000, description="number of surfels at the start")
     budget: int = Field(ge=1, le=10_000_000, description="maximum number of surfels")
+    density: float = Field(
+        ge=0,
+        description="maximum number of surfels for each pixel of the object in a photo, where that is less than budget, but "
+        "at least twice start; 0: budget alone counts",
+    )
     hull: int = Field(ge=16, le=512, description="voxels along each side of the visual hull")
     inside: float = Field(
         ge=0, lt=1, description="part of the first surfels inside the visual hull; the others lie on it"

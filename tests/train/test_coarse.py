@@ -7,6 +7,7 @@ import torch
 from refgs import train_job
 from refgs.capture import cached
 from refgs.train import coarse
+from refgs.train.object_size import object_size
 from refgs.train.plan import FULL, Stage
 from tests.makers.training import check_equal, trainer
 
@@ -32,7 +33,7 @@ def test_photos_are_reduced_as_long_as_the_object_stays_large(pixels, factors):
 def test_a_small_object_is_trained_on_full_photos(ball_capture, tmp_path):
     state = trainer(ball_capture, tmp_path / "run").state
     assert state.reduced is None and state.stages == FULL
-    assert 30 < coarse.extent(state) < 64
+    assert 30 < object_size(state).span < 64
 
 
 def test_where_the_object_is_not_known_photos_are_full(ball_capture, tmp_path, large):
@@ -40,9 +41,9 @@ def test_where_the_object_is_not_known_photos_are_full(ball_capture, tmp_path, l
     state = trainer(ball_capture, tmp_path / "run").state
     assert state.reduced is not None
     state.from_hull = False
-    assert coarse.extent(state) == 0
+    assert object_size(state).span == 0
     small = ["region.centre=[0.0,0.0,0.9]", "region.size=[0.2,0.2,0.2]"]
-    assert 0 < coarse.extent(trainer(ball_capture, tmp_path / "part", *small).state) < 20
+    assert 0 < object_size(trainer(ball_capture, tmp_path / "part", *small).state).span < 20
 
 
 def test_each_stage_has_its_photos_and_decisions_see_full_ones(ball_capture, tmp_path, large, monkeypatch):

@@ -18,11 +18,11 @@ QUICK, STANDARD = load_settings("quick"), load_settings("standard")
 def test_it_lies_between_the_presets():
     assert between(QUICK, STANDARD, 0.0) == QUICK and between(QUICK, STANDARD, 1.0) == STANDARD
     half = between(QUICK, STANDARD, 0.5)
-    assert half.surfels.budget == pytest.approx((24000 * 60000) ** 0.5, abs=1)
+    assert half.surfels.budget == pytest.approx((24000 * 160000) ** 0.5, abs=1)
     assert half.environment.resolution == 64 and half.image.max_side == 566
     assert half.loss == STANDARD.loss and half.rates == STANDARD.rates
     beyond = between(QUICK, STANDARD, 2.0)
-    assert beyond.surfels.budget == 150_000 and beyond.environment.resolution == 256 and beyond.image.max_side == 1600
+    assert beyond.surfels.budget == 1_066_667 and beyond.environment.resolution == 256 and beyond.image.max_side == 1600
 
 
 @pytest.mark.parametrize("part, factor", [(0.25, 2), (0.5, 2**0.5), (1.01, 1), (1.99, 1), (4, 0.5**0.5)])
@@ -57,7 +57,8 @@ def test_more_time_brings_more_of_all(ball_capture, tmp_path):
     short, *_, long = found
     assert short.surfels.budget == QUICK.surfels.budget and short.train.iterations < QUICK.train.iterations
     assert short.densify.every < QUICK.densify.every and short.indirect.every < QUICK.indirect.every
-    assert long.surfels.budget == 150_000 and long.train.iterations > 2 * STANDARD.train.iterations
+    assert long.surfels.budget == 2 * long.surfels.start == 112_500  # the ball is small
+    assert long.train.iterations > 2 * STANDARD.train.iterations
     ratio = QUICK.train.iterations / short.train.iterations
     assert short.rates.albedo == pytest.approx(min(ratio**0.5, FASTEST) * QUICK.rates.albedo, rel=1e-3)
     assert short.rates.decay == QUICK.rates.decay

@@ -3,37 +3,17 @@
 Small objects are trained on full photos from the start: of an object of 64 pixels, half the size loses 0.3 dB.
 """
 
-from statistics import median
-
 from refgs.capture import LoadedView, reduced_views
 from refgs.run_folder import PHOTOS
 from refgs.train import poses
 from refgs.train.losses import Photo
 from refgs.train.needs.photos import MARGIN, bounds
+from refgs.train.object_size import object_size
 from refgs.train.plan import FULL, Stage
-from refgs.train.state import Reduced, State, spread
+from refgs.train.state import Reduced, State
 
 STAGES = (0.35, 4), (0.7, 2)  # part of the training until which photos are reduced, and by what factor
 LEAST = 200  # pixels of the object in reduced photos
-VIEWS = 24  # that are looked at, at the most
-
-
-def extent(state: State) -> float:
-    """Measure how many pixels the object spans in the full photos: the longer side of a mask's bounds, a median over views.
-
-    With a region to train, it is at most the width of the ball around that. Without masks, the object is not known, and the extent is 0.
-    """
-    if not state.from_hull:
-        return 0.0
-    found, capture = [], state.capture
-    for view in spread(state.views, VIEWS):
-        rows, columns = bounds(view.alpha, 0)
-        pixels = max(rows.stop - rows.start, columns.stop - columns.start)
-        if capture.box is not None:
-            depth = view.camera.world_to_camera[2] @ [*capture.centre, 1.0]
-            pixels = min(pixels, 2 * capture.radius * view.camera.fx / max(depth, capture.radius))
-        found.append(float(pixels))
-    return median(found)
 
 
 def stages(pixels: float) -> tuple[Stage, ...]:
@@ -45,7 +25,8 @@ def begin(state: State) -> None:
     """Choose the stages of a training by its photos, and start with the first one."""
     if state.settings.image.coarse == "off":
         return
-    found = stages(pixels := extent(state))
+    pixels = object_size(state).span
+    found = stages(pixels)
     if state.poses is not None:  # that they are refined takes full photos
         found = *(stage for stage in found if stage.until <= poses.KNOWN), *FULL
     state.stages = found

@@ -8,6 +8,7 @@ from refgs.events import Report
 from refgs.settings import RATES, Settings, load_settings, validate
 from refgs.train import coarse
 from refgs.train.effective import Effective
+from refgs.train.object_size import object_size, surfel_budget
 from refgs.train.plan import BY_PIXELS, END, END_A_VIEW, FULL, OTHERS, Plan, growth, iterations_time
 from refgs.train.trainer import Trainer
 
@@ -37,7 +38,7 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
         marks.append(plan.spent)
     pace = (marks[-1] - marks[WARM - 1]) / (REHEARSED - WARM) / trainer.state.stages[0].cost  # on full photos
     views, first = len(capture.train_views) + len(capture.test_views), len(trainer.state.parameters["position"])
-    pixels, spans = _pixels(capture, quick), coarse.extent(trainer.state)
+    pixels, size = _pixels(capture, quick), object_size(trainer.state)
 
     def iterations(settings: Settings) -> float:
         """Estimate how many iterations with these settings fit into the time that is left."""
@@ -48,8 +49,8 @@ def fitting(capture: Capture, changes: list[str], folder: Path, plan: Plan, devi
         left = 60 * plan.minutes - plan.spent
         if settings is not quick:
             left -= (started - begun) * larger  # for another start
-        more = growth(start, settings.surfels.budget)
-        stages = FULL if settings.image.coarse == "off" else coarse.stages(spans * larger**0.5)
+        more = growth(start, surfel_budget(settings.surfels, size.area * larger))
+        stages = FULL if settings.image.coarse == "off" else coarse.stages(size.span * larger**0.5)
         return (left / one - more * (END_A_VIEW * views + END)) / iterations_time(more, 1.0, stages)
 
     why = f"{plan.minutes:g} minutes were given"

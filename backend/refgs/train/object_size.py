@@ -1,0 +1,56 @@
+"""Measure how large the object is in the photos, and allow as many surfels as that takes."""
+
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+
+from refgs.settings import SurfelSettings
+from refgs.train.needs.photos import bounds
+from refgs.train.state import State, spread
+
+VIEWS = 24  # that are looked at, at the most
+LEAST = 2  # times as many surfels as at the start are allowed, however small the object is
+
+
+class ObjectSize(NamedTuple):
+    """Hold the object's size in the full photos, in pixels: medians over views. Both are 0 if it is not known, without masks.
+
+    `span` is the longer side of a mask's bounds, and `area` is the number of pixels in the mask. With a region to train, they are at most
+    those of the ball around that.
+    """
+
+    span: float
+    area: float
+
+
+def object_size(state: State) -> ObjectSize:
+    """Measure the object's size in the training photos."""
+    if not state.from_hull:
+        return ObjectSize(0.0, 0.0)
+    spans, areas, capture = [], [], state.capture
+    for view in spread(state.views, VIEWS):
+        rows, columns = bounds(view.alpha, 0)
+        span, area = max(rows.stop - rows.start, columns.stop - columns.start), np.count_nonzero(view.alpha > 127)
+        if capture.box is not None:
+            depth = view.camera.world_to_camera[2] @ [*capture.centre, 1.0]
+            ball = 2 * capture.radius * view.camera.fx / max(depth, capture.radius)
+            span, area = min(span, ball), min(area, np.pi / 4 * ball**2)
+        spans.append(float(span))
+        areas.append(float(area))
+    return ObjectSize(median(spans), median(areas))
+
+
+def surfel_budget(settings: SurfelSettings, area: float) -> int:
+    """Return how many surfels an object of `area` pixels in a photo gets at the most: `density` a pixel, but no more than `budget`."""
+    if settings.density == 0:
+        return settings.budget
+    return min(settings.budget, max(LEAST * settings.start, round(settings.density * area)))
+
+
+def limit_surfels(state: State) -> None:
+    """Lower the surfel budget to what the object takes."""
+    area = object_size(state).area
+    if (budget := surfel_budget(state.settings.surfels, area)) < state.settings.surfels.budget:
+        known = f"the object covers {area:,.0f} pixels of a photo" if area else "no masks show the object's size"
+        state.change("surfels.budget", budget, "photos", known)
