@@ -12,7 +12,7 @@ from benchmarks.scenes.analytic import write_ball_capture
 from refgs.color import srgb_encode
 from refgs.model import cubemap
 from refgs.model.surfels import activate
-from refgs.train import metals, view_dependence
+from refgs.train import even_metal, metals, view_dependence
 from refgs.train.changing_light import explained
 from refgs.train.densify import densify
 from refgs.train.needs.materials import CHANGES
@@ -202,3 +202,24 @@ def test_what_is_metal_all_over_is_held(made):
     made.step()
     assert divided > 0
     assert int((state.parameters["metallic"] == metals.HELD).sum()) > held + 0.9 * divided
+
+
+@pytest.mark.parametrize("albedo, even", [(ORANGE, True), ([1.0, 1.0, 1.0], False)])
+def test_paint_is_averaged_on_coloured_metal_only(made, albedo, even):
+    """Check that base colours differ less where the surface is coloured metal, and are left alone elsewhere and late in the training."""
+    state = made.state
+    upper = state.parameters["position"].detach()[:, 2] > 0
+    noise = 0.5 * torch.randn(len(upper), 1, generator=torch.Generator().manual_seed(0))
+    paint = torch.tensor(albedo) + noise  # brighter and darker
+    put(made, metallic=torch.where(upper, 6.0, -6.0), albedo=paint, opacity=2.0)
+    state.metals_set, state.iteration = True, even_metal.EVERY
+    even_metal.even_out_due(state, even_metal.UNTIL)
+    assert torch.equal(state.parameters["albedo"], paint)
+    even_metal.even_out_due(state, 0.5)
+    found = state.parameters["albedo"].detach() - torch.tensor(albedo)
+    assert torch.equal(state.parameters["albedo"][~upper], paint[~upper])
+    if even:
+        assert float(found[upper].std()) < 0.35 * float(noise[upper].std())  # of 16 neighbours: 1/4
+        assert float(found[upper].mean()) == pytest.approx(float(noise[upper].mean()), abs=0.03)
+    else:
+        assert torch.equal(state.parameters["albedo"], paint)

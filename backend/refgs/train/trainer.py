@@ -12,7 +12,7 @@ from refgs.compare.metrics import decibels
 from refgs.events import Report
 from refgs.memory import trim
 from refgs.settings import Settings
-from refgs.train import coarse, densify, exposures, history, light, metals, needs, poses, snapshot
+from refgs.train import coarse, densify, even_metal, exposures, history, light, metals, needs, poses, snapshot
 from refgs.train.effective import Effective
 from refgs.train.guard import Guard, running, warn
 from refgs.train.losses import departure, objective
@@ -80,6 +80,7 @@ class Trainer:
         with state.clock.part("deciding"):
             needs.evaluate_iteration(state, progress)
             metals.set_metals_due(state, progress)
+        even_metal.even_out_due(state, progress)
         densify.densify_due(state, progress)
         densify.reshape_due(state)
         exposures.leave_out_alike(state, progress)

@@ -180,10 +180,9 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Tensor:
     axis = axis * torch.sign(axis.sum(dim=1, keepdim=True))
     axis = axis / axis.sum(dim=1, keepdim=True).clamp_min(0.2)
     from_grey = mean / mean.sum(dim=1, keepdim=True) - 1 / 3
-    saturation = from_grey.norm(dim=1)
-    tint = ((axis - 1 / 3) * from_grey).sum(dim=1) / saturation.square().clamp_min(1e-6)
+    tint = ((axis - 1 / 3) * from_grey).sum(dim=1) / from_grey.square().sum(dim=1).clamp_min(1e-6)
     size = covariance.diagonal(dim1=1, dim2=2).mean(dim=1).sqrt()
-    told = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation > SATURATED) & (tint > METAL) & (size > FAINT_CHANGES)
+    told = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation(mean) > SATURATED) & (tint > METAL) & (size > FAINT_CHANGES)
     metal = told & (size > CHANGES)
     for _ in range(GROWTH):
         metal = metal | told & (pooled(metal.float()[:, None], near)[:, 0] > near.shape[1] / 4)
@@ -204,6 +203,11 @@ def falls_as_metal(observations: Observations, positions: Tensor, light: float) 
     median, low = radiance.nanquantile(0.5, dim=1), radiance.nanquantile(LOW, dim=1)
     usable = known.sum(dim=1) >= LEAST_VIEWS
     return usable & (median - low > DROP * light) & (low < FALLS * median)
+
+
+def saturation(colour: Tensor) -> Tensor:
+    """Return the distance of linear colours' (N, 3) chromaticity from grey (N,)."""
+    return (colour / colour.sum(dim=1, keepdim=True).clamp_min(1e-6) - 1 / 3).norm(dim=1)
 
 
 def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:

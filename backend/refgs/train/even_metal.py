@@ -1,0 +1,45 @@
+"""Learn the relief of coloured metal as normals, not as paint.
+
+Base colours and roughness that differ from surfel to surfel explain the light and shade of an embossed metal as well as normals do, and
+they learn faster. Until late in the training, both are therefore averaged over neighbours where the surface is coloured metal, and normals
+have to explain what is finer. After that, the photos add what normals do not explain, such as dirt in the hollows. Grey metals are left
+alone: print, brushing and tarnish are real patterns on them, of a colour of their own or none.
+"""
+
+import torch
+from torch import Tensor
+
+from refgs.model.surfels import Surfels
+from refgs.train.state import State
+from refgs.train.view_dependence import neighbours, pooled, saturation
+
+EVERY = 50  # iterations
+UNTIL = 0.7  # part of the training
+AVERAGED = 16  # neighbours
+METALLIC = 0.8
+SATURATED = 0.08  # distance of the base colour's chromaticity from grey: gold has 0.23, copper 0.14, silver 0.03
+
+
+def coloured_metal(surfels: Surfels) -> Tensor:
+    """Tell which surfels (N,) are coloured metal, as far as they have learned."""
+    return (surfels.metallic > METALLIC) & (saturation(surfels.albedo) > SATURATED)
+
+
+@torch.no_grad()
+def even_out_due(state: State, progress: float) -> None:
+    """Average base colour and roughness of coloured metal over neighbours, if this iteration is scheduled for it.
+
+    Opaque neighbours count more, and only those that are coloured metal, too.
+    """
+    if not state.metals_set or state.iteration % EVERY or progress >= UNTIL:
+        return
+    surfels = state.surfels()
+    if not (metal := coloured_metal(surfels)).any():
+        return
+    near = neighbours(surfels.positions, AVERAGED)
+    weight = (surfels.opacities * metal).view(-1, 1)
+    total = pooled(weight, near).clamp_min(1e-6)
+    for name in {"albedo", "roughness"} & state.parameters.keys():
+        values = state.parameters[name]
+        mean = pooled(weight * values.view(len(weight), -1), near) / total
+        values[metal] = mean.view_as(values)[metal]
