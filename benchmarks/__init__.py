@@ -3,4 +3,4 @@
 Both commands need a clone of the repository. `benchmarks.scenes` renders test scenes whose true shape, materials and light are known.
 """
 
-BENCHMARKS = ("kernels", "truth", "real", "cameras", "paper", "needs", "poses", "minutes", "gpu", "page")
+BENCHMARKS = ("kernels", "truth", "real", "cameras", "paper", "needs", "poses", "masks", "minutes", "gpu", "page")

@@ -32,7 +32,7 @@ class Renderer:
     def __init__(self, mesh: Mesh, materials: tuple[Material, ...], size: int, samples: int):
         bpy.ops.wm.read_factory_settings(use_empty=True)
         self.scene = scene = bpy.context.scene
-        self._object(mesh, materials)
+        self.add(mesh, materials)
         self._camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
         self._camera.data.angle = FIELD_OF_VIEW
         scene.collection.objects.link(self._camera)
@@ -120,7 +120,8 @@ class Renderer:
             parts = OpenEXR.File(str(path), separate_channels=True).parts
             return {name: channel.pixels for part in parts for name, channel in part.channels.items()}
 
-    def _object(self, mesh: Mesh, materials: tuple[Material, ...]) -> None:
+    def add(self, mesh: Mesh, materials: tuple[Material, ...]) -> bpy.types.Object:
+        """Add a mesh to the scene. Return its Blender object."""
         data = bpy.data.meshes.new("Object")
         data.from_pydata(mesh.vertices, [], mesh.triangles)
         data.polygons.foreach_set("material_index", mesh.material.astype(np.int32))
@@ -134,7 +135,9 @@ class Renderer:
                     layer.data.foreach_set("color", value.ravel())
             data.materials.append(_material(material, index))
         data.update()
-        self.scene.collection.objects.link(bpy.data.objects.new("Object", data))
+        added = bpy.data.objects.new("Object", data)
+        self.scene.collection.objects.link(added)
+        return added
 
 
 def _material(values: Material, index: int) -> bpy.types.Material:
