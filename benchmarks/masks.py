@@ -10,6 +10,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -49,7 +50,8 @@ def sheet(folder: Path) -> np.ndarray:
     for index in np.unique(np.linspace(0, len(views) - 1, SHOWN).round().astype(int)):
         view = load_view(views[index], SIDE)
         inside = (view.alpha > 127).astype(np.uint8)
-        picture = np.where(inside[..., None] > 0, view.bytes, view.bytes // 3)
+        whole = load_view(replace(views[index], mask_path=None), SIDE).bytes
+        picture = np.where(inside[..., None] > 0, whole, whole // 3)
         picture[cv2.morphologyEx(inside, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > 0] = (0, 255, 0)
         height, width = picture.shape[:2]
         pictures.append(np.pad(picture, ((0, SIDE - height), (0, SIDE - width), (0, 0))))

@@ -11,13 +11,24 @@ from PIL import Image
 from refgs import commands
 from refgs.capture import masks as making
 from refgs.capture import read_capture, silhouettes
+from refgs.capture.backdrop import find_plane
 from refgs.capture.images import read_image
 from refgs.capture.masks import make_masks, region_settings
-from refgs.capture.silhouettes import find_floor
 from refgs.errors import InputError
 from refgs.settings import load_settings
-from tests.makers.captures import CENTRE, ball, colmap, edit, look_at, ring, write, write_as_phone
-from tests.makers.unmasked import ASIDE, COUNT, SIZE, colored, photograph
+from tests.makers.captures import (
+    CENTRE,
+    ball,
+    ball_normals,
+    colmap,
+    edit,
+    look_at,
+    nerfstudio,
+    ring,
+    write,
+    write_as_phone,
+)
+from tests.makers.unmasked import ASIDE, COUNT, FOCAL, SIZE, colored, photograph
 
 LENS = {"k1": 0.1, "k2": -0.02, "p1": 0.002, "p2": -0.001}
 
@@ -38,6 +49,23 @@ def washer(pose, width, height, focal):
         x, y, z = np.moveaxis(pose[:3, 3] + depth * rays - CENTRE, -1, 0)
         hit |= (np.abs(z) < 0.08) & (np.hypot(x, y) < 0.65) & (np.hypot(x, y) > 0.35)
     return np.where(hit[..., None], np.uint8([220, 0, 0, 255]), np.uint8(0))
+
+
+VIEWS = [(np.cos(a), np.sin(a), (0.6, 1.3)[i % 2]) for i, a in enumerate(np.arange(14) * 2 * np.pi / 14)]
+
+
+def mottled(pose):
+    """Render a ball on a floor, both mottled alike in the same colours. Return the photo (H, W, 3) and the ball's mask."""
+    u, v = np.meshgrid(np.arange(SIZE[0]) + 0.5 - SIZE[0] / 2, np.arange(SIZE[1]) + 0.5 - SIZE[1] / 2)
+    rays = np.stack([u / FOCAL, -v / FOCAL, -np.ones_like(u)], axis=-1) @ pose[:3, :3].T
+    normals = ball_normals(pose, *SIZE, FOCAL)
+    mask = ~np.isnan(normals[..., 0])
+    depth = (CENTRE[2] - 0.5 - pose[2, 3]) / np.minimum(rays[..., 2], -1e-3)
+    point = np.where(mask[..., None], 7 + 0.5 * normals, pose[:3, 3] + depth[..., None] * rays)
+    waves = np.random.default_rng(1).normal(size=(2, 10, 3)) * [[[7.0]], [[14.0]]]
+    tone = sum(np.sin(point @ wave + 2 * i) for i, wave in enumerate(waves.reshape(-1, 3))) / np.sqrt(20)
+    colors = np.array([[60, 40, 30], [150, 110, 80], [210, 190, 160]])
+    return np.stack([np.interp(tone, [-1, 0, 1], colors[:, c]) for c in range(3)], axis=-1), mask
 
 
 def read_masks(folder, count=COUNT):
@@ -211,14 +239,33 @@ def test_box_is_in_the_frame_of_the_capture_with_its_masks(tmp_path):
     assert capture.box.moved(capture.to_capture).contains(CENTRE + 0.5 * np.vstack([np.eye(3), -np.eye(3)])).all()
 
 
-def test_floor_is_the_plane_below_the_object():
+def test_plane_is_the_floor_below_the_object_or_the_wall_behind_it():
     random = np.random.default_rng(0)
     object_points = random.normal(0, 0.3, (300, 3))
     table = np.column_stack([random.uniform(-2, 2, (300, 2)), random.normal(-1, 0.003, 300)])
     up = np.array([0.0, 0.0, 1.0])
-    normal, distance = find_floor(np.vstack([object_points, table]), np.zeros(3), 1.0, up)
-    assert normal == pytest.approx(up, abs=0.02) and distance == pytest.approx(-0.97, abs=0.02)
-    assert find_floor(object_points, np.zeros(3), 1.0, up) is None
+    above = np.array([[3.0, 0.0, 2.0], [-3.0, 0.0, 2.0]])
+    plane = find_plane(np.vstack([object_points, table]), np.zeros(3), 1.0, up, above)
+    assert plane.normal == pytest.approx(up, abs=0.02) and plane.distance == pytest.approx(-1, abs=0.02)
+    assert find_plane(object_points, np.zeros(3), 1.0, up, above) is None
+    # The same plane is a wall if the world's up direction is along it, and none if a camera stands behind it.
+    side, wall = np.array([1.0, 0.0, 0.0]), np.vstack([object_points, table])
+    assert find_plane(wall, np.zeros(3), 1.0, side, above).normal == pytest.approx(up, abs=0.02)
+    assert find_plane(wall, np.zeros(3), 1.0, side, np.vstack([above, [[3.0, 0.0, -2.0]]])) is None
+
+
+def test_object_of_the_floors_colours_is_told_from_it(tmp_path):
+    poses = [look_at(CENTRE + 3 * np.array(x) / np.linalg.norm(x), CENTRE) for x in VIEWS]
+    shown = [mottled(pose) for pose in poses]
+    nerfstudio(tmp_path, poses=poses)
+    random = np.random.default_rng(0)
+    for i, (photo, _) in enumerate(shown):
+        exposed = photo * random.uniform(0.8, 1.1) + random.normal(0, 2, photo.shape)
+        write(tmp_path / "images" / f"{i:04d}.png", exposed.clip(0, 255).astype(np.uint8))
+    intrinsics = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": SIZE[0] / 2, "cy": SIZE[1] / 2, "w": SIZE[0], "h": SIZE[1]}
+    edit(tmp_path / "transforms.json", lambda data: data.update(intrinsics))
+    make_masks(tmp_path, None, silent)
+    assert np.mean(overlap(read_masks(tmp_path, len(VIEWS)), [mask for _, mask in shown])) > 0.8
 
 
 def test_made_masks_are_noted(tmp_path):

@@ -21,12 +21,13 @@ from PIL import Image
 
 from refgs.camera import Camera
 from refgs.capture import View, load_view, read_capture
+from refgs.capture.backdrop import Backdrop, find_plane
 from refgs.capture.box import Box
 from refgs.capture.colmap import find_model
 from refgs.capture.images import read_image
 from refgs.capture.lens import Lens
 from refgs.capture.region import LOOK_OUT, find_region, sample_silhouettes, up_direction
-from refgs.capture.silhouettes import Photo, carve_object, cut_out, find_floor
+from refgs.capture.silhouettes import Photo, carve_object, cut_out
 from refgs.capture.triangulate import triangulate
 from refgs.capture.types import Capture
 from refgs.errors import InputError
@@ -81,7 +82,9 @@ def make_masks(
         guessed = region_settings(box)
         report("region", {"region": guessed, "what": f"looking for the object in the box {' '.join(guessed)}"})
     points = triangulate(chosen, reading) if capture.points is None else capture.points
-    floor = find_floor(points, box.centre, size, up_direction(views))
+    positions = np.array([view.camera.position for view in views])
+    plane = find_plane(points, box.centre, size, up_direction(views), positions)
+    backdrop = None if plane is None else Backdrop(plane, box.centre, size)
     photos = []
     for view in chosen:
         photos.append(_load(view, root, SIDE))
@@ -93,7 +96,7 @@ def make_masks(
     nothing = InputError(
         f"{folder}: no object was found. Set a box about it (region.size), or draw strokes on some photos."
     )
-    shape = carve_object(photos, box, fill, floor, carving)
+    shape = carve_object(photos, box, fill, backdrop, carving)
     if shape is None:
         raise nothing
     if shape.objects > 1:

@@ -14,16 +14,20 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, label
 
 from refgs.camera import Camera
+from refgs.capture.backdrop import Backdrop
 from refgs.capture.box import Box
 from refgs.geometry.project import inside, project
 
 GRID = 48  # voxels along an edge of the box
 ROUNDS = 6  # of colours and carving; a real head's shape changes by less than 1 % in the last one
 DISAGREE = 0.12  # part of the photos that may contradict a voxel: colours are ambiguous in some
+DISAGREE_PLANE = 0.18  # the same before a plane: an object of its colours looks like it here and there
 OPEN = 0.2  # probability below which two neighbouring photos see through a voxel, as through a ring, whatever the others say
 NEAR = 0.2  # probability from which a pixel may be object, so that thin parts, which few voxels hold, are not lost
 SEEN = 0.3  # part of the photos that must show a voxel
 COUNTED = 0.1  # part of the largest object's volume, from which on another one is an object too
+LEARNED = (0, 1, 3)  # rounds in which the plane's texture is learned
+UNKNOWN = 0.02  # likelihood of a colour that nothing is known of
 LEVELS = (20, 32, 32)  # bins of the histograms, in Lab
 
 
@@ -51,6 +55,7 @@ class Shape:
     occupied: np.ndarray
     objects: int
     colors: tuple[np.ndarray, np.ndarray]
+    backdrop: Backdrop | None
 
     def bounds(self, to_frame: np.ndarray) -> Box:
         """Return the box, parallel to the axes, about the shape in other coordinates, with a margin of a twentieth.
@@ -68,37 +73,43 @@ class Shape:
         return _project_voxels(self.occupied, self.box, camera)
 
 
-def carve_object(
-    photos: list[Photo], box: Box, fill: float, floor: tuple[np.ndarray, float] | None, progress
-) -> Shape | None:
+def carve_object(photos: list[Photo], box: Box, fill: float, backdrop: Backdrop | None, progress) -> Shape | None:
     """Carve the object in a box out of the photos. Return None if nothing is left.
 
-    At first the object is taken for an ellipsoid in the box, which fills the part `fill` of it. `floor` is the plane (normal, distance)
-    that it stands on, or None. `progress(done, total)` is called after each round.
+    At first the object is taken for an ellipsoid in the box, which fills the part `fill` of it. `backdrop` is the plane that carries it,
+    or None; its texture is learned here. `progress(done, total)` is called after each round.
     """
     points = box.grid(GRID)
     centred = np.linalg.norm(np.linalg.solve(box.matrix[:3, :3], (points - box.centre).T), axis=0)
     occupied = np.clip(1.3 - 1.25 * centred / fill, 0.0, 0.85)
-    allowed = np.ones(len(points), bool) if floor is None else points @ floor[0] > floor[1]
+    allowed = np.ones(len(points), bool) if backdrop is None else backdrop.before(points)
     occupied[~allowed] = 0
     pixels = [_pixels(points, photo.camera) for photo in photos]
     seen = sum((at >= 0).astype(int) for at in pixels)
     allowed &= seen >= max(2, SEEN * len(photos))
     pairs = _neighbours(photos, box.centre)
+    disagree = DISAGREE if backdrop is None else DISAGREE_PLANE
     objects, colors = 0, None
     for turn in range(ROUNDS):
         priors = [_project_voxels(occupied, box, photo.camera, at) for photo, at in zip(photos, pixels, strict=True)]
-        colors = _learn_colors(photos, priors, colors)
+        if backdrop is not None and turn in LEARNED:
+            hidden = [_hidden(prior) if turn else np.zeros(prior.shape, bool) for prior in priors]
+            backdrop.learn([photo.image for photo in photos], [photo.camera for photo in photos], hidden)
+        plains = [_plain(photo, prior, backdrop) for photo, prior in zip(photos, priors, strict=True)]
+        colors = _learn_colors(photos, priors, plains, colors)
         votes = np.full((len(photos), len(points)), 255, np.uint8)  # bytes sort fast
         struck = np.zeros(len(points), bool)
-        for vote, photo, prior, at in zip(votes, photos, priors, pixels, strict=True):
+        for vote, photo, prior, plain, at in zip(votes, photos, priors, plains, pixels, strict=True):
             shown = at >= 0
-            vote[shown] = (255 * _posterior(photo, prior, colors)).astype(np.uint8).ravel()[at[shown]]
+            posterior = _posterior(photo, prior, plain, colors)
+            if backdrop is not None:  # a pixel may look like the plane by chance, a voxel's footprint less often
+                posterior = cv2.GaussianBlur(posterior, (0, 0), 0.5 * _footprint(box, photo.camera))
+            vote[shown] = (255 * posterior).astype(np.uint8).ravel()[at[shown]]
             struck[shown] |= (photo.known.ravel()[at[shown]] < 0) & (vote[shown] < 128)
         for pair in pairs:
             struck |= votes[pair].max(axis=0) < 255 * OPEN
         ordered = np.sort(np.ascontiguousarray(votes.T), axis=1)
-        kept = ordered[np.arange(len(points)), (DISAGREE * seen).astype(int)] / np.float32(255)
+        kept = ordered[np.arange(len(points)), (disagree * seen).astype(int)] / np.float32(255)
         kept[~allowed | struck] = 0
         field = gaussian_filter(kept.reshape(GRID, GRID, GRID), 0.7)
         parts, count = label(field > 0.5)
@@ -110,20 +121,26 @@ def carve_object(
         objects = int(large.sum())
         occupied = np.where(large[parts] | (parts == 0), field, 0).ravel()
         progress(turn + 1, ROUNDS)
-    return Shape(box, occupied, objects, colors)
+    return Shape(box, occupied, objects, colors, backdrop)
 
 
 def cut_out(photo: Photo, shape: Shape) -> np.ndarray:
     """Find the silhouette's exact edge in a photo. Return the mask (H, W) uint8, 0 or 255."""
     prior = shape.project(photo.camera)
-    likely = _posterior(photo, prior, shape.colors) > 0.5
+    plain = _plain(photo, prior, shape.backdrop)
+    posterior = _posterior(photo, prior, plain, shape.colors)
+    likely = posterior > 0.5
     margin = max(3, round(0.03 * max(prior.shape))) | 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (margin, margin))
     solid = (prior > 0.5).astype(np.uint8)
-    core = cv2.erode(solid, kernel, borderValue=1) > 0
+    inner = kernel if plain is None else np.ones((5, 5), np.uint8)
+    core = cv2.erode(solid, inner, borderValue=1) > 0
     around = cv2.dilate(((prior > NEAR) | (photo.known > 0)).astype(np.uint8), kernel) > 0
     labels = np.where(likely, np.uint8(cv2.GC_PR_FGD), np.uint8(cv2.GC_PR_BGD))
     labels[core & likely] = cv2.GC_FGD
+    if plain is not None:  # GrabCut knows colours only
+        labels[(plain > 0) & (posterior < 0.1)] = cv2.GC_BGD  # by chance on the shape, too: its core wins
+        labels[core | ((prior > 0.5) & (posterior > 0.9))] = cv2.GC_FGD
     labels[~around] = cv2.GC_BGD
     labels[photo.known > 0] = cv2.GC_FGD
     labels[photo.known < 0] = cv2.GC_BGD
@@ -156,41 +173,6 @@ def _only_connected(mask: np.ndarray, solid: np.ndarray, known: np.ndarray) -> n
     return kept | ~opened
 
 
-def find_floor(
-    points: np.ndarray, centre: np.ndarray, radius: float, up: np.ndarray
-) -> tuple[np.ndarray, float] | None:
-    """Find the plane that the object stands on: most structure-from-motion points, hardly any below, and within 30° of level.
-
-    Return its normal and a distance just above it: points p on the object's side have normal @ p > distance. Return None if no plane
-    with a twentieth of the points is found. `centre` and `radius` are a ball about the object; `up` is the world's up direction.
-    """
-    near = points[np.linalg.norm(points - centre, axis=1) < 3 * radius]
-    if len(near) < 50:
-        return None
-    random = np.random.default_rng(0)
-    best, found = 0.05 * len(near), None
-    for _ in range(1000):
-        a, b, c = near[random.choice(len(near), 3, replace=False)]
-        normal = np.cross(b - a, c - a)
-        length = np.linalg.norm(normal)
-        if length < 1e-9 * radius**2:
-            continue
-        normal *= np.sign(normal @ up) / length
-        height = near @ normal - a @ normal
-        # What it carries is not part of it: its points reach beyond the object.
-        on = np.abs(height) < 0.015 * radius
-        if (
-            normal @ up < 0.87
-            or (height < -0.04 * radius).mean() > 0.03
-            or on.sum() <= best
-            or normal @ (centre - a) < 0.1 * radius
-        ):
-            continue
-        if np.linalg.norm(near[on] - near[on].mean(axis=0), axis=1).mean() > 0.8 * radius:
-            best, found = on.sum(), (normal, float(a @ normal) + 0.03 * radius)
-    return found
-
-
 def _neighbours(photos: list[Photo], centre: np.ndarray) -> np.ndarray:
     """Return the pairs (N, 2) of each photo and the nearest one that looks at `centre` from another direction: by 5° to 40°."""
     away = np.array([photo.camera.position for photo in photos]) - centre
@@ -210,15 +192,17 @@ def _pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where(shown, index, -1)
 
 
+def _footprint(box: Box, camera: Camera) -> float:
+    """Return the size of a voxel at the box's centre, in pixels."""
+    depth = max(float((camera.world_to_camera @ [*box.centre, 1])[2]), 1e-6)
+    return 2 * np.linalg.norm(box.matrix[:3, :3], axis=0).max() / (GRID - 1) * camera.fx / depth
+
+
 def _project_voxels(occupied: np.ndarray, box: Box, camera: Camera, at: np.ndarray | None = None) -> np.ndarray:
     """Return the largest value of the voxels along each pixel's ray, (H, W) float32, smooth over a voxel's size."""
     width, height = camera.width, camera.height
-    depth = max(float((camera.world_to_camera @ [*box.centre, 1])[2]), 1e-6)
-    size = (
-        2 * np.linalg.norm(box.matrix[:3, :3], axis=0).max() / (GRID - 1) * camera.fx / depth
-    )  # of a voxel, in pixels
     # Voxels of several pixels are drawn in a smaller picture, in which they leave no gaps.
-    step = max(1.0, size)
+    step = max(1.0, _footprint(box, camera))
     small = camera.resized(max(1, round(width / step)), max(1, round(height / step)))
     if at is None or small.width != width:
         at = _pixels(box.grid(GRID), small)
@@ -234,8 +218,30 @@ def _histogram(bins: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return (counts / max(counts.sum(), 1e-9)).ravel()
 
 
+def _hidden(prior: np.ndarray) -> np.ndarray:
+    """Mark the pixels (H, W) that may show the object, by the shape's projection, with a margin."""
+    margin = max(3, round(0.02 * max(prior.shape))) | 1
+    return cv2.dilate((prior > 0.3).astype(np.uint8), np.ones((margin, margin), np.uint8)) > 0
+
+
+def _plain(photo: Photo, prior: np.ndarray, backdrop: Backdrop | None) -> np.ndarray | None:
+    """Return how likely the bare plane has each pixel's colour, NaN where it is not known; None without a plane."""
+    return None if backdrop is None else backdrop.likelihood(photo.image, photo.camera, _hidden(prior))
+
+
+def _surroundings(ours: np.ndarray, theirs: np.ndarray, plain: np.ndarray | None) -> np.ndarray:
+    """Return how likely the surroundings have each pixel's colour, (H, W): by the histogram, and by the bare plane.
+
+    `ours` and `theirs` (H, W) are by the histograms, `plain` is `Backdrop.likelihood`.
+    """
+    if plain is None:
+        return theirs
+    hidden = -ours / np.where(plain < 0, plain, -1)
+    return np.where(np.isnan(plain), theirs, np.where(plain < 0, hidden, 0.95 * plain + 0.05 * theirs))
+
+
 def _weights(
-    photo: Photo, prior: np.ndarray, colors: tuple[np.ndarray, np.ndarray] | None
+    photo: Photo, prior: np.ndarray, plain: np.ndarray | None, colors: tuple[np.ndarray, np.ndarray] | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return each pixel's weight (H, W) in the colours of the object, and in those of the surroundings.
 
@@ -244,7 +250,10 @@ def _weights(
     """
     ours = prior * (prior > 0.5)
     if colors is not None:
-        ours = ours * (colors[0] / (colors[0] + colors[1] + 1e-9))[photo.bins]
+        own = colors[0][photo.bins]
+        ours = ours * (own / (own + _surroundings(own, colors[1][photo.bins], plain) + 1e-9))
+    elif plain is not None:
+        ours = ours * (UNKNOWN / (UNKNOWN + np.where(plain >= 0, plain, UNKNOWN)))
     band = max(3, round(0.06 * max(prior.shape))) | 1
     near = cv2.dilate((prior > 0.25).astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (band, band)))
     theirs = np.where(near > 0, 0.0, 1.0)
@@ -255,22 +264,34 @@ def _weights(
 
 
 def _learn_colors(
-    photos: list[Photo], priors: list[np.ndarray], before: tuple[np.ndarray, np.ndarray] | None
+    photos: list[Photo],
+    priors: list[np.ndarray],
+    plains: list[np.ndarray | None],
+    before: tuple[np.ndarray, np.ndarray] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the histograms of the object's and of the surroundings' colours, the mean over the photos. `before` are the last round's."""
     pairs = [
-        [_histogram(photo.bins, weight) for weight in _weights(photo, prior, before)]
-        for photo, prior in zip(photos, priors, strict=True)
+        [_histogram(photo.bins, weight) for weight in _weights(photo, prior, plain, before)]
+        for photo, prior, plain in zip(photos, priors, plains, strict=True)
     ]
     return tuple(np.mean(side, axis=0) for side in zip(*pairs, strict=True))
 
 
-def _posterior(photo: Photo, prior: np.ndarray, colors: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the probability that each pixel shows the object, by the colours of all photos, of this one, and by the shape's projection."""
-    ours, theirs = (_histogram(photo.bins, weight) for weight in _weights(photo, prior, colors))
+def _posterior(
+    photo: Photo, prior: np.ndarray, plain: np.ndarray | None, colors: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Return the probability that each pixel shows the object.
+
+    It is by the colours of all photos and of this one, by the bare plane's, and by the shape's projection.
+    """
+    ours, theirs = (_histogram(photo.bins, weight) for weight in _weights(photo, prior, plain, colors))
     ours = 0.5 * colors[0] + 0.5 * ours
     theirs = 0.3 * colors[1] + 0.7 * theirs if theirs.any() else colors[1]
-    evidence = np.log((ours[photo.bins] + 1e-6) / (theirs[photo.bins] + 1e-6)).astype(np.float32)
+    ours, theirs = ours[photo.bins], theirs[photo.bins]
+    if plain is not None:  # where the plane is known, an object of the surroundings' colours can be told from it
+        ours = 0.7 * ours + 0.3 * theirs
+    theirs = _surroundings(ours, theirs, plain)
+    evidence = np.log((ours + 1e-6) / (theirs + 1e-6)).astype(np.float32)
     evidence = np.clip(cv2.GaussianBlur(evidence, (0, 0), max(prior.shape) / 256), -3, 3)
     odds = np.clip(prior, 0.1, 0.9)
     result = 1 / (1 + np.exp(-(evidence + 0.7 * np.log(odds / (1 - odds)))))

@@ -1,0 +1,206 @@
+"""Find the plane that an object stands on or hangs on, and learn what this plane looks like, so that it can be told from the object.
+
+The photos are warped onto the plane, and each texel gets the median of the photos that see it: the object hides another part of the plane
+in each photo. A pixel whose colour is not the one that its texel predicts is not plane. This holds where object and plane share colours.
+Shadows that stand still are part of the texture. What moves, as a reflection in a shiny floor, differs between photos, so that its texels
+are uncertain.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from refgs.camera import Camera
+
+SIDE = 512  # texels
+REACH = 3.0  # half the texture's side, in radii of the region: low cameras see the object before a far part
+ABOVE = 0.03  # in radii of the region: what is nearer to the plane is part of it
+UNSURE = 5.0  # times the median spread between photos, from which on a texel's colour is not known
+HIDDEN = 3.0  # odds of object to plane at texels that something hides in all photos
+SEEN = 4  # photos that must see a texel
+STEPS = 72.8  # of a byte for a change by a factor of e: log(255 + DARK) fits
+DARK = 8.0  # added to 8-bit values before their logarithm, which noise would dominate otherwise
+BIN = np.array([12.75, 5.0, 5.0], np.float32)  # in 8-bit Lab, as the bins of the colours' histograms
+LEAST = np.array([2.0, 1.0, 1.0], np.float32)  # standard deviations that are taken for rounding
+PARTS = (
+    (0.97, np.float32([0, 0, 0])),
+    (0.03, np.float32([20, 2, 2])),
+)  # the plane as it was, and in a shadow or a highlight
+GRAZING = 0.15  # sine of the angle to the plane, below which a photo's pixels smear over the texture
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """Plane `normal` @ p = `distance`. The object is where this is greater."""
+
+    normal: np.ndarray
+    distance: float
+
+    def height(self, points: np.ndarray) -> np.ndarray:
+        return points @ self.normal - self.distance
+
+
+def find_plane(
+    points: np.ndarray, centre: np.ndarray, radius: float, up: np.ndarray, positions: np.ndarray
+) -> Plane | None:
+    """Find the plane that carries the object: a floor or a wall with many structure-from-motion points, and hardly any behind.
+
+    `centre` and `radius` are a ball about the object, `up` is the world's up direction, and `positions` (N, 3) are the cameras', which all
+    are on the object's side. Return None if there is no such plane.
+    """
+    near = points[np.linalg.norm(points - centre, axis=1) < 3 * radius]
+    if len(near) < 50:
+        return None
+    random = np.random.default_rng(0)
+    best, found = 0.05 * len(near), None
+    for _ in range(1000):
+        a, b, c = near[random.choice(len(near), 3, replace=False)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-9 * radius**2:
+            continue
+        level = normal @ up / length
+        normal *= np.sign(level if abs(level) > 0.87 else normal @ (positions.mean(axis=0) - a)) / length
+        height = near @ normal - a @ normal
+        on = np.abs(height) < 0.015 * radius
+        if on.sum() <= best or (height < -0.04 * radius).mean() > 0.03:
+            continue
+        if normal @ up >= 0.87:  # a floor: within 30° of level, and below the object
+            if normal @ (centre - a) < 0.1 * radius:
+                continue
+        elif (
+            ((positions - a) @ normal).min() < 0.3 * radius
+            or (height > 0.1 * radius).mean() < 0.1
+            or on.sum() < 0.2 * len(near)
+        ):
+            continue  # not a wall: one has all cameras before it, and something hangs on it
+        # What it carries is not part of it: its points reach beyond the object.
+        if np.linalg.norm(near[on] - near[on].mean(axis=0), axis=1).mean() > 0.8 * radius:
+            best, found = on.sum(), Plane(normal, float(a @ normal))
+    return found
+
+
+class Backdrop:
+    """Colours of a plane, and how much they differ between photos, on a square grid of SIDE² texels around the object.
+
+    Colours are logarithms of 8-bit values in steps, so that exposure and white balance of a photo are an offset for each channel.
+    """
+
+    def __init__(self, plane: Plane, centre: np.ndarray, radius: float):
+        self.plane, self.radius = plane, radius
+        across = np.linalg.svd(plane.normal[None])[2][1:]  # two axes in the plane
+        texel = 2 * REACH * radius / SIDE
+        foot = centre - plane.height(centre) * plane.normal
+        self.to_world = np.zeros((4, 3))  # from homogeneous texels
+        self.to_world[:3, :2] = across.T * texel
+        self.to_world[:3, 2] = foot - across.T @ np.full(2, texel * SIDE / 2)
+        self.to_world[3, 2] = 1
+
+    def before(self, points: np.ndarray) -> np.ndarray:
+        """Mark the points (N, 3) that are before the plane, not in it."""
+        return self.plane.height(points) > ABOVE * self.radius
+
+    def learn(self, images: list[np.ndarray], cameras: list[Camera], hidden: list[np.ndarray]) -> None:
+        """Learn from photos (H, W, 3) uint8 RGB. Pixels (H, W) that are `hidden` may show the object."""
+        stack = np.full((SIDE * SIDE, 3, len(images)), 255, np.uint8)
+        shown = np.zeros((SIDE, SIDE), int)  # photos that show a texel, or what hides it
+        for index, (image, camera, hide) in enumerate(zip(images, cameras, hidden, strict=True)):
+            at, valid = self._texels_in(camera)
+            shown += valid
+            warped = cv2.remap(_logarithm(image), at, None, cv2.INTER_LINEAR)
+            valid &= cv2.remap(hide.astype(np.uint8), at, None, cv2.INTER_LINEAR, borderValue=1) == 0
+            stack[valid.ravel(), :, index] = warped[valid]
+        count = (stack[:, 0] < 255).sum(axis=1)
+        texels = np.flatnonzero(count >= SEEN)
+        self.known = (count >= SEEN).reshape(SIDE, SIDE)
+        self.color = np.zeros((SIDE, SIDE, 3), np.float32)
+        self.spread = np.zeros((SIDE, SIDE, 3), np.float32)
+        self.odds = np.full((SIDE, SIDE), np.nan, np.float32)
+        self.odds[~self.known & (shown >= SEEN)] = HIDDEN
+        if not len(texels):
+            return
+        values, count = stack[texels].astype(np.float32), count[texels]
+        values[stack[texels] == 255] = np.nan
+        # Photos see different texels, so exposures are fitted in turns with the texture.
+        offset = np.zeros((3, len(images)), np.float32)
+        some = values[:: max(1, len(texels) // 20000)]
+        for _ in range(4):
+            middle = np.nanmedian(some - offset, axis=2, keepdims=True)
+            with np.errstate(invalid="ignore"):
+                change = np.nanmedian(some - offset - middle, axis=0)
+            offset += np.nan_to_num(change)
+        ordered = np.sort(values - offset, axis=2)  # NaN last
+        low, middle, high = (
+            np.take_along_axis(ordered, (part * (count - 1)).astype(int)[:, None, None], axis=2)[..., 0]
+            for part in (0.25, 0.5, 0.75)
+        )
+        self.color[self.known], self.spread[self.known] = middle, (high - low) / 1.35
+        # What the object hides in most photos has its colours in these: no two photos agree.
+        spread = self.spread.mean(axis=-1)
+        unsure = self.known & (spread > UNSURE * np.median(spread[self.known]))
+        self.odds[unsure] = 1
+        self.known &= ~unsure
+
+    def likelihood(self, image: np.ndarray, camera: Camera, hidden: np.ndarray) -> np.ndarray:
+        """Return how likely the bare plane has each pixel's colour, (H, W) float32: the mass in a cell of BIN.
+
+        Where the texel's colour is not known, as below the object, it is minus the odds of object to plane. It is NaN where the photos do
+        not show the plane.
+
+        The photo's exposure and noise are measured on the pixels that are not `hidden`.
+        """
+        texel, meets = self._pixels_on(camera)
+        known = meets & (cv2.remap(self.known.astype(np.uint8), texel, None, cv2.INTER_NEAREST) > 0)
+        color = cv2.remap(self.color, texel, None, cv2.INTER_LINEAR)
+        spread = cv2.remap(self.spread, texel, None, cv2.INTER_LINEAR).mean(axis=-1)
+        visible = known & ~hidden
+        if visible.sum() < 200:
+            return np.full(known.shape, np.nan, np.float32)
+        color += np.median((_logarithm(image) - color)[visible], axis=0)
+        expected = np.clip(DARK * np.exp(color / STEPS) - DARK, 0, 255).astype(np.float32)
+        off = _lab(image.astype(np.float32)) - _lab(expected)
+        spread = np.clip(spread / max(np.median(spread[visible]), 1e-3), 0.5, 4.0)[..., None]
+        sigma = np.maximum(1.48 * np.median(np.abs(off / spread)[visible], axis=0), LEAST) * spread
+        result = np.zeros(known.shape, np.float32)
+        for part, wide in PARTS:
+            width = np.hypot(sigma, wide)
+            result += part * np.exp(-0.5 * ((off / width) ** 2).sum(axis=-1)) * np.prod(BIN / (2.507 * width), axis=-1)
+        odds = cv2.remap(self.odds, texel, None, cv2.INTER_NEAREST, borderValue=np.nan)
+        return np.where(known, np.minimum(result, 1), np.where(meets, -odds, np.float32(np.nan)))
+
+    def _pixels_on(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Return the texel at each pixel as a map for cv2.remap (H, W, 2), and where there is one (H, W)."""
+        column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        ray = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], axis=-1)
+        ray = ray @ camera.world_to_camera[:3, :3]
+        fall = -(ray @ self.plane.normal)
+        meets = fall > GRAZING / 2 * np.linalg.norm(ray, axis=-1)
+        point = camera.position + ray * (self.plane.height(camera.position) / np.where(meets, fall, 1))[..., None]
+        texel = (point - self.to_world[:3, 2]) @ np.linalg.pinv(self.to_world[:3, :2]).T - 0.5
+        meets &= ((texel > 0) & (texel < SIDE - 1)).all(axis=-1)
+        texel = np.where(meets[..., None], texel, -10).astype(np.float32)
+        return texel, meets
+
+    def _texels_in(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixel of each texel as a map for cv2.remap (SIDE, SIDE, 2), and which texels the photo shows well enough."""
+        column, row = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
+        texel = np.stack([column, row, np.ones_like(row)], axis=-1)
+        u, v, depth = np.moveaxis(texel @ (camera.projection @ self.to_world).T, -1, 0)
+        away = camera.position - texel @ self.to_world[:3].T
+        sine = away @ self.plane.normal / np.linalg.norm(away, axis=-1)
+        safe = np.where(depth > 1e-9, depth, 1.0)
+        u, v = u / safe, v / safe
+        valid = (depth > 1e-9) & (sine > GRAZING) & (u > 0.5) & (v > 0.5)
+        valid &= (u < camera.width - 0.5) & (v < camera.height - 0.5)
+        at = np.stack([u - 0.5, v - 0.5], axis=-1).astype(np.float32)
+        return np.where(valid[..., None], at, np.float32(-10)), valid
+
+
+def _logarithm(image: np.ndarray) -> np.ndarray:
+    return STEPS * np.log((image.astype(np.float32) + DARK) / DARK)
+
+
+def _lab(image: np.ndarray) -> np.ndarray:
+    """Convert float RGB of 0..255 to Lab with all channels on 8-bit scales."""
+    return cv2.cvtColor(image / 255, cv2.COLOR_RGB2LAB) * np.float32([2.55, 1, 1])
