@@ -198,6 +198,28 @@ def test_the_artists_masks_are_kept(tmp_path):
         make_masks(tmp_path, None, silent)
 
 
+@pytest.mark.parametrize(("value", "what"), [(255, "white"), (0, "empty")])
+def test_masks_that_say_nothing_are_refused_until_they_are_deleted(tmp_path, value, what):
+    photograph(tmp_path)
+    for i in range(COUNT):
+        write(tmp_path / "masks" / f"{i:04d}.png", np.full(SIZE[::-1], value, np.uint8))
+    with pytest.raises(InputError, match=f"masks: all {COUNT} masks are {what}.*0000.png too"):
+        make_masks(tmp_path, None, silent)
+    for file in (tmp_path / "masks").iterdir():
+        assert (read_image(file)[0] == value).all()
+        file.unlink()
+    assert make_masks(tmp_path, None, silent)["made"] == COUNT
+
+
+def test_photos_with_opaque_alpha_get_masks(tmp_path):
+    truths = photograph(tmp_path)
+    for file in (tmp_path / "images").iterdir():
+        write(file, np.dstack([read_image(file)[0], np.full(SIZE[::-1], 255, np.uint8)]))
+    make_masks(tmp_path, None, silent)
+    assert min(overlap(read_masks(tmp_path), truths)) > 0.9
+    assert read_capture(tmp_path).masked
+
+
 def test_interrupted_call_leaves_the_masks_of_before(tmp_path, monkeypatch):
     photograph(tmp_path)
     make_masks(tmp_path, None, silent)

@@ -41,6 +41,7 @@ __all__ = [
     "find_layout",
     "load_view",
     "load_views",
+    "mask_files",
     "published_normals",
     "read_cameras",
     "read_capture",
@@ -107,6 +108,11 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
         warnings=[*warnings, *shared, *white],
     )
     return capture if np.array_equal(to_capture, np.eye(4)) else _in_run_frame(capture, unit)
+
+
+def mask_files(folder: Path) -> list[Path]:
+    """Return the mask files of a capture, also those that `read_capture` does not use because all are white."""
+    return [view.mask_path for view in _read(folder, _check_layout(folder))[0] if view.mask_path is not None]
 
 
 def _check_layout(folder: Path) -> str:

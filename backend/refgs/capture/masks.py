@@ -20,13 +20,13 @@ import numpy as np
 from PIL import Image
 
 from refgs.camera import Camera
-from refgs.capture import View, load_view, read_capture
+from refgs.capture import View, load_view, mask_files, read_capture
 from refgs.capture.backdrop import Backdrop, find_plane
 from refgs.capture.box import Box
 from refgs.capture.colmap import find_model
 from refgs.capture.images import read_image
 from refgs.capture.lens import Lens
-from refgs.capture.region import LOOK_OUT, find_region, sample_silhouettes, up_direction
+from refgs.capture.region import LOOK_OUT, WHITE_MASKS, find_region, sample_silhouettes, up_direction
 from refgs.capture.silhouettes import Photo, carve_object, cut_out
 from refgs.capture.triangulate import triangulate
 from refgs.capture.types import Capture
@@ -56,13 +56,15 @@ def make_masks(
     list, is p_new = moved @ p.
 
     All masks are written together at the end; an interrupted call leaves those of before. Raises InputError if all photos have masks by the
-    artist, if strokes do not fit, or if nothing is found, and ReadOnlyError if the folder cannot be written to.
+    artist, if these are all white, if strokes do not fit, or if nothing is found, and ReadOnlyError if the folder cannot be written to.
     """
     folder = Path(folder)
     capture = read_capture(folder, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
     root = _root(capture)
     _check_writable(root)
     made = _hashes(root)
+    if WHITE_MASKS in capture.warnings:
+        _check_white(folder, made)
     views = [replace(v, mask_path=None) if v.mask_path and _hash(v.mask_path) in made else v for v in capture.views]
     if all(view.masked for view in views):
         raise InputError(f"{folder}: every photo has a mask that was not made here. Remove those that you want made.")
@@ -168,6 +170,15 @@ def _check_writable(root: Path) -> None:
     # A folder whose owner took away the right to write is left alone, even where this process could write to it.
     if not os.access(root, os.W_OK) or not root.stat().st_mode & 0o222:
         raise ReadOnlyError(f"{root} is read-only: masks cannot be written to it. Copy the capture.")
+
+
+def _check_white(folder: Path, made: set[str]) -> None:
+    given = [file for file in mask_files(folder) if _hash(file) not in made]
+    if given:
+        raise InputError(
+            f"{given[0].parent}: all {len(given)} masks are white (opaque) everywhere, {given[0].name} too. "
+            "Delete them, and refgs masks makes new ones."
+        )
 
 
 def _root(capture: Capture) -> Path:
