@@ -1,11 +1,13 @@
 """Test that photos of a large capture are mapped from files, and read anew when the files no longer fit."""
 
 import os
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from refgs.capture import cached, load_view, load_views, read_capture, reduced_views
+from refgs.capture import LoadedView, cached, load_view, load_views, read_capture, reduced_views, release_memory
 
 SIDE = 40
 
@@ -71,6 +73,21 @@ def test_a_full_disk_leaves_photos_in_memory(views, tmp_path, monkeypatch):
     for view, loaded in zip(views, load_views(views, SIDE, tmp_path / "photos"), strict=True):
         assert not mapped(loaded.image)
         check_same(loaded, load_view(view, SIDE))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux can be told")
+def test_mapped_photos_leave_the_processs_memory_and_come_back(views, tmp_path):
+    def mapped_bytes():
+        status = Path("/proc/self/status").read_text()
+        return 1024 * int(status.partition("RssFile:")[2].split()[0])
+
+    large = np.random.default_rng(0).integers(0, 255, (3000, 4000, 3), np.uint8)
+    view = cached._cached(LoadedView(large, None, views[0].camera), tmp_path, "large")
+    assert view.image.sum() == large.sum()
+    before = mapped_bytes()
+    release_memory([view, LoadedView(large, None, views[0].camera)])
+    assert before - mapped_bytes() > 30e6
+    np.testing.assert_array_equal(view.image, large)
 
 
 def test_few_photos_stay_in_memory(ball_capture, tmp_path):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from refgs.capture.box import Box
-from refgs.capture.cached import load_views, reduced_views, remove_cached
+from refgs.capture.cached import load_views, reduced_views, release_memory, remove_cached
 from refgs.capture.cameras import read_cameras, read_run_cameras, write_cameras
 from refgs.capture.colmap import find_model, read_colmap
 from refgs.capture.files import find_photos
@@ -47,6 +47,7 @@ __all__ = [
     "read_capture",
     "read_run_cameras",
     "reduced_views",
+    "release_memory",
     "remove_cached",
     "write_cameras",
 ]

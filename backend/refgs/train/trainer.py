@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from refgs.capture import Capture
+from refgs.capture import Capture, release_memory
 from refgs.compare.metrics import decibels
 from refgs.events import Report
 from refgs.memory import trim
@@ -113,6 +113,7 @@ class Trainer:
             # Running means, read now and then: a card need not wait.
             means = {name: running(means.get(name, figure), figure) for name, figure in figures.items()}
             if state.iteration % REPORT_EVERY == 0 or state.iteration == state.total:
+                release_memory([*state.views, *state.test])
                 self._check(whole=state.ended)
                 pace = (state.seconds - before) / max(state.cost(first, state.iteration), 1e-9)  # it may have gone back
                 self._report_progress(means, pace)
