@@ -88,6 +88,9 @@ def test_mapped_photos_leave_the_processs_memory_and_come_back(views, tmp_path):
     release_memory([view, LoadedView(large, None, views[0].camera)])
     assert before - mapped_bytes() > 30e6
     np.testing.assert_array_equal(view.image, large)
+    before = mapped_bytes()
+    reduced_views([view], 4, tmp_path)
+    assert before - mapped_bytes() > 30e6
 
 
 def test_few_photos_stay_in_memory(ball_capture, tmp_path):

@@ -25,8 +25,8 @@ LARGE = 500e6  # bytes of all photos of a capture, from which on they are cached
 def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedView]:
     """Load photos for training as `load_view` does. If they take more than LARGE bytes, cache them in `folder`.
 
-    The arrays of a cached photo are mapped from files, copy-on-write: a change of their values stays in memory. Where the disk has no room,
-    photos are held in memory. Raises InputError naming the photo that cannot be read.
+    The arrays of a cached photo are mapped from files. A change of their values stays in memory until `release_memory` is called. Where the
+    disk has no room, photos are held in memory. Raises InputError naming the photo that cannot be read.
     """
     cameras = [view.camera.fitted(max_side) for view in views]
     if sum(4 * camera.width * camera.height for camera in cameras) <= LARGE:
@@ -45,13 +45,17 @@ def load_views(views: list[View], max_side: int, folder: Path) -> list[LoadedVie
 
 
 def reduced_views(views: list[LoadedView], factor: int, folder: Path) -> list[LoadedView]:
-    """Reduce the sides of loaded photos by a factor, in linear light as `load_view` does. If `folder` exists, cache them there, too."""
+    """Reduce the sides of loaded photos by a factor, in linear light as `load_view` does. If `folder` exists, cache them there, too.
+
+    Of mapped photos, one at a time is in memory.
+    """
     found = []
     for number, view in enumerate(views):
         width, height = (max(1, round(side / factor)) for side in (view.camera.width, view.camera.height))
         camera = view.camera.resized(width, height)
         small = LoadedView(*reduced(view.image, view.alpha, view.white, view.camera, camera), camera, view.white)
         found.append(_cached(small, folder, f"{number:05}-{factor}") if folder.is_dir() else small)
+        release_memory([view])
     return found
 
 
