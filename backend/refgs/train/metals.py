@@ -17,7 +17,7 @@ from refgs.train.state import State
 from refgs.train.view_dependence import falls_as_metal, observe, shines_as_metal
 
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
-METAL = 0.9  # metallic; training can still change it
+METAL, PAINT = 0.9, 0.02  # metallic; training can still change it
 CERTAIN = 0.85  # part of the surface that shines as coloured metals do, above which all is metal; a gold cape has 0.95, matte clay 0.71
 LIT = 0.25  # part of the changes that a light which changed explains, from which on it may be all; matte clay has 0.32
 MIRRORED = 0.05  # part of the changes that only mirroring explains, below which the light changed; a gold cape has 0.17, matte clay 0.03
@@ -30,7 +30,7 @@ def set_metals_due(state: State, progress: float) -> None:
     """Once, early in the training, raise the metallic of the surfels that change with the view as only metals do.
 
     See `shines_as_metal` for coloured metals, `falls_as_metal` for all. If a light that changed from photo to photo explains the changes,
-    and mirroring hardly any of the rest (see `changing_light.explained`), none is metal.
+    and mirroring hardly any of the rest (see `changing_light.explained`), none is metal, and the metallic learned so far is lowered.
 
     If nearly all shine as coloured metals do, all are metal from then on (see `hold`). Otherwise the others keep the metallic that they
     have learned: it started low, as that of a dielectric.
@@ -47,9 +47,10 @@ def set_metals_due(state: State, progress: float) -> None:
     coloured = shines_as_metal(observations, positions)
     metal = coloured | falls_as_metal(observations, positions, light)
     lit, mirrored = explained(observations, positions, state.capture.radius, metal)
-    if lit > LIT and mirrored < MIRRORED:
-        coloured, metal = torch.zeros_like(metal), torch.zeros_like(metal)
     with torch.no_grad():
+        if lit > LIT and mirrored < MIRRORED:
+            coloured, metal = torch.zeros_like(metal), torch.zeros_like(metal)
+            metallic.clamp_(max=raw_metallic(PAINT))
         if float(weight[coloured].sum()) > CERTAIN * float(weight.sum()):
             metal = torch.ones_like(metal)
             metallic.fill_(float(HELD))
