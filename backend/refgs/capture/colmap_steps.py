@@ -15,9 +15,11 @@ from PIL import Image
 
 from refgs import CORES
 from refgs.capture.images import read_focal_length, read_header, read_image, read_mask, write_for_colmap
+from refgs.capture.similar import similar_pairs
 
 SIDE = 1600  # pixels on the longer side for finding features; presets train on fewer
 ALL_PAIRS = 150  # photos; up to this many, every pair is matched
+NEXT, SIMILAR = 5, 15  # photos that each one is matched with where there are more
 CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential distortion only fit noise
 SEED = 1
 TIED = 3  # points that a photo must share with others; COLMAP asks for 30 where it places one photo after the other
@@ -31,18 +33,22 @@ INSIDE_FEATURES = (
 )
 
 
-def pairs(count: int) -> list[tuple[int, int]]:
-    """Choose which pairs of photos to match. Return pairs of indices; photos are sorted by name.
+def choose_pairs(database: Path) -> list[tuple[int, int]]:
+    """Choose which photos in COLMAP's database to match. Return pairs of their indices; photos are sorted by name.
 
-    With up to ALL_PAIRS photos, this is every pair. With more, each photo is matched with the next ten, and with those 16, 32, 64 … places
-    further on. The last photos are matched with the first, because photographers walk around an object. To link several rounds around the
-    object, the photos 0, 10, 20 … are also matched with one another.
+    With up to ALL_PAIRS photos, this is every pair. With more, each photo is matched with the next NEXT ones, which are close by in a film
+    or a walk around the object, and with SIMILAR ones that look like it. These link several rounds, and photos whose names say nothing.
     """
-    if count <= ALL_PAIRS:
-        return list(combinations(range(count), 2))
-    steps = [*range(1, 11), *(2**k for k in range(4, count.bit_length() - 1))]
-    near = {tuple(sorted((i, (i + step) % count))) for i in range(count) for step in steps}
-    return sorted(near | set(combinations(range(0, count, 10), 2)))
+    import pycolmap
+
+    with pycolmap.Database.open(database) as known:
+        images = {int(image.name): image.image_id for image in known.read_all_images()}
+        photos = sorted(images)
+        if len(photos) <= ALL_PAIRS:
+            return list(combinations(photos, 2))
+        similar = similar_pairs(lambda place: known.read_descriptors(images[photos[place]]).data, len(photos), SIMILAR)
+    following = {(a, b) for a in range(len(photos)) for b in range(a + 1, min(a + NEXT + 1, len(photos)))}
+    return sorted((photos[a], photos[b]) for a, b in following | similar)
 
 
 def extract_features(photos: list[Path], masks: list[Path], database: Path, progress: Callable) -> None:
@@ -130,8 +136,8 @@ def _lens(camera) -> tuple[int, int, float]:
     return camera.width, camera.height, camera.mean_focal_length()
 
 
-def match_features(count: int, database: Path, progress: Callable) -> None:
-    """Match the features of `count` photos, in the pairs that `pairs(count)` chooses. Store the matches in COLMAP's database."""
+def match_features(database: Path, progress: Callable) -> None:
+    """Match the features of the photos in the pairs that `choose_pairs` chooses. Store the matches in COLMAP's database."""
     import pycolmap
 
     verification = pycolmap.TwoViewGeometryOptions()
@@ -140,9 +146,7 @@ def match_features(count: int, database: Path, progress: Callable) -> None:
     listed = database.with_name(database.name + ".pairs.txt")
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(listed)
-    with pycolmap.Database.open(database) as known:
-        names = {image.name for image in known.read_all_images()}
-    all_pairs = [f"{a} {b}" for a, b in pairs(count) if str(a) in names and str(b) in names]
+    all_pairs = [f"{a} {b}" for a, b in choose_pairs(database)]
     for start in range(0, len(all_pairs), 100):
         progress("matching", start, len(all_pairs))
         listed.write_text("\n".join(all_pairs[start : start + 100]), encoding="utf-8")

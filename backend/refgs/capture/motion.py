@@ -252,7 +252,7 @@ def _search(photos: list[Path], masks: list[Path], database: Path, progress: Cal
         extracted = bool(names) and all(name.isdigit() for name in names)  # the last step of `extract_features`
     if not extracted:
         extract_features(photos, masks, database, progress)
-    match_features(len(photos), database, progress)
+    match_features(database, progress)
     models = map_one_by_one(photos, database, progress)
     best, found = _describe(models, photos, database, bool(masks))
     if len(found.placed) < len(photos):
