@@ -92,7 +92,7 @@ def test_surfels_start_in_the_box_and_around_it(balls, tmp_path):
 def test_a_box_with_nothing_in_it_is_said_in_a_line(balls, tmp_path):
     if not read_capture(balls).masked:
         pytest.skip("without masks there may be something anywhere")
-    with pytest.raises(InputError, match="in the region") as error:
+    with pytest.raises(InputError, match=r"lies in the region: move its box, or enlarge it$") as error:
         train(balls, tmp_path / "run", "region.centre=[0.0, 0.0, 1.0]", "region.size=[0.3, 0.3, 0.3]")
     assert "\n" not in str(error.value) and not (tmp_path / "run").exists()
 

@@ -87,10 +87,8 @@ def _hull_points(capture: Capture, views: list[LoadedView], count: int, settings
     around = within(capture.reach)
     try:
         near = within(capture.radius)
-    except InputError as error:
-        raise InputError(
-            f"nothing that the masks show lies in the region: move its box, or enlarge it ({error})"
-        ) from None
+    except InputError:  # they have an object beyond the box
+        raise InputError("nothing that the masks show lies in the region: move its box, or enlarge it") from None
     chosen = _in_and_around(capture.box, near[0], around[0], count, seed)
     positions, normals, _, on_it = (
         np.concatenate([values[rows] for values, rows in zip(pair, chosen, strict=True)])
