@@ -76,6 +76,35 @@ def test_an_object_on_a_turntable(tmp_path):
         assert not found["inside"] and any("put masks of the object in the folder masks" in line for line in warnings)
 
 
+def test_masks_where_nothing_turns(tmp_path):
+    """Check that the whole photos are used where they agree, though all have masks, and that masks leave only features inside them."""
+    poses = orbit(np.arange(0, 60, 10))
+    photograph(tmp_path, poses)
+    masks = [speckled(pose)[1] for pose in poses]
+    for number, mask in enumerate(masks):
+        write(tmp_path / "masks" / f"{number:03d}.png", mask)
+    places = in_child(features_inside_masks, tmp_path)
+    for mask, found in zip(masks, places, strict=True):
+        column, row = found.astype(int).T
+        assert len(found) > 50 and (mask[row, column] > 0).all()
+    found, warnings = warnings_of(tmp_path)
+    assert found["placed"] == len(poses) and not found["inside"] and not warnings
+    distances, angles = pose_errors(read_capture(tmp_path).views, poses)
+    assert distances.max() < 0.1 and angles.max() < 2
+
+
+def features_inside_masks(folder: Path) -> list[np.ndarray]:
+    """Return the places (M, 2) of the features that are found inside the masks of each photo, in pixels."""
+    import pycolmap
+
+    photos, database = find_photos(folder), folder / "inside" / "inside.db"
+    database.parent.mkdir()
+    colmap_steps.extract_features(photos, sorted((folder / "masks").iterdir()), database, lambda *_: None)
+    with pycolmap.Database.open(database) as known:
+        images = sorted(known.read_all_images(), key=lambda image: int(image.name))
+        return [known.read_keypoints(image.image_id)[:, :2] for image in images]
+
+
 @pytest.fixture(scope="module")
 def two_sides(tmp_path_factory):
     """Photograph two sides of the block that hardly anything links. Return the folder and the true poses."""
