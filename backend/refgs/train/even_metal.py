@@ -14,7 +14,7 @@ from refgs.train.state import State
 from refgs.train.view_dependence import neighbours, pooled, saturation
 
 EVERY = 50  # iterations
-UNTIL = 0.7  # part of the training
+UNTIL = 0.6  # part of the training
 AVERAGED = 16  # neighbours
 METALLIC = 0.8
 SATURATED = 0.08  # distance of the base colour's chromaticity from grey: gold has 0.23, copper 0.14, silver 0.03
