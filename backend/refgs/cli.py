@@ -53,11 +53,14 @@ def masks(
         list[str] | None,
         typer.Option("--set", help="region.key=value, a box about the object, e.g. region.size=[1,1,2]"),
     ] = None,
+    model: Annotated[
+        Path | None, typer.Option(help="your own model of salient-object segmentation, an ONNX file")
+    ] = None,
 ) -> None:
     """Make masks of the photos and write them to CAPTURE/masks. Strokes in CAPTURE/strokes correct them; your own masks are kept."""
     from refgs import commands
 
-    commands.masks(capture, changes or [])
+    commands.masks(capture, changes or [], model)
 
 
 @app.command()

@@ -88,13 +88,16 @@ def poses(folder: Path) -> None:
         console.print("The object turned in front of still surroundings: only the pixels inside the masks were used.")
 
 
-def masks(folder: Path, changes: list[str]) -> None:
-    """Make masks of a capture's photos, and write them to its folder `masks`. `changes` set the box about the object."""
+def masks(folder: Path, changes: list[str], model: Path | None = None) -> None:
+    """Make masks of a capture's photos, and write them to its folder `masks`.
+
+    `changes` set the box about the object. `model` is an ONNX file that judges pixels in place of their colours.
+    """
     from refgs.capture.masks import make_masks
     from refgs.settings import load_settings
 
     with job_report("making masks") as report:
-        found = make_masks(folder, load_settings("standard", changes).region, report)
+        found = make_masks(folder, load_settings("standard", changes).region, report, model)
     kept = f", {found['kept']} of yours kept" if found["kept"] else ""
     console.print(f"{found['made']} masks made{kept}: {folder / 'masks'}")
     console.print(f"the object's box: {' '.join(found['region'])}")

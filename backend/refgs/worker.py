@@ -57,6 +57,7 @@ class Masks(_Command):
     command: Literal["masks"]
     capture: str
     settings: list[str] = []
+    model: str | None = None
 
 
 class Train(_Command):
@@ -221,7 +222,8 @@ class Worker:
     def _masks(self, command: Masks) -> tuple[str, dict]:
         region = load_settings("standard", command.settings).region
         folder = Path(command.capture)
-        return "done", make_masks(folder, region, self.send) | {"capture": str(folder.resolve())}
+        model = Path(command.model) if command.model else None
+        return "done", make_masks(folder, region, self.send, model) | {"capture": str(folder.resolve())}
 
     def _train(self, command: Train) -> tuple[str, dict]:
         out = Path(command.out)

@@ -28,7 +28,7 @@ from tests.makers.captures import (
     write,
     write_as_phone,
 )
-from tests.makers.unmasked import ASIDE, COUNT, FOCAL, SIZE, colored, photograph
+from tests.makers.unmasked import ASIDE, COUNT, FOCAL, SIZE, colored, overlap, photograph, read_masks
 
 LENS = {"k1": 0.1, "k2": -0.02, "p1": 0.002, "p2": -0.001}
 
@@ -66,15 +66,6 @@ def mottled(pose):
     tone = sum(np.sin(point @ wave + 2 * i) for i, wave in enumerate(waves.reshape(-1, 3))) / np.sqrt(20)
     colors = np.array([[60, 40, 30], [150, 110, 80], [210, 190, 160]])
     return np.stack([np.interp(tone, [-1, 0, 1], colors[:, c]) for c in range(3)], axis=-1), mask
-
-
-def read_masks(folder, count=COUNT):
-    return [np.asarray(Image.open(folder / "masks" / f"{i:04d}.png")) > 127 for i in range(count)]
-
-
-def overlap(ours, truths):
-    """Return the intersection over union of each mask."""
-    return [(a & b).sum() / (a | b).sum() for a, b in zip(ours, truths, strict=True)]
 
 
 def region(*changes):

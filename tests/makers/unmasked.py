@@ -1,6 +1,7 @@
-"""Write captures without masks: photos of a ball before a mottled ground, and their true masks."""
+"""Write captures without masks: photos of a ball before a mottled ground, and their true masks. Compare masks with these."""
 
 import numpy as np
+from PIL import Image
 
 from tests.makers.captures import CENTRE, ball, edit, nerfstudio, ring, write
 
@@ -33,3 +34,13 @@ def photograph(folder, beside=False, poses=None, show=ball):
     intrinsics = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": SIZE[0] / 2, "cy": SIZE[1] / 2, "w": SIZE[0], "h": SIZE[1]}
     edit(folder / "transforms.json", lambda data: data.update(intrinsics))
     return truths
+
+
+def read_masks(folder, count=COUNT):
+    """Read the masks of a capture's photos, bool (H, W) each."""
+    return [np.asarray(Image.open(folder / "masks" / f"{i:04d}.png")) > 127 for i in range(count)]
+
+
+def overlap(ours, truths):
+    """Return the intersection over union of each mask."""
+    return [(a & b).sum() / (a | b).sum() for a, b in zip(ours, truths, strict=True)]

@@ -27,6 +27,7 @@ from refgs.capture.colmap import find_model
 from refgs.capture.images import read_image
 from refgs.capture.lens import Lens
 from refgs.capture.region import LOOK_OUT, WHITE_MASKS, find_region, sample_silhouettes, up_direction
+from refgs.capture.salience import SalienceModel
 from refgs.capture.silhouettes import Photo, carve_object, cut_out
 from refgs.capture.triangulate import triangulate
 from refgs.capture.types import Capture
@@ -44,21 +45,27 @@ class ReadOnlyError(InputError):
 
 
 def make_masks(
-    folder: Path, wanted: RegionSettings | None, report: Callable[[str, dict[str, Any]], None]
+    folder: Path,
+    wanted: RegionSettings | None,
+    report: Callable[[str, dict[str, Any]], None],
+    model: Path | None = None,
 ) -> dict[str, Any]:
     """Make the masks of a capture's photos, and write them to its folder `masks`.
 
     `wanted` may set a box about the object, as for `read_capture`; its up direction is not used. Without a box, the object is guessed
     (`guess_box`), and the guess is reported as the event "region". `report(event, facts)` is also called with "progress" and "warning".
+    `model` is an ONNX file (`SalienceModel`) that judges pixels in place of their colours.
 
     Returns a dict: `photos`, `made` and `kept` are numbers of masks, `objects` is the number of separate objects, and `region` is the box
     about them, as settings for a training of the capture with its new masks. These masks may move the capture's frame: `moved` (4, 4), a
     list, is p_new = moved @ p.
 
     All masks are written together at the end; an interrupted call leaves those of before. Raises InputError if all photos have masks by the
-    artist, if these are all white, if strokes do not fit, or if nothing is found, and ReadOnlyError if the folder cannot be written to.
+    artist, if these are all white, if strokes or the model do not fit, or if nothing is found, and ReadOnlyError if the folder cannot be
+    written to.
     """
     folder = Path(folder)
+    judge = _Judge(SalienceModel(model)) if model is not None else None
     capture = read_capture(folder, wanted and wanted.model_copy(update={"up": (0.0, 0.0, 0.0)}))
     root = _root(capture)
     _check_writable(root)
@@ -89,7 +96,7 @@ def make_masks(
     backdrop = None if plane is None else Backdrop(plane, box.centre, size)
     photos = []
     for view in chosen:
-        photos.append(_load(view, root, SIDE))
+        photos.append(_load(view, root, SIDE, judge))
         report("progress", {"stage": "reading", "done": len(photos), "total": len(chosen)})
 
     def carving(done: int, total: int) -> None:
@@ -108,7 +115,7 @@ def make_masks(
     try:
         files, found = {}, False
         for view, target in targets.items():
-            mask = _to_photo(view, cut_out(_load(view, root, FINE), shape))
+            mask = _to_photo(view, cut_out(_load(view, root, FINE, judge), shape))
             found |= bool(mask.any())
             path = work / target.relative_to(root)
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -235,15 +242,33 @@ def _stroke_file(view: View, root: Path) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-def _load(view: View, root: Path, side: int) -> Photo:
-    """Load a photo, undistorted and reduced, with what the artist's mask or strokes say about its pixels."""
+class _Judge:
+    """What a model finds in photos. Each photo is shown to it once, for it may take seconds."""
+
+    def __init__(self, model: SalienceModel):
+        self.model = model
+        self.found: dict[Path, np.ndarray] = {}
+
+    def __call__(self, view: View, size: tuple[int, int]) -> np.ndarray:
+        """Return the probability of the object at each pixel of a photo that is undistorted and reduced to `size` (width, height)."""
+        if view.image_path not in self.found:
+            likely = self.model(load_view(view, self.model.side).bytes)
+            shrink = min(1.0, FINE / max(likely.shape))
+            small = cv2.resize(likely, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+            self.found[view.image_path] = np.rint(255 * small).astype(np.uint8)
+        return cv2.resize(self.found[view.image_path], size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+
+
+def _load(view: View, root: Path, side: int, judge: _Judge | None) -> Photo:
+    """Load a photo, undistorted and reduced, with what the artist's mask or strokes and the model say about its pixels."""
     loaded = load_view(view, side)
     known = np.zeros(loaded.image.shape[:2], np.int8)
     if loaded.alpha is not None:
         known = np.where(loaded.alpha > 127, np.int8(1), np.int8(-1))
     elif (file := _stroke_file(view, root)) is not None:
         known = _read_strokes(file, view, loaded.camera)
-    return Photo(loaded.bytes, loaded.camera, known)
+    salient = None if judge is None else judge(view, (loaded.camera.width, loaded.camera.height))
+    return Photo(loaded.bytes, loaded.camera, known, salient)
 
 
 def _read_strokes(file: Path, view: View, camera: Camera) -> np.ndarray:

@@ -33,11 +33,15 @@ LEVELS = (20, 32, 32)  # bins of the histograms, in Lab
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """Reduced photo: `image` (H, W, 3) uint8 RGB, its pinhole `camera`, and what is `known` (H, W) int8: 1 object, −1 not, 0 nothing."""
+    """Reduced photo: `image` (H, W, 3) uint8 RGB, its pinhole `camera`, and what is `known` (H, W) int8: 1 object, −1 not, 0 nothing.
+
+    `salient` (H, W) is the probability of the object by a model. With it, colours are not asked.
+    """
 
     image: np.ndarray
     camera: Camera
     known: np.ndarray
+    salient: np.ndarray | None = None
 
     @cached_property
     def bins(self) -> np.ndarray:
@@ -77,13 +81,15 @@ def carve_object(photos: list[Photo], box: Box, fill: float, backdrop: Backdrop 
     """Carve the object in a box out of the photos. Return None if nothing is left.
 
     At first the object is taken for an ellipsoid in the box, which fills the part `fill` of it. `backdrop` is the plane that carries it,
-    or None; its texture is learned here. `progress(done, total)` is called after each round.
+    or None; its texture is learned here, unless the photos are `salient`. `progress(done, total)` is called after each round.
     """
     points = box.grid(GRID)
     centred = np.linalg.norm(np.linalg.solve(box.matrix[:3, :3], (points - box.centre).T), axis=0)
     occupied = np.clip(1.3 - 1.25 * centred / fill, 0.0, 0.85)
     allowed = np.ones(len(points), bool) if backdrop is None else backdrop.before(points)
     occupied[~allowed] = 0
+    if any(photo.salient is not None for photo in photos):
+        backdrop = None
     pixels = [_pixels(points, photo.camera) for photo in photos]
     seen = sum((at >= 0).astype(int) for at in pixels)
     allowed &= seen >= max(2, SEEN * len(photos))
@@ -282,8 +288,23 @@ def _posterior(
 ) -> np.ndarray:
     """Return the probability that each pixel shows the object.
 
-    It is by the colours of all photos and of this one, by the bare plane's, and by the shape's projection.
+    It is by the colours of all photos and of this one, and by the bare plane's, or by the model; and by the shape's projection.
     """
+    evidence = _of_colors(photo, prior, plain, colors) if photo.salient is None else _of_model(photo.salient)
+    odds = np.clip(prior, 0.1, 0.9)
+    result = 1 / (1 + np.exp(-(np.clip(evidence, -3, 3) + 0.7 * np.log(odds / (1 - odds)))))
+    return np.where(photo.known > 0, 0.999, np.where(photo.known < 0, 0.001, result))
+
+
+def _of_model(salient: np.ndarray) -> np.ndarray:
+    likely = np.clip(salient, 0.01, 0.99)
+    return np.log(likely / (1 - likely))
+
+
+def _of_colors(
+    photo: Photo, prior: np.ndarray, plain: np.ndarray | None, colors: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Return the logarithm of the odds that each pixel's colour is the object's, (H, W)."""
     ours, theirs = (_histogram(photo.bins, weight) for weight in _weights(photo, prior, plain, colors))
     ours = 0.5 * colors[0] + 0.5 * ours
     theirs = 0.3 * colors[1] + 0.7 * theirs if theirs.any() else colors[1]
@@ -292,7 +313,4 @@ def _posterior(
         ours = 0.7 * ours + 0.3 * theirs
     theirs = _surroundings(ours, theirs, plain)
     evidence = np.log((ours + 1e-6) / (theirs + 1e-6)).astype(np.float32)
-    evidence = np.clip(cv2.GaussianBlur(evidence, (0, 0), max(prior.shape) / 256), -3, 3)
-    odds = np.clip(prior, 0.1, 0.9)
-    result = 1 / (1 + np.exp(-(evidence + 0.7 * np.log(odds / (1 - odds)))))
-    return np.where(photo.known > 0, 0.999, np.where(photo.known < 0, 0.001, result))
+    return cv2.GaussianBlur(evidence, (0, 0), max(prior.shape) / 256)
