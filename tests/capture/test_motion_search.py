@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from refgs.capture import colmap_steps, motion, read_capture
+from refgs.capture import colmap_steps, motion, read_capture, similar
 from refgs.capture.files import find_photos
 from refgs.capture.motion import find_cameras
 from refgs.errors import InputError
@@ -160,7 +160,7 @@ def test_many_photos_in_any_order(tmp_path):
 
 def search_as_of_many(folder: Path) -> int:
     """Find cameras as if ALL_PAIRS photos were few, and write them. Return how many pairs of photos were chosen."""
-    colmap_steps.ALL_PAIRS, colmap_steps.SIMILAR = 16, 8
+    colmap_steps.ALL_PAIRS, similar.RANKS = 16, (0, 1, 2, 3, 5, 8)
     photos, database = find_photos(folder), folder / "many.db"
     best, _ = motion._search(photos, [], database, lambda *_: None)
     for number in best.reg_image_ids():

@@ -19,7 +19,7 @@ from refgs.capture.similar import similar_pairs
 
 SIDE = 1600  # pixels on the longer side for finding features; presets train on fewer
 ALL_PAIRS = 150  # photos; up to this many, every pair is matched
-NEXT, SIMILAR = 5, 15  # photos that each one is matched with where there are more
+NEXT = 5  # photos by name that each one is matched with where there are more
 CAMERA_MODEL = "RADIAL"  # with few photos a second focal length and tangential distortion only fit noise
 SEED = 1
 TIED = 3  # points that a photo must share with others; COLMAP asks for 30 where it places one photo after the other
@@ -37,7 +37,7 @@ def choose_pairs(database: Path) -> list[tuple[int, int]]:
     """Choose which photos in COLMAP's database to match. Return pairs of their indices; photos are sorted by name.
 
     With up to ALL_PAIRS photos, this is every pair. With more, each photo is matched with the next NEXT ones, which are close by in a film
-    or a walk around the object, and with SIMILAR ones that look like it. These link several rounds, and photos whose names say nothing.
+    or a walk around the object, and with some that look like it. These link several rounds, and photos whose names say nothing.
     """
     import pycolmap
 
@@ -46,7 +46,9 @@ def choose_pairs(database: Path) -> list[tuple[int, int]]:
         photos = sorted(images)
         if len(photos) <= ALL_PAIRS:
             return list(combinations(photos, 2))
-        similar = similar_pairs(lambda place: known.read_descriptors(images[photos[place]]).data, len(photos), SIMILAR)
+        similar = similar_pairs(
+            lambda place: known.read_descriptors(images[photos[place]]).data, len(photos), beside=NEXT
+        )
     following = {(a, b) for a in range(len(photos)) for b in range(a + 1, min(a + NEXT + 1, len(photos)))}
     return sorted((photos[a], photos[b]) for a, b in following | similar)
 

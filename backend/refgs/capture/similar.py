@@ -10,18 +10,18 @@ from collections.abc import Callable
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-WORDS = 64
+WORDS = 256
 SAMPLE = 200  # features of each photo that the means are made of
 ROUNDS = 10  # of k-means
-APART = 2  # places
+RANKS = *range(8), 9, 11, 14, 18, 24, 32, 43  # by likeness, of the photos that each one is paired with
 
 
-def similar_pairs(read: Callable[[int], np.ndarray], count: int, most: int) -> set[tuple[int, int]]:
-    """Pair each of `count` photos with up to `most` others that look most like it. Return pairs of indices, the smaller one first.
+def similar_pairs(read: Callable[[int], np.ndarray], count: int, beside: int) -> set[tuple[int, int]]:
+    """Pair each of `count` photos with others that look like it. Return pairs of indices, the smaller one first.
 
-    `read(index)` returns the descriptors of a photo's features, (M, D) of any dtype. It is called twice for each photo. A photo and those
-    it is paired with are more than APART places from each other: otherwise a film's neighbours, which look most alike, would leave no place
-    for its other rounds. The result is the same for the same photos.
+    `read(index)` returns the descriptors of a photo's features, (M, D) of any dtype. It is called twice for each photo. Photos at most
+    `beside` places from each other are not paired. RANKS are ever further apart: where photos are many, the most alike ones are all
+    neighbours, and would leave no place for other rounds around the object. The result is the same for the same photos.
     """
     random = np.random.default_rng(0)
     sample = np.concatenate([random.permutation(read(index))[:SAMPLE] for index in range(count)])
@@ -31,13 +31,9 @@ def similar_pairs(read: Callable[[int], np.ndarray], count: int, most: int) -> s
     vectors = np.stack([_describe(_unit(read(index)), means) for index in range(count)])
     pairs = set()
     for one, likeness in enumerate(vectors @ vectors.T):
-        likeness[max(0, one - APART) : one + APART + 1] = -np.inf
-        for _ in range(most):
-            other = int(np.argmax(likeness))
-            if likeness[other] == -np.inf:
-                break
-            pairs.add((min(one, other), max(one, other)))
-            likeness[max(0, other - APART) : other + APART + 1] = -np.inf
+        order = [other for other in np.argsort(-likeness, kind="stable").tolist() if abs(other - one) > beside]
+        chosen = [order[rank] for rank in RANKS if rank < len(order)]
+        pairs.update((min(one, other), max(one, other)) for other in chosen)
     return pairs
 
 
