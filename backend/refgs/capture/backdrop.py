@@ -16,8 +16,9 @@ from refgs.camera import Camera
 SIDE = 512  # texels
 REACH = 3.0  # half the texture's side, in radii of the region: low cameras see the object before a far part
 ABOVE = 0.03  # in radii of the region: what is nearer to the plane is part of it
+AGREE = 2.0  # times the median spread between photos, below which photos agree on a texel, so that nothing hides it
 UNSURE = 5.0  # times the median spread between photos, from which on a texel's colour is not known
-HIDDEN = 3.0  # odds of object to plane at texels that something hides in all photos
+HIDDEN = 3.0  # odds of object to plane at texels that the shape covers in all photos
 SEEN = 4  # photos that must see a texel
 STEPS = 72.8  # of a byte for a change by a factor of e: log(255 + DARK) fits
 DARK = 8.0  # added to 8-bit values before their logarithm, which noise would dominate otherwise
@@ -104,43 +105,30 @@ class Backdrop:
     def learn(self, images: list[np.ndarray], cameras: list[Camera], hidden: list[np.ndarray]) -> None:
         """Learn from photos (H, W, 3) uint8 RGB. Pixels (H, W) that are `hidden` may show the object."""
         stack = np.full((SIDE * SIDE, 3, len(images)), 255, np.uint8)
-        shown = np.zeros((SIDE, SIDE), int)  # photos that show a texel, or what hides it
+        bare = np.zeros((SIDE * SIDE, len(images)), bool)  # photos in which nothing may hide a texel
         for index, (image, camera, hide) in enumerate(zip(images, cameras, hidden, strict=True)):
             at, valid = self._texels_in(camera)
-            shown += valid
             warped = cv2.remap(_logarithm(image), at, None, cv2.INTER_LINEAR)
-            valid &= cv2.remap(hide.astype(np.uint8), at, None, cv2.INTER_LINEAR, borderValue=1) == 0
             stack[valid.ravel(), :, index] = warped[valid]
-        count = (stack[:, 0] < 255).sum(axis=1)
-        texels = np.flatnonzero(count >= SEEN)
-        self.known = (count >= SEEN).reshape(SIDE, SIDE)
-        self.color = np.zeros((SIDE, SIDE, 3), np.float32)
-        self.spread = np.zeros((SIDE, SIDE, 3), np.float32)
-        self.odds = np.full((SIDE, SIDE), np.nan, np.float32)
-        self.odds[~self.known & (shown >= SEEN)] = HIDDEN
-        if not len(texels):
-            return
-        values, count = stack[texels].astype(np.float32), count[texels]
-        values[stack[texels] == 255] = np.nan
-        # Photos see different texels, so exposures are fitted in turns with the texture.
-        offset = np.zeros((3, len(images)), np.float32)
-        some = values[:: max(1, len(texels) // 20000)]
-        for _ in range(4):
-            middle = np.nanmedian(some - offset, axis=2, keepdims=True)
-            with np.errstate(invalid="ignore"):
-                change = np.nanmedian(some - offset - middle, axis=0)
-            offset += np.nan_to_num(change)
-        ordered = np.sort(values - offset, axis=2)  # NaN last
-        low, middle, high = (
-            np.take_along_axis(ordered, (part * (count - 1)).astype(int)[:, None, None], axis=2)[..., 0]
-            for part in (0.25, 0.5, 0.75)
-        )
-        self.color[self.known], self.spread[self.known] = middle, (high - low) / 1.35
-        # What the object hides in most photos has its colours in these: no two photos agree.
-        spread = self.spread.mean(axis=-1)
-        unsure = self.known & (spread > UNSURE * np.median(spread[self.known]))
-        self.odds[unsure] = 1
-        self.known &= ~unsure
+            free = valid & (cv2.remap(hide.astype(np.uint8), at, None, cv2.INTER_LINEAR, borderValue=1) == 0)
+            bare[:, index] = free.ravel()
+        shown = stack[:, 0] < 255
+        known = bare.sum(axis=1) >= SEEN
+        covered = (shown.sum(axis=1) >= SEEN) & ~known
+        color, spread = np.zeros((2, SIDE * SIDE, 3), np.float32)
+        odds = np.full(SIDE * SIDE, np.nan, np.float32)
+        if known.any():
+            color[known], spread[known], offset = _median(stack[known], bare[known])
+            color[covered], spread[covered], _ = _median(stack[covered], shown[covered], offset)
+        deviation = spread.mean(axis=-1)
+        usual = np.median(deviation[known]) if known.any() else 0.0
+        # What the object hides has its colours, of other places in each photo. Where photos agree, the shape may cover bare plane.
+        odds[covered & (deviation >= AGREE * usual)] = HIDDEN
+        unsure = known & (deviation > UNSURE * usual)
+        odds[unsure] = 1
+        known &= ~unsure
+        self.known, self.odds = known.reshape(SIDE, SIDE), odds.reshape(SIDE, SIDE)
+        self.color, self.spread = color.reshape(SIDE, SIDE, 3), spread.reshape(SIDE, SIDE, 3)
 
     def likelihood(self, image: np.ndarray, camera: Camera, hidden: np.ndarray) -> np.ndarray:
         """Return how likely the bare plane has each pixel's colour, (H, W) float32: the mass in a cell of BIN.
@@ -195,6 +183,31 @@ class Backdrop:
         valid &= (u < camera.width - 0.5) & (v < camera.height - 0.5)
         at = np.stack([u - 0.5, v - 0.5], axis=-1).astype(np.float32)
         return np.where(valid[..., None], at, np.float32(-10)), valid
+
+
+def _median(
+    stack: np.ndarray, used: np.ndarray, offset: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the median (N, 3) and the spread (N, 3) of texels over the photos that are `used` (N, photos), and the photos' exposures.
+
+    `stack` (N, 3, photos) has the texels' logarithms. Exposures (3, photos) are fitted unless `offset` gives them.
+    """
+    count = used.sum(axis=1)
+    values = np.where(used[:, None], stack, np.float32(np.nan))
+    if offset is None:
+        # Photos see different texels, so exposures are fitted in turns with the texture.
+        offset = np.zeros(stack.shape[1:], np.float32)
+        every = max(1, len(values) // 20000)
+        some, seen = values[::every], used[::every].any(axis=0)
+        for _ in range(4):
+            middle = np.nanmedian(some - offset, axis=2, keepdims=True)
+            offset[:, seen] += np.nanmedian((some - offset - middle)[..., seen], axis=0)
+    ordered = np.sort(values - offset, axis=2)  # NaN last
+    low, middle, high = (
+        np.take_along_axis(ordered, (part * (count - 1)).astype(int)[:, None, None], axis=2)[..., 0]
+        for part in (0.25, 0.5, 0.75)
+    )
+    return middle, (high - low) / 1.35, offset
 
 
 def _logarithm(image: np.ndarray) -> np.ndarray:
