@@ -4,17 +4,20 @@ import hashlib
 import json
 import struct
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 from refgs import commands
+from refgs.camera import Camera
 from refgs.capture import masks as making
 from refgs.capture import read_capture, silhouettes
-from refgs.capture.backdrop import find_plane
+from refgs.capture.backdrop import HIDDEN, Backdrop, Plane, find_plane
 from refgs.capture.images import read_image
 from refgs.capture.masks import make_masks, region_settings
 from refgs.errors import InputError
+from refgs.geometry.project import project
 from refgs.settings import load_settings
 from tests.makers.captures import (
     CENTRE,
@@ -279,6 +282,33 @@ def test_object_of_the_floors_colours_is_told_from_it(tmp_path):
     edit(tmp_path / "transforms.json", lambda data: data.update(intrinsics))
     make_masks(tmp_path, None, silent)
     assert np.mean(overlap(read_masks(tmp_path, len(VIEWS)), [mask for _, mask in shown])) > 0.8
+
+
+def test_covered_floor_counts_for_the_object_only_where_photos_disagree():
+    poses = [look_at(CENTRE + 3 * np.array(x) / np.linalg.norm(x), CENTRE) for x in VIEWS]
+    shown = [mottled(pose) for pose in poses]
+    floor, aside = CENTRE + np.array([[0, 0, -0.5], [0.9, 0, -0.5]])
+    backdrop = Backdrop(Plane(np.array([0.0, 0.0, 1.0]), floor[2]), CENTRE, 1.0)
+    cameras, hidden = [], []
+    for pose, (_, mask) in zip(poses, shown, strict=True):
+        world_to_camera = np.linalg.inv(pose @ np.diag([1.0, -1.0, -1.0, 1.0]))
+        camera = Camera("", *SIZE, FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2, world_to_camera)
+        (u, v), _ = (x[0] for x in project(camera, aside[None]))
+        columns, rows = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+        cameras.append(camera)
+        hidden.append(cv2.dilate(mask.astype(np.uint8), np.ones((5, 5))) > 0)
+        hidden[-1] |= np.hypot(columns + 0.5 - u, rows + 0.5 - v) < 12
+    backdrop.learn([photo.astype(np.uint8) for photo, _ in shown], cameras, hidden)
+
+    def odds(point):
+        """Return the odds of object to plane at the texels close to a point of the floor."""
+        column, row = np.linalg.lstsq(backdrop.to_world[:3, :2], point - backdrop.to_world[:3, 2], rcond=None)[
+            0
+        ].astype(int)
+        return backdrop.odds[row - 3 : row + 4, column - 3 : column + 4]
+
+    assert np.mean(odds(floor) == HIDDEN) > 0.8
+    assert np.mean(np.isnan(odds(aside))) > 0.8
 
 
 def test_made_masks_are_noted(tmp_path):
