@@ -81,7 +81,7 @@ PROFILE = [
 ]  # fmt: skip
 
 
-def build() -> Scene:
+def build_can() -> Scene:
     """Build the can, two units high."""
     return Scene(lathe([(0, PROFILE)], rows=360, columns=420), MATERIALS, light=window_light())
 
@@ -129,7 +129,7 @@ def photograph(out: Path, samples: int) -> None:
     """Render the photos and the true masks into the new folder `out`. Exposures differ, as a phone's do."""
     from scripts.demo.cycles import FIELD_OF_VIEW, Renderer
 
-    scene, generator = build(), np.random.default_rng(0)
+    scene, generator = build_can(), np.random.default_rng(0)
     renderer = Renderer(scene.mesh, scene.materials, SIZE[0], samples)
     renderer.scene.render.resolution_y = SIZE[1]
     surroundings = renderer.add(room(), scene.materials)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from refgs.capture import read_capture
+from refgs.capture.backdrop import find_plane
 from refgs.capture.region import up_direction
-from refgs.capture.silhouettes import find_floor
 from refgs.capture.triangulate import neighbours, triangulate
 from tests.makers.captures import CENTRE, edit, nerfstudio, ring, write
 
@@ -41,10 +41,11 @@ def test_the_table_is_found_by_triangulated_points(table):
     assert heard[-1] == (COUNT, COUNT) and len(points) > 100
     height = (points @ capture.to_capture[:3, :3].T + capture.to_capture[:3, 3])[:, 2] - CENTRE[2]
     assert np.quantile(np.abs(height + DEPTH), 0.9) < 0.02
-    normal, distance = find_floor(points, capture.centre, 0.6 * capture.radius, up_direction(capture.views))
-    assert normal[2] > 0.99
-    above = (distance * normal @ capture.to_capture[:3, :3].T + capture.to_capture[:3, 3])[2] - CENTRE[2]
-    assert 0 < above + DEPTH < 0.1
+    positions = np.array([view.camera.position for view in capture.views])
+    plane = find_plane(points, capture.centre, 0.6 * capture.radius, up_direction(capture.views), positions)
+    assert plane.normal[2] > 0.99
+    foot = plane.distance * plane.normal @ capture.to_capture[:3, :3].T + capture.to_capture[:3, 3]
+    assert abs(foot[2] - CENTRE[2] + DEPTH) < 0.03
 
 
 def test_photos_without_texture_have_no_points(tmp_path):

@@ -151,8 +151,10 @@ def test_masks_by_others_that_are_not_used_stay(tmp_path):
 
     for i in range(COUNT):
         Image.fromarray(white).save(tmp_path / "masks" / f"{i:04d}.png")
-    with pytest.raises(InputError, match="was not made here"):
+    before = {file: file.read_bytes() for file in (tmp_path / "masks").iterdir()}
+    with pytest.raises(InputError, match=f"all {COUNT} masks are white"):
         masks.make_masks(tmp_path, None, lambda *_: None)
+    assert {file: file.read_bytes() for file in (tmp_path / "masks").iterdir()} == before
 
 
 def test_check_says_where_the_object_is_looked_for(tmp_path):
