@@ -8,7 +8,6 @@ from refgs.run_folder import PHOTOS
 from refgs.train import poses
 from refgs.train.losses import Photo
 from refgs.train.needs.photos import MARGIN, bounds
-from refgs.train.object_size import object_size
 from refgs.train.plan import FULL, Stage
 from refgs.train.state import Reduced, State
 
@@ -21,11 +20,10 @@ def stages(pixels: float) -> tuple[Stage, ...]:
     return *(Stage(*stage) for stage in STAGES if pixels / stage[1] >= LEAST), *FULL
 
 
-def begin(state: State) -> None:
-    """Choose the stages of a training by its photos, and start with the first one."""
+def begin(state: State, pixels: float) -> None:
+    """Choose the stages of a training of an object that spans so many `pixels` in the full photos, and start with the first one."""
     if state.settings.image.coarse == "off":
         return
-    pixels = object_size(state).span
     found = stages(pixels)
     if state.poses is not None:  # that they are refined takes full photos
         found = *(stage for stage in found if stage.until <= poses.KNOWN), *FULL

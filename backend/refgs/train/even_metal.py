@@ -11,18 +11,17 @@ from torch import Tensor
 
 from refgs.model.surfels import Surfels
 from refgs.train.state import State
-from refgs.train.view_dependence import neighbours, pooled, saturation
+from refgs.train.view_dependence import SATURATED, from_grey, neighbours, pooled
 
 EVERY = 50  # iterations
 UNTIL = 0.6  # part of the training
 AVERAGED = 16  # neighbours
 METALLIC = 0.8
-SATURATED = 0.08  # distance of the base colour's chromaticity from grey: gold has 0.23, copper 0.14, silver 0.03
 
 
 def coloured_metal(surfels: Surfels) -> Tensor:
     """Tell which surfels (N,) are coloured metal, as far as they have learned."""
-    return (surfels.metallic > METALLIC) & (saturation(surfels.albedo) > SATURATED)
+    return (surfels.metallic > METALLIC) & (from_grey(surfels.albedo).norm(dim=1) > SATURATED)
 
 
 @torch.no_grad()

@@ -48,9 +48,8 @@ def surfel_budget(settings: SurfelSettings, area: float) -> int:
     return min(settings.budget, max(LEAST * settings.start, round(settings.density * area)))
 
 
-def limit_surfels(state: State) -> None:
-    """Lower the surfel budget to what the object takes."""
-    area = object_size(state).area
+def limit_surfels(state: State, area: float) -> None:
+    """Lower the surfel budget to what an object of `area` pixels in a photo takes."""
     if (budget := surfel_budget(state.settings.surfels, area)) < state.settings.surfels.budget:
         known = f"the object covers {area:,.0f} pixels of a photo" if area else "no masks show the object's size"
         state.change("surfels.budget", budget, "photos", known)

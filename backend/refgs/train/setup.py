@@ -16,7 +16,7 @@ from refgs.train.effective import Effective
 from refgs.train.guard import limits
 from refgs.train.light_frame import light_frame
 from refgs.train.losses import Photo
-from refgs.train.object_size import limit_surfels
+from refgs.train.object_size import limit_surfels, object_size
 from refgs.train.plan import Plan
 from refgs.train.start import start_appearance, start_parameters
 from refgs.train.state import EXPOSURE, State, why_not_traced
@@ -36,8 +36,9 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     _start_learning(state)
     poses.start(state)
     needs.evaluate_due(state, "start")
-    limit_surfels(state)
-    coarse.begin(state)
+    size = object_size(state)
+    limit_surfels(state, size.area)
+    coarse.begin(state, size.span)
     return state
 
 

@@ -29,7 +29,7 @@ LEAST_CLIPPED = 0.05  # of a surfel's pixels in a photo; then its highlights loo
 DARK = 0.03  # linear radiance below which a surfel does not count for a photo's exposure
 NEIGHBOURS = 64  # surfels whose changes are pooled, as one alone has too few photos
 FEW = 32  # of them, where the size of the change is asked and not its colour: pooling evens it out
-SATURATED = 0.08  # distance of a chromaticity from grey, below which metals and dielectrics change alike
+SATURATED = 0.08  # distance of a chromaticity from grey, below which metals and dielectrics change alike: silver has 0.03, copper 0.14
 CHANGES = 0.15  # change relative to the mean radiance, below which it may be texture that is slightly out of place
 FAINT_CHANGES = 0.08  # enough where neighbours change clearly, and alike
 GROWTH = 8  # steps from neighbours to neighbours
@@ -179,10 +179,11 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Tensor:
     axis = torch.linalg.eigh(covariance).eigenvectors[:, :, 2]
     axis = axis * torch.sign(axis.sum(dim=1, keepdim=True))
     axis = axis / axis.sum(dim=1, keepdim=True).clamp_min(0.2)
-    from_grey = mean / mean.sum(dim=1, keepdim=True) - 1 / 3
-    tint = ((axis - 1 / 3) * from_grey).sum(dim=1) / from_grey.square().sum(dim=1).clamp_min(1e-6)
+    own = from_grey(mean)
+    saturation = own.norm(dim=1)
+    tint = ((axis - 1 / 3) * own).sum(dim=1) / saturation.square().clamp_min(1e-6)
     size = covariance.diagonal(dim1=1, dim2=2).mean(dim=1).sqrt()
-    told = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation(mean) > SATURATED) & (tint > METAL) & (size > FAINT_CHANGES)
+    told = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation > SATURATED) & (tint > METAL) & (size > FAINT_CHANGES)
     metal = told & (size > CHANGES)
     for _ in range(GROWTH):
         metal = metal | told & (pooled(metal.float()[:, None], near)[:, 0] > near.shape[1] / 4)
@@ -205,9 +206,9 @@ def falls_as_metal(observations: Observations, positions: Tensor, light: float) 
     return usable & (median - low > DROP * light) & (low < FALLS * median)
 
 
-def saturation(colour: Tensor) -> Tensor:
-    """Return the distance of linear colours' (N, 3) chromaticity from grey (N,)."""
-    return (colour / colour.sum(dim=1, keepdim=True).clamp_min(1e-6) - 1 / 3).norm(dim=1)
+def from_grey(colour: Tensor) -> Tensor:
+    """Return how far the chromaticities of linear colours (N, 3) are from grey's (N, 3)."""
+    return colour / colour.sum(dim=1, keepdim=True).clamp_min(1e-6) - 1 / 3
 
 
 def averaged(observations: Observations, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
