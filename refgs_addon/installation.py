@@ -180,7 +180,7 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
         _run_uv(program, variables, home, "venv", "--python", PYTHONS, str(home / "env"))
     _emit("stage", what="Resolving the trainer's dependencies")
     # --no-build: the artist's machine may have no compiler.
-    _run_uv(program, variables, home, "pip", "install", "--no-build", "--python", str(python(home)), str(trainer))
+    _run_uv(program, variables, home, "pip", "install", "--no-build", "--python", str(python(home)), f"{trainer}[onnx]")
     _emit("stage", what="Starting the trainer for the first time", part=0.99)
     _start_trainer(python(home))
     _marker(home).write_text(trainer.name.split("-")[1], encoding="utf-8")

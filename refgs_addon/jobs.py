@@ -256,15 +256,18 @@ def extract_photos(python: Path, video: Path, out: Path, count: int, log: Path) 
     return _add(Job(out.name, python, [command], log))
 
 
-def make_masks(python: Path, capture: Path, out: Path, log: Path, settings: Mapping[str, object]) -> Job:
+def make_masks(
+    python: Path, capture: Path, out: Path, log: Path, settings: Mapping[str, object], model: Path | None
+) -> Job:
     """Start a job that makes masks for a capture's photos, then does the same as `check`. It does not wait for other jobs.
 
-    `settings` may have a box about the object, as for `train`. Raises InputError if such a job is running already.
+    `settings` may have a box about the object, as for `train`. `model` is an ONNX file that finds the object in a photo. Raises InputError
+    if such a job is running already.
     """
     kind = {"command": "masks", "capture": str(capture)}
     if any(not job.ended and job.commands and kind.items() <= job.commands[0].items() for job in JOBS):
         raise InputError(f"the masks of {capture.name} are being made already: wait for them, or stop that")
-    command = kind | {"settings": _words(settings)}
+    command = kind | {"settings": _words(settings), "model": model and str(model)}
     return _add(Job(capture.name, python, [command, _check(capture, out)], log))
 
 

@@ -33,6 +33,12 @@ class Preferences(bpy.types.AddonPreferences):
         description="Folder with your own panoramas (EXR or HDR), shown beside those that come with Blender",
         subtype="DIR_PATH",
     )
+    mask_model: StringProperty(
+        name="Mask Model",
+        description="ONNX file of a model that segments salient objects, such as BiRefNet. "
+        "If left empty, Make Masks finds the object by colours",
+        subtype="FILE_PATH",
+    )
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
@@ -48,9 +54,10 @@ class Preferences(bpy.types.AddonPreferences):
         row.enabled = not installing()
         row.use_property_split = True
         row.prop(self, "python", text="Or an Existing Python")
-        row = layout.row()
-        row.use_property_split = True
-        row.prop(self, "hdris")
+        column = layout.column()
+        column.use_property_split = True
+        column.prop(self, "hdris")
+        column.prop(self, "mask_model")
 
 
 _own_jobs: list[jobs.Job] = []  # the newest query or installation; at most one
@@ -84,6 +91,11 @@ def hdri_folder() -> Path | None:
     """Return the folder of the artist's panoramas, or None if none is chosen."""
     addon = bpy.context.preferences.addons.get(PACKAGE)
     return Path(bpy.path.abspath(addon.preferences.hdris)) if addon and addon.preferences.hdris else None
+
+
+def mask_model() -> Path | None:
+    """Return the path of the artist's model for masks, or None if none is chosen."""
+    return Path(bpy.path.abspath(preferences().mask_model)) if preferences().mask_model else None
 
 
 def log_file(name: str) -> Path:

@@ -9,7 +9,7 @@ from mathutils import Matrix
 from .. import jobs
 from ..errors import InputError
 from ..job_timers import follow_jobs
-from ..preferences import capture_folder, log_file, python, set_up
+from ..preferences import capture_folder, log_file, mask_model, python, set_up
 from . import strokes
 from .capture_cameras import cameras_of, show_cameras
 from .decisions import find_decision
@@ -68,13 +68,14 @@ def make_masks(scene: bpy.types.Scene) -> jobs.Job:
     """Start a job that makes masks for the scene's capture, and then checks the capture.
 
     The trainer looks for the object in the box that limits the training, if the artist placed one; otherwise in the middle of what the
-    cameras look at. When the job is done, the capture's cameras are shown, with the box around the object among them: masks change the
-    frame of both. Canvases of strokes show the new masks.
+    cameras look at. It asks the model of the preferences, if one is chosen. When the job is done, the capture's cameras are shown, with the
+    box around the object among them: masks change the frame of both. Canvases of strokes show the new masks.
     """
     capture, mine = _capture(scene), artists_region(scene) is not None
     settings = region_settings(scene) if mine else {}
     settings.pop("region.up", None)  # turns the frame of a training, not that of the cameras
-    job = jobs.make_masks(python(), capture, capture_folder(capture), log_file(f"masks {capture.name}"), settings)
+    log = log_file(f"masks {capture.name}")
+    job = jobs.make_masks(python(), capture, capture_folder(capture), log, settings, mask_model())
     jobs.JOBS[:] = [other for other in jobs.JOBS if other is job or not (other.ended and "masks" in other.results)]
     number = scene.session_uid
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from refgs_addon import jobs
+from refgs_addon import jobs, preferences
 from refgs_addon.errors import InputError
 from refgs_addon.scene import regions, strokes, training
 from refgs_addon.scene.capture_cameras import cameras_of, show_cameras
@@ -28,6 +28,11 @@ def capture(addon, tmp_path):
     (folder / "images").mkdir(parents=True)
     addon.refgs.capture = f"{folder}/"
     return folder
+
+
+def asked(folder):
+    """Read with what the fake trainer was asked to make masks."""
+    return json.loads((folder / "asked").read_text())
 
 
 def add_photo(scene, folder, name, pixels=None, **saved):
@@ -92,7 +97,7 @@ def test_masks_show_the_box_among_the_cameras(addon, capture):
     job = jobs.JOBS[-1]
     with pytest.raises(RuntimeError, match="are being made already"):
         bpy.ops.refgs.make_masks()
-    assert final_state(job) == "done" and json.loads((capture / "asked").read_text()) == []
+    assert final_state(job) == "done" and asked(capture) == {"settings": [], "model": None}
     assert [item.name for item in cameras_of(addon, capture).objects] == ["0", "1"]
     # The box is in the frame of the masked capture already, and has room.
     box = regions.training_region(addon)
@@ -101,12 +106,14 @@ def test_masks_show_the_box_among_the_cameras(addon, capture):
     assert settings["region.size"] == pytest.approx([regions.ROOM * edge for edge in (1, 2, 4)])
     # As long as nobody touches it, it does not limit masks: strokes may add what is outside.
     assert regions.artists_region(addon) is None
-    assert final_state(training.make_masks(addon)) == "done" and json.loads((capture / "asked").read_text()) == []
+    assert final_state(training.make_masks(addon)) == "done" and asked(capture) == {"settings": [], "model": None}
     assert sum("masks" in job.results for job in jobs.JOBS) == 1
     box.location = 1, 2, 3
     assert regions.artists_region(addon) == box
+    preferences.preferences().mask_model = "/models/birefnet.onnx"
     assert final_state(training.make_masks(addon)) == "done"
-    sent = json.loads((capture / "asked").read_text())
+    assert asked(capture)["model"] == "/models/birefnet.onnx"
+    sent = asked(capture)["settings"]
     assert [word.split("=")[0] for word in sent] == ["region.centre", "region.size", "region.rotation"]
     assert json.loads(sent[0].split("=")[1]) == [1, 2, 3]
     # The masks changed the frame, and the box with it.

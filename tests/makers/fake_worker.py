@@ -161,7 +161,9 @@ def main():
                 counts = {"frames": 3, "photos": command["count"], "blurred": 1, "duplicates": 2}
                 say("done", job="frames", capture=command["out"], **counts)
             elif command["command"] == "masks":
-                (Path(command["capture"]) / "asked").write_text(json.dumps(command["settings"]))
+                (Path(command["capture"]) / "asked").write_text(
+                    json.dumps({key: command[key] for key in ("settings", "model")})
+                )
                 say("progress", stage="carving", done=1, total=3)
                 say("done", job="masks", photos=3, made=2, kept=1, objects=1, **made_masks(command))
             elif command["command"] == "poses":

@@ -180,6 +180,15 @@ def test_metals_are_set_once(made):
     assert (state.parameters["metallic"] == 0).all()
 
 
+def test_propagation_finds_metals_by_itself(large_ball, tmp_path):
+    made = small(large_ball, tmp_path / "run", *ALL, "propagation.every=20", total=400)
+    show(made, metallic=6.0, roughness=-1.0)
+    put(made, metallic=0.0)
+    made.state.iteration = metals.SOONEST
+    metals.set_metals_due(made.state, 0.25)
+    assert not made.state.metals_set and (made.state.parameters["metallic"] == 0).all()
+
+
 def test_what_is_metal_all_over_is_held(made):
     """Check that a ball of metal stays metal while everything else learns, and that halves of its surfels are held, too."""
     show(made, metallic=6.0, roughness=-1.0)

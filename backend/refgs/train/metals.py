@@ -34,12 +34,14 @@ def set_metals_due(state: State, progress: float) -> None:
 
     If nearly all shine as coloured metals do, all are metal from then on (see `hold`). Otherwise the others keep the metallic that they
     have learned: it started low, as that of a dielectric.
+
+    Schedules that propagate normals find metals by that, as the paper does: nothing is set there.
     """
     settings = state.settings
     early = progress - settings.initial.until < KNOWN or state.iteration < SOONEST
     if state.metals_set or early or progress >= state.residual_start:
         return
-    if settings.render.reflection != "microfacet" or not needs.decidable(state):
+    if settings.render.reflection != "microfacet" or settings.propagation.every or not needs.decidable(state):
         return
     observations, metallic = observe(state), state.parameters["metallic"]
     positions, weight = state.parameters["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
