@@ -39,7 +39,7 @@ def test_a_value_between_two_8_bit_codes_comes_into_the_loss(tmp_path, bits):
     view = load_view(View(camera, tmp_path / "a.png", None, "train"), 8)  # through the decoding and reducing, too
     color = torch.full((8, 8, 3), 100.25 / 255, requires_grad=True)
     one = torch.ones(8, 8)
-    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, matte=0, light=0, exposure=0)
+    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, dark=0, matte=0, light=0, exposure=0)
     rendering = Rendering(color, one, one, torch.zeros(8, 8, 3))
     objective(rendering, None, Photo.of(view), torch.zeros(3), only, 1.0).loss.backward()
     assert ((color.grad < 0) if bits == 16 else (color.grad > 0)).all()

@@ -18,7 +18,7 @@ from tests.makers.emulate import emulate
 
 DARK, FLAT = 0.1, 0.01
 ALL = LossSettings(
-    dssim=0.2, normal=0.3, smooth=0.4, even=0.25, alpha=0.5, metallic=0.6, matte=0.7, light=0.0, exposure=0.0
+    dssim=0.2, normal=0.3, smooth=0.4, even=0.25, alpha=0.5, metallic=0.6, dark=0.35, matte=0.7, light=0.0, exposure=0.0
 )
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
 MAPS = ("color", "normal", "blended_depth", "alpha", "material")
@@ -67,7 +67,7 @@ def reference(rendering: Rendering, view: Photo, weights: LossSettings, progress
         terms["metallic"] = weights.metallic * progress**2 * (m * (1 - m)).sum() / covered
         dark = (1 - rendering.albedo.detach().amax(dim=-1) / DARK).clamp(0, 1)
         terms["matte"] = weights.matte * huber((rendering.roughness - 0.3).clamp_min(0)).sum() / covered
-        terms["dark metal"] = weights.metallic * (dark * m).sum() / covered
+        terms["dark metal"] = weights.dark * (dark * m).sum() / covered
     return terms
 
 
@@ -166,7 +166,9 @@ def test_the_light_is_held_to_be_neutral_on_the_whole(device):
     The term grows as the light's mean colour departs from grey.
     """
     rendering, view = pictures(8, 8, masked=True, material=True)
-    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, matte=0, light=0.5, exposure=0)
+    only = LossSettings(
+        dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, dark=0, matte=0, light=0.5, exposure=0
+    )
     mean = torch.rand(3, generator=torch.Generator().manual_seed(0))
     for scale in (1e-6, 1, 1e6):
         exact = (scale * mean).double().requires_grad_()
@@ -227,7 +229,9 @@ def test_a_clipped_photo_is_a_lower_bound(code, white, term, device):
 
     A photo one code below the largest is not clipped and pulls from above, too.
     """
-    only = LossSettings(dssim=term, normal=0, smooth=0, even=0, alpha=0, metallic=0, matte=0, light=0, exposure=0)
+    only = LossSettings(
+        dssim=term, normal=0, smooth=0, even=0, alpha=0, metallic=0, dark=0, matte=0, light=0, exposure=0
+    )
     camera, bound = scenes.camera(16, 16), code / white
     dtype = torch.uint8 if white == 255 else torch.uint16
 
@@ -257,7 +261,7 @@ def test_the_background_is_no_lower_bound(device):
     rendering, view = pictures(8, 8, masked=True, material=False)
     rendering.color[:] = 1.5
     view.image[:], view.mask[:] = 255, 0
-    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, matte=0, light=0, exposure=0)
+    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, dark=0, matte=0, light=0, exposure=0)
     found = leaves(rendering, torch.float32, device)
     loss = objective(found, None, moved(view, device), torch.ones(3, device=device), only, 1.0).loss
     assert (gradients(loss, found)["color"] > 0).all()
@@ -272,7 +276,7 @@ def test_normals_of_a_plane_agree_with_its_depth():
     flat = Rendering(
         torch.zeros(30, 40, 3), one, torch.tensor(depth).float(), torch.tensor(normal).float().expand(30, 40, 3)
     )
-    only = LossSettings(dssim=0, normal=1, smooth=1, even=1, alpha=0, metallic=0, matte=0, light=0, exposure=0)
+    only = LossSettings(dssim=0, normal=1, smooth=1, even=1, alpha=0, metallic=0, dark=0, matte=0, light=0, exposure=0)
     assert abs(float(objective(flat, None, view, BACKGROUND, only, 1.0).loss)) < 1e-6
     turned = replace(flat, normal=-flat.normal)
     assert float(objective(turned, None, view, BACKGROUND, only, 1.0).loss) == pytest.approx(2, abs=1e-6)

@@ -39,7 +39,7 @@ constexpr float SOLID = 0.5f, COVERED = 1 / 255.0f;  // least alpha of an opaque
 constexpr int MATERIAL = 5, METAL = 3, ROUGH = 4;    // channels of a material; the index of metallic, and of roughness
 constexpr float FLAT = 0.01f;                        // Huber threshold: smaller differences of metallic or roughness cost quadratically
 constexpr float GLOSSY = 0.3f;                       // roughness above this costs: only the photos can justify it
-constexpr float DARK = 0.1f;                         // every metal's base colour is brighter than this in some channel
+constexpr float DARK = 0.1f;                         // every clean metal's base colour is brighter than this in some channel
 
 // LANES adjacent pixels of a row.
 struct Pixels {

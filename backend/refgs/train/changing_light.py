@@ -5,6 +5,9 @@ coloured metal changes with the view. In each photo, such a change is nearly lin
 whatever it is in other photos. What is mirrored is one function of the mirrored direction, the same in all photos.
 """
 
+import math
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -12,28 +15,53 @@ from refgs.render.relight import mirror, sphere
 from refgs.train.view_dependence import LEAST_PIXELS, LEAST_VIEWS, Observations, averaged, neighbours, pooled
 
 SURFELS = 3000  # that are looked at, at the most
-LEAST_SURFELS = 100  # fewer tell nothing
+LEAST_SURFELS = 400  # fewer tell nothing
 SMOOTHED = 32  # neighbours whose normals are averaged: those of single surfels are rough early in the training
 LOBES, SHARPNESS = 50, 10.0  # of the function of the mirrored direction: lobes 0.3 radians wide, which cover the sphere
 RIDGE = 1e-3  # of the columns' mean square
+CHANGED = 0.13  # by which a changed light explains more than mirroring; matte clay has 0.19, seven metals up to 0.08, a sharp mirror 0.17
+LEFT = 0.05  # part of the rest that mirroring explains, below which light changed; matte clay has 0.03, a sharp mirror 0.14
+NOISE = 0.15  # a fox's fur has 0.07, six coloured metals from 0.27
 CELL = 0.15  # scene radii: one half of the cells of a grid is fitted, and the other half tells how well
 
 
-@torch.no_grad()
-def explained(observations: Observations, positions: Tensor, radius: float, wanted: Tensor) -> tuple[float, float]:
-    """Measure how much of the surface's changes a light that changed explains, and how much of the rest is explained by what it mirrors.
+class Explained(NamedTuple):
+    """Hold which part of the variance of a surface's changes is explained, on surfels that were not fitted to. NaN if too few are seen.
 
-    The first result is the part of the variance that each photo's exposure and a linear function of the normal explain. The second is the
-    part of what they leave that a function of the mirrored direction explains. Both are measured on surfels that were not fitted to.
-    Changes and normals are averaged over neighbours. Only the surfels `wanted` (N,) count; if they are too few, both are 0. `radius` is the
-    scene's.
+    - `lit`: by a light that changed, as a linear function of the normal, another one in each photo.
+    - `mirrored`: by an exposure of each photo and one function of the mirrored direction.
+    - `both`: by both together.
+    """
+
+    lit: float
+    mirrored: float
+    both: float
+
+    @property
+    def by_changes(self) -> bool:
+        """Tell whether a light that changed explains clearly more than mirroring, which then explains hardly any of the rest.
+
+        In a single photo of a mirror, the mirrored direction is a function of the normal, too, so `lit` alone tells nothing.
+        """
+        return self.lit - self.mirrored > CHANGED and self.both - self.lit < LEFT * (1 - self.lit)
+
+    @property
+    def by_none(self) -> bool:
+        return max(self) < NOISE
+
+
+@torch.no_grad()
+def explained(observations: Observations, positions: Tensor, radius: float, wanted: Tensor) -> Explained:
+    """Explain how a surface changes with the view, by a light that changed from photo to photo and by what it mirrors.
+
+    Changes and normals are averaged over neighbours. Only the surfels `wanted` (N,) count. `radius` is the scene's.
     """
     near = neighbours(positions, SMOOTHED)
     mean, change, known = averaged(observations, near)
     known &= wanted[:, None] & (known.sum(dim=1, keepdim=True) >= LEAST_VIEWS)
     chosen = known.any(dim=1).nonzero()[:, 0]
     if len(chosen) < LEAST_SURFELS:
-        return 0.0, 0.0
+        return Explained(math.nan, math.nan, math.nan)
     chosen = chosen[:: -(-len(chosen) // SURFELS)]
     surfel, photo = known[chosen].nonzero(as_tuple=True)
     at = chosen[surfel]
@@ -48,15 +76,15 @@ def explained(observations: Observations, positions: Tensor, radius: float, want
     linear = torch.cat([torch.ones_like(weight)[:, None], normal], dim=1)
     lobes = (SHARPNESS * (mirrored @ torch.from_numpy(sphere(LOBES)).to(weight).T - 1)).exp()
     lit = (of_photo[:, :, None] * linear[:, None]).flatten(1)
-    columns = torch.cat([relative[:, None], lit, lobes], dim=1)
+    columns = torch.cat([relative[:, None], lit, of_photo, lobes], dim=1)
     total = columns.new_zeros(len(chosen), columns.shape[1]).index_add_(0, surfel, weight[:, None] * columns)
     weights = weight.new_zeros(len(chosen)).index_add_(0, surfel, weight)
     columns = columns - (total / weights[:, None])[surfel]
     fitted = ((positions[at] / (CELL * radius)).floor().sum(dim=1) % 2) == 0
-    target, columns = columns[:, 0], columns[:, 1:]
-    lit_left, left = (_unexplained(target, part, weight, fitted) for part in (columns[:, : lit.shape[1]], columns))
-    unlit = _mean_square(target, weight, ~fitted)
-    return tuple(max(0.0, 1 - after / max(before, 1e-12)) for before, after in ((unlit, lit_left), (lit_left, left)))
+    target, lit, mirrored = columns[:, 0], columns[:, 1 : 1 + lit.shape[1]], columns[:, 1 + lit.shape[1] :]
+    before = max(_mean_square(target, weight, ~fitted), 1e-12)
+    models = lit, mirrored, torch.cat([lit, mirrored[:, of_photo.shape[1] :]], dim=1)
+    return Explained(*(max(0.0, 1 - _unexplained(target, model, weight, fitted) / before) for model in models))
 
 
 def _unexplained(target: Tensor, columns: Tensor, weight: Tensor, fitted: Tensor) -> float:

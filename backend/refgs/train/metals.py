@@ -19,8 +19,10 @@ from refgs.train.view_dependence import falls_as_metal, observe, shines_as_metal
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
 METAL, PAINT = 0.9, 0.02  # metallic; training can still change it
 CERTAIN = 0.85  # part of the surface that shines as coloured metals do, above which all is metal; a gold cape has 0.95, matte clay 0.71
-LIT = 0.25  # part of the changes that a light which changed explains, from which on it may be all; matte clay has 0.32
-MIRRORED = 0.05  # part of the changes that only mirroring explains, below which the light changed; a gold cape has 0.17, matte clay 0.03
+MOSTLY, TELLING = (
+    0.6,
+    0.3,
+)  # part of what is coloured that shines, and that part's of all; a bronze head has 0.69 and 0.48, a car 0.14
 HELD = torch.tensor(
     raw_metallic(0.98)
 )  # raw metallic that is held; surfels that have exactly this value are known by it
@@ -29,11 +31,13 @@ HELD = torch.tensor(
 def set_metals_due(state: State, progress: float) -> None:
     """Once, early in the training, raise the metallic of the surfels that change with the view as only metals do.
 
-    See `shines_as_metal` for coloured metals, `falls_as_metal` for all. If a light that changed from photo to photo explains the changes,
-    and mirroring hardly any of the rest (see `changing_light.explained`), none is metal, and the metallic learned so far is lowered.
+    See `shines_as_metal` for coloured metals, `falls_as_metal` for all. If a light that changed from photo to photo explains the changes
+    far better than mirroring does (see `changing_light.explained`), none is metal. If neither explains those of coloured surfels, nothing
+    that has a colour is metal: fur hides and shows what is below it, which has its colour. The metallic learned so far is then lowered.
 
     If nearly all shine as coloured metals do, all are metal from then on (see `hold`). Otherwise the others keep the metallic that they
-    have learned: it started low, as that of a dielectric.
+    have learned: it started low, as that of a dielectric. If most of what is coloured enough to tell shines, what is dark may be metal as
+    well, such as patina: then `loss.dark` ends.
 
     Schedules that propagate normals find metals by that, as the paper does: nothing is set there.
     """
@@ -45,24 +49,29 @@ def set_metals_due(state: State, progress: float) -> None:
         return
     observations, metallic = observe(state), state.parameters["metallic"]
     positions, weight = state.parameters["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
-    light = float(state.environment().radiance.detach().mean())
-    coloured = shines_as_metal(observations, positions)
-    metal = coloured | falls_as_metal(observations, positions, light)
-    lit, mirrored = explained(observations, positions, state.capture.radius, metal)
+    coloured, tells = shines_as_metal(observations, positions)
+    metal = coloured | falls_as_metal(observations, positions, float(state.environment().radiance.detach().mean()))
+    refuted = torch.zeros_like(metal)
+    if explained(observations, positions, state.capture.radius, metal).by_changes:
+        refuted = torch.ones_like(metal)
+    elif explained(observations, positions, state.capture.radius, coloured).by_none:
+        refuted = tells
+    coloured, metal = coloured & ~refuted, metal & ~refuted
+    shining, telling, whole = (float(weight[part].sum()) for part in (coloured, tells, torch.ones_like(metal)))
+    if shining > MOSTLY * telling > MOSTLY * TELLING * whole:
+        state.change("loss.dark", 0.0, "photos", f"{shining / telling:.0%} of what is coloured shines as metals do")
     with torch.no_grad():
-        if lit > LIT and mirrored < MIRRORED:
-            coloured, metal = torch.zeros_like(metal), torch.zeros_like(metal)
-            metallic.clamp_(max=raw_metallic(PAINT))
-        if float(weight[coloured].sum()) > CERTAIN * float(weight.sum()):
+        metallic[refuted] = metallic[refuted].clamp(max=raw_metallic(PAINT))
+        if shining > CERTAIN * whole:
             metal = torch.ones_like(metal)
             metallic.fill_(float(HELD))
         else:
             metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
     moments = state.optimizer.state.get(metallic, {})
     for name in ("exp_avg", "exp_avg_sq") if moments else ():
-        moments[name][metal] = 0
+        moments[name][metal | refuted] = 0
     state.metals_set = True
-    part = float(weight[metal].sum() / weight.sum().clamp_min(1e-6))
+    part = float(weight[metal].sum()) / max(whole, 1e-6)
     state.announce("metals", f"{part:.0%} of the surface shines as metals do")
 
 

@@ -162,8 +162,8 @@ def change_seen(observations: Observations, wanted: Tensor) -> float:
 
 
 @torch.no_grad()
-def shines_as_metal(observations: Observations, positions: Tensor) -> Tensor:
-    """Find the surfels (N,) that change with the view as a coloured metal does.
+def shines_as_metal(observations: Observations, positions: Tensor) -> tuple[Tensor, Tensor]:
+    """Find the surfels (N,) that change with the view as a coloured metal does, and those (N,) that are coloured enough to tell.
 
     A metal tints what it reflects: its radiance changes along its own colour. A dielectric's reflection has the light's colour, grey on the
     average, whatever the colour below. The direction of change is the first principal axis of the linear radiance over the photos. Radiance
@@ -183,11 +183,12 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> Tensor:
     saturation = own.norm(dim=1)
     tint = ((axis - 1 / 3) * own).sum(dim=1) / saturation.square().clamp_min(1e-6)
     size = covariance.diagonal(dim1=1, dim2=2).mean(dim=1).sqrt()
-    told = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation > SATURATED) & (tint > METAL) & (size > FAINT_CHANGES)
+    tells = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation > SATURATED)
+    told = tells & (tint > METAL) & (size > FAINT_CHANGES)
     metal = told & (size > CHANGES)
     for _ in range(GROWTH):
         metal = metal | told & (pooled(metal.float()[:, None], near)[:, 0] > near.shape[1] / 4)
-    return metal
+    return metal, tells
 
 
 @torch.no_grad()
