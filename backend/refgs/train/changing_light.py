@@ -21,7 +21,7 @@ LOBES, SHARPNESS = 50, 10.0  # of the function of the mirrored direction: lobes 
 RIDGE = 1e-3  # of the columns' mean square
 CHANGED = 0.13  # by which a changed light explains more than mirroring; matte clay has 0.19, seven metals up to 0.08, a sharp mirror 0.17
 LEFT = 0.05  # part of the rest that mirroring explains, below which light changed; matte clay has 0.03, a sharp mirror 0.14
-NOISE = 0.15  # a fox's fur has 0.07, six coloured metals from 0.27
+NOISE = 0.3  # part that both explain, below which changes are noise; a fox's fur has up to 0.19, six coloured metals from 0.42
 CELL = 0.15  # scene radii: one half of the cells of a grid is fitted, and the other half tells how well
 
 
@@ -47,7 +47,7 @@ class Explained(NamedTuple):
 
     @property
     def by_none(self) -> bool:
-        return max(self) < NOISE
+        return self.both < NOISE
 
 
 @torch.no_grad()
