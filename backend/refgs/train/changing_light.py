@@ -46,6 +46,10 @@ class Explained(NamedTuple):
         return self.lit - self.mirrored > CHANGED and self.both - self.lit < LEFT * (1 - self.lit)
 
     @property
+    def by_mirroring(self) -> bool:
+        return self.mirrored > NOISE and not self.by_changes
+
+    @property
     def by_none(self) -> bool:
         return self.both < NOISE
 

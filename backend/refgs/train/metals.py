@@ -18,11 +18,12 @@ from refgs.train.view_dependence import falls_as_metal, observe, shines_as_metal
 
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
 METAL, PAINT = 0.9, 0.02  # metallic; training can still change it
+FAINTEST = 0.05  # change relative to the mean radiance that counts where nearly all of the surface has it; embossed gold has 0.07 to 0.2
 CERTAIN = 0.85  # part of the surface that shines as coloured metals do, above which all is metal; a gold cape has 0.95, matte clay 0.71
-MOSTLY, TELLING = (
-    0.6,
-    0.3,
-)  # part of what is coloured that shines, and that part's of all; a bronze head has 0.69 and 0.48, a car 0.14
+MOSTLY = 0.6  # part of what is coloured that shines, above which what is dark may be metal, too; a bronze head has 0.69, a car 0.14
+TELLING = (
+    0.3  # part of the surface that is coloured, below which it tells nothing about the rest; a bronze head has 0.48
+)
 HELD = torch.tensor(
     raw_metallic(0.98)
 )  # raw metallic that is held; surfels that have exactly this value are known by it
@@ -35,9 +36,9 @@ def set_metals_due(state: State, progress: float) -> None:
     far better than mirroring does (see `changing_light.explained`), none is metal. If neither explains those of coloured surfels, nothing
     that has a colour is metal: fur hides and shows what is below it, which has its colour. The metallic learned so far is then lowered.
 
-    If nearly all shine as coloured metals do, all are metal from then on (see `hold`). Otherwise the others keep the metallic that they
-    have learned: it started low, as that of a dielectric. If most of what is coloured enough to tell shines, what is dark may be metal as
-    well, such as patina: then `loss.dark` ends.
+    If nearly all shine as coloured metals do, all are metal from then on (see `hold`), even if they do so faintly, as long as mirroring
+    explains that. Otherwise the others keep the metallic that they have learned: it started low, as that of a dielectric. If most of what
+    is coloured enough to tell shines, what is dark may be metal as well, such as patina: then `loss.dark` ends.
 
     Schedules that propagate normals find metals by that, as the paper does: nothing is set there.
     """
@@ -60,9 +61,14 @@ def set_metals_due(state: State, progress: float) -> None:
     shining, telling, whole = (float(weight[part].sum()) for part in (coloured, tells, torch.ones_like(metal)))
     if shining > MOSTLY * telling > MOSTLY * TELLING * whole:
         state.change("loss.dark", 0.0, "photos", f"{shining / telling:.0%} of what is coloured shines as metals do")
+    faint, _ = shines_as_metal(observations, positions, FAINTEST)
+    all_over = shining > CERTAIN * whole or (
+        float(weight[faint & ~refuted].sum()) > CERTAIN * whole
+        and explained(observations, positions, state.capture.radius, faint).by_mirroring
+    )
     with torch.no_grad():
         metallic[refuted] = metallic[refuted].clamp(max=raw_metallic(PAINT))
-        if shining > CERTAIN * whole:
+        if all_over:
             metal = torch.ones_like(metal)
             metallic.fill_(float(HELD))
         else:

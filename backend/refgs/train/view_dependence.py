@@ -162,13 +162,13 @@ def change_seen(observations: Observations, wanted: Tensor) -> float:
 
 
 @torch.no_grad()
-def shines_as_metal(observations: Observations, positions: Tensor) -> tuple[Tensor, Tensor]:
+def shines_as_metal(observations: Observations, positions: Tensor, least: float = CHANGES) -> tuple[Tensor, Tensor]:
     """Find the surfels (N,) that change with the view as a coloured metal does, and those (N,) that are coloured enough to tell.
 
     A metal tints what it reflects: its radiance changes along its own colour. A dielectric's reflection has the light's colour, grey on the
     average, whatever the colour below. The direction of change is the first principal axis of the linear radiance over the photos. Radiance
-    is averaged over neighbours first: texture that is slightly out of place then cancels, and highlights do not. A smaller
-    change is enough beside surfels that change clearly. Surfels near grey tell nothing.
+    is averaged over neighbours first: texture that is slightly out of place then cancels, and highlights do not. The change has to be
+    `least` of the mean radiance; less is enough beside surfels that change so. Surfels near grey tell nothing.
     """
     near = neighbours(positions, NEIGHBOURS)
     mean, change, known = averaged(observations, near)
@@ -184,8 +184,8 @@ def shines_as_metal(observations: Observations, positions: Tensor) -> tuple[Tens
     tint = ((axis - 1 / 3) * own).sum(dim=1) / saturation.square().clamp_min(1e-6)
     size = covariance.diagonal(dim1=1, dim2=2).mean(dim=1).sqrt()
     tells = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation > SATURATED)
-    told = tells & (tint > METAL) & (size > FAINT_CHANGES)
-    metal = told & (size > CHANGES)
+    told = tells & (tint > METAL) & (size > min(least, FAINT_CHANGES))
+    metal = told & (size > least)
     for _ in range(GROWTH):
         metal = metal | told & (pooled(metal.float()[:, None], near)[:, 0] > near.shape[1] / 4)
     return metal, tells
