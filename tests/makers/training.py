@@ -6,7 +6,7 @@ import torch
 
 from refgs.capture import read_capture
 from refgs.run import create_run, open_run
-from refgs.settings import load_settings
+from refgs.settings import LossSettings, load_settings
 from refgs.train.asset import write_asset
 from refgs.train.trainer import Trainer
 
@@ -35,6 +35,11 @@ def trainer(
     if not folder.exists():
         create_run(folder, capture, made.state.settings, preset, "cpu", made.state.effective.chosen())
     return made
+
+
+def only(**weights: float) -> LossSettings:
+    """Make weights of the loss that are all 0, but for `weights`."""
+    return LossSettings(**dict.fromkeys(LossSettings.model_fields, 0) | weights)
 
 
 def trained(*arguments, **options) -> Trainer:

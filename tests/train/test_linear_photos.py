@@ -14,11 +14,10 @@ from refgs.color import srgb_decode
 from refgs.formats.exr import write_exr
 from refgs.formats.panorama import directions
 from refgs.render.renderer import Rendering
-from refgs.settings import LossSettings
 from refgs.train.losses import Photo, objective
 from refgs.train.measures import held_out_psnr
 from tests.makers.captures import write
-from tests.makers.training import trained
+from tests.makers.training import only, trained
 
 LAMP = np.array([0.5, 0.5, 0.7]) / np.linalg.norm([0.5, 0.5, 0.7])
 TOTAL = 700
@@ -39,9 +38,8 @@ def test_a_value_between_two_8_bit_codes_comes_into_the_loss(tmp_path, bits):
     view = load_view(View(camera, tmp_path / "a.png", None, "train"), 8)  # through the decoding and reducing, too
     color = torch.full((8, 8, 3), 100.25 / 255, requires_grad=True)
     one = torch.ones(8, 8)
-    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, dark=0, matte=0, light=0, exposure=0)
     rendering = Rendering(color, one, one, torch.zeros(8, 8, 3))
-    objective(rendering, None, Photo.of(view), torch.zeros(3), only, 1.0).loss.backward()
+    objective(rendering, None, Photo.of(view), torch.zeros(3), only(), 1.0).loss.backward()
     assert ((color.grad < 0) if bits == 16 else (color.grad > 0)).all()
 
 

@@ -15,6 +15,7 @@ from refgs.settings import LossSettings
 from refgs.train.losses import Photo, objective
 from tests.makers import scenes
 from tests.makers.emulate import emulate
+from tests.makers.training import only
 
 DARK, FLAT = 0.1, 0.01
 ALL = LossSettings(
@@ -166,24 +167,22 @@ def test_the_light_is_held_to_be_neutral_on_the_whole(device):
     The term grows as the light's mean colour departs from grey.
     """
     rendering, view = pictures(8, 8, masked=True, material=True)
-    only = LossSettings(
-        dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, dark=0, matte=0, light=0.5, exposure=0
-    )
+    weights = only(light=0.5)
     mean = torch.rand(3, generator=torch.Generator().manual_seed(0))
     for scale in (1e-6, 1, 1e6):
         exact = (scale * mean).double().requires_grad_()
         expected = 0.5 * ((exact / exact.mean() - 1) ** 2).mean()
         light = exact.detach().float().to(device).requires_grad_()
         found = leaves(rendering, torch.float32, device)
-        without = objective(found, None, moved(view, device), BACKGROUND.to(device), only, 1.0).loss
-        loss = objective(found, light, moved(view, device), BACKGROUND.to(device), only, 1.0).loss
+        without = objective(found, None, moved(view, device), BACKGROUND.to(device), weights, 1.0).loss
+        loss = objective(found, light, moved(view, device), BACKGROUND.to(device), weights, 1.0).loss
         assert float((loss - without).detach()) == pytest.approx(float(expected.detach()), rel=1e-4)
         loss.backward()
         torch.testing.assert_close(
             light.grad.cpu().double(), *torch.autograd.grad(expected, exact), rtol=1e-4, atol=1e-6 / scale
         )
     dark = torch.zeros(3, device=device, requires_grad=True)
-    objective(found, dark, moved(view, device), BACKGROUND.to(device), only, 1.0).loss.backward()
+    objective(found, dark, moved(view, device), BACKGROUND.to(device), weights, 1.0).loss.backward()
     assert not dark.grad.any()
 
 
@@ -229,9 +228,7 @@ def test_a_clipped_photo_is_a_lower_bound(code, white, term, device):
 
     A photo one code below the largest is not clipped and pulls from above, too.
     """
-    only = LossSettings(
-        dssim=term, normal=0, smooth=0, even=0, alpha=0, metallic=0, dark=0, matte=0, light=0, exposure=0
-    )
+    weights = only(dssim=term)
     camera, bound = scenes.camera(16, 16), code / white
     dtype = torch.uint8 if white == 255 else torch.uint16
 
@@ -244,7 +241,7 @@ def test_a_clipped_photo_is_a_lower_bound(code, white, term, device):
         rendering = Rendering(color, one, one, torch.zeros(16, 16, 3, device=device))
         image = torch.full((16, 16, 3), codes, dtype=torch.int32).to(dtype).to(device)
         photo = Photo(image, torch.full((16, 16), 255, dtype=torch.uint8, device=device), camera, white=white)
-        loss, _ = objective(rendering, None, photo, BACKGROUND.to(device), only, 1.0)
+        loss, _ = objective(rendering, None, photo, BACKGROUND.to(device), weights, 1.0)
         return torch.autograd.grad(loss, (radiance, exposed))
 
     for exposure in (1.0, 0.25, 3.0):
@@ -261,9 +258,9 @@ def test_the_background_is_no_lower_bound(device):
     rendering, view = pictures(8, 8, masked=True, material=False)
     rendering.color[:] = 1.5
     view.image[:], view.mask[:] = 255, 0
-    only = LossSettings(dssim=0, normal=0, smooth=0, even=0, alpha=0, metallic=0, dark=0, matte=0, light=0, exposure=0)
+    weights = only()
     found = leaves(rendering, torch.float32, device)
-    loss = objective(found, None, moved(view, device), torch.ones(3, device=device), only, 1.0).loss
+    loss = objective(found, None, moved(view, device), torch.ones(3, device=device), weights, 1.0).loss
     assert (gradients(loss, found)["color"] > 0).all()
 
 
@@ -276,10 +273,10 @@ def test_normals_of_a_plane_agree_with_its_depth():
     flat = Rendering(
         torch.zeros(30, 40, 3), one, torch.tensor(depth).float(), torch.tensor(normal).float().expand(30, 40, 3)
     )
-    only = LossSettings(dssim=0, normal=1, smooth=1, even=1, alpha=0, metallic=0, dark=0, matte=0, light=0, exposure=0)
-    assert abs(float(objective(flat, None, view, BACKGROUND, only, 1.0).loss)) < 1e-6
+    weights = only(normal=1, smooth=1, even=1)
+    assert abs(float(objective(flat, None, view, BACKGROUND, weights, 1.0).loss)) < 1e-6
     turned = replace(flat, normal=-flat.normal)
-    assert float(objective(turned, None, view, BACKGROUND, only, 1.0).loss) == pytest.approx(2, abs=1e-6)
+    assert float(objective(turned, None, view, BACKGROUND, weights, 1.0).loss) == pytest.approx(2, abs=1e-6)
 
 
 def test_same_bits_for_any_number_of_threads():

@@ -47,22 +47,34 @@ class Explained(NamedTuple):
 
     @property
     def by_mirroring(self) -> bool:
+        """Tell whether what is mirrored explains much, and the light did not change."""
         return self.mirrored > NOISE and not self.by_changes
 
     @property
     def by_none(self) -> bool:
+        """Tell whether the changes are noise, which neither explains."""
         return self.both < NOISE
 
 
 @torch.no_grad()
-def explained(observations: Observations, positions: Tensor, radius: float, wanted: Tensor) -> Explained:
-    """Explain how a surface changes with the view, by a light that changed from photo to photo and by what it mirrors.
+def explained(observations: Observations, positions: Tensor, radius: float, *parts: Tensor) -> list[Explained]:
+    """Explain how parts of a surface change with the view, by a light that changed from photo to photo and by what they mirror.
 
-    Changes and normals are averaged over neighbours. Only the surfels `wanted` (N,) count. `radius` is the scene's.
+    Changes and normals are averaged over neighbours. Each of `parts` (N,) is a choice of surfels. `radius` is the scene's.
     """
     near = neighbours(positions, SMOOTHED)
     mean, change, known = averaged(observations, near)
-    known &= wanted[:, None] & (known.sum(dim=1, keepdim=True) >= LEAST_VIEWS)
+    known &= known.sum(dim=1, keepdim=True) >= LEAST_VIEWS
+    relative = (change.mean(dim=2) / mean.mean(dim=1, keepdim=True).clamp_min(1e-2)).clamp(-1, 2)
+    smooth = torch.nn.functional.normalize(
+        pooled(observations.normal.flatten(1), near).view_as(observations.normal), dim=2
+    )
+    smoothed = observations._replace(normal=smooth)
+    return [_explained(smoothed, relative, known & part[:, None], positions / (CELL * radius)) for part in parts]
+
+
+def _explained(observations: Observations, relative: Tensor, known: Tensor, cells: Tensor) -> Explained:
+    """Explain the changes `relative` (N, V) to the mean radiance, where they are `known` (N, V). One cell of `cells` (N, 3) is 1 wide."""
     chosen = known.any(dim=1).nonzero()[:, 0]
     if len(chosen) < LEAST_SURFELS:
         return Explained(math.nan, math.nan, math.nan)
@@ -70,24 +82,18 @@ def explained(observations: Observations, positions: Tensor, radius: float, want
     surfel, photo = known[chosen].nonzero(as_tuple=True)
     at = chosen[surfel]
     weight = observations.pixels[at, photo].double().clamp_min(LEAST_PIXELS)
-    relative = (change[at, photo].mean(dim=1) / mean[at].mean(dim=1).clamp_min(1e-2)).clamp(-1, 2).double()
-    smooth = torch.nn.functional.normalize(
-        pooled(observations.normal.flatten(1), near).view_as(observations.normal), dim=2
-    )
-    normal, towards = smooth[at, photo].double(), observations.towards[at, photo].double()
-    mirrored = mirror(-towards, normal)
-    of_photo = torch.nn.functional.one_hot(photo, observations.pixels.shape[1]).double()
-    linear = torch.cat([torch.ones_like(weight)[:, None], normal], dim=1)
-    lobes = (SHARPNESS * (mirrored @ torch.from_numpy(sphere(LOBES)).to(weight).T - 1)).exp()
-    lit = (of_photo[:, :, None] * linear[:, None]).flatten(1)
-    columns = torch.cat([relative[:, None], lit, of_photo, lobes], dim=1)
+    normal, towards = observations.normal[at, photo].double(), observations.towards[at, photo].double()
+    exposures = torch.nn.functional.one_hot(photo, observations.pixels.shape[1]).double()
+    tilts = (exposures[:, :, None] * normal[:, None]).flatten(1)
+    lobes = (SHARPNESS * (mirror(-towards, normal) @ torch.from_numpy(sphere(LOBES)).to(weight).T - 1)).exp()
+    columns = torch.cat([tilts, exposures, lobes, relative[at, photo].double()[:, None]], dim=1)
     total = columns.new_zeros(len(chosen), columns.shape[1]).index_add_(0, surfel, weight[:, None] * columns)
     weights = weight.new_zeros(len(chosen)).index_add_(0, surfel, weight)
     columns = columns - (total / weights[:, None])[surfel]
-    fitted = ((positions[at] / (CELL * radius)).floor().sum(dim=1) % 2) == 0
-    target, lit, mirrored = columns[:, 0], columns[:, 1 : 1 + lit.shape[1]], columns[:, 1 + lit.shape[1] :]
+    fitted = (cells[at].floor().sum(dim=1) % 2) == 0
+    both, target = columns[:, :-1], columns[:, -1]
+    models = both[:, : -lobes.shape[1]], both[:, tilts.shape[1] :], both
     before = max(_mean_square(target, weight, ~fitted), 1e-12)
-    models = lit, mirrored, torch.cat([lit, mirrored[:, of_photo.shape[1] :]], dim=1)
     return Explained(*(max(0.0, 1 - _unexplained(target, model, weight, fitted) / before) for model in models))
 
 

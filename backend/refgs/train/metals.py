@@ -18,7 +18,6 @@ from refgs.train.view_dependence import falls_as_metal, observe, shines_as_metal
 
 KNOWN = 0.1  # part of the training after which surfels lie near enough to the surface
 METAL, PAINT = 0.9, 0.02  # metallic; training can still change it
-FAINTEST = 0.05  # change relative to the mean radiance that counts where nearly all of the surface has it; embossed gold has 0.07 to 0.2
 CERTAIN = 0.85  # part of the surface that shines as coloured metals do, above which all is metal; a gold cape has 0.95, matte clay 0.71
 MOSTLY = 0.6  # part of what is coloured that shines, above which what is dark may be metal, too; a bronze head has 0.69, a car 0.14
 TELLING = (
@@ -50,25 +49,22 @@ def set_metals_due(state: State, progress: float) -> None:
         return
     observations, metallic = observe(state), state.parameters["metallic"]
     positions, weight = state.parameters["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
-    coloured, tells = shines_as_metal(observations, positions)
+    coloured, faint, tells = shines_as_metal(observations, positions)
     metal = coloured | falls_as_metal(observations, positions, float(state.environment().radiance.detach().mean()))
+    told, shown, shown_faintly = explained(observations, positions, state.capture.radius, metal, coloured, faint)
     refuted = torch.zeros_like(metal)
-    if explained(observations, positions, state.capture.radius, metal).by_changes:
+    if told.by_changes:
         refuted = torch.ones_like(metal)
-    elif explained(observations, positions, state.capture.radius, coloured).by_none:
+    elif shown.by_none:
         refuted = tells
     coloured, metal = coloured & ~refuted, metal & ~refuted
-    shining, telling, whole = (float(weight[part].sum()) for part in (coloured, tells, torch.ones_like(metal)))
-    if shining > MOSTLY * telling > MOSTLY * TELLING * whole:
+    shining, faintly, telling = (float(weight[part].sum()) for part in (coloured, faint & ~refuted, tells))
+    whole = float(weight.sum())
+    if telling > TELLING * whole and shining > MOSTLY * telling:
         state.change("loss.dark", 0.0, "photos", f"{shining / telling:.0%} of what is coloured shines as metals do")
-    faint, _ = shines_as_metal(observations, positions, FAINTEST)
-    all_over = shining > CERTAIN * whole or (
-        float(weight[faint & ~refuted].sum()) > CERTAIN * whole
-        and explained(observations, positions, state.capture.radius, faint).by_mirroring
-    )
     with torch.no_grad():
         metallic[refuted] = metallic[refuted].clamp(max=raw_metallic(PAINT))
-        if all_over:
+        if shining > CERTAIN * whole or (faintly > CERTAIN * whole and shown_faintly.by_mirroring):
             metal = torch.ones_like(metal)
             metallic.fill_(float(HELD))
         else:

@@ -32,6 +32,7 @@ FEW = 32  # of them, where the size of the change is asked and not its colour: p
 SATURATED = 0.08  # distance of a chromaticity from grey, below which metals and dielectrics change alike: silver has 0.03, copper 0.14
 CHANGES = 0.15  # change relative to the mean radiance, below which it may be texture that is slightly out of place
 FAINT_CHANGES = 0.08  # enough where neighbours change clearly, and alike
+FAINTEST_CHANGES = 0.05  # may be noise, unless nearly all of the surface has them; embossed gold has 0.07 to 0.2
 GROWTH = 8  # steps from neighbours to neighbours
 LOW = 0.15  # part of the photos in which a surfel is darker than where its drop is measured; fewer may be shadows or outlines
 DROP = 0.08  # of the light's mean radiance; a dielectric mirrors 0.04 of the light, and so cannot fall by much more below its median
@@ -62,6 +63,19 @@ class Observations(NamedTuple):
         """Tell which photos of which surfels count (N, V): none of a surfel that too few photos show."""
         shown = self.pixels > LEAST_PIXELS
         return shown & (shown.sum(dim=1, keepdim=True) >= LEAST_VIEWS)
+
+
+class Shining(NamedTuple):
+    """Tell which surfels (N,) change with the view in their own colour.
+
+    - `clearly`: those that change by CHANGES of their mean radiance, or by FAINT_CHANGES beside such.
+    - `faintly`: those that change by FAINTEST_CHANGES.
+    - `tells`: those that are coloured and seen well enough to tell.
+    """
+
+    clearly: Tensor
+    faintly: Tensor
+    tells: Tensor
 
 
 @torch.no_grad()
@@ -162,13 +176,13 @@ def change_seen(observations: Observations, wanted: Tensor) -> float:
 
 
 @torch.no_grad()
-def shines_as_metal(observations: Observations, positions: Tensor, least: float = CHANGES) -> tuple[Tensor, Tensor]:
-    """Find the surfels (N,) that change with the view as a coloured metal does, and those (N,) that are coloured enough to tell.
+def shines_as_metal(observations: Observations, positions: Tensor) -> Shining:
+    """Find the surfels that change with the view as a coloured metal does.
 
     A metal tints what it reflects: its radiance changes along its own colour. A dielectric's reflection has the light's colour, grey on the
     average, whatever the colour below. The direction of change is the first principal axis of the linear radiance over the photos. Radiance
-    is averaged over neighbours first: texture that is slightly out of place then cancels, and highlights do not. The change has to be
-    `least` of the mean radiance; less is enough beside surfels that change so. Surfels near grey tell nothing.
+    is averaged over neighbours first: texture that is slightly out of place then cancels, and highlights do not. Surfels near grey tell
+    nothing.
     """
     near = neighbours(positions, NEIGHBOURS)
     mean, change, known = averaged(observations, near)
@@ -184,11 +198,11 @@ def shines_as_metal(observations: Observations, positions: Tensor, least: float 
     tint = ((axis - 1 / 3) * own).sum(dim=1) / saturation.square().clamp_min(1e-6)
     size = covariance.diagonal(dim1=1, dim2=2).mean(dim=1).sqrt()
     tells = (known.sum(dim=1) >= LEAST_VIEWS) & (saturation > SATURATED)
-    told = tells & (tint > METAL) & (size > min(least, FAINT_CHANGES))
-    metal = told & (size > least)
+    tinted = tells & (tint > METAL)
+    metal, beside = tinted & (size > CHANGES), tinted & (size > FAINT_CHANGES)
     for _ in range(GROWTH):
-        metal = metal | told & (pooled(metal.float()[:, None], near)[:, 0] > near.shape[1] / 4)
-    return metal, tells
+        metal = metal | beside & (pooled(metal.float()[:, None], near)[:, 0] > near.shape[1] / 4)
+    return Shining(metal, tinted & (size > FAINTEST_CHANGES), tells)
 
 
 @torch.no_grad()
