@@ -156,6 +156,29 @@ def test_normals_that_a_data_set_brings_are_the_truth_where_there_is_no_other(ma
     assert evaluated(run, truth)["normal_mae_degrees"] < 0.1 and len(asked) == 4
 
 
+def test_a_larger_truth_is_reduced(made):
+    """Check true maps at half their size against the mean of four pixels, in which only the object counts."""
+    _, truth, views = made
+    known, camera = GroundTruth(truth, np.eye(4)), views[0].camera
+    half = camera.resized(32, 32)
+
+    def mean(values):
+        return values.reshape(32, 2, 32, 2, -1).mean(axis=(1, 3))
+
+    alpha = known.view("alpha", camera)[..., None]
+    assert known.view("alpha", half)[..., None] == pytest.approx(mean(alpha), abs=1e-6)
+    inside = mean(alpha)[..., 0] > 0.1
+    assert (inside & (mean(alpha)[..., 0] < 0.9)).sum() > 10, "the outline is asked about, too"
+    for name in ("normal", "albedo", "roughness"):
+        whole = known.view(name, camera)
+        expected = mean(whole.reshape(64, 64, -1) * alpha) / np.maximum(mean(alpha), 1e-6)
+        if name == "normal":
+            expected /= np.maximum(np.linalg.norm(expected, axis=-1, keepdims=True), 1e-6)
+        found = known.view(name, half).reshape(32, 32, -1)
+        assert found[inside] == pytest.approx(expected[inside], abs=1e-4), name
+    assert known.relit("dusk", half) == pytest.approx(mean(known.relit("dusk", camera)), abs=1e-5)
+
+
 def test_a_missing_file_is_one_line(made, tmp_path):
     run, truth, views = made
     with pytest.raises(InputError, match="no ground truth in it"):
@@ -166,11 +189,13 @@ def test_a_missing_file_is_one_line(made, tmp_path):
         with pytest.raises(InputError, match=f"{views[2].camera.name}.exr is missing"):
             commands.evaluate(run, "test", truth)
         kept.rename(file)
-    known, smaller = GroundTruth(truth, np.eye(4)), views[0].camera.resized(32, 32)
-    with pytest.raises(InputError, match="its size is not the view's"):
-        known.view("albedo", smaller)
-    with pytest.raises(InputError, match="it should be 32×32"):
-        known.relit("dusk", smaller)
+    known = GroundTruth(truth, np.eye(4))
+    for size in ((128, 128), (64, 32)):
+        other = views[0].camera.resized(*size)
+        with pytest.raises(InputError, match=f"64×64 pixels, which does not fit its view of {size[0]}×{size[1]}"):
+            known.view("albedo", other)
+        with pytest.raises(InputError, match="64×64 pixels, which does not fit"):
+            known.relit("dusk", other)
     (tmp_path / "grey" / "normal").mkdir(parents=True)
     write_exr(tmp_path / "grey" / "normal" / f"{views[0].camera.name}.exr", np.ones((64, 64)))
     with pytest.raises(InputError, match="one channel where there should be 3"):

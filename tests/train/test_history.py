@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.scenes.analytic import F0, ONE, sky
 from refgs.capture import read_capture
-from refgs.formats.exr import write_exr
+from refgs.formats.exr import read_exr, write_exr
 from refgs.formats.panorama import directions
 from refgs.train import history
 from tests.makers import scenes
@@ -220,9 +220,12 @@ def test_without_colour_that_is_material_there_is_none_to_compare(known_capture,
 
 def test_a_truth_that_does_not_fit_is_left_out_with_a_line(known_capture, tmp_path):
     said = []
-    made = make(known_capture, tmp_path / "run", "image.max_side=32", report=lambda *event: said.append(event))
+    folder = shutil.copytree(known_capture, tmp_path / "ball")
+    for file in (folder / "ground_truth" / "normal").iterdir():
+        write_exr(file, read_exr(file)[::2])
+    made = make(folder, tmp_path / "run", report=lambda *event: said.append(event))
     (warning,) = [facts["what"] for event, facts in said if event == "warning"]
-    assert "its size is not the view's (32×32)" in warning
+    assert "does not fit its view of 64×64" in warning
     assert made.measures.errors(made.state).keys() == {"psnr_test"}
 
 

@@ -10,10 +10,10 @@ NAME_normal_0000.png, whose encoding is undocumented.
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from refgs.capture.images import read_alpha, read_image
+from refgs.capture.reduce import reduced_map
 from refgs.capture.transforms import read_frames, read_views
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
@@ -48,9 +48,7 @@ def published_normals(view: View, max_side: int | None = None) -> tuple[np.ndarr
     alpha = np.ones((height, width), np.float32) if mask is None else mask.astype(np.float32) / 255
     fitted = camera.fitted(max_side) if max_side else camera
     if fitted is not camera:
-        size = (fitted.width, fitted.height)
-        normals = cv2.resize(normals * alpha[..., None], size, interpolation=cv2.INTER_AREA)
-        alpha = cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)
+        normals, alpha = reduced_map(normals, alpha, fitted)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     return np.where((alpha > 0)[..., None], normals / np.maximum(length, 1e-6), 0), alpha
 

@@ -1,4 +1,7 @@
-"""Undistort and reduce photos in linear radiance, a strip at a time: as floats, a whole photo would take ten times its file's memory."""
+"""Undistort and reduce photos in linear radiance, and reduce maps such as normals.
+
+Photos are reduced a strip at a time: as floats, a whole photo would take ten times its file's memory.
+"""
 
 from functools import cache
 
@@ -42,6 +45,20 @@ def reduced(
             linear[opaque[rows] == 0] = 0
         codes[rows] = encode(linear, white)
     return codes, opaque
+
+
+def reduced_map(values: np.ndarray, alpha: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Reduce a map (H, W) or (H, W, C), such as normals, and its alpha (H, W) to the size of `camera`, both as float32.
+
+    Values are averaged over each new pixel's area, weighted by alpha; they are 0 where alpha is. Unit vectors are shortened by this.
+    """
+    weights = alpha if values.ndim == 2 else alpha[..., None]
+    size = camera.width, camera.height
+    mean, weight = (
+        cv2.resize(each.astype(np.float32), size, interpolation=cv2.INTER_AREA) for each in (values * weights, alpha)
+    )
+    divisor = np.maximum(weight, 1e-6)
+    return mean / (divisor if values.ndim == 2 else divisor[..., None]), weight
 
 
 def encode(linear: np.ndarray, white: int) -> np.ndarray:

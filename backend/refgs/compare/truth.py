@@ -2,11 +2,13 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from refgs.camera import Camera
 from refgs.capture import View, published_normals
 from refgs.capture.poses import split_similarity
+from refgs.capture.reduce import reduced_map
 from refgs.compare import metrics
 from refgs.errors import InputError
 from refgs.formats.exr import read_exr
@@ -54,18 +56,27 @@ class GroundTruth:
     def view(self, name: str, camera: Camera) -> np.ndarray:
         """Read one true map of the camera's view, float32 (h, w) or (h, w, 3). `name` is "alpha" or one of PASSES.
 
-        Raises InputError if the file is missing, or has another size or too few channels.
+        A larger map is reduced. Raises InputError if the file is missing, is smaller, has another shape or too few channels.
         """
+        pixels = self._read(name, camera)
+        if pixels.shape[:2] != (camera.height, camera.width):
+            alpha = self._read("alpha", camera)
+            reduced, weight = reduced_map(pixels, alpha, camera)
+            if name == "normal":
+                reduced /= np.maximum(np.linalg.norm(reduced, axis=-1, keepdims=True), 1e-6)
+            pixels = weight if name == "alpha" else reduced
+        return pixels @ self._turn.T.astype(np.float32) if name == "normal" else pixels
+
+    def _read(self, name: str, camera: Camera) -> np.ndarray:
         file = self.folder / name / f"{camera.name}.exr"
         pixels = read_exr(file)
-        if pixels.shape[:2] != (camera.height, camera.width):
-            raise InputError(f"{file}: its size is not the view's ({camera.width}×{camera.height})")
+        _check_size(file, pixels, camera)
         channels = {"normal": 3, "albedo": 3}.get(name, 1)
         if pixels.ndim == 2 and channels > 1:
             raise InputError(f"{file}: it has one channel where there should be {channels}")
         if channels == 1:
             return pixels if pixels.ndim == 2 else pixels[..., 0]
-        return pixels[..., :3] @ self._turn.T.astype(np.float32) if name == "normal" else pixels[..., :3]
+        return pixels[..., :3]
 
     def panorama(self, name: str) -> np.ndarray:
         """Read the light in the file NAME.exr. Return a panorama (H, W, 3), rotated to the coordinates of the training.
@@ -80,21 +91,30 @@ class GroundTruth:
         return Mesh(mesh.vertices @ self._to_run[:3, :3].T + self._to_run[:3, 3], mesh.faces)
 
     def relit(self, hdri: str, camera: Camera) -> np.ndarray:
-        """Read the true picture of the camera's view under the light with the name `hdri`, as premultiplied linear RGBA (h, w, 4)."""
+        """Read the true picture of the camera's view under the light with the name `hdri`, as premultiplied linear RGBA (h, w, 4).
+
+        A larger picture is reduced.
+        """
         file = self.folder / "relight" / hdri / f"{camera.name}.exr"
-        return read_relit(file, (camera.height, camera.width))
+        pixels = read_relit(file)
+        _check_size(file, pixels, camera)
+        return cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
 
-def read_relit(file: Path, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Read a picture of an object under another light, as premultiplied linear RGBA (H, W, 4).
+def _check_size(file: Path, pixels: np.ndarray, camera: Camera) -> None:
+    """Raise InputError if a true picture is not as large as the camera's view, nor a larger one of the same shape."""
+    height, width = pixels.shape[:2]
+    size = camera.width, camera.height
+    scale = max(size) / max(width, height)
+    if scale > 1 or (round(width * scale), round(height * scale)) != size:
+        raise InputError(f"{file} has {width}×{height} pixels, which does not fit its view of {size[0]}×{size[1]}")
 
-    Raises InputError if it has no alpha, or if its (height, width) is not `size`.
-    """
+
+def read_relit(file: Path) -> np.ndarray:
+    """Read a picture of an object under another light, as premultiplied linear RGBA (H, W, 4). Raises InputError if it has no alpha."""
     pixels = read_exr(file)
     if pixels.ndim != 3 or pixels.shape[2] != 4:
         raise InputError(f"{file} has no alpha: an RGBA picture is needed to put it over a background")
-    if size is not None and pixels.shape[:2] != size:
-        raise InputError(f"{file} is {pixels.shape[1]}×{pixels.shape[0]}, it should be {size[1]}×{size[0]}")
     return pixels
 
 
