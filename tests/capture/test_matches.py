@@ -67,3 +67,18 @@ def test_photos_without_features_tell_nothing(views):
     assert match_neighbours(plain) == []
     assert pixels_apart([], [view.camera for view in plain]) is None
     assert pixels_apart(match_neighbours(views[:1]), [views[0].camera]) is None
+
+
+def test_matches_by_chance_tell_nothing(views, monkeypatch):
+    """Check matches at random places: some of them always fit an epipolar geometry, but most do not."""
+    random, cameras = np.random.default_rng(0), [view.camera for view in views]
+    descriptors = random.uniform(0, 255, (100, 128)).astype(np.float32)
+
+    def anywhere(view):
+        return random.uniform(0, [WIDTH, HEIGHT], (100, 2)), descriptors
+
+    monkeypatch.setattr("refgs.capture.matches._features", anywhere)
+    monkeypatch.setattr("refgs.capture.matches.LEAST", 8)
+    assert pixels_apart(match_neighbours(views), cameras) is None
+    monkeypatch.setattr("refgs.capture.matches.AGREEING", 0.0)
+    assert pixels_apart(match_neighbours(views), cameras) > 5, "some fit, and contradict the cameras"

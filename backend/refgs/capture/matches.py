@@ -14,6 +14,7 @@ SIDE = 800  # pixels of the longer side that they are reduced to; SIFT takes 180
 FEATURES = 2000  # of a photo
 DISTINCT = 0.8  # of the second-best match's distance, below which a match counts (Lowe 2004, §7.1)
 TOLERANCE = 1.0  # pixels from the epipolar geometry that fits a pair best; other matches are wrong
+AGREEING = 0.5  # part of a pair's distinct matches that fits one epipolar geometry; where less does, that may be chance
 LEAST = 16  # matches of a pair of photos; fewer say little about its epipolar geometry, which has 7 degrees of freedom
 LEAST_PAIRS = 8
 
@@ -33,8 +34,9 @@ class Matches(NamedTuple):
 def match_neighbours(views: list[LoadedView]) -> list[Matches]:
     """Match some photos, spread over all, each with that of the nearest camera. Only pixels inside the masks are matched.
 
-    The matches of a pair fit some epipolar geometry, whatever the cameras are. Pairs with hardly any are left out. A mirror's image is not
-    at rest on the mirror, so what a mirror shows may be among the matches.
+    The matches of a pair fit some epipolar geometry, whatever the cameras are. Pairs with hardly any are left out, and those of which most
+    fit none: seven matches always fit one, and so do some more by chance. A mirror's image is not at rest on the mirror, so what a mirror
+    shows may be among the matches.
     """
     if len(views) < 2:
         return []
@@ -98,7 +100,7 @@ def _match(
         return nothing
     cv2.setRNGSeed(0)
     _, fits = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, TOLERANCE, 0.999, 10_000)
-    if fits is None:
+    if fits is None or fits.mean() < AGREEING:
         return nothing
     fits = fits[:, 0].astype(bool)
     return first[fits], second[fits]
