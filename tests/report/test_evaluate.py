@@ -1,6 +1,7 @@
 """Test the evaluation of a run against known ground truth. The ground truth is in rotated, moved and scaled coordinates."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from refgs.compare import surface
 from refgs.compare.pictures import maps
 from refgs.compare.truth import GroundTruth
 from refgs.errors import InputError
-from refgs.formats.exr import write_exr
+from refgs.formats.exr import read_exr, write_exr
 from refgs.formats.panorama import directions
 from refgs.model.environment import Environment
 from refgs.run import open_run
@@ -165,16 +166,16 @@ def test_a_larger_truth_is_reduced(made):
     def mean(values):
         return values.reshape(32, 2, 32, 2, -1).mean(axis=(1, 3))
 
-    alpha = known.view("alpha", camera)[..., None]
-    assert known.view("alpha", half)[..., None] == pytest.approx(mean(alpha), abs=1e-6)
+    (wholes, alpha), (halves, reduced) = known.maps(camera), known.maps(half)
+    alpha = alpha[..., None]
+    assert reduced[..., None] == pytest.approx(mean(alpha), abs=1e-6)
     inside = mean(alpha)[..., 0] > 0.1
     assert (inside & (mean(alpha)[..., 0] < 0.9)).sum() > 10, "the outline is asked about, too"
     for name in ("normal", "albedo", "roughness"):
-        whole = known.view(name, camera)
-        expected = mean(whole.reshape(64, 64, -1) * alpha) / np.maximum(mean(alpha), 1e-6)
+        expected = mean(wholes[name].reshape(64, 64, -1) * alpha) / np.maximum(mean(alpha), 1e-6)
         if name == "normal":
             expected /= np.maximum(np.linalg.norm(expected, axis=-1, keepdims=True), 1e-6)
-        found = known.view(name, half).reshape(32, 32, -1)
+        found = halves[name].reshape(32, 32, -1)
         assert found[inside] == pytest.approx(expected[inside], abs=1e-4), name
     assert known.relit("dusk", half) == pytest.approx(mean(known.relit("dusk", camera)), abs=1e-5)
 
@@ -193,10 +194,15 @@ def test_a_missing_file_is_one_line(made, tmp_path):
     for size in ((128, 128), (64, 32)):
         other = views[0].camera.resized(*size)
         with pytest.raises(InputError, match=f"64×64 pixels, which does not fit its view of {size[0]}×{size[1]}"):
-            known.view("albedo", other)
+            known.maps(other)
         with pytest.raises(InputError, match="64×64 pixels, which does not fit"):
             known.relit("dusk", other)
+    other = shutil.copytree(truth, tmp_path / "other")
+    file = other / "albedo" / f"{views[0].camera.name}.exr"
+    write_exr(file, np.repeat(np.repeat(read_exr(file), 2, axis=0), 2, axis=1))
+    with pytest.raises(InputError, match=r"albedo/.* is not as large as the alpha"):
+        GroundTruth(other, np.eye(4)).maps(views[0].camera)
     (tmp_path / "grey" / "normal").mkdir(parents=True)
     write_exr(tmp_path / "grey" / "normal" / f"{views[0].camera.name}.exr", np.ones((64, 64)))
     with pytest.raises(InputError, match="one channel where there should be 3"):
-        GroundTruth(tmp_path / "grey", np.eye(4)).view("normal", views[0].camera)
+        GroundTruth(tmp_path / "grey", np.eye(4)).maps(views[0].camera)

@@ -45,27 +45,27 @@ class GroundTruth:
             raise InputError(f"{folder}: there is no ground truth in it; known are {known}")
 
     def maps(self, camera: Camera) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Read the true maps of the camera's view by name, and the object's alpha (h, w).
+        """Read the true maps of the camera's view by name, float32 (h, w) or (h, w, 3), and the object's alpha (h, w).
 
-        If the folder has no maps, return {} and an alpha of 0.
+        Larger maps are reduced. If the folder has no maps, return {} and an alpha of 0. Raises InputError if a file is missing, is smaller
+        than the view, has another shape or too few channels, or another size than the alpha.
         """
+        size = camera.height, camera.width
         if not self.passes:
-            return {}, np.zeros((camera.height, camera.width), np.float32)
-        return {name: self.view(name, camera) for name in self.passes}, self.view("alpha", camera)
-
-    def view(self, name: str, camera: Camera) -> np.ndarray:
-        """Read one true map of the camera's view, float32 (h, w) or (h, w, 3). `name` is "alpha" or one of PASSES.
-
-        A larger map is reduced. Raises InputError if the file is missing, is smaller, has another shape or too few channels.
-        """
-        pixels = self._read(name, camera)
-        if pixels.shape[:2] != (camera.height, camera.width):
-            alpha = self._read("alpha", camera)
-            reduced, weight = reduced_map(pixels, alpha, camera)
-            if name == "normal":
-                reduced /= np.maximum(np.linalg.norm(reduced, axis=-1, keepdims=True), 1e-6)
-            pixels = weight if name == "alpha" else reduced
-        return pixels @ self._turn.T.astype(np.float32) if name == "normal" else pixels
+            return {}, np.zeros(size, np.float32)
+        known, alpha = {name: self._read(name, camera) for name in self.passes}, self._read("alpha", camera)
+        if different := [name for name, pixels in known.items() if pixels.shape[:2] != alpha.shape]:
+            raise InputError(
+                f"{self.folder}: {different[0]}/{camera.name}.exr is not as large as the alpha of this view"
+            )
+        if alpha.shape != size:
+            known = {name: reduced_map(pixels, alpha, camera)[0] for name, pixels in known.items()}
+            alpha = cv2.resize(alpha, size[::-1], interpolation=cv2.INTER_AREA)
+            if "normal" in known:  # the mean of unit vectors is shorter
+                known["normal"] /= np.maximum(np.linalg.norm(known["normal"], axis=-1, keepdims=True), 1e-6)
+        if "normal" in known:
+            known["normal"] = known["normal"] @ self._turn.T.astype(np.float32)
+        return known, alpha
 
     def _read(self, name: str, camera: Camera) -> np.ndarray:
         file = self.folder / name / f"{camera.name}.exr"
@@ -103,11 +103,10 @@ class GroundTruth:
 
 def _check_size(file: Path, pixels: np.ndarray, camera: Camera) -> None:
     """Raise InputError if a true picture is not as large as the camera's view, nor a larger one of the same shape."""
-    height, width = pixels.shape[:2]
-    size = camera.width, camera.height
-    scale = max(size) / max(width, height)
-    if scale > 1 or (round(width * scale), round(height * scale)) != size:
-        raise InputError(f"{file} has {width}×{height} pixels, which does not fit its view of {size[0]}×{size[1]}")
+    (height, width), size = pixels.shape[:2], f"{camera.width}×{camera.height}"
+    fitted = camera.resized(width, height).fitted(max(camera.width, camera.height))
+    if (fitted.width, fitted.height) != (camera.width, camera.height):
+        raise InputError(f"{file} has {width}×{height} pixels, which does not fit its view of {size}")
 
 
 def read_relit(file: Path) -> np.ndarray:
