@@ -10,7 +10,7 @@ import pytest
 from refgs.capture import load_view, read_capture
 from refgs.capture.colmap_steps import MATCH_TOLERANCE, _write_mask, epipolar_distance
 from refgs.capture.images import read_header, read_image
-from refgs.capture.motion import CONTRADICTED, find_cameras
+from refgs.capture.motion import UNEXPLAINED, find_cameras
 from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.color import srgb_decode
 from refgs.errors import InputError, NoCameras
@@ -259,5 +259,5 @@ def test_what_stands_still_contradicts_what_turns():
     of_block, of_room = (6, slice(100)), (count, slice(100, None))  # six photos on, the block's features are hidden
     for poses in (around, inside):
         both = [contradicted(poses, *of_block), contradicted(poses, *of_room)]
-        assert np.concatenate(both).mean() > CONTRADICTED
+        assert np.concatenate(both).mean() > UNEXPLAINED
         assert both[0 if poses is around else 1].mean() == 0

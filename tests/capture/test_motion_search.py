@@ -125,6 +125,25 @@ def test_photos_that_share_little_are_placed_together(two_sides):
     assert distances.max() < 0.1 and angles.max() < 2
 
 
+def test_photos_without_cameras_are_unexplained(tmp_path):
+    """Check that what photos without cameras share with others counts as unexplained: one photo of five is in 4 of 10 pairs."""
+    photograph(tmp_path, orbit(np.arange(0, 50, 10)))
+    with_all, without_one = in_child(unexplained, tmp_path)
+    assert with_all < 0.02 and 0.2 < without_one < 0.6
+
+
+def unexplained(folder: Path) -> tuple[float, float]:
+    """Return the part of the feature matches that cameras leave unexplained: the cameras of all photos, and without that in the middle."""
+    photos, database = find_photos(folder), folder / "all.db"
+    colmap_steps.extract_features(photos, [], database, lambda *_: None)
+    colmap_steps.match_features(database, lambda *_: None)
+    model = colmap_steps.map_one_by_one(photos, database, lambda *_: None)[0]
+    middle = next(image for image in model.images.values() if int(image.name) == len(photos) // 2)
+    with_all = colmap_steps.unexplained_part(model, database)
+    model.deregister_frame(middle.frame_id)
+    return with_all, colmap_steps.unexplained_part(model, database)
+
+
 def in_child(work, folder: Path):
     """Return `work(folder)`, called in a process of its own, because COLMAP's OpenMP conflicts with torch's on some systems."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:

@@ -242,10 +242,11 @@ def epipolar_distance(ours: np.ndarray, theirs: np.ndarray, pose: np.ndarray) ->
     return np.abs((y * line).sum(axis=1)) / np.sqrt(np.maximum(slope, 1e-24))
 
 
-def contradicted_part(model: Any, database: Path) -> float:
-    """Return the fraction of feature matches that disagree with the cameras of a model (a pycolmap.Reconstruction).
+def unexplained_part(model: Any, database: Path) -> float:
+    """Return the fraction of feature matches that the cameras of a model (a pycolmap.Reconstruction) do not explain.
 
-    A match disagrees if its points are more than MATCH_TOLERANCE pixels from their epipolar lines.
+    A match is explained if its points are at most MATCH_TOLERANCE pixels from their epipolar lines, and both its photos have cameras: if an
+    object turns before a still room, some photos may follow the object and the others, which follow the room, get no camera.
     """
     import pycolmap
 
@@ -257,14 +258,17 @@ def contradicted_part(model: Any, database: Path) -> float:
     wrong, total = 0, 0
     for pair, geometry in verified:
         (a, b), matches = pycolmap.pair_id_to_image_pair(pair), geometry.inlier_matches
-        if {a, b} <= placed:
+        total += len(matches)
+        if not {a, b} <= placed:
+            wrong += len(matches)
+        else:
             ours, theirs = model.image(a), model.image(b)
             pose = (theirs.cam_from_world() * ours.cam_from_world().inverse()).matrix()
             far = (
                 epipolar_distance(rays[a][matches[:, 0]], rays[b][matches[:, 1]], pose)
                 * ours.camera.mean_focal_length()
             )
-            wrong, total = wrong + int((far > MATCH_TOLERANCE).sum()), total + len(far)
+            wrong += int((far > MATCH_TOLERANCE).sum())
     return wrong / max(total, 1)
 
 

@@ -8,9 +8,9 @@ first, with or without masks.
 
 If the object stands on a turntable instead, the surroundings do not turn with it and lead to wrong cameras. Therefore matches at the same
 pixel in both photos are dropped. This does not help if the camera also moved a little: some cameras then follow the turntable and others
-the surroundings (all 66 photos of a bronze head got cameras, 19° wrong on average). Such cameras disagree with many feature matches. If
-there are masks, the cameras are then found anew from the pixels inside them, and kept if they disagree with less. A shiny object has few
-strong features, so weaker ones count there. Without masks, the user gets a warning.
+the surroundings (all 66 photos of a bronze head got cameras, 19° wrong on average), or get none. Such cameras leave many feature matches
+unexplained. If there are masks, the cameras are then found anew from the pixels inside them, and kept if they explain more. A shiny object
+has few strong features, so weaker ones count there. Without masks, the user gets a warning.
 """
 
 import hashlib
@@ -26,18 +26,18 @@ from refgs.capture import find_layout
 from refgs.capture.colmap_steps import (
     SEED,
     color_points,
-    contradicted_part,
     extract_features,
     map_at_once,
     map_one_by_one,
     match_features,
+    unexplained_part,
 )
 from refgs.capture.files import Masks, find_photos
 from refgs.capture.images import read_header, read_mask
 from refgs.capture.region import WHITE_MASKS, empty_masks
 from refgs.errors import InputError
 
-CONTRADICTED = 0.2  # part of the matches, above which the cameras are not trusted
+UNEXPLAINED = 0.2  # part of the matches, above which the cameras are not trusted
 DOUBTED = "as happens if an object turns in front of still surroundings: look at the cameras before you train (Show Cameras in Blender)"
 AGAIN = "or put something plain behind the object, or walk around it, and take the photos again"
 WITHOUT_MASKS = (
@@ -52,13 +52,13 @@ WITH_MASKS = (
 class _Found(NamedTuple):
     """Hold what COLMAP found: names of the photos that got a camera, the mean reprojection error (pixels), and what casts doubt on them.
 
-    `contradicted` is the fraction of feature matches that disagree with the cameras. `apart` are the names of photos that fit together but
+    `unexplained` is the fraction of feature matches that the cameras do not explain. `apart` are the names of photos that fit together but
     share nothing with those placed. `inside` says that only the pixels inside the masks were used.
     """
 
     placed: set[str]
     error: float
-    contradicted: float
+    unexplained: float
     apart: set[str]
     inside: bool
 
@@ -66,8 +66,8 @@ class _Found(NamedTuple):
 def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) -> dict[str, Any]:
     """Find the cameras of the photos in a folder, or in its subfolder `images`. Write them to the subfolder `sparse/0` as a COLMAP model.
 
-    If these cameras contradict the photos or there are hardly any, and all photos have masks, cameras are found anew from the pixels inside
-    the masks. This is the way for an object on a turntable.
+    If these cameras leave much unexplained or there are hardly any, and all photos have masks, cameras are found anew from the pixels
+    inside the masks. This is the way for an object on a turntable.
 
     Returns a dict: `photos` is their number, `placed` is how many got a camera, `error` is the mean reprojection error in pixels, and
     `inside` is whether only the pixels inside the masks were used.
@@ -120,8 +120,8 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
                 "; if the object turned, put masks of the object in the folder masks, remove sparse and search again"
             )
         report("warning", {"what": what})
-    if found.contradicted > CONTRADICTED:
-        what = f"the cameras contradict {found.contradicted:.0%} of what the photos have in common, {DOUBTED}"
+    if found.unexplained > UNEXPLAINED:
+        what = f"the cameras do not explain {found.unexplained:.0%} of what the photos have in common, {DOUBTED}"
         report("warning", {"what": f"{what}. {WITH_MASKS if masks else WITHOUT_MASKS}"})
     for path in list(work.glob(f"{database.name}*")):
         _remove(path)
@@ -225,9 +225,9 @@ def _run_colmap(photos: list[Path], masks: list[Path], database: Path, model: Pa
         events.send({"stage": stage, "done": done, "total": total})
 
     best, found = _search(photos, [], database, progress)
-    if masks and (not _enough(found.placed, photos) or found.contradicted > CONTRADICTED):
+    if masks and (not _enough(found.placed, photos) or found.unexplained > UNEXPLAINED):
         other, inside = _search(photos, masks, database.with_name(f"{database.name}.inside"), progress)
-        better = not _enough(found.placed, photos) or inside.contradicted < found.contradicted
+        better = not _enough(found.placed, photos) or inside.unexplained < found.unexplained
         if _enough(inside.placed, photos) and better:
             best, found = other, inside
     if best is not None:
@@ -257,7 +257,7 @@ def _search(photos: list[Path], masks: list[Path], database: Path, progress: Cal
     best, found = _describe(models, photos, database, bool(masks))
     if len(found.placed) < len(photos):
         other, at_once = _describe(map_at_once(photos, database), photos, database, bool(masks))
-        if len(at_once.placed) > len(found.placed) and at_once.contradicted <= CONTRADICTED:
+        if len(at_once.placed) > len(found.placed) and at_once.unexplained <= UNEXPLAINED:
             best, found = other, at_once
     return best, found
 
@@ -271,6 +271,4 @@ def _describe(models: list[Any], photos: list[Path], database: Path, inside: boo
         {photos[int(model.image(number).name)].name for number in model.reg_image_ids()} for model in models
     )
     apart = max((group for group in groups if group.isdisjoint(placed)), key=len, default=set())
-    return best, _Found(
-        placed, best.compute_mean_reprojection_error(), contradicted_part(best, database), apart, inside
-    )
+    return best, _Found(placed, best.compute_mean_reprojection_error(), unexplained_part(best, database), apart, inside)
