@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Sequence
 
-from benchmarks import kernels, minutes, needs, truth
+from benchmarks import gpu, kernels, minutes, needs, truth
 from benchmarks.harness import KEPT, Row, markdown_table, read
 from refgs.paths import whole
 
@@ -14,7 +14,7 @@ Machine: {machine}. Date: {date}.
 
 `refgs bench page` writes this page from [measurements.csv](measurements.csv), which has the date and commit of each
 figure. [The notebook](notebook/README.md) tells how they came about; [run-folder.md](run-folder.md#what-the-figures-mean) says
-what they mean. No CUDA card has been measured yet; `refgs bench gpu` does that.
+what they mean.
 """
 SECTIONS = (
     (
@@ -43,12 +43,18 @@ PSNR stands the best that a preset had reached by then. The same training again 
 An iteration is of the deferred stage.""",
         kernels.TABLES,
     ),
+    (
+        "On a CUDA card",
+        """`refgs bench gpu`; the floors are what the bytes and the operations take at least on this card. [The notebook](notebook/speed.md)
+has the kernels of an iteration, and trainings.""",
+        gpu.TABLES[:2],
+    ),
 )
 
 
 def markdown(rows: Sequence[Row]) -> str:
     """Make the text of docs/measurements.md from rows of docs/measurements.csv."""
-    machines, dates = ", ".join(sorted({row.machine for row in rows})), sorted({row.date for row in rows})
+    machines, dates = "; ".join(sorted({row.machine for row in rows})), sorted({row.date for row in rows})
     parts = [HEAD.format(machine=machines, date=" to ".join(dict.fromkeys((dates[0], dates[-1]))))]
     for title, text, tables in SECTIONS:
         found = [lines for table in tables if len(lines := table.lines(rows)) > 1]
