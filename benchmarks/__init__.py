@@ -3,4 +3,17 @@
 Both commands need a clone of the repository. `benchmarks.scenes` renders test scenes whose true shape, materials and light are known.
 """
 
-BENCHMARKS = ("kernels", "truth", "real", "cameras", "paper", "needs", "poses", "masks", "minutes", "gpu", "page")
+BENCHMARKS = (
+    "kernels",
+    "truth",
+    "real",
+    "cameras",
+    "paper",
+    "needs",
+    "poses",
+    "masks",
+    "minutes",
+    "look",
+    "gpu",
+    "page",
+)

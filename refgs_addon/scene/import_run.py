@@ -33,9 +33,10 @@ class Run:
 def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     """Import a run folder, the result of a training, into a scene, as a new collection `RefGS NAME`.
 
-    splats.ply must exist. mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be missing. The mesh is hidden
-    at first, because it overlaps the splats; `run_parts.show` shows it. If `capture_cameras.show_cameras` added the cameras of the same
-    capture, the run's cameras replace them. If this function raises InputError, it leaves the open file unchanged.
+    splats.ply must exist. mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be missing. If there is a mesh,
+    it is shown and the splats are hidden: Blender shades each splat by itself, which looks grainy on polished surfaces. `run_parts.show`
+    shows the splats. If `capture_cameras.show_cameras` added the cameras of the same capture, the run's cameras replace them. If this
+    function raises InputError, it leaves the open file unchanged.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -66,7 +67,7 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
             run.cameras = {frame["name"]: add_camera(frame, cameras) for frame in frames}
             if scene.camera is None:
                 frame_camera(scene, next(iter(run.cameras.values())))
-        run_parts.show(collection, "splats")
+        run_parts.show(collection, "mesh" if any(item.data.polygons for item in run.mesh) else "splats")
     except BaseException:
         scene.world, scene.camera = world, camera
         bpy.data.batch_remove(data_blocks() - before)

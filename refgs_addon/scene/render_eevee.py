@@ -19,8 +19,9 @@ def render_preview(
     size: int | None = None,
     samples: int = 64,
     exr: Path | None = None,
+    engine: str = compat.EEVEE,
 ) -> None:
-    """Render a camera's view in Eevee over a transparent background. The default camera is the scene's.
+    """Render a camera's view over a transparent background, in Eevee or with Cycles. The default camera is the scene's.
 
     `size` is the picture's longer side in pixels; by default the picture is as large as the camera's photo. `png` gets 8-bit sRGB with
     straight alpha, through the Standard view transform. `exr` gets linear Rec.709 radiance in 32 bits, premultiplied. The scene's own
@@ -32,10 +33,11 @@ def render_preview(
     with _restored(scene):
         frame_camera(scene, camera, size)
         render, view = scene.render, scene.view_settings
-        render.engine = compat.EEVEE
+        render.engine = engine
         render.film_transparent = True
         render.use_compositing = render.use_sequencer = False
         scene.eevee.taa_render_samples = samples
+        scene.cycles.samples = samples
         scene.display_settings.display_device = "sRGB"
         view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
         bpy.ops.render.render(scene=scene.name)
@@ -60,6 +62,7 @@ def _restored(scene: bpy.types.Scene) -> Iterator[None]:
         (render, ["engine", "film_transparent", "use_compositing", "use_sequencer", "resolution_x", "resolution_y"]),
         (render, ["resolution_percentage", "pixel_aspect_x", "pixel_aspect_y"]),
         (scene.eevee, ["taa_render_samples"]),
+        (scene.cycles, ["samples"]),
         (scene.display_settings, ["display_device"]),
         (scene.view_settings, ["view_transform", "look", "exposure", "gamma"]),
         (render.image_settings, compat.FORMAT),

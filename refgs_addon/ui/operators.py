@@ -92,6 +92,9 @@ def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, 
 
     run = import_run(folder, context.scene)
     operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
+    shown = next((item for item in run.mesh if not item.hide_viewport), run.splats)
+    select_only(context, shown)
+    frame_selected(context, shaded=shown == run.splats)
     if run.left_out:
         operator.report({"WARNING"}, f"{run.left_out:,} splats with values that are not finite were left out")
     if run.light_of:
@@ -149,6 +152,18 @@ class Crop(ReportsErrors, bpy.types.Operator):
         box = crop(splats, splats.users_collection[0], self.on)
         if self.on:
             select_only(context, box)
+
+
+def frame_selected(context: bpy.types.Context, shaded: bool) -> None:
+    """Bring the selected object into view in all 3D views. If `shaded`, those in Solid mode, which shows no splats, show materials."""
+    for area in context.screen.areas if context.screen else ():
+        if area.type == "VIEW_3D":
+            shading = area.spaces.active.shading
+            if shaded and shading.type in ("SOLID", "WIREFRAME"):
+                shading.type = "MATERIAL"
+            region = next(region for region in area.regions if region.type == "WINDOW")
+            with context.temp_override(area=area, region=region):
+                bpy.ops.view3d.view_selected()
 
 
 def select_only(context: bpy.types.Context, item: bpy.types.Object) -> None:

@@ -19,6 +19,13 @@ GOLD = (1.0, 0.766, 0.336), 1.0, 0.15  # base colour, metallic, roughness
 CHROME_ROUGHNESS = 0.02
 
 
+@pytest.fixture
+def run(run):
+    """Import the run and show its splats, as Blender does not evaluate hidden objects."""
+    show(run.collection, "splats")
+    return run
+
+
 def drawn(run, name):
     """Read an attribute of the splats after all edits: one value per splat, taken from the first corner of its quad."""
     return attribute(evaluated_mesh(run.splats), name)[::4]

@@ -14,6 +14,7 @@ from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import export_mesh, export_run
 from refgs_addon.scene.import_run import data_blocks, import_run
+from refgs_addon.scene.run_parts import show
 from tests.makers.blender import principled
 from tests.makers.box import textured_box
 
@@ -35,6 +36,7 @@ def textured(run_folder):
 def test_it_comes_back_as_it_was(textured, scene, tmp_path, ending, read):
     folder, mesh = textured
     run = import_run(folder, scene)
+    show(run.collection, "splats")
     scene.view_layers[0].objects.active = run.splats
     run.splats.select_set(True)
     before = data_blocks()

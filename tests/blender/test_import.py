@@ -70,6 +70,7 @@ def test_points_hold_what_the_file_holds(run):
 
 
 def test_quads_lie_in_the_splats_planes(run):
+    show(run.collection, "splats")
     columns = random_columns()
     mesh = evaluated_mesh(run.splats)
     assert len(mesh.polygons) == COUNT and len(mesh.vertices) == 4 * COUNT
@@ -84,6 +85,7 @@ def test_quads_lie_in_the_splats_planes(run):
 
 
 def test_size_opacity_cut_and_display(run):
+    show(run.collection, "splats")
     columns, modifier = random_columns(), run.splats.modifiers[NAME]
     whole = attribute(evaluated_mesh(run.splats), "position").reshape(COUNT, 4, 3)
     compat.set_modifier_input(modifier, "Size", 0.5)
@@ -327,12 +329,13 @@ def test_optional_parts_may_be_missing(run_folder, scene):
     assert run.mesh == [] and run.world is None and run.cameras == {} and scene.world is None
 
 
-def test_show_hides_the_other_part(run):
+def test_the_mesh_is_shown_first_and_show_hides_the_other_part(run):
     assert set(parts(run.collection)) == {"splats", "mesh"}
-    assert not run.splats.hide_render and run.mesh[0].hide_render
-    show(run.collection, "mesh")
     assert run.splats.hide_render and run.splats.hide_viewport
     assert not run.mesh[0].hide_render and not run.mesh[0].hide_viewport
+    show(run.collection, "splats")
+    assert not run.splats.hide_render and not run.splats.hide_viewport
+    assert run.mesh[0].hide_render and run.mesh[0].hide_viewport
 
 
 def cut(path):

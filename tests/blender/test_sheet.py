@@ -10,11 +10,13 @@ from refgs_addon.nodes.panorama_world import IMAGE, ROTATION, STRENGTH
 from refgs_addon.scene.contact_sheet import GAP, contact_sheet
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.render_eevee import render_preview
+from refgs_addon.scene.run_parts import show
 from refgs_addon.scene.world_light import relight
 from tests.makers.runs import write_panorama
 
 
 def test_a_view_under_each_light(run, scene, tmp_path):
+    show(run.collection, "splats")
     colors = {"red": (1, 0.05, 0.05), "green": (0.05, 1, 0.05), "blue": (0.05, 0.05, 1)}
     for name, color in colors.items():
         write_panorama(tmp_path / f"{name}.exr", np.broadcast_to(color, (8, 16, 3)))
