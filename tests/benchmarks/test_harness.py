@@ -69,7 +69,7 @@ def test_the_page_is_what_the_kept_figures_make():
 def test_a_wrong_word_lists_the_benchmarks():
     with pytest.raises(
         InputError,
-        match="no benchmark 'foo': take one of kernels, truth, real, cameras, paper, needs, poses, masks, minutes, gpu",
+        match="no benchmark 'foo': take one of kernels, truth, real, cameras, paper, needs, poses, masks, minutes, look",
     ):
         commands.bench("foo", [])
     files = Path(benchmarks.__file__).parent.glob("*.py")
