@@ -44,6 +44,7 @@ def main() -> None:
     scene.eevee.use_shadows = (
         False  # there are no lamps, and software Eevee spends most of a frame on preparing for them
     )
+    scene.cycles.samples = 64  # as many as Eevee's
     run = import_run(options.run, scene)
     times = {drawn: [] for drawn in DRAWN}
     for hdri in (None, *options.hdri):

@@ -49,16 +49,16 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def preview(options: argparse.Namespace) -> None:
+    # Blender and its add-ons print to stdout, even while they load: send that to stderr, so that only events are on stdout.
+    events = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+
     import bpy
 
     from .scene.import_run import import_run
     from .scene.render_eevee import render_preview
     from .scene.run_parts import show
     from .scene.world_light import relight
-
-    # Blender and its add-ons print to stdout: send that to stderr, so that only events are on stdout.
-    events = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)
 
     def say(**event) -> None:
         print(json.dumps(event), file=events)

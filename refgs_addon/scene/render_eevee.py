@@ -21,11 +21,11 @@ def render_preview(
     exr: Path | None = None,
     engine: str = compat.EEVEE,
 ) -> None:
-    """Render a camera's view over a transparent background, in Eevee or with Cycles. The default camera is the scene's.
+    """Render a camera's view in Eevee, or another engine, over a transparent background. The default camera is the scene's.
 
-    `size` is the picture's longer side in pixels; by default the picture is as large as the camera's photo. `png` gets 8-bit sRGB with
-    straight alpha, through the Standard view transform. `exr` gets linear Rec.709 radiance in 32 bits, premultiplied. The scene's own
-    settings are restored. Raises InputError where there is no camera or a file cannot be written.
+    `size` is the picture's longer side in pixels; by default the picture is as large as the camera's photo. `samples` are Eevee's. `png`
+    gets 8-bit sRGB with straight alpha, through the Standard view transform. `exr` gets linear Rec.709 radiance in 32 bits, premultiplied.
+    The scene's own settings are restored. Raises InputError where there is no camera or a file cannot be written.
     """
     camera = camera or scene.camera
     if camera is None:
@@ -37,7 +37,6 @@ def render_preview(
         render.film_transparent = True
         render.use_compositing = render.use_sequencer = False
         scene.eevee.taa_render_samples = samples
-        scene.cycles.samples = samples
         scene.display_settings.display_device = "sRGB"
         view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
         bpy.ops.render.render(scene=scene.name)
@@ -62,7 +61,6 @@ def _restored(scene: bpy.types.Scene) -> Iterator[None]:
         (render, ["engine", "film_transparent", "use_compositing", "use_sequencer", "resolution_x", "resolution_y"]),
         (render, ["resolution_percentage", "pixel_aspect_x", "pixel_aspect_y"]),
         (scene.eevee, ["taa_render_samples"]),
-        (scene.cycles, ["samples"]),
         (scene.display_settings, ["display_device"]),
         (scene.view_settings, ["view_transform", "look", "exposure", "gamma"]),
         (render.image_settings, compat.FORMAT),
