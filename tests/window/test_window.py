@@ -139,9 +139,9 @@ def test_closing_asks(tmp_path, ball_capture, letter):
     report = in_window("close.py", tmp_path, sys.executable, capture, letter)
     assert report["states"] == ["running"]  # after Cancel
     run = Path(report["run"])
+    while jobs.run_state(run) == "training":  # after Stop Cleanly, until the checkpoint is written
+        time.sleep(1)
     if letter == "S":
         assert jobs.run_state(run) == "stopped"
     else:
-        while jobs.run_state(run) == "training":
-            time.sleep(1)
         assert (run / "splats.ply").exists() and (run / "mesh.glb").exists()
