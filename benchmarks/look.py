@@ -11,7 +11,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from benchmarks.harness import Bench, Column, Table, call, console, find_scenes
@@ -21,7 +20,7 @@ from refgs.capture import read_capture
 from refgs.compare import metrics
 from refgs.compare.pictures import as_bytes, maps, over_white, write_png
 from refgs.compare.truth import FOLDER, GroundTruth, read_relit
-from refgs.formats.exr import read_exr, write_exr
+from refgs.formats.exr import write_exr
 from refgs.paths import clone_root
 from refgs.run import Run, open_run
 
@@ -75,15 +74,13 @@ def measure(bench: Bench, capture: Path, run: Run, out: Path) -> None:
     names = [views[i].camera.name for i in np.linspace(0, len(views) - 1, min(VIEWS, len(views))).round().astype(int)]
     cameras = [camera for camera in run.cameras if camera.name in names]
     out.mkdir(parents=True, exist_ok=True)
-    panoramas = [out / f"{hdri}.exr" for hdri in truth.hdris]
-    for panorama in panoramas:
-        write_exr(panorama, truth.panorama(f"relight/{panorama.stem}"))
+    panoramas = {hdri: truth.panorama(f"relight/{hdri}") for hdri in truth.hdris}
     milliseconds = draw_in_blender(run.folder, panoramas, names, out)
-    draw(run, truth, cameras, out)
+    draw(run, panoramas, cameras, out)
     rows, found = [], {}
     for light in (RECOVERED, *truth.hdris):
-        true = [true_picture(truth, light, camera) for camera in cameras]
-        rows += [[over_white(picture)] for picture in true]
+        true = [truth.color(camera) if light == RECOVERED else truth.relit(light, camera) for camera in cameras]
+        rows += [[over_white(image)] for image in true]
         for drawn in (RENDERER, *DRAWN):
             pictures = [read_relit(picture(out, light, drawn, camera.name)) for camera in cameras]
             for row, image in zip(rows[-len(cameras) :], pictures, strict=True):
@@ -104,26 +101,21 @@ def measure(bench: Bench, capture: Path, run: Run, out: Path) -> None:
     write_png(out.with_suffix(".png"), as_bytes(np.concatenate([np.concatenate(row, axis=1) for row in rows])))
 
 
-def true_picture(truth: GroundTruth, light: str, camera: Camera) -> np.ndarray:
-    """Read a view's true picture under a light, in premultiplied linear RGBA (h, w, 4)."""
-    if light != RECOVERED:
-        return truth.relit(light, camera)
-    pixels = read_exr(truth.folder / "color" / f"{camera.name}.exr")
-    return cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-
-
-def draw(run: Run, truth: GroundTruth, cameras: list[Camera], out: Path) -> None:
+def draw(run: Run, panoramas: dict[str, np.ndarray], cameras: list[Camera], out: Path) -> None:
     """Draw the views with the trainer's renderer, under the recovered light and the others."""
-    for light in (RECOVERED, *truth.hdris):
-        environment = None if light == RECOVERED else run.light(truth.panorama(f"relight/{light}"))
+    lights = {RECOVERED: None} | {hdri: run.light(panorama) for hdri, panorama in panoramas.items()}
+    for light, environment in lights.items():
         for camera in cameras:
             write_exr(picture(out, light, RENDERER, camera.name), maps(run.render(camera, environment))["color"])
 
 
-def draw_in_blender(run: Path, panoramas: list[Path], views: list[str], out: Path) -> dict[str, float]:
+def draw_in_blender(run: Path, panoramas: dict[str, np.ndarray], views: list[str], out: Path) -> dict[str, float]:
     """Draw the views in Blender, in a process of its own. Returns the median milliseconds of a frame, by how the run is drawn."""
+    files = [out / f"{hdri}.exr" for hdri in panoramas]
+    for file in files:
+        write_exr(file, panoramas[file.stem])
     command = [sys.executable, "-m", "benchmarks.look_in_blender", run, "--out", out]
-    command += ["--views", *views, "--hdri", *panoramas]
+    command += ["--views", *views, "--hdri", *files]
     done = subprocess.run(list(map(str, command)), cwd=clone_root(), capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"Blender did not draw {run}:\n{done.stderr[-2000:]}")

@@ -9,20 +9,14 @@ import pytest
 from benchmarks import look
 from benchmarks.harness import read
 from benchmarks.look_in_blender import DRAWN
-from benchmarks.scenes.analytic import sky
 from refgs.capture import read_capture
 from refgs.compare.pictures import maps
 from refgs.formats.exr import write_exr
 from refgs.formats.panorama import directions
 from refgs.run import open_run
-from tests.makers.ball import TURN, write_run
+from tests.makers.ball import TURN, dusk, write_run
 
 pytest.importorskip("bpy", reason="needs Blender's Python module")
-
-
-def dusk(direction):
-    """Compute the radiance of another light, which is redder and comes from elsewhere."""
-    return sky(direction[..., [1, 2, 0]]) * [1.0, 0.6, 0.3]
 
 
 @pytest.fixture

@@ -19,6 +19,11 @@ SCALE, MOVE = 3.0, np.array([5.0, -2.0, 1.0])
 BOX = trimesh.creation.box((1.0, 1.4, 0.8)).subdivide().subdivide()
 
 
+def dusk(direction):
+    """Compute the radiance of another light in the unit directions (…, 3): redder than the sky, and from elsewhere."""
+    return sky(direction[..., [1, 2, 0]]) * [1.0, 0.6, 0.3]
+
+
 def write_run(folder, capture):
     """Write the output folder of a training on the data set `capture`, and return it. The learned object is a metal ball.
 

@@ -21,13 +21,7 @@ from refgs.formats.panorama import directions
 from refgs.model.environment import Environment
 from refgs.run import open_run
 from refgs.run_folder import update_metrics
-from tests.makers.ball import BOX, MOVE, SCALE, TURN, write_run
-
-
-def dusk(direction):
-    """Compute the radiance of the light `dusk`, with which the run is relit."""
-    return sky(direction[..., [1, 2, 0]]) * [1.0, 0.6, 0.3]
-
+from tests.makers.ball import BOX, MOVE, SCALE, TURN, dusk, write_run
 
 DUSK = Environment.from_panorama(dusk(directions(64, 128)).astype(np.float32), 16)
 

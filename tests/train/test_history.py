@@ -13,6 +13,7 @@ from refgs.formats.exr import read_exr, write_exr
 from refgs.formats.panorama import directions
 from refgs.train import history
 from tests.makers import scenes
+from tests.makers.ball import dusk
 from tests.makers.training import TINY, put, trainer
 
 
@@ -128,10 +129,6 @@ def test_a_training_that_is_ended_early_has_a_last_line(ball_capture, tmp_path):
     made.run(stop=finish)
     assert [row["iteration"] for row in rows(tmp_path / "run")] == [10, 13, 14]
     assert "flip_test" in rows(tmp_path / "run")[-1]
-
-
-def dusk(direction):
-    return sky(direction[..., [1, 2, 0]]) * [1.0, 0.6, 0.3]
 
 
 def write_truth(capture):

@@ -95,7 +95,14 @@ class GroundTruth:
 
         A larger picture is reduced.
         """
-        file = self.folder / "relight" / hdri / f"{camera.name}.exr"
+        return self._picture(f"relight/{hdri}", camera)
+
+    def color(self, camera: Camera) -> np.ndarray:
+        """Read the true picture of the camera's view under the photos' light, as `relit` does."""
+        return self._picture("color", camera)
+
+    def _picture(self, folder: str, camera: Camera) -> np.ndarray:
+        file = self.folder / folder / f"{camera.name}.exr"
         pixels = read_relit(file)
         _check_size(file, pixels, camera)
         return cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
