@@ -11,6 +11,8 @@ from bpy.props import (
     StringProperty,
 )
 
+from .scene.run_parts import ROOT
+
 
 class KnownRun(bpy.types.PropertyGroup):
     """Store one entry in the scene's list of runs: the folder of a training's result, and the capture that was trained."""
@@ -120,7 +122,24 @@ CLASSES = (KnownRun, Training)
 
 def register() -> None:
     bpy.types.Scene.refgs = PointerProperty(type=Training, name="RefGS")
+    bpy.types.Object.refgs_longest_side = FloatProperty(
+        name="Longest Side",
+        description="Size of the object: the longest side of a box around it. Photos do not tell it; type it in",
+        unit="LENGTH",
+        min=1e-6,
+        get=_longest_side,
+        set=_scale_to,
+    )
 
 
 def unregister() -> None:
-    del bpy.types.Scene.refgs
+    del bpy.types.Scene.refgs, bpy.types.Object.refgs_longest_side
+
+
+def _longest_side(item: bpy.types.Object) -> float:
+    return item.get(ROOT, 0.0) * max(map(abs, item.scale))
+
+
+def _scale_to(item: bpy.types.Object, metres: float) -> None:
+    """Scale the Empty of an imported run by one factor until its longest side is as long as given."""
+    item.scale *= metres / max(_longest_side(item), 1e-12)

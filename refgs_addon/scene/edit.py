@@ -94,7 +94,8 @@ def _paint_target(mesh: bpy.types.Object, collection: bpy.types.Collection) -> t
     else:
         canvas = bpy.data.objects.new(f"{mesh.name} to paint on", mesh.data)
         canvas[REGION] = canvas.hide_render = True
-        canvas.matrix_world = mesh.matrix_world
+        canvas.parent, canvas.matrix_parent_inverse = mesh.parent, mesh.matrix_parent_inverse
+        canvas.matrix_basis = mesh.matrix_basis
         collection.objects.link(canvas)
     group = canvas.vertex_groups.new(name="RefGS Painted")
     canvas.vertex_groups.active = group

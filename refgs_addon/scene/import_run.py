@@ -4,11 +4,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import bpy
+from mathutils import Matrix, Vector
 
 from ..errors import InputError
 from . import run_parts
 from .camera_objects import add_camera, frame_camera, light_of, read_cameras
 from .capture_cameras import replace_cameras
+from .regions import bounds
 from .run_toml import capture_of
 from .splat_cloud import add_splats, cloud_attributes, normal_slopes, point_cloud, read_constants, read_splats
 from .world_light import light_with_recovered, load_panorama
@@ -19,6 +21,8 @@ class Run:
     """Hold the objects that `import_run` made. What the run folder does not contain is None or empty here."""
 
     collection: bpy.types.Collection
+    root: bpy.types.Object
+    """Empty that moves, rotates and scales all other objects."""
     splats: bpy.types.Object
     left_out: int
     """Number of splats left out for values that are not finite."""
@@ -35,8 +39,8 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
 
     splats.ply must exist. mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be missing. If there is a mesh,
     it is shown and the splats are hidden: Blender shades each splat by itself, which looks grainy on polished surfaces. `run_parts.show`
-    shows the splats. If `capture_cameras.show_cameras` added the cameras of the same capture, the run's cameras replace them. If this
-    function raises InputError, it leaves the open file unchanged.
+    shows the splats. The cameras are hidden. An Empty is the parent of all objects. If `capture_cameras.show_cameras` added the cameras of
+    the same capture, the run's cameras replace them. If this function raises InputError, it leaves the open file unchanged.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -52,10 +56,9 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         scene.collection.children.link(collection)
         cloud = point_cloud(f"{name} splats", cloud_attributes(splats, *normal_slopes(splats)))
         drawn = add_splats(cloud.name, cloud, collection, read_constants(folder / "splats.ply"))
-        run = Run(collection, drawn, left_out)
-        run.splats[run_parts.KEY] = "splats"
-        if (folder / "mesh.glb").exists():
-            run.mesh = add_mesh(folder / "mesh.glb", f"{name} mesh", collection)
+        drawn[run_parts.KEY] = "splats"
+        mesh = add_mesh(folder / "mesh.glb", f"{name} mesh", collection) if (folder / "mesh.glb").exists() else []
+        run = Run(collection, add_root(f"RefGS {name}", drawn, mesh), drawn, left_out, mesh)
         if (folder / "environment.exr").exists():
             run.world = light_with_recovered(scene, f"RefGS {name}", load_panorama(folder / "environment.exr"))
             run.light_of = light_of(folder / "cameras.json") if frames else ""
@@ -63,10 +66,13 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
                 run.world["refgs_light_of"] = run.light_of
         if frames:
             cameras = bpy.data.collections.new(f"{name} cameras")
+            cameras[run_parts.CAMERAS] = cameras.hide_viewport = True  # a hundred cameras hide the object
             collection.children.link(cameras)
             run.cameras = {frame["name"]: add_camera(frame, cameras) for frame in frames}
             if scene.camera is None:
                 frame_camera(scene, next(iter(run.cameras.values())))
+        for item in (drawn, *mesh, *run.cameras.values()):
+            item.parent, item.matrix_parent_inverse = run.root, Matrix.Translation(-run.root.location)
         run_parts.show(collection, "mesh" if any(item.data.polygons for item in run.mesh) else "splats")
     except BaseException:
         scene.world, scene.camera = world, camera
@@ -75,6 +81,22 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     if capture is not None and frames:
         replace_cameras(scene, capture, run.cameras)
     return run
+
+
+def add_root(name: str, splats: bpy.types.Object, mesh: list[bpy.types.Object]) -> bpy.types.Object:
+    """Add the Empty that moves, rotates and scales a run. It stands at the middle of the object's lowest side."""
+    solid = [item for item in mesh if item.data.polygons]
+    if solid:
+        corners = [item.matrix_world @ Vector(corner) for item in solid for corner in item.bound_box]
+        low, high = (Vector(f(corner[axis] for corner in corners) for axis in range(3)) for f in (min, max))
+    else:
+        low, high = bounds(splats.data)
+    item = bpy.data.objects.new(name, None)
+    item.location = (low.x + high.x) / 2, (low.y + high.y) / 2, low.z
+    item[run_parts.ROOT] = max(high - low)
+    item.empty_display_size = max(high - low) / 2
+    splats.users_collection[0].objects.link(item)
+    return item
 
 
 def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bpy.types.Object]:

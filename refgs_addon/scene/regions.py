@@ -26,16 +26,21 @@ def add_region(splats: bpy.types.Object, collection: bpy.types.Collection, name:
     region = bpy.data.objects.new(name, None)
     region[REGION] = True
     region.empty_display_type = shape
-    cloud = splats.data
+    low, high = bounds(splats.data)
+    region.parent, region.matrix_parent_inverse = splats.parent, splats.matrix_parent_inverse
+    region.location = splats.matrix_basis @ ((low + high) / 2)
+    region.scale = [side / 2 or 1.0 for side in high - low]
+    collection.objects.link(region)
+    return region
+
+
+def bounds(cloud: bpy.types.PointCloud) -> tuple[Vector, Vector]:
+    """Return the lowest and the highest corner of the box around a point cloud. On each of its sides, 2 % of the points are left out."""
     places = [0.0] * (3 * len(cloud.points))
     cloud.attributes["position"].data.foreach_get("vector", places)
     axes = [sorted(places[axis::3]) for axis in range(3)]
-    low, high = ([axis[int(part * (len(axis) - 1))] for axis in axes] for part in (0.02, 0.98))
-    middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
-    region.location = splats.matrix_world @ type(splats.location)(middle)
-    region.scale = [(b - a) / 2 or 1.0 for a, b in zip(low, high, strict=True)]
-    collection.objects.link(region)
-    return region
+    low, high = (Vector(axis[int(part * (len(axis) - 1))] for axis in axes) for part in (0.02, 0.98))
+    return low, high
 
 
 def crop(splats: bpy.types.Object, collection: bpy.types.Collection, on: bool) -> bpy.types.Object | None:

@@ -1,8 +1,10 @@
-"""Find the parts of an imported run, the splats and the mesh, and show one part."""
+"""Find the parts of an imported run: its splats and mesh, the Empty that moves them, its cameras. Show the splats or the mesh."""
 
 import bpy
 
 KEY = "refgs_part"  # custom property of an imported object: "splats" or "mesh"
+CAMERAS = "refgs_cameras"  # custom property of the collection of a run's cameras
+ROOT = "refgs_root"  # custom property of the Empty that moves a run: the run's longest side, in the Empty's coordinates
 FOLDER = "refgs_folder"  # custom property of a run's collection: its run folder
 
 
@@ -13,6 +15,16 @@ def parts(collection: bpy.types.Collection) -> dict[str, list[bpy.types.Object]]
         if KEY in item:
             found.setdefault(item[KEY], []).append(item)
     return found
+
+
+def root(collection: bpy.types.Collection) -> bpy.types.Object | None:
+    """Find the Empty that moves, rotates and scales an imported run. Returns None if it was deleted."""
+    return next((item for item in collection.objects if ROOT in item), None)
+
+
+def cameras(collection: bpy.types.Collection) -> bpy.types.Collection | None:
+    """Find the collection of a run's cameras. Returns None if the run has none."""
+    return next((child for child in collection.children if CAMERAS in child), None)
 
 
 def show(collection: bpy.types.Collection, part: str) -> None:

@@ -6,7 +6,7 @@ import bpy
 
 from .. import compat
 from ..errors import InputError
-from .run_parts import parts
+from .run_parts import parts, root
 
 KEY = "refgs_turntable"  # custom property of the Empty that rotates
 
@@ -22,7 +22,8 @@ def add_turntable(scene: bpy.types.Scene, collection: bpy.types.Collection, seco
         raise InputError(f"{collection.name} is not an imported run: import one first")
     if any(KEY in item for item in collection.objects):
         raise InputError(f"{collection.name} is on a turntable already: delete its Empty to remove it")
-    items = [item for item in collection.objects if item.parent is None]
+    base = root(collection)
+    items = [item for item in collection.objects if item != base and item.parent == base]
     low, high = (
         [f(corner[axis] for item in found["splats"] for corner in item.bound_box) for axis in range(3)]
         for f in (min, max)
@@ -44,7 +45,7 @@ def add_turntable(scene: bpy.types.Scene, collection: bpy.types.Collection, seco
         curve.extrapolation = "LINEAR"
     scene.frame_set(1)
     table.rotation_euler = 0.0, 0.0, 0.0
-    bpy.context.view_layer.update()
+    table.parent, table.matrix_parent_inverse = base, found["splats"][0].matrix_parent_inverse
     for item in items:
-        item.parent, item.matrix_parent_inverse = table, table.matrix_world.inverted()
+        item.parent, item.matrix_parent_inverse = table, table.matrix_basis.inverted()
     return table

@@ -7,7 +7,7 @@ import bpy
 from .. import compat, jobs
 from ..nodes.splats_tree import NAME as MODIFIER
 from ..scene.camera_objects import photo_shown
-from ..scene.run_parts import parts
+from ..scene.run_parts import cameras, parts, root
 from . import operators
 from .icons import thumbnail
 
@@ -36,6 +36,10 @@ class RunPanel(Tab, bpy.types.Panel):
         for part, items in found.items():
             button = row.operator(operators.ShowPart.bl_idname, text=part.title(), depress=not items[0].hide_viewport)
             button.collection, button.part = collection.name, part
+        if cameras(collection):
+            row.prop(cameras(collection), "hide_viewport", text="Cameras", toggle=1, invert_checkbox=True)
+        if root(collection):
+            layout.prop(root(collection), "refgs_longest_side")
         for splats in found.get("splats", []):
             if splats.hide_viewport or MODIFIER not in splats.modifiers:
                 continue

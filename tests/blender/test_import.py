@@ -21,7 +21,8 @@ from refgs_addon.scene.camera_objects import frame_camera, next_camera, photo_sh
 from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import export_mesh, export_splats
 from refgs_addon.scene.import_run import import_run
-from refgs_addon.scene.run_parts import parts, show
+from refgs_addon.scene.regions import REGION
+from refgs_addon.scene.run_parts import cameras, parts, show
 from refgs_addon.scene.run_toml import newer_release
 from refgs_addon.scene.splat_cloud import MATERIALS, normal_slopes, read_splats
 from tests.makers.blender import attribute, evaluated_mesh
@@ -249,7 +250,48 @@ def test_mesh_stands_where_the_splats_are(run):
     corners = np.array([mesh.matrix_world @ v.co for v in mesh.data.vertices])
     np.testing.assert_allclose(corners.min(axis=0), [0.9, -3.3, 1.8], atol=1e-5)
     np.testing.assert_allclose(corners.max(axis=0), [1.1, -2.7, 2.2], atol=1e-5)
-    assert mesh.users_collection == (run.collection,) and mesh.parent is None
+    assert mesh.users_collection == (run.collection,) and mesh.parent == run.root
+
+
+def test_one_empty_moves_the_whole_run(run, scene):
+    add_edit(run.collection, "Box")
+    (region,) = (item for item in run.collection.objects if item.get(REGION))
+    show(run.collection, "splats")
+    run.mesh[0].hide_viewport = cameras(run.collection).hide_viewport = False  # hidden objects are not evaluated
+    items = [run.splats, run.mesh[0], region, *run.cameras.values()]
+    bpy.context.view_layer.update()
+    before = [np.array(item.matrix_world) for item in (*items, run.root)]
+    np.testing.assert_allclose(before[-1][:3, 3], [1.0, -3.0, 1.8], atol=1e-5)  # under the middle of the mesh
+    run.root.location, run.root.rotation_euler, run.root.scale = (2, 1, 0), (0.3, 0.2, 0.1), (0.5, 0.5, 0.5)
+    bpy.context.view_layer.update()
+    moved = np.array(run.root.matrix_world) @ np.linalg.inv(before[-1])
+    for item, was in zip(items, before, strict=False):
+        np.testing.assert_allclose(np.array(item.matrix_world), moved @ was, atol=1e-5)
+
+
+def test_the_true_size_is_typed_in(run_folder, addon):
+    run = import_run(run_folder, addon)
+    assert run.root.refgs_longest_side == pytest.approx(0.6, rel=1e-5)
+    run.root.scale = (2, 2, 2)
+    assert run.root.refgs_longest_side == pytest.approx(1.2, rel=1e-5)
+    run.root.refgs_longest_side = 0.15
+    run.mesh[0].hide_viewport = False
+    bpy.context.view_layer.update()
+    corners = np.array([run.mesh[0].matrix_world @ v.co for v in run.mesh[0].data.vertices])
+    assert np.ptp(corners, axis=0).max() == pytest.approx(0.15, rel=1e-4)
+
+
+def test_without_a_mesh_the_empty_stands_under_the_splats(run_folder, scene):
+    (run_folder / "mesh.glb").unlink()
+    run = import_run(run_folder, scene)
+    place = attribute(run.splats.data, "position")
+    low, high = (np.sort(place, axis=0)[i] for i in (0, -2))  # 2 % of 40 splats are none at one side, one at the other
+    np.testing.assert_allclose(run.root.location, [*(low + high)[:2] / 2, low[2]], atol=1e-5)
+
+
+def test_cameras_are_hidden_and_still_looked_through(run, scene):
+    assert cameras(run.collection).hide_viewport and set(cameras(run.collection).objects) == {*run.cameras.values()}
+    assert next_camera(scene, cameras(run.collection)) == run.cameras["shifted"] == scene.camera
 
 
 def test_cameras_project_as_the_photos_did(run, scene):

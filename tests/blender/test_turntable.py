@@ -8,6 +8,7 @@ import pytest
 
 from refgs_addon.errors import InputError
 from refgs_addon.scene.edit import add_edit
+from refgs_addon.scene.regions import REGION
 from refgs_addon.scene.turntable import add_turntable
 
 
@@ -17,7 +18,7 @@ def matrix(item):
 
 def test_one_turn_about_the_upright(run, scene):
     edit = add_edit(run.collection, "Box")
-    region = next(item for item in run.collection.objects if item.type == "EMPTY")
+    region = next(item for item in run.collection.objects if item.get(REGION))
     bpy.context.view_layer.update()
     items = [run.splats, run.mesh[0], region]
     before, camera = list(map(matrix, items)), matrix(scene.camera)
