@@ -6,12 +6,12 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from scipy.ndimage import distance_transform_edt
 
-from refgs.export.composite import Progress, composite
 from refgs.export.occlusion import openness
 from refgs.formats.mesh import Mesh
 from refgs.formats.splats import Splats
 from refgs.formats.tangents import vertex_tangents
 from refgs.formats.textures import Textures
+from refgs.render.composite import Progress, composite
 
 # Resolution of compositing, in texels a standard deviation of a splat. Textures with more texels are interpolated.
 FINE = 3

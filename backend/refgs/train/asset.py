@@ -15,6 +15,7 @@ from refgs.model import harmonics
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, to_splats
 from refgs.paths import write_text
+from refgs.render.composite import blended_normals
 from refgs.render.facing import facing_cosine
 from refgs.render.volume import with_normals_last
 from refgs.run import OCCLUDER
@@ -55,6 +56,7 @@ def write_asset(state: State) -> None:
     splats = to_splats(surfels.chosen(kept))
     splats.constants = constants
     splats.normals *= side[kept].numpy(force=True)[:, None]
+    splats.normals = blended_normals(splats)
     write_splats(folder / "splats.ply", splats)
     if state.exposures is not None or state.poses is not None:
         exposures = None
