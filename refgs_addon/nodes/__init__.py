@@ -46,6 +46,11 @@ def out(node: bpy.types.Node, name: str | None = None) -> bpy.types.NodeSocket:
     return next(s for s in node.outputs if s.enabled and name in (None, s.name))
 
 
+def principled(material: bpy.types.Material) -> bpy.types.ShaderNode:
+    """Find a material's first Principled BSDF."""
+    return next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
+
+
 def math(tree: bpy.types.NodeTree, operation: str, *inputs) -> bpy.types.NodeSocket:
     """Add a math node and return its output. Each of `inputs` is a socket or a number."""
     return out(add(tree, "ShaderNodeMath", dict(enumerate(inputs)), operation=operation))

@@ -18,6 +18,7 @@ from . import (
     store_attribute,
     vector_math,
 )
+from .world_diffuse import surface_inputs
 
 NAME = "RefGS Edit"  # the tree; its modifiers' names begin with it
 MESH_EDITS = "RefGS Follow"  # the mesh's tree and modifier
@@ -170,11 +171,10 @@ def mesh_edits_tree() -> bpy.types.NodeTree:
 
 def add_edits_to_material(material: bpy.types.Material) -> None:
     """Add nodes to a mesh's material that blend the values of the edits over its textures. Does nothing if it has these nodes already."""
-    nodes = material.node_tree.nodes
-    principled = next((node for node in nodes if node.type == "BSDF_PRINCIPLED"), None)
-    if principled is None or _MIXED in nodes:
-        return
     tree = material.node_tree
+    if _MIXED in tree.nodes or not any(node.type == "BSDF_PRINCIPLED" for node in tree.nodes):
+        return
+    sockets = surface_inputs(material)
 
     def attribute(name: str) -> bpy.types.NodeSocket:
         return add(tree, "ShaderNodeAttribute", attribute_name=name).outputs["Vector"]
@@ -186,7 +186,7 @@ def add_edits_to_material(material: bpy.types.Material) -> None:
         ("Metallic", amounts[1], surface[0]),
         ("Roughness", amounts[2], surface[1]),
     ):
-        socket = principled.inputs[key]
+        socket = sockets[key][0]
         learned = socket.links[0].from_socket if socket.links else socket.default_value
         kept = math(tree, "SUBTRACT", 1.0, amount)
         if key == "Base Color":
@@ -194,4 +194,5 @@ def add_edits_to_material(material: bpy.types.Material) -> None:
             result = vector_math(tree, "ADD", scaled(tree, learned, kept), added)
         else:
             result = out(add(tree, "ShaderNodeMath", {0: learned, 1: kept, 2: added}, operation="MULTIPLY_ADD"))
-        tree.links.new(result, socket)
+        for socket in sockets[key]:
+            tree.links.new(result, socket)

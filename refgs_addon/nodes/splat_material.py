@@ -3,8 +3,9 @@
 import bpy
 
 from ..compat import node_tree
-from . import add, math, out, scaled, vector_math
+from . import add, math, out, principled, scaled, vector_math
 from .edit_tree import AMOUNT
+from .world_diffuse import surface_inputs
 
 VALUES_NAME = "RefGS Splat Values"
 COLOR, VECTOR, FACTOR = 0, 1, 2  # outputs of an Attribute node; the third is called Fac up to 4.5, Factor in 5.2
@@ -41,11 +42,6 @@ def splat_material(name: str, constants: dict[str, float]) -> bpy.types.Material
     return material
 
 
-def principled(material: bpy.types.Material) -> bpy.types.ShaderNode:
-    """Find a material's first Principled BSDF."""
-    return next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
-
-
 def connect_edits(material: bpy.types.Material) -> None:
     """Change a material of `splat_material` so that it shows edits of the splats.
 
@@ -54,10 +50,13 @@ def connect_edits(material: bpy.types.Material) -> None:
     """
     tree = material.node_tree
     shader = principled(material)
+    sockets = surface_inputs(material)
     for key in ("metallic", "roughness"):
-        socket = shader.inputs[_SURFACE[key]]
-        if not socket.links:
-            tree.links.new(_attribute(tree, key, FACTOR), socket)
+        unlinked = [socket for socket in sockets[_SURFACE[key]] if not socket.links]
+        if unlinked:
+            value = _attribute(tree, key, FACTOR)
+            for socket in unlinked:
+                tree.links.new(value, socket)
     specular = shader.inputs[_SURFACE["specular"]]
     if specular.default_value == 0 and not specular.links:
         amount = add(tree, "ShaderNodeSeparateXYZ", {0: _attribute(tree, AMOUNT, VECTOR)}).outputs["Z"]

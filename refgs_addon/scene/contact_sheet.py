@@ -10,7 +10,7 @@ from ..errors import InputError
 from ..nodes.panorama_world import RECOVERED, get_light, is_panorama, set_light
 from .atomic_file import atomic_write
 from .render_eevee import render_preview
-from .world_light import relight
+from .world_light import correct_diffuse, relight
 
 GAP = 4  # pixels between pictures
 
@@ -53,6 +53,7 @@ def contact_sheet(
         lit, scene.world = scene.world, world
         if before is not None:
             set_light(world, *before)
+            correct_diffuse(scene)
         elif lit is not None:
             bpy.data.worlds.remove(lit)
     progress(len(lights), "layout")

@@ -7,13 +7,14 @@ import bpy
 from mathutils import Matrix, Vector
 
 from ..errors import InputError
+from ..nodes.world_diffuse import add_world_diffuse
 from . import run_parts
 from .camera_objects import add_camera, frame_camera, light_of, read_cameras
 from .capture_cameras import replace_cameras
 from .regions import bounds
 from .run_toml import capture_of
 from .splat_cloud import add_splats, cloud_attributes, normal_slopes, point_cloud, read_constants, read_splats
-from .world_light import light_with_recovered, load_panorama
+from .world_light import correct_diffuse, light_with_recovered, load_panorama
 
 
 @dataclass
@@ -73,6 +74,9 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
                 frame_camera(scene, next(iter(run.cameras.values())))
         for item in (drawn, *mesh, *run.cameras.values()):
             item.parent, item.matrix_parent_inverse = run.root, Matrix.Translation(-run.root.location)
+        for material in {material for item in (drawn, *mesh) for material in item.data.materials}:
+            add_world_diffuse(material, _occlusion(material))
+        correct_diffuse(scene)
         run_parts.show(collection, "mesh" if any(item.data.polygons for item in run.mesh) else "splats")
     except BaseException:
         scene.world, scene.camera = world, camera
@@ -124,6 +128,12 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
     if not meshes:
         raise InputError(f"{path} contains no mesh: export the run again")
     return meshes
+
+
+def _occlusion(material: bpy.types.Material) -> bpy.types.NodeSocket | None:
+    """Find the socket with the occlusion of a material that Blender's glTF importer made. Blender itself does not use it."""
+    inputs = (node.inputs.get("Occlusion") for node in material.node_tree.nodes if node.type == "GROUP")
+    return next((socket.links[0].from_socket for socket in inputs if socket and socket.links), None)
 
 
 def data_blocks() -> set[bpy.types.ID]:

@@ -7,8 +7,8 @@ import bpy
 
 from ..compat import node_tree, usd_keeps_textures
 from ..errors import InputError
-from ..nodes import add, out
-from ..nodes.splat_material import SPECULAR, principled
+from ..nodes import add, out, principled
+from ..nodes.splat_material import SPECULAR
 from .atomic_file import atomic_write
 from .import_run import add_mesh, data_blocks
 

@@ -6,8 +6,10 @@ import bpy
 
 from ..errors import InputError
 from ..nodes.panorama_world import IMAGE, RECOVERED, get_light, is_panorama, panorama_world, set_light
+from ..nodes.world_diffuse import NAME, set_harmonics
 
 ENDINGS = (".exr", ".hdr")
+LIGHT = "refgs_light"  # custom property of the node group that corrects diffuse light: the light it is set to
 
 
 def hdris(folder: Path | None = None) -> list[Path]:
@@ -56,6 +58,7 @@ def relight(scene: bpy.types.Scene, hdri: Path | None, rotation: float = 0.0, st
     else:
         raise InputError("this scene has no recovered light: import a RefGS run that has one")
     set_light(world, image, (0.0, 0.0, rotation), strength)
+    correct_diffuse(scene)
 
 
 def match_light(scene: bpy.types.Scene) -> None:
@@ -74,3 +77,25 @@ def match_light(scene: bpy.types.Scene) -> None:
 
     rotation, scale = best_rotation(image, world[RECOVERED])
     set_light(world, image, (0.0, 0.0, rotation), scale)
+    correct_diffuse(scene)
+
+
+def correct_diffuse(scene: bpy.types.Scene) -> None:
+    """Make the materials of imported runs show the diffuse light of the scene's world right in Eevee, after the world has changed.
+
+    A world that RefGS did not make is shown as Eevee shows it.
+    """
+    tree = bpy.data.node_groups.get(NAME)
+    if tree is None:
+        return
+    image, rotation, _ = get_light(scene.world) if is_panorama(scene.world) else (None, (), 0.0)
+    light = f"{image.name if image else ''} {[round(angle, 6) for angle in rotation]}"
+    if tree.get(LIGHT) == light:
+        return
+    tree[LIGHT] = light
+    if image is None or min(image.size) == 0:
+        set_harmonics(tree, [(1.0,) * 3, *[(0.0,) * 3] * 8], 1.0)
+        return
+    from .panorama import diffuse_light
+
+    set_harmonics(tree, *diffuse_light(image, rotation))

@@ -11,7 +11,7 @@ from bpy_extras.io_utils import ImportHelper
 from ..errors import InputError
 from ..nodes.panorama_world import IMAGE, RECOVERED, ROTATION, STRENGTH, get_light, is_panorama
 from ..preferences import hdri_folder
-from ..scene.world_light import hdris, match_light, relight
+from ..scene.world_light import correct_diffuse, hdris, match_light, relight
 from . import icons
 from .operators import ReportsErrors
 from .panels import Tab
@@ -140,11 +140,21 @@ class LightPanel(Tab, bpy.types.Panel):
 CLASSES = (Relight, RecoveredLight, MatchLight, LightPanel)
 
 
+@bpy.app.handlers.persistent
+def _follow_world(scene: bpy.types.Scene, *_) -> None:
+    """Keep diffuse light right when the world was rotated, or replaced, by hand or in an animation."""
+    correct_diffuse(scene)
+
+
 def register() -> None:
     bpy.types.WindowManager.refgs_light = EnumProperty(
         name="Light", description="Panorama that lights the scene", items=_lights, get=_get, set=_set
     )
+    for handlers in (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.frame_change_post):
+        handlers.append(_follow_world)
 
 
 def unregister() -> None:
+    for handlers in (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.frame_change_post):
+        handlers.remove(_follow_world)
     del bpy.types.WindowManager.refgs_light

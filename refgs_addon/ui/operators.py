@@ -155,12 +155,15 @@ class Crop(ReportsErrors, bpy.types.Operator):
 
 
 def frame_selected(context: bpy.types.Context, shaded: bool) -> None:
-    """Bring the selected object into view in all 3D views. If `shaded`, those in Solid mode, which shows no splats, show materials."""
+    """Bring the selected object into view in all 3D views.
+
+    If `shaded`, those in Solid mode, which shows no splats, change to Material Preview under the scene's light.
+    """
     for area in context.screen.areas if context.screen else ():
         if area.type == "VIEW_3D":
             shading = area.spaces.active.shading
             if shaded and shading.type in ("SOLID", "WIREFRAME"):
-                shading.type = "MATERIAL"
+                shading.type, shading.use_scene_world = "MATERIAL", True
             region = next(region for region in area.regions if region.type == "WINDOW")
             with context.temp_override(area=area, region=region):
                 bpy.ops.view3d.view_selected()

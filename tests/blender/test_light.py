@@ -6,13 +6,17 @@ import bpy
 import numpy as np
 import pytest
 
+from refgs_addon import compat
 from refgs_addon.errors import InputError
+from refgs_addon.nodes import world_diffuse
 from refgs_addon.nodes.panorama_world import IMAGE, ROTATION, STRENGTH
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.panorama import best_rotation
-from refgs_addon.scene.world_light import hdris, load_panorama, match_light, relight
+from refgs_addon.scene.render_eevee import render_preview
+from refgs_addon.scene.run_parts import show
+from refgs_addon.scene.world_light import correct_diffuse, hdris, load_panorama, match_light, relight
 from refgs_addon.ui import light_panel
-from tests.makers.runs import write_panorama
+from tests.makers.runs import read_exr, write_panorama
 
 
 def room(height=48, seed=0):
@@ -87,3 +91,89 @@ def test_the_chooser_says_and_sets_what_lights_the_scene(run_folder, addon, monk
     assert strength.default_value == 2.0
     manager.refgs_light = "RECOVERED"
     assert nodes[IMAGE].image.name == "environment.exr" and strength.default_value == 1.0
+
+
+def half_sky(height=32):
+    """Draw a panorama whose side towards +x is bright and orange, and whose other side is dim: (height, 2 × height, 3)."""
+    azimuth = math.pi * (1 - 2 * (np.arange(2 * height) + 0.5) / (2 * height))
+    elevation = math.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
+    bright = np.cos(azimuth) * np.cos(elevation) > 0.8
+    return np.where(bright[..., None], [8.0, 4.0, 2.0], [0.1, 0.1, 0.2])
+
+
+def irradiance(panorama, normals, turn):
+    """Compute the irradiance over π (N, 3) at unit normals (N, 3), under a panorama that is rotated by `turn` about z. By summation."""
+    height = len(panorama)
+    azimuth = math.pi * (1 - 2 * (np.arange(2 * height) + 0.5) / (2 * height)) + turn
+    elevation = math.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
+    x, y, z = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth
+    area = np.cos(elevation) * (math.pi / height) ** 2
+    cosines = np.maximum(np.einsum("na,ahw->nhw", normals, np.stack([x, y, z])), 0) * area / math.pi
+    return np.einsum("nhw,hwc->nc", cosines, panorama)
+
+
+def balls(scene, file, turn, corrected):
+    """Render a white ball without gloss and a metal one in Eevee, each seen from +x. Returns their radiances (P, 3) and normals (P, 3).
+
+    With `corrected`, their materials have the node group `world_diffuse`.
+    """
+    for metallic, y in ((0.0, -1.0), (1.0, 1.0)):
+        bpy.ops.mesh.primitive_uv_sphere_add(segments=96, ring_count=48, radius=1.0, location=(0.0, y, 0.0))
+        bpy.ops.object.shade_smooth()
+        material = bpy.data.materials.new("ball")
+        material.use_nodes = True
+        shader = material.node_tree.nodes["Principled BSDF"].inputs
+        shader["Base Color"].default_value, shader["Specular IOR Level"].default_value = (1.0, 1.0, 1.0, 1.0), 0.0
+        shader["Metallic"].default_value, shader["Roughness"].default_value = metallic, 0.4
+        if corrected:
+            world_diffuse.add_world_diffuse(material)
+        bpy.context.object.data.materials.append(material)
+    camera = bpy.data.cameras.new("camera")
+    camera.type, camera.ortho_scale = "ORTHO", 4.0
+    item = bpy.data.objects.new("camera", camera)
+    item.location, item.rotation_euler = (5.0, 0.0, 0.0), (math.pi / 2, 0.0, math.pi / 2)
+    scene.collection.objects.link(item)
+    scene.render.resolution_x, scene.render.resolution_y = 64, 32
+    scene.eevee.use_shadows = False
+    relight(scene, file, rotation=turn)
+    render_preview(scene, file.with_suffix(".png"), item, samples=8, exr=file.with_name("out.exr"))
+    picture = read_exr(file.with_name("out.exr"))
+    across, up = (np.arange(32) + 0.5) / 16 - 1, 1 - (np.arange(32)[:, None] + 0.5) / 16
+    depth = 1 - across**2 - up**2
+    inside = depth > 0.1
+    normals = np.stack([np.sqrt(depth.clip(0)), across + 0 * up, up + 0 * across], axis=-1)[inside]
+    return picture[:, :32, :3][inside], picture[:, 32:, :3][inside], normals
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0])
+def test_diffuse_light_in_eevee_is_the_worlds_irradiance(scene, tmp_path, turn):
+    panorama = half_sky()
+    write_panorama(tmp_path / "sky.exr", panorama)
+    white, metal, normals = balls(scene, tmp_path / "sky.exr", turn, corrected=True)
+    expected = irradiance(panorama, normals, turn)
+    error = np.abs(white - expected).mean() / expected.mean()
+    assert error < 0.04
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    plain, plain_metal, _ = balls(bpy.context.scene, tmp_path / "sky.exr", turn, corrected=False)
+    assert error < 0.3 * np.abs(plain - expected).mean() / expected.mean()  # what Eevee does alone
+    np.testing.assert_allclose(metal, plain_metal, rtol=0.02, atol=0.01)
+
+
+def test_only_eevee_and_only_worlds_of_ours_are_corrected(run_folder, scene, tmp_path):
+    write_panorama(tmp_path / "sky.exr", half_sky())
+    show(import_run(run_folder, scene).collection, "splats")
+    relight(scene, tmp_path / "sky.exr")
+    tree = bpy.data.node_groups[world_diffuse.NAME]
+    switch = next(node for node in tree.nodes if node.label == "Only in Eevee")
+    for engine, on in (("CYCLES", 0.0), (compat.EEVEE, 1.0), ("BLENDER_WORKBENCH", 0.0)):
+        scene.render.engine = engine
+        bpy.context.view_layer.update()
+        assert switch.outputs[0].default_value == on
+
+    def harmonics():
+        return np.array([[x.default_value for x in tree.nodes[f"Harmonic {i}"].inputs] for i in range(9)])
+
+    assert harmonics()[1, 0] > harmonics()[1, 2] > 0.1
+    scene.world = bpy.data.worlds.new("the artist's own")
+    correct_diffuse(scene)
+    assert not harmonics()[1:].any() and harmonics()[0].all()

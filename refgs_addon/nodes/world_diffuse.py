@@ -1,0 +1,129 @@
+"""Correct the diffuse light of the world in Eevee, by a node group that the materials of runs share.
+
+Of the world's light, Eevee keeps only the first two bands of spherical harmonics for diffuse surfaces, and weakens the second where their
+sum could be negative. So the bright side of an object is up to a third too dark, its dark side too bright. The group multiplies the base
+colour by the true irradiance over Eevee's. Three bands give the true irradiance to a percent (Ramamoorthi and Hanrahan 2001, "An Efficient
+Representation for Irradiance Environment Maps").
+"""
+
+from collections.abc import Sequence
+
+import bpy
+
+from ..compat import EEVEE
+from . import add, add_input, math, out, principled, scaled, vector_math
+
+NAME = "RefGS World Diffuse"  # the group, and its node in a material
+BANDS = (0.28209479177387814, 0.4886025119029199)  # constants of the first two bands
+# Constants of the third band, for xy, yz, 3z² − 1, xz and x² − y².
+THIRD = (1.0925484305920792, 1.0925484305920792, 0.31539156525252005, 1.0925484305920792, 0.5462742152960396)
+MOST = 3.0  # largest factor; more would show where Eevee's irradiance is nearly zero
+_WINDOW = "Eevee's Second Band"
+
+
+def world_diffuse_group() -> bpy.types.ShaderNodeTree:
+    """Make the node group `RefGS World Diffuse`, or return the existing one. It changes nothing until `set_harmonics` is called.
+
+    Inputs: Base Color; Metallic, Normal (world space) and Occlusion (1 is open) of the surface. Output: the base colour for Eevee.
+    Occlusion darkens the world's diffuse light, which Eevee does not shadow. Metals have no diffuse light, and keep their colour. In other
+    engines a driver switches the group off.
+    """
+    if NAME in bpy.data.node_groups:
+        return bpy.data.node_groups[NAME]
+    tree = bpy.data.node_groups.new(NAME, "ShaderNodeTree")
+    add_input(tree, "Base Color", "Color", default_value=(0.8, 0.8, 0.8, 1.0))
+    add_input(tree, "Metallic", "Float")
+    add_input(tree, "Normal", "Vector", hide_value=True)
+    add_input(tree, "Occlusion", "Float", default_value=1.0)
+    tree.interface.new_socket("Base Color", in_out="OUTPUT", socket_type="NodeSocketColor")
+    group = add(tree, "NodeGroupInput").outputs
+
+    # Irradiance over π, in red, green and blue: the sum of nine vectors, each times a polynomial of the normal.
+    x, y, z = add(tree, "ShaderNodeSeparateXYZ", {0: group["Normal"]}).outputs
+    twice = math(tree, "MULTIPLY_ADD", math(tree, "MULTIPLY", z, z), 3.0, -1.0)
+    difference = math(tree, "SUBTRACT", math(tree, "MULTIPLY", x, x), math(tree, "MULTIPLY", y, y))
+    third = [
+        math(tree, "MULTIPLY", x, y),
+        math(tree, "MULTIPLY", y, z),
+        twice,
+        math(tree, "MULTIPLY", x, z),
+        difference,
+    ]
+    terms = []
+    for number, polynomial in enumerate([None, x, y, z, *third]):
+        vector = out(add(tree, "ShaderNodeCombineXYZ", name=_term(number)))
+        terms.append(vector if polynomial is None else scaled(tree, vector, polynomial))
+
+    def total(values: list[bpy.types.NodeSocket]) -> bpy.types.NodeSocket:
+        result = values[0]
+        for value in values[1:]:
+            result = vector_math(tree, "ADD", result, value)
+        return result
+
+    second, window = total(terms[1:4]), out(add(tree, "ShaderNodeValue", name=_WINDOW))
+    true = total([terms[0], second, *terms[4:]])
+    eevees = vector_math(tree, "ADD", terms[0], scaled(tree, second, window))
+    ratio = vector_math(tree, "DIVIDE", scaled(tree, true, group["Occlusion"]), eevees)
+    ratio = vector_math(tree, "MINIMUM", vector_math(tree, "MAXIMUM", ratio, (0.0,) * 3), (MOST,) * 3)
+
+    switch = add(tree, "ShaderNodeValue", label="Only in Eevee")
+    _switch_off_elsewhere(out(switch))
+    amount = math(tree, "MULTIPLY", math(tree, "SUBTRACT", 1.0, group["Metallic"]), out(switch))
+    factor = scaled(tree, vector_math(tree, "SUBTRACT", ratio, (1.0,) * 3), amount)
+    factor = vector_math(tree, "ADD", factor, (1.0,) * 3)
+    add(tree, "NodeGroupOutput", {"Base Color": vector_math(tree, "MULTIPLY", group["Base Color"], factor)})
+    set_harmonics(tree, [(1.0,) * 3, *[(0.0,) * 3] * 8], 1.0)
+    return tree
+
+
+def _term(number: int) -> str:
+    return f"Harmonic {number}"
+
+
+def _switch_off_elsewhere(value: bpy.types.NodeSocket) -> None:
+    """Drive a Value node: 1 where the scene is rendered by Eevee, else 0. Blender evaluates so simple an expression without Python."""
+    driver = value.driver_add("default_value").driver
+    variable = driver.variables.new()
+    variable.name, variable.type = "engine", "CONTEXT_PROP"
+    variable.targets[0].context_property, variable.targets[0].data_path = "ACTIVE_SCENE", "render.engine"
+    engines = bpy.types.RenderSettings.bl_rna.properties["engine"].enum_items
+    driver.expression = f"engine == {engines[EEVEE].value}"
+
+
+def set_harmonics(tree: bpy.types.ShaderNodeTree, harmonics: Sequence[Sequence[float]], window: float) -> None:
+    """Set the world's light: nine harmonics of its irradiance over π, in linear Rec.709, and Eevee's factor of the second band.
+
+    The order of the harmonics is 1; x, y, z; xy, yz, 3z² − 1, xz, x² − y². Constants are not included.
+    """
+    constants = (BANDS[0], *[BANDS[1]] * 3, *THIRD)
+    for number, (rgb, constant) in enumerate(zip(harmonics, constants, strict=True)):
+        for socket, value in zip(tree.nodes[_term(number)].inputs, rgb, strict=True):
+            socket.default_value = value * constant
+    tree.nodes[_WINDOW].outputs[0].default_value = window
+
+
+def add_world_diffuse(material: bpy.types.Material, occlusion: bpy.types.NodeSocket | None = None) -> None:
+    """Put the group before the base colour of a material's Principled BSDF. `occlusion` is a socket of the material's tree, if any."""
+    tree, shader = material.node_tree, principled(material)
+    node = add(tree, "ShaderNodeGroup", name=NAME, node_tree=world_diffuse_group())
+    for name in ("Base Color", "Metallic", "Normal"):
+        socket = shader.inputs[name]
+        if socket.links:
+            tree.links.new(socket.links[0].from_socket, node.inputs[name])
+        elif name == "Normal":
+            tree.links.new(add(tree, "ShaderNodeNewGeometry").outputs["Normal"], node.inputs[name])
+        else:
+            node.inputs[name].default_value = socket.default_value
+    if occlusion is not None:
+        tree.links.new(occlusion, node.inputs["Occlusion"])
+    tree.links.new(node.outputs[0], shader.inputs["Base Color"])
+
+
+def surface_inputs(material: bpy.types.Material) -> dict[str, list[bpy.types.NodeSocket]]:
+    """Find the sockets that take a material's base colour, metallic and roughness. Returns them by the Principled BSDF's names."""
+    shader, node = principled(material), material.node_tree.nodes.get(NAME)
+    found = {name: [shader.inputs[name]] for name in ("Base Color", "Metallic", "Roughness")}
+    if node is not None:
+        found["Base Color"] = [node.inputs["Base Color"]]
+        found["Metallic"].append(node.inputs["Metallic"])
+    return found
