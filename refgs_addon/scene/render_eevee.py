@@ -37,6 +37,9 @@ def render_preview(
         render.film_transparent = True
         render.use_compositing = render.use_sequencer = False
         scene.eevee.taa_render_samples = samples
+        # Mesa's software renderer reads far-off texels when it filters anisotropically: pixels of wrong colours, on flat parts, too. The
+        # samples filter as well.
+        bpy.context.preferences.system.anisotropic_filter = "FILTER_0"
         scene.display_settings.display_device = "sRGB"
         view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
         bpy.ops.render.render(scene=scene.name)
@@ -61,6 +64,7 @@ def _restored(scene: bpy.types.Scene) -> Iterator[None]:
         (render, ["engine", "film_transparent", "use_compositing", "use_sequencer", "resolution_x", "resolution_y"]),
         (render, ["resolution_percentage", "pixel_aspect_x", "pixel_aspect_y"]),
         (scene.eevee, ["taa_render_samples"]),
+        (bpy.context.preferences.system, ["anisotropic_filter"]),
         (scene.display_settings, ["display_device"]),
         (scene.view_settings, ["view_transform", "look", "exposure", "gamma"]),
         (render.image_settings, compat.FORMAT),

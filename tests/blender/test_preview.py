@@ -11,6 +11,7 @@ from PIL import Image
 from refgs.color import srgb_encode
 from refgs_addon import compat
 from refgs_addon.errors import InputError
+from refgs_addon.nodes import add, out
 from refgs_addon.nodes.splats_tree import NAME
 from refgs_addon.scene.camera_objects import add_camera
 from refgs_addon.scene.import_run import import_run
@@ -134,6 +135,28 @@ def test_relight_leaves_the_artists_own_world_alone(scene, tmp_path):
     assert scene.world != own and "Mine" in bpy.data.worlds
 
 
+def test_a_texture_is_read_where_the_surface_is(scene, tmp_path):
+    """Draw small triangles that use a quarter of a texture: no pixel shows the rest of it."""
+    bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=3)
+    mesh = bpy.context.object.data
+    uv = np.empty(2 * len(mesh.loops), np.float32)
+    mesh.uv_layers[0].data.foreach_get("uv", uv)
+    mesh.uv_layers[0].data.foreach_set("uv", (0.05 + 0.4 * uv.reshape(-1, 2)).ravel())
+    image = bpy.data.images.new("quarter", 512, 512, float_buffer=True)
+    pixels = np.zeros((512, 512, 4), np.float32)
+    pixels[:256, :256] = 1
+    image.pixels.foreach_set(pixels.ravel())
+    material = bpy.data.materials.new("quarter")
+    tree = compat.node_tree(material)
+    texture = add(tree, "ShaderNodeTexImage", image=image)
+    shader = add(tree, "ShaderNodeEmission", {"Color": texture.outputs["Color"]})
+    add(tree, "ShaderNodeOutputMaterial", {"Surface": out(shader)})
+    mesh.materials.append(material)
+    pixels = rendered(scene, tmp_path, camera_at(scene, [0.0, -3.0, 1.0]), 1)
+    solid = pixels[..., 3] > 0.999
+    assert solid.sum() > 1000 and pixels[solid].min() > 0.99
+
+
 def snapshot(struct):
     """Read the settings of a Blender struct: all writable numbers, booleans and texts, by name."""
     kinds = (bool, int, float, str)
@@ -149,6 +172,7 @@ def test_a_preview_puts_the_settings_back(run, scene, tmp_path):
     scene.eevee.taa_render_samples = 7
     scene.camera = run.cameras["front"]
     owners = (scene.render, scene.render.image_settings, scene.view_settings, scene.display_settings, scene.eevee)
+    owners += (bpy.context.preferences.system,)
     before = list(map(snapshot, owners))
     render_preview(scene, tmp_path / "a.png", run.cameras["shifted"], size=16, samples=1)
     assert list(map(snapshot, owners)) == before and scene.camera == run.cameras["front"]
