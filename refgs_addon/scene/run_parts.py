@@ -5,6 +5,7 @@ import bpy
 KEY = "refgs_part"  # custom property of an imported object: "splats" or "mesh"
 CAMERAS = "refgs_cameras"  # custom property of the collection of a run's cameras
 ROOT = "refgs_root"  # custom property of the Empty that moves a run: the run's longest side, in the Empty's coordinates
+INSIDE = "RefGS Inside"  # modifier that draws a mesh in, under the splats
 FOLDER = "refgs_folder"  # custom property of a run's collection: its run folder
 
 
@@ -28,10 +29,22 @@ def cameras(collection: bpy.types.Collection) -> bpy.types.Collection | None:
 
 
 def show(collection: bpy.types.Collection, part: str) -> None:
-    """Show one part of a run, "splats" or "mesh", in the viewport and in renders, and hide the other part."""
-    for name, items in parts(collection).items():
-        for item in items:
-            item.hide_viewport = item.hide_render = name != part
+    """Show one part of a run, "splats" or "mesh", in the viewport and in renders, and hide the other part.
+
+    Beside the splats, the mesh stays for all but the camera: it casts their shadows, and light that is reflected elsewhere sees it.
+    """
+    found = parts(collection)
+    for item in found.get("splats", []):
+        item.hide_viewport = item.hide_render = part != "splats"
+    for item in found.get("mesh", []):
+        item.visible_camera = part == "mesh"
+        if INSIDE in item.modifiers:
+            item.modifiers[INSIDE].show_viewport = item.modifiers[INSIDE].show_render = part == "splats"
+
+
+def shown(collection: bpy.types.Collection) -> str:
+    """Tell which part of a run is shown, "splats" or "mesh"."""
+    return "mesh" if all(item.hide_viewport for item in parts(collection).get("splats", [])) else "splats"
 
 
 def active_run(context: bpy.types.Context) -> bpy.types.Collection | None:

@@ -15,7 +15,7 @@ from ..scene.capture_cameras import active_cameras
 from ..scene.regions import crop, training_region
 from ..scene.render_eevee import render_preview
 from ..scene.render_process import render_in_background
-from ..scene.run_parts import active_run, show
+from ..scene.run_parts import active_run, show, shown
 from ..scene.run_toml import capture_of, newer_release, up_was_chosen
 from ..scene.turntable import add_turntable
 from ..scene.world_light import hdris
@@ -92,9 +92,9 @@ def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, 
 
     run = import_run(folder, context.scene)
     operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
-    shown = next((item for item in run.mesh if not item.hide_viewport), run.splats)
-    select_only(context, shown)
-    frame_selected(context, shaded=shown == run.splats)
+    splats = shown(run.collection) == "splats"
+    select_only(context, run.splats if splats else run.mesh[0])
+    frame_selected(context, shaded=splats)
     if run.left_out:
         operator.report({"WARNING"}, f"{run.left_out:,} splats with values that are not finite were left out")
     if run.light_of:

@@ -7,7 +7,7 @@ import bpy
 from .. import compat, jobs
 from ..nodes.splats_tree import NAME as MODIFIER
 from ..scene.camera_objects import photo_shown
-from ..scene.run_parts import cameras, parts, root
+from ..scene.run_parts import cameras, parts, root, shown
 from . import operators
 from .icons import thumbnail
 
@@ -33,8 +33,8 @@ class RunPanel(Tab, bpy.types.Panel):
     def _run(self, layout: bpy.types.UILayout, collection: bpy.types.Collection, found: dict) -> None:
         layout.label(text=collection.name, icon="POINTCLOUD_DATA")
         row = layout.row(align=True)
-        for part, items in found.items():
-            button = row.operator(operators.ShowPart.bl_idname, text=part.title(), depress=not items[0].hide_viewport)
+        for part in found:
+            button = row.operator(operators.ShowPart.bl_idname, text=part.title(), depress=part == shown(collection))
             button.collection, button.part = collection.name, part
         if cameras(collection):
             row.prop(cameras(collection), "hide_viewport", text="Cameras", toggle=1, invert_checkbox=True)

@@ -43,7 +43,7 @@ def test_it_comes_back_as_it_was(textured, scene, tmp_path, ending, read):
     there, moved = tmp_path / "là", tmp_path / "ailleurs, déplacé"
     there.mkdir()
     export_mesh(run.collection, there / f"le pot été{ending}")
-    assert data_blocks() == before and run.mesh[0].hide_viewport
+    assert data_blocks() == before and not run.mesh[0].visible_camera
     assert bpy.context.view_layer.objects.active == run.splats and run.splats.select_get()
     assert {file.name for file in there.iterdir()} == {f"le pot été{ending}", "le pot été textures"}
 

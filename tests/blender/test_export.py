@@ -38,7 +38,7 @@ def test_edits_are_written_and_nothing_else_changes(run, run_folder, tmp_path, p
         np.testing.assert_allclose(after[name][outside], before[name][outside], atol=1e-6)
     for name in ("x", "opacity", "rot_2", "scale_1"):
         np.testing.assert_array_equal(after[name], before[name])
-    assert (run.splats.hide_viewport, run.mesh[0].hide_viewport) == (part == "mesh", part == "splats")
+    assert (run.splats.hide_viewport, run.mesh[0].visible_camera) == (part == "mesh", part == "mesh")
     edit.show_viewport = False
     np.testing.assert_allclose(edited_materials(run.splats)["metallic"], before["metallic"])
 

@@ -257,7 +257,7 @@ def test_one_empty_moves_the_whole_run(run, scene):
     add_edit(run.collection, "Box")
     (region,) = (item for item in run.collection.objects if item.get(REGION))
     show(run.collection, "splats")
-    run.mesh[0].hide_viewport = cameras(run.collection).hide_viewport = False  # hidden objects are not evaluated
+    cameras(run.collection).hide_viewport = False  # hidden objects are not evaluated
     items = [run.splats, run.mesh[0], region, *run.cameras.values()]
     bpy.context.view_layer.update()
     before = [np.array(item.matrix_world) for item in (*items, run.root)]
@@ -374,10 +374,10 @@ def test_optional_parts_may_be_missing(run_folder, scene):
 def test_the_mesh_is_shown_first_and_show_hides_the_other_part(run):
     assert set(parts(run.collection)) == {"splats", "mesh"}
     assert run.splats.hide_render and run.splats.hide_viewport
-    assert not run.mesh[0].hide_render and not run.mesh[0].hide_viewport
+    assert run.mesh[0].visible_camera and not run.mesh[0].hide_render and not run.mesh[0].hide_viewport
     show(run.collection, "splats")
     assert not run.splats.hide_render and not run.splats.hide_viewport
-    assert run.mesh[0].hide_render and run.mesh[0].hide_viewport
+    assert not run.mesh[0].visible_camera and not run.mesh[0].hide_render  # it casts the splats' shadows
 
 
 def cut(path):
