@@ -67,6 +67,8 @@ def set_modifier_input(modifier: bpy.types.NodesModifier, name: str, value) -> N
             items = modifier.id_properties_ui(key).as_dict()["items"]
             value = next(item[4] for item in items if item[0] == value)
         owner[key] = value
+    if isinstance(value, bpy.types.ID):
+        modifier.node_group = modifier.node_group  # or Blender does not evaluate the modifier when `value` changes
     modifier.id_data.update_tag()
 
 

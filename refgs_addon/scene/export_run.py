@@ -10,9 +10,10 @@ import numpy as np
 from numpy.lib.recfunctions import append_fields
 
 from ..errors import InputError
+from ..nodes.kept_tree import ROW
 from ..nodes.splats_tree import NAME as SPLATS
 from .atomic_file import atomic_write
-from .edit import edits, splats_of
+from .edit import edits, is_edited, splats_of
 from .mesh_exchange import TEXTURES, write_mesh
 from .run_parts import FOLDER
 from .splat_cloud import MATERIALS, PLY_TYPES, SH_DC, finite_rows, read_constants, read_rows, srgb_to_linear
@@ -22,7 +23,10 @@ DARK = 0.02  # a darker base colour does not reveal how much light falls on it
 
 
 def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
-    """Return the splats' materials after all edits: base_color (N, 3) linear Rec.709, metallic (N,), roughness (N,)."""
+    """Return the splats' materials after all edits: base_color (N, 3) linear Rec.709, metallic (N,), roughness (N,).
+
+    N is the number of splats that were not deleted. `row` (N,) says where each was among all splats.
+    """
     drawing = splats.modifiers[SPLATS]
     before = drawing.show_viewport, splats.hide_viewport, splats.hide_get()
     drawing.show_viewport = splats.hide_viewport = False  # Blender does not evaluate hidden objects
@@ -35,6 +39,9 @@ def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
             values = np.empty(width * len(cloud.points), np.float32)
             cloud.attributes[name].data.foreach_get(field, values)
             found[name] = values.reshape(-1, 4)[:, :3] if width == 4 else values
+        found[ROW] = np.arange(len(cloud.points), dtype=np.int32)
+        if ROW in cloud.attributes:
+            cloud.attributes[ROW].data.foreach_get("value", found[ROW])
     finally:
         drawing.show_viewport, splats.hide_viewport = before[:2]
         splats.hide_set(before[2])
@@ -42,11 +49,11 @@ def edited_materials(splats: bpy.types.Object) -> dict[str, np.ndarray]:
 
 
 def export_splats(collection: bpy.types.Collection, path: Path) -> None:
-    """Write the splats of a run, with the edits of their materials, as a splats.ply.
+    """Write the splats of a run that were not deleted, with the edits of their materials, as a splats.ply.
 
-    The new file is a copy of the run's file with the edited materials. Each splat also has a fixed colour (f_dc), for viewers without
-    lights. Where an edit changes the base colour, the fixed colour changes by the same factor. Raises InputError if the run's file is
-    missing or has changed, or the new file cannot be written.
+    The new file is a copy of the run's file without deleted splats and with the edited materials. Each splat also has a fixed colour
+    (f_dc), for viewers without lights. Where an edit changes the base colour, the fixed colour changes by the same factor. Raises
+    InputError if the run's file is missing or has changed, or the new file cannot be written.
     """
     splats = splats_of(collection)
     source = run_folder(collection) / "splats.ply"
@@ -57,6 +64,9 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
         fix = "add them with `refgs export FILE.ply --splats splats.ply`, and import that file"
         raise InputError(f"{source} has no materials to edit: {fix}")
     new = edited_materials(splats)
+    if not len(new[ROW]):
+        raise InputError(f"all splats of {collection.name} are deleted: restore some")
+    rows = rows[new[ROW]]
     if edits(splats):  # the splats may differ now: write columns
         columns = {name: np.full(len(rows), constants[name], "<f4") for name in MATERIALS[3:] if name in constants}
         rows = append_fields(rows, [*columns], [*columns.values()], usemask=False) if columns else rows
@@ -87,7 +97,8 @@ def export_splats(collection: bpy.types.Collection, path: Path) -> None:
 def export_run(collection: bpy.types.Collection, folder: Path) -> None:
     """Write a run with its edits as a new run folder, which must not exist. The run itself does not change.
 
-    If the run has edits, its mesh is not copied, because the textures do not contain them. `refgs export` or the trainer makes a new mesh.
+    If the run was edited, its mesh is not copied, because neither shape nor textures contain that. `refgs export` or the trainer makes a
+    new mesh.
     Raises InputError where the run's files are missing or have changed, or the folder exists or cannot be written.
     """
     original = run_folder(collection)
@@ -97,7 +108,7 @@ def export_run(collection: bpy.types.Collection, folder: Path) -> None:
     try:
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         export_splats(collection, temporary / "splats.ply")
-        kept = [*KEPT] if edits(splats_of(collection)) else [*KEPT, "mesh.glb"]
+        kept = [*KEPT] if is_edited(splats_of(collection)) else [*KEPT, "mesh.glb"]
         for name in kept:
             if (original / name).is_file():
                 shutil.copy2(original / name, temporary / name)
@@ -126,10 +137,10 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
 def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
     """Write a run's mesh with its textures. A .glb is a copy of the run's file; `mesh_exchange` writes .usdc and .fbx.
 
-    Raises InputError if the run has no mesh. Raises InputError too if the run has edits, because the mesh's textures do not contain them.
+    Raises InputError if the run has no mesh. Raises InputError too if the run was edited, because the mesh does not contain that.
     """
     mesh = run_folder(collection) / "mesh.glb"
-    if edits(splats_of(collection)):
+    if is_edited(splats_of(collection)):
         raise InputError("the mesh lacks the edits: apply them to a new run, and export the mesh of that one")
     if not mesh.is_file():
         raise InputError(f"{mesh} does not exist: make the run's mesh first")

@@ -43,8 +43,9 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
 
     splats.ply must exist. mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be missing. If there is a mesh,
     it is shown and the splats are hidden: Blender shades each splat by itself, which looks grainy on polished surfaces. `run_parts.show`
-    shows the splats; the mesh casts their shadows. Cycles is set to pass LAYERS transparent quads. The cameras are hidden. An Empty is the parent of all objects. If `capture_cameras.show_cameras` added the cameras of
-    the same capture, the run's cameras replace them. If this function raises InputError, it leaves the open file unchanged.
+    shows the splats; the mesh casts their shadows. Cycles is set to pass LAYERS transparent quads. The cameras are hidden. An Empty is the
+    parent of all objects. If `capture_cameras.show_cameras` added the cameras of the same capture, the run's cameras replace them. If this
+    function raises InputError, it leaves the open file unchanged.
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -189,13 +189,13 @@ def export_display_splats(collection: bpy.types.Collection, file: Path) -> jobs.
     Display splats have fixed colours: how the run looks under the light recovered from the photos. An existing file is replaced. Raises
     InputError if there is no trainer, or the run or the file's folder does not exist.
     """
-    from .edit import edits, splats_of
+    from .edit import is_edited, splats_of
     from .export_run import export_run, run_folder
 
     trainer, folder = python(), run_folder(collection)
     if not file.parent.is_dir():
         raise InputError(f"cannot write {file}: its folder does not exist")
-    if edits(splats_of(collection)):
+    if is_edited(splats_of(collection)):
         edited = Path(tempfile.mkdtemp(dir=bpy.app.tempdir), folder.name)  # Blender deletes tempdir when it ends
         export_run(collection, edited)
         folder = edited

@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..preferences import hdri_folder, set_up
 from ..scene.camera_objects import PHOTO, next_camera, photo_shown, show_photo
 from ..scene.capture_cameras import active_cameras
+from ..scene.deleted_splats import add_points, restore
 from ..scene.regions import crop, training_region
 from ..scene.render_eevee import render_preview
 from ..scene.render_process import render_in_background
@@ -154,6 +155,38 @@ class Crop(ReportsErrors, bpy.types.Operator):
             select_only(context, box)
 
 
+class DeleteSplats(ReportsErrors, bpy.types.Operator):
+    bl_idname = "refgs.delete_splats"
+    bl_label = "Delete Splats"
+    bl_description = "Select splats as points, with lasso, box or any other tool, and delete them with X. Tab ends it"
+
+    splats: StringProperty(name="Splats", description="The object")
+
+    def work(self, context: bpy.types.Context) -> None:
+        points = add_points(bpy.data.objects[self.splats])
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        select_only(context, points)
+        bpy.ops.object.mode_set(mode="EDIT")
+        bpy.ops.mesh.select_mode(type="VERT")
+        bpy.ops.mesh.select_all(action="DESELECT")
+        if context.space_data is not None:
+            bpy.ops.wm.tool_set_by_id(name="builtin.select_lasso")
+
+
+class RestoreSplats(ReportsErrors, bpy.types.Operator):
+    bl_idname = "refgs.restore_splats"
+    bl_label = "Restore Splats"
+    bl_description = "Bring all deleted splats back"
+
+    splats: StringProperty(name="Splats", description="The object")
+
+    def work(self, context: bpy.types.Context) -> None:
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        restore(bpy.data.objects[self.splats])
+
+
 def frame_selected(context: bpy.types.Context, shaded: bool) -> None:
     """Bring the selected object into view in all 3D views.
 
@@ -273,4 +306,5 @@ class ContactSheet(_Render, bpy.types.Operator):
             render_in_background(context.scene, png, lights, self.size, self.samples)
 
 
-CLASSES = (ImportRun, ShowPart, Crop, NextCamera, Photo, Turntable, RenderPreview, ContactSheet)
+CLASSES = (ImportRun, ShowPart, Crop, DeleteSplats, RestoreSplats, NextCamera, Photo, Turntable)
+CLASSES += (RenderPreview, ContactSheet)

@@ -7,8 +7,10 @@ import bpy
 from .. import compat, jobs
 from ..nodes.splats_tree import NAME as MODIFIER
 from ..scene.camera_objects import photo_shown
+from ..scene.deleted_splats import points_of
 from ..scene.run_parts import cameras, parts, root, shown
 from . import operators
+from .export_menu import ApplyEdits
 from .icons import thumbnail
 
 
@@ -52,7 +54,18 @@ class RunPanel(Tab, bpy.types.Panel):
             cropped = bool(compat.get_modifier_input(modifier, "Crop"))
             button = column.operator(operators.Crop.bl_idname, icon="CUBE", depress=cropped)
             button.splats, button.on = splats.name, not cropped
-            layout.label(text=f"{len(splats.data.points):,} splats")
+            points, count = points_of(splats), len(splats.data.points)
+            row = layout.row(align=True)
+            row.operator(operators.DeleteSplats.bl_idname, icon="TRASH").splats = splats.name
+            if points is None:
+                layout.label(text=f"{count:,} splats")
+                continue
+            row.operator(operators.RestoreSplats.bl_idname, text="", icon="LOOP_BACK").splats = splats.name
+            if points.mode == "EDIT":
+                layout.label(text="Select points with any tool, delete them with X. Tab ends it")
+            else:
+                layout.label(text=f"{len(points.data.vertices):,} of {count:,} splats")
+                layout.operator(ApplyEdits.bl_idname, icon="CHECKMARK")
 
 
 class PreviewPanel(Tab, bpy.types.Panel):

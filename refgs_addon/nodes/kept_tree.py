@@ -1,0 +1,32 @@
+"""Build the geometry-nodes tree that deletes splats whose points were deleted from a mesh of points."""
+
+import bpy
+
+from . import add, add_input, math, modifier_tree, out, store_attribute
+
+NAME = "RefGS Kept"  # the tree and its modifier
+ROW = "row"  # attribute of the splats that are left: where each was among all splats
+_SAME = 1e-6  # farthest that a splat is from its own point, which is a copy of its position
+
+
+def kept_tree() -> bpy.types.NodeTree:
+    """Make the node tree `RefGS Kept`, or return the existing one, which all runs share.
+
+    It keeps a splat if the mesh of the object Points has a vertex at its position, in the objects' local coordinates. It keeps all splats
+    if there is no such mesh, or the mesh is empty.
+    """
+    if NAME in bpy.data.node_groups:
+        return bpy.data.node_groups[NAME]
+    tree = modifier_tree(NAME)
+    add_input(tree, "Points", "Object", "Mesh with a vertex for each splat that is kept")
+    group = add(tree, "NodeGroupInput").outputs
+    points = add(tree, "GeometryNodeObjectInfo", {"Object": group["Points"]}, transform_space="ORIGINAL")
+    position = out(add(tree, "GeometryNodeInputPosition"))
+    near = {"Geometry": points.outputs["Geometry"], "Sample Position": position}
+    distance = add(tree, "GeometryNodeProximity", near, target_element="POINTS").outputs["Distance"]
+    index = out(add(tree, "GeometryNodeInputIndex"))
+    stored = store_attribute(tree, group["Geometry"], ROW, "INT", index)
+    gone = math(tree, "GREATER_THAN", distance, _SAME)
+    kept = add(tree, "GeometryNodeDeleteGeometry", {"Geometry": stored, "Selection": gone})
+    add(tree, "NodeGroupOutput", {"Geometry": out(kept)})
+    return tree
