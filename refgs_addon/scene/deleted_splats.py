@@ -19,7 +19,7 @@ def add_points(splats: bpy.types.Object) -> bpy.types.Object:
     splats.data.attributes["position"].data.foreach_get("vector", places)
     mesh.vertices.foreach_set("co", places)
     points = bpy.data.objects.new(mesh.name, mesh)
-    points.hide_render = True
+    points.hide_render = points.show_in_front = True  # in front: splats would hide their own points
     points.parent, points.matrix_parent_inverse = splats.parent, splats.matrix_parent_inverse
     points.matrix_basis = splats.matrix_basis
     splats.users_collection[0].objects.link(points)

@@ -4,14 +4,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import bpy
-from mathutils import Matrix, Vector
+from mathutils import Matrix
 
 from ..errors import InputError
 from ..nodes.world_diffuse import add_world_diffuse
 from . import run_parts
 from .camera_objects import add_camera, frame_camera, light_of, read_cameras
 from .capture_cameras import replace_cameras
-from .regions import bounds
+from .place_run import extent
 from .run_toml import capture_of
 from .splat_cloud import add_splats, cloud_attributes, normal_slopes, point_cloud, read_constants, read_splats
 from .world_light import correct_diffuse, light_with_recovered, load_panorama
@@ -43,9 +43,9 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
 
     splats.ply must exist. mesh.glb, environment.exr (which becomes the scene's world) and cameras.json may be missing. If there is a mesh,
     it is shown and the splats are hidden: Blender shades each splat by itself, which looks grainy on polished surfaces. `run_parts.show`
-    shows the splats; the mesh casts their shadows. Cycles is set to pass LAYERS transparent quads. The cameras are hidden. An Empty is the
-    parent of all objects. If `capture_cameras.show_cameras` added the cameras of the same capture, the run's cameras replace them. If this
-    function raises InputError, it leaves the open file unchanged.
+    shows the splats; the mesh casts their shadows. `trace_rays` sets up Eevee and Cycles. The cameras are hidden. An Empty is the parent of
+    all objects. If `capture_cameras.show_cameras` added the cameras of the same capture, the run's cameras replace them. If this function
+    raises InputError, it leaves the open file unchanged.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -81,8 +81,7 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         for material in {material for item in (drawn, *mesh) for material in item.data.materials}:
             add_world_diffuse(material, _occlusion(material))
         correct_diffuse(scene)
-        if hasattr(scene, "cycles"):  # its add-on can be off
-            scene.cycles.transparent_max_bounces = max(scene.cycles.transparent_max_bounces, LAYERS)
+        trace_rays(scene)
         solid = [item for item in run.mesh if item.data.polygons]
         if solid:
             put_under(solid, drawn)
@@ -98,12 +97,7 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
 
 def add_root(name: str, splats: bpy.types.Object, mesh: list[bpy.types.Object]) -> bpy.types.Object:
     """Add the Empty that moves, rotates and scales a run. It stands at the middle of the object's lowest side."""
-    solid = [item for item in mesh if item.data.polygons]
-    if solid:
-        corners = [item.matrix_world @ Vector(corner) for item in solid for corner in item.bound_box]
-        low, high = (Vector(f(corner[axis] for corner in corners) for axis in range(3)) for f in (min, max))
-    else:
-        low, high = bounds(splats.data)
+    low, high = extent(splats, mesh)
     item = bpy.data.objects.new(name, None)
     item.location = (low.x + high.x) / 2, (low.y + high.y) / 2, low.z
     item[run_parts.ROOT] = max(high - low)
@@ -124,6 +118,20 @@ def put_under(meshes: list[bpy.types.Object], splats: bpy.types.Object) -> None:
         modifier.direction, modifier.mid_level, modifier.strength = "CUSTOM_NORMAL", 0.0, -depth
     for kind in ("diffuse", "glossy", "transmission", "volume_scatter"):
         setattr(splats, f"visible_{kind}", False)
+
+
+def trace_rays(scene: bpy.types.Scene) -> None:
+    """Make a scene fit for a run: Eevee traces rays on the screen, unless it does so already, and Cycles passes LAYERS transparent quads.
+
+    The object then mirrors and darkens itself in Eevee, too. Rays are traced for each pixel and not denoised: half the resolution, or
+    Blender's denoising, made chrome and glossy paint look dull.
+    """
+    if not scene.eevee.use_raytracing:
+        scene.eevee.use_raytracing = True
+        scene.eevee.ray_tracing_options.resolution_scale = "1"
+        scene.eevee.ray_tracing_options.use_denoise = False
+    if hasattr(scene, "cycles"):  # its add-on can be off
+        scene.cycles.transparent_max_bounces = max(scene.cycles.transparent_max_bounces, LAYERS)
 
 
 def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bpy.types.Object]:

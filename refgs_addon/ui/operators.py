@@ -13,6 +13,7 @@ from ..preferences import hdri_folder, set_up
 from ..scene.camera_objects import PHOTO, next_camera, photo_shown, show_photo
 from ..scene.capture_cameras import active_cameras
 from ..scene.deleted_splats import add_points, restore
+from ..scene.place_run import put_beside
 from ..scene.regions import crop, training_region
 from ..scene.render_eevee import render_preview
 from ..scene.render_process import render_in_background
@@ -92,7 +93,9 @@ def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, 
     from ..scene.import_run import import_run
 
     run = import_run(folder, context.scene)
-    operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats")
+    beside = put_beside(run.collection, context.view_layer)
+    where = f", beside {beside.name}, which was in its place" if beside else ""
+    operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats{where}")
     splats = shown(run.collection) == "splats"
     select_only(context, run.splats if splats else run.mesh[0])
     frame_selected(context, shaded=splats)

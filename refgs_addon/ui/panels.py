@@ -62,7 +62,8 @@ class RunPanel(Tab, bpy.types.Panel):
                 continue
             row.operator(operators.RestoreSplats.bl_idname, text="", icon="LOOP_BACK").splats = splats.name
             if points.mode == "EDIT":
-                layout.label(text="Select points with any tool, delete them with X. Tab ends it")
+                layout.label(text="Select points with any tool;")
+                layout.label(text="X deletes them, Tab ends it")
             else:
                 layout.label(text=f"{len(points.data.vertices):,} of {count:,} splats")
                 layout.operator(ApplyEdits.bl_idname, icon="CHECKMARK")

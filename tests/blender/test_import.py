@@ -21,6 +21,7 @@ from refgs_addon.scene.camera_objects import frame_camera, next_camera, photo_sh
 from refgs_addon.scene.edit import add_edit
 from refgs_addon.scene.export_run import export_mesh, export_splats
 from refgs_addon.scene.import_run import import_run
+from refgs_addon.scene.place_run import put_beside
 from refgs_addon.scene.regions import REGION
 from refgs_addon.scene.run_parts import cameras, parts, show
 from refgs_addon.scene.run_toml import newer_release
@@ -438,3 +439,33 @@ def test_a_broken_folder_leaves_nothing_behind(run_folder, scene, name, spoil, s
     assert "\n" not in str(error.value) and name in str(error.value)
     assert set(bpy.data.user_map()) == before
     assert scene.world is None and scene.camera is None
+
+
+def test_a_run_stands_beside_what_was_in_its_place(run_folder, addon):
+    def box(item):
+        bpy.context.view_layer.update()
+        corners = np.array([item.matrix_world @ Vector(corner) for corner in item.bound_box])
+        return corners.min(axis=0), corners.max(axis=0)
+
+    bpy.ops.mesh.primitive_cube_add(size=2, location=(1, -3, 2))  # like Blender's default cube, around the mesh
+    bpy.ops.mesh.primitive_cube_add(size=0.1, location=(2.1, -3, 2))
+    bpy.ops.mesh.primitive_cube_add(size=9, location=(0, 0, 0))  # a room
+    cubes = list(addon.objects)
+    bpy.ops.refgs.import_run(directory=str(run_folder))
+    (mesh,) = (item for item in addon.objects if item.name == "pot mesh")
+    low, high = box(mesh)
+    assert low[0] > box(cubes[1])[1][0] and low[0] < 2.4
+    np.testing.assert_allclose([*low[1:], *high[1:]], [-3.3, 1.8, -2.7, 2.2], atol=1e-5)
+    for cube in cubes:
+        bpy.data.objects.remove(cube)
+    again = import_run(run_folder, addon)
+    assert put_beside(again.collection, bpy.context.view_layer) is None
+    np.testing.assert_allclose(box(again.mesh[0])[0], [0.9, -3.3, 1.8], atol=1e-5)
+
+
+def test_eevee_traces_rays_as_the_artist_wants(run_folder, scene):
+    import_run(run_folder, scene)
+    assert scene.eevee.use_raytracing and scene.eevee.ray_tracing_options.resolution_scale == "1"
+    scene.eevee.ray_tracing_options.resolution_scale = "4"
+    import_run(run_folder, scene)
+    assert scene.eevee.ray_tracing_options.resolution_scale == "4"
