@@ -134,8 +134,8 @@ def export_light(collection: bpy.types.Collection, path: Path) -> None:
     _copy(light, path)
 
 
-def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
-    """Write a run's mesh with its textures. A .glb is a copy of the run's file; `mesh_exchange` writes .usdc and .fbx.
+def export_mesh(collection: bpy.types.Collection, path: Path, engine: str = "Any Program") -> None:
+    """Write a run's mesh with its textures. A .glb is a copy of the run's file; `mesh_exchange` writes .usdc and .fbx for `engine`.
 
     Raises InputError if the run has no mesh. Raises InputError too if the run was edited, because the mesh does not contain that.
     """
@@ -147,7 +147,7 @@ def export_mesh(collection: bpy.types.Collection, path: Path) -> None:
     if path.suffix.lower() == ".glb":
         _copy(mesh, path)
     else:
-        write_mesh(mesh, path)
+        write_mesh(mesh, path, engine)
 
 
 def _copy(file: Path, path: Path) -> None:

@@ -16,10 +16,22 @@ TEXTURES = "textures"  # folder beside a run's mesh.glb
 _PICTURES = {"base_color": "Base Color", "metallic": "Metallic", "roughness": "Roughness", "normal": "Normal"}
 
 
-def write_mesh(mesh: Path, path: Path) -> None:
+# Textures that a game engine wants beside the separate ones: its channels, each a texture's, turned over (1 - value) after "-".
+PACKED = {
+    "Any Program": {},
+    "Unreal": {
+        "occlusion_roughness_metallic": (("occlusion", 0), ("roughness", 0), ("metallic", 0)),
+        "normal_directx": (("normal", 0), ("-normal", 1), ("normal", 2)),
+    },
+    "Unity": {"metallic_smoothness": (("metallic", 0), ("metallic", 0), ("metallic", 0), ("-roughness", 0))},
+}
+
+
+def write_mesh(mesh: Path, path: Path, engine: str = "Any Program") -> None:
     """Write a run's mesh.glb as a .usdc or .fbx, and its textures into the folder `NAME textures` beside that file.
 
-    The open .blend does not change. Raises InputError where a texture is missing or a file cannot be read or written.
+    `engine` is a key of PACKED, whose textures are written as well. The open .blend does not change. Raises InputError where a texture is
+    missing or a file cannot be read or written.
     """
     sources = {name: mesh.parent / TEXTURES / f"{name}.png" for name in (*_PICTURES, "occlusion")}
     for source in sources.values():
@@ -42,6 +54,8 @@ def write_mesh(mesh: Path, path: Path) -> None:
             for item in items:
                 item.data.materials.clear()
                 item.data.materials.append(material)
+            for name, channels in PACKED[engine].items():
+                _pack(folder / f"{name}.png", folder, channels)
             with atomic_write(path) as temporary:
                 _EXPORTERS[path.suffix.lower()](str(temporary))
     finally:
@@ -67,6 +81,26 @@ def _material(name: str, folder: Path, specular: float) -> bpy.types.Material:
     inputs["Normal"] = out(add(tree, "ShaderNodeNormalMap", {"Color": inputs["Normal"]}))
     add(tree, "ShaderNodeOutputMaterial", {"Surface": out(add(tree, "ShaderNodeBsdfPrincipled", inputs))})
     return material
+
+
+def _pack(path: Path, folder: Path, channels: tuple[tuple[str, int], ...]) -> None:
+    """Write a PNG whose channels are those of the textures in `folder`: pairs of a texture's name and a channel's number."""
+    import numpy as np  # Debian's Blender may lack it
+
+    found = []
+    for name, channel in channels:
+        image = bpy.data.images.load(str(folder / f"{name.removeprefix('-')}.png"))
+        image.colorspace_settings.name = "Non-Color"
+        values = np.empty(4 * image.size[0] * image.size[1], np.float32)
+        image.pixels.foreach_get(values)
+        found.append(1 - values[channel::4] if name.startswith("-") else values[channel::4])
+    packed = bpy.data.images.new(path.stem, *image.size, alpha=len(found) == 4, is_data=True)
+    packed.alpha_mode = "CHANNEL_PACKED"
+    packed.pixels.foreach_set(np.stack([*found, np.ones_like(found[0])][:4], axis=1).ravel())
+    packed.file_format = "PNG"
+    with atomic_write(path) as temporary:
+        packed.filepath_raw = str(temporary)
+        packed.save()
 
 
 def _usd(file: str) -> None:

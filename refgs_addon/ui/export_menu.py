@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import bpy
-from bpy.props import StringProperty
+from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
 from ..scene import training
@@ -26,13 +26,17 @@ class _Export(OnRun, ExportHelper):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
+    def chosen(self) -> dict[str, str]:
+        """Return what the artist chose besides the file, as arguments of the function that writes it."""
+        return {}
+
     def work(self, context: bpy.types.Context) -> None:
         from ..scene import export_run
 
         write = {"splats": export_run.export_splats, "mesh": export_run.export_mesh, "light": export_run.export_light}[
             self.kind
         ]
-        write(active_run(context), Path(bpy.path.abspath(self.filepath)))
+        write(active_run(context), Path(bpy.path.abspath(self.filepath)), **self.chosen())
         self.report({"INFO"}, f"Wrote {self.filepath}")
 
 
@@ -72,7 +76,22 @@ class ExportMesh(_Export, bpy.types.Operator):
     kind, filename_ext = "mesh", ".glb"
 
 
-class ExportMeshUsd(_Export, bpy.types.Operator):
+class _ExportMeshFor(_Export):
+    engine: EnumProperty(
+        name="Textures for",
+        description="Write textures as a game engine packs them beside the separate ones",
+        items=[
+            ("Any Program", "Any Program", "Base colour, metallic, roughness, normal and occlusion"),
+            ("Unreal", "Unreal Engine", "Also occlusion, roughness and metallic in one, and a normal map with Y down"),
+            ("Unity", "Unity", "Also metallic with smoothness in its alpha"),
+        ],
+    )
+
+    def chosen(self) -> dict[str, str]:
+        return {"engine": self.engine}
+
+
+class ExportMeshUsd(_ExportMeshFor, bpy.types.Operator):
     bl_idname = "refgs.export_mesh_usd"
     bl_label = "RefGS Mesh with Textures (.usdc)"
     bl_description = "Export the mesh as USD, with its textures in a folder beside it, whatever is hidden or selected"
@@ -80,7 +99,7 @@ class ExportMeshUsd(_Export, bpy.types.Operator):
     kind, filename_ext = "mesh", ".usdc"
 
 
-class ExportMeshFbx(_Export, bpy.types.Operator):
+class ExportMeshFbx(_ExportMeshFor, bpy.types.Operator):
     bl_idname = "refgs.export_mesh_fbx"
     bl_label = "RefGS Mesh with Textures (.fbx)"
     bl_description = "Export the mesh as FBX, with its textures in a folder beside it, whatever is hidden or selected"

@@ -131,6 +131,32 @@ def test_a_run_that_was_copied_has_its_pictures(textured, scene, tmp_path):
     assert all(file.read_bytes() == (source / file.name).read_bytes() for file in found.iterdir())
 
 
+@pytest.mark.parametrize("ending", [".usdc", ".fbx"])
+def test_engines_get_textures_as_they_pack_them(textured, addon, tmp_path, ending):
+    random = np.random.default_rng(0)
+    plain = {name: random.integers(0, 256, (64, 64), np.uint8) for name in ("occlusion", "roughness", "metallic")}
+    plain["normal"] = random.integers(0, 256, (64, 64, 3), np.uint8)
+    for name, pixels in plain.items():
+        Image.fromarray(pixels).save(textured[0] / "textures" / f"{name}.png")
+    bpy.ops.refgs.import_run(directory=f"{textured[0]}/")
+    export = bpy.ops.refgs.export_mesh_usd if ending == ".usdc" else bpy.ops.refgs.export_mesh_fbx
+    before = data_blocks()
+    for engine in ("Unreal", "Unity"):
+        export(filepath=str(tmp_path / f"{engine}{ending}"), engine=engine)
+    assert data_blocks() == before
+
+    def texture(engine, name):
+        return np.asarray(Image.open(tmp_path / f"{engine} textures" / f"{name}.png"))
+
+    packed = np.dstack([plain["occlusion"], plain["roughness"], plain["metallic"]])
+    np.testing.assert_array_equal(texture("Unreal", "occlusion_roughness_metallic"), packed)
+    turned = plain["normal"] * [1, -1, 1] + [0, 255, 0]
+    np.testing.assert_array_equal(texture("Unreal", "normal_directx"), turned)
+    smooth = np.dstack([*[plain["metallic"]] * 3, 255 - plain["roughness"]])
+    np.testing.assert_array_equal(texture("Unity", "metallic_smoothness"), smooth)
+    assert not (tmp_path / "Unity textures" / "normal_directx.png").exists()
+
+
 def test_the_file_menu_has_them(textured, addon, tmp_path):
     bpy.ops.refgs.import_run(directory=f"{textured[0]}/")
     bpy.ops.refgs.export_mesh_usd(filepath=str(tmp_path / "a.usdc"))
