@@ -5,6 +5,7 @@ import bpy
 from . import (
     add,
     add_input,
+    math,
     max_component,
     modifier_tree,
     object_frame,
@@ -37,6 +38,8 @@ def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
     text = "Scale of all splats: small values show how they cover the surface"
     add_input(tree, "Size", "Float", text, default_value=1.0, min_value=0.0, max_value=4.0)
     limits = {"min_value": 0.0, "max_value": 1.0, "subtype": "FACTOR"}
+    text = "Part of the splats to draw, enlarged to cover the same"
+    add_input(tree, "Detail", "Float", text, default_value=1.0, **limits)
     add_input(tree, "Opacity Cut", "Float", "Hide splats with a lower opacity", default_value=0.0, **limits)
     add_input(tree, "Crop", "Bool", "Draw only the splats in a box")
     add_input(tree, "Crop Box", "Object", "Box that crops the splats: move, rotate and scale it")
@@ -62,6 +65,10 @@ def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
     outside = out(add(tree, "FunctionNodeCompare", distance, operation="GREATER_THAN"))
     away = add(tree, "FunctionNodeBooleanMath", {0: group["Crop"], 1: outside}, operation="AND")
     unseen = out(add(tree, "FunctionNodeBooleanMath", {0: faint, 1: out(away)}, operation="OR"))
+    drawn = out(add(tree, "FunctionNodeRandomValue", {"Probability": group["Detail"]}, data_type="BOOLEAN"))
+    left_out = out(add(tree, "FunctionNodeBooleanMath", {0: drawn}, operation="NOT"))
+    unseen = out(add(tree, "FunctionNodeBooleanMath", {0: unseen, 1: left_out}, operation="OR"))
+    enlarged = math(tree, "DIVIDE", group["Size"], math(tree, "SQRT", math(tree, "MAXIMUM", group["Detail"], 1e-3)))
     points = add(tree, "GeometryNodeDeleteGeometry", {"Geometry": group["Geometry"], "Selection": unseen})
     half = (0.5, 0.5, 0.5)
     values = [
@@ -83,7 +90,7 @@ def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
         "Points": points,
         "Instance": store_attribute(tree, grid, "gaussian", "FLOAT_VECTOR", position),
         "Rotation": attribute("rotation", "QUATERNION"),
-        "Scale": scaled(tree, attribute("scale", "FLOAT_VECTOR"), group["Size"]),
+        "Scale": scaled(tree, attribute("scale", "FLOAT_VECTOR"), enlarged),
     }
     instances = add(tree, "GeometryNodeInstanceOnPoints", placed)
     realised = add(tree, "GeometryNodeRealizeInstances", {"Geometry": out(instances)})

@@ -135,10 +135,13 @@ def trace_rays(scene: bpy.types.Scene) -> None:
 
 
 def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bpy.types.Object]:
-    """Import a GLB with Blender's importer, and move its meshes into the collection."""
+    """Import a GLB with Blender's importer, and move its meshes into the collection.
+
+    Vertices that the file doubles at the seams of the textures are merged, so that the mesh is closed.
+    """
     before = set(bpy.data.objects)
     try:
-        bpy.ops.import_scene.gltf(filepath=str(path))
+        bpy.ops.import_scene.gltf(filepath=str(path), merge_vertices=True)
     except (AttributeError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[0]
         raise InputError(f"Blender's glTF add-on did not import {path}: {reason}") from None

@@ -13,6 +13,7 @@ from ..preferences import hdri_folder, set_up
 from ..scene.camera_objects import PHOTO, next_camera, photo_shown, show_photo
 from ..scene.capture_cameras import active_cameras
 from ..scene.deleted_splats import add_points, restore
+from ..scene.detail import set_detail
 from ..scene.place_run import put_beside
 from ..scene.regions import crop, training_region
 from ..scene.render_eevee import render_preview
@@ -141,6 +142,18 @@ class ShowPart(ReportsErrors, bpy.types.Operator):
 
     def work(self, context: bpy.types.Context) -> None:
         show(bpy.data.collections[self.collection], self.part)
+
+
+class SetDetail(ReportsErrors, bpy.types.Operator):
+    bl_idname = "refgs.set_detail"
+    bl_label = "Detail"
+    bl_description = "Show all splats and triangles of the run, or a part of them, which is faster and smaller"
+
+    collection: StringProperty(name="Run", description="The run's collection")
+    level: FloatProperty(name="Detail", description="Part of the splats and triangles", min=0.01, max=1.0, default=1.0)
+
+    def work(self, context: bpy.types.Context) -> None:
+        set_detail(bpy.data.collections[self.collection], self.level)
 
 
 class Crop(ReportsErrors, bpy.types.Operator):
@@ -309,5 +322,5 @@ class ContactSheet(_Render, bpy.types.Operator):
             render_in_background(context.scene, png, lights, self.size, self.samples)
 
 
-CLASSES = (ImportRun, ShowPart, Crop, DeleteSplats, RestoreSplats, NextCamera, Photo, Turntable)
+CLASSES = (ImportRun, ShowPart, SetDetail, Crop, DeleteSplats, RestoreSplats, NextCamera, Photo, Turntable)
 CLASSES += (RenderPreview, ContactSheet)

@@ -8,6 +8,7 @@ from .. import compat, jobs
 from ..nodes.splats_tree import NAME as MODIFIER
 from ..scene.camera_objects import photo_shown
 from ..scene.deleted_splats import points_of
+from ..scene.detail import LEVELS, detail
 from ..scene.run_parts import cameras, parts, root, shown
 from . import operators
 from .export_menu import ApplyEdits
@@ -40,6 +41,12 @@ class RunPanel(Tab, bpy.types.Panel):
             button.collection, button.part = collection.name, part
         if cameras(collection):
             row.prop(cameras(collection), "hide_viewport", text="Cameras", toggle=1, invert_checkbox=True)
+        row = layout.row(align=True)
+        row.label(text="Detail")
+        for level in LEVELS:
+            shown_now = abs(detail(collection) - level) < 1e-3
+            button = row.operator(operators.SetDetail.bl_idname, text=f"{level:.0%}", depress=shown_now)
+            button.collection, button.level = collection.name, level
         if root(collection):
             layout.prop(root(collection), "refgs_longest_side")
         for splats in found.get("splats", []):

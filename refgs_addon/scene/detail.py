@@ -1,0 +1,41 @@
+"""Show a run in less detail: fewer splats, and a mesh of fewer triangles."""
+
+import bpy
+
+from .. import compat
+from ..nodes.splats_tree import NAME as SPLATS
+from .run_parts import parts
+
+NAME = "RefGS Detail"  # the mesh's modifier
+LEVELS = (1.0, 0.25, 0.05)  # parts of the splats and triangles
+
+
+def set_detail(collection: bpy.types.Collection, level: float) -> None:
+    """Show a part of a run's splats, enlarged to cover the same, and of its mesh's triangles. `level` is 0 to 1, 1 for all."""
+    found = parts(collection)
+    for splats in found.get("splats", []):
+        if SPLATS in splats.modifiers:
+            compat.set_modifier_input(splats.modifiers[SPLATS], "Detail", level)
+    for mesh in found.get("mesh", []):
+        simplify(mesh, level)
+
+
+def simplify(mesh: bpy.types.Object, level: float) -> None:
+    """Give a mesh a modifier that leaves this part of its triangles, or remove it if `level` is 1."""
+    modifier = mesh.modifiers.get(NAME)
+    if level == 1:
+        if modifier:
+            mesh.modifiers.remove(modifier)
+        return
+    if modifier is None:
+        modifier = mesh.modifiers.new(NAME, "DECIMATE")
+        mesh.modifiers.move(len(mesh.modifiers) - 1, 0)
+    modifier.ratio = level
+
+
+def detail(collection: bpy.types.Collection) -> float:
+    """Tell in which detail a run is shown, 0 to 1."""
+    splats = parts(collection).get("splats", [])
+    if not splats or SPLATS not in splats[0].modifiers:
+        return 1.0
+    return compat.get_modifier_input(splats[0].modifiers[SPLATS], "Detail")
