@@ -10,6 +10,7 @@ from bpy_extras.io_utils import ExportHelper
 from .. import jobs
 from ..errors import InputError
 from ..preferences import hdri_folder, set_up
+from ..scene.asset import mark_asset
 from ..scene.camera_objects import PHOTO, next_camera, photo_shown, show_photo
 from ..scene.capture_cameras import active_cameras
 from ..scene.deleted_splats import add_points, restore
@@ -276,6 +277,15 @@ class Turntable(OnRun, bpy.types.Operator):
         add_turntable(context.scene, active_run(context), self.seconds)
 
 
+class MarkAsset(OnRun, bpy.types.Operator):
+    bl_idname = "refgs.mark_asset"
+    bl_label = "Mark as Asset"
+    bl_description = "Show the run in the asset browser, by a picture from the scene's camera"
+
+    def work(self, context: bpy.types.Context) -> None:
+        mark_asset(context.scene, active_run(context))
+
+
 class _Render(ReportsErrors, ExportHelper):
     """Render in another Blender process. If Blender has no window, render in this process. Base class of the operators that render."""
 
@@ -323,4 +333,4 @@ class ContactSheet(_Render, bpy.types.Operator):
 
 
 CLASSES = (ImportRun, ShowPart, SetDetail, Crop, DeleteSplats, RestoreSplats, NextCamera, Photo, Turntable)
-CLASSES += (RenderPreview, ContactSheet)
+CLASSES += (RenderPreview, ContactSheet, MarkAsset)

@@ -97,6 +97,7 @@ class PreviewPanel(Tab, bpy.types.Panel):
         layout.operator(operators.Turntable.bl_idname, icon="FILE_REFRESH")
         layout.operator(operators.RenderPreview.bl_idname, icon="RENDER_STILL")
         layout.operator(operators.ContactSheet.bl_idname, icon="IMGDISPLAY")
+        layout.operator(operators.MarkAsset.bl_idname, icon="ASSET_MANAGER")
         for number, job in enumerate(jobs.JOBS):
             if job.program == jobs.BLENDER:
                 self._render(layout.box(), number, job)

@@ -1,0 +1,36 @@
+"""Make an imported run an asset, which Blender's asset browser shows by a picture."""
+
+import tempfile
+from pathlib import Path
+
+import bpy
+
+from ..errors import InputError
+from .render_eevee import render_preview
+from .run_parts import cameras
+
+SIDE = 256  # pixels of the picture
+
+
+def mark_asset(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None:
+    """Mark a run's collection as an asset. Its picture is how the scene's camera sees the run alone, under the scene's light.
+
+    Raises InputError if there is no camera.
+    """
+    own = cameras(collection)
+    camera = scene.camera or next(iter(own.objects if own else ()), None)
+    if camera is None:
+        raise InputError("there is no camera to picture the asset: add one, or import a RefGS run with cameras.json")
+    alone = bpy.data.scenes.new(collection.name)
+    try:
+        alone.world = scene.world
+        alone.collection.children.link(collection)
+        alone.eevee.use_raytracing = scene.eevee.use_raytracing
+        with tempfile.TemporaryDirectory() as folder:
+            picture = Path(folder) / "asset.png"
+            render_preview(alone, picture, camera, SIDE)
+            collection.asset_mark()
+            with bpy.context.temp_override(id=collection):
+                bpy.ops.ed.lib_id_load_custom_preview(filepath=str(picture))
+    finally:
+        bpy.data.scenes.remove(alone)
