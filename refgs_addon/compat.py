@@ -99,10 +99,13 @@ def fcurves(item: bpy.types.Object) -> list[bpy.types.FCurve]:
     return [curve for strip in strips for curve in strip.channelbag(animation.action_slot).fcurves]
 
 
-def usd_keeps_textures() -> dict[str, str | bool]:
-    """Return the arguments that stop Blender's USD exporter from copying textures. The USD file then refers to the existing texture files.
+def usd_materials() -> dict[str, str | bool]:
+    """Return arguments of Blender's USD exporter: it writes MaterialX beside UsdPreviewSurface, and copies no textures.
+
+    The USD file then refers to the existing texture files.
 
     Raises KeyError if Blender was built without USD, as Debian's Blender is.
     """
     known = bpy.ops.wm.usd_export.get_rna_type().properties
-    return {"export_textures_mode": "KEEP"} if "export_textures_mode" in known else {"export_textures": False}
+    textures = {"export_textures_mode": "KEEP"} if "export_textures_mode" in known else {"export_textures": False}
+    return textures | {"generate_materialx_network": True}

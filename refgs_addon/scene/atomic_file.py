@@ -16,9 +16,14 @@ def atomic_write(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         os.replace(temporary, path)
-    except (RuntimeError, OSError) as error:  # Blender's own writers raise RuntimeError
-        reason = getattr(error, "strerror", None) or "does its folder exist, and has the disk free space?"
-        raise InputError(f"cannot write {path}: {reason}") from None
+    except (RuntimeError, OSError) as error:
+        raise unwritable(path, error) from None
     finally:
         with contextlib.suppress(OSError):  # its parent may be a file
             temporary.unlink(missing_ok=True)
+
+
+def unwritable(path: Path, error: RuntimeError | OSError) -> InputError:
+    """Return an InputError that says why a file cannot be written. Blender's own writers raise RuntimeError, without a reason."""
+    reason = getattr(error, "strerror", None) or "does its folder exist, and has the disk free space?"
+    return InputError(f"cannot write {path}: {reason}")

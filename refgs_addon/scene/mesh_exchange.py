@@ -1,15 +1,17 @@
 """Export a run's mesh as USD or FBX through Blender's own exporters, with its textures beside it."""
 
+import os
 import shutil
+import tempfile
 from pathlib import Path
 
 import bpy
 
-from ..compat import node_tree, usd_keeps_textures
+from ..compat import node_tree, usd_materials
 from ..errors import InputError
 from ..nodes import add, out, principled
 from ..nodes.splat_material import SPECULAR
-from .atomic_file import atomic_write
+from .atomic_file import unwritable
 from .import_run import add_mesh, data_blocks
 
 TEXTURES = "textures"  # folder beside a run's mesh.glb
@@ -37,27 +39,33 @@ def write_mesh(mesh: Path, path: Path, engine: str = "Any Program") -> None:
     for source in sources.values():
         if not source.is_file():
             raise InputError(f"{source} does not exist: make the run's mesh again")
-    folder = path.with_name(f"{path.stem} {TEXTURES}")
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot write {folder}: {error.strerror}") from None
-    for name, source in sources.items():
-        with atomic_write(folder / f"{name}.png") as temporary:
-            shutil.copyfile(source, temporary)
     before = data_blocks()
     try:
-        scene = bpy.data.scenes.new(path.stem)  # of its own: the export ignores what is selected or hidden elsewhere
-        with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
-            items = add_mesh(mesh, path.stem, scene.collection)
-            material = _material(path.stem, folder, _specular(items[0]))
-            for item in items:
-                item.data.materials.clear()
-                item.data.materials.append(material)
+        # All is made in a folder of its own: with MaterialX, Blender leaves a second copy of the textures beside the file.
+        with tempfile.TemporaryDirectory(prefix=".", dir=path.parent) as work:
+            made, folder = Path(work, path.name), Path(work, f"{path.stem} {TEXTURES}")
+            folder.mkdir()
+            for name, source in sources.items():
+                shutil.copyfile(source, folder / f"{name}.png")
             for name, channels in PACKED[engine].items():
                 _pack(folder / f"{name}.png", folder, channels)
-            with atomic_write(path) as temporary:
-                _EXPORTERS[path.suffix.lower()](str(temporary))
+            scene = bpy.data.scenes.new(
+                path.stem
+            )  # of its own: the export ignores what is selected or hidden elsewhere
+            with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
+                items = add_mesh(mesh, path.stem, scene.collection)
+                material = _material(path.stem, folder, _specular(items[0]))
+                for item in items:
+                    item.data.materials.clear()
+                    item.data.materials.append(material)
+                _EXPORTERS[path.suffix.lower()](str(made))
+            target = path.with_name(folder.name)
+            target.mkdir(exist_ok=True)
+            for file in folder.iterdir():
+                os.replace(file, target / file.name)
+            os.replace(made, path)
+    except (RuntimeError, OSError) as error:
+        raise unwritable(path, error) from None
     finally:
         bpy.data.batch_remove(data_blocks() - before)
 
@@ -98,17 +106,16 @@ def _pack(path: Path, folder: Path, channels: tuple[tuple[str, int], ...]) -> No
     packed.alpha_mode = "CHANNEL_PACKED"
     packed.pixels.foreach_set(np.stack([*found, np.ones_like(found[0])][:4], axis=1).ravel())
     packed.file_format = "PNG"
-    with atomic_write(path) as temporary:
-        packed.filepath_raw = str(temporary)
-        packed.save()
+    packed.filepath_raw = str(path)
+    packed.save()
 
 
 def _usd(file: str) -> None:
     try:
-        textures = usd_keeps_textures()
+        materials = usd_materials()
     except KeyError:
         raise InputError("this Blender was built without USD: use the one from blender.org, or export FBX") from None
-    bpy.ops.wm.usd_export(filepath=file, export_custom_properties=False, convert_world_material=False, **textures)
+    bpy.ops.wm.usd_export(filepath=file, export_custom_properties=False, convert_world_material=False, **materials)
 
 
 def _fbx(file: str) -> None:

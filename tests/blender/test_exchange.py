@@ -47,6 +47,8 @@ def test_it_comes_back_as_it_was(textured, scene, tmp_path, ending, read):
     assert bpy.context.view_layer.objects.active == run.splats and run.splats.select_get()
     assert {file.name for file in there.iterdir()} == {f"le pot été{ending}", "le pot été textures"}
 
+    if ending == ".usdc":  # a MaterialX network beside UsdPreviewSurface
+        assert b"open_pbr" in (there / "le pot été.usdc").read_bytes()
     shutil.move(there, moved)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     read(str(moved / f"le pot été{ending}"))
