@@ -37,6 +37,7 @@ TABLES = (
             Column("other lights: PSNR dB", "other_psnr", ".1f"),
             Column("aligned", "other_psnr_aligned", ".1f"),
             Column("FLIP", "other_flip", ".3f"),
+            Column("specks, of 1000 pixels", "other_specks", ".2f"),
             Column("ms a frame", "milliseconds", ".0f"),
         ),
         variant="drawn as",
@@ -87,7 +88,7 @@ def measure(bench: Bench, capture: Path, run: Run, out: Path) -> None:
                 row.append(over_white(image))
             pairs = list(zip(pictures, true, strict=True))
             found.setdefault((drawn, OTHER if light != RECOVERED else light), []).append(
-                metrics.relit(lambda pairs=pairs: pairs)
+                metrics.relit(lambda pairs=pairs: pairs, (metrics.psnr, metrics.flip, metrics.specks))
             )
     for (drawn, light), errors in found.items():
         mean = {name: float(np.mean([error[name] for error in errors])) for name in errors[0]}
@@ -96,6 +97,7 @@ def measure(bench: Bench, capture: Path, run: Run, out: Path) -> None:
             **{f"{light}_psnr": mean["psnr_raw"], f"{light}_psnr_aligned": mean["psnr_aligned"]},
         )  # fmt: skip
         bench.record(capture.name, drawn, "", **{f"{light}_flip": mean["flip_raw"]})
+        bench.record(capture.name, drawn, "‰", **{f"{light}_specks": mean["specks_raw"]})
     for drawn, time in milliseconds.items():
         bench.record(capture.name, drawn, "ms", milliseconds=time)
     write_png(out.with_suffix(".png"), as_bytes(np.concatenate([np.concatenate(row, axis=1) for row in rows])))

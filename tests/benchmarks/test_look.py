@@ -49,6 +49,7 @@ def test_a_run_that_is_the_truth(made, tmp_path):
         errors = {drawn: found[drawn, f"{light}_psnr_aligned"] for drawn in (look.RENDERER, *DRAWN)}
         assert errors.pop(look.RENDERER) > 45, light
         assert all(17 < error < 45 for error in errors.values()), (light, errors)
+        assert found[look.RENDERER, f"{light}_specks"] == 0
     assert all(found[drawn, "milliseconds"] > 0 for drawn in DRAWN)
     height, width = cv2.imread(str(tmp_path / "out" / "ball.png")).shape[:2]
     assert (height, width) == (2 * look.VIEWS * 64, 5 * 64)

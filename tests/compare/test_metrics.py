@@ -205,3 +205,19 @@ def test_a_light_that_was_not_found_counts_as_thirty_degrees_and_an_even_sky_has
     without = np.minimum(truth, lamps(turn=60))  # both lamps are removed
     assert metrics.lights_error(without, truth)[0] == pytest.approx(30)
     assert metrics.lights_error(truth, np.ones((32, 64, 3))) is None
+
+
+def test_specks_are_single_wrong_pixels():
+    truth = np.full((40, 50, 3), 0.5)
+    truth[:, 25:] = 0.9  # an edge is none
+    truth[10, 10] = 0.0  # nor is what the truth shows
+    image = truth.copy()
+    image[30, 10, 2] = 0.7
+    image[20, 40] = 0.2
+    image[11, 11] = 0.9  # beside what the truth shows
+    image[5, 5] = 0.55  # too faint
+    assert metrics.specks(image, truth) == pytest.approx(1e3 * 2 / (40 * 50))
+    assert metrics.specks(truth, truth) == 0
+    shifted = truth.copy()
+    shifted[:, 25] = 0.5
+    assert metrics.specks(shifted, truth) == 0
