@@ -1,6 +1,7 @@
 """Render a view in Eevee, independently of the scene's own render settings."""
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +11,13 @@ from .. import compat
 from ..errors import InputError
 from .atomic_file import atomic_write
 from .camera_objects import frame_camera
+
+if bpy.app.background:
+    # Mesa's software renderer reads far-off texels when it filters anisotropically: pixels of wrong colours, on flat parts, too. Mesa reads
+    # this variable before the first picture. Blender's preference does not reach its renders in 5.2.
+    os.environ.setdefault(
+        "MESA_EXTENSION_OVERRIDE", "-GL_EXT_texture_filter_anisotropic -GL_ARB_texture_filter_anisotropic"
+    )
 
 
 def render_preview(
@@ -37,9 +45,6 @@ def render_preview(
         render.film_transparent = True
         render.use_compositing = render.use_sequencer = False
         scene.eevee.taa_render_samples = samples
-        # Mesa's software renderer reads far-off texels when it filters anisotropically: pixels of wrong colours, on flat parts, too. The
-        # samples filter as well.
-        bpy.context.preferences.system.anisotropic_filter = "FILTER_0"
         scene.display_settings.display_device = "sRGB"
         view.view_transform, view.look, view.exposure, view.gamma = "Standard", "None", 0.0, 1.0
         bpy.ops.render.render(scene=scene.name)
@@ -64,7 +69,6 @@ def _restored(scene: bpy.types.Scene) -> Iterator[None]:
         (render, ["engine", "film_transparent", "use_compositing", "use_sequencer", "resolution_x", "resolution_y"]),
         (render, ["resolution_percentage", "pixel_aspect_x", "pixel_aspect_y"]),
         (scene.eevee, ["taa_render_samples"]),
-        (bpy.context.preferences.system, ["anisotropic_filter"]),
         (scene.display_settings, ["display_device"]),
         (scene.view_settings, ["view_transform", "look", "exposure", "gamma"]),
         (render.image_settings, compat.FORMAT),
