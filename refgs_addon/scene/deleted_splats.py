@@ -37,6 +37,15 @@ def points_of(splats: bpy.types.Object) -> bpy.types.Object | None:
     return compat.get_modifier_input(modifier, "Points") if modifier else None
 
 
+def count_deleted(splats: bpy.types.Object) -> int:
+    """Count the splats that were deleted."""
+    points = points_of(splats)
+    if points is None:
+        return 0
+    points.update_from_editmode()
+    return len(splats.data.points) - len(points.data.vertices)
+
+
 def restore(splats: bpy.types.Object) -> None:
     """Bring all deleted splats back."""
     if (points := points_of(splats)) is not None:

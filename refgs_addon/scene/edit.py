@@ -7,7 +7,7 @@ from ..errors import InputError
 from ..nodes.edit_tree import MESH_EDITS, NAME, REGIONS, add_edits_to_material, edit_tree, mesh_edits_tree
 from ..nodes.splat_material import connect_edits
 from ..nodes.splats_tree import NAME as SPLATS
-from .deleted_splats import points_of
+from .deleted_splats import count_deleted
 from .material_presets import read_material, set_inputs
 from .regions import REGION, add_region
 from .run_parts import parts
@@ -54,7 +54,7 @@ def edits(splats: bpy.types.Object) -> list[bpy.types.NodesModifier]:
 
 def is_edited(splats: bpy.types.Object) -> bool:
     """Tell whether materials of the splats were edited, or splats deleted."""
-    return bool(edits(splats)) or points_of(splats) is not None
+    return bool(edits(splats)) or count_deleted(splats) > 0
 
 
 def remove_edit(splats: bpy.types.Object, name: str) -> None:

@@ -49,9 +49,8 @@ def write_mesh(mesh: Path, path: Path, engine: str = "Any Program") -> None:
                 shutil.copyfile(source, folder / f"{name}.png")
             for name, channels in PACKED[engine].items():
                 _pack(folder / f"{name}.png", folder, channels)
-            scene = bpy.data.scenes.new(
-                path.stem
-            )  # of its own: the export ignores what is selected or hidden elsewhere
+            # A scene of its own: the export ignores what is selected or hidden elsewhere.
+            scene = bpy.data.scenes.new(path.stem)
             with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
                 items = add_mesh(mesh, path.stem, scene.collection)
                 material = _material(path.stem, folder, _specular(items[0]))

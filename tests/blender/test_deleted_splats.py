@@ -7,8 +7,8 @@ from plyfile import PlyData
 
 from refgs_addon.errors import InputError
 from refgs_addon.nodes.kept_tree import NAME
-from refgs_addon.scene.deleted_splats import add_points, points_of, restore
-from refgs_addon.scene.edit import add_edit
+from refgs_addon.scene.deleted_splats import add_points, count_deleted, points_of, restore
+from refgs_addon.scene.edit import add_edit, is_edited
 from refgs_addon.scene.export_run import export_mesh, export_run, export_splats
 from refgs_addon.scene.import_run import import_run
 from refgs_addon.scene.run_parts import show
@@ -88,8 +88,10 @@ def test_buttons_delete_and_restore(run_folder, addon):
     bpy.ops.refgs.delete_splats(splats=run.splats.name)
     points = points_of(run.splats)
     assert points.mode == "EDIT" and bpy.context.active_object == points and points.hide_render
+    assert not is_edited(run.splats)  # nothing is deleted yet
     bpy.ops.object.mode_set(mode="OBJECT")
-    assert len(drawn(run)) == COUNT
+    assert len(drawn(run)) == COUNT and not is_edited(run.splats)
     delete(points, GONE)
+    assert is_edited(run.splats) and count_deleted(run.splats) == len(GONE)
     bpy.ops.refgs.restore_splats(splats=run.splats.name)
     assert len(drawn(run)) == COUNT and points_of(run.splats) is None
