@@ -5,7 +5,6 @@ from pathlib import Path
 
 import bpy
 
-from ..errors import InputError
 from .render_eevee import render_preview
 from .run_parts import cameras
 
@@ -19,13 +18,13 @@ def mark_asset(scene: bpy.types.Scene, collection: bpy.types.Collection) -> None
     """
     own = cameras(collection)
     camera = scene.camera or next(iter(own.objects if own else ()), None)
-    if camera is None:
-        raise InputError("there is no camera to picture the asset: add one, or import a RefGS run with cameras.json")
-    alone = bpy.data.scenes.new(collection.name)
+    alone = scene.copy()  # with its world and how it traces rays
     try:
-        alone.world = scene.world
-        alone.collection.children.link(collection)
-        alone.eevee.use_raytracing = scene.eevee.use_raytracing
+        for item in alone.collection.objects:
+            alone.collection.objects.unlink(item)
+        for child in alone.collection.children:
+            if child != collection:
+                alone.collection.children.unlink(child)
         with tempfile.TemporaryDirectory() as folder:
             picture = Path(folder) / "asset.png"
             render_preview(alone, picture, camera, SIDE)

@@ -81,7 +81,6 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         for material in {material for item in (drawn, *mesh) for material in item.data.materials}:
             add_world_diffuse(material, _occlusion(material))
         correct_diffuse(scene)
-        trace_rays(scene)
         solid = [item for item in run.mesh if item.data.polygons]
         if solid:
             put_under(solid, drawn)
@@ -90,6 +89,7 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
         scene.world, scene.camera = world, camera
         bpy.data.batch_remove(data_blocks() - before)
         raise
+    trace_rays(scene)
     if capture is not None and frames:
         replace_cameras(scene, capture, run.cameras)
     return run
