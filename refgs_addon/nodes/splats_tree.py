@@ -66,8 +66,7 @@ def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
     away = add(tree, "FunctionNodeBooleanMath", {0: group["Crop"], 1: outside}, operation="AND")
     unseen = out(add(tree, "FunctionNodeBooleanMath", {0: faint, 1: out(away)}, operation="OR"))
     drawn = out(add(tree, "FunctionNodeRandomValue", {"Probability": group["Detail"]}, data_type="BOOLEAN"))
-    left_out = out(add(tree, "FunctionNodeBooleanMath", {0: drawn}, operation="NOT"))
-    unseen = out(add(tree, "FunctionNodeBooleanMath", {0: unseen, 1: left_out}, operation="OR"))
+    unseen = out(add(tree, "FunctionNodeBooleanMath", {0: drawn, 1: unseen}, operation="IMPLY"))  # not drawn, or unseen
     enlarged = math(tree, "DIVIDE", group["Size"], math(tree, "SQRT", math(tree, "MAXIMUM", group["Detail"], 1e-3)))
     points = add(tree, "GeometryNodeDeleteGeometry", {"Geometry": group["Geometry"], "Selection": unseen})
     half = (0.5, 0.5, 0.5)

@@ -4,6 +4,7 @@ import bpy
 
 from .. import compat
 from ..nodes.kept_tree import NAME, kept_tree
+from .run_parts import stand_with
 
 
 def add_points(splats: bpy.types.Object) -> bpy.types.Object:
@@ -20,8 +21,7 @@ def add_points(splats: bpy.types.Object) -> bpy.types.Object:
     mesh.vertices.foreach_set("co", places)
     points = bpy.data.objects.new(mesh.name, mesh)
     points.hide_render = points.show_in_front = True  # in front: splats would hide their own points
-    points.parent, points.matrix_parent_inverse = splats.parent, splats.matrix_parent_inverse
-    points.matrix_basis = splats.matrix_basis
+    stand_with(points, splats)
     splats.users_collection[0].objects.link(points)
     modifier = splats.modifiers.get(NAME) or splats.modifiers.new(NAME, "NODES")
     modifier.node_group = kept_tree()

@@ -17,20 +17,9 @@ def set_detail(collection: bpy.types.Collection, level: float) -> None:
         if SPLATS in splats.modifiers:
             compat.set_modifier_input(splats.modifiers[SPLATS], "Detail", level)
     for mesh in found.get("mesh", []):
-        simplify(mesh, level)
-
-
-def simplify(mesh: bpy.types.Object, level: float) -> None:
-    """Give a mesh a modifier that leaves this part of its triangles, or remove it if `level` is 1."""
-    modifier = mesh.modifiers.get(NAME)
-    if level == 1:
-        if modifier:
-            mesh.modifiers.remove(modifier)
-        return
-    if modifier is None:
-        modifier = mesh.modifiers.new(NAME, "DECIMATE")
-        mesh.modifiers.move(len(mesh.modifiers) - 1, 0)
-    modifier.ratio = level
+        modifier = mesh.modifiers.get(NAME) or mesh.modifiers.new(NAME, "DECIMATE")
+        mesh.modifiers.move(mesh.modifiers.find(NAME), 0)
+        modifier.ratio = level  # at 1 it does nothing
 
 
 def detail(collection: bpy.types.Collection) -> float:

@@ -10,7 +10,7 @@ from ..nodes.splats_tree import NAME as SPLATS
 from .deleted_splats import count_deleted
 from .material_presets import read_material, set_inputs
 from .regions import REGION, add_region
-from .run_parts import parts
+from .run_parts import parts, stand_with
 
 
 def add_edit(
@@ -100,8 +100,7 @@ def _paint_target(mesh: bpy.types.Object, collection: bpy.types.Collection) -> t
     else:
         canvas = bpy.data.objects.new(f"{mesh.name} to paint on", mesh.data)
         canvas[REGION] = canvas.hide_render = True
-        canvas.parent, canvas.matrix_parent_inverse = mesh.parent, mesh.matrix_parent_inverse
-        canvas.matrix_basis = mesh.matrix_basis
+        stand_with(canvas, mesh)
         collection.objects.link(canvas)
     group = canvas.vertex_groups.new(name="RefGS Painted")
     canvas.vertex_groups.active = group

@@ -47,6 +47,12 @@ def shown(collection: bpy.types.Collection) -> str:
     return "mesh" if all(item.hide_viewport for item in parts(collection).get("splats", [])) else "splats"
 
 
+def stand_with(item: bpy.types.Object, other: bpy.types.Object) -> None:
+    """Put an object where another one is, under the same parent, so that they move together."""
+    item.parent, item.matrix_parent_inverse = other.parent, other.matrix_parent_inverse
+    item.matrix_basis = other.matrix_basis
+
+
 def active_run(context: bpy.types.Context) -> bpy.types.Collection | None:
     """Find the collection of the run to which the active object belongs. If it belongs to none, find the scene's newest run."""
     runs = [collection for collection in context.scene.collection.children if parts(collection)]

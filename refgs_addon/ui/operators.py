@@ -172,18 +172,24 @@ class Crop(ReportsErrors, bpy.types.Operator):
             select_only(context, box)
 
 
-class DeleteSplats(ReportsErrors, bpy.types.Operator):
+class _Deletes(ReportsErrors):
+    """Find the splats that an operator deletes or restores, and leave the mode in which points are deleted. Base class."""
+
+    splats: StringProperty(name="Splats", description="The object")
+
+    def found(self, context: bpy.types.Context) -> bpy.types.Object:
+        if context.mode != "OBJECT":
+            bpy.ops.object.mode_set(mode="OBJECT")
+        return bpy.data.objects[self.splats]
+
+
+class DeleteSplats(_Deletes, bpy.types.Operator):
     bl_idname = "refgs.delete_splats"
     bl_label = "Delete Splats"
     bl_description = "Select splats as points, with lasso, box or any other tool, and delete them with X. Tab ends it"
 
-    splats: StringProperty(name="Splats", description="The object")
-
     def work(self, context: bpy.types.Context) -> None:
-        points = add_points(bpy.data.objects[self.splats])
-        if context.mode != "OBJECT":
-            bpy.ops.object.mode_set(mode="OBJECT")
-        select_only(context, points)
+        select_only(context, add_points(self.found(context)))
         bpy.ops.object.mode_set(mode="EDIT")
         bpy.ops.mesh.select_mode(type="VERT")
         bpy.ops.mesh.select_all(action="DESELECT")
@@ -191,17 +197,13 @@ class DeleteSplats(ReportsErrors, bpy.types.Operator):
             bpy.ops.wm.tool_set_by_id(name="builtin.select_lasso")
 
 
-class RestoreSplats(ReportsErrors, bpy.types.Operator):
+class RestoreSplats(_Deletes, bpy.types.Operator):
     bl_idname = "refgs.restore_splats"
     bl_label = "Restore Splats"
     bl_description = "Bring all deleted splats back"
 
-    splats: StringProperty(name="Splats", description="The object")
-
     def work(self, context: bpy.types.Context) -> None:
-        if context.mode != "OBJECT":
-            bpy.ops.object.mode_set(mode="OBJECT")
-        restore(bpy.data.objects[self.splats])
+        restore(self.found(context))
 
 
 def frame_selected(context: bpy.types.Context, shaded: bool) -> None:

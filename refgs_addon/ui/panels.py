@@ -43,9 +43,9 @@ class RunPanel(Tab, bpy.types.Panel):
             row.prop(cameras(collection), "hide_viewport", text="Cameras", toggle=1, invert_checkbox=True)
         row = layout.row(align=True)
         row.label(text="Detail")
+        now = detail(collection)
         for level in LEVELS:
-            shown_now = abs(detail(collection) - level) < 1e-3
-            button = row.operator(operators.SetDetail.bl_idname, text=f"{level:.0%}", depress=shown_now)
+            button = row.operator(operators.SetDetail.bl_idname, text=f"{level:.0%}", depress=abs(now - level) < 1e-3)
             button.collection, button.level = collection.name, level
         if root(collection):
             layout.prop(root(collection), "refgs_longest_side")

@@ -276,7 +276,6 @@ def test_the_true_size_is_typed_in(run_folder, addon):
     run.root.scale = (2, 2, 2)
     assert run.root.refgs_longest_side == pytest.approx(1.2, rel=1e-5)
     run.root.refgs_longest_side = 0.15
-    run.mesh[0].hide_viewport = False
     bpy.context.view_layer.update()
     corners = np.array([run.mesh[0].matrix_world @ v.co for v in run.mesh[0].data.vertices])
     assert np.ptp(corners, axis=0).max() == pytest.approx(0.15, rel=1e-4)

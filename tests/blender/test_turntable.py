@@ -33,7 +33,6 @@ def test_one_turn_about_the_upright(run, scene):
     np.testing.assert_allclose(angles, [0, math.pi / 2, math.pi, 3 * math.pi / 2], atol=1e-4)
     scene.frame_set(13)
     place = matrix(table)[:3, 3]
-    run.mesh[0].hide_viewport = False  # hidden objects are not evaluated
     bpy.context.view_layer.update()
     for item, was in zip(items, before, strict=True):
         expected = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ (was[:3, 3] - place) + place

@@ -24,7 +24,7 @@ from refgs.formats.panorama import directions
 
 COVERED = 0.5  # alpha from which on a pixel belongs to the object
 
-SPECK = 0.1
+SPECK = 0.1  # encoded, from which on a pixel stands out of those about it
 LIGHT_BLUR = 3.0  # degrees, standard deviation
 LIGHTS_APART = 15.0  # degrees
 MOST_LIGHTS = 5
