@@ -37,3 +37,17 @@ def museum() -> np.ndarray:
     radiance = mix(radiance, floor, z < -1.99)
     panel = step(1.1, 0.6, np.abs(np.abs(x) - 1.4)) * step(0.9, 0.5, np.abs(np.abs(y) - 1.4)) * (z > 1.99)
     return mix(radiance, (2.6, 2.5, 2.3), panel).reshape(HEIGHT, 2 * HEIGHT, 3)
+
+
+def white_studio() -> np.ndarray:
+    """Make a photographer's tent: white cloth all around, brighter where two lamps light it, with the floor's edge and a dark slit."""
+    way = directions(HEIGHT, 2 * HEIGHT).reshape(-1, 3).astype(float)
+    up = way[:, 2]
+    radiance = mix((0.62, 0.62, 0.63), (0.92, 0.92, 0.92), step(-0.8, 0.9, up + 0.1 * clouds(way, 0.8, seed=7)))
+    for lamp, bright in (((0.75, 0.5, 0.43), 3.0), ((-0.8, 0.2, 0.55), 1.6)):
+        cosine = way @ (np.array(lamp) / np.linalg.norm(lamp))
+        radiance = radiance + step(0.72, 0.93, cosine)[:, None] * bright * np.array([1.0, 0.98, 0.95])
+    slit = step(0.10, 0.06, np.abs(way[:, 0] - 0.15)) * (way[:, 1] < 0) * step(0.75, 0.70, np.abs(up))
+    radiance = mix(radiance, (0.03, 0.03, 0.03), slit)
+    edge = step(0.02, 0.0, np.abs(up + 0.35))
+    return mix(radiance, (0.35, 0.34, 0.33), edge).reshape(HEIGHT, 2 * HEIGHT, 3)

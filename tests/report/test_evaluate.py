@@ -77,6 +77,7 @@ def test_a_run_that_is_the_truth_has_no_error_in_whatever_frame(made, capsys):
     assert found["normal_mae_degrees"] < 0.1 and found["normal_ssim"] > 0.9999
     assert found["albedo"]["psnr_raw"] > 90 and found["albedo"]["scale"] == pytest.approx([1, 1, 1], abs=1e-4)
     assert found["roughness_mae"] < 1e-6 and found["metallic_mae"] < 1e-6
+    assert found["metallic_wrong"] == 0
     assert found["visibility_agreement"] == found["visibility_free"] == 1
     assert found["environment"]["log_rmse"] < 0.02 and found["environment"]["scale"] == pytest.approx(1, abs=0.01)
     assert found["mesh"]["chamfer"] < 1e-3 and found["mesh"]["normal_consistency"] > 0.99

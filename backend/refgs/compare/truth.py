@@ -156,5 +156,8 @@ def errors(images: dict[str, np.ndarray], known: dict[str, np.ndarray], true_alp
         elif name == "albedo" and name in images:
             figures[name] = metrics.channel_products(images[name], true, covered)
         elif name in images:
-            figures[f"{name}_mae"] = float(np.abs(images[name] - true)[covered].mean(dtype=np.float64))
+            difference = np.abs(images[name] - true)[covered]
+            figures[f"{name}_mae"] = float(difference.mean(dtype=np.float64))
+            if name == "metallic":  # the part taken for the other kind
+                figures["metallic_wrong"] = float((difference > 0.5).mean())
     return figures
