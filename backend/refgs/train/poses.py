@@ -74,7 +74,10 @@ def put_back_if_worse(state: State, progress: float) -> None:
     if state.poses is None or state.settings.cameras.poses != "auto" or state.poses_judged or progress < KNOWN:
         return
     state.poses_judged = True
-    matches = match_neighbours(state.views)
+    # The pairs that `start` matched: neighbours may be others by now, with too few matches to tell.
+    matches = match_neighbours(
+        [replace(view, camera=camera) for view, camera in zip(state.views, state.given, strict=True)]
+    )
     given, found = (pixels_apart(matches, cameras) for cameras in (state.given, [view.camera for view in state.views]))
     if found < BETTER * given:
         what = f"the cameras' poses are refined: features are {found:.1f} pixels off, and were {given:.1f}"
