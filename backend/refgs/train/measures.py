@@ -93,9 +93,9 @@ class Measures:
         """Measure the errors of the training now, averaged over the held-out views. Returns them by name.
 
         `psnr_test` is measured against the held-out photos. The others need ground truth: `normal_mae_degrees`, `albedo_psnr`,
-        `metallic_mae`, `roughness_mae`, `light_log_rmse` (natural logarithm) and `relit_psnr` (without inter-reflection). Some
-        values are first scaled to fit the truth best: each channel of the linear albedo by its own factor, and the light and the relit
-        pictures each by one factor for all channels.
+        `metallic_mae`, `metallic_wrong`, `roughness_mae`, `light_log_rmse` (natural logarithm) and `relit_psnr` (without
+        inter-reflection). Some values are first scaled to fit the truth best: each channel of the linear albedo by its own factor, and
+        the light and the relit pictures each by one factor for all channels.
         """
         rows: dict[str, list] = {}
         for test in self._test_views:
