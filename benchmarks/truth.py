@@ -22,7 +22,7 @@ TABLES = (
             Column("base colour dB", "albedo", ".1f", "deferred"),
             Column("roughness", "roughness", ".3f", "deferred"),
             Column("metallic", "metallic", ".3f", "deferred"),
-            Column("wrong %", "wrong", ".1f", "deferred"),
+            Column("wrong", "wrong", ".1%", "deferred"),
             Column("light log-RMSE", "light", ".2f", "deferred"),
             Column("relit dB", "relit", ".1f", "deferred"),
             Column("aligned dB", "relit_aligned", ".1f", "deferred"),
@@ -55,6 +55,5 @@ def record(bench: Bench, scene: str, variant: str, metrics: dict) -> None:
     bench.record(scene, variant, "°", normals=metrics.get("normal_mae_degrees"))
     bench.record(scene, variant, "", ssim=metrics.get("ssim"), light=metrics.get("environment", {}).get("log_rmse"))
     bench.record(scene, variant, "", roughness=metrics.get("roughness_mae"), metallic=metrics.get("metallic_mae"))
-    wrong = metrics.get("metallic_wrong")
-    bench.record(scene, variant, "%", wrong=None if wrong is None else 100 * wrong)
+    bench.record(scene, variant, "", wrong=metrics.get("metallic_wrong"))
     bench.record(scene, variant, "s", seconds=metrics.get("processor_seconds"))

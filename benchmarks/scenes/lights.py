@@ -9,9 +9,14 @@ from scripts.demo.shapes import mix, step
 HEIGHT = 512
 
 
+def _ways() -> np.ndarray:
+    """Return the unit directions of a panorama's pixels, row by row: (2·HEIGHT², 3)."""
+    return directions(HEIGHT, 2 * HEIGHT).reshape(-1, 3).astype(float)
+
+
 def overcast() -> np.ndarray:
     """Make an overcast sky over gravel with trees along the horizon. The zenith is three times as bright as the horizon (CIE)."""
-    way = directions(HEIGHT, 2 * HEIGHT).reshape(-1, 3).astype(float)
+    way = _ways()
     up = way[:, 2]
     sky = (1 + 2 * up.clip(0)) / 3 * (1 + 0.25 * clouds(way * [1, 1, 2], 0.7, seed=1))
     ground = mix((0.16, 0.155, 0.14), (0.27, 0.26, 0.24), step(-0.8, 0.8, clouds(way, 0.5, seed=2)))
@@ -24,7 +29,7 @@ def overcast() -> np.ndarray:
 
 def museum() -> np.ndarray:
     """Make a room of pale walls with four broad panels of frosted glass in its ceiling, a doorway and a wooden floor."""
-    way = directions(HEIGHT, 2 * HEIGHT).reshape(-1, 3).astype(float)
+    way = _ways()
     wall = np.array([3.0, 3.0, 2.0])  # half the room's size; the object is in its middle
     along = (wall / np.abs(way).clip(1e-9)).min(axis=1)
     x, y, z = (way * along[:, None]).T
@@ -41,7 +46,7 @@ def museum() -> np.ndarray:
 
 def white_studio() -> np.ndarray:
     """Make a photographer's tent: white cloth all around, brighter where two lamps light it, with the floor's edge and a dark slit."""
-    way = directions(HEIGHT, 2 * HEIGHT).reshape(-1, 3).astype(float)
+    way = _ways()
     up = way[:, 2]
     radiance = mix((0.62, 0.62, 0.63), (0.92, 0.92, 0.92), step(-0.8, 0.9, up + 0.1 * clouds(way, 0.8, seed=7)))
     for lamp, bright in (((0.75, 0.5, 0.43), 3.0), ((-0.8, 0.2, 0.55), 1.6)):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.scenes.solids import box, disc, ellipsoid, ring, sculpt
+from benchmarks.scenes.solids import box, disc, ellipsoid, placed, ring, sculpt
 from scripts.demo.shapes import Material, Scene, join, mix, moved, step
 
 
@@ -25,12 +25,12 @@ MATERIALS = (
 
 def build() -> Scene:
     """Build the board, 2 units wide, and what stands on it."""
-    turned = np.array([[0.9, 0.436, 0], [-0.436, 0.9, 0], [0, 0, 1]])
-    block = box((0, 0, 0), (0.24, 0.17, 0.26), 0.06)
+    axes = [[0.9, 0.436, 0], [-0.436, 0.9, 0], [0, 0, 1]]
+    block = placed(box((0, 0, 0), (0.24, 0.17, 0.26), 0.06), (-0.42, 0.22, -0.19), axes)
     mesh = join(
         sculpt(disc((0, 0, -0.50), (0, 0, 1), 0.98, 0.05, 0.03), (-1, -1, -0.56), (1, 1, -0.44), 0.011, WOOD),
         sculpt(ellipsoid((0.30, 0.28, -0.02), (0.33, 0.33, 0.43)), (-0.1, -0.1, -0.5), (0.7, 0.7, 0.5), 0.009, CHROME),
-        sculpt(lambda p: block((p - (-0.42, 0.22, -0.19)) @ turned.T), (-0.8, -0.2, -0.5), (0, 0.6, 0.2), 0.009, GLAZE),
+        sculpt(block, (-0.8, -0.2, -0.5), (0, 0.6, 0.2), 0.009, GLAZE),
         sculpt(ring((-0.05, -0.50, -0.35), (0, 0, 1), 0.26, 0.10), (-0.5, -0.9, -0.5), (0.4, -0.1, -0.2), 0.009, CLAY),
     )
     return Scene(moved(mesh, (0, 0, 0.07)), MATERIALS, light="night", lowest=0.0)

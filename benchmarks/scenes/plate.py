@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.scenes.solids import box, ring, sculpt
+from benchmarks.scenes.solids import box, placed, ring, sculpt
 from scripts.demo.shapes import Material, Scene, join, lathe, mix, moved, step
 
 
@@ -53,8 +53,8 @@ HOLLOW = [(0.15, 0.44), (0.11, 0.37), (0.0, 0.33)]
 def build() -> Scene:
     """Build the plate and the objects on it. The plate is 2 units wide; the objects stand at z = -0.36."""
     ball = [(0.30 * abs(np.cos(a)), 0.30 * np.sin(a)) for a in np.linspace(-np.pi / 2, np.pi / 2, 65)]
-    turned = np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])
-    cube = box((0, 0, 0), (0.15, 0.15, 0.15), 0.04)
+    axes = [[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]]
+    cube = placed(box((0, 0, 0), (0.15, 0.15, 0.15), 0.04), (-0.42, -0.32, -0.212), axes)
     mesh = join(
         lathe([(PLATE, UNDER + OVER)], rows=420, columns=720),
         moved(lathe([(STEEL, ball)], rows=160, columns=240), (0.30, 0.34, -0.062)),
@@ -64,9 +64,7 @@ def build() -> Scene:
             (-0.36, 0.28, -0.02),
         ),
         moved(lathe([(GOLD, GOBLET + CUP + HOLLOW)], rows=320, columns=200), (-0.02, -0.06, -0.362)),
-        sculpt(
-            lambda p: cube((p - (-0.42, -0.32, -0.212)) @ turned.T), (-0.7, -0.6, -0.4), (-0.15, -0.05, 0), 0.01, CLAY
-        ),
+        sculpt(cube, (-0.7, -0.6, -0.4), (-0.15, -0.05, 0), 0.01, CLAY),
         sculpt(ring((0.34, -0.34, -0.292), (0, 0, 1), 0.17, 0.07), (0, -0.65, -0.4), (0.65, 0, -0.2), 0.008, COPPER),
     )
     return Scene(mesh, MATERIALS, light="interior", lowest=0.0)

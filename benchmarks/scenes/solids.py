@@ -119,6 +119,12 @@ def carve(width: float, solid: Solid, *tools: Solid) -> Solid:
     return lambda points: -rest(points)
 
 
+def placed(solid: Solid, centre, axes) -> Solid:
+    """Turn a solid so that its axes point along the rows of `axes` (3, 3), which are unit vectors, and move its origin to `centre`."""
+    centre, axes = np.asarray(centre, float), np.asarray(axes, float)
+    return lambda points: solid((points - centre) @ axes.T)
+
+
 def mirrored(solid: Solid) -> Solid:
     """Make a symmetric solid: replace the half at y < 0 by the mirror image of the half at y > 0."""
     return lambda points: solid(np.stack([points[:, 0], np.abs(points[:, 1]), points[:, 2]], axis=1))
