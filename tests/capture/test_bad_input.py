@@ -8,8 +8,20 @@ import numpy as np
 import pytest
 
 from refgs.capture import load_view, published_normals, read_cameras, read_capture
+from refgs.capture.stanford_orb import novel_views
 from refgs.errors import InputError
-from tests.makers.captures import colmap, edit, nerf_blender, nerfstudio, nero, ring, shiny_blender, write
+from tests.makers.captures import (
+    colmap,
+    edit,
+    nerf_blender,
+    nerfstudio,
+    nero,
+    ring,
+    shiny_blender,
+    stanford_orb,
+    tensoir,
+    write,
+)
 
 SMALL_MASK = np.full((24, 32), 255, np.uint8)
 
@@ -284,3 +296,33 @@ def test_published_normals_of_another_size(tmp_path):
     write(folder / "test" / "r_0_normal.png", np.zeros((24, 32, 3), np.uint8))
     capture = read_capture(folder)
     refused(lambda: published_normals(capture.test_views[0]), "r_0_normal.png", "32×24", "64×48")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda data: data.pop("cam_transform_mat"), "cam_transform_mat is not 16 numbers"),
+        (lambda data: data.update(cam_transform_mat="1,2,3"), "cam_transform_mat is not 16 numbers"),
+        (lambda data: data.update(cam_transform_mat=",".join("x" * 16)), "not a 4×4 matrix of numbers"),
+        (lambda data: data.update(cam_angle_x="wide"), "camera_angle_x is not a number"),
+        (lambda data: data.update(imw=100), "the photo has 64×64"),
+    ],
+)
+def test_cameras_of_tensoir(tmp_path, spoil, says):
+    folder = tensoir(tmp_path / "synthetic" / "ball")
+    edit(folder / "train_005" / "metadata.json", spoil)
+    refused(lambda: read_capture(folder), "train_005", says)
+
+
+def test_missing_photos_of_tensoir(tmp_path):
+    folder = tensoir(tmp_path / "synthetic" / "ball")
+    (folder / "test_002" / "rgba.png").unlink()
+    refused(lambda: read_capture(folder), "1 of the 16 images", "test_002/rgba.png")
+
+
+def test_missing_masks_and_scenes_of_stanford_orb(tmp_path):
+    folder = stanford_orb(tmp_path)
+    edit(folder / "transforms_novel.json", lambda data: data["frames"][1].pop("scene_name"))
+    refused(lambda: novel_views(folder), "transforms_novel.json", "test/0001", "no scene_name")
+    (folder / "train_mask" / "0003.png").unlink()
+    refused(lambda: read_capture(folder), "train/0003", "train_mask/0003.png is missing")

@@ -1,6 +1,7 @@
 """Test reading captures in every supported layout. The cameras must project points of the scene to where the photos show them."""
 
 import json
+import shutil
 from functools import partial
 from itertools import count
 
@@ -9,6 +10,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from refgs.capture import load_view, published_normals, read_capture, read_run_cameras, write_cameras
+from refgs.capture.stanford_orb import novel_views
 from tests.makers.captures import (
     CENTRE,
     RADIUS,
@@ -21,6 +23,8 @@ from tests.makers.captures import (
     nero,
     ring,
     shiny_blender,
+    stanford_orb,
+    tensoir,
     write,
 )
 
@@ -55,19 +59,21 @@ def assert_sees_the_ball(capture):
         ):
             point = (to_run @ np.append(CENTRE + RADIUS * offset, 1))[:3]
             u, v = project(view.camera, point).astype(int)
-            shown = loaded.image[v, u] if loaded.alpha is None or loaded.alpha[v, u] else NOTHING
+            shown = loaded.bytes[v, u] if loaded.alpha is None or loaded.alpha[v, u] else NOTHING
             assert tuple(shown) == expected
 
 
 MAKERS = {"nerf-blender": nerf_blender, "nerfstudio": nerfstudio, "colmap": colmap, "nero": nero}
 MAKERS["colmap-text"] = partial(colmap, binary=False)
+MAKERS["tensoir"] = lambda folder: tensoir(folder / "synthetic" / "ball")
+MAKERS |= {"stanford-orb": stanford_orb, "stanford-orb-ldr": partial(stanford_orb, suffix=".png")}
 
 
 @pytest.fixture(params=MAKERS)
 def capture(request, tmp_path):
     """Write a capture in one of the supported layouts, and read it. A test that uses this fixture runs once for each layout."""
     capture = read_capture(MAKERS[request.param](tmp_path / "été dans le jardin"))
-    assert capture.layout == request.param.removesuffix("-text")
+    assert capture.layout == request.param.removesuffix("-text").removesuffix("-ldr")
     return capture
 
 
@@ -81,7 +87,7 @@ def test_region_is_the_ball_and_up_is_z(capture):
     assert np.linalg.norm(centre - CENTRE) < 0.35 * RADIUS
     assert 0.8 * RADIUS < capture.radius * scale < 3 * RADIUS
     np.testing.assert_allclose(capture.to_capture[:3, 2] / scale, (0, 0, 1), atol=0.02)
-    if capture.layout == "nerf-blender":
+    if capture.layout in ("nerf-blender", "tensoir"):
         assert np.array_equal(capture.to_capture, np.eye(4))
     else:
         assert capture.radius == 1 and not capture.centre.any()
@@ -367,6 +373,45 @@ def test_glossy_synthetic_converted_to_nerf_blender(tmp_path):
     capture = read_capture(folder)
     assert capture.masked and len(capture.test_views) == 4
     assert_sees_the_ball(capture)
+
+
+def test_tensoir_leaves_validation_views_out(tmp_path):
+    folder = tensoir(tmp_path / "synthetic" / "ball")
+    (folder / "transforms_train.json").write_text(
+        "{}"
+    )  # copies of the data set have one that names photos in other folders
+    capture = read_capture(folder)
+    assert capture.layout == "tensoir" and capture.masked and not capture.warnings
+    assert [view.camera.name for view in capture.test_views] == [f"test_{i:03d}" for i in range(4)]
+    assert len(capture.train_views) == 12
+
+
+def test_tensoir_with_photos_under_another_name(tmp_path):
+    folder = tensoir(tmp_path / "synthetic" / "ball")
+    for photo in folder.glob("*/rgba.png"):
+        photo.rename(photo.with_name("rgba_sunset.png"))
+    assert_sees_the_ball(read_capture(folder))
+
+
+def test_tensoir_without_its_lights_is_warned_of(tmp_path):
+    folder = tensoir(tmp_path / "synthetic" / "ball")
+    shutil.rmtree(tmp_path / "synthetic" / "Environment_Maps")
+    (warning,) = read_capture(folder).warnings
+    assert "Environment_Maps" in warning and "does not relight" in warning
+
+
+def test_photos_of_the_object_in_other_scenes(tmp_path):
+    folder = stanford_orb(tmp_path)
+    found = novel_views(folder)
+    assert [view.camera.name for _, view in found] == [f"ball_scene002_{i:04d}" for i in range(4)]
+    for (scene, view), pose in zip(found, ring(4), strict=True):
+        assert scene == "ball_scene002" and view.image_path.parts[-3] == scene and view.masked
+        np.testing.assert_allclose(view.camera.position, pose[:3, 3])
+        u, v = project(view.camera, CENTRE + 0.8 * RADIUS * np.array([0, 0, 1])).astype(int)
+        loaded = load_view(view)
+        assert loaded.alpha[v, u] and loaded.encoded[v, u, 0] > 0.5 > loaded.encoded[v, u, 1]
+    shutil.rmtree(folder.with_name("ball_scene002"))
+    assert novel_views(folder) == []
 
 
 @pytest.mark.parametrize("suffix", [".png", ".PNG", ".webp"])

@@ -12,6 +12,9 @@ from PIL import ExifTags, Image
 from pillow_heif import register_heif_opener
 from scipy.spatial.transform import Rotation
 
+from refgs.color import srgb_decode
+from refgs.formats.exr import write_exr
+
 CENTRE = np.array([1.0, 2.0, 3.0])
 RADIUS = 0.5
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -200,3 +203,77 @@ def nero(folder: Path, count: int = 16, split: tuple[list, list] | None = None, 
     if split is not None:
         (folder.parent / "synthetic_split_128.pkl").write_bytes(pickle.dumps(split, protocol))
     return folder
+
+
+def tensoir(folder: Path, splits: dict[str, int] | None = None, side: int = 64) -> Path:
+    """Write a scene in the layout of TensoIR-Synthetic, and panoramas beside it. Photos have `side` × `side` pixels.
+
+    The true base colour is half the photo's. Under the light "bridge" the photo is darker by a third; other lights are not there.
+    """
+    focal = 60.0 / 64 * side
+    for split, count in (splits or {"train": 12, "val": 2, "test": 4}).items():
+        for i, pose in enumerate(ring(count)):
+            view, image = folder / f"{split}_{i:03d}", ball(pose, side, side, focal)
+            inside = image[..., 3:]
+            normal = np.where(inside > 0, ball_normals(pose, side, side, focal), 0)
+            write(view / "rgba.png", image)
+            write(view / "rgba_bridge.png", np.dstack([image[..., :3] // 3 * 2, inside]))
+            write(view / "normal.png", np.dstack([np.rint(127.5 * (normal + 1)).astype(np.uint8), inside]))
+            write(view / "albedo.png", np.dstack([image[..., :3] // 2, inside]))
+            camera = {"cam_angle_x": 2 * np.arctan(side / 2 / focal), "imw": side, "imh": side}
+            camera["cam_transform_mat"] = ",".join(map(str, pose.ravel().tolist()))
+            (view / "metadata.json").write_text(json.dumps(camera))
+    maps = folder.parent / "Environment_Maps" / "high_res_envmaps_2k"
+    write(maps / "bridge.hdr", np.full((8, 16, 3), 0.5, np.float32))
+    return folder
+
+
+def stanford_orb(data: Path, suffix: str = ".exr", side: int = 64) -> Path:
+    """Write two scenes of one object in the layout of Stanford-ORB, and their ground truth. Return the folder of the first.
+
+    `data` becomes the folder that holds blender_HDR or blender_LDR, and ground_truth. `suffix` is the photos'. The light of a test photo
+    is 3 where the camera looks, 1 to its left, 0.5 above it, and 0.2 elsewhere.
+    """
+    focal, blender = 60.0 / 64 * side, data / f"blender_{'HDR' if suffix == '.exr' else 'LDR'}"
+    first, second = blender / "ball_scene001", blender / "ball_scene002"
+    angle = 2 * np.arctan(side / 2 / focal)
+    for scene, scale in ((first, 1.0), (second, 0.5)):
+        truth = data / "ground_truth" / scene.name
+        for split, count in {"train": 12, "test": 4}.items():
+            frames = []
+            for i, pose in enumerate(ring(count)):
+                name, image = f"{i:04d}", ball(pose, side, side, focal)
+                mask, normals = image[..., 3], ball_normals(pose, side, side, focal)
+                photo = scene / split / f"{name}{suffix}"
+                if suffix == ".exr":
+                    photo.parent.mkdir(parents=True, exist_ok=True)
+                    write_exr(photo, scale * srgb_decode(image[..., :3] / 255.0))
+                else:
+                    write(photo, image[..., :3])
+                write(scene / f"{split}_mask" / f"{name}.png", mask)
+                frames.append({"file_path": f"./{split}/{name}", "transform_matrix": pose.tolist()})
+                if split == "test":
+                    _orb_truth(truth, name, pose, normals, focal)
+            text = json.dumps({"camera_angle_x": angle, "frames": frames})
+            (scene / f"transforms_{split}.json").write_text(text)
+    for scene, other in ((first, second), (second, first)):
+        frames = json.loads((other / "transforms_test.json").read_text())["frames"]
+        novel = [frame | {"scene_name": other.name, "camera_angle_x": angle} for frame in frames]
+        (scene / "transforms_novel.json").write_text(json.dumps({"frames": novel}))
+    return first
+
+
+def _orb_truth(truth: Path, name: str, pose: np.ndarray, normals: np.ndarray, focal: float) -> None:
+    """Write the true maps of a test photo: normals and depth by the camera's axes, base colour, and the light around the camera."""
+    for what in ("surface_normal", "z_depth", "env_map"):
+        (truth / what).mkdir(parents=True, exist_ok=True)
+    missed = np.isnan(normals[..., :1])
+    seen = np.where(missed, 0, normals @ pose[:3, :3])  # OpenGL's axes
+    depth = -(CENTRE + RADIUS * normals - pose[:3, 3]) @ pose[:3, 2]
+    np.save(truth / "surface_normal" / f"{name}.npy", seen.astype(np.float32))
+    np.save(truth / "z_depth" / f"{name}.npy", np.where(missed[..., 0], 0, depth).astype(np.float32))
+    image = ball(pose, *normals.shape[1::-1], focal)
+    write(truth / "pseudo_gt_albedo" / f"{name}.png", image[..., :3] // 2)
+    light = np.full((16, 32, 3), 0.2, np.float32)
+    light[6:10, 14:18], light[6:10, 6:10], light[:3] = 3, 1, 0.5
+    write_exr(truth / "env_map" / f"{name}.exr", light)

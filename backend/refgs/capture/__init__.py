@@ -28,7 +28,9 @@ from refgs.capture.region import (
     sample_silhouettes,
     up_direction,
 )
-from refgs.capture.types import Capture, View
+from refgs.capture.stanford_orb import NOVEL, read_stanford_orb
+from refgs.capture.tensoir import is_tensoir, read_tensoir
+from refgs.capture.types import Z_UP, Capture, View
 from refgs.errors import InputError, NoCameras
 from refgs.paths import check_folder
 from refgs.settings import RegionSettings
@@ -54,12 +56,14 @@ __all__ = [
 
 
 def find_layout(folder: Path) -> str | None:
-    """Return the layout of a folder's camera files: "nerf-blender", "nerfstudio", "colmap" or "nero".
+    """Return the layout of a folder's camera files: "nerf-blender", "stanford-orb", "tensoir", "nerfstudio", "colmap" or "nero".
 
     Return None if the folder has no camera files.
     """
+    if is_tensoir(folder):  # first, because copies of the data set have a transforms_train.json, too
+        return "tensoir"
     if (folder / "transforms_train.json").is_file():
-        return "nerf-blender"
+        return "stanford-orb" if (folder / NOVEL).is_file() else "nerf-blender"
     if (folder / "transforms.json").is_file():
         return "nerfstudio"
     if find_model(folder) is not None:
@@ -125,8 +129,9 @@ def _check_layout(folder: Path) -> str:
     if photos := find_photos(folder):
         raise NoCameras(f"{folder}: {len(photos)} photos, but no cameras. Find them first: refgs poses {folder}")
     raise InputError(
-        f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender), transforms.json (nerfstudio, "
-        "instant-ngp), sparse/0 (COLMAP), 0-camera.pkl (NeRO), and for photos, here and in images. "
+        f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender, Stanford-ORB), transforms.json "
+        "(nerfstudio, instant-ngp), sparse/0 (COLMAP), 0-camera.pkl (NeRO), train_000/metadata.json (TensoIR), and for "
+        "photos, here and in images. "
         "Name the folder that holds them."
     )
 
@@ -140,6 +145,11 @@ def _read(folder: Path, layout: str) -> tuple[list[View], np.ndarray | None, np.
     match layout:
         case "nerf-blender":
             return read_nerf_blender(folder), None, None, []
+        case "stanford-orb":
+            return read_stanford_orb(folder), None, None, []
+        case "tensoir":
+            views, warnings = read_tensoir(folder)
+            return views, None, None, warnings
         case "nerfstudio":
             return read_nerfstudio(folder)
         case "colmap":
@@ -220,10 +230,10 @@ def _silhouettes(views: list[View]) -> tuple[list[View], list[tuple[View, np.nda
 def _run_frame(layout: str, region: Region, up: np.ndarray) -> tuple[np.ndarray, float]:
     """Choose the run's frame: +Z is up, and the region of interest is a ball of radius 1 about the origin.
 
-    Return the similarity transform (4, 4) from the run's frame to the capture's, and its scale. A NeRF-Blender capture keeps its own
-    coordinates, unless its region of interest is so far away, so large or so small that float32 is too inexact.
+    Return the similarity transform (4, 4) from the run's frame to the capture's, and its scale. A capture whose layout is one of Z_UP keeps
+    its own coordinates, unless its region of interest is so far away, so large or so small that float32 is too inexact.
     """
-    if layout == "nerf-blender":
+    if layout in Z_UP:
         if is_near(region):
             return np.eye(4), 1.0
         up = np.array([0.0, 0.0, 1.0])

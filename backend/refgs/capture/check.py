@@ -11,7 +11,7 @@ from PIL import Image
 
 from refgs.capture.cameras import write_cameras
 from refgs.capture.images import LoadedView, load_view
-from refgs.capture.types import Capture, View
+from refgs.capture.types import Z_UP, Capture, View
 from refgs.errors import InputError
 from refgs.paths import whole
 
@@ -21,6 +21,8 @@ BLACK, WHITE = 8, 235  # of 255: brightness of photos whose radiance has another
 
 LAYOUTS = {
     "nerf-blender": "NeRF-Blender",
+    "stanford-orb": "Stanford-ORB",
+    "tensoir": "TensoIR-Synthetic",
     "nerfstudio": "nerfstudio / instant-ngp",
     "colmap": "COLMAP",
     "nero": "NeRO's Glossy Synthetic",
@@ -160,7 +162,7 @@ def _masks(capture: Capture, statistics: list[_Statistics]) -> str:
 
 def _guessed_object(capture: Capture) -> list[str]:
     """Say where a training of a capture without masks looks for the object. Return no line if there are masks, or if it makes none."""
-    if any(view.masked for view in capture.views) or capture.layout == "nerf-blender" or capture.box is not None:
+    if any(view.masked for view in capture.views) or capture.layout in Z_UP or capture.box is not None:
         return []
     from refgs.capture.masks import (  # imports scipy, which a wrong folder should not wait for
         guess_box,
@@ -228,7 +230,7 @@ def _warnings(capture: Capture, statistics: list[_Statistics]) -> list[str]:
     if black or (linear and np.median([s.brightness for s in linear]) > WHITE):
         what = f"EXR photos are almost {'black' if black else 'white'}"
         warnings.append(f"{what}: multiply all of them by the same factor, so that a white surface is about 1")
-    if not capture.masked and capture.bounded and capture.layout == "nerf-blender":  # others get masks first
+    if not capture.masked and capture.bounded and capture.layout in Z_UP:  # others get masks first
         what = "no masks: the surroundings will be reconstructed with the object"
         warnings.append(f"{what}; an alpha channel leaves them out")
     if len(capture.train_views) < 20:

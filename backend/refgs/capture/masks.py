@@ -30,7 +30,7 @@ from refgs.capture.region import LOOK_OUT, WHITE_MASKS, find_region, sample_silh
 from refgs.capture.salience import SalienceModel
 from refgs.capture.silhouettes import Photo, carve_object, cut_out
 from refgs.capture.triangulate import triangulate
-from refgs.capture.types import Capture
+from refgs.capture.types import Z_UP, Capture
 from refgs.errors import InputError
 from refgs.paths import write_text
 from refgs.settings import RegionSettings
@@ -190,9 +190,9 @@ def _check_white(folder: Path, made: set[str]) -> None:
 
 def _root(capture: Capture) -> Path:
     """Return the folder in which `masks` lies."""
-    if capture.layout == "nerf-blender":
+    if capture.layout in Z_UP:
         raise InputError(
-            f"{capture.folder}: the masks of a NeRF-Blender capture are its photos' alpha channels. Cut them out there."
+            f"{capture.folder}: the masks of a {capture.layout} capture are its photos' alpha channels. Cut them out there."
         )
     if capture.layout != "colmap":
         return capture.folder

@@ -51,16 +51,21 @@ class Frame:
         return float(value)
 
 
-def read_frames(file: Path) -> tuple[dict, list[Frame]]:
-    """Read a transforms JSON. Return its top-level keys and values as a dict, and its frames. Raises InputError for another format."""
+def read_json(file: Path) -> object:
+    """Read a JSON file. Raises InputError naming the file if it is missing or not JSON."""
     try:
-        data = json.loads(file.read_text(encoding="utf-8-sig"))
+        return json.loads(file.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"{file}: there is no such file. Name a transforms JSON.") from None
     except json.JSONDecodeError as error:
         raise InputError(f"{file}: not JSON: line {error.lineno}: {error.msg}. Export the file again.") from error
     except (UnicodeDecodeError, OSError) as error:
         raise InputError(f"{file}: cannot be read as text ({error}). Export the file again.") from error
+
+
+def read_frames(file: Path) -> tuple[dict, list[Frame]]:
+    """Read a transforms JSON. Return its top-level keys and values as a dict, and its frames. Raises InputError for another format."""
+    data = read_json(file)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list):
         raise InputError(f'{file}: there is no list "frames" in it. Export the cameras again.')

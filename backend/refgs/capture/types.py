@@ -11,6 +11,7 @@ from refgs.capture.box import Box
 from refgs.capture.lens import Lens
 
 Split = Literal["train", "test"]
+Z_UP = ("nerf-blender", "tensoir")  # layouts in whose coordinates +Z is up, and whose masks are the photos' alpha
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +45,9 @@ class View:
 class Capture:
     """Photos with cameras, in the run's frame: the world coordinates used in training, with Z up.
 
-    - `to_capture` is the 4×4 float64 similarity p_capture = to_capture @ p_run. It is the identity for most NeRF-Blender captures. Others
-      are moved and scaled so that their region of interest has radius 1 about the origin. An up direction from the user rotates the run's
-      frame.
+    - `to_capture` is the 4×4 float64 similarity p_capture = to_capture @ p_run. It is the identity for most captures with a layout of
+      Z_UP. Others are moved and scaled so that their region of interest has radius 1 about the origin. An up direction from the user
+      rotates the run's frame.
     - `points` (M, 3) are from structure from motion, `point_colors` (M, 3) their sRGB colours in 0..1. Both are None if the capture has
       none.
     - `centre` (3,) and `radius` are the region of interest: a ball about the object, or about a room's foreground.

@@ -1,0 +1,55 @@
+"""Read captures of Stanford-ORB in its NeRF-Blender form: `blender_HDR/SCENE` or `blender_LDR/SCENE`.
+
+The layout is that of the README of Stanford-ORB's repository and of its `orb/datasets/mymethod.py` (Kuang et al., NeurIPS 2023). It is
+NeRF-Blender's, and more:
+
+    {train,test}_mask/NAME.png      masks of the photos {train,test}/NAME.exr, or .png
+    transforms_novel.json           cameras of the test photos of the same object in other scenes, in this scene's coordinates. A
+                                    frame has `scene_name` and its own `camera_angle_x`; the photo is in ../SCENE_NAME
+    ../../ground_truth/SCENE/       true maps and lights of a scene's test photos, see `refgs.compare.published`
+"""
+
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from refgs.capture.transforms import Frame, read_frames, read_views
+from refgs.capture.types import Split, View
+from refgs.errors import InputError
+
+NOVEL = "transforms_novel.json"
+
+
+def read_stanford_orb(folder: Path) -> list[View]:
+    """Read the training and test views of a Stanford-ORB capture, in the capture's coordinates. Raises InputError."""
+    return [view for split in ("train", "test") for view in _read(folder / f"transforms_{split}.json", split)]
+
+
+def novel_views(folder: Path) -> list[tuple[str, View]]:
+    """Read the photos of the same object in other scenes, each with the name of its scene. Scenes that are not on disk are left out.
+
+    The cameras are in the coordinates of the capture in `folder`. Raises InputError.
+    """
+    file = folder / NOVEL
+    frames, scenes = [], []
+    for frame in read_frames(file)[1]:
+        scene = frame.values.get("scene_name")
+        if not isinstance(scene, str):
+            raise InputError(f"{frame.where}: there is no scene_name. Download the data set again.")
+        if (folder.parent / scene).is_dir():
+            path = {"file_path": f"../{scene}/{PurePosixPath(frame.path)}"}
+            frames.append((_masked(replace(frame, values=frame.values | path)), "test"))
+            scenes.append(scene)
+    return [
+        (scene, replace(view, camera=replace(view.camera, name=f"{scene}_{view.camera.name}")))
+        for scene, view in zip(scenes, read_views(file, frames), strict=True)
+    ]
+
+
+def _read(file: Path, split: Split) -> list[View]:
+    return read_views(file, [(_masked(frame), split) for frame in read_frames(file)[1]])
+
+
+def _masked(frame: Frame) -> Frame:
+    """Add the path of the frame's mask."""
+    path = PurePosixPath(frame.path)
+    return replace(frame, values=frame.values | {"mask_path": f"{path.parent}_mask/{path.stem}.png"})

@@ -1,0 +1,80 @@
+"""Read captures of TensoIR-Synthetic: a folder for each view, `train_000`, `test_000` and so on, with its camera and its pictures.
+
+The layout and its conventions are those that the loaders of TensoIR read (Jin et al., CVPR 2023; `dataLoader/tensoIR_rotation_setting.py`
+and `dataLoader/tensoIR_relighting_test.py` in its repository). NeRFactor's data have the same layout.
+
+    metadata.json       cam_transform_mat   camera to world with OpenGL's axes: 16 numbers, row by row, with commas between them
+                        cam_angle_x         horizontal field of view in radians
+                        imw, imh            width and height in pixels
+    rgba.png            the photo, with straight alpha. Copies of the data set name it differently: PHOTOS
+    normal.png          n/2 + 1/2, in world coordinates
+    albedo.png          linear base colour
+    rgba_LIGHT.png      the view under each of the other lights in LIGHTS
+
+A light is the panorama LIGHT.hdr, in Blender's orientation. It is in `Environment_Maps`, which is beside the scene's folder or one
+folder further up. The views `val_000` … are not used.
+"""
+
+from pathlib import Path
+
+from refgs.capture.files import photo_view, report_missing
+from refgs.capture.images import read_header
+from refgs.capture.transforms import Frame, frame_camera, read_json
+from refgs.capture.types import Split, View
+from refgs.errors import InputError
+
+LIGHTS = ("bridge", "city", "fireplace", "forest", "night")  # that TensoIR relights with
+PHOTOS = ("rgba.png", "rgba_sunset.png", "rgba_sunset_000.png")  # the first that is there
+_MAPS = (
+    "high_res_envmaps_2k",
+    "high_res_envmaps_1k",
+    ".",
+)  # in Environment_Maps; the pictures were rendered with the larger ones
+
+
+def is_tensoir(folder: Path) -> bool:
+    """Tell whether a folder is a scene of TensoIR-Synthetic."""
+    return (folder / "train_000" / "metadata.json").is_file()
+
+
+def read_tensoir(folder: Path) -> tuple[list[View], list[str]]:
+    """Read the training and test views of a TensoIR capture, in the capture's coordinates, and warnings. Raises InputError."""
+    found: list[tuple[Path, Split]] = []
+    for split in ("train", "test"):
+        found += [(file.parent, split) for file in sorted(folder.glob(f"{split}_[0-9]*/metadata.json"))]
+    report_missing(folder, [f"{view.name}/{PHOTOS[0]}" for view, _ in found if _photo(view) is None], len(found))
+    warnings = []
+    if light_folder(folder) is None:
+        what = "Environment_Maps is neither beside the scene's folder nor above it"
+        warnings.append(f"{what}: the evaluation does not relight without its panoramas")
+    return [_view(view, split) for view, split in found], warnings
+
+
+def light_folder(folder: Path) -> Path | None:
+    """Return the folder with the panoramas for the scene in `folder`. Return None if it is not there."""
+    tops = [top / "Environment_Maps" / size for top in folder.resolve().parents[:2] for size in _MAPS]
+    return next((top for top in tops if any((top / f"{light}.hdr").is_file() for light in LIGHTS)), None)
+
+
+def _photo(folder: Path) -> Path | None:
+    return next((folder / name for name in PHOTOS if (folder / name).is_file()), None)
+
+
+def _view(folder: Path, split: Split) -> View:
+    file, photo = folder / "metadata.json", _photo(folder)
+    data = read_json(file)
+    text = data.get("cam_transform_mat") if isinstance(data, dict) else None
+    numbers = str(text).split(",")
+    if len(numbers) != 16:
+        raise InputError(
+            f"{file}: cam_transform_mat is not 16 numbers with commas between. Download the data set again."
+        )
+    values = {
+        "file_path": folder.name,
+        "transform_matrix": [numbers[row : row + 4] for row in range(0, 16, 4)],
+        "camera_angle_x": data.get("cam_angle_x"),
+        "w": data.get("imw"),
+        "h": data.get("imh"),
+    }
+    camera = frame_camera(Frame(values, file), read_header(photo)[:2])
+    return photo_view(photo, camera, split, None, str(file))
