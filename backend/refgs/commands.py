@@ -218,11 +218,15 @@ def _relight(run, hdri: Path):
 
 
 def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
-    """Compare renderings with held-out photos, and with ground truth if it is given. Write metrics.json and the folder pictures."""
+    """Compare renderings with held-out photos, and with ground truth if it is given or if the photos' data set has it.
+
+    Writes metrics.json and the folder pictures.
+    """
     if split not in ("test", "train"):
         raise InputError(f"--split {split}: take test or train")
     check_finished(folder)  # before torch is imported
     from refgs.capture import read_capture
+    from refgs.compare.published import published_truth
     from refgs.compare.truth import GroundTruth
     from refgs.report.evaluate import evaluate as measure
     from refgs.report.figures import DETAILS, HEADLINE, in_words, relit_in_words
@@ -235,7 +239,10 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
     views = capture.test_views if split == "test" else capture.train_views
     if not views:
         raise InputError(f"{run.capture_folder} has no {split} views")
-    truth = GroundTruth(ground_truth, run.to_capture) if ground_truth else None
+    if ground_truth:
+        truth = GroundTruth(ground_truth, run.to_capture)
+    else:
+        truth = published_truth(capture, run.to_capture) if split == "test" else None
     with progress_bar("evaluating", len(views)) as bar:
         figures = measure(run, split, views, truth, bar)
     update_metrics(folder, figures)

@@ -1,7 +1,9 @@
+import cv2
 import numpy as np
 import OpenEXR
 import pytest
 
+from refgs.errors import InputError
 from refgs.formats.exr import read_exr, write_exr
 from refgs.formats.panorama import directions, read_environment, sample
 
@@ -17,6 +19,25 @@ def test_half_float_panoramas_are_read(tmp_path):
     assert radiance.dtype == np.float32
     np.testing.assert_array_equal(radiance[0, 0], [65504, 0, 0])
     np.testing.assert_array_equal(radiance[1:], 1)
+
+
+def test_radiance_panoramas_are_read(tmp_path):
+    """Check a Radiance file: red, green and blue in this order, the first row at the top, bright values kept, to 1 % of the brightest."""
+    pixels = RNG.random((4, 8, 3)).astype(np.float32)
+    pixels[1, 2] = [900.0, 500.0, 20.0]
+    cv2.imencode(".hdr", pixels[..., ::-1])[1].tofile(tmp_path / "a.HDR")
+    radiance = read_environment(tmp_path / "a.HDR")
+    assert radiance.dtype == np.float32
+    assert (np.abs(radiance - pixels) <= 0.01 * pixels.max(axis=-1, keepdims=True)).all()
+
+
+@pytest.mark.parametrize("content", [None, b"", b"text"])
+def test_broken_radiance_panoramas_are_one_line(tmp_path, content):
+    if content is not None:
+        (tmp_path / "a.hdr").write_bytes(content)
+    with pytest.raises(InputError, match=r"a.hdr is missing|a.hdr: this is not a Radiance picture") as error:
+        read_environment(tmp_path / "a.hdr")
+    assert "\n" not in str(error.value)
 
 
 def test_six_known_directions():

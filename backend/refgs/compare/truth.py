@@ -36,13 +36,20 @@ class GroundTruth:
     def __init__(self, folder: Path, to_capture: np.ndarray):
         self.folder, self._to_run = folder, np.linalg.inv(to_capture)
         self._turn = self._to_run[:3, :3] / np.cbrt(np.linalg.det(self._to_run[:3, :3]))
-        self.passes = [name for name in PASSES if (folder / name).is_dir()]
-        relit = (folder / "relight").iterdir() if (folder / "relight").is_dir() else ()
+        self.passes: list[str] = []
+        self.hdris: list[str] = []
+        self.has_light = self.has_mesh = False
+        self._find()
+
+    def _find(self) -> None:
+        """Find what is in the folder. Raises InputError if there is nothing."""
+        self.passes = [name for name in PASSES if (self.folder / name).is_dir()]
+        relit = (self.folder / "relight").iterdir() if (self.folder / "relight").is_dir() else ()
         self.hdris = sorted({file.stem for file in relit if file.is_dir() or file.suffix == ".exr"})
-        self.has_light, self.has_mesh = ((folder / name).exists() for name in ("light.exr", "mesh.ply"))
+        self.has_light, self.has_mesh = ((self.folder / name).exists() for name in ("light.exr", "mesh.ply"))
         if not (self.passes or self.hdris or self.has_light or self.has_mesh):
             known = ", ".join([f"{name}/" for name in PASSES] + ["relight/", "light.exr", "mesh.ply"])
-            raise InputError(f"{folder}: there is no ground truth in it; known are {known}")
+            raise InputError(f"{self.folder}: there is no ground truth in it; known are {known}")
 
     def maps(self, camera: Camera) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Read the true maps of the camera's view by name, float32 (h, w) or (h, w, 3), and the object's alpha (h, w).
@@ -70,7 +77,7 @@ class GroundTruth:
     def _read(self, name: str, camera: Camera) -> np.ndarray:
         file = self.folder / name / f"{camera.name}.exr"
         pixels = read_exr(file)
-        _check_size(file, pixels, camera)
+        check_size(file, pixels, camera)
         channels = {"normal": 3, "albedo": 3}.get(name, 1)
         if pixels.ndim == 2 and channels > 1:
             raise InputError(f"{file}: it has one channel where there should be {channels}")
@@ -83,8 +90,11 @@ class GroundTruth:
 
         The panorama is equirectangular, in Blender's orientation.
         """
-        panorama = read_environment(self.folder / f"{name}.exr")
+        panorama = read_environment(self._light_file(name))
         return sample(panorama, directions(*panorama.shape[:2]) @ self._turn.astype(np.float32))
+
+    def _light_file(self, name: str) -> Path:
+        return self.folder / f"{name}.exr"
 
     def mesh(self) -> Mesh:
         mesh = read_mesh(self.folder / "mesh.ply")
@@ -104,11 +114,11 @@ class GroundTruth:
     def _picture(self, folder: str, camera: Camera) -> np.ndarray:
         file = self.folder / folder / f"{camera.name}.exr"
         pixels = read_relit(file)
-        _check_size(file, pixels, camera)
+        check_size(file, pixels, camera)
         return cv2.resize(pixels, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
 
-def _check_size(file: Path, pixels: np.ndarray, camera: Camera) -> None:
+def check_size(file: Path, pixels: np.ndarray, camera: Camera) -> None:
     """Raise InputError if a true picture is not as large as the camera's view, nor a larger one of the same shape."""
     (height, width), size = pixels.shape[:2], f"{camera.width}×{camera.height}"
     fitted = camera.resized(width, height).fitted(max(camera.width, camera.height))

@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from pathlib import Path
 
 import numpy as np
 
@@ -10,12 +11,12 @@ from refgs.formats.exr import read_exr
 
 
 def read_environment(path: str | os.PathLike) -> np.ndarray:
-    """Read a panorama of linear radiance as float32 (H, W, 3). Raises InputError if the file is not a panorama.
+    """Read a panorama of linear radiance, EXR or Radiance (.hdr), as float32 (H, W, 3). Raises InputError if the file is no panorama.
 
     Infinite pixels (a sun that overflowed half floats) become the largest half float. Negative radiance becomes 0. NaN becomes 0 too, with
     an InputWarning.
     """
-    pixels = read_exr(path)
+    pixels = _read_radiance(Path(path)) if Path(path).suffix.lower() == ".hdr" else read_exr(path)
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=2)
     height, width = pixels.shape[:2]
@@ -24,6 +25,20 @@ def read_environment(path: str | os.PathLike) -> np.ndarray:
     if missing := int(np.isnan(pixels[..., :3]).any(axis=-1).sum()):
         warnings.warn(InputWarning(f"{path}: {missing:,} pixels are not a number and give no light"), stacklevel=2)
     return np.nan_to_num(pixels[..., :3], nan=0, posinf=65504, neginf=0).clip(min=0)
+
+
+def _read_radiance(path: Path) -> np.ndarray:
+    import cv2  # here, because most lights are EXR
+
+    if not path.is_file():
+        raise InputError(f"{path} is missing")
+    try:
+        pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    except cv2.error:  # an empty file
+        pixels = None
+    if pixels is None or pixels.dtype != np.float32:
+        raise InputError(f"{path}: this is not a Radiance picture that can be read. Download it again.")
+    return pixels[..., ::-1]
 
 
 def directions(height: int, width: int) -> np.ndarray:

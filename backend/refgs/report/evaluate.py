@@ -23,6 +23,7 @@ from refgs.model.surfels import Surfels
 from refgs.render.align import fitted
 from refgs.render.baselines import method_of
 from refgs.render.renderer import render
+from refgs.report import published
 from refgs.run import Run
 
 PANORAMA = 256  # rows of the light's pictures, at most
@@ -35,13 +36,16 @@ Step = Callable[[int, str, int], None]
 def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None, step: Step) -> dict[str, Any]:
     """Compare a run with the photos of `views`, and with ground truth if it is given. Returns the metrics for metrics.json, such as PSNR.
 
+    Ground truth of a published data set is compared by the data set's protocol, too, and relit by it alone (`refgs.report.published`).
+
     Writes pictures into the run's folder: of the views to pictures/`split`, of the light to pictures/, and of the views under other lights
     to pictures/relight. `split` is "test" for held-out views. After each rendering, `step` is called with the number of renderings that are
     done, a note, and their total number.
     """
     pictures, lit = run.folder / "pictures", run.environment is not None
-    hdris = truth.hdris if truth and lit else []
-    total, done, cameras = len(views) * (1 + 2 * len(hdris)), 0, []
+    by_protocol = published.steps(truth, len(views)) if lit else 0  # how often the data set's protocol renders
+    hdris = truth.hdris if truth and lit and not by_protocol else []
+    total, done, cameras = len(views) * (1 + 2 * len(hdris)) + by_protocol, 0, []
 
     def next_step(note: str) -> None:
         nonlocal done
@@ -70,6 +74,8 @@ def evaluate(run: Run, split: str, views: list[View], truth: GroundTruth | None,
     for hdri in hdris:
         figures = _measure_relit(run, hdri, cameras, truth, pictures / "relight", next_step)
         found.setdefault("relight", {})[hdri] = {"refgs": figures}
+    if by_protocol:
+        found |= published.measure(run, views, truth, pictures / "relight", next_step)
     if truth and truth.has_mesh and (run.folder / "mesh.glb").exists():
         mesh = read_glb(run.folder / "mesh.glb")
         found["mesh"] = surface.compare(mesh, truth.mesh(), run.training_cameras())

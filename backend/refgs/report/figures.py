@@ -60,6 +60,10 @@ DETAILS = [
     Quantity("environment.lights_degrees", "light: angular error of the brightest lights", "{:.2f}°".format, min),
     Quantity("mesh.chamfer", "mesh: Chamfer distance, of the object's radius", "{:.3%}".format, min),
     Quantity("mesh.normal_consistency", "mesh: normal consistency", "{:.4f}".format, max),
+    Quantity("tensoir.relit_psnr", "relit, as TensoIR measures: PSNR", "{:.2f} dB".format, max),
+    Quantity("tensoir.albedo_psnr", "base colour, as TensoIR measures: PSNR", "{:.2f} dB".format, max),
+    Quantity("stanford_orb.light.psnr_h", "relit, as Stanford-ORB measures: PSNR-H", "{:.2f} dB".format, max),
+    Quantity("stanford_orb.light.psnr_l", "relit, as Stanford-ORB measures: PSNR-L", "{:.2f} dB".format, max),
     Quantity("peak_card_memory_bytes", "peak memory on the card", lambda x: f"{x / 2**30:.2f} GiB", min),
 ]
 

@@ -9,6 +9,7 @@ import torch
 from refgs.capture import LoadedView, View
 from refgs.compare import metrics
 from refgs.compare.pictures import composite, maps
+from refgs.compare.published import published_truth
 from refgs.compare.truth import FOLDER, PASSES, GroundTruth, errors, known_maps
 from refgs.errors import InputError
 from refgs.model.environment import Environment
@@ -45,8 +46,8 @@ class _TestView(NamedTuple):
 class Measures:
     """Measure a few fixed held-out views against their photos and their ground truth.
 
-    Ground truth is the capture's folder `ground_truth` (see `compare.truth.GroundTruth`), or the true normals of the capture's data set. If
-    its pictures differ in size from the photos, a warning is reported and ground truth is not used.
+    Ground truth is the capture's folder `ground_truth` (see `compare.truth.GroundTruth`), or that of the capture's data set. If its
+    pictures differ in size from the photos, a warning is reported and ground truth is not used.
     """
 
     def __init__(self, state: State) -> None:
@@ -57,7 +58,8 @@ class Measures:
         folder = capture.folder / FOLDER
         self._light = self._panorama = None
         try:
-            truth = GroundTruth(folder, capture.to_capture) if folder.is_dir() else None
+            read = GroundTruth(folder, capture.to_capture) if folder.is_dir() else None
+            truth = read or published_truth(capture, capture.to_capture)
             self._test_views = [self._test_view(*pair, truth, capture.to_capture) for pair in chosen]
             if truth:
                 self._read_lights(truth, state.device)
