@@ -95,7 +95,7 @@ def render(
     passes: Annotated[
         str, typer.Option(help="some of color,normal,albedo,roughness,metallic,depth,alpha,visibility")
     ] = "color",
-    hdri: Annotated[Path | None, typer.Option(help="panorama to relight with")] = None,
+    hdri: Annotated[Path | None, typer.Option(help="panorama to relight with, .exr or .hdr")] = None,
     format: Annotated[str, typer.Option(help="png or exr")] = "png",
 ) -> None:
     """Render images of a trained run, from the cameras in a JSON file."""

@@ -99,7 +99,7 @@ def test_everything_is_on_the_page_and_in_the_page(run):
     kinds = [kind for kind, _ in page.images]
     for kind in ("photo", "rendered", "normal", "base colour", "roughness", "metallic"):
         assert kinds.count(kind) == 4, "four of eight views, evenly chosen"
-    for kind in ("ground truth (Cycles)", "splats (Eevee)", "mesh (Eevee)", "recovered"):
+    for kind in ("ground truth", "splats (Eevee)", "mesh (Eevee)", "recovered"):
         assert kinds.count(kind) == 1
     assert all(address.startswith(("data:image/png;base64,", "#")) for address in page.addresses)
     assert not {"script", "link", "iframe"} & set(page.tags)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
 RELIT = {
-    "truth": "ground truth (Cycles)",
+    "truth": "ground truth",
     "refgs": "surfels (RefGS)",
     "splats": "splats (Eevee)",
     "mesh": "mesh (Eevee)",
