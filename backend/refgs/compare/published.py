@@ -72,8 +72,8 @@ class StanfordORBTruth(GroundTruth):
 
     def _find(self) -> None:
         self._truths = truth_folder(self.folder)
-        names = {"normal": "surface_normal", "albedo": "pseudo_gt_albedo"}
-        self.passes = [name for name, where in names.items() if (self._truths / self.folder.name / where).is_dir()]
+        files = {"normal": "surface_normal/*.npy", "albedo": "pseudo_gt_albedo/*.png"}
+        self.passes = [name for name, some in files.items() if any((self._truths / self.folder.name).glob(some))]
 
     def _read(self, name: str, camera: Camera) -> np.ndarray:
         if name == "albedo":

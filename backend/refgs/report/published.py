@@ -23,7 +23,8 @@ RATIO_VIEWS = 20  # by which TensoIR corrects base colour, evenly chosen; pictur
 def steps(truth: GroundTruth | None, views: int) -> int:
     """Return how often `measure` renders for a number of test views."""
     if isinstance(truth, TensoIRTruth):
-        return (views if truth.passes else 0) + min(views, RATIO_VIEWS) + views * len(truth.hdris)
+        ratio = min(views, RATIO_VIEWS) if "albedo" in truth.passes else 0
+        return ratio + (views if truth.passes else 0) + views * len(truth.hdris)
     return views + len(truth.novel_views()) if isinstance(truth, StanfordORBTruth) else 0
 
 
@@ -48,8 +49,7 @@ def _tensoir(
 ) -> dict[str, Any]:
     """Measure as TensoIR does: normals and base colour over whole pictures, and relit pictures with base colour corrected.
 
-    The correction of base colour is one factor a channel, `ratio`. Relit pictures are put over the run's background, which presets make
-    white, in sRGB-encoded colours.
+    The correction of base colour is one factor a channel, `ratio`.
     """
     found: dict[str, Any] = {}
     places = np.linspace(0, len(cameras) - 1, min(len(cameras), RATIO_VIEWS)).round().astype(int)
@@ -78,24 +78,39 @@ def _tensoir(
     found |= {name: float(np.mean(values)) for name, values in rows.items()}
     if "albedo" in found:
         found["albedo_psnr"] = metrics.decibels(found.pop("albedo"))
-    background = np.array(run.settings.image.background, np.float32)
     for hdri in truth.hdris:
-        light, rows = run.light(truth.panorama(f"relight/{hdri}")), []
-        for camera in cameras:
-            image = np.clip(run.render(camera, light).color.numpy(), 0, 1)
-            pixels = truth.relit(hdri, camera)
-            alpha = pixels[..., 3:]
-            true = srgb_encode(pixels[..., :3] / np.maximum(alpha, 1e-6)) * alpha + background * (1 - alpha)
-            if camera in chosen:
-                _write(pictures, f"{hdri}_{camera.name}", image, true)
-            rows.append((metrics.psnr(image, true), metrics.ssim(image, true)))
-            next_step(f"under {hdri}")
-        psnr, ssim = np.mean(rows, axis=0).tolist()
-        found.setdefault("relit", {})[hdri] = {"psnr": psnr, "ssim": ssim}
+        found.setdefault("relit", {})[hdri] = _relit_as_tensoir(run, hdri, cameras, chosen, truth, pictures, next_step)
     if "relit" in found:
         lights = list(found["relit"].values())
         found |= {f"relit_{name}": float(np.mean([light[name] for light in lights])) for name in ("psnr", "ssim")}
     return found
+
+
+def _relit_as_tensoir(
+    run: Run,
+    hdri: str,
+    cameras: list[Camera],
+    chosen: list[Camera],
+    truth: TensoIRTruth,
+    pictures: Path,
+    next_step: Callable[[str], None],
+) -> dict[str, float]:
+    """Measure the views under another light, as means. Writes pictures of the `chosen` cameras.
+
+    Pictures are put over the run's background, which presets make white, in sRGB-encoded colours.
+    """
+    light, rows = run.light(truth.panorama(f"relight/{hdri}")), []
+    background = np.array(run.settings.image.background, np.float32)
+    for camera in cameras:
+        image = np.clip(run.render(camera, light).color.numpy(), 0, 1)
+        pixels = truth.relit(hdri, camera)
+        alpha = pixels[..., 3:]
+        true = srgb_encode(pixels[..., :3] / np.maximum(alpha, 1e-6)) * alpha + background * (1 - alpha)
+        if camera in chosen:
+            _write(pictures, f"{hdri}_{camera.name}", image, true)
+        rows.append((metrics.psnr(image, true), metrics.ssim(image, true)))
+        next_step(f"under {hdri}")
+    return dict(zip(("psnr", "ssim"), np.mean(rows, axis=0).tolist(), strict=True))
 
 
 def _stanford_orb(
