@@ -17,6 +17,7 @@ from refgs.errors import InputError
 from refgs.lock import LOCK, PROGRESS, STOP, RunLock
 from tests.makers.captures import nerfstudio
 from tests.makers.films import write_video
+from tests.makers.training import TINY, trained
 from tests.makers.unmasked import photograph
 from tests.makers.waiting import until
 
@@ -153,6 +154,23 @@ def test_a_training_is_cancelled_while_it_makes_masks(talk, tmp_path):
     # The next job runs.
     talk.tell("check", capture=str(tmp_path / "photos"))
     assert any(line.startswith("Object") for line in talk.until("done")["lines"])
+
+
+def test_a_run_is_continued_with_hints(talk, ball_capture, tmp_path):
+    run, file, out = (
+        trained(ball_capture, tmp_path / "run", *TINY, total=30).state.folder,
+        tmp_path / "hints.json",
+        tmp_path / "new",
+    )
+    file.write_text(json.dumps({"hints": [{"kind": "metal", "points": [[0, 0, 1]]}]}))
+    told = {"capture": str(ball_capture), "out": str(out), "from": str(run)}
+    talk.tell("train", **told)
+    talk.tell("train", **told, hints=str(file))
+    assert "--from and --hints go together" in talk.until("failed")["what"]
+    done = talk.until("done")
+    assert done["run"] == str(out) and done["iteration"] == 30
+    assert any("hints hold" in event.get("what", "") for event in talk.heard)
+    assert talk.end() == 0
 
 
 def test_photos_without_cameras(talk, tmp_path):

@@ -80,11 +80,13 @@ def train(
         list[str] | None, typer.Option("--set", help="section.key=value, e.g. train.iterations=2000")
     ] = None,
     resume: Annotated[bool, typer.Option(help="resume the run in --out")] = False,
+    run: Annotated[Path | None, typer.Option("--from", help="finished run to continue in --out, with --hints")] = None,
+    hints: Annotated[Path | None, typer.Option(help="JSON file: which parts of that run are metal or paint")] = None,
 ) -> None:
     """Train surfels, materials and light from a capture."""
     from refgs import commands
 
-    commands.train(capture, out, preset, device, minutes, changes or [], resume)
+    commands.train(capture, out, preset, device, minutes, changes or [], resume, run, hints)
 
 
 @app.command()

@@ -111,12 +111,14 @@ def train(
     minutes: float | None,
     changes: list[str],
     resume: bool,
+    run: Path | None = None,
+    hints: Path | None = None,
 ) -> None:
-    """Train on a capture and write a run folder.
+    """Train on a capture and write a run folder. With a finished `run` and a file of `hints` about it, continue its training.
 
     Ctrl-C ends the training with a checkpoint, from which `resume` continues. A second Ctrl-C ends it at once.
     """
-    stopped = []
+    stopped, hinted = [], train_job.hinted(run, hints, resume)
     with progress_bar("training", 1) as bar:
 
         def report(event: str, facts: dict) -> None:
@@ -138,7 +140,7 @@ def train(
         before = signal.signal(signal.SIGINT, stop)
         try:
             trainer, quality = train_job.train(
-                capture_folder, out, preset, device, minutes, changes, resume, report, lambda _: bool(stopped)
+                capture_folder, out, preset, device, minutes, changes, resume, report, lambda _: bool(stopped), hinted
             )
         finally:
             signal.signal(signal.SIGINT, before)

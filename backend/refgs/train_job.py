@@ -9,22 +9,30 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from refgs.errors import InputError
 from refgs.events import Report
 from refgs.lock import RunLock
 from refgs.memory import trim
 from refgs.paths import check_folder, disk_errors_named
-from refgs.run_folder import PHOTOS, check_free, read_run_facts, update_metrics
+from refgs.run_folder import PHOTOS, check_finished, check_free, read_run_facts, update_metrics
 from refgs.settings import Settings, load_settings
 from refgs.train.effective import Change
 from refgs.train.plan import Plan
 
 if TYPE_CHECKING:
     from refgs.capture import Capture
+    from refgs.formats.hints import Hint
     from refgs.train.state import State
     from refgs.train.trainer import Trainer
+
+
+class Hinted(NamedTuple):
+    """Name a finished `run` whose training is continued in a new folder, and the `file` of hints about its parts."""
+
+    run: Path
+    file: Path
 
 
 def train(
@@ -37,6 +45,7 @@ def train(
     resume: bool,
     report: Report,
     attend: "Callable[[State], bool]",
+    hinted: Hinted | None = None,
 ) -> "tuple[State, float | None]":
     """Train on a capture and write a run folder, or resume the training in it. At the end write the results and measure their quality.
 
@@ -46,20 +55,27 @@ def train(
     - `report(event, facts)` is called for progress and warnings.
     - `attend(state)` is called before each iteration. If it returns True, the training stops with a checkpoint; `resume` continues it.
       Another process can stop it too (`refgs.lock`).
+    - With `hinted`, most of that run's training is repeated, with its settings, while the hinted parts are held (`train/hints.py`).
 
     Returns the training's state and the mean PSNR of the held-out views. `state.ended` is False if the training was stopped. The PSNR is
     None then, or if there are no held-out views.
     """
     plan, lock = Plan(minutes), RunLock(out)
     _check_device(device)
-    facts, settings = _resumed_settings(out, changes) if resume else _new_settings(out, preset, changes)
+    hints: list[Hint] = []
+    if resume:
+        facts, settings = _resumed_settings(out, changes)
+    elif hinted is not None:
+        facts, settings, hints = _hinted_settings(hinted, out, preset, changes)
+    else:
+        facts, settings = _new_settings(out, preset, changes)
     with ExitStack() as held:
         if resume:
             held.enter_context(lock)
             _check_unfinished(out)
-        capture = _read_capture(capture_folder, settings, out, facts)
+        capture = _read_capture(capture_folder, settings, hinted.run if hinted else out, facts)
         masked: dict[str, Change] = {}
-        if not resume and settings.image.masks == "auto" and not any(view.masked for view in capture.views):
+        if facts is None and settings.image.masks == "auto" and not any(view.masked for view in capture.views):
             capture, settings, changes, masked = _with_masks(capture, settings, preset, changes, report)
         for what in capture.warnings:
             report("warning", {"what": what})
@@ -68,6 +84,11 @@ def train(
         with _card_memory():
             if resume:
                 trainer = _resume(capture, settings, out, plan, device, report)
+            elif hinted is not None:
+                trainer = _start_hinted(
+                    capture, settings, facts["preset"], hinted.run, hints, out, plan, device, report
+                )
+                held.enter_context(lock)
             else:
                 trainer = _start(capture, settings, preset, changes, masked, out, plan, device, report)
                 held.enter_context(lock)  # its folder exists only now
@@ -81,6 +102,17 @@ def train(
             trainer.release_photos()
             _remove_photos(out)
         return state, quality
+
+
+def hinted(run: Path | None, file: Path | None, resume: bool) -> Hinted | None:
+    """Return the run to continue and the file of hints, if both were given; None if neither. Raises InputError otherwise."""
+    if run is None and file is None:
+        return None
+    if run is None or file is None:
+        raise InputError("--from and --hints go together: a finished run, and a file that says what its parts are")
+    if resume:
+        raise InputError("--resume continues the run in --out, which knows its hints: leave out --from and --hints")
+    return Hinted(run, file)
 
 
 def choose_device(device: str, report: Report) -> str:
@@ -117,6 +149,22 @@ def _resumed_settings(out: Path, changes: list[str]) -> tuple[dict, Settings]:
     if changes:
         raise InputError("--set cannot change a run that is resumed: train into a new folder")
     return facts, settings
+
+
+def _hinted_settings(
+    hinted: Hinted, out: Path, preset: str | None, changes: list[str]
+) -> "tuple[dict, Settings, list[Hint]]":
+    from refgs.formats.hints import read_hints
+
+    facts, settings = check_finished(hinted.run)
+    if changes or preset:
+        raise InputError("--set and --preset cannot change a run that is continued with hints: it keeps its settings")
+    if not any((hinted.run / "checkpoints").glob("*.toml")):
+        raise InputError(
+            f"{hinted.run} has no checkpoint to continue from: name the run that was trained, not an edited copy"
+        )
+    check_free(out)
+    return facts, settings, read_hints(hinted.file)
 
 
 def _check_unfinished(out: Path) -> None:
@@ -191,25 +239,64 @@ def _start(
 
     `masked` are changes that are recorded with those of the training: what the making of masks changed.
     """
-    from refgs.run import create_run, record_changes
     from refgs.train.fit import fitting
     from refgs.train.trainer import Trainer
 
-    try:
+    with _no_photos_left(out):
         if preset is None and plan.minutes is not None:
             trainer, preset = fitting(capture, changes, out, plan, device, report), f"{plan.minutes:g} minutes"
         else:
             trainer = Trainer(capture, settings, out, report, plan, device)
-    except BaseException:  # there is nothing to resume: leave nothing behind
-        _remove_photos(out)
-        raise
     state = trainer.state
     state.effective = replace(state.effective, changes=masked | state.effective.changes)
-    with disk_errors_named([out], "train again"):
-        effective = state.effective
-        create_run(out, capture, effective.settings, preset or "standard", device, effective.chosen())
-        record_changes(out, effective.rows())
+    _create_run(state, preset or "standard", device)
     return trainer
+
+
+def _start_hinted(
+    capture: "Capture",
+    settings: Settings,
+    preset: str,
+    run: Path,
+    hints: "list[Hint]",
+    out: Path,
+    plan: Plan,
+    device: str,
+    report: Report,
+) -> "Trainer":
+    """Make the trainer that continues a finished run with hints, create its run folder with a first checkpoint, and return the trainer."""
+    from refgs.formats.hints import FILE, write_hints
+    from refgs.train.hints import continue_with_hints
+    from refgs.train.trainer import Trainer
+
+    with _no_photos_left(out):
+        trainer = Trainer(capture, settings, out, report, plan, device)
+        continue_with_hints(trainer.state, run, hints)
+    _create_run(trainer.state, preset, device)
+    with disk_errors_named([out], "train again"):
+        write_hints(out / FILE, run, hints)
+        trainer.save()
+    return trainer
+
+
+@contextmanager
+def _no_photos_left(out: Path) -> Iterator[None]:
+    """Remove the reduced photos from a folder if a `with` block raises: there is no run yet that could be resumed."""
+    try:
+        yield
+    except BaseException:
+        _remove_photos(out)
+        raise
+
+
+def _create_run(state: "State", preset: str, device: str) -> None:
+    """Create the run folder of a training that is ready to start."""
+    from refgs.run import create_run, record_changes
+
+    effective = state.effective
+    with disk_errors_named([state.folder], "train again"):
+        create_run(state.folder, state.capture, effective.settings, preset, device, effective.chosen())
+        record_changes(state.folder, effective.rows())
 
 
 def _resume(capture: "Capture", settings: Settings, out: Path, plan: Plan, device: str, report: Report) -> "Trainer":

@@ -69,6 +69,8 @@ class Train(_Command):
     minutes: Annotated[float, Field(ge=0.05)] | None = None
     settings: list[str] = []
     resume: bool = False
+    run: Annotated[str | None, Field(alias="from")] = None
+    hints: str | None = None
 
 
 class Export(_Command):
@@ -233,6 +235,7 @@ class Worker:
             return "cancelled", {"run": str(out.resolve()), "iteration": 0, "seconds": 0.0}
 
     def _train_into(self, out: Path, command: Train) -> tuple[str, dict]:
+        run, hints = (Path(path) if path else None for path in (command.run, command.hints))
         state, quality = train_job.train(
             Path(command.capture),
             out,
@@ -243,6 +246,7 @@ class Worker:
             command.resume,
             self._hear_training,
             self._attend,
+            train_job.hinted(run, hints, command.resume),
         )
         facts = {"run": str(out.resolve()), "iteration": state.iteration, "seconds": state.seconds}
         if not state.ended:

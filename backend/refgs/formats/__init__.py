@@ -1,1 +1,1 @@
-"""Read and write files: PLY, EXR, glTF, OBJ, COLMAP's models, history.jsonl. Nothing here imports torch."""
+"""Read and write files: PLY, EXR, glTF, OBJ, COLMAP's models, history.jsonl, hints.json. Nothing here imports torch."""

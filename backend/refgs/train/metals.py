@@ -23,9 +23,10 @@ MOSTLY = 0.6  # part of what is coloured that shines, above which what is dark m
 TELLING = (
     0.3  # part of the surface that is coloured, below which it tells nothing about the rest; a bronze head has 0.48
 )
+KINDS = "metal", "paint"  # what a surfel can be held as
 HELD = torch.tensor(
-    raw_metallic(0.98)
-)  # raw metallic that is held; surfels that have exactly this value are known by it
+    [raw_metallic(0.98), raw_metallic(0.002)]
+)  # raw metallic that is held, of each kind; surfels that have exactly this value are known by it
 
 
 def set_metals_due(state: State, progress: float) -> None:
@@ -66,19 +67,26 @@ def set_metals_due(state: State, progress: float) -> None:
         metallic[refuted] = metallic[refuted].clamp(max=raw_metallic(PAINT))
         if shining > CERTAIN * whole or (faintly > CERTAIN * whole and shown_faintly.by_mirroring):
             metal = torch.ones_like(metal)
-            metallic.fill_(float(HELD))
+            metallic.fill_(float(HELD[0]))
         else:
             metallic[metal] = metallic[metal].clamp(min=raw_metallic(METAL))
-    moments = state.optimizer.state.get(metallic, {})
-    for name in ("exp_avg", "exp_avg_sq") if moments else ():
-        moments[name][metal | refuted] = 0
+    state.forget_moments("metallic", metal | refuted)
     state.metals_set = True
     part = float(weight[metal].sum()) / max(whole, 1e-6)
     state.announce("metals", f"{part:.0%} of the surface shines as metals do")
+
+
+@torch.no_grad()
+def hold_as(state: State, kinds: torch.Tensor) -> None:
+    """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) has each surfel's index in KINDS, −1 for those that learn."""
+    metallic, which = state.parameters["metallic"], kinds >= 0
+    metallic[which] = HELD.to(metallic)[kinds[which]]
+    state.forget_moments("metallic", which)
+    state.metals_set = True
 
 
 def hold(state: State) -> None:
     """Remove the gradient of the metallic of surfels that are held, so that it stays. Halves of a divided surfel are held, too."""
     metallic = state.parameters.get("metallic")
     if state.metals_set and metallic is not None and metallic.grad is not None:
-        metallic.grad.masked_fill_(metallic.detach() == HELD.to(metallic), 0)
+        metallic.grad.masked_fill_(torch.isin(metallic.detach(), HELD.to(metallic)), 0)

@@ -1,5 +1,7 @@
 """Save and restore the state of a training: everything that the next iteration depends on."""
 
+from pathlib import Path
+
 import numpy as np
 import torch
 
@@ -39,9 +41,9 @@ def save(state: State) -> None:
     checkpoint.save(state.folder / "checkpoints", state.iteration, tensors, facts)
 
 
-def restore(state: State) -> None:
-    """Resume from the last complete checkpoint. Raises InputError if there is none, or if another release of RefGS wrote it."""
-    tensors, facts = checkpoint.load(state.folder / "checkpoints")
+def restore(state: State, run: Path) -> None:
+    """Take over the last complete checkpoint of a run. Raises InputError if there is none, or if another release of RefGS wrote it."""
+    tensors, facts = checkpoint.load(run / "checkpoints")
     state.total = facts["total"]
     needs.restore(state, facts.get("needs", {}))
     for name in state.constant:  # left out after this checkpoint, where the training goes back to it
@@ -54,7 +56,7 @@ def restore(state: State) -> None:
             tensors[f"parameter.{name}"] = row.expand(count, *row.shape[1:]).clone()
     needed = {f"parameter.{name}" for name in state.parameters} | {f"constant.{name}" for name in state.constant}
     if not needed <= tensors.keys():
-        raise InputError(f"{state.folder} was begun by another release of RefGS: train again into a new folder")
+        raise InputError(f"{run} was begun by another release of RefGS: train again into a new folder")
     mesh = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("occluder.")}
     tensors = {name: value.to(state.device) for name, value in tensors.items()}
     state.iteration, state.seconds = facts["iteration"], facts["seconds"]

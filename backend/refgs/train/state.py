@@ -263,6 +263,12 @@ class State:
         """Restart the mean of the screen gradients, which says which surfels to divide. Call this after surfels have been replaced."""
         self.motion = ScreenGradient(len(self.parameters["position"]), self.device)
 
+    def forget_moments(self, name: str, which: Tensor) -> None:
+        """Set Adam's moments of a parameter to zero for some surfels, those that are true in `which` (N,), whose values were set."""
+        moments = self.optimizer.state.get(self.parameters[name], {})
+        for key in ("exp_avg", "exp_avg_sq") if moments else ():
+            moments[key][which] = 0
+
     def forget_gradients(self) -> None:
         """Drop the last backward pass's gradients."""
         for group in self.optimizer.param_groups:

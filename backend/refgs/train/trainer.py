@@ -194,5 +194,5 @@ class Trainer:
 
     def resume(self) -> None:
         """Resume from the last complete checkpoint."""
-        snapshot.restore(self.state)
+        snapshot.restore(self.state, self.state.folder)
         history.trim(self.state.folder, self.state.iteration)

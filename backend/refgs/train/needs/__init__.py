@@ -39,6 +39,7 @@ __all__ = [
     "CONSTANTS",
     "NEEDS",
     "WHOLE_EVERY",
+    "bring_back_specular",
     "decidable",
     "evaluate_due",
     "evaluate_iteration",
@@ -85,9 +86,22 @@ def decidable(state: State) -> bool:
 def _look_again(state: State) -> None:
     """Bring specular shading back if it is found halfway that a scene is not matte, and all that was left out with it."""
     if decision := SPECULAR.look_again(state):
-        _record(state, SPECULAR, decision)
-        SPECULAR.undo(state, decision.why)
-        _undo_following(state, state.needs, decision.why)
+        _bring_back_specular(state, decision)
+
+
+def bring_back_specular(state: State, why: str) -> bool:
+    """Bring specular shading back, with all that was left out with it, as `why` says. Returns False if a setting left it out."""
+    found = state.needs.get(SPECULAR.name, {"needed": True})
+    if found["needed"] or SPECULAR.asked(state) != "auto":
+        return False
+    _bring_back_specular(state, Decision(True, why))
+    return True
+
+
+def _bring_back_specular(state: State, decision: Decision) -> None:
+    _record(state, SPECULAR, decision)
+    SPECULAR.undo(state, decision.why)
+    _undo_following(state, state.needs, decision.why)
 
 
 def _undo_following(state: State, decisions: dict[str, dict[str, Any]], why: str) -> None:

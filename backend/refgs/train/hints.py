@@ -1,0 +1,82 @@
+"""Continue a finished training with hints: parts of the surface that a user says are metal or paint.
+
+Photos of a mirror can often be explained twice: a chrome egg at night mirrors darkness, and looks like black plastic. Training stays with
+the explanation that it found first, even if the other one is better: on the way there, pictures are worse.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from refgs.errors import InputError
+from refgs.formats.hints import Hint
+from refgs.formats.splats import read_splats
+from refgs.settings import Settings
+from refgs.train import metals, needs, snapshot
+from refgs.train.start import start_appearance
+from refgs.train.state import State
+
+AGAIN = 0.4  # part of the training from which it is repeated: surfels lie on the surface, light and materials still learn fast
+# Hinted metals start as what is hard to tell from paint: bright and smooth.
+MIRROR = {"albedo": 0.8, "roughness": 0.1}
+
+
+def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
+    """Take over what a finished `run` has learned, and go back in the training, with the hinted parts' materials held.
+
+    Hinted metals start as a bright mirror, for the base colour that they had as plastic tells nothing. Hinted paint keeps its base colour
+    and roughness, as rough metal looks much like paint of its colour. The residual of all surfels starts again.
+
+    Raises InputError if the run has no checkpoint, or if it was told not to learn metals.
+    """
+    snapshot.restore(state, run)
+    if "metallic" not in state.parameters and not needs.bring_back_specular(state, "hints say what is metal"):
+        raise InputError(f"{run} was trained with settings that leave out metals: train it without them first")
+    settings = state.settings
+    kinds = hinted_kinds(state, read_splats(run / "splats.ply").positions, hints)
+    _go_back(state)
+    metals.hold_as(state, kinds)
+    mirror = settings.model_copy(update={"surfels": settings.surfels.model_copy(update=MIRROR)})
+    _restart(state, ("albedo", "roughness"), kinds == metals.KINDS.index("metal"), mirror)
+    _restart(state, ("sh_rest",), torch.ones_like(kinds, dtype=torch.bool), settings)
+    part = {kind: float((kinds == number).float().mean()) for number, kind in enumerate(metals.KINDS)}
+    what = ", ".join(f"{share:.0%} as {kind}" for kind, share in part.items() if share)
+    state.report("stage", {"what": f"hints hold {what} of {len(kinds):,} surfels; training again from {AGAIN:.0%} on"})
+
+
+def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.Tensor:
+    """Return for each surfel (N,) the index of its hinted kind in `metals.KINDS`, −1 without a hint.
+
+    `splats` (M, 3) are the positions of the run's splats. Each point of a hint means the nearest splat. A surfel is as the splat nearest to
+    it: surfels that no photo shows have no row in splats.ply. The last hint about a splat counts.
+    """
+    tree, kinds = cKDTree(splats), np.full(len(splats), -1)
+    for hint in hints:
+        kinds[tree.query(hint.points)[1]] = metals.KINDS.index(hint.kind)
+    nearest = tree.query(state.parameters["position"].numpy(force=True))[1]
+    return torch.from_numpy(kinds[nearest]).to(state.device)
+
+
+def _go_back(state: State) -> None:
+    """Set the iteration back to AGAIN of the training, or to where the rest takes the time that is given. Start its clocks anew."""
+    count = (1 - AGAIN) * state.total
+    if state.plan.minutes is not None:
+        pace = state.seconds / max(state.iteration, 1)
+        count = (60 * state.plan.minutes - state.plan.spent) / max(pace, 1e-9)
+    count = max(round(count), 1)
+    state.iteration = round(count * AGAIN / (1 - AGAIN))
+    state.total = state.iteration + count
+    state.seconds = state.processor_seconds = state.plan.before = 0.0
+    state.clock.resume({})
+
+
+@torch.no_grad()
+def _restart(state: State, names: tuple[str, ...], which: torch.Tensor, settings: Settings) -> None:
+    """Give some surfels, those that are true in `which` (N,), the values of parameters with which surfels start by these settings."""
+    start = start_appearance(settings)
+    for name in {*names} & state.parameters.keys():
+        value, row = state.parameters[name], start[name][0]
+        value[which] = (row[: value.shape[1]] if row.ndim == 2 else row).to(value)  # degrees may be left out
+        state.forget_moments(name, which)
