@@ -324,6 +324,7 @@ def train(
     settings: Mapping[str, object] | None = None,
     mesh: bool = True,
     resume: bool = False,
+    hinted: tuple[Path, Path] | None = None,
 ) -> Job:
     """Start a job that trains on a capture (a folder with photos) and writes the result into the run folder `out`.
 
@@ -331,7 +332,8 @@ def train(
 
     `preset` is the name of a set of settings. If it is None, the settings are chosen so that the training takes `minutes`. If both are
     None, the preset is "standard". `settings` overrides single settings: `{"train.iterations": 2000}`. `resume` continues a stopped
-    training. Raises InputError if `capture` is not a folder, if `out` is being trained already, or if a new run's `out` is not empty.
+    training. `hinted` names a finished run and a file of hints: its training is continued in `out`, with its own preset and settings.
+    Raises InputError if `capture` is not a folder, if `out` is being trained already, or if a new run's `out` is not empty.
     """
     if not capture.is_dir():
         raise InputError(f"{capture} is not a folder: choose the folder of a capture")
@@ -342,6 +344,8 @@ def train(
     arguments = {"preset": preset, "minutes": minutes, "settings": _words(settings or {})}
     if resume:
         arguments = {"minutes": minutes, "resume": True}
+    elif hinted is not None:
+        arguments = {"from": str(hinted[0]), "hints": str(hinted[1])}
     commands = [{"command": "train", "capture": str(capture), "out": str(out)} | arguments]
     if mesh:
         commands.append({"command": "export", "run": str(out)})

@@ -108,6 +108,11 @@ def capture_folder(capture: Path) -> Path:
     return _folder("captures") / f"{capture.name} {crc32(str(capture).encode()):08x}"
 
 
+def hints_file(run: Path) -> Path:
+    """Return the path of the file with the hints that a run is trained with. It stays when Blender closes, as the training may wait."""
+    return _folder("hints") / f"{run.name} {crc32(str(run).encode()):08x}.json"
+
+
 def _folder(name: str) -> Path:
     """Return the path of the folder `name` for the add-on's own data. Updates of the add-on keep this folder.
 

@@ -4,12 +4,12 @@ import tempfile
 from pathlib import Path
 
 import bpy
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from .. import jobs
 from ..errors import InputError
 from ..job_timers import follow_jobs
-from ..preferences import capture_folder, log_file, mask_model, python, set_up
+from ..preferences import capture_folder, hints_file, log_file, mask_model, python, set_up
 from . import strokes
 from .capture_cameras import cameras_of, show_cameras
 from .decisions import find_decision
@@ -120,15 +120,48 @@ def train_other_way(scene: bpy.types.Scene, folder: Path, need: str) -> jobs.Job
     The result goes into a new folder beside that run. Where the scene has a property for the need, it gets the other answer. Raises
     InputError as `train` does, and if the run's capture is not the scene's.
     """
-    decision, settings = find_decision(folder, need), scene.refgs
-    trained = next((known.capture for known in settings.runs if Path(known.folder) == folder), "") or capture_of(folder)
-    if trained and Path(trained).resolve() != _capture(scene).resolve():
+    decision, settings, trained = find_decision(folder, need), scene.refgs, _trained_capture(scene, folder)
+    if trained is not None and trained.resolve() != _capture(scene).resolve():
         raise InputError(f"{folder.name} was trained on {trained}: choose that capture first")
     job = _train(
         scene, _free(folder, {Path(known.folder) for known in settings.runs}), {f"needs.{need}": decision.other}
     )
     if need in CHOSEN_NEEDS:
         setattr(settings, need, decision.other)
+    return job
+
+
+def train_with_hint(
+    scene: bpy.types.Scene, collection: bpy.types.Collection, kind: str, ray: tuple[Vector, Vector] | None = None
+) -> jobs.Job:
+    """Start a job that repeats most of a run's training, with a part of the run held as metal or as paint. `kind` is "metal" or "paint".
+
+    The part is the one that the artist has chosen (`hints.chosen_part`), else the one that a `ray` hits: its origin and its direction, in
+    world space. The result goes into a new folder beside the run. Raises InputError if there is no trainer or no part, or if the run's
+    folder has no checkpoint or its capture is missing.
+    """
+    from .edit import splats_of
+    from .export_run import run_folder
+    from .hints import chosen_part, part_at, write_hint
+
+    trainer, folder = python(), run_folder(collection)
+    if not any((folder / "checkpoints").glob("*.toml")):
+        raise InputError(f"{folder.name} has no checkpoint to train from: import the run as it was trained")
+    capture = _trained_capture(scene, folder)
+    if capture is None or not capture.is_dir():
+        raise InputError(f"the photos of {folder.name} are no longer at {capture}: put them back there")
+    splats = splats_of(collection)
+    points = chosen_part(splats, bpy.context.view_layer.objects.active)
+    if points is None:
+        if ray is None:
+            raise InputError("no part is chosen: click on it, or select its splats as points in Edit Mode")
+        points = part_at(splats, *ray)
+    out = _free(folder, {Path(known.folder) for known in scene.refgs.runs})
+    file = hints_file(out)
+    write_hint(file, kind, points)
+    job = jobs.train(trainer, capture, out, log_file(out.name), mesh=scene.refgs.mesh, hinted=(folder, file))
+    _remember(scene, out, capture)
+    follow_jobs()
     return job
 
 
@@ -243,6 +276,12 @@ def _remember(scene: bpy.types.Scene, run: Path, capture: Path | None = None) ->
     if all(Path(known.folder) != run for known in scene.refgs.runs):
         known = scene.refgs.runs.add()
         known.folder, known.capture = str(run), str(capture or "")
+
+
+def _trained_capture(scene: bpy.types.Scene, run: Path) -> Path | None:
+    """Return the capture that a run was trained on, as the scene's list says, or the run itself. None if neither does."""
+    known = next((known.capture for known in scene.refgs.runs if Path(known.folder) == run), "")
+    return Path(known) if known else capture_of(run)
 
 
 def _capture(scene: bpy.types.Scene) -> Path:

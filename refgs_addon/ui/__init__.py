@@ -9,6 +9,7 @@ from . import (
     decisions_box,
     drop,
     export_menu,
+    hint_buttons,
     icons,
     light_panel,
     materials_panel,
@@ -33,6 +34,7 @@ _MODULES = (
     strokes_panel,
     closing,
     panels,
+    hint_buttons,
 )
 _MODULES += (materials_panel, light_panel, export_menu, drop)
 CLASSES = [cls for module in _MODULES for cls in getattr(module, "CLASSES", ())]

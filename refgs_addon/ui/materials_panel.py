@@ -12,6 +12,7 @@ from ..scene.edit import add_edit, edits, remove_edit
 from ..scene.material_presets import PRESETS, ROOT, materials, remove_material, save_material, set_material
 from ..scene.run_parts import active_run, parts
 from .export_menu import ApplyEdits
+from .hint_buttons import Hint
 from .operators import OnRun, ReportsErrors, select_only
 from .panels import Tab
 
@@ -143,6 +144,10 @@ class MaterialPanel(Tab, bpy.types.Panel):
                 self._edit(layout.box(), edit)
             if edits(splats):
                 layout.operator(ApplyEdits.bl_idname, icon="CHECKMARK")
+
+        row = layout.row(align=True)
+        row.operator(Hint.bl_idname, text="This Part Is Metal", icon="SHADING_RENDERED").kind = "metal"
+        row.operator(Hint.bl_idname, text="This Part Is Paint", icon="SHADING_SOLID").kind = "paint"
 
     def _edit(self, box: bpy.types.UILayout, edit: bpy.types.NodesModifier) -> None:
         row = box.row(align=True)

@@ -34,6 +34,14 @@ def test_a_training_to_its_end(start, tmp_path):
     assert job._process.wait(timeout=10) == 0
 
 
+def test_a_training_with_hints_keeps_the_settings_of_the_run(start, tmp_path):
+    job = start(hinted=(tmp_path / "old", tmp_path / "hints.json"), mesh=False)
+    assert final_state(job) == "done"
+    asked = json.loads((tmp_path / "run" / "started").read_text())
+    told = {"from": str(tmp_path / "old"), "hints": str(tmp_path / "hints.json")}
+    assert asked == {"command": "train", "capture": job.commands[0]["capture"], "out": str(job.run)} | told
+
+
 def test_one_that_is_silent_is_not_waited_for(tmp_path):
     """Check that `poll` returns at once for a job whose process still runs but has closed its output."""
     ends_with_its_input = "import os, sys; print('{}', flush=True); os.close(1); sys.stdin.read(); os._exit(3)"

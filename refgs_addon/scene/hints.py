@@ -1,0 +1,137 @@
+"""Find the part of a run that the artist calls metal or paint, and write it as a hint for the trainer."""
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+from mathutils.kdtree import KDTree
+
+from ..errors import InputError
+from .atomic_file import atomic_write
+from .deleted_splats import points_of
+from .regions import REGION
+
+KINDS = ("metal", "paint")
+HALF = 0.5  # of the light along a ray, which the splats in front let through at the splat that is under the cursor
+SOLID = 0.2  # opacity of splats that make up a surface; fainter ones belong to the part of the nearest solid one
+NEIGHBOURS = 13  # the splat itself is among them
+MOST = 0.6  # of a splat's neighbours that are in a part, above which it belongs there, whatever its normal
+BEND = np.cos(np.radians(15))  # of the normals of two neighbours on a smooth surface; at a crease they differ more
+STEP = 0.35  # sine of the angle between a smooth surface and the line to a neighbour on it
+
+
+def chosen_part(splats: bpy.types.Object, active: bpy.types.Object | None) -> np.ndarray | None:
+    """Return the positions (P, 3) of the splats that the artist has chosen, in the splats' coordinates. Returns None if there are none.
+
+    They are the points that are selected in Edit Mode (see `deleted_splats.add_points`), or those in the box or ball that is the `active`
+    object (see `regions.add_region`).
+    """
+    points = points_of(splats)
+    if points is not None and points.mode == "EDIT":
+        points.update_from_editmode()
+        vertices = points.data.vertices
+        chosen = np.empty(len(vertices), bool)
+        vertices.foreach_get("select", chosen)
+        places = np.empty(3 * len(vertices), np.float32)
+        vertices.foreach_get("co", places)
+        return places.reshape(-1, 3)[chosen] if chosen.any() else None
+    if active is None or REGION not in active or active.type != "EMPTY" or active.empty_display_type == "ARROWS":
+        return None
+    places = _attribute(splats, "position", "vector", 3)
+    matrix = np.array(active.matrix_world.inverted_safe() @ _to_world(splats))
+    inside = np.abs(places @ matrix[:3, :3].T + matrix[:3, 3])
+    inside /= max(active.empty_display_size, 1e-12)
+    chosen = (np.linalg.norm(inside, axis=1) if active.empty_display_type == "SPHERE" else inside.max(axis=1)) <= 1
+    return places[chosen] if chosen.any() else None
+
+
+def part_at(splats: bpy.types.Object, origin: Vector, direction: Vector) -> np.ndarray:
+    """Return the positions (P, 3) of the splats of the part that a ray hits first, in the splats' coordinates.
+
+    The ray is in world space. A part ends at creases: materials do not tell, for they are what may be wrong. Raises InputError if the ray
+    hits no splat.
+    """
+    inverse = _to_world(splats).inverted_safe()
+    seed = _hit(splats, np.array(inverse @ origin), np.array(inverse.to_3x3() @ direction))
+    if seed is None:
+        raise InputError("no splat is under the cursor: click on the part")
+    return _attribute(splats, "position", "vector", 3)[_smooth_part(splats, seed)]
+
+
+def write_hint(file: Path, kind: str, points: np.ndarray) -> None:
+    """Write a file of hints for the trainer: the splats at `points` (P, 3) are of this kind, "metal" or "paint"."""
+    if kind not in KINDS:
+        raise InputError(f"a part cannot be {kind}: choose one of {', '.join(KINDS)}")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(file) as temporary:
+        temporary.write_text(json.dumps({"hints": [{"kind": kind, "points": points.tolist()}]}), encoding="utf-8")
+
+
+def _hit(splats: bpy.types.Object, origin: np.ndarray, direction: np.ndarray) -> int | None:
+    """Find the splat at which half of the light along a ray is blocked, or the last one if less is. None if no splat is hit."""
+    position, scale = (_attribute(splats, name, "vector", 3) for name in ("position", "scale"))
+    w, x, y, z = _attribute(splats, "rotation", "value", 4).T
+    first = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
+    second = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
+    normal = np.cross(first, second)
+    towards = position - origin
+    slope = normal @ direction
+    distance = np.einsum("na,na->n", normal, towards) / np.where(np.abs(slope) < 1e-9, np.inf, slope)
+    offset = distance[:, None] * direction - towards
+    u, v = (np.einsum("na,na->n", offset, axis) / scale[:, i] for i, axis in enumerate((first, second)))
+    alpha = _attribute(splats, "opacity", "value", 1)[:, 0] * np.exp(-0.5 * (u * u + v * v)) * (distance > 0)
+    hit = np.flatnonzero(alpha > 1 / 255)
+    if not len(hit):
+        return None
+    hit = hit[np.argsort(distance[hit])]
+    through = np.cumprod(1 - alpha[hit])
+    return int(hit[min(np.searchsorted(-through, -HALF), len(hit) - 1)])
+
+
+def _smooth_part(splats: bpy.types.Object, seed: int) -> np.ndarray:
+    """Tell which splats (N,) are connected with the splat `seed` by a surface without creases.
+
+    Neighbours are connected if their normals agree, and if the line between them runs along the surface. Splats most of whose neighbours
+    are in the part belong to it, too.
+    """
+    position, normal = (_attribute(splats, name, "vector", 3) for name in ("position", "normal"))
+    solid = _attribute(splats, "opacity", "value", 1)[:, 0] >= SOLID
+    solid[seed] = True
+    rows = np.flatnonzero(solid)
+    tree = KDTree(len(rows))
+    for row in rows:
+        tree.insert(position[row], row)
+    tree.balance()
+    near = np.zeros((len(position), min(NEIGHBOURS, len(rows))), int)
+    near[rows] = [[other for _, other, _ in tree.find_n(position[row], near.shape[1])] for row in rows]
+    part = np.arange(len(position)) == seed
+    front = np.array([seed])
+    while len(front):
+        pairs = np.repeat(front, near.shape[1]), near[front].ravel()
+        line = position[pairs[1]] - position[pairs[0]]
+        line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-12)
+        lifted = np.maximum(*(np.abs(np.einsum("na,na->n", normal[ends], line)) for ends in pairs))
+        smooth = np.einsum("na,na->n", *(normal[ends] for ends in pairs)) > BEND
+        front = np.unique(pairs[1][smooth & (lifted < STEP) & ~part[pairs[1]]])
+        part[front] = True
+    while (gaps := solid & ~part & (part[near].mean(axis=1) > MOST)).any():
+        part |= gaps
+    for row in np.flatnonzero(~solid):
+        part[row] = part[tree.find(position[row])[1]]
+    return part
+
+
+def _to_world(splats: bpy.types.Object) -> Matrix:
+    """Return the matrix from the splats' coordinates to world space. `matrix_world` is old while they are hidden and the mesh is shown."""
+    local = splats.matrix_parent_inverse @ splats.matrix_basis
+    return splats.parent.matrix_world @ local if splats.parent else splats.matrix_basis.copy()
+
+
+def _attribute(splats: bpy.types.Object, name: str, field: str, width: int) -> np.ndarray:
+    """Read an attribute of the splats as float32 (N, width)."""
+    attribute = splats.data.attributes[name]
+    values = np.empty(width * len(attribute.data), np.float32)
+    attribute.data.foreach_get(field, values)
+    return values.reshape(-1, width)

@@ -1,0 +1,74 @@
+"""Define the operator that tells the trainer what a part of a run is made of. A click in the 3D view chooses the part."""
+
+import bpy
+from bpy.props import EnumProperty, FloatVectorProperty
+from bpy_extras.view3d_utils import region_2d_to_origin_3d, region_2d_to_vector_3d
+from mathutils import Vector
+
+from ..scene import training
+from ..scene.run_parts import active_run
+from .operators import OnRun, has_trainer
+
+
+class Hint(OnRun, bpy.types.Operator):
+    """Train again with a hint. Without a chosen part, wait for a click on one."""
+
+    bl_idname = "refgs.hint"
+    bl_label = "This Part Is"
+
+    kind: EnumProperty(name="Material", items=[("metal", "Metal", ""), ("paint", "Paint", "")])
+    origin: FloatVectorProperty(name="Origin", description="Of the ray through the clicked pixel", options={"HIDDEN"})
+    direction: FloatVectorProperty(name="Direction", description="Of this ray; zero without", options={"HIDDEN"})
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return has_trainer(cls) and super().poll(context)
+
+    @classmethod
+    def description(cls, context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        what = {"metal": "metal, such as chrome", "paint": "no metal: paint, plastic, glaze"}[properties.kind]
+        return (
+            f"Train again, where a part is {what}. Click on the part: it is taken up to its creases. "
+            "Or first select its splats in Edit Mode, or the box or ball of a material edit around them"
+        )
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        from ..scene.edit import splats_of
+        from ..scene.hints import chosen_part
+
+        if chosen_part(splats_of(active_run(context)), context.view_layer.objects.active) is not None:
+            return self.execute(context)
+        context.window.cursor_modal_set("EYEDROPPER")
+        context.window_manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if event.type in ("RIGHTMOUSE", "ESC"):
+            context.window.cursor_modal_restore()
+            return {"CANCELLED"}
+        if event.type != "LEFTMOUSE" or event.value != "PRESS":
+            return {"PASS_THROUGH"}  # the view can be turned
+        context.window.cursor_modal_restore()
+        ray = clicked_ray(context.screen, event.mouse_x, event.mouse_y)
+        if ray is None:
+            return {"CANCELLED"}
+        self.origin, self.direction = ray
+        return self.execute(context)
+
+    def work(self, context: bpy.types.Context) -> None:
+        ray = (Vector(self.origin), Vector(self.direction)) if any(self.direction) else None
+        job = training.train_with_hint(context.scene, active_run(context), self.kind, ray)
+        self.report({"INFO"}, f"Training {job.name} with this part as {self.kind}")
+
+
+def clicked_ray(screen: bpy.types.Screen, x: int, y: int) -> tuple[Vector, Vector] | None:
+    """Return the ray through a pixel of the window, as origin and direction in world space. Returns None if no 3D view is there."""
+    regions = [region for area in screen.areas if area.type == "VIEW_3D" for region in area.regions]
+    there = [r for r in regions if r.x <= x < r.x + r.width and r.y <= y < r.y + r.height]
+    if not there or any(region.type != "WINDOW" for region in there):  # the sidebar and the header lie over the view
+        return None
+    region, place = there[0], (x - there[0].x, y - there[0].y)
+    return region_2d_to_origin_3d(region, region.data, place), region_2d_to_vector_3d(region, region.data, place)
+
+
+CLASSES = (Hint,)
