@@ -207,6 +207,10 @@ class LossSettings(_Section):
     )
     matte: float = Field(ge=0, description="penalty of roughness above 0.3")
     light: float = Field(ge=0, description="penalty of a coloured mean of the light")
+    prior: float = Field(
+        ge=0,
+        description="agreement with the capture's normals and depth from other programs, if it has any (docs/photos.md); fades to 0",
+    )
     exposure: float = Field(ge=0, description="penalty of a photo's exposure or white balance that differs from most")
 
 
@@ -323,7 +327,7 @@ def recorded_settings(tables: dict[str, Any], source: str) -> Settings:
     """Complete the settings recorded by a run. Keys that its release did not have yet get the standard preset's values."""
     # Before these keys existed, light was fixed to the world, there were no exposures and no residual, and nothing was left out.
     still = {"light": {"frame": "world", "exposure": "off"}, "residual": {"start": 1.0}}
-    still |= {"cameras": {"poses": "off"}, "image": {"coarse": "off"}}
+    still |= {"cameras": {"poses": "off"}, "image": {"coarse": "off"}, "loss": {"prior": 0.0}}
     still["needs"] = dict.fromkeys(NeedsSettings.model_fields, "on")
     return validate(_merge(_merge(_read_preset("standard"), still), tables), source)
 

@@ -19,7 +19,17 @@ from tests.makers.training import only
 
 DARK, FLAT = 0.1, 0.01
 ALL = LossSettings(
-    dssim=0.2, normal=0.3, smooth=0.4, even=0.25, alpha=0.5, metallic=0.6, dark=0.35, matte=0.7, light=0.0, exposure=0.0
+    dssim=0.2,
+    normal=0.3,
+    smooth=0.4,
+    even=0.25,
+    alpha=0.5,
+    metallic=0.6,
+    dark=0.35,
+    matte=0.7,
+    light=0.0,
+    prior=0.0,
+    exposure=0.0,
 )
 BACKGROUND = torch.tensor([0.2, 0.5, 1.0])
 MAPS = ("color", "normal", "blended_depth", "alpha", "material")

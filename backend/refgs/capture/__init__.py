@@ -11,13 +11,14 @@ import numpy as np
 from refgs.capture.box import Box
 from refgs.capture.cached import load_views, reduced_views, release_memory, remove_cached
 from refgs.capture.cameras import read_cameras, read_run_cameras, write_cameras
-from refgs.capture.colmap import find_model, read_colmap
+from refgs.capture.colmap import find_model, masks_root, read_colmap
 from refgs.capture.files import find_photos
 from refgs.capture.images import LoadedView, load_view
 from refgs.capture.nerf_blender import published_normals, read_nerf_blender
 from refgs.capture.nerfstudio import read_nerfstudio
 from refgs.capture.nero import read_nero
 from refgs.capture.poses import in_frame
+from refgs.capture.priors import load_depth, load_normals, with_priors
 from refgs.capture.region import (
     WHITE_MASKS,
     Region,
@@ -41,6 +42,8 @@ __all__ = [
     "LoadedView",
     "View",
     "find_layout",
+    "load_depth",
+    "load_normals",
     "load_view",
     "load_views",
     "mask_files",
@@ -86,6 +89,7 @@ def read_capture(folder: Path, wanted: RegionSettings | None = None) -> Capture:
     views = _hold_out(views)
     _check_cameras(folder, views)
     views = _unique_names(views)
+    views = with_priors(views, masks_root(find_model(folder)[0]) if layout == "colmap" else folder)
     views, silhouettes, white = _silhouettes(views)
     up = up_direction(views)
     region = find_region(views, up, points, silhouettes)

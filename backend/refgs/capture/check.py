@@ -11,6 +11,7 @@ from PIL import Image
 
 from refgs.capture.cameras import write_cameras
 from refgs.capture.images import LoadedView, load_view
+from refgs.capture.priors import FOLDERS, load_depth, load_normals
 from refgs.capture.types import Z_UP, Capture, View
 from refgs.errors import InputError
 from refgs.paths import whole
@@ -52,8 +53,8 @@ def check(capture: Capture, out: Path) -> dict[str, Any]:
 def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
     """Describe a capture in lines of text. At the end there is a line `Warning: …` for each likely mistake.
 
-    Decodes every photo and mask. If the folder `thumbnails` is given, thumbnails of up to 12 photos are written to it. Raises InputError if
-    photos or masks cannot be read: the message gives their number and the name of the first.
+    Decodes every photo, mask and prior. If the folder `thumbnails` is given, thumbnails of up to 12 photos are written to it. Raises
+    InputError if any of these cannot be read: the message gives their number and the name of the first.
     """
     statistics = _decode_all(capture, thumbnails)
     return [
@@ -62,6 +63,7 @@ def describe(capture: Capture, thumbnails: Path | None = None) -> list[str]:
         _sizes(capture),
         _lenses(capture),
         _masks(capture, statistics),
+        *_priors(capture),
         *_guessed_object(capture),
         _poses(capture),
         _extent(capture),
@@ -124,6 +126,7 @@ def _decode_all(capture: Capture, thumbnails: Path | None) -> list[_Statistics]:
     for number, view in enumerate(capture.views):
         try:
             loaded = load_view(view, 512)
+            load_normals(view), load_depth(view)
         except InputError as error:
             broken.append(str(error))
             continue
@@ -158,6 +161,15 @@ def _masks(capture: Capture, statistics: list[_Statistics]) -> str:
     return (
         f"Masks: {len(coverage)} views ({kind}), covering {_span([100 * c for c in coverage], '.0f')} % of the picture"
     )
+
+
+def _priors(capture: Capture) -> list[str]:
+    """Say for how many photos there are normals and depth from other programs. Return no line if there are none."""
+    lines = []
+    for name, field in FOLDERS.items():
+        if count := sum(getattr(view, field) is not None for view in capture.train_views):
+            lines.append(f"{name.capitalize()}: for {count} of {len(capture.train_views)} views to train on")
+    return lines
 
 
 def _guessed_object(capture: Capture) -> list[str]:

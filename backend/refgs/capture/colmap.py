@@ -50,7 +50,7 @@ def read_colmap(photos: Path, model: Path) -> tuple[list[View], np.ndarray | Non
 
     found = [(image, find_image(photos / image.name, any_suffix=True)) for image in images]
     report_missing(images_file, [f"{photos.name}/{i.name}" for i, path in found if path is None], len(found))
-    masks = Masks(photos if (photos / "sparse").is_dir() else photos.parent)
+    masks = Masks(masks_root(photos))
     views = []
     for image, path in found:
         where = f"{images_file}, image {image.name}"
@@ -59,6 +59,11 @@ def read_colmap(photos: Path, model: Path) -> tuple[list[View], np.ndarray | Non
         mask = masks.find(path, None, where)
         views.append(photo_view(path, _camera(image, cameras[image.camera_id], where), "train", mask, where))
     return views, points, colors
+
+
+def masks_root(photos: Path) -> Path:
+    """Return the folder in which the folder `masks` lies: the one that also has `sparse`. `photos` is the folder of the photos."""
+    return photos if (photos / "sparse").is_dir() else photos.parent
 
 
 def _camera(image: Image, intrinsics: Intrinsics, where: str) -> tuple[Camera, Lens | None]:

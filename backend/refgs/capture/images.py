@@ -124,11 +124,11 @@ def read_image(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | No
     `shrink` may be 2, 4 or 8: a JPEG is decoded at that fraction of its size, or a larger one that divides its sides, and RAW at half its
     size. Raises InputError naming the file if it is truncated or unreadable.
     """
-    image, alpha, white = _read_codes(path, shrink)
+    image, alpha, white = read_codes(path, shrink)
     return _as_bytes(image, white), alpha
 
 
-def _read_codes(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | None, int]:
+def read_codes(path: Path, shrink: int = 1) -> tuple[np.ndarray, np.ndarray | None, int]:
     """Decode an image file to RGB codes (H, W, 3), uint8 or uint16 as the file has them, alpha (H, W) uint8 or None, and white's code.
 
     The arguments and errors are those of `read_image`.
@@ -227,7 +227,7 @@ def load_view(view: View, max_side: int | None = None) -> LoadedView:
         raise InputError(f"{view.image_path}: the photo changed its size since the capture was read. Start again.")
     fitted = camera.fitted(max_side) if max_side else camera
     shrink = next(n for n in (8, 4, 2, 1) if n == 1 or n * SPARE * fitted.width <= camera.width)
-    image, own_alpha, white = _read_codes(view.image_path, shrink)
+    image, own_alpha, white = read_codes(view.image_path, shrink)
     alpha = own_alpha if view.has_alpha else None
     if view.mask_path is not None:
         alpha = read_alpha(view)

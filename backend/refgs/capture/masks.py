@@ -23,7 +23,7 @@ from refgs.camera import Camera
 from refgs.capture import View, load_view, mask_files, read_capture
 from refgs.capture.backdrop import Backdrop, find_plane
 from refgs.capture.box import Box
-from refgs.capture.colmap import find_model
+from refgs.capture.colmap import find_model, masks_root
 from refgs.capture.images import read_image
 from refgs.capture.lens import Lens
 from refgs.capture.region import LOOK_OUT, WHITE_MASKS, find_region, sample_silhouettes, up_direction
@@ -196,8 +196,7 @@ def _root(capture: Capture) -> Path:
         )
     if capture.layout != "colmap":
         return capture.folder
-    photos = find_model(capture.folder)[0]
-    return photos if (photos / "sparse").is_dir() else photos.parent
+    return masks_root(find_model(capture.folder)[0])
 
 
 def _inner(view: View, root: Path) -> Path:

@@ -24,6 +24,7 @@ class View:
     - `mask_path` is a mask file. Without one, `has_alpha` tells that the photo's own alpha channel is the mask.
     - `mask_below` is set if the mask file is a depth map. The object is where depth is below this fraction of the largest possible value.
     - `normal_path` is an image of the true normals, if the data set has them (see `published_normals`).
+    - `prior_normals` and `prior_depth` are files of what another program guessed from a training photo (see `capture/priors.py`).
     """
 
     camera: Camera
@@ -34,6 +35,8 @@ class View:
     has_alpha: bool = False
     mask_below: float | None = None
     normal_path: Path | None = None
+    prior_normals: Path | None = None
+    prior_depth: Path | None = None
 
     @property
     def masked(self) -> bool:

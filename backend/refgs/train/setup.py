@@ -11,7 +11,7 @@ from refgs.capture import Capture
 from refgs.events import Report
 from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters, activate
-from refgs.train import coarse, light, needs, poses
+from refgs.train import coarse, light, needs, poses, priors
 from refgs.train.effective import Effective
 from refgs.train.guard import limits
 from refgs.train.light_frame import light_frame
@@ -39,6 +39,7 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     size = object_size(state)
     limit_surfels(state, size.area)
     coarse.begin(state, size.span)
+    priors.start(state)
     return state
 
 

@@ -52,6 +52,18 @@ class Reduced(NamedTuple):
     crops: list[tuple[slice, slice]] | None
 
 
+class Priors(NamedTuple):
+    """Hold what other programs guessed from the training views' photos (see `train/priors.py`), by the view's number.
+
+    A guess is a map and the photo's camera for its size: `normals` int8 (H, W, 3) in the camera's axes, and `depth` float32 (H, W) of any
+    scale and shift, which is a `disparity` for all views or for none. Both are 0 where nothing is known.
+    """
+
+    normals: dict[int, tuple[Tensor, Camera]]
+    depth: dict[int, tuple[Tensor, Camera]]
+    disparity: bool
+
+
 class State:
     """Hold the state of a training: the capture, the parameters that it learns, and the decisions that it has made.
 
@@ -76,6 +88,7 @@ class State:
             None  # the parts of the photos that are trained on; None: all of them
         )
 
+        self.priors = Priors({}, {}, False)
         self.stages: tuple[Stage, ...] = FULL  # of the training, by its photos' sizes
         self.reduced: Reduced | None = None  # photos that are trained on in an earlier stage; None: full photos
 

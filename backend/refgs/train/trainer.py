@@ -12,7 +12,7 @@ from refgs.compare.metrics import decibels
 from refgs.events import Report
 from refgs.memory import trim
 from refgs.settings import Settings
-from refgs.train import coarse, densify, even_metal, exposures, history, light, metals, needs, poses, snapshot
+from refgs.train import coarse, densify, even_metal, exposures, history, light, metals, needs, poses, priors, snapshot
 from refgs.train.effective import Effective
 from refgs.train.guard import Guard, running, warn
 from refgs.train.losses import departure, objective
@@ -64,6 +64,8 @@ class Trainer:
         loss, square = objective(rendering, mean, photo, state.background, state.losses, progress)
         if state.exposures is not None:
             loss = loss + state.settings.loss.exposure * departure(state.exposures[view])
+        if (leaning := priors.loss(state, view, rendering, photo, progress)) is not None:
+            loss = loss + leaning
         loss.backward()
         metals.hold(state)
         accepted, position = self.guard.judge(loss, state.optimizer), state.parameters["position"]

@@ -1,0 +1,186 @@
+"""Read normals and depth that other programs guessed from single photos: priors, which training only leans on.
+
+They are files in the folders `normals` and `depth`, beside the folder `masks`. A file has its photo's name, as a mask has. Words that such
+programs append are allowed, as in `0001_pred.npy` for the photo `0001.jpg`.
+"""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from refgs.camera import Camera
+from refgs.capture.files import PICTURE_SUFFIXES
+from refgs.capture.images import read_codes
+from refgs.capture.reduce import reduced_map
+from refgs.capture.types import View
+from refgs.errors import InputError
+from refgs.formats.exr import read_exr
+
+FOLDERS = {"normals": "prior_normals", "depth": "prior_depth"}  # and the field of a view that has the path
+SUFFIXES = (
+    ".npy",
+    ".npz",
+    ".exr",
+    *PICTURE_SUFFIXES,
+)  # of two files for a photo, the one whose suffix comes first is read
+SIDE = 512  # pixels of a prior on its longer side: programs guess it from photos of this size or so
+SHAPE = (
+    0.02  # of the ratio of width and height, by which that of a prior may differ from its photo's: sizes are rounded
+)
+UNIT = 0.5, 1.4  # lengths of an encoded unit vector, blurred or rounded; black and white have 1.73, grey has 0
+GREY = 0.02  # difference of a grey picture's channels at the most, of 1; JPEG does not keep them equal
+
+
+class Prior(NamedTuple):
+    """Hold a prior of one photo, undistorted and reduced: values (H, W) or (H, W, 3), and where they are known (H, W).
+
+    Values are float32, and 0 where they are not known. `camera` is the photo's camera for this size.
+    """
+
+    values: np.ndarray
+    known: np.ndarray
+    camera: Camera
+
+
+def with_priors(views: list[View], root: Path) -> list[View]:
+    """Add the paths of priors to the training views. The folders `normals` and `depth` are looked for in the folder `root`.
+
+    No file is opened. Files that have no photo's name are ignored.
+    """
+    for folder, field in FOLDERS.items():
+        if (root / folder).is_dir():
+            found = _find(views, root, root / folder)
+            views = [replace(view, **{field: found.get(view)}) for view in views]
+    return views
+
+
+def _find(views: list[View], root: Path, folder: Path) -> dict[View, Path]:
+    """Return the file of each training view that has any in `folder`. Of several, take the one whose suffix comes first in SUFFIXES.
+
+    As for masks, the first folder of a photo's path may be left out: `0001.png` is for `images/0001.jpg`. A name that two training photos
+    could have is for none, and one that only a held-out photo has is for that.
+    """
+    named: dict[str, list[View]] = {}
+    for view in sorted(views, key=lambda view: view.split != "train"):
+        parts = view.image_path.relative_to(root).parts if view.image_path.is_relative_to(root) else ()
+        for path in (Path(*some) for some in (parts, parts[1:]) if some):
+            for name in (path.as_posix(), path.with_suffix("").as_posix()):
+                others = named.setdefault(name, [])
+                if view.split == "train" or not others:
+                    others.append(view)
+    found: dict[View, list[Path]] = {}
+    for file in sorted(folder.rglob("*")):
+        if file.suffix.lower() in SUFFIXES:
+            name = file.relative_to(folder).as_posix().removesuffix(file.suffix)
+            while name not in named and (shorter := re.sub(r"[-_.][^-_./]*$", "", name)) != name:
+                name = shorter
+            if len(named.get(name, ())) == 1 and named[name][0].split == "train":
+                found.setdefault(named[name][0], []).append(file)
+    return {view: min(files, key=_preference) for view, files in found.items()}
+
+
+def _preference(file: Path) -> tuple[int, int]:
+    return SUFFIXES.index(file.suffix.lower()), len(file.name)
+
+
+def load_normals(view: View) -> Prior | None:
+    """Load the guessed normals of a view as unit vectors (H, W, 3), or return None if it has none.
+
+    They have the axes of the file, which are not known: x may point right or left, and so on. Raises InputError naming the file.
+    """
+    path = view.prior_normals
+    if path is None:
+        return None
+    values = _read(path, 3)
+    if values.min() >= 0:  # encoded: real vectors do not all point into one octant
+        values = 2 * values - 1
+    length = np.linalg.norm(values, axis=2)
+    known = (length > UNIT[0]) & (length < UNIT[1])
+    if not known.any():
+        raise InputError(f"{path}: there are no normals in it. Save unit vectors, in pictures as (n + 1) / 2.")
+    values = values / np.maximum(length, UNIT[0])[..., None]
+    mean, known, camera = _fitted(path, view, values, known)
+    length = np.linalg.norm(mean, axis=2)
+    known &= length > UNIT[0]
+    return Prior(np.where(known[..., None], mean / np.maximum(length, UNIT[0])[..., None], 0), known, camera)
+
+
+def load_depth(view: View) -> Prior | None:
+    """Load the guessed depth or disparity of a view (H, W), or return None if it has none.
+
+    Its scale and what its zero means are not known; 0 itself is taken for no value. Raises InputError naming the file.
+    """
+    path = view.prior_depth
+    if path is None:
+        return None
+    values = _read(path, 1)
+    known = values > 0
+    if not known.any() or values[known].min() == values.max():
+        raise InputError(f"{path}: there is no depth in it: all values are the same. Save it again.")
+    return Prior(*_fitted(path, view, np.where(known, values, 0), known))
+
+
+def _read(path: Path, channels: int) -> np.ndarray:
+    """Read a file of `channels` numbers a pixel as float32: (H, W, 3), or (H, W) for one. What is not finite or transparent becomes 0.
+
+    Values of integers are divided by the largest of their type.
+    """
+    if path.suffix.lower() in (".npy", ".npz"):
+        values = _read_array(path, channels)
+    elif path.suffix.lower() == ".exr":
+        values = read_exr(path)
+        values = values[..., :3] if values.ndim == 3 else values[..., None]
+    else:
+        codes, alpha, white = read_codes(path)
+        values = codes.astype(np.float32) / white
+        if alpha is not None:
+            values[alpha < 128] = 0
+    values = np.nan_to_num(values, posinf=0, neginf=0)
+    if values.shape[2] == 3 and channels == 1:
+        if np.ptp(values, axis=2).max() > GREY:
+            raise InputError(f"{path}: the depth is in false colours. Save it in grey.")
+        values = values[..., :1]
+    if values.shape[2] != channels:
+        raise InputError(f"{path}: it has {values.shape[2]} channels where there should be {channels}. Save it again.")
+    return values if channels > 1 else values[..., 0]
+
+
+def _read_array(path: Path, channels: int) -> np.ndarray:
+    """Read NumPy's file of one array as float32 (H, W, C). The array may be (C, H, W), and have more axes of length 1."""
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if not isinstance(loaded, np.ndarray):
+            loaded = next(iter(loaded.values()))
+        values = loaded.astype(np.float32)
+    except Exception as error:
+        raise InputError(f"{path}: NumPy cannot read an array from it. Save it again.") from error
+    if np.issubdtype(loaded.dtype, np.integer):
+        values /= np.iinfo(loaded.dtype).max
+    values = values.squeeze()
+    if channels == 1 and values.ndim == 2:
+        return values[..., None]
+    if values.ndim != 3 or channels not in (values.shape[0], values.shape[2]):
+        shape = "×".join(map(str, loaded.shape))
+        raise InputError(f"{path}: an array of {shape} is no map of {channels} numbers a pixel. Save one a file.")
+    return values if values.shape[2] == channels else values.transpose(1, 2, 0)
+
+
+def _fitted(path: Path, view: View, values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, Camera]:
+    """Reduce a prior to at most SIDE pixels, and undistort it as its photo. Return it, where it is known, and the camera for its size."""
+    height, width = known.shape
+    camera = view.camera
+    if abs(width / height * camera.height / camera.width - 1) > SHAPE:
+        raise InputError(
+            f"{path}: it has {width}×{height} pixels, which is not the shape of the photo ({camera.width}×{camera.height}). "
+            "Make it from the whole photo, upright."
+        )
+    small = camera.fitted(min(SIDE, max(width, height)))
+    mean, weight = reduced_map(values, known, small)
+    if view.lens is not None:
+        maps = view.lens.resized(small.width / camera.width, small.height / camera.height).maps(small)
+        mean, weight = (cv2.remap(each, *maps, cv2.INTER_LINEAR) for each in (mean, weight))
+    return mean, weight > 0.5, small

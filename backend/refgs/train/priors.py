@@ -1,0 +1,247 @@
+"""Lean on normals and depth that other programs guessed from single photos, early in the training.
+
+Photos of mirrors and hollows can also be explained by wrong shapes, such as the visual hull's lid over a bowl. What a network guesses from
+one photo knows of bowls. It is wrong in detail, and its depth has no scale. So its terms of the loss saturate, and fade to nothing: photos
+have the last word.
+
+Programs write normals with different axes. The ones that agree best with the surfels at the start are taken, for all views alike. Depth
+is fitted to what is rendered, by a scale and a shift a view, each time that it is used.
+"""
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from refgs.camera import Camera
+from refgs.capture import load_depth, load_normals
+from refgs.capture.poses import split_similarity
+from refgs.render.rendering import Rendering
+from refgs.train.losses import Photo
+from refgs.train.state import Priors, State, spread
+
+FADED = 0.6  # part of the training after which priors have no weight
+VIEWS = 16  # that are looked at to find what the files mean, at the most
+OUTLINE = 80  # part of a photo's side that counts as near an outline
+AGREES = 0.35  # least correlation across the view, near outlines: of a bowl 0.58, with 15° of noise 0.48; of other scenes' normals 0.32
+WRONG = 0.5  # 1 − cosine of a normal that is as likely wrong as the surface: its pull is a quarter
+FAR = 0.1  # distance, in scene radii, of a depth that is as likely wrong as the surface
+ROUNDS = 3  # of reweighting in the fit of depth
+SOLID = 0.5  # alpha
+CODE = 127  # of a component of 1 in a map of normals
+
+
+def start(state: State) -> None:
+    """Load the priors of the training views, and find out what they mean: the axes of normals, and whether depth is a disparity.
+
+    They are used only if all photos have masks: else nothing is known of the shape to compare them with.
+    """
+    given = {view.camera.name: view for view in state.capture.train_views if view.prior_normals or view.prior_depth}
+    if state.settings.loss.prior == 0 or not given:
+        return
+    if not state.from_hull:
+        state.announce("priors", "without normals or depth from elsewhere: not every photo has a mask of the object")
+        return
+    with state.clock.part("start"):
+        found = Priors({}, {}, False)
+        for index, view in enumerate(state.views):
+            if (files := given.get(view.camera.name)) is None:
+                continue
+            if (prior := load_normals(files)) is not None:
+                codes = torch.from_numpy(np.rint(CODE * prior.values).astype(np.int8))
+                found.normals[index] = codes.to(state.device), prior.camera
+            if (prior := load_depth(files)) is not None:
+                found.depth[index] = torch.from_numpy(prior.values).to(state.device), prior.camera
+        state.priors = Priors(_with_axes(state, found.normals), *_with_kind(state, found.depth))
+
+
+def loss(state: State, view: int, rendering: Rendering, photo: Photo, progress: float) -> Tensor | None:
+    """Compute the loss of a view's priors. Return None if it has none, or if they have faded.
+
+    `rendering` is the picture of the `photo` of the view. `progress` is 0 at the start of the training and 1 at its end. As in `objective`,
+    the loss is a mean over the pixels of the whole photo.
+    """
+    weight, priors = state.settings.loss.prior * fade(progress), state.priors
+    terms = []
+    if weight > 0 and view in priors.normals:
+        terms.append(normals_loss(rendering, photo, *priors.normals[view]))
+    if weight > 0 and view in priors.depth:
+        terms.append(depth_loss(rendering, photo, *priors.depth[view], priors.disparity, state.capture.radius))
+    return weight * sum(terms) if terms else None
+
+
+def fade(progress: float) -> float:
+    """Return the part of their weight that priors have at a progress of 0..1: half a wave of a cosine, from 1 to 0 at FADED."""
+    return 0.5 + 0.5 * math.cos(math.pi * min(progress / FADED, 1.0))
+
+
+def normals_loss(rendering: Rendering, photo: Photo, codes: Tensor, camera: Camera) -> Tensor:
+    """Compute how far rendered normals are from guessed ones: a scalar.
+
+    `codes` (H, W, 3) int8 are unit vectors times CODE in the axes of a camera (x right, y down, z forward), 0 where not known. `camera` is
+    the photo's for their size. The loss of a pixel is e / (e + WRONG), where e is 1 − the cosine: it saturates.
+    """
+    guessed = at_pixels(codes, camera, photo.camera).to(rendering.normal) / CODE
+    counts = _counts(rendering, photo) * (guessed.square().sum(dim=-1) > 0.5)
+    turn = torch.from_numpy(photo.camera.world_to_camera[:3, :3].copy()).to(guessed)
+    return _saturating(1 - _cosine(rendering.normal @ turn.T, guessed), WRONG, counts, photo)
+
+
+def depth_loss(
+    rendering: Rendering, photo: Photo, guessed: Tensor, camera: Camera, disparity: bool, radius: float
+) -> Tensor:
+    """Compute how far rendered depth is from guessed depth (H, W), or disparity, that is scaled and shifted to fit it best: a scalar.
+
+    Guesses are 0 where not known. `camera` is the photo's for their size. The loss of a pixel is r² / (r² + FAR²), where r is the distance
+    in scene radii: it saturates.
+    """
+    guessed, depth = at_pixels(guessed, camera, photo.camera), rendering.depth
+    counts = _counts(rendering, photo) * (guessed > 0)
+    guessed = torch.where(counts > 0, guessed, 0)  # a far background would overflow
+    target, fits = fitted(guessed, depth.detach(), counts, disparity, radius)
+    return _saturating(((depth - target) / radius).square(), FAR**2, counts * fits, photo)
+
+
+def at_pixels(values: Tensor, camera: Camera, pixels: Camera) -> Tensor:
+    """Look up a map (H, W, …) of `camera` at the pixels of another camera in the same place, of another size, or of a crop. Nearest."""
+    found = []
+    for axis, (size, focal, centre) in enumerate((("height", "fy", "cy"), ("width", "fx", "cx"))):
+        offset = torch.arange(getattr(pixels, size), device=values.device) + (0.5 - getattr(pixels, centre))
+        place = offset * (getattr(camera, focal) / getattr(pixels, focal)) + getattr(camera, centre)
+        found.append(place.long().clamp(0, values.shape[axis] - 1))
+    return values[found[0]][:, found[1]]
+
+
+def fitted(guessed: Tensor, depth: Tensor, counts: Tensor, disparity: bool, radius: float) -> tuple[Tensor, Tensor]:
+    """Scale and shift guessed depth or disparity (H, W) to fit `depth` (H, W) best, by robust least squares.
+
+    Pixels are weighted by `counts`, and by less the farther they are from the fit (Cauchy's weights, at FAR scene radii). Returns the depth
+    (H, W), and a scalar: 1, or 0 if the guess falls where depth rises. No gradients.
+    """
+    wanted = 1 / depth.clamp_min(1e-6 * radius) if disparity else depth
+    weight = counts
+    for _ in range(ROUNDS):
+        total = weight.sum().clamp_min(1e-6)
+        means = (weight * guessed).sum() / total, (weight * wanted).sum() / total
+        apart = guessed - means[0], wanted - means[1]
+        slope = (weight * apart[0] * apart[1]).sum() / (weight * apart[0].square()).sum().clamp_min(1e-12)
+        found = means[1] + slope * apart[0]
+        if disparity:
+            found = 1 / found.clamp_min(1e-6 / radius)
+        weight = counts / (1 + ((found - depth) / (FAR * radius)).square())
+    return found, (slope > 0).to(depth)
+
+
+def axes_of(pairs: Iterable[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor | None, float]:
+    """Find the axes of guessed normals. Each of `pairs` has three sets of unit vectors (P, 3), all seen by one camera:
+
+    - those of the surface, in the camera's axes (x right, y down, z forward)
+    - the guessed ones, as they are in the file
+    - the guessed ones turned to the camera's axes, as if those in the file were in world space
+
+    Returns the signs (3,) by which the file's x, y and z have to be multiplied, None if they are in world space, whichever gives the larger
+    mean cosine. Also returns how well x and y agree then: the smaller of their correlations.
+    """
+    sums = torch.zeros(2, 3, 3, dtype=torch.float64)
+    for seen, *guesses in pairs:
+        for row, guess in zip(sums, guesses, strict=True):
+            products = torch.stack([seen * guess, seen.square(), guess.square()]).double()
+            row += products.sum(dim=1).cpu()
+    together, ours, theirs = sums.unbind(dim=1)
+    across = together[:, :2] / (ours * theirs)[:, :2].sqrt().clamp_min(1e-12)
+    if together[0].abs().sum() >= together[1].sum():
+        return together[0].sign(), float(across[0].abs().min())
+    return None, float(across[1].min())
+
+
+def _with_axes(state: State, normals: dict[int, tuple[Tensor, Camera]]) -> dict[int, tuple[Tensor, Camera]]:
+    """Return the maps of normals in the axes of their cameras, or none if it is not clear which axes they have."""
+    if not normals:
+        return {}
+    turn = split_similarity(state.capture.to_capture)[1]
+
+    def to_camera(view: int) -> Tensor:
+        """Return the rotation (3, 3) from the capture's world to the view's camera."""
+        return torch.from_numpy(state.views[view].camera.world_to_camera[:3, :3] @ turn.T).to(state.device).float()
+
+    def pairs() -> Iterable[tuple[Tensor, Tensor, Tensor]]:
+        for view in spread([*normals], VIEWS):
+            photo = state.photo(view)
+            rendering = state.render(photo.camera)
+            guessed = at_pixels(*normals[view], photo.camera).float() / CODE
+            chosen = _near_outline(photo.mask) & (rendering.alpha > SOLID) & (guessed.square().sum(dim=-1) > 0.5)
+            rotation = torch.from_numpy(photo.camera.world_to_camera[:3, :3].copy()).to(guessed)
+            seen = torch.nn.functional.normalize(rendering.normal[chosen], dim=-1) @ rotation.T
+            yield seen, guessed[chosen], guessed[chosen] @ to_camera(view).T
+
+    signs, agreement = axes_of(pairs())
+    count = f"normals from elsewhere for {len(normals)} of {len(state.views)} photos"
+    if agreement < AGREES:
+        why = f"they do not agree with the outlines, whatever their axes are (correlation {agreement:.2f})"
+        state.announce("prior normals", f"without {count}: {why}")
+        return {}
+    if signs is None:
+        axes = "in world space"
+        normals = {
+            view: ((codes.float() @ to_camera(view).T).round().to(torch.int8), camera)
+            for view, (codes, camera) in normals.items()
+        }
+    else:
+        words = ("left", "right"), ("up", "down"), ("to the camera", "away")
+        named = (pair[int(sign > 0)] for pair, sign in zip(words, signs, strict=True))
+        axes = ", ".join(f"{axis} {word}" for axis, word in zip("xyz", named, strict=True))
+        by = signs.to(state.device, torch.int8)
+        normals = {view: (codes * by, camera) for view, (codes, camera) in normals.items()}
+    state.announce("prior normals", f"with {count}: {axes} (correlation with the outlines {agreement:.2f})")
+    return normals
+
+
+def _near_outline(mask: Tensor) -> Tensor:
+    """Tell which pixels (H, W) of a mask lie just inside its outline: there the visual hull has the surface's normals, over a bowl, too."""
+    shown = (mask > 127).float()[None]
+    reach = max(1, max(mask.shape) // OUTLINE)
+    deep = -torch.nn.functional.max_pool2d(-shown, 2 * reach + 1, stride=1, padding=reach)
+    return (shown > deep)[0]
+
+
+def _with_kind(state: State, depth: dict[int, tuple[Tensor, Camera]]) -> tuple[dict[int, tuple[Tensor, Camera]], bool]:
+    """Return the maps of depth, or none if they are unlike that of the surfels at the start; and whether they are disparities.
+
+    Disparity falls where depth rises: its correlation with depth is negative.
+    """
+    if not depth:
+        return {}, False
+    found = []
+    for view in spread([*depth], VIEWS):
+        photo = state.photo(view)
+        rendering = state.render(photo.camera)
+        guessed = at_pixels(*depth[view], photo.camera)
+        chosen = (_counts(rendering, photo) > SOLID) & (guessed > 0)
+        pair = torch.stack([guessed[chosen], rendering.depth[chosen]]).double()
+        found.append(float(pair.corrcoef()[0, 1].nan_to_num()) if pair.shape[1] > 1 else 0.0)
+    agreement, count = sum(found) / len(found), f"depth from elsewhere for {len(depth)} of {len(state.views)} photos"
+    if abs(agreement) < AGREES:
+        why = f"it neither rises nor falls with that of the outlines' shape (correlation {agreement:.2f})"
+        state.announce("prior depth", f"without {count}: {why}")
+        return {}, False
+    kind = "a disparity" if agreement < 0 else "a depth"
+    state.announce("prior depth", f"with {count}: {kind} (correlation with the outlines' shape {agreement:.2f})")
+    return depth, agreement < 0
+
+
+def _counts(rendering: Rendering, photo: Photo) -> Tensor:
+    """Return how much each pixel (H, W) counts: the mask's alpha where the surface is opaque, else 0."""
+    opaque = (rendering.alpha.detach() > SOLID).float()
+    return opaque if photo.mask is None else opaque * (photo.mask.float() / 255)
+
+
+def _cosine(one: Tensor, other: Tensor) -> Tensor:
+    return torch.nn.functional.cosine_similarity(one, other, dim=-1)
+
+
+def _saturating(error: Tensor, half: float, counts: Tensor, photo: Photo) -> Tensor:
+    """Average error / (error + half) over the whole photo, weighted by `counts`."""
+    rows, columns = photo.whole or photo.image.shape[:2]
+    return (counts * error / (error + half)).sum() / (rows * columns)
