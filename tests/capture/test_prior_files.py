@@ -143,6 +143,16 @@ def test_depth_is_read_from_each_format(tmp_path, name):
     assert prior.known[10:].all() and not prior.known[:10].any()
 
 
+def test_unknown_depth_does_not_mix_with_known_one(tmp_path):
+    nerfstudio(tmp_path)
+    edit(tmp_path / "transforms.json", lambda data: data.update(k1=0.3, k2=0.05))
+    depth = np.zeros((3 * HEIGHT, 3 * WIDTH), np.float32)
+    depth[20:, 31:] = 2.0
+    put(tmp_path, "depth/0001.npy", depth + np.linspace(0, 0.1, 3 * WIDTH, dtype=np.float32) * (depth > 0))
+    prior = load_depth(first(tmp_path))
+    assert prior.known.any() and prior.values[prior.known].min() >= 2 - 1e-4 and not prior.values[~prior.known].any()
+
+
 RAINBOW = cv2.applyColorMap(np.tile(np.arange(64, dtype=np.uint8) * 4, (48, 1)), cv2.COLORMAP_TURBO)
 
 

@@ -21,16 +21,9 @@ from refgs.errors import InputError
 from refgs.formats.exr import read_exr
 
 FOLDERS = {"normals": "prior_normals", "depth": "prior_depth"}  # and the field of a view that has the path
-SUFFIXES = (
-    ".npy",
-    ".npz",
-    ".exr",
-    *PICTURE_SUFFIXES,
-)  # of two files for a photo, the one whose suffix comes first is read
+SUFFIXES = (".npy", ".npz", ".exr", *PICTURE_SUFFIXES)  # the first is preferred
 SIDE = 512  # pixels of a prior on its longer side: programs guess it from photos of this size or so
-SHAPE = (
-    0.02  # of the ratio of width and height, by which that of a prior may differ from its photo's: sizes are rounded
-)
+SHAPE = 0.02  # part by which a prior's ratio of width and height may differ from its photo's: sizes are rounded
 UNIT = 0.5, 1.4  # lengths of an encoded unit vector, blurred or rounded; black and white have 1.73, grey has 0
 GREY = 0.02  # difference of a grey picture's channels at the most, of 1; JPEG does not keep them equal
 
@@ -180,7 +173,12 @@ def _fitted(path: Path, view: View, values: np.ndarray, known: np.ndarray) -> tu
         )
     small = camera.fitted(min(SIDE, max(width, height)))
     mean, weight = reduced_map(values, known, small)
+    known = weight > 0.5
     if view.lens is not None:
         maps = view.lens.resized(small.width / camera.width, small.height / camera.height).maps(small)
-        mean, weight = (cv2.remap(each, *maps, cv2.INTER_LINEAR) for each in (mean, weight))
-    return mean, weight > 0.5, small
+        mean[~known] = 0
+        mean, share = (cv2.remap(each, *maps, cv2.INTER_LINEAR) for each in (mean, known.astype(np.float32)))
+        mean /= np.maximum(share if mean.ndim == 2 else share[..., None], 1e-6)
+        known = share > 0.5
+    mean[~known] = 0
+    return mean, known, small
