@@ -93,7 +93,7 @@ class Transport:
         ways, points = sphere(directions), surfels.positions.double().numpy()
         normals, mesh = surfels.normals().double().numpy(), occluder.mesh
         material = [surfels.albedo, surfels.metallic[:, None], surfels.roughness[:, None]]
-        self._to_mesh = _blend(surfels, normals, mesh.vertices, smooth_normals(mesh.vertices, mesh.faces))
+        self._to_mesh = blend(surfels, normals, mesh.vertices, smooth_normals(mesh.vertices, mesh.faces))
         self.material = self.at_vertices(torch.cat(material, dim=1))  # (V, 5)
         self.vertex_normals = _unit(self._to_mesh @ normals)
         self.directions, self.normals = torch.from_numpy(ways).float(), torch.from_numpy(normals).float()
@@ -142,7 +142,7 @@ class Transport:
             yield slice(start, end), rays, torch.arange(end - start).repeat_interleave(count)
 
 
-def _blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: np.ndarray) -> sparse.csr_matrix:
+def blend(surfels: Surfels, normals: np.ndarray, points: np.ndarray, outward: np.ndarray) -> sparse.csr_matrix:
     """Compute the weights (P, N) by which values of the surfels are interpolated to `points` (P, 3). Each row sums to one.
 
     The points lie on a surface with normals `outward` (P, 3). Near surfels that face the same way have the largest weights.
@@ -189,8 +189,8 @@ def received(surfels: Surfels, occluder: Occluder, light: Environment) -> Tensor
     found, _ = _gather(traced, light, BOUNCES)
     part = (found / light.diffuse(traced.normals).clamp_min(1e-6)).clamp_max(MOST_RECEIVED)
     wide = probes._replace(scales=probes.scales * math.sqrt(len(positions) / len(chosen)))
-    blend = _blend(wide, traced.normals.double().numpy(), positions, surfels.normals().double().numpy())
-    return torch.from_numpy(blend @ part.numpy())
+    weights = blend(wide, traced.normals.double().numpy(), positions, surfels.normals().double().numpy())
+    return torch.from_numpy(weights @ part.numpy())
 
 
 def _gather(transport: Transport, light: Environment, bounces: int) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,7 @@ again, since roughness, light and base colour explain rough metal and paint abou
 import torch
 
 from refgs.model.surfels import raw_metallic
-from refgs.train import needs
+from refgs.train import mirrored, needs, same_material
 from refgs.train.changing_light import explained
 from refgs.train.needs.materials import SOONEST
 from refgs.train.state import State
@@ -23,6 +23,7 @@ MOSTLY = 0.6  # part of what is coloured that shines, above which what is dark m
 TELLING = (
     0.3  # part of the surface that is coloured, below which it tells nothing about the rest; a bronze head has 0.48
 )
+TOLD = 0.005  # part of the surface, above which a change is announced
 KINDS = "metal", "paint"  # what a surfel can be held as
 HELD = torch.tensor(
     [raw_metallic(0.98), raw_metallic(0.002)]
@@ -42,11 +43,8 @@ def set_metals_due(state: State, progress: float) -> None:
 
     Schedules that propagate normals find metals by that, as the paper does: nothing is set there.
     """
-    settings = state.settings
-    early = progress - settings.initial.until < KNOWN or state.iteration < SOONEST
-    if state.metals_set or early or progress >= state.residual_start:
-        return
-    if settings.render.reflection != "microfacet" or settings.propagation.every or not needs.decidable(state):
+    early = progress - state.settings.initial.until < KNOWN or state.iteration < SOONEST
+    if state.metals_set or early or progress >= state.residual_start or not _decidable(state):
         return
     observations, metallic = observe(state), state.parameters["metallic"]
     positions, weight = state.parameters["position"].detach(), observations.pixels.sum(dim=1) * state.wanted()
@@ -74,6 +72,43 @@ def set_metals_due(state: State, progress: float) -> None:
     state.metals_set = True
     part = float(weight[metal].sum()) / max(whole, 1e-6)
     state.announce("metals", f"{part:.0%} of the surface shines as metals do")
+
+
+@torch.no_grad()
+def judge_due(state: State, progress: float) -> None:
+    """After each new mesh, judge again which surfels are metal, by what they mirror (see `mirrored`, `same_material`).
+
+    A surfel that is taken for paint but is of a piece with metals becomes metal, with their base colour and roughness: it mirrors evenly,
+    such as the lower half of a ball on a table, and has learned the mirrored table as its own colour. A metal that looks the same from
+    everywhere, where it would mirror changes, becomes paint. Training can still change both.
+    """
+    again = state.settings.indirect.every
+    if not state.metals_set or not state.from_hull or state.iteration % again or progress >= state.residual_start:
+        return
+    if not _decidable(state) or state.ended:
+        return
+    surfels, seen, fit = mirrored.observe(state)
+    found = same_material.decide(surfels, seen, fit)
+    names = "metallic", "albedo", "roughness"
+    metallic, albedo, roughness = (state.parameters[name] for name in names)
+    free = ~torch.isin(metallic.detach(), HELD.to(metallic))
+    raised, lowered = (which.to(metallic.device) & free for which in (found.metal, found.paint))
+    like = torch.logit(found.like_metals.clamp(0.02, 0.98)).to(metallic.device)
+    metallic[raised], metallic[lowered] = raw_metallic(METAL), raw_metallic(PAINT)
+    albedo[raised], roughness[raised] = like[raised, :3], like[raised, 3]
+    for name in names:
+        state.forget_moments(name, raised | lowered)
+    whole = max(float(seen.pixels.sum()), 1e-6)
+    parts = [float(seen.pixels[which.cpu()].sum()) / whole for which in (raised, lowered)]
+    if max(parts) > TOLD:
+        words = f"{parts[0]:.1%} of the surface is of a piece with metals, {parts[1]:.1%} does not mirror as metals do"
+        state.announce("mirrored", words)
+
+
+def _decidable(state: State) -> bool:
+    """Tell whether photos decide what is metal: not in schedules that find metals otherwise, or that have no specular shading."""
+    settings = state.settings
+    return settings.render.reflection == "microfacet" and not settings.propagation.every and needs.decidable(state)
 
 
 @torch.no_grad()

@@ -82,6 +82,7 @@ class Trainer:
         with state.clock.part("deciding"):
             needs.evaluate_iteration(state, progress)
             metals.set_metals_due(state, progress)
+            metals.judge_due(state, progress)
         even_metal.even_out_due(state, progress)
         densify.densify_due(state, progress)
         densify.reshape_due(state)

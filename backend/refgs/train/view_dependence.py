@@ -112,7 +112,7 @@ def observe(state: State) -> Observations:
     return Observations(mean, totals / some[..., None], usable, burnt / some, facing, towards)
 
 
-def _linear(photo: Photo) -> Tensor:
+def linear(photo: Photo) -> Tensor:
     """Return a photo's linear radiance (H, W, 3) over black."""
     image = srgb_decode(photo.encoded)
     return image if photo.mask is None else image * (photo.mask.float() / 255)[..., None]
@@ -128,7 +128,7 @@ def _residuals(
     sums = []
     for number, photo in enumerate(photos):
         # Decoded anew each time: as floats, all photos together would take five times their memory.
-        target, lost = _linear(photo), photo.clipped.any(dim=-1, keepdim=True).float()
+        target, lost = linear(photo), photo.clipped.any(dim=-1, keepdim=True).float()
         features = torch.cat([mean * factor[:, number, None], torch.ones_like(mean[:, :2])], dim=1)
 
         def residual(shown: Tensor, target: Tensor = target, lost: Tensor = lost) -> Tensor:

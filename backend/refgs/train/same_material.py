@@ -1,0 +1,100 @@
+"""Decide between metal and paint for whole surfaces: what photos tell of some surfels spreads to those that are of the same piece.
+
+The model is a random walk with seeds (Grady 2006) on a graph of neighbouring surfels. Steps are likely along a smooth surface of one
+brightness. They are unlikely across a concave crease, where two objects touch, or two parts.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.sparse.linalg import cg
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from refgs.model.surfels import Surfels
+from refgs.train.mirrored import Fit, Seen
+
+# Of a surfel's error as a metal, in parts of its error as paint: it is a metal below METAL, if what it mirrors shows by SLOPE and if it
+# reflects REFLECTANCE, and paint above PAINT. Painted plastic reaches a reflectance of 0.3, most metals have more than 0.4.
+METAL, PAINT = 0.6, 2.5
+SLOPE, REFLECTANCE = 0.12, 0.35
+SURE = 1.5  # logarithm of that ratio, above which evidence does not count more
+# Weight of what tells paint, where it is to keep paint: a metal whose shape is wrong looks like paint.
+AGAINST_METAL = 0.5
+KEPT_PAINT, KEPT_METAL = 0.045, 0.15  # weight of the kind so far
+# How likely a metal is, above which paint becomes metal, and below which metal becomes paint.
+LIKELY, UNLIKELY = 0.5, 0.2
+FITTED = 0.01  # weight of a metal that was only fitted, beside one that was learned
+REACH = 3.0  # how far evidence spreads, as the weight of differences between neighbours
+NEIGHBOURS = 16
+BENT, CREASED = 0.35, 0.12  # radians between neighbours' normals that convex and concave surfaces have at the most
+STEP = 0.5  # sine by which a neighbour may lie off the surfel's plane
+SHADE = 1.0  # logarithm by which the neighbours' mean radiance may differ
+FRINGE = 1.0  # pixels in all photos, below which a surfel takes no part
+TOLERANCE, STEPS = 1e-4, 400  # of conjugate gradients
+
+
+class Found(NamedTuple):
+    """Hold the decision for N surfels.
+
+    - `metal`, `paint` (N,): bool, which of those that were taken for the other kind are metals, and which are paint
+    - `like_metals` (N, 4): base colour and roughness of the metals that each is connected to
+    """
+
+    metal: Tensor
+    paint: Tensor
+    like_metals: Tensor
+
+
+def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
+    """Decide which surfels are taken for the wrong kind, from what photos tell (see `refgs.train.mirrored`) and from their neighbours.
+
+    Evidence for either kind spreads over a surface. The kind that training has found so far stays where there is none. It does not spread.
+    """
+    graph, part = _laplacian(surfels.positions.double().numpy(), seen), (seen.pixels > FRINGE).double().numpy()
+    ratio = fit.ratio.clamp(1e-3, 1e3).log().double().numpy() * fit.seen.numpy()
+    mirrors = (fit.slope > SLOPE) & (fit.reflectance.amax(dim=1) > REFLECTANCE)
+    metal = np.where(mirrors.numpy() & (ratio < np.log(METAL)), np.clip(-ratio, 0, SURE), 0) * part
+    paint = np.clip(ratio - np.log(PAINT), 0, SURE) * part
+    was, none = (surfels.metallic > 0.5).numpy(), 1e-4
+    likely = _solve(graph, metal + AGAINST_METAL * paint + KEPT_PAINT * part + none, metal)
+    kept = KEPT_METAL * was * part
+    unlikely = _solve(graph, metal + paint + kept + none, metal + kept)
+    sure = np.clip(metal, 0, 1) * (likely > LIKELY) * np.where(was, 1, FITTED)
+    learned, fitted = (
+        torch.cat([colour, rough[:, None]], dim=1).double().numpy()
+        for colour, rough in ((surfels.albedo, surfels.roughness), (fit.reflectance, fit.roughness))
+    )
+    # What others have learned as paint is the colour of what they mirror, so they have what was fitted.
+    material = np.where(was[:, None], learned, fitted)
+    mean = (material * sure[:, None]).sum(axis=0) / max(sure.sum(), 1e-9)
+    like = [_solve(graph, sure + none, sure * of + none * all_of) for of, all_of in zip(material.T, mean, strict=True)]
+    turned = torch.from_numpy(~was & (likely > LIKELY)), torch.from_numpy(was & (unlikely < UNLIKELY))
+    return Found(*turned, torch.from_numpy(np.stack(like, axis=1)).float())
+
+
+def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -> np.ndarray:
+    """Return the values x (N,) that minimise Σ w_i (x_i − v_i)² + REACH Σ g_ij (x_i − x_j)², where `weighted` is w v."""
+    return cg(REACH * graph + sparse.diags(weight), weighted, rtol=TOLERANCE, maxiter=STEPS)[0]
+
+
+def _laplacian(points: np.ndarray, seen: Seen) -> sparse.csr_matrix:
+    """Return the Laplacian (N, N) of the graph of neighbouring surfels."""
+    count, most = len(points), min(NEIGHBOURS + 1, len(points))
+    near = cKDTree(points).query(points, k=np.arange(1, most + 1))[1][:, 1:]
+    one, other = np.repeat(np.arange(count), most - 1), near.ravel()
+    normal = seen.outward.double().numpy()
+    apart = points[other] - points[one]
+    apart /= np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-12)
+    angle = np.arccos((normal[one] * normal[other]).sum(axis=1).clip(-1, 1))
+    concave = ((normal[other] - normal[one]) * apart).sum(axis=1) < 0
+    off = (apart * normal[one]).sum(axis=1)
+    shade = (seen.mean.clamp_min(0) + 0.05 * seen.mean.mean() + 1e-6).log().double().numpy()
+    differs = np.linalg.norm(shade[one] - shade[other], axis=1)
+    exponent = (angle / np.where(concave, CREASED, BENT)) ** 2 + (off / STEP) ** 2 + (differs / SHADE) ** 2
+    part = (seen.pixels > FRINGE).numpy()
+    graph = sparse.coo_matrix((np.exp(-exponent) * part[one] * part[other], (one, other)), (count, count)).tocsr()
+    graph = (graph + graph.T) / 2
+    return sparse.diags(np.asarray(graph.sum(axis=1)).ravel()) - graph

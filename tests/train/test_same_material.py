@@ -1,0 +1,178 @@
+"""Test how surfels are told metal or paint by what they mirror, and how that spreads over a surface."""
+
+import math
+
+import pytest
+import torch
+
+from benchmarks.scenes.analytic import write_ball_capture
+from refgs.model.surfels import activate, raw_metallic
+from refgs.train import metals, mirrored, same_material
+from refgs.train.mirrored import Fit, Seen
+from tests.makers.lamps import show
+from tests.makers.training import put
+from tests.makers.training import trainer as small
+
+DIM = 1.0  # of lamps whose mirror images are not clipped: a radiance of 1.3, beside 0.2
+GOLD = [3.0, 1.0, -1.0]  # logits: 0.95, 0.73, 0.27
+ALL = ["surfels.sh_degree=0", "needs.specular=on", "needs.outside=off", "indirect.every=100"]
+
+
+@pytest.fixture(scope="module")
+def large_ball(tmp_path_factory):
+    """Write a capture whose photos have several pixels for each surfel."""
+    folder = tmp_path_factory.mktemp("ball")
+    write_ball_capture(folder, 96, samples=1)
+    return folder
+
+
+@pytest.fixture
+def made(large_ball, tmp_path):
+    made = small(large_ball, tmp_path / "run", *ALL, total=400)
+    made.state.metals_set, made.state.iteration = True, 100
+    return made
+
+
+@pytest.mark.parametrize("turn", [False, True])
+@pytest.mark.parametrize("roughness", [-3.0, -1.0])
+def test_a_metal_shows_what_it_mirrors(made, roughness, turn):
+    show(made, metallic=6.0, roughness=roughness, albedo=GOLD, turn=turn, lamp=DIM)
+    _, _, fit = mirrored.observe(made.state)
+    assert float(fit.seen.float().mean()) > 0.8
+    assert float((fit.ratio[fit.seen] < same_material.METAL).float().mean()) > 0.8
+    # Photos are rendered at half the light, as by a shorter exposure: so a metal's reflectance is half of its base colour.
+    half = torch.tensor(GOLD).sigmoid() / 2
+    assert torch.allclose(fit.reflectance[fit.seen].median(dim=0)[0], half, atol=0.06)
+    assert float((fit.slope[fit.seen] > same_material.SLOPE).float().mean()) > 0.9
+
+
+@pytest.mark.parametrize("albedo", [[1.0, 1.0, 1.0], [2.0, 0.0, -2.0]])
+def test_paint_looks_the_same_from_everywhere(made, albedo):
+    show(made, metallic=-6.0, roughness=-1.0, albedo=albedo)
+    _, _, fit = mirrored.observe(made.state)
+    assert float((fit.ratio[fit.seen] > same_material.PAINT).float().mean()) > 0.8
+
+
+def test_what_no_photo_shows_is_not_told(made):
+    show(made, metallic=6.0, roughness=-1.0)
+    state = made.state
+    state.photos[:] = [photo._replace(image=torch.full_like(photo.image, 255)) for photo in state.photos]
+    _, seen, fit = mirrored.observe(state)
+    assert not fit.seen.any() and not seen.weight.any() and seen.pixels.any()
+
+
+def ball_on_board(count=4000):
+    """Return points and normals of a ball that stands on a board, and which of them are the ball's."""
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
+    normal = normal[normal[:, 2] > -0.95]
+    board = 4 * torch.rand(count, 3, generator=generator) - 2
+    board[:, 2] = 0
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(len(board), 3)
+    points = torch.cat([normal + torch.tensor([0.0, 0.0, 1.0]), board])
+    ball = torch.arange(len(points)) < len(normal)
+    return points, torch.cat([normal, up]), ball
+
+
+def decided(points, normals, ratio, metallic, mean=None):
+    """Decide what is metal, if photos tell the `ratio` (N,) of errors and the training has the `metallic` (N,)."""
+    count = len(points)
+    start = {"position": points, "albedo": torch.zeros(count, 3), "metallic": metallic, "roughness": torch.zeros(count)}
+    start |= {"rotation": torch.tensor([1.0, 0, 0, 0]).expand(count, 4), "scale": torch.zeros(count, 2)}
+    start |= {"opacity": torch.zeros(count), "received": torch.ones(count, 3), "sh_dc": torch.zeros(count, 1, 3)}
+    start |= {name: torch.zeros(count, 15, 3) for name in ("sh_rest", "indirect_rest")}
+    start["indirect_dc"] = torch.zeros(count, 1, 3)
+    start["albedo"][:, 0] = torch.where(points[:, 2] > 1, 2.0, -2.0)
+    start["roughness"] = torch.where(points[:, 2] > 1, -3.0, 0.0)
+    mean = torch.full((count, 3), 0.5) if mean is None else mean
+    one = torch.ones(count, 1)
+    seen = Seen(mean[:, None], 9 * one, 9 * one[:, 0], mean, normals[:, None], normals[:, None])
+    told = torch.ones(count, dtype=torch.bool)
+    fit = Fit(ratio, torch.full((count,), 0.5), torch.full((count, 3), 0.8), torch.full((count,), 0.2), told)
+    return same_material.decide(activate(start), seen, fit)
+
+
+def test_a_balls_lower_half_is_of_its_upper_halfs_metal():
+    """Check that evidence for metal crosses the ball's equator, but not the crease to the board."""
+    points, normals, ball = ball_on_board()
+    ratio = torch.where(ball & (points[:, 2] > 1), 0.3, 1.0)
+    metallic = torch.where(ball & (points[:, 2] > 1), raw_metallic(0.98), raw_metallic(0.02))
+    found = decided(points, normals, ratio, metallic)
+    metal = found.metal | (metallic > 0)
+    assert float(metal[ball].float().mean()) > 0.98 and float(metal[~ball].float().mean()) < 0.02
+    lower = ball & (points[:, 2] < 0.8)
+    like = found.like_metals[lower].mean(dim=0)
+    assert like[0] == pytest.approx(1 / (1 + math.exp(-2)), abs=0.05), "the base colour of the upper half"
+    assert like[3] == pytest.approx(1 / (1 + math.exp(3)), abs=0.05), "its roughness"
+
+
+def test_metals_that_nothing_was_learned_of_are_as_they_fit():
+    points, normals, ball = ball_on_board()
+    found = decided(points, normals, torch.where(ball, 0.3, 1.0), torch.full((len(points),), raw_metallic(0.02)))
+    like = found.like_metals[ball]
+    assert torch.allclose(like, torch.tensor([0.8, 0.8, 0.8, 0.2]).expand_as(like), atol=0.01)
+
+
+def test_paint_of_another_brightness_stays_paint():
+    """Check a ball whose lower half is painted black: no crease, but an edge of its brightness."""
+    points, normals, ball = ball_on_board()
+    upper = points[:, 2] > 1
+    mean = torch.where(upper, 0.6, 0.01)[:, None].expand(-1, 3)
+    ratio = torch.where(upper, 0.3, 1.7)
+    found = decided(points, normals, ratio, torch.full((len(points),), raw_metallic(0.02)), mean)
+    assert float(found.metal[ball & (points[:, 2] < 0.95)].float().mean()) < 0.02
+
+
+def test_a_surface_that_is_clearly_paint_does_not_stay_metal():
+    points, normals, ball = ball_on_board()
+    ratio = torch.where(ball, 0.3, torch.where(points[:, 0] > 0, 8.0, 1.0))
+    found = decided(points, normals, ratio, torch.full((len(points),), raw_metallic(0.98)))
+    board = ~ball & (points[:, 0] > 0.2)
+    assert float(found.paint[board].float().mean()) > 0.95 and not found.paint[ball].any()
+
+
+def test_without_evidence_all_stays_as_it_is():
+    points, normals, ball = ball_on_board()
+    metallic = torch.where(ball, raw_metallic(0.98), raw_metallic(0.02))
+    found = decided(points, normals, torch.ones(len(points)), metallic)
+    assert not found.metal.any() and not found.paint.any()
+
+
+def test_half_a_mirror_makes_all_of_it_metal(made):
+    """Check that the half of a metal ball that was learned as dark paint becomes metal like the rest."""
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    state = made.state
+    shown = mirrored.observe(state)[1].pixels > same_material.FRINGE
+    left = shown & (state.parameters["position"][:, 0] < -0.2)
+    state.parameters["metallic"].data[left] = raw_metallic(0.01)
+    half = torch.tensor(GOLD).sigmoid() / 2  # photos are rendered at half the light
+    state.parameters["albedo"].data[:] = half.logit()
+    state.parameters["albedo"].data[left] = -3.0
+    state.parameters["roughness"].data[left] = 1.0
+    metals.judge_due(state, 0.25)
+    with torch.no_grad():
+        found = activate({**state.constant, **state.parameters})
+    assert float((found.metallic > 0.8)[left].float().mean()) > 0.95
+    assert torch.allclose(found.albedo[left].median(dim=0)[0], half, atol=0.05)
+    assert float(found.roughness[left].median()) == pytest.approx(1 / (1 + math.exp(3)), abs=0.02)
+    assert "of a piece with metals" in state.decided["mirrored"]
+
+
+def test_paint_that_was_taken_for_metal_becomes_paint(made):
+    show(made, metallic=-6.0, roughness=-1.0)
+    state = made.state
+    put(made, metallic=raw_metallic(0.9))
+    metals.judge_due(state, 0.25)
+    assert float((state.surfels().metallic < 0.1).float().mean()) > 0.3, "where lamps should show most clearly"
+
+
+@pytest.mark.parametrize("iteration, progress, held", [(101, 0.25, False), (100, 0.9, False), (100, 0.25, True)])
+def test_materials_are_judged_with_new_meshes_unless_held(made, iteration, progress, held):
+    """Check that nothing changes between meshes, when the residual learns, and where metals are held."""
+    show(made, metallic=-6.0, roughness=-1.0)
+    state = made.state
+    before = float(metals.HELD[0]) if held else raw_metallic(0.9)
+    put(made, metallic=before)
+    state.iteration = iteration
+    metals.judge_due(state, progress)
+    assert bool((state.parameters["metallic"] == torch.tensor(before)).all())
