@@ -33,7 +33,7 @@ BENT, CREASED = 0.35, 0.12  # radians between neighbours' normals that convex an
 STEP = 0.5  # sine by which a neighbour may lie off the surfel's plane
 SHADE = 1.0  # logarithm by which the neighbours' mean radiance may differ
 FRINGE = 1.0  # pixels in all photos, below which a surfel takes no part
-TOLERANCE, STEPS = 1e-4, 400  # of conjugate gradients
+TOLERANCE, STEPS = 1e-3, 200  # of conjugate gradients
 
 
 class Found(NamedTuple):
