@@ -15,22 +15,24 @@ from . import (
     store_attribute,
     vector_math,
 )
+from .doubt_material import doubt_color
 
 NAME = "RefGS Splats"  # the tree and its modifier
 # The quad reaches three standard deviations: the Gaussian is exp(-4.5) = 1.1 % of its peak there.
 EXTENT = 3.0
-DISPLAYS = ("Shaded", "Base Color", "Roughness", "Metallic", "Normal")
+DISPLAYS = ("Shaded", "Base Color", "Roughness", "Metallic", "Normal", "Doubt")
 
 
 def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
     """Make the node tree `RefGS Splats`, or return the existing one, which all runs share. It draws each point as a quad.
 
     The tree reads these attributes of the points: scale (standard deviations along two axes), rotation (quaternion), opacity 0..1, and
-    base_color, roughness, metallic and normal. The quads keep all attributes of their points. They get one more, `gaussian`: the position
-    on the splat in standard deviations. Quads are realised, because Eevee draws them several times faster than instances.
+    base_color, roughness, metallic, normal and, if they have it, doubt. The quads keep all attributes of their points. They get one more,
+    `gaussian`: the position on the splat in standard deviations. Quads are realised, because Eevee draws them several times faster than
+    instances.
 
     The input Display selects what is shown. "Shaded" uses the splats' own material. Every other choice copies one attribute to `display`,
-    and uses `values_material` to show it without lighting.
+    and uses `values_material` to show it without lighting. "Doubt" is black if the points have no such attribute.
     """
     if NAME in bpy.data.node_groups:
         return bpy.data.node_groups[NAME]
@@ -70,11 +72,13 @@ def splats_tree(values_material: bpy.types.Material) -> bpy.types.NodeTree:
     enlarged = math(tree, "DIVIDE", group["Size"], math(tree, "SQRT", math(tree, "MAXIMUM", group["Detail"], 1e-3)))
     points = add(tree, "GeometryNodeDeleteGeometry", {"Geometry": group["Geometry"], "Selection": unseen})
     half = (0.5, 0.5, 0.5)
+    doubt = add(tree, "GeometryNodeInputNamedAttribute", {"Name": "doubt"}, data_type="FLOAT")
     values = [
         attribute("base_color", "FLOAT_COLOR"),
         attribute("roughness", "FLOAT"),
         attribute("metallic", "FLOAT"),
         vector_math(tree, "MULTIPLY_ADD", attribute("normal", "FLOAT_VECTOR"), half, half),
+        scaled(tree, doubt_color(tree, out(doubt)), out(doubt, "Exists")),
     ]
     value = add(tree, "GeometryNodeIndexSwitch", {"Index": shown}, data_type="RGBA")
     while len(value.index_switch_items) < len(DISPLAYS):

@@ -1,5 +1,6 @@
 """Import a run folder, the result of a training: its splats, mesh and cameras, and the light recovered from the photos."""
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -58,6 +59,8 @@ def import_run(folder: Path, scene: bpy.types.Scene) -> Run:
     try:
         collection = bpy.data.collections.new(f"RefGS {name}")
         collection[run_parts.FOLDER] = str(folder.resolve())
+        if words := _doubt_words(folder):
+            collection[run_parts.DOUBT] = words
         scene.collection.children.link(collection)
         cloud = point_cloud(f"{name} splats", cloud_attributes(splats, *normal_slopes(splats)))
         drawn = add_splats(cloud.name, cloud, collection, read_constants(folder / "splats.ply"))
@@ -162,6 +165,14 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
     if not meshes:
         raise InputError(f"{path} contains no mesh: export the run again")
     return meshes
+
+
+def _doubt_words(folder: Path) -> str:
+    """Read the trainer's words on where a run's photos do not tell, from its metrics.json. Returns "" if there are none."""
+    try:
+        return str(json.loads((folder / "metrics.json").read_text(encoding="utf-8"))["doubt"]["what"])
+    except (OSError, ValueError, KeyError, TypeError):  # not there, of an older release, or half copied
+        return ""
 
 
 def _occlusion(material: bpy.types.Material) -> bpy.types.NodeSocket | None:

@@ -93,7 +93,8 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     - scale (N, 2), in standard deviations;
     - rotation (N, 4), unit quaternions wxyz;
     - opacity, metallic and roughness (N,), all 0..1;
-    - base_color (N, 3), linear.
+    - base_color (N, 3), linear;
+    - doubt (N,), 0..1, only if the file has it: how little photos tell metal from paint.
 
     Splats without materials become matte; their base colour is that of their constant spherical harmonic. Splats without normals get their
     shortest axis as normal. Raises InputError for any other file.
@@ -116,6 +117,8 @@ def read_splats(path: Path) -> tuple[dict[str, np.ndarray], int]:
     else:
         names["base_color"] = list(MATERIALS[:3])
         names |= {name: [name] for name in MATERIALS[3:] if name not in constants}
+        if "doubt" in found:
+            names["doubt"] = ["doubt"]
     missing = [name for group in names.values() for name in group if name not in found]
     if missing:
         raise InputError(f"{path} has no {', '.join(missing)}: it is not the splats.ply of a RefGS run")

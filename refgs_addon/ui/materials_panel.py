@@ -8,12 +8,14 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 
 from .. import compat
 from ..nodes.edit_tree import REGIONS
+from ..preferences import wrapped_text
+from ..scene.doubt import doubt_shown, doubt_words, has_doubt, show_doubt
 from ..scene.edit import add_edit, edits, remove_edit
 from ..scene.material_presets import PRESETS, ROOT, materials, remove_material, save_material, set_material
 from ..scene.run_parts import active_run, parts
 from .export_menu import ApplyEdits
 from .hint_buttons import Hint
-from .operators import OnRun, ReportsErrors, select_only
+from .operators import OnRun, ReportsErrors, select_only, show_materials
 from .panels import Tab
 
 _WHERE = {
@@ -23,6 +25,19 @@ _WHERE = {
     "Painted": ("Edit the area that you paint on the mesh", "BRUSH_DATA"),
     "Similar": ("Edit all places with a material like the one at a point that you move", "EYEDROPPER"),
 }
+
+
+class ShowDoubt(OnRun, bpy.types.Operator):
+    bl_idname = "refgs.show_doubt"
+    bl_label = "Show Where Photos Do Not Tell"
+    bl_description = "Colour the run orange where its photos do not tell metal from paint; or show its materials again"
+
+    on: BoolProperty(name="Show", default=True)
+
+    def work(self, context: bpy.types.Context) -> None:
+        show_doubt(active_run(context), self.on)
+        if self.on:
+            show_materials(context)
 
 
 class AddEdit(OnRun, bpy.types.Operator):
@@ -138,6 +153,8 @@ class MaterialPanel(Tab, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, run = self.layout, active_run(context)
+        if run and has_doubt(run):
+            self._doubt(layout, run, context)
         layout.operator_menu_enum(AddEdit.bl_idname, "where", text="Edit Material", icon="ADD")
         for splats in parts(run).get("splats", []) if run else ():
             for edit in edits(splats):
@@ -148,6 +165,13 @@ class MaterialPanel(Tab, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator(Hint.bl_idname, text="This Part Is Metal", icon="SHADING_RENDERED").kind = "metal"
         row.operator(Hint.bl_idname, text="This Part Is Paint", icon="SHADING_SOLID").kind = "paint"
+
+    def _doubt(self, layout: bpy.types.UILayout, run: bpy.types.Collection, context: bpy.types.Context) -> None:
+        width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
+        if words := doubt_words(run):
+            wrapped_text(layout, words[0].upper() + words[1:], width, "QUESTION")
+        on = doubt_shown(run)
+        layout.operator(ShowDoubt.bl_idname, icon="HIDE_OFF" if on else "HIDE_ON", depress=on).on = not on
 
     def _edit(self, box: bpy.types.UILayout, edit: bpy.types.NodesModifier) -> None:
         row = box.row(align=True)
@@ -181,7 +205,7 @@ class MaterialPanel(Tab, bpy.types.Panel):
             layout.prop(owner, path, text=text)
 
 
-CLASSES = (AddEdit, RemoveEdit, SetMaterial, KeepMaterial, MaterialPresets, MaterialPanel)
+CLASSES = (ShowDoubt, AddEdit, RemoveEdit, SetMaterial, KeepMaterial, MaterialPresets, MaterialPanel)
 
 
 def register() -> None:

@@ -100,7 +100,9 @@ def import_run_folder(operator: bpy.types.Operator, context: bpy.types.Context, 
     operator.report({"INFO"}, f"Imported {run.collection.name}: {len(run.splats.data.points):,} splats{where}")
     splats = shown(run.collection) == "splats"
     select_only(context, run.splats if splats else run.mesh[0])
-    frame_selected(context, shaded=splats)
+    if splats:
+        show_materials(context)
+    frame_selected(context)
     if run.left_out:
         operator.report({"WARNING"}, f"{run.left_out:,} splats with values that are not finite were left out")
     if run.light_of:
@@ -206,16 +208,19 @@ class RestoreSplats(_Deletes, bpy.types.Operator):
         restore(self.found(context))
 
 
-def frame_selected(context: bpy.types.Context, shaded: bool) -> None:
-    """Bring the selected object into view in all 3D views.
-
-    If `shaded`, those in Solid mode, which shows no splats, change to Material Preview under the scene's light.
-    """
+def show_materials(context: bpy.types.Context) -> None:
+    """Change all 3D views that show no materials, those in Solid or Wireframe mode, to Material Preview under the scene's light."""
     for area in context.screen.areas if context.screen else ():
         if area.type == "VIEW_3D":
             shading = area.spaces.active.shading
-            if shaded and shading.type in ("SOLID", "WIREFRAME"):
+            if shading.type in ("SOLID", "WIREFRAME"):
                 shading.type, shading.use_scene_world = "MATERIAL", True
+
+
+def frame_selected(context: bpy.types.Context) -> None:
+    """Bring the selected object into view in all 3D views."""
+    for area in context.screen.areas if context.screen else ():
+        if area.type == "VIEW_3D":
             region = next(region for region in area.regions if region.type == "WINDOW")
             with context.temp_override(area=area, region=region):
                 bpy.ops.view3d.view_selected()

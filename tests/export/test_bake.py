@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from scipy.ndimage import distance_transform_edt, label
 from scipy.spatial import cKDTree
 
@@ -9,6 +10,7 @@ from refgs.export.occlusion import openness
 from refgs.export.unwrap import unwrap
 from refgs.formats.mesh import Mesh
 from refgs.formats.splats import Splats
+from refgs.formats.textures import write_textures
 from tests.makers.painted_ball import ball, look_up, on_surface, paint, shaded_normals, sphere_of_splats
 from tests.makers.splats import arrays, chosen
 
@@ -34,6 +36,27 @@ def test_materials_come_back_where_they_were(unwrapped):
     assert np.abs(look_up(textures.roughness, uv) - (0.5 - 0.4 * points[:, 0])).max() < 0.05
 
 
+def test_doubt_is_a_texture_where_splats_have_it(unwrapped, tmp_path):
+    splats = sphere_of_splats()
+    without = bake(unwrapped, splats, 256)
+    assert without.doubt is None
+    splats.doubt = 0.5 + 0.5 * splats.positions[:, 1]
+    textures = bake(unwrapped, splats, 256)
+    faces, weights, uv = on_surface(unwrapped)
+    points = np.einsum("nk,nkc->nc", weights, unwrapped.vertices[faces])
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    assert np.abs(look_up(textures.doubt, uv) - (0.5 + 0.5 * points[:, 1])).max() < 0.05
+    for name in ("base_color", "normal"):
+        np.testing.assert_allclose(getattr(textures, name), getattr(without, name), atol=1e-5)
+    write_textures(tmp_path, textures)
+    grey = np.asarray(Image.open(tmp_path / "doubt.png"))
+    np.testing.assert_allclose(grey / 255, textures.doubt.clip(0, 1), atol=0.51 / 255)
+    write_textures(tmp_path / "without", without)
+    assert {path.stem for path in tmp_path.glob("*.png")} - {
+        path.stem for path in (tmp_path / "without").iterdir()
+    } == {"doubt"}
+
+
 def test_the_normal_map_mends_a_coarse_mesh():
     # Disturb the vertex normals: the normal map has to correct them when it is shaded.
     mesh = ball(2)
@@ -56,10 +79,11 @@ def test_how_many_rows_are_baked_at_a_time_does_not_matter(unwrapped, monkeypatc
     The small texture is computed at every texel. The large one is computed at a lower resolution, then enlarged.
     """
     splats, found = sphere_of_splats(300), []
+    splats.doubt = splats.metallic
     for rows in (37, size):
         monkeypatch.setattr("refgs.export.bake._ROWS", rows)
         found.append(bake(unwrapped, splats, size))
-    for name, value in vars(found[0]).items():
+    for name, value in arrays(found[0]).items():
         np.testing.assert_allclose(value, getattr(found[1], name), atol=1e-5, err_msg=name)
 
 

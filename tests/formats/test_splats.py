@@ -1,9 +1,15 @@
 import numpy as np
 import pytest
-from plyfile import PlyData
+from plyfile import PlyData, PlyElement
 
 from refgs.formats.splats import read_splats, write_splats
 from tests.makers.splats import arrays, make
+
+
+def read(folder, splats):
+    """Write splats to a file and read it."""
+    write_splats(folder / "s.ply", splats)
+    return read_splats(folder / "s.ply")
 
 
 @pytest.mark.parametrize("count", [0, 1, 7])
@@ -45,6 +51,26 @@ def test_layout_is_what_other_programs_expect(tmp_path):
     opacity = splats.opacities[1:]
     np.testing.assert_allclose(vertex["opacity"][1:], np.log(opacity / (1 - opacity)), rtol=1e-4, atol=1e-5)
     assert np.isfinite(vertex["opacity"]).all()
+
+
+@pytest.mark.parametrize("constants", [{}, {"metallic": 1.0}])
+def test_doubt_is_a_column_where_it_is_known(tmp_path, constants):
+    splats = make()
+    assert splats.doubt is None and read(tmp_path, splats).doubt is None, "files of older releases"
+    splats.doubt, splats.constants = np.linspace(0, 1, len(splats), dtype=np.float32), constants
+    again = read(tmp_path, splats)
+    np.testing.assert_array_equal(again.doubt, splats.doubt)
+    assert again.others == () and again.constants == constants
+
+
+def test_others_doubt_is_not_ours(tmp_path):
+    """Check that a property `doubt` of a file without materials is kept as unknown."""
+    rows = np.zeros(1, [(name, "<f4") for name in ("x", "y", "z", *(f"f_dc_{i}" for i in range(3)), "opacity", "doubt",
+                                                   "scale_0", "scale_1", *(f"rot_{i}" for i in range(4)))])  # fmt: skip
+    rows["rot_0"], rows["doubt"] = 1, 7
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "s.ply"))
+    found = read_splats(tmp_path / "s.ply")
+    assert found.doubt is None and found.others[0].data["doubt"] == 7
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):

@@ -13,11 +13,12 @@ from refgs import commands
 from refgs.capture import read_capture
 from refgs.color import srgb_encode
 from refgs.compare import surface
-from refgs.compare.pictures import maps
+from refgs.compare.pictures import DOUBTFUL, TOLD, maps
 from refgs.compare.truth import GroundTruth
 from refgs.errors import InputError
 from refgs.formats.exr import read_exr, write_exr
 from refgs.formats.panorama import directions
+from refgs.formats.splats import read_splats, write_splats
 from refgs.model.environment import Environment
 from refgs.run import open_run
 from refgs.run_folder import update_metrics
@@ -126,6 +127,23 @@ def test_known_errors_are_found(made, tmp_path):
     assert found["environment"]["scale"] == pytest.approx(2, rel=0.02) and found["environment"]["log_rmse"] > 0.03
     relit = found["relight"]["dusk"]["refgs"]
     assert relit["scale"] == pytest.approx(0.5, rel=0.01) and relit["psnr_aligned"] > 45 > 30 > relit["psnr_raw"]
+
+
+def test_where_photos_do_not_tell_is_a_picture(made, tmp_path):
+    """Check the colours of a ball about the origin, whose half to the right of the camera is in doubt."""
+    run, _, views = made
+    camera = views[0].camera
+    shutil.copytree(run, tmp_path / "run")
+    splats = read_splats(run / "splats.ply")
+    splats.doubt = (splats.positions @ camera.camera_to_world[:3, 0] > 0).astype(np.float32)
+    write_splats(tmp_path / "run" / "splats.ply", splats)
+    evaluated(tmp_path / "run", None)
+    picture = cv2.imread(str(tmp_path / "run/pictures/test/doubt" / f"{camera.name}.png"))[..., ::-1] / 255
+    x, y, _ = camera.projection @ [0, 0, 0, 1] / np.linalg.norm(camera.position)
+    half = 0.5 * camera.fx / np.linalg.norm(camera.position)
+    np.testing.assert_allclose(picture[int(y), int(x + half)], DOUBTFUL, atol=0.03)
+    np.testing.assert_allclose(picture[int(y), int(x - half)], TOLD, atol=0.03)
+    assert (picture[0, 0] == 0).all()
 
 
 def test_only_what_is_there_is_measured(made, tmp_path):

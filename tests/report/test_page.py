@@ -108,6 +108,26 @@ def test_everything_is_on_the_page_and_in_the_page(run):
     assert sorted(path.name for path in run.glob("report*")) == ["report.csv", "report.html"]
 
 
+def test_where_photos_do_not_tell_is_shown_beside_the_materials(run):
+    def captions():
+        return [kind for kind, _ in reported(run).images]
+
+    orange = "orange: photos do not tell metal from paint"
+    assert orange not in captions()
+    for view in VIEWS:
+        picture(run / f"pictures/test/doubt/{view}.png", 120)
+    shown = captions()
+    assert shown.count(orange) == 4 and shown[shown.index(orange) - 1] == "metallic"
+    figures = json.loads((run / "metrics.json").read_text())
+    what = "photos do not tell metal from paint on 12% of the surface"
+    (run / "metrics.json").write_text(json.dumps(figures | {"doubt": {"part": 0.1234, "what": what}}))
+    text = reported(run).text
+    assert (
+        what.replace("photos", "Photos", 1) in text
+        and "surface where photos do not tell metal from paint 12.3%" in text
+    )
+
+
 def charts(html):
     return [html[at.start() : html.index("</svg>", at.start())] for at in re.finditer("<svg", html)]
 

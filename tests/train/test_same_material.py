@@ -1,13 +1,17 @@
 """Test how surfels are told metal or paint by what they mirror, and how that spreads over a surface."""
 
+import json
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from benchmarks.scenes.analytic import write_ball_capture
+from refgs.formats.splats import read_splats
 from refgs.model.surfels import activate, raw_metallic
 from refgs.train import metals, mirrored, same_material
+from refgs.train.asset import write_asset
 from refgs.train.mirrored import Fit, Seen
 from tests.makers.lamps import show
 from tests.makers.training import put
@@ -74,8 +78,11 @@ def ball_on_board(count=4000):
     return points, torch.cat([normal, up]), ball
 
 
-def decided(points, normals, ratio, metallic, mean=None):
-    """Decide what is metal, if photos tell the `ratio` (N,) of errors and the training has the `metallic` (N,)."""
+def observed(points, normals, ratio, metallic, mean=None, shown=None):
+    """Make what `mirrored.observe` returns, if photos tell the `ratio` (N,) of errors and the training has the `metallic` (N,).
+
+    `shown` (N,) are the surfels that photos show; all by default.
+    """
     count = len(points)
     start = {"position": points, "albedo": torch.zeros(count, 3), "metallic": metallic, "roughness": torch.zeros(count)}
     start |= {"rotation": torch.tensor([1.0, 0, 0, 0]).expand(count, 4), "scale": torch.zeros(count, 2)}
@@ -86,10 +93,16 @@ def decided(points, normals, ratio, metallic, mean=None):
     start["roughness"] = torch.where(points[:, 2] > 1, -3.0, 0.0)
     mean = torch.full((count, 3), 0.5) if mean is None else mean
     one = torch.ones(count, 1)
-    seen = Seen(mean[:, None], 9 * one, 9 * one[:, 0], mean, normals[:, None], normals[:, None])
+    pixels = 9 * (torch.ones(count) if shown is None else shown.float())
+    seen = Seen(mean[:, None], 9 * one, pixels, mean, normals[:, None], normals[:, None])
     told = torch.ones(count, dtype=torch.bool)
     fit = Fit(ratio, torch.full((count,), 0.5), torch.full((count, 3), 0.8), torch.full((count,), 0.2), told)
-    return same_material.decide(activate(start), seen, fit)
+    return activate(start), seen, fit
+
+
+def decided(*given):
+    """Decide what is metal; the arguments are those of `observed`."""
+    return same_material.decide(*observed(*given))
 
 
 def test_a_balls_lower_half_is_of_its_upper_halfs_metal():
@@ -136,6 +149,69 @@ def test_without_evidence_all_stays_as_it_is():
     metallic = torch.where(ball, raw_metallic(0.98), raw_metallic(0.02))
     found = decided(points, normals, torch.ones(len(points)), metallic)
     assert not found.metal.any() and not found.paint.any()
+
+
+@pytest.mark.parametrize("metallic", [0.02, 0.98])
+def test_what_photos_do_not_tell_is_in_doubt(metallic):
+    """Check a ball whose upper half photos tell to be metal, on a board of which they tell nothing, whatever was learned so far."""
+    points, normals, ball = ball_on_board()
+    ratio = torch.where(ball & (points[:, 2] > 1), 0.3, 1.0)
+    doubt = same_material.doubt(*observed(points, normals, ratio, torch.full((len(points),), raw_metallic(metallic))))
+    assert bool((doubt[ball & (points[:, 2] > 1.2)] < 0.1).all())
+    assert bool((doubt[ball] < metals.DOUBTFUL).all()), "its lower half is of a piece with its upper half"
+    assert bool((doubt[~ball] > 0.99).all())
+
+
+def test_clear_paint_is_not_in_doubt():
+    points, normals, ball = ball_on_board()
+    ratio = torch.where(ball, 1.0, 4.0)
+    doubt = same_material.doubt(*observed(points, normals, ratio, torch.full((len(points),), raw_metallic(0.98))))
+    assert bool((doubt[~ball] < 0.1).all()) and bool((doubt[ball] > 0.99).all())
+
+
+def test_what_hardly_any_pixel_shows_is_in_doubt():
+    points, normals, _ = ball_on_board()
+    given = observed(points, normals, torch.full((len(points),), 0.3), torch.zeros(len(points)), None, points[:, 0] > 0)
+    doubt = same_material.doubt(*given)
+    assert bool((doubt[points[:, 0] < 0] == 1).all()) and bool((doubt[points[:, 0] > 0] < 0.1).all())
+
+
+def test_how_much_of_the_surface_is_in_doubt_is_said(made):
+    """Check a metal ball that photos show clearly, and a light that is the same from everywhere, under which they tell nothing."""
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    doubt, facts = metals.doubt(made.state)
+    assert len(doubt) == len(made.state.parameters["position"]) and facts["part"] < 0.05
+    made.state.light.data[:] = made.state.light.data.mean()
+    doubt, facts = metals.doubt(made.state)
+    assert facts["part"] > 0.9 and facts["what"] == made.state.decided["doubt"]
+    assert facts["what"] == f"photos do not tell metal from paint on {facts['part']:.0%} of the surface"
+
+
+def test_the_asset_has_the_doubt_of_the_surfels_that_are_written(made):
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    position, light = made.state.parameters["position"], made.state.light
+    position.data[0] = 0  # within the ball, so that no photo shows it
+    light.data[:] = light.data.mean()
+    doubt, facts = metals.doubt(made.state)
+    write_asset(made.state)
+    splats = read_splats(made.state.folder / "splats.ply")
+    row = {tuple(place): i for i, place in enumerate(position.tolist())}
+    written = [row[tuple(place)] for place in splats.positions.tolist()]
+    assert 0 not in written and np.array_equal(splats.doubt, doubt.numpy()[written])
+    assert json.loads((made.state.folder / "metrics.json").read_text())["doubt"] == facts
+
+
+def test_metals_that_are_held_are_not_in_doubt(made):
+    show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
+    made.state.light.data[:] = made.state.light.data.mean()
+    put(made, metallic=float(metals.HELD))
+    facts = metals.doubt(made.state)[1]
+    assert facts["part"] < 0.002 and "what" not in facts, "only what hardly any pixel shows is"
+
+
+@pytest.mark.parametrize("change", ["render.reflection=none", "propagation.every=50"])
+def test_doubt_is_only_measured_where_photos_decide(large_ball, tmp_path, change):
+    assert metals.doubt(small(large_ball, tmp_path / "run", "surfels.sh_degree=0", change).state) is None
 
 
 def test_half_a_mirror_makes_all_of_it_metal(made):

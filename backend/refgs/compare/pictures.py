@@ -12,6 +12,8 @@ from refgs.color import srgb_encode
 from refgs.paths import whole
 from refgs.render.renderer import Rendering
 
+TOLD, DOUBTFUL = (0.33, 0.35, 0.38), (1.0, 0.6, 0.15)  # sRGB: where photos tell metal from paint, and where they do not
+
 
 def composite(view: LoadedView, background: Tensor) -> Tensor:
     """Composite a photo over a background colour (3,). Return sRGB-encoded floats (H, W, 3) in 0..1.
@@ -55,6 +57,7 @@ def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     - albedo: sRGB-encoded
     - normal: n/2 + 1/2; black where `alpha` is 0.5 or less
     - depth: divided by its maximum
+    - doubt: from TOLD, where it is 0, to DOUBTFUL, where it is 1; black where `alpha` is 0.5 or less
     - others: only converted from 0..1 to 8 bits
     """
     if name == "color":
@@ -63,6 +66,9 @@ def picture(name: str, value: np.ndarray, alpha: np.ndarray) -> np.ndarray:
         value = (value * 0.5 + 0.5) * (alpha > 0.5)[..., None]
     elif name == "albedo":
         value = srgb_encode(value)
+    elif name == "doubt":
+        told, doubtful = (np.array(color) for color in (TOLD, DOUBTFUL))
+        value = (told + (doubtful - told) * value[..., None]) * (alpha > 0.5)[..., None]
     elif name == "depth":
         value = value / max(float(value.max()), 1e-12)
     return as_bytes(value)

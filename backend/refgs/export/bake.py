@@ -11,7 +11,7 @@ from refgs.formats.mesh import Mesh
 from refgs.formats.splats import Splats
 from refgs.formats.tangents import vertex_tangents
 from refgs.formats.textures import Textures
-from refgs.render.composite import Progress, composite
+from refgs.render.composite import NORMAL, Progress, composite
 
 # Resolution of compositing, in texels a standard deviation of a splat. Textures with more texels are interpolated.
 FINE = 3
@@ -22,9 +22,9 @@ _NEIGHBOURS = [(0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, 
 def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done, total: None) -> Textures:
     """Bake the textures of a mesh, `size` texels on each side, from the splats around it.
 
-    Each texel has a point on the mesh. Base colour, metallic, roughness and normal at this point come from `composite`, occlusion from
-    `openness`. A texel just outside a chart (a connected piece of the uv layout) has a point on the plane of the nearest face. `mesh` must
-    have normals and uv, as made by `unwrap`. `progress` is called with the number of points done and their total.
+    Each texel has a point on the mesh. Base colour, metallic, roughness, normal, and doubt if the splats have one, come from `composite` at
+    this point, occlusion from `openness`. A texel just outside a chart (a connected piece of the uv layout) has a point on the plane of the
+    nearest face. `mesh` must have normals and uv, as made by `unwrap`. `progress` is called with the number of points done and their total.
     """
     coarse = _composited(mesh, splats, size, progress)
     tangents, signs = vertex_tangents(mesh)
@@ -32,6 +32,7 @@ def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done
     widths = (3, 1, 1, 1, 3)
     maps = [np.zeros((size, size, width) if width > 1 else (size, size), np.float32) for width in widths]
     color, metallic, roughness, occlusion, normal = maps
+    doubt = np.zeros((size, size), np.float32) if splats.doubt is not None else None
     mask = np.zeros((size, size), bool)
     for rows in _row_blocks(size):
         face, weights, _ = _rasterise(mesh, scene, size, rows)
@@ -41,13 +42,15 @@ def bake(mesh: Mesh, splats: Splats, size: int, progress: Progress = lambda done
         bitangent = signs[corners[:, :1]].astype(np.float32) * np.cross(normals, tangent)
         color[rows][on], metallic[rows][on], roughness[rows][on] = texels[:, :3], texels[:, 3], texels[:, 4]
         occlusion[rows][on] = open_[:, 0]
-        normal[rows][on] = _in_tangent_space(texels[:, 5:], tangent, bitangent, normals)
-    _pad(maps, mask)
-    return Textures(*maps, mask, specular=float(splats.constants.get("specular", 1.0) > 0))
+        normal[rows][on] = _in_tangent_space(texels[:, NORMAL], tangent, bitangent, normals)
+        if doubt is not None:
+            doubt[rows][on] = texels[:, 8]
+    _pad([*maps, doubt] if doubt is not None else maps, mask)
+    return Textures(*maps, mask, specular=float(splats.constants.get("specular", 1.0) > 0), doubt=doubt)
 
 
 def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np.ndarray:
-    """Composite the splats' base colour, metallic, roughness and normal at the texels of a texture. Returns (C, C, 8).
+    """Composite the splats' values at the texels of a texture. Returns (C, C, K), with the K values of `composite`.
 
     C is smaller than `size` if the splats are large: FINE texels per standard deviation of a splat are enough.
     """
@@ -65,8 +68,9 @@ def _composited(mesh: Mesh, splats: Splats, size: int, progress: Progress) -> np
         found.append((points[on].astype(np.float32), _interpolate(weights[on], mesh.normals[mesh.faces[face[on]]])))
     points, normals = map(np.concatenate, zip(*found, strict=True))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    blended = np.zeros((coarse, coarse, 8), np.float32)
-    blended[mask] = composite(splats, points, normals, progress)
+    values = composite(splats, points, normals, progress)
+    blended = np.zeros((coarse, coarse, values.shape[1]), np.float32)
+    blended[mask] = values
     _pad([blended], mask)
     return blended
 
@@ -77,12 +81,15 @@ def _row_blocks(size: int) -> list[slice]:
 
 
 def _enlarged_rows(picture: np.ndarray, size: int, rows: slice) -> np.ndarray:
-    """Enlarge a square picture (C, C, 8) to (size, size, 8), bilinearly. Compute and return only its rows in `rows`."""
+    """Enlarge a square picture (C, C, K) to (size, size, K), bilinearly. Compute and return only its rows in `rows`."""
     place = ((np.arange(rows.start, rows.stop) + 0.5) * len(picture) / size - 0.5).clip(0, len(picture) - 1)
     above = place.astype(int)
     below, part = np.minimum(above + 1, len(picture) - 1), (place - above).astype(np.float32)[:, None, None]
     lines = picture[above] * (1 - part) + picture[below] * part
-    return np.dstack([cv2.resize(lines[..., half], (size, len(lines))) for half in (slice(0, 4), slice(4, 8))])
+    parts = (
+        lines[..., first : first + 4] for first in range(0, picture.shape[2], 4)
+    )  # cv2 takes four channels at most
+    return np.dstack([cv2.resize(part, (size, len(lines))) for part in parts])
 
 
 def _pad(maps: list[np.ndarray], mask: np.ndarray) -> None:

@@ -35,6 +35,7 @@ class Splats:
     - received (N, 3): the irradiance, divided by the irradiance without occlusion. It includes light that the object reflects to itself.
     - indirect (N, K', 3): spherical harmonics of the linear radiance that other parts of the object reflect to the splat. Without
       inter-reflection, K' is 0 and `received` is 1.
+    - doubt (N,) in 0..1: how little photos tell whether the splat is metal or paint; None where that is not known
     - constants: material values that are the same for all splats, by name (see CONSTANTS). Files store them in the header.
     - others: what a PLY file has besides these properties. `write_splats` writes it again.
     """
@@ -50,6 +51,7 @@ class Splats:
     roughness: np.ndarray
     received: np.ndarray
     indirect: np.ndarray
+    doubt: np.ndarray | None = None
     constants: dict[str, float] = field(default_factory=dict)
     others: tuple[PlyElement, ...] = ()
 
@@ -62,6 +64,7 @@ _TAIL = ["opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3"]
 THIN = 0.05  # third scale of a surfel in 3DGS viewers, as a part of its smaller scale
 CHUNK = 4096  # rows copied at a time; they fit the processor's cache
 _RECEIVED = ["received_r", "received_g", "received_b"]
+_DOUBT = "doubt"
 _MATERIAL = ["albedo_r", "albedo_g", "albedo_b", "metallic", "roughness"]
 # `specular` is the Principled BSDF's Specular IOR Level. Its default is 0.5.
 CONSTANTS = ("metallic", "roughness", "specular")
@@ -86,6 +89,9 @@ def write_splats(path: str | os.PathLike, splats: Splats) -> None:
         if name not in splats.constants:
             names.append(name)
             columns.append(getattr(splats, name))
+    if splats.doubt is not None:
+        names.append(_DOUBT)
+        columns.append(splats.doubt)
     if splats.indirect.shape[1]:
         names += [*_RECEIVED, *(f"ind_{i}" for i in range(3 * splats.indirect.shape[1]))]
         columns += [splats.received, splats.indirect.transpose(0, 2, 1)]
@@ -233,6 +239,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
             roughness=roughness,
             received=columns(*_RECEIVED) if {*_RECEIVED} <= {*names} else np.ones((vertex.count, 3), np.float32),
             indirect=harmonics("ind_", 0, 3, 12, 27, 48),
+            doubt=columns(_DOUBT)[:, 0] if ours and _DOUBT in names else None,
             constants=constants,
         )
     none = ~splats.normals.any(axis=1)  # 3DGS writes zeros

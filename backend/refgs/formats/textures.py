@@ -23,6 +23,7 @@ class Textures:
     - normal (S, S, 3): unit vectors in MikkTSpace tangent space, y along v (OpenGL, glTF and Blender)
     - mask (S, S): true for a texel if its centre, or a neighbour's centre, lies on the mesh. A bilinear look-up on the mesh reads only
       these texels. The other texels are padding: copies of the nearest texel in the mask.
+    - doubt (S, S): how little photos tell whether a texel is metal or paint, 0..1; None where that is not known
     - specular: 1, or 0 for a material without specular reflection
     """
 
@@ -33,6 +34,7 @@ class Textures:
     normal: np.ndarray
     mask: np.ndarray
     specular: float = 1.0
+    doubt: np.ndarray | None = None
 
 
 def write_textures(folder: Path, textures: Textures) -> dict[str, np.ndarray]:
@@ -48,6 +50,8 @@ def write_textures(folder: Path, textures: Textures) -> dict[str, np.ndarray]:
         "occlusion": textures.occlusion,
         "normal": 0.5 + 0.5 * textures.normal,
     }
+    if textures.doubt is not None:
+        maps["doubt"] = textures.doubt
     folder.mkdir(parents=True, exist_ok=True)
     pictures = {}
     for name, linear in maps.items():

@@ -14,6 +14,7 @@ NEAREST = 64  # splats tested per ray
 LEAST_ALPHA = 1 / 255  # alpha at or below which a splat is transparent
 REACH = 3.0  # largest distance of a splat from the surface, in its standard deviations
 RIDGE = 0.1  # part of the positions' total variance: bounds the normals' slope where splats lie in a line
+NORMAL = slice(5, 8)  # its columns in the result of `composite`
 _CHUNK = 1 << 13  # points at a time: about 100 MB
 
 Progress = Callable[[int, int], None]
@@ -22,7 +23,7 @@ Progress = Callable[[int, int], None]
 def composite(splats: Splats, points: np.ndarray, normals: np.ndarray, progress: Progress) -> np.ndarray:
     """Composite the splats at points (N, 3) on a surface with unit normals (N, 3).
 
-    Returns (N, 8): base colour, metallic, roughness, unit normal.
+    Returns (N, 8): base colour, metallic, roughness, unit normal; (N, 9) with the doubt, if the splats have one.
 
     At each point a ray looks at the surface from outside, along the reversed normal. Splats are composited front to back if they are near
     the surface and face outwards. A splat's alpha is its opacity times its Gaussian where the ray meets the splat's plane. The result is
@@ -61,7 +62,7 @@ def blended_normals(splats: Splats) -> np.ndarray:
     shade each splat by itself, as Blender does, need the blend. Where it lies beyond the splat's plane, the splat's own normal is returned.
     """
     own = _outward(splats)
-    blended = composite(splats, splats.positions, own, lambda done, total: None)[:, 5:]
+    blended = composite(splats, splats.positions, own, lambda done, total: None)[:, NORMAL]
     return np.where((blended * own).sum(axis=1, keepdims=True) > 0, blended, own)
 
 
@@ -86,6 +87,8 @@ def _geometry(splats: Splats) -> Tensor:
 
 def _appearance(splats: Splats) -> Tensor:
     columns = [splats.albedo, splats.metallic[:, None], splats.roughness[:, None], _outward(splats)]
+    if splats.doubt is not None:
+        columns.append(splats.doubt[:, None])
     return torch.from_numpy(np.concatenate(columns, axis=1).astype(np.float32))
 
 
@@ -117,8 +120,8 @@ def _blend(table: Tensor, values: Tensor, near: Tensor, points: Tensor, normals:
     across = (offset - mean) * weight.transpose(1, 2)
     square = across.transpose(1, 2) @ (offset - mean)
     square = square + (RIDGE * square.diagonal(dim1=1, dim2=2).sum(dim=1) + 1e-12)[:, None, None] * torch.eye(3)
-    slope = torch.linalg.solve(square, across.transpose(1, 2) @ (of_splats[..., 5:] - blended[:, None, 5:]))
+    slope = torch.linalg.solve(square, across.transpose(1, 2) @ (of_splats[..., NORMAL] - blended[:, None, NORMAL]))
     along = mean[:, 0] - (mean[:, 0] * normals).sum(dim=1, keepdim=True) * normals
-    blended[:, 5:] -= covered * (along[:, None] @ slope)[:, 0]
-    blended[:, 5:] = torch.nn.functional.normalize(blended[:, 5:], dim=1)
+    blended[:, NORMAL] -= covered * (along[:, None] @ slope)[:, 0]
+    blended[:, NORMAL] = torch.nn.functional.normalize(blended[:, NORMAL], dim=1)
     return blended

@@ -22,7 +22,10 @@ from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels
 from refgs.render.align import fitted
 from refgs.render.baselines import method_of
+from refgs.render.rasterize import rasterize
 from refgs.render.renderer import render
+from refgs.render.rendering import COVERED
+from refgs.render.volume import discs
 from refgs.report import published
 from refgs.run import Run
 
@@ -115,6 +118,8 @@ def _measure_view(
     for name in PASSES:
         if name in images:
             write(name, picture(name, images[name], alpha))
+    if run.splats.doubt is not None:
+        write("doubt", picture("doubt", _doubt(run, camera), alpha))
     known, true_alpha = known_maps(truth, view, camera, run.to_capture)
     for name, true in known.items():
         write(f"true_{name}", picture(name, true, true_alpha))
@@ -122,6 +127,13 @@ def _measure_view(
     if "normal_mae_degrees" in figures:
         figures["normal_ssim"] = metrics.normal_ssim(images["normal"], known["normal"], alpha, true_alpha)
     return figures
+
+
+def _doubt(run: Run, camera: Camera) -> np.ndarray:
+    """Render the doubt of the splats' metallic (H, W), 0..1, as a camera sees it. The splats must have one."""
+    feature = torch.from_numpy(run.splats.doubt)[:, None]
+    drawn = rasterize(*discs(run.surfels(), camera), feature, camera, near=run.near)
+    return (drawn.features[..., 0] / drawn.alpha.clamp_min(COVERED)).numpy()
 
 
 def _measure_light(run: Run, truth: GroundTruth | None, pictures: Path) -> dict[str, dict[str, float]]:

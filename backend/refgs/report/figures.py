@@ -54,6 +54,7 @@ DETAILS = [
     Quantity("roughness_mae", "roughness: mean error", "{:.4f}".format, min),
     Quantity("metallic_mae", "metallic: mean error", "{:.4f}".format, min),
     Quantity("metallic_wrong", "metallic off by more than 0.5", "{:.1%}".format, min),
+    Quantity("doubt.part", "surface where photos do not tell metal from paint", "{:.1%}".format, None),
     Quantity("visibility_agreement", "mirror visibility: pixels that agree", "{:.1%}".format, max),
     Quantity("visibility_free", "mirror visibility: pixels that are free in truth", "{:.1%}".format, None),
     Quantity("environment.log_rmse", "light: RMS error of log radiance after one scale", "{:.3f}".format, min),

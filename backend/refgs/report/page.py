@@ -3,12 +3,12 @@
 It reads these files of a run folder. If a file is missing, its section is left out:
 
     metrics.json     nested objects. Their numbers are metrics: those that `refgs.report.figures` names,
-                     relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}, and any others. ambiguities.NAME.what is text.
+                     relight.HDRI.{refgs,splats,mesh}.{psnr,flip}_{raw,aligned}, and any others. Text: ambiguities.NAME.what, doubt.what.
     history.jsonl    one object a line: seconds, iteration, parts (seconds by kind of work), and the errors that `refgs.report.curves` names
     needs.json       optional features that were kept or left out: a list of {"what", "why"}, with "saved", "cost", "needed" if known, and
                      "pictures" of both answers in needs/
     run.toml         the settings, and the capture's folder
-    pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png, and true_normal/VIEW.png … if known
+    pictures/test/{photo,color,normal,albedo,roughness,metallic}/VIEW.png, and doubt/VIEW.png, true_normal/VIEW.png … if known
     pictures/relight/{truth,refgs,splats,mesh}/HDRI_VIEW.png
     pictures/environment.png, and environment_truth.png if the true light is known
 """
@@ -40,6 +40,7 @@ PASSES = {
     "albedo": "base colour",
     "roughness": "roughness",
     "metallic": "metallic",
+    "doubt": "orange: photos do not tell metal from paint",
     "true_normal": "true normal",
     "true_albedo": "true base colour",
     "true_roughness": "true roughness",
@@ -92,7 +93,9 @@ def write_report(runs: list[Path], out: Path) -> None:
         rest=_other_figures(pages),
         views=_unique_names(page.views for page in pages),
         relit=_unique_names(page.relit for page in pages),
-        passes=PASSES,
+        passes={
+            kind: PASSES[kind] for kind in PASSES if any(view[kind] for page in pages for view in page.views.values())
+        },
         relit_kinds=RELIT,
         errors=error_chart(groups, [page.label for page in pages]),
         times=_time_tables(groups),
@@ -160,9 +163,9 @@ def _read_run(folder: Path) -> RunPage:
 
 
 def _ambiguities(metrics: dict) -> list[str]:
-    """Collect the sentences of metrics.json about ambiguities: changes to the scene that the photos cannot tell apart."""
+    """Collect the sentences of metrics.json about what the photos cannot tell apart: changes to the scene, and metal from paint."""
     found = metrics.get("ambiguities")
-    known = found.values() if isinstance(found, dict) else ()
+    known = [*(found.values() if isinstance(found, dict) else ()), metrics.get("doubt")]
     return [facts["what"] for facts in known if isinstance(facts, dict) and "what" in facts]
 
 

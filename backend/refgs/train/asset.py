@@ -19,7 +19,8 @@ from refgs.render.composite import blended_normals
 from refgs.render.facing import facing_cosine
 from refgs.render.volume import with_normals_last
 from refgs.run import OCCLUDER
-from refgs.train import needs, poses
+from refgs.run_folder import update_metrics
+from refgs.train import metals, needs, poses
 from refgs.train.probe import blended_shares
 from refgs.train.state import State, why_not_traced
 
@@ -28,7 +29,8 @@ def write_asset(state: State) -> None:
     """Write the results of a training into its run folder.
 
     These are the surfels (splats.ply), the light (environment.exr), and what the training left out (needs.json). With inter-reflection, the
-    object's mesh is written to occluder.ply. With learned exposures or poses, cameras.json is written again to include them.
+    object's mesh is written to occluder.ply. With learned exposures or poses, cameras.json is written again to include them. Where photos
+    decide what is metal, splats.ply says where they do not tell, and metrics.json on how much of the surface.
     """
     folder, settings = state.folder, state.settings
     with torch.no_grad():
@@ -55,6 +57,10 @@ def write_asset(state: State) -> None:
         surfels = surfels._replace(**{name: torch.full_like(getattr(surfels, name), constants[name])})
     splats = to_splats(surfels.chosen(kept))
     splats.constants = constants
+    if found := metals.doubt(state):
+        doubt, facts = found
+        splats.doubt = doubt.numpy()[kept.numpy(force=True)]
+        update_metrics(folder, {"doubt": facts})
     splats.normals *= side[kept].numpy(force=True)[:, None]
     splats.normals = blended_normals(splats)
     write_splats(folder / "splats.ply", splats)

@@ -25,6 +25,7 @@ TELLING = (
 )
 JUDGED = 0.5  # part of the training after which materials are judged no more: by then little changes, and each time takes seconds
 TOLD = 0.005  # part of the surface, above which a change is announced
+DOUBTFUL = 0.5  # doubt from which on photos do not tell
 KINDS = "metal", "paint"  # what a surfel can be held as
 HELD = torch.tensor(
     [raw_metallic(0.98), raw_metallic(0.002)]
@@ -102,6 +103,30 @@ def judge_due(state: State, progress: float) -> None:
     if max(parts) > TOLD:
         words = f"{parts[0]:.1%} of the surface is of a piece with metals, {parts[1]:.1%} does not mirror as metals do"
         state.announce("mirrored", words)
+
+
+@torch.no_grad()
+def doubt(state: State) -> tuple[torch.Tensor, dict] | None:
+    """Measure where photos do not tell metal from paint (see `same_material.doubt`), and announce on how much of the surface.
+
+    Returns the doubt of each surfel (N,) in 0..1, and facts for metrics.json: `part`, the part of the surface with at least DOUBTFUL, 0..1,
+    and `what`, the words that are announced, if that is more than TOLD. Returns None where photos do not decide what is metal: without a
+    light, without specular shading, or without a mask of each photo. Surfels whose metallic is held are not in doubt.
+    """
+    if not state.from_hull or not _decidable(state):
+        return None
+    surfels, seen, fit = mirrored.observe(state)
+    found = same_material.doubt(surfels, seen, fit)
+    if "metallic" in state.parameters:
+        held = torch.isin(state.parameters["metallic"], HELD.to(state.device)).cpu()
+        found[held & (seen.pixels > same_material.FRINGE)] = 0
+    weight = seen.pixels * state.wanted().cpu()
+    part = float(weight[found >= DOUBTFUL].sum()) / max(float(weight.sum()), 1e-6)
+    facts = {"part": part}
+    if part > TOLD:
+        facts["what"] = f"photos do not tell metal from paint on {part:.0%} of the surface"
+        state.announce("doubt", facts["what"])
+    return found, facts
 
 
 def _decidable(state: State) -> bool:

@@ -26,6 +26,7 @@ AGAINST_METAL = 0.5
 KEPT_PAINT, KEPT_METAL = 0.045, 0.15  # weight of the kind so far
 # How likely a metal is, above which paint becomes metal, and below which metal becomes paint.
 LIKELY, UNLIKELY = 0.5, 0.2
+OPEN = 0.02 * SURE  # weight with which `doubt` takes a surfel for neither
 FITTED = 0.01  # weight of a metal that was only fitted, beside one that was learned
 REACH = 3.0  # how far evidence spreads, as the weight of differences between neighbours
 NEIGHBOURS = 16
@@ -53,11 +54,7 @@ def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
 
     Evidence for either kind spreads over a surface. The kind that training has found so far stays where there is none. It does not spread.
     """
-    graph, part = _laplacian(surfels.positions.double().numpy(), seen), (seen.pixels > FRINGE).double().numpy()
-    ratio = fit.ratio.clamp(1e-3, 1e3).log().double().numpy() * fit.seen.numpy()
-    mirrors = (fit.slope > SLOPE) & (fit.reflectance.amax(dim=1) > REFLECTANCE)
-    metal = np.where(mirrors.numpy() & (ratio < np.log(METAL)), np.clip(-ratio, 0, SURE), 0) * part
-    paint = np.clip(ratio - np.log(PAINT), 0, SURE) * part
+    graph, part, metal, paint = _evidence(surfels, seen, fit)
     was, none = (surfels.metallic > 0.5).numpy(), 1e-4
     likely = _solve(graph, metal + AGAINST_METAL * paint + KEPT_PAINT * part + none, metal)
     kept = KEPT_METAL * was * part
@@ -73,6 +70,28 @@ def decide(surfels: Surfels, seen: Seen, fit: Fit) -> Found:
     like = [_solve(graph, sure + none, sure * of + none * all_of) for of, all_of in zip(material.T, mean, strict=True)]
     turned = torch.from_numpy(~was & (likely > LIKELY)), torch.from_numpy(was & (unlikely < UNLIKELY))
     return Found(*turned, torch.from_numpy(np.stack(like, axis=1)).float())
+
+
+def doubt(surfels: Surfels, seen: Seen, fit: Fit) -> Tensor:
+    """Measure where photos do not tell metal from paint, whatever the training has made of it: (N,) in 0..1.
+
+    0 is a surfel that photos tell. 1 is one that hardly any pixel shows, or of whose piece photos tell nothing. Between them, doubt rises
+    with the distance from surfels of the same piece that photos tell.
+
+    With p, how likely a metal is, doubt is 1 − |2 p − 1|. 2 p − 1 solves the system of `decide` for metals at 1 and paint at −1. All are
+    drawn to 0, by the weight OPEN in place of that of the material so far.
+    """
+    graph, _, metal, paint = _evidence(surfels, seen, fit)
+    return 1 - torch.from_numpy(_solve(graph, metal + paint + OPEN, metal - paint)).float().abs().clamp_max(1)
+
+
+def _evidence(surfels: Surfels, seen: Seen, fit: Fit) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the graph of surfels (N, N), which of them take part (N,), and how much photos tell that each is metal, and paint (N,)."""
+    graph, part = _laplacian(surfels.positions.double().numpy(), seen), (seen.pixels > FRINGE).double().numpy()
+    ratio = fit.ratio.clamp(1e-3, 1e3).log().double().numpy() * fit.seen.numpy()
+    mirrors = (fit.slope > SLOPE) & (fit.reflectance.amax(dim=1) > REFLECTANCE)
+    metal = np.where(mirrors.numpy() & (ratio < np.log(METAL)), np.clip(-ratio, 0, SURE), 0) * part
+    return graph, part, metal, np.clip(ratio - np.log(PAINT), 0, SURE) * part
 
 
 def _solve(graph: sparse.csr_matrix, weight: np.ndarray, weighted: np.ndarray) -> np.ndarray:

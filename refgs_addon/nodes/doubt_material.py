@@ -1,0 +1,37 @@
+"""Build what colours a run by its doubt: how little its photos tell metal from paint, 0..1."""
+
+import bpy
+
+from ..compat import node_tree
+from . import add, add_input, modifier_tree, out
+
+NAME = "RefGS Doubt"  # the mesh's tree and modifier
+# Linear colours where photos tell, and where they do not: those of the report's pictures, backend/refgs/compare/pictures.py.
+TOLD, DOUBTFUL = (0.089, 0.1, 0.119, 1.0), (1.0, 0.319, 0.02, 1.0)
+
+
+def doubt_color(tree: bpy.types.NodeTree, doubt: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Add a node that turns doubt into a colour, from TOLD where it is 0 to DOUBTFUL where it is 1. Returns its output."""
+    return out(add(tree, "ShaderNodeMix", {"Factor": doubt, "A": TOLD, "B": DOUBTFUL}, data_type="RGBA"))
+
+
+def doubt_material(name: str, texture: bpy.types.Image) -> bpy.types.Material:
+    """Make a material that shows a mesh's texture of doubt in colours, without lighting."""
+    material = bpy.data.materials.new(name)
+    tree = node_tree(material)
+    doubt = add(tree, "ShaderNodeTexImage", image=texture).outputs["Color"]
+    shown = add(tree, "ShaderNodeEmission", {"Color": doubt_color(tree, doubt)})
+    add(tree, "ShaderNodeOutputMaterial", {"Surface": out(shown)})
+    return material
+
+
+def doubt_tree() -> bpy.types.NodeTree:
+    """Make the node tree `RefGS Doubt`, or return the existing one. It gives a mesh the material of its input Material."""
+    if NAME in bpy.data.node_groups:
+        return bpy.data.node_groups[NAME]
+    tree = modifier_tree(NAME)
+    add_input(tree, "Material", "Material")
+    group = add(tree, "NodeGroupInput").outputs
+    colored = {"Geometry": group["Geometry"], "Material": group["Material"]}
+    add(tree, "NodeGroupOutput", {"Geometry": out(add(tree, "GeometryNodeSetMaterial", colored))})
+    return tree
