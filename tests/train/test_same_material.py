@@ -204,7 +204,7 @@ def test_the_asset_has_the_doubt_of_the_surfels_that_are_written(made):
 def test_metals_that_are_held_are_not_in_doubt(made):
     show(made, metallic=6.0, roughness=-3.0, albedo=GOLD, lamp=DIM)
     made.state.light.data[:] = made.state.light.data.mean()
-    put(made, metallic=float(metals.HELD))
+    put(made, metallic=float(metals.HELD[0]))
     facts = metals.doubt(made.state)[1]
     assert facts["part"] < 0.002 and "what" not in facts, "only what hardly any pixel shows is"
 

@@ -82,7 +82,7 @@ def test_an_artist_trains(tmp_path, ball_capture):
     """Check a whole session in a Blender window with the real trainer.
 
     The session checks and trains a capture, shows live surfels, pauses, stops, resumes, finishes and imports the run. Then it compares
-    with a photo, relights, edits, applies the edits, and renders in another Blender.
+    with a photo, relights, edits, applies the edits, renders in another Blender, and clicks on a part for a hint.
     """
     capture = tmp_path / "ball photos"
     shutil.copytree(ball_capture, capture)
@@ -94,7 +94,7 @@ def test_an_artist_trains(tmp_path, ball_capture):
         "checked": "done", "cameras": "done", "training": "running", "paused": "paused", "stopped": "cancelled",
         "resumed": "running", "done": "done", "imported": "done",
     } | dict.fromkeys(states.keys() & {"photo", "relit", "edited", "applied"}, "done") | (
-        {"live": "running", "previewed": "done"} if report["imported"] == ["FINISHED"] else {}
+        {"live": "running", "previewed": "done", "hinted": "running"} if report["imported"] == ["FINISHED"] else {}
     )  # fmt: skip
     run = Path(report["run"])
     assert run == tmp_path / "ball photos RefGS" and (run / "splats.ply").exists() and (run / "mesh.glb").exists()

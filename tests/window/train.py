@@ -9,7 +9,21 @@ import time
 import traceback
 
 import bpy
-from stage import MODULE, OUT, PATIENCE, WORDS, area, choose_tab, install, jobs, photograph, quit_blender, report, view
+from stage import (
+    MODULE,
+    OUT,
+    PATIENCE,
+    WORDS,
+    area,
+    choose_tab,
+    install,
+    jobs,
+    photograph,
+    quit_blender,
+    region,
+    report,
+    view,
+)
 
 PYTHON, CAPTURE = WORDS
 report |= {"steps": {}, "longest": {}, "ours": {}, "clicks": {}}
@@ -74,7 +88,7 @@ def artist():
 
 
 def use_result(folder):
-    """Compare the result with its photos, relight it, edit it, apply the edits and render it. Yields as `artist` does."""
+    """Compare the result with its photos, relight, edit, apply the edits, render, and click on it for a hint. Yields as `artist` does."""
     report["left"] = [item.name for item in bpy.data.objects if "in training" in item.name]
     scene, manager = bpy.context.scene, bpy.context.window_manager
     area().spaces.active.shading.type = "MATERIAL"
@@ -97,6 +111,21 @@ def use_result(folder):
     yield lambda: jobs()[-1].ended, "previewed"
     report["preview"] = jobs()[-1].state, jobs()[-1].line
     report["scene"] = scene.render.engine, scene.world.name
+    with view():
+        bpy.ops.refgs.hint("INVOKE_DEFAULT", kind="metal")
+    yield lambda: True, None
+    click_middle()
+    yield last("running"), "hinted"
+    tell("cancel")
+    yield last("cancelled"), None
+
+
+def click_middle():
+    """Click in the middle of the 3D view, where a photo's camera sees the object."""
+    window, middle = bpy.context.window_manager.windows[0], region("WINDOW")
+    x, y = middle.x + middle.width // 2, middle.y + middle.height // 2
+    for event, value in (("MOUSEMOVE", "NOTHING"), ("LEFTMOUSE", "PRESS"), ("LEFTMOUSE", "RELEASE")):
+        window.event_simulate(type=event, value=value, x=x, y=y)
 
 
 ours = 0.0  # seconds: longest wait of the window for the add-on since the last step

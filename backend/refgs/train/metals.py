@@ -23,7 +23,6 @@ MOSTLY = 0.6  # part of what is coloured that shines, above which what is dark m
 TELLING = (
     0.3  # part of the surface that is coloured, below which it tells nothing about the rest; a bronze head has 0.48
 )
-JUDGED = 0.5  # part of the training after which materials are judged no more: by then little changes, and each time takes seconds
 TOLD = 0.005  # part of the surface, above which a change is announced
 DOUBTFUL = 0.5  # doubt from which on photos do not tell
 KINDS = "metal", "paint"  # what a surfel can be held as
@@ -84,7 +83,7 @@ def judge_due(state: State, progress: float) -> None:
     such as the lower half of a ball on a table, and has learned the mirrored table as its own colour. A metal that looks the same from
     everywhere, where it would mirror changes, becomes paint. Training can still change both.
     """
-    due = progress <= JUDGED and state.iteration % state.settings.indirect.every == 0
+    due = progress < state.residual_start and state.iteration % state.settings.indirect.every == 0
     if not due or not state.metals_set or not state.from_hull or not _decidable(state):
         return
     surfels, seen, fit = mirrored.observe(state)
