@@ -65,6 +65,14 @@ def ball_capture(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="session")
+def large_ball(tmp_path_factory):
+    """Write a capture whose photos have several pixels for each surfel."""
+    folder = tmp_path_factory.mktemp("large ball")
+    write_ball_capture(folder, 96, samples=1)
+    return folder
+
+
 @pytest.fixture
 def python(tmp_path):
     """Return a fake Python executable. It always runs fake_worker.py, which imitates the trainer but does not train."""

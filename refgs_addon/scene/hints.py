@@ -12,6 +12,7 @@ from ..errors import InputError
 from .atomic_file import atomic_write
 from .deleted_splats import points_of
 from .regions import REGION
+from .splat_cloud import splat_axes
 
 KINDS = ("metal", "paint")
 HALF = 0.5  # of the light along a ray, which the splats in front let through at the splat that is under the cursor
@@ -72,15 +73,13 @@ def write_hint(file: Path, kind: str, points: np.ndarray) -> None:
 def _hit(splats: bpy.types.Object, origin: np.ndarray, direction: np.ndarray) -> int | None:
     """Find the splat at which half of the light along a ray is blocked, or the last one if less is. None if no splat is hit."""
     position, scale = (_attribute(splats, name, "vector", 3) for name in ("position", "scale"))
-    w, x, y, z = _attribute(splats, "rotation", "value", 4).T
-    first = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
-    second = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1)
-    normal = np.cross(first, second)
+    axes = splat_axes(_attribute(splats, "rotation", "value", 4))
+    normal = np.cross(*axes)
     towards = position - origin
     slope = normal @ direction
     distance = np.einsum("na,na->n", normal, towards) / np.where(np.abs(slope) < 1e-9, np.inf, slope)
     offset = distance[:, None] * direction - towards
-    u, v = (np.einsum("na,na->n", offset, axis) / scale[:, i] for i, axis in enumerate((first, second)))
+    u, v = (np.einsum("na,na->n", offset, axis) / scale[:, i] for i, axis in enumerate(axes))
     alpha = _attribute(splats, "opacity", "value", 1)[:, 0] * np.exp(-0.5 * (u * u + v * v)) * (distance > 0)
     hit = np.flatnonzero(alpha > 1 / 255)
     if not len(hit):

@@ -244,6 +244,15 @@ def _parse_header(head: bytes, last_line: bytes, path: Path) -> tuple[np.dtype, 
     return kind, count
 
 
+def splat_axes(rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the two axes of each splat, unit vectors (N, 3): the first two columns of the matrices of unit quaternions wxyz (N, 4)."""
+    w, x, y, z = rotation.T
+    return (
+        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1),
+        np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1),
+    )
+
+
 def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Estimate how the normal changes across each splat: dn/du and dn/dv (N, 3) per standard deviation.
 
@@ -253,11 +262,7 @@ def normal_slopes(splats: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray
     """
     position, normal = (splats[key].astype(np.float32) for key in ("position", "normal"))
     count = len(position)
-    w, x, y, z = splats["rotation"].astype(np.float32).T
-    tangents = (  # the first two columns of the rotation matrix: the splat's axes
-        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1),
-        np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], axis=1),
-    )
+    tangents = splat_axes(splats["rotation"].astype(np.float32))
     orders = [_morton_order(position, shift) for shift in _SHIFTS]
     beside = np.full((2 * len(orders), count), np.inf, np.float32)  # squared distances to the adjacent splats
     for row, order in enumerate(orders):

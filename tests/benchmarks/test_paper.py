@@ -171,9 +171,8 @@ def test_a_scene_that_fails_does_not_stop_the_others(tmp_path, monkeypatch, caps
     assert "shiny_blender/ball" in said.partition("not measured, see above")[2]
 
 
-def test_from_photos_to_the_tables(tmp_path, monkeypatch, capsys):
-    """Train and evaluate a tiny version of Shiny Blender's ball, and print the tables."""
-    shiny_blender(tmp_path / "shiny_blender" / "ball")
+def measure_tiny(tmp_path, monkeypatch):
+    """Train and evaluate, by a tiny preset, the data sets in `tmp_path`. The runs are in `tmp_path / "runs" / "tiny"`."""
     preset = tmp_path / "tiny.toml"
     preset.write_text(
         'base = "quick"\n[surfels]\nstart = 300\nbudget = 300\nhull = 32\n[environment]\nresolution = 16\n'
@@ -190,6 +189,12 @@ def test_from_photos_to_the_tables(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(harness, "call", call)
     paper.main(["--data", str(tmp_path), "--out", str(tmp_path / "runs"), "--preset", str(preset)])
+
+
+def test_from_photos_to_the_tables(tmp_path, monkeypatch, capsys):
+    """Train and evaluate a tiny version of Shiny Blender's ball, and print the tables."""
+    shiny_blender(tmp_path / "shiny_blender" / "ball")
+    measure_tiny(tmp_path, monkeypatch)
     assert "Tables 1 and 2, Shiny Blender" in capsys.readouterr().out
     assert (tmp_path / "runs/tiny/shiny_blender/ball/pictures/test/photo/r_0.png").exists()
 
@@ -202,21 +207,7 @@ def test_from_published_data_to_relit_figures(tmp_path, monkeypatch, capsys, mak
     else:
         monkeypatch.setitem(paper.PAPER["stanford_orb"], "scenes", ["ball_scene001"])
         stanford_orb(tmp_path / "stanford_orb")
-    preset = tmp_path / "tiny.toml"
-    preset.write_text(
-        'base = "quick"\n[surfels]\nstart = 300\nbudget = 300\nhull = 32\n[environment]\nresolution = 16\n'
-        "[train]\niterations = 3\nlight_first = 1\n[indirect]\nstart = 1\n"
-    )
-
-    def call(what, folder, *options):
-        if what == "train":
-            commands.train(folder, options[1], str(preset), "cpu", None, [options[5]], False)
-        else:
-            commands.evaluate(folder, "test", None)
-        return 0
-
-    monkeypatch.setattr(harness, "call", call)
-    paper.main(["--data", str(tmp_path), "--out", str(tmp_path / "runs"), "--preset", str(preset)])
+    measure_tiny(tmp_path, monkeypatch)
     (found,) = (tmp_path / "runs" / "tiny").glob("*/*/metrics.json")
     metrics = json.loads(found.read_text())
     relit = metrics["tensoir"]["relit_psnr"] if maker is tensoir else metrics["stanford_orb"]["light"]["psnr_h"]

@@ -9,7 +9,7 @@ import torch
 from benchmarks.scenes.analytic import write_ball_capture
 from refgs import train_job
 from refgs.errors import InputError
-from refgs.formats.hints import FILE, Hint, read_hints, write_hints
+from refgs.formats.hints import FILE, KINDS, Hint, read_hints, write_hints
 from refgs.formats.splats import read_splats
 from refgs.run_folder import read_run_facts
 from refgs.train import checkpoint, metals, needs
@@ -20,7 +20,7 @@ from refgs.train.measures import held_out_psnr
 from tests.makers.training import TINY, put, trained, trainer
 
 TOTAL = 400
-METAL, PAINT = (metals.HELD[metals.KINDS.index(kind)] for kind in ("metal", "paint"))
+METAL, PAINT = (metals.HELD[KINDS.index(kind)] for kind in ("metal", "paint"))
 
 
 def silent(event, facts):

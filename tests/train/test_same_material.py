@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.scenes.analytic import write_ball_capture
 from refgs.formats.splats import read_splats
 from refgs.model.surfels import activate, raw_metallic
 from refgs.train import metals, mirrored, same_material
@@ -20,14 +19,6 @@ from tests.makers.training import trainer as small
 DIM = 1.0  # of lamps whose mirror images are not clipped: a radiance of 1.3, beside 0.2
 GOLD = [3.0, 1.0, -1.0]  # logits: 0.95, 0.73, 0.27
 ALL = ["surfels.sh_degree=0", "needs.specular=on", "needs.outside=off", "indirect.every=100"]
-
-
-@pytest.fixture(scope="module")
-def large_ball(tmp_path_factory):
-    """Write a capture whose photos have several pixels for each surfel."""
-    folder = tmp_path_factory.mktemp("ball")
-    write_ball_capture(folder, 96, samples=1)
-    return folder
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ The photos are renderings of the model itself, whose materials are known.
 import pytest
 import torch
 
-from benchmarks.scenes.analytic import write_ball_capture
 from refgs.model.surfels import activate
 from refgs.train import even_metal, metals, view_dependence
 from refgs.train.changing_light import CHANGED, LEFT, explained
@@ -17,14 +16,6 @@ from tests.makers.training import put
 from tests.makers.training import trainer as small
 
 ALL = ["surfels.sh_degree=0", "needs.specular=on", "needs.outside=off"]
-
-
-@pytest.fixture(scope="module")
-def large_ball(tmp_path_factory):
-    """Write a capture whose photos have several pixels for each surfel."""
-    folder = tmp_path_factory.mktemp("ball")
-    write_ball_capture(folder, 96, samples=1)
-    return folder
 
 
 @pytest.fixture

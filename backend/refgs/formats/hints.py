@@ -11,6 +11,7 @@ from refgs.paths import write_text
 
 FILE = "hints.json"  # in the folder of a run that was trained with hints
 Kind = Literal["metal", "paint"]
+KINDS = get_args(Kind)
 
 
 class Hint(NamedTuple):
@@ -30,8 +31,8 @@ def read_hints(file: Path) -> list[Hint]:
     except (ValueError, KeyError, TypeError):
         raise InputError(f'{file} has no hints: it must be JSON as {{"hints": [{{"kind": "metal", …}}]}}') from None
     for hint in hints:
-        if hint.kind not in get_args(Kind):
-            raise InputError(f"{file}: a hint is of the kind {hint.kind!r}: take {' or '.join(get_args(Kind))}")
+        if hint.kind not in KINDS:
+            raise InputError(f"{file}: a hint is of the kind {hint.kind!r}: take {' or '.join(KINDS)}")
         if len(hint.points) == 0 or not np.isfinite(hint.points).all():
             raise InputError(f"{file}: the points of a hint must be positions of splats, at least one: choose a part")
     if not hints:

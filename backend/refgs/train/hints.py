@@ -11,7 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from refgs.errors import InputError
-from refgs.formats.hints import Hint
+from refgs.formats.hints import KINDS, Hint
 from refgs.formats.splats import read_splats
 from refgs.settings import Settings
 from refgs.train import metals, needs, snapshot
@@ -39,22 +39,22 @@ def continue_with_hints(state: State, run: Path, hints: list[Hint]) -> None:
     _go_back(state)
     metals.hold_as(state, kinds)
     mirror = settings.model_copy(update={"surfels": settings.surfels.model_copy(update=MIRROR)})
-    _restart(state, ("albedo", "roughness"), kinds == metals.KINDS.index("metal"), mirror)
+    _restart(state, ("albedo", "roughness"), kinds == KINDS.index("metal"), mirror)
     _restart(state, ("sh_rest",), torch.ones_like(kinds, dtype=torch.bool), settings)
-    part = {kind: float((kinds == number).float().mean()) for number, kind in enumerate(metals.KINDS)}
+    part = {kind: float((kinds == number).float().mean()) for number, kind in enumerate(KINDS)}
     what = ", ".join(f"{share:.0%} as {kind}" for kind, share in part.items() if share)
     state.report("stage", {"what": f"hints hold {what} of {len(kinds):,} surfels; training again from {AGAIN:.0%} on"})
 
 
 def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.Tensor:
-    """Return for each surfel (N,) the index of its hinted kind in `metals.KINDS`, −1 without a hint.
+    """Return for each surfel (N,) the index of its hinted kind in `KINDS`, −1 without a hint.
 
     `splats` (M, 3) are the positions of the run's splats. Each point of a hint means the nearest splat. A surfel is as the splat nearest to
     it: surfels that no photo shows have no row in splats.ply. The last hint about a splat counts.
     """
     tree, kinds = cKDTree(splats), np.full(len(splats), -1)
     for hint in hints:
-        kinds[tree.query(hint.points)[1]] = metals.KINDS.index(hint.kind)
+        kinds[tree.query(hint.points)[1]] = KINDS.index(hint.kind)
     nearest = tree.query(state.parameters["position"].numpy(force=True))[1]
     return torch.from_numpy(kinds[nearest]).to(state.device)
 

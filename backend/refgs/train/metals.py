@@ -25,10 +25,9 @@ TELLING = (
 )
 TOLD = 0.005  # part of the surface, above which a change is announced
 DOUBTFUL = 0.5  # doubt from which on photos do not tell
-KINDS = "metal", "paint"  # what a surfel can be held as
 HELD = torch.tensor(
     [raw_metallic(0.98), raw_metallic(0.002)]
-)  # raw metallic that is held, of each kind; surfels that have exactly this value are known by it
+)  # raw metallic that is held, of each of `formats.hints.KINDS`; surfels that have exactly this value are known by it
 
 
 def set_metals_due(state: State, progress: float) -> None:
@@ -136,7 +135,7 @@ def _decidable(state: State) -> bool:
 
 @torch.no_grad()
 def hold_as(state: State, kinds: torch.Tensor) -> None:
-    """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) has each surfel's index in KINDS, −1 for those that learn."""
+    """Hold the metallic of surfels from now on (see `hold`). `kinds` (N,) has their index in `hints.KINDS`, −1 for those that learn."""
     metallic, which = state.parameters["metallic"], kinds >= 0
     metallic[which] = HELD.to(metallic)[kinds[which]]
     state.forget_moments("metallic", which)

@@ -5,6 +5,7 @@ it mirrors. Both are fitted to some photos by least squares. What a surfel mirro
 the mean radiance that photos show there: so no material has to be known.
 """
 
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -17,8 +18,7 @@ from refgs.model.surfels import Surfels
 from refgs.render import reference
 from refgs.render.relight import blend, mirror
 from refgs.train import probe
-from refgs.train.losses import Photo
-from refgs.train.state import State
+from refgs.train.state import RenderInputs, State
 from refgs.train.view_dependence import LEAST_CLIPPED, LEAST_PIXELS, NEIGHBOURS, VIEWS, linear, neighbours, pooled
 
 ROUGHNESSES = 0.05, 0.2, 0.45  # that are tried
@@ -75,26 +75,23 @@ def observe(state: State) -> tuple[Surfels, Seen, Fit]:
     The state must have a light. What surfels mirror of the object is known only if the state has a mesh (`occluder`).
     """
     photos = probe.spread_views(state, VIEWS)
-    seen = _look(state, photos)
-    surfels = Surfels(*(value.detach().cpu() for value in state.surfels()))
-    light = state.environment()
-    turns = [torch.from_numpy(light.turn(state.photo(view).camera)).float() for view in photos]
-    light = Environment(light.radiance.detach().cpu())
+    inputs = state.inputs()
+    inputs = inputs._replace(surfels=Surfels(*(value.detach() for value in inputs.surfels)))
+    seen = _look(state, inputs, photos)
+    surfels = Surfels(*(value.cpu() for value in inputs.surfels))
+    turns = [torch.from_numpy(inputs.environment.turn(state.photo(view).camera)).float() for view in photos]
+    light = Environment(inputs.environment.radiance.cpu())
     return surfels, seen, _fit(seen, _mirrored(state, surfels, seen, light, turns), surfels.positions)
 
 
-def _look(state: State, views: list[int]) -> Seen:
-    surfels = Surfels(*(value.detach() for value in state.surfels()))
-    towards, sums = [], []
+def _look(state: State, inputs: RenderInputs, views: list[int]) -> Seen:
+    positions, towards, sums = inputs.surfels.positions, [], []
     for view in views:
-        photo = state.photo(view)
-        position = torch.from_numpy(photo.camera.position).to(surfels.positions)
-        towards.append(torch.nn.functional.normalize(position - surfels.positions, dim=1))
-        sums.append(_sums(state, surfels, view, photo))
-    (radiance, pixels, clipped, normal), towards = (
-        torch.stack(sums, dim=1).cpu().split([3, 1, 1, 3], dim=2),
-        torch.stack(towards, dim=1).cpu(),
-    )
+        camera = torch.from_numpy(state.photo(view).camera.position).to(positions)
+        towards.append(torch.nn.functional.normalize(camera - positions, dim=1))
+        sums.append(_sums(state, inputs, view))
+    radiance, pixels, clipped, normal = torch.stack(sums, dim=1).cpu().split([3, 1, 1, 3], dim=2)
+    towards = torch.stack(towards, dim=1).cpu()
     pixels, clipped = pixels[..., 0], clipped[..., 0]
     mean = radiance.sum(dim=1) / pixels.sum(dim=1, keepdim=True).clamp_min(1e-6)
     some, normal = pixels.clamp_min(1e-6), torch.nn.functional.normalize(normal, dim=2)
@@ -102,19 +99,21 @@ def _look(state: State, views: list[int]) -> Seen:
     return Seen(radiance / some[..., None], pixels * known, pixels.sum(dim=1), mean, normal, towards)
 
 
-def _sums(state: State, surfels: Surfels, view: int, photo: Photo) -> Tensor:
+def _sums(state: State, inputs: RenderInputs, view: int) -> Tensor:
     """Sum over each surfel's pixels in a photo (N, 8): linear radiance, weights, those of clipped pixels, and blended normals."""
-    exposure, radiance = state.exposure(view), linear(photo)
+    photo, exposure = state.photo(view), state.exposure(view)
+    radiance = linear(photo)
     radiance = radiance if exposure is None else radiance / exposure
     one = torch.ones_like(radiance[..., :1])
     clipped = photo.clipped.any(dim=-1, keepdim=True).float()
-    shown = torch.cat([radiance, one, clipped, state.render(photo.camera).normal], dim=-1)
-    return probe.pixel_sums(
-        surfels, photo, state.near, torch.ones_like(surfels.positions[:, :1]).expand(-1, 8), lambda _: shown
-    )
+    shown = torch.cat([radiance, one, clipped, probe.picture(state, view, inputs).normal], dim=-1)
+    features = torch.ones_like(inputs.surfels.positions[:, :1]).expand(-1, 8)
+    return probe.pixel_sums(inputs.surfels, photo, state.near, features, lambda _: shown)
 
 
-def _mirrored(state: State, surfels: Surfels, seen: Seen, light: Environment, turns: list[Tensor]):
+def _mirrored(
+    state: State, surfels: Surfels, seen: Seen, light: Environment, turns: list[Tensor]
+) -> Iterator[list[Tensor]]:
     """Yield for each photo what the surfels mirror there, as one tensor (N, 3) for each of ROUGHNESSES."""
     levels, occluder, there = cubemap.in_texel_order(light.levels, light.sides), state.occluder, None
     if occluder is not None:
@@ -131,14 +130,15 @@ def _mirrored(state: State, surfels: Surfels, seen: Seen, light: Environment, tu
         shown = [cubemap.sample(levels, light.sides, direction @ turn.T, level) for level in levels_of]
         if there is not None:
             face, inside = occluder.meet(points, normal.double().numpy(), direction.double().numpy())
-            met = torch.from_numpy(face >= 0)
-            corners = there[torch.from_numpy(mesh.faces[face[face >= 0]]).long()]
+            met = face >= 0
+            corners = there[torch.from_numpy(mesh.faces[face[met]]).long()]
+            radiance = (corners * torch.from_numpy(inside[met])[..., None]).sum(dim=1)
             for each in shown:
-                each[met] = (corners * torch.from_numpy(inside[face >= 0])[..., None]).sum(dim=1)
+                each[torch.from_numpy(met)] = radiance
         yield [each.clamp_max(BRIGHTEST) for each in shown]
 
 
-def _fit(seen: Seen, mirrored, positions: Tensor) -> Fit:
+def _fit(seen: Seen, mirrored: Iterable[list[Tensor]], positions: Tensor) -> Fit:
     """Fit both materials to all photos, for each of ROUGHNESSES, and keep the best of each kind.
 
     With reflectance s and diffuse radiance c, a metal shows (s FG0 + FG1) R and paint c + F R of what it mirrors, R: FG0, FG1 and F are the

@@ -86,7 +86,8 @@ def normals_loss(rendering: Rendering, photo: Photo, codes: Tensor, camera: Came
     guessed = at_pixels(codes, camera, photo.camera).to(rendering.normal) / CODE
     counts = _counts(rendering, photo) * (guessed.square().sum(dim=-1) > 0.5)
     turn = torch.from_numpy(photo.camera.world_to_camera[:3, :3].copy()).to(guessed)
-    return _saturating(1 - _cosine(rendering.normal @ turn.T, guessed), WRONG, counts, photo)
+    cosine = torch.nn.functional.cosine_similarity(rendering.normal @ turn.T, guessed, dim=-1)
+    return _saturating(1 - cosine, WRONG, counts, photo)
 
 
 def depth_loss(
@@ -235,10 +236,6 @@ def _counts(rendering: Rendering, photo: Photo) -> Tensor:
     """Return how much each pixel (H, W) counts: the mask's alpha where the surface is opaque, else 0."""
     opaque = (rendering.alpha.detach() > SOLID).float()
     return opaque if photo.mask is None else opaque * (photo.mask.float() / 255)
-
-
-def _cosine(one: Tensor, other: Tensor) -> Tensor:
-    return torch.nn.functional.cosine_similarity(one, other, dim=-1)
 
 
 def _saturating(error: Tensor, half: float, counts: Tensor, photo: Photo) -> Tensor:
