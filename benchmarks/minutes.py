@@ -51,7 +51,7 @@ def best(presets: dict[str, Path], seconds: float) -> tuple[float, str] | None:
 
 
 def _lines(run: Path) -> list[dict]:
-    return history.read((run / history.FILE).read_text(encoding="utf-8"))
+    return history.read(run / history.FILE)[0]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

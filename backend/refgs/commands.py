@@ -236,8 +236,7 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
 
     run = open_run(folder)
     capture = read_capture(run.capture_folder, run.settings.region)
-    if capture.fingerprint() != run.fingerprint:
-        raise InputError(f"{run.capture_folder} was changed since {folder} was trained on it")
+    capture.check_unchanged(folder, run.fingerprint)
     views = capture.test_views if split == "test" else capture.train_views
     if not views:
         raise InputError(f"{run.capture_folder} has no {split} views")

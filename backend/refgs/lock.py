@@ -12,14 +12,17 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from refgs.errors import InputError
-from refgs.paths import write_text
+from refgs.paths import remove_leftovers, write_text
 
 LOCK, PROGRESS, STOP = "run.lock", "progress.json", "stop"
 EVERY = 1.0  # seconds between looks
 
 
 class RunLock:
-    """Lock a run folder for this process during a `with` block. Raises InputError if another process has locked it."""
+    """Lock a run folder for this process during a `with` block. Raises InputError if another process has locked it.
+
+    What killed processes left half-written in the folder is removed. A folder that does not exist is made.
+    """
 
     def __init__(self, folder: Path):
         self._folder, self._lock, self._next = folder, FileLock(folder / LOCK), 0.0
@@ -33,6 +36,7 @@ class RunLock:
         except OSError:  # a file system without locks
             pass
         self._tidy()
+        remove_leftovers(self._folder)
         return self
 
     def __exit__(self, *_) -> None:
@@ -55,7 +59,7 @@ class RunLock:
         facts = {"iteration": iteration, "total": total, "seconds_left": left}
         # A reader that has the file open on Windows, or a full disk, must not end the training.
         with suppress(OSError):
-            write_text(self._folder / PROGRESS, json.dumps(facts))
+            write_text(self._folder / PROGRESS, json.dumps(facts), durable=False)
         return (self._folder / STOP).exists()
 
     def _tidy(self) -> None:

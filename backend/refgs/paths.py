@@ -2,8 +2,10 @@
 
 import errno
 import os
+import re
+import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from refgs.errors import InputError
@@ -12,26 +14,67 @@ PACKAGE = Path(__file__).resolve().parent
 ROOT = PACKAGE.parents[1]
 PRESETS = PACKAGE / "presets" if (PACKAGE / "presets").is_dir() else ROOT / "presets"  # in a wheel, in a clone
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES)
+_TEMPORARY = re.compile(r"\.refgs-[0-9a-f]{16}\.tmp")
 
 
 @contextmanager
-def whole(path: str | os.PathLike) -> Iterator[Path]:
+def whole(path: str | os.PathLike, durable: bool = True) -> Iterator[Path]:
     """Write a file completely or not at all.
 
-    Yields a temporary path to write to. It is renamed to `path` at the end of the `with` block, or deleted if the block raises an error.
+    Yields a temporary file, empty and in the same folder, to write to. It is renamed to `path` at the end of the `with` block, or deleted
+    if the block raises an error. A killed process leaves it behind: see `remove_leftovers`.
+
+    The file is on the disk when the block ends, so that it outlives a power failure. `durable=False` leaves that out, which takes
+    milliseconds, for files that are of no use then.
     """
     path = Path(path)
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = path.with_name(f".refgs-{secrets.token_hex(8)}.tmp")
     try:
+        # Create it here: no other writer has this name, and a link that somebody put there is not followed.
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_NOFOLLOW", 0), 0o666))
         yield temporary
+        if durable:
+            _sync(temporary, os.O_RDWR)  # Windows refuses to sync what is open for reading
         os.replace(temporary, path)
+        if durable and os.name == "posix":  # nowhere else can a folder be opened
+            with suppress(OSError):  # some network file systems sync no folder
+                _sync(path.parent, os.O_RDONLY)
+    except OSError as error:
+        if str(error.filename) == str(temporary):  # a name that tells the user nothing
+            error.filename = str(path)
+        raise
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
-def write_text(file: Path, text: str) -> None:
-    """Write a text file completely or not at all."""
-    with whole(file) as temporary:
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files of `whole` that killed processes left in a folder and the folders in it.
+
+    Call this only while no other process writes there.
+    """
+    for file in folder.rglob("*.tmp"):
+        if is_leftover(file):
+            with suppress(OSError):
+                file.unlink()
+
+
+def is_leftover(file: Path) -> bool:
+    """Tell by its name whether a file is a temporary one of `whole`."""
+    return _TEMPORARY.fullmatch(file.name) is not None
+
+
+def _sync(path: Path, flags: int) -> None:
+    opened = os.open(path, flags)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
+
+
+def write_text(file: Path, text: str, durable: bool = True) -> None:
+    """Write a text file completely or not at all, by `whole`."""
+    with whole(file, durable) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 

@@ -15,6 +15,7 @@ import torch
 from refgs import __version__
 from refgs.camera import Camera
 from refgs.capture import Capture, read_run_cameras, write_cameras
+from refgs.capture.contents import write_hashes
 from refgs.errors import InputError
 from refgs.formats.mesh import read_mesh
 from refgs.formats.panorama import read_environment
@@ -26,7 +27,7 @@ from refgs.paths import write_text
 from refgs.render.baselines import method_of
 from refgs.render.relight import Progress, Transport, relit
 from refgs.render.renderer import Rendering, near_plane, render
-from refgs.run_folder import check_finished, check_free
+from refgs.run_folder import CHECKPOINTS, SPLATS, check_finished, check_free
 from refgs.settings import Settings
 
 OCCLUDER = "occluder.ply"  # the mesh that inter-reflection was traced on; absent without inter-reflection
@@ -110,16 +111,22 @@ class Run:
 
 
 def create_run(
-    folder: Path, capture: Capture, settings: Settings, preset: str, device: str, chosen: dict[str, str] | None = None
+    folder: Path,
+    capture: Capture,
+    settings: Settings,
+    preset: str,
+    device: str,
+    chosen: dict[str, str] | None = None,
+    changed: dict[str, dict] | None = None,
 ) -> None:
-    """Create a run folder with run.toml and cameras.json. Raise InputError if the folder exists and is not empty.
+    """Create a run folder with cameras.json, capture.json, and run.toml, which comes last. Raise InputError if the folder is not free.
 
-    `settings` are the values in use. `chosen` is written to run.toml for the user: for each setting that was "auto", the value that was
-    chosen and why.
+    `settings` are the values in use. `chosen` and `changed` are written to run.toml for the user: for each setting that was "auto", the
+    value that was chosen and why; and the rows of changed settings (see `record_changes`).
     """
     check_free(folder)
     try:
-        (folder / "checkpoints").mkdir(parents=True)
+        (folder / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: the folder cannot be made ({error.strerror}): choose another with --out") from None
     facts = {
@@ -140,8 +147,11 @@ def create_run(
         "settings": settings.model_dump(mode="json"),
         "chosen": chosen or {},
     }
-    write_text(folder / "run.toml", tomli_w.dumps(facts))
+    if changed:
+        facts["changed"] = changed
+    write_hashes(folder, capture.hashes)
     write_cameras(folder / "cameras.json", capture, settings.light.frame)
+    write_text(folder / "run.toml", tomli_w.dumps(facts))
 
 
 def record_changes(folder: Path, rows: dict[str, dict]) -> None:
@@ -162,7 +172,7 @@ def open_run(folder: Path) -> Run:
     """Open the run folder of a finished training. Raise InputError naming what is missing."""
     facts, settings = check_finished(folder)
     cameras, splits, to_capture, exposures, refined = read_run_cameras(folder / "cameras.json")
-    splats, environment = read_splats(folder / "splats.ply"), None
+    splats, environment = read_splats(folder / SPLATS), None
     method = method_of(settings.render)
     if not method.mirror:  # edits may have added or removed specular shading: the splats know
         reflection = "none" if splats.constants.get("specular") == 0 else "microfacet"

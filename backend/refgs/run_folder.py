@@ -1,26 +1,59 @@
 """Check run folders, read run.toml and update metrics.json. This module does not import torch."""
 
 import json
+import shutil
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from refgs import __version__
 from refgs.errors import InputError
-from refgs.paths import write_text
+from refgs.lock import LOCK, PROGRESS, STOP
+from refgs.paths import is_leftover, write_text
 from refgs.settings import Settings, recorded_settings
 
 PHOTOS = "photos"  # a folder of reduced photos, while they are trained on
+CHECKPOINTS = "checkpoints"
+SPLATS = "splats.ply"  # written last: a run that has it has ended
+# What a training leaves that is killed before its first checkpoint: what it writes before run.toml, and after it.
+_BEFORE = (CHECKPOINTS, "capture.json", "cameras.json", "hints.json")
+_AFTER = ("run.toml", "needs.json", "needs", "history.jsonl", "preview")
+_KEPT = (PHOTOS, "log.txt", LOCK, PROGRESS, STOP)  # does no harm to a new run
 
 
 def check_free(folder: Path) -> None:
-    """Raise InputError if a new run cannot be created in the folder, because it is not empty or is a file.
+    """Raise InputError if a new run cannot be created in the folder, because it holds a run or files of the user, or is a file.
 
-    Reduced photos do not count: a training that was killed while it read them leaves these, and the next one uses them.
+    A run that has not learned anything, for its training was killed before its first checkpoint, does not count.
     """
-    if folder.exists() and (not folder.is_dir() or any(file.name != PHOTOS for file in folder.iterdir())):
+    if folder.exists() and not (folder.is_dir() and _nothing_learned(folder)):
         what = "holds another run" if (folder / "run.toml").exists() else "is not empty"
         raise InputError(f"{folder} {what}: choose another folder with --out, or resume that run with --resume")
+
+
+def clear(folder: Path) -> None:
+    """Remove from a folder what a training left that was killed before its first checkpoint. Reduced photos stay: the next one uses them.
+
+    Raises InputError if the folder holds anything else.
+    """
+    check_free(folder)
+    for name in reversed((*_BEFORE, *_AFTER)):  # run.toml before what is not without it
+        if (folder / name).is_dir():
+            shutil.rmtree(folder / name)
+        else:
+            (folder / name).unlink(missing_ok=True)
+
+
+def _nothing_learned(folder: Path) -> bool:
+    """Tell whether all that is in a folder was left by a training that was killed before its first checkpoint."""
+    own, checkpoints = {*_KEPT}, folder / CHECKPOINTS
+    if checkpoints.is_dir():
+        own |= {*_BEFORE}
+        if (folder / "run.toml").exists():
+            own |= {*_AFTER}
+            if any(checkpoints.glob("*.toml*")):  # the name of a damaged one ends in more
+                return False
+    return all(file.name in own or is_leftover(file) for file in folder.iterdir())
 
 
 def check_finished(folder: Path) -> tuple[dict, Settings]:
@@ -29,7 +62,7 @@ def check_finished(folder: Path) -> tuple[dict, Settings]:
     Otherwise return what `read_run_facts` returns: the table [run] and the settings.
     """
     facts, settings = read_run_facts(folder)
-    if not (folder / "splats.ply").exists():
+    if not (folder / SPLATS).exists():
         raise InputError(
             f"{folder}: the training has not ended: resume it with `refgs train … --out {folder} --resume`"
         )

@@ -16,7 +16,16 @@ from refgs.events import Report
 from refgs.lock import RunLock
 from refgs.memory import trim
 from refgs.paths import check_folder, disk_errors_named
-from refgs.run_folder import PHOTOS, check_finished, check_free, read_run_facts, update_metrics
+from refgs.run_folder import (
+    CHECKPOINTS,
+    PHOTOS,
+    SPLATS,
+    check_finished,
+    check_free,
+    clear,
+    read_run_facts,
+    update_metrics,
+)
 from refgs.settings import Settings, load_settings
 from refgs.train.effective import Change
 from refgs.train.plan import Plan
@@ -70,9 +79,12 @@ def train(
     else:
         facts, settings = _new_settings(out, preset, changes)
     with ExitStack() as held:
+        held.enter_context(_removed_if_empty(out))
+        held.enter_context(lock)
         if resume:
-            held.enter_context(lock)
             _check_unfinished(out)
+        else:
+            clear(out)
         capture = _read_capture(capture_folder, settings, hinted.run if hinted else out, facts)
         masked: dict[str, Change] = {}
         if facts is None and settings.image.masks == "auto" and not any(view.masked for view in capture.views):
@@ -90,17 +102,12 @@ def train(
                     trainer = _start_hinted(capture, settings, *how)
                 else:
                     trainer = _start(capture, settings, preset, changes, masked, out, plan, device, report)
-                held.enter_context(lock)  # its folder exists only now
             held.enter_context(disk_errors_named([out], "resume with --resume"))
             state = trainer.state
             trainer.run(lambda: attend(state) or lock.attend(state.iteration, state.total, state.seconds))
         if not state.ended:
             return state, None  # its reduced photos stay, for it may be resumed
-        quality = _finish(trainer, out, plan, report)
-        if (out / PHOTOS).exists():
-            trainer.release_photos()
-            _remove_photos(out)
-        return state, quality
+        return state, _finish(trainer, out, plan, report)
 
 
 def hinted(run: Path | None, file: Path | None, resume: bool) -> Hinted | None:
@@ -158,7 +165,7 @@ def _hinted_settings(
     facts, settings = check_finished(hinted.run)
     if changes or preset:
         raise InputError("--set and --preset cannot change a run that is continued with hints: it keeps its settings")
-    if not any((hinted.run / "checkpoints").glob("*.toml")):
+    if not any((hinted.run / CHECKPOINTS).glob("*.toml")):
         raise InputError(
             f"{hinted.run} has no checkpoint to continue from: name the run that was trained, not an edited copy"
         )
@@ -167,7 +174,7 @@ def _hinted_settings(
 
 
 def _check_unfinished(out: Path) -> None:
-    if (out / "splats.ply").exists():
+    if (out / SPLATS).exists():
         raise InputError(f"{out}: this training has ended; there is nothing to resume")
 
 
@@ -176,8 +183,8 @@ def _read_capture(folder: Path, settings: Settings, out: Path, facts: dict | Non
     from refgs.capture import read_capture
 
     capture = read_capture(folder, settings.region)
-    if facts is not None and capture.fingerprint() != facts["fingerprint"]:
-        raise InputError(f"{folder} is not the capture that {out} was trained on, or it was changed since")
+    if facts is not None:
+        capture.check_unchanged(out, facts["fingerprint"])
     return capture
 
 
@@ -271,11 +278,23 @@ def _start_hinted(
     with _no_photos_left(out):
         trainer = Trainer(capture, settings, out, report, plan, device)
         continue_with_hints(trainer.state, run, hints)
-    _create_run(trainer.state, preset, device)
     with disk_errors_named([out], "train again"):
+        trainer.save()  # before run.toml, so that a run with hints always has a checkpoint: it cannot start over without them
         write_hints(out / FILE, run, hints)
-        trainer.save()
+    _create_run(trainer.state, preset, device)
     return trainer
+
+
+@contextmanager
+def _removed_if_empty(out: Path) -> Iterator[None]:
+    """Remove a folder after a `with` block that has made it if nothing is in it."""
+    new = not out.exists()
+    try:
+        yield
+    finally:
+        if new:
+            with suppress(OSError):  # it is not empty
+                out.rmdir()
 
 
 @contextmanager
@@ -290,45 +309,61 @@ def _no_photos_left(out: Path) -> Iterator[None]:
 
 def _create_run(state: "State", preset: str, device: str) -> None:
     """Create the run folder of a training that is ready to start."""
-    from refgs.run import create_run, record_changes
+    from refgs.run import create_run
 
     effective = state.effective
+    facts = effective.settings, preset, device, effective.chosen(), effective.rows()
     with disk_errors_named([state.folder], "train again"):
-        create_run(state.folder, state.capture, effective.settings, preset, device, effective.chosen())
-        record_changes(state.folder, effective.rows())
+        create_run(state.folder, state.capture, *facts)
 
 
 def _resume(capture: "Capture", settings: Settings, out: Path, plan: Plan, device: str, report: Report) -> "Trainer":
-    """Return the trainer of an interrupted training, with its last checkpoint loaded."""
+    """Return the trainer of an interrupted training, with its last checkpoint loaded, or ready to start over if there is none."""
+    from refgs.formats.hints import FILE
     from refgs.train.trainer import Trainer
 
     trainer = Trainer(capture, settings, out, report, plan, device)
     trainer.resume()
-    report("stage", {"what": f"resumed at iteration {trainer.state.iteration}"})
+    what = f"resumed at iteration {trainer.state.iteration}"
+    if trainer.state.iteration == 0:
+        if (out / FILE).exists():
+            raise InputError(f"{out} has no checkpoint left: train again with --from and --hints, into a new folder")
+        what = "there is no checkpoint to resume from yet: starting over"
+    report("stage", {"what": what})
     return trainer
 
 
 def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float | None:
-    """Write the results and metrics.json. Return the mean PSNR of the held-out views, None without such views."""
+    """Write the results and metrics.json. Return the mean PSNR of the held-out views, None without such views.
+
+    splats.ply comes last. A training that is killed before it is resumed, and does all this again.
+    """
     from refgs.run import record_changes
     from refgs.train.ambiguity import ambiguities
     from refgs.train.asset import write_asset
     from refgs.train.measures import held_out_psnr
 
-    state = trainer.state
-    update_metrics(out, _costs(trainer))
+    state, quality = trainer.state, None
     again = f"refgs train {state.capture.folder} --out {out} --resume --device cpu"
-    with _card_memory(f"the card's memory is full; nothing is lost, resume with: {again}"):
-        write_asset(state)
+
+    def measure() -> None:
+        nonlocal quality
         record_changes(out, state.effective.rows())
         trim()
         quality = held_out_psnr(state, most=len(state.test))
         trim()
         trades = ambiguities(state)
-    update_metrics(out, {"ambiguities": trades, "total_seconds": plan.spent})
-    for facts in trades.values():
-        if "what" in facts:
-            report("stage", {"what": facts["what"]})
+        update_metrics(out, {"ambiguities": trades, "total_seconds": plan.spent})
+        for facts in trades.values():
+            if "what" in facts:
+                report("stage", {"what": facts["what"]})
+        if (out / PHOTOS).exists():
+            trainer.release_photos()
+            _remove_photos(out)
+
+    update_metrics(out, _costs(trainer))
+    with _card_memory(f"the card's memory is full; nothing is lost, resume with: {again}"):
+        write_asset(state, measure)
     return quality
 
 

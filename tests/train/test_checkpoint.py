@@ -1,5 +1,7 @@
 import pytest
+import tomli_w
 import torch
+from safetensors.torch import load_file, save_file
 
 from refgs.errors import InputError
 from refgs.train import checkpoint
@@ -35,3 +37,75 @@ def test_a_full_disk_leaves_the_previous_checkpoint_whole(small_disk):
         checkpoint.save(folder, 20, {"x": torch.zeros(2_000_000)}, {})
     assert sorted(file.name for file in folder.iterdir()) == ["00000010.safetensors", "00000010.toml"]
     torch.testing.assert_close(checkpoint.load(folder)[0]["x"], torch.arange(1000.0))
+
+
+def truncate(data, note):
+    data.write_bytes(data.read_bytes()[:-7])
+
+
+def empty_note(data, note):
+    note.write_bytes(b"")
+
+
+def half_a_note(data, note):
+    note.write_bytes(note.read_bytes()[:-5])
+
+
+def no_text(data, note):
+    note.write_bytes(b"\xff\xfe" + note.read_bytes())
+
+
+def no_data(data, note):
+    data.unlink()
+
+
+def not_a_number(data, note):
+    data.write_bytes(data.read_bytes()[:-4] + b"\x00\x00\xc0\x7f")
+
+
+def another_shape(data, note):
+    save_file({"x": load_file(str(data))["x"][:2].clone()}, str(data))
+
+
+def another_iteration(data, note):
+    note.write_text(note.read_text().replace("iteration = 20", "iteration = 200"))
+
+
+DAMAGES = [truncate, empty_note, half_a_note, no_text, no_data, not_a_number, another_shape, another_iteration]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_one_is_set_aside_and_the_one_before_is_read(tmp_path, damage):
+    for iteration in (10, 20):
+        checkpoint.save(tmp_path, iteration, {"x": torch.full((3,), float(iteration))}, {"seconds": 1.5})
+    damage(tmp_path / "00000020.safetensors", tmp_path / "00000020.toml")
+    said = []
+    tensors, facts = checkpoint.load(tmp_path, lambda event, facts: said.append((event, facts["what"])))
+    assert tensors["x"].tolist() == [10, 10, 10] and facts == {"iteration": 10, "seconds": 1.5}
+    assert len(said) == 1 and said[0][0] == "warning" and "\n" not in said[0][1]
+    assert "checkpoint of iteration 20 is damaged and set aside as *.damaged" in said[0][1]
+    assert checkpoint.complete(tmp_path) == [10] and (tmp_path / "00000020.toml.damaged").exists()
+    checkpoint.save(tmp_path, 20, {"x": torch.zeros(1)}, {})
+    assert checkpoint.load(tmp_path)[1]["iteration"] == 20
+
+
+def test_without_a_whole_one_it_is_an_error(tmp_path):
+    checkpoint.save(tmp_path, 10, {"x": torch.zeros(1)}, {})
+    no_data(tmp_path / "00000010.safetensors", None)
+    with pytest.raises(checkpoint.NoCheckpoint):
+        checkpoint.load(tmp_path)
+
+
+def test_one_of_an_earlier_release_has_no_hash(tmp_path):
+    save_file({"x": torch.ones(2)}, str(tmp_path / "00000010.safetensors"))
+    (tmp_path / "00000010.toml").write_text(tomli_w.dumps({"iteration": 10, "total": 30}))
+    tensors, facts = checkpoint.load(tmp_path)
+    assert tensors["x"].tolist() == [1, 1] and facts == {"iteration": 10, "total": 30}
+
+
+def test_what_a_kill_between_two_files_left_is_removed(tmp_path):
+    for iteration in (10, 20, 30):
+        checkpoint.save(tmp_path, iteration, {"x": torch.zeros(1)}, {})
+    (tmp_path / "00000020.toml").unlink()
+    checkpoint.save(tmp_path, 40, {"x": torch.zeros(1)}, {})
+    assert sorted(file.stem for file in tmp_path.iterdir()) == ["00000030", "00000030", "00000040", "00000040"]

@@ -1,6 +1,9 @@
 """Define captures and views: photos with their cameras, in the same form for every file layout."""
 
+import hashlib
+import json
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -8,7 +11,9 @@ import numpy as np
 
 from refgs.camera import Camera
 from refgs.capture.box import Box
+from refgs.capture.contents import changed_files, hash_files
 from refgs.capture.lens import Lens
+from refgs.errors import InputError
 
 Split = Literal["train", "test"]
 Z_UP = ("nerf-blender", "tensoir")  # layouts in whose coordinates +Z is up, and whose masks are the photos' alpha
@@ -58,6 +63,7 @@ class Capture:
     - `box` is the user's box around the part to reconstruct, or None. It makes the region of interest smaller.
     - `reach` is the radius of a ball about `centre` that contains the whole region of interest found without the box. It equals `radius` if
       there is no box.
+    - `digest` is a SHA-256 hash of file names, file sizes, camera poses and intrinsics.
     - `warnings` are lines of text about what was left out or looks wrong.
     """
 
@@ -89,6 +95,28 @@ class Capture:
         """Tell whether every training view has a mask."""
         return all(view.masked for view in self.train_views)
 
+    @cached_property
+    def hashes(self) -> dict[str, str]:
+        """Hash the contents of the files that a training reads: photos, masks, and what other programs guessed. Keys are their paths."""
+        files = [(v.image_path, v.mask_path, v.prior_normals, v.prior_depth) for v in self.views]
+        return hash_files(self.folder, [path for paths in files for path in paths if path is not None])
+
     def fingerprint(self) -> str:
-        """Return a SHA-256 hash of file names, file sizes, camera poses and intrinsics. It changes if the capture is changed."""
-        return self.digest
+        """Return a SHA-256 hash of `digest` and of the contents of all files. It changes if the capture is changed.
+
+        The files are read in the first call. Raises InputError naming the file that cannot be read.
+        """
+        return hashlib.sha256(json.dumps([self.digest, self.hashes], sort_keys=True).encode()).hexdigest()
+
+    def check_unchanged(self, run: Path, known: str) -> None:
+        """Raise InputError if this is not the capture that a run was trained on, as it was then. Name a file that has changed.
+
+        `known` is the fingerprint in run.toml. Earlier releases wrote `digest`, which of the files' contents knows only the sizes.
+        """
+        if known in (self.digest, self.fingerprint()):
+            return
+        if changed := changed_files(run, self.hashes):
+            others = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+            what = f"{self.folder / changed[0]}{others} changed since {run} was trained on it"
+            raise InputError(f"{what}: put back what was there, or train into a new folder")
+        raise InputError(f"{self.folder} is not the capture that {run} was trained on, or it was changed since")

@@ -132,7 +132,7 @@ def _read_run(folder: Path) -> RunPage:
     except (KeyError, TypeError, tomllib.TOMLDecodeError):
         facts, trained_on = {}, ""
     metrics = read("metrics.json", json.loads, "there are no figures") or {}
-    lines = read("history.jsonl", _lines, "there is no chart of error against time") or []
+    lines = _history(folder, missing)
     left_out = read("needs.json", json.loads, "what was left out of this scene is not known")
     rows = [item for item in left_out if isinstance(item, dict)] if isinstance(left_out, list) else []
     pictures = folder / "pictures"
@@ -188,9 +188,20 @@ def _decisions(folder: Path, rows: list[dict]) -> list[dict]:
     return found
 
 
-def _lines(text: str) -> list[dict]:
-    """Parse history.jsonl. Skip lines that have no number "seconds"."""
-    return [line for line in history.read(text) if is_number(line.get("seconds"))]
+def _history(folder: Path, missing: list[str]) -> list[dict]:
+    """Read history.jsonl. Skip lines that have no number "seconds". Add to `missing` a sentence on what cannot be read."""
+    without = "there is no chart of error against time"
+    try:
+        lines, damaged = history.read(folder / history.FILE)
+    except FileNotFoundError:
+        missing.append(f"{history.FILE} is not there: {without}")
+        return []
+    except OSError as error:
+        missing.append(f"{history.FILE} cannot be read ({error}): {without}")
+        return []
+    if damaged:
+        missing.append(history.damage(damaged))
+    return [line for line in lines if is_number(line.get("seconds"))]
 
 
 def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[str, str]]:

@@ -1,6 +1,7 @@
 """Write the asset of a training that has ended: surfels whose materials can be relit, and the environment's light."""
 
 import json
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -19,18 +20,20 @@ from refgs.render.composite import blended_normals
 from refgs.render.facing import facing_cosine
 from refgs.render.volume import with_normals_last
 from refgs.run import OCCLUDER
-from refgs.run_folder import update_metrics
+from refgs.run_folder import SPLATS, update_metrics
 from refgs.train import metals, needs, poses
 from refgs.train.probe import blended_shares
 from refgs.train.state import State, why_not_traced
 
 
-def write_asset(state: State) -> None:
+def write_asset(state: State, before_splats: Callable[[], None] = lambda: None) -> None:
     """Write the results of a training into its run folder.
 
     These are the surfels (splats.ply), the light (environment.exr), and what the training left out (needs.json). With inter-reflection, the
     object's mesh is written to occluder.ply. With learned exposures or poses, cameras.json is written again to include them. Where photos
     decide what is metal, splats.ply says where they do not tell, and metrics.json on how much of the surface.
+
+    A run that has splats.ply has ended. So this file is written last, after a call of `before_splats`.
     """
     folder, settings = state.folder, state.settings
     with torch.no_grad():
@@ -63,7 +66,6 @@ def write_asset(state: State) -> None:
         update_metrics(folder, {"doubt": facts})
     splats.normals *= side[kept].numpy(force=True)[:, None]
     splats.normals = blended_normals(splats)
-    write_splats(folder / "splats.ply", splats)
     if state.exposures is not None or state.poses is not None:
         exposures = None
         if state.exposures is not None:
@@ -73,6 +75,8 @@ def write_asset(state: State) -> None:
             folder / "cameras.json", poses.refined(state), settings.light.frame, exposures, state.poses is not None
         )
     write_text(folder / "needs.json", json.dumps(_needs_rows(state, surfels, side, wanted), indent=1))
+    before_splats()
+    write_splats(folder / SPLATS, splats)
 
 
 def _constant_columns(state: State, surfels: Surfels, kept: Tensor) -> dict[str, float]:

@@ -1,21 +1,32 @@
 """Write and read checkpoints: a safetensors file for the tensors, a TOML file for the rest.
 
-The last two complete checkpoints are kept.
+The last two complete checkpoints are kept. The TOML file begins with a hash of both files' contents, by which damage is noticed.
 """
 
 import errno
+import hashlib
 import os
 import tomllib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import tomli_w
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from refgs.errors import InputError
+from refgs.events import Report
+from refgs.paths import whole
 
 KEPT = 2
+_HASH = "hash = "  # begins the TOML file's first line
+DAMAGED = ".damaged"  # added to the names of a checkpoint's files that cannot be read
+
+
+class NoCheckpoint(InputError):
+    """Error for a folder without a complete checkpoint. A training that was killed before its first one can start over."""
 
 
 def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
@@ -25,19 +36,15 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
     is full; earlier checkpoints then stay complete.
     """
     folder.mkdir(exist_ok=True)
-    data, note = folder / f"{iteration:08d}.safetensors", folder / f"{iteration:08d}.toml"
-    temporary = [file.with_name(file.name + ".tmp") for file in (data, note)]
+    data, note = _files(folder, iteration)
+    text = tomli_w.dumps({"iteration": iteration, **facts})
     try:
-        save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, str(temporary[0]))
-        temporary[1].write_text(tomli_w.dumps({"iteration": iteration, **facts}), encoding="utf-8")
-        for file in temporary:
-            with open(file, "rb") as handle:
-                os.fsync(handle.fileno())
-        os.replace(temporary[0], data)
-        os.replace(temporary[1], note)
+        with whole(data) as temporary:
+            save_file({name: value.detach().cpu().contiguous() for name, value in tensors.items()}, str(temporary))
+            text = f'{_HASH}"{_hash(temporary, text)}"\n{text}'
+        with whole(note) as temporary:
+            temporary.write_text(text, encoding="utf-8")
     except Exception as error:
-        for file in temporary:
-            file.unlink(missing_ok=True)
         # safetensors wraps the system's error and keeps only its text.
         if (
             getattr(error, "errno", None) == errno.ENOSPC
@@ -49,24 +56,64 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
             raise InputError(f"{folder}: the disk is full; {kept}: free some space, then train with --resume") from None
         raise
     for old in complete(folder)[:-KEPT]:
-        (folder / f"{old:08d}.toml").unlink()
-        (folder / f"{old:08d}.safetensors").unlink()
+        for file in reversed(_files(folder, old)):
+            file.unlink()
+    for file in folder.glob("*.safetensors"):  # of a process that was killed between the two files
+        if not file.with_suffix(".toml").exists():
+            file.unlink()
 
 
 def complete(folder: Path) -> list[int]:
-    """List the iterations that have a complete checkpoint, in ascending order."""
-    return sorted(
-        int(file.stem)
-        for file in folder.glob("*.toml")
-        if file.stem.isdigit() and file.with_suffix(".safetensors").exists()
-    )
+    """List the iterations that have a complete checkpoint, in ascending order. Its files may be damaged: `load` notices."""
+    return [iteration for iteration in _begun(folder) if all(file.exists() for file in _files(folder, iteration))]
 
 
-def load(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the tensors, and the other values as a dictionary, from the last complete checkpoint. Raises InputError if there is none."""
-    iterations = complete(folder)
-    if not iterations:
-        raise InputError(f"{folder} holds no complete checkpoint: train without --resume into a new folder")
-    stem = folder / f"{iterations[-1]:08d}"
-    facts = tomllib.loads(stem.with_suffix(".toml").read_text(encoding="utf-8"))
-    return load_file(str(stem.with_suffix(".safetensors"))), facts
+def load(folder: Path, report: Report = lambda event, facts: None) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read the tensors, and the other values as a dictionary, from the last complete checkpoint that is not damaged.
+
+    Later ones, which are damaged, are renamed and reported with a line each. Raises NoCheckpoint if none is left.
+    """
+    for iteration in reversed(_begun(folder)):
+        try:
+            return _read(folder, iteration)
+        except (OSError, ValueError, KeyError, RecursionError, SafetensorError) as error:
+            for file in _files(folder, iteration):
+                with suppress(OSError):  # not there, or in a folder that is read-only
+                    os.replace(file, file.with_name(file.name + DAMAGED))
+            why = " ".join(str(error).split())
+            what = f"{folder}: the checkpoint of iteration {iteration} is damaged and set aside as *{DAMAGED}: {why}"
+            report("warning", {"what": what})
+    raise NoCheckpoint(f"{folder} holds no complete checkpoint: train without --resume into a new folder")
+
+
+def _begun(folder: Path) -> list[int]:
+    """List the iterations that have the last file of a checkpoint, in ascending order."""
+    return sorted(int(file.stem) for file in folder.glob("*.toml") if file.stem.isdecimal() and len(file.stem) == 8)
+
+
+def _files(folder: Path, iteration: int) -> tuple[Path, Path]:
+    """Return the files of a checkpoint in the order in which they are written."""
+    return folder / f"{iteration:08d}.safetensors", folder / f"{iteration:08d}.toml"
+
+
+def _read(folder: Path, iteration: int) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read a checkpoint. Raises one of many errors if it is damaged."""
+    data, note = _files(folder, iteration)
+    whole_text = note.read_text(encoding="utf-8")
+    head, _, text = whole_text.partition("\n")
+    if not head.startswith(_HASH):  # an earlier release wrote none
+        text = whole_text
+    elif head != f'{_HASH}"{_hash(data, text)}"':
+        raise ValueError("its files are not what was written")
+    facts = tomllib.loads(text)
+    if facts["iteration"] != iteration:
+        raise ValueError(f"it says that it is of iteration {facts['iteration']}")
+    return load_file(str(data)), facts
+
+
+def _hash(data: Path, text: str) -> str:
+    """Hash the contents of a checkpoint's two files, the second without its first line."""
+    with open(data, "rb") as file:
+        found = hashlib.file_digest(file, "blake2b")
+    found.update(text.encode())
+    return found.hexdigest()

@@ -4,8 +4,9 @@ import json
 import math
 from pathlib import Path
 
-from refgs.formats.history import FILE, read
-from refgs.paths import whole
+from refgs.events import Report
+from refgs.formats.history import FILE, damage, read
+from refgs.paths import write_text
 from refgs.train.measures import Measures
 from refgs.train.state import State
 
@@ -65,10 +66,15 @@ def record(state: State, measures: Measures, loss: float, quality: float) -> Non
         file.write(json.dumps(facts) + "\n")
 
 
-def trim(folder: Path, iteration: int) -> None:
-    """Remove from the history the lines of iterations after `iteration`, because the training will do these iterations again."""
+def trim(folder: Path, iteration: int, report: Report) -> None:
+    """Remove from the history the lines of iterations after `iteration`, because the training will do these iterations again.
+
+    Damaged lines are removed, too, and reported.
+    """
     file = folder / FILE
     if file.exists():
-        kept = [line for line in read(file.read_text(encoding="utf-8")) if line.get("iteration", math.inf) <= iteration]
-        with whole(file) as temporary:
-            temporary.write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+        lines, damaged = read(file)
+        kept = [line for line in lines if (line.get("iteration") or math.inf) <= iteration]
+        write_text(file, "".join(json.dumps(line) + "\n" for line in kept))
+        if damaged:
+            report("warning", {"what": damage(damaged)})

@@ -42,8 +42,11 @@ def save(state: State) -> None:
 
 
 def restore(state: State, run: Path) -> None:
-    """Take over the last complete checkpoint of a run. Raises InputError if there is none, or if another release of RefGS wrote it."""
-    tensors, facts = checkpoint.load(run / "checkpoints")
+    """Take over the last complete checkpoint of a run that is not damaged.
+
+    Raises `checkpoint.NoCheckpoint` if there is none, and InputError if another release of RefGS wrote it.
+    """
+    tensors, facts = checkpoint.load(run / "checkpoints", state.report)
     state.total = facts["total"]
     needs.restore(state, facts.get("needs", {}))
     for name in state.constant:  # left out after this checkpoint, where the training goes back to it

@@ -12,7 +12,20 @@ from refgs.compare.metrics import decibels
 from refgs.events import Report
 from refgs.memory import trim
 from refgs.settings import Settings
-from refgs.train import coarse, densify, even_metal, exposures, history, light, metals, needs, poses, priors, snapshot
+from refgs.train import (
+    checkpoint,
+    coarse,
+    densify,
+    even_metal,
+    exposures,
+    history,
+    light,
+    metals,
+    needs,
+    poses,
+    priors,
+    snapshot,
+)
 from refgs.train.effective import Effective
 from refgs.train.guard import Guard, running, warn
 from refgs.train.losses import departure, objective
@@ -196,6 +209,10 @@ class Trainer:
         del self.measures
 
     def resume(self) -> None:
-        """Resume from the last complete checkpoint."""
-        snapshot.restore(self.state, self.state.folder)
-        history.trim(self.state.folder, self.state.iteration)
+        """Resume from the last complete checkpoint that is not damaged. Start over, from the first iteration, if there is none."""
+        try:
+            snapshot.restore(self.state, self.state.folder)
+        except checkpoint.NoCheckpoint:
+            if self.state.iteration:
+                raise
+        history.trim(self.state.folder, self.state.iteration, self.state.report)
