@@ -422,7 +422,8 @@ def run_state(folder: Path) -> str:
         return "training"
     if (folder / "splats.ply").is_file():
         return "finished"
-    return "stopped" if any((folder / "checkpoints").glob("*.toml")) else ""
+    begun = (folder / "run.toml").is_file()  # killed before its first checkpoint, it starts over
+    return "stopped" if begun or any((folder / "checkpoints").glob("*.toml")) else ""
 
 
 def run_progress(folder: Path) -> dict:

@@ -279,6 +279,7 @@ def _start_hinted(
         trainer = Trainer(capture, settings, out, report, plan, device)
         continue_with_hints(trainer.state, run, hints)
     with disk_errors_named([out], "train again"):
+        out.mkdir(parents=True, exist_ok=True)
         trainer.save()  # before run.toml, so that a run with hints always has a checkpoint: it cannot start over without them
         write_hints(out / FILE, run, hints)
     _create_run(trainer.state, preset, device)

@@ -206,6 +206,7 @@ def test_broken_parts_are_left_out(run):
         path.write_bytes(path.read_bytes()[:30])
     page = reported(run)
     assert "metrics.json cannot be read" in page.text
+    assert "history.jsonl has damaged lines, which are left out: 2" in page.text
     assert "svg" in page.tags and "photo" not in dict(page.images) and "rendered" in dict(page.images)
 
 
