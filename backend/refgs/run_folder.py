@@ -37,7 +37,7 @@ def clear(folder: Path) -> None:
     Raises InputError if the folder holds anything else.
     """
     check_free(folder)
-    for name in reversed((*_BEFORE, *_AFTER)):  # run.toml before what is not without it
+    for name in reversed((*_BEFORE, *_AFTER)):  # killed here, it leaves what is free again
         if (folder / name).is_dir():
             shutil.rmtree(folder / name)
         else:

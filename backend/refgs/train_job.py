@@ -329,7 +329,7 @@ def _resume(capture: "Capture", settings: Settings, out: Path, plan: Plan, devic
     if trainer.state.iteration == 0:
         if (out / FILE).exists():
             raise InputError(f"{out} has no checkpoint left: train again with --from and --hints, into a new folder")
-        what = "there is no checkpoint to resume from yet: starting over"
+        what = "there is no checkpoint to resume from: starting over"
     report("stage", {"what": what})
     return trainer
 
@@ -337,7 +337,7 @@ def _resume(capture: "Capture", settings: Settings, out: Path, plan: Plan, devic
 def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float | None:
     """Write the results and metrics.json. Return the mean PSNR of the held-out views, None without such views.
 
-    splats.ply comes last. A training that is killed before it is resumed, and does all this again.
+    All comes before splats.ply, by which a run has ended. So a training that is killed here is resumed, and does it again.
     """
     from refgs.run import record_changes
     from refgs.train.ambiguity import ambiguities

@@ -7,6 +7,7 @@ import random
 import shutil
 import sys
 import time
+from collections import Counter
 from fnmatch import fnmatch
 
 import pytest
@@ -89,7 +90,7 @@ def test_killed_before_its_first_checkpoint_it_starts_over(ball_capture, whole, 
     run = tmp_path / "run"
     with pytest.raises(Killed):
         train(ball_capture, run, kill_at(5))
-    assert ("stage", "there is no checkpoint to resume from yet: starting over") in train(
+    assert ("stage", "there is no checkpoint to resume from: starting over") in train(
         ball_capture, run, resume=True
     )
     check_same(run, whole)
@@ -151,6 +152,13 @@ def command(capture, run, resume):
         cli.main()
 
 
+def stage(run):
+    """Say how far a training that was killed had come, by the files that it has written."""
+    files = "splats.ply", "environment.exr", "checkpoints/*.toml", "run.toml"
+    stages = "after its end", "writing results", "training", "before a checkpoint"
+    return next((name for file, name in zip(files, stages, strict=True) if any(run.glob(file))), "reading photos")
+
+
 KILLS = [3, pytest.param(int(os.environ.get("REFGS_KILLS", "30")), marks=pytest.mark.slow)]
 
 
@@ -164,6 +172,7 @@ def test_killed_at_random_moments_it_ends_the_same(ball_capture, whole, tmp_path
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["refgs.train.trainer", "refgs.commands"])
     run, moments, killed, ended, longest = tmp_path / "run", random.Random(kills), 0, 0, None
+    found = Counter()
     while killed < kills or run.exists():
         begun = time.monotonic()
         process = context.Process(target=command, args=(ball_capture, run, (run / "run.toml").exists()))
@@ -173,9 +182,10 @@ def test_killed_at_random_moments_it_ends_the_same(ball_capture, whole, tmp_path
             process.kill()
             process.join()
             killed += 1
+            found[stage(run)] += 1
             continue
         assert process.exitcode == 0, run.with_suffix(".said").read_text()
         check_same(run, whole)
         shutil.rmtree(run)
         ended, longest = ended + 1, longest or time.monotonic() - begun
-    print(f"{killed} kills, {ended} trainings with the same files")
+    print(f"{killed} kills, {dict(found)}; {ended} trainings ended with the same files")
