@@ -90,9 +90,7 @@ def test_killed_before_its_first_checkpoint_it_starts_over(ball_capture, whole, 
     run = tmp_path / "run"
     with pytest.raises(Killed):
         train(ball_capture, run, kill_at(5))
-    assert ("stage", "there is no checkpoint to resume from: starting over") in train(
-        ball_capture, run, resume=True
-    )
+    assert ("stage", "there is no checkpoint to resume from: starting over") in train(ball_capture, run, resume=True)
     check_same(run, whole)
 
 
