@@ -28,7 +28,8 @@ from refgs.paths import clone_root, whole
 from refgs.settings import load_settings
 
 KEPT = clone_root() / "docs" / "measurements.csv"
-console = Console(soft_wrap=True, width=None if sys.stdout.isatty() else 200)  # files get whole tables
+WIDTH = None if sys.stdout.isatty() else 200  # files get whole tables
+console = Console(soft_wrap=True, markup=False, emoji=False, width=WIDTH)
 
 
 class Row(NamedTuple):

@@ -86,7 +86,7 @@ def run(talk, ball_capture, tmp_path):
 
 
 def test_jobs_one_after_another(talk, ball_capture, tmp_path):
-    """Check that commands run in order. A wrong command is answered by one line, and the next command still runs."""
+    """Check that commands run in order. A wrong command fails in its turn, with one line, and the next command still runs."""
     run = tmp_path / "größe 'a'"
     talk.tell("check", capture=str(ball_capture))
     talk.tell("check", capture=str(ball_capture), out=str(tmp_path / "found"))
@@ -105,16 +105,39 @@ def test_jobs_one_after_another(talk, ball_capture, tmp_path):
     assert failed["job"] == "check" and not failed["no_cameras"] and not failed["fault"]
     assert "nothing" in failed["what"] and "\n" not in failed["what"]
     assert talk.until("progress").keys() >= {"iteration", "total", "seconds_left", "loss", "psnr", "splats"}
-    wrong = [event["what"] for event in talk.heard if event["event"] == "warning"]
-    assert len(wrong) >= 2 and "train.out Field required" in wrong[0] and "JSON" in wrong[1]
     talk.tell("stop")
     trained = talk.until("done")
     assert trained["run"] == str(run) and trained["psnr"] > 5
     assert any(part["what"] == "inter-reflection" for part in trained["left_out"])
     assert "holds another run" in talk.until("failed")["what"]
+    wrong = [talk.until("failed") for _ in range(2)]
+    assert [event["job"] for event in wrong] == ["train", None]
+    assert "train.out Field required" in wrong[0]["what"] and "not a command" in wrong[1]["what"]
     assert talk.until("done")["mesh"] == str(run / "mesh.glb") and (run / "mesh.glb").exists()
     talk.tell("pause")
     assert "no job is running" in talk.until("warning")["what"]
+    assert talk.end() == 0
+
+
+def test_messages_that_are_no_commands_fail(talk, tmp_path):
+    """Check that each bad line is answered by `failed` with one line, and that the worker then hears the next, and ends with its input."""
+    lines = {
+        b'{"command": "check", "capture": "caf\xe9"}': (None, "can't decode byte 0xe9"),
+        b'{"command": "check", "capture": "caf\\udce9"}': ("check", "check.capture is not Unicode: rename"),
+        b'{"command": "export", "run"': (None, "delimiter"),
+        b"[" * 100_000: (None, "recursion"),
+        b'{"command": ["train"]}': (None, "command"),
+        b'{"command": "pause", "now": 1}': (None, "pause.now"),
+        b"null": (None, "not a command of protocol 1"),
+        json.dumps({"command": "check", "capture": str(tmp_path / "two\nlines")}).encode(): ("check", "no such folder"),
+    }
+    for line, (job, says) in lines.items():
+        talk.process.stdin.buffer.write(line + b"\n")
+        talk.process.stdin.flush()
+        failed = talk.until("failed")
+        assert failed["job"] == job and not failed["fault"] and says in failed["what"] and "\n" not in failed["what"], (
+            failed
+        )
     assert talk.end() == 0
 
 

@@ -10,7 +10,9 @@ from typing import Annotated
 import typer
 
 import refgs
-from refgs.errors import InputError, InputWarning
+from refgs.errors import InputError, InputWarning, one_line
+from refgs.memory import shortage_named
+from refgs.paths import disk_errors_named
 
 app = typer.Typer(help=refgs.__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 RunFolder = Annotated[Path, typer.Argument(help="run folder, made by `refgs train`")]
@@ -207,7 +209,7 @@ def _one_line(show):
 
     def shown(message, category, *where) -> None:
         if issubclass(category, InputWarning):
-            print(f"refgs: warning: {message}", file=sys.stderr)
+            print(f"refgs: warning: {one_line(message)}", file=sys.stderr)
         else:
             show(message, category, *where)
 
@@ -216,19 +218,22 @@ def _one_line(show):
 
 def main() -> None:
     """Run a command. Exit status: 0 success, 1 internal error (prints a traceback), 2 wrong input (prints one line), 130 interrupted."""
+    for stream in (sys.stdout, sys.stderr):  # a path may hold what the terminal's encoding lacks
+        stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = _one_line(warnings.showwarning)
     signal.signal(signal.SIGTERM, _interrupt)
     try:
-        app(standalone_mode=True)
+        with shortage_named(), disk_errors_named([], "run the command again"):
+            app(standalone_mode=True)
     except InputError as error:
-        print(f"refgs: {error}", file=sys.stderr)
+        print(f"refgs: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("refgs: interrupted", file=sys.stderr)
         sys.exit(130)
     except Exception as error:
         traceback.print_exc()
-        print(f"refgs: a fault of ours: {type(error).__name__}: {error}", file=sys.stderr)
+        print(f"refgs: a fault of ours: {type(error).__name__}: {one_line(error)}", file=sys.stderr)
         sys.exit(1)
 
 

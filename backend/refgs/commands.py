@@ -10,12 +10,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from refgs import train_job
-from refgs.errors import InputError
+from refgs.errors import InputError, one_line
 from refgs.export.export_job import export as export_run
-from refgs.paths import clone_root
+from refgs.paths import clone_root, command_line, disk_errors_named, make_folders
 from refgs.run_folder import check_finished, update_metrics
 
-console = Console(highlight=False, soft_wrap=True)
+console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)  # paths are printed as they are
 PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha", "visibility")
 
 
@@ -26,11 +26,11 @@ def progress_bar(what: str, total: int):
     Yields a function update(done, note, total) that moves the bar and shows the text `note`.
     """
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
     )
     with Progress(*columns, console=console, transient=True) as progress:
         task = progress.add_task(what, total=total, note="")
@@ -39,7 +39,7 @@ def progress_bar(what: str, total: int):
 
 def print_event(event: str, facts: dict) -> None:
     """Print an event of a long-running job as one line. The text is facts["what"]; warnings are marked."""
-    console.print(("warning: " if event == "warning" else "") + facts["what"])
+    console.print(("warning: " if event == "warning" else "") + one_line(facts["what"]))
 
 
 @contextmanager
@@ -145,9 +145,8 @@ def train(
         finally:
             signal.signal(signal.SIGINT, before)
     if not trainer.ended:
-        console.print(
-            f"stopped at iteration {trainer.iteration}; resume with: refgs train {capture_folder} --out {out} --resume"
-        )
+        again = command_line("refgs", "train", capture_folder, "--out", out, "--resume")
+        console.print(f"stopped at iteration {trainer.iteration}; resume with: {again}")
         raise KeyboardInterrupt
     held_out = "" if quality is None else f", {quality:.2f} dB on {len(trainer.capture.test_views)} held-out views"
     console.print(f"trained {trainer.iteration} iterations in {trainer.seconds:.0f} s{held_out}: {out}")
@@ -175,7 +174,8 @@ def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path
     to_run = np.linalg.inv(run.to_capture)
     views = [in_frame(camera, to_run) for camera in read_cameras(cameras)]
     background = np.array(run.settings.image.background)
-    with progress_bar("rendering", len(views)) as bar:
+    make_folders([out])
+    with disk_errors_named([out], "render again"), progress_bar("rendering", len(views)) as bar:
         for done, camera in enumerate(views):
             rendering = run.render(camera, light)
             images = maps(rendering)
@@ -244,9 +244,10 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
         truth = GroundTruth(ground_truth, run.to_capture)
     else:
         truth = published_truth(capture, run.to_capture) if split == "test" else None
-    with progress_bar("evaluating", len(views)) as bar:
-        figures = measure(run, split, views, truth, bar)
-    update_metrics(folder, figures)
+    with disk_errors_named([folder], "evaluate again"):
+        with progress_bar("evaluating", len(views)) as bar:
+            figures = measure(run, split, views, truth, bar)
+        update_metrics(folder, figures)
     console.print(f"{len(views)} {split} views: {', '.join(in_words(figures, HEADLINE))}")
     for line in [*in_words(figures, DETAILS), *relit_in_words(figures)]:
         console.print(f"  {line}")

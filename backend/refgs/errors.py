@@ -1,5 +1,15 @@
 """Define errors and warnings about the user's input."""
 
+import re
+
+# Control characters, line separators and lone surrogates: names of files may hold them.
+_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+
+
+def one_line(message: object) -> str:
+    """Return a message as one line that every terminal can print: what cannot be printed, such as a newline, is escaped as Python does."""
+    return _UNPRINTABLE.sub(lambda found: repr(found[0])[1:-1], str(message))
+
 
 class InputError(Exception):
     """Error in the user's input.

@@ -1,7 +1,14 @@
-"""Return memory to the system that has been freed, but that the C library keeps for later."""
+"""Return freed memory to the system, and say what to lower when memory runs out."""
 
 import ctypes
+import errno
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from refgs.errors import InputError
+
+LESS = "close other programs, or ask for less: smaller photos, fewer surfels, smaller textures"
 
 
 def trim() -> None:
@@ -13,3 +20,20 @@ def trim() -> None:
         release = getattr(ctypes.CDLL(None), "malloc_trim", None)  # absent in musl
         if release is not None:
             release(0)
+
+
+def is_shortage(error: BaseException) -> bool:
+    """Return True if an error of Python, NumPy, torch or OpenCV says that the main memory is full."""
+    said = isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
+    return said or any(words in str(error) for words in ("DefaultCPUAllocator", "Insufficient memory"))
+
+
+@contextmanager
+def shortage_named(lower: str = LESS) -> Iterator[None]:
+    """Raise InputError if a `with` block runs out of main memory. `lower` says what needs less."""
+    try:
+        yield
+    except Exception as error:
+        if not is_shortage(error):
+            raise
+        raise InputError(f"memory is full: {lower}") from error

@@ -4,6 +4,9 @@ import errno
 import os
 import re
 import secrets
+import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,7 +16,15 @@ from refgs.errors import InputError
 PACKAGE = Path(__file__).resolve().parent
 ROOT = PACKAGE.parents[1]
 PRESETS = PACKAGE / "presets" if (PACKAGE / "presets").is_dir() else ROOT / "presets"  # in a wheel, in a clone
-DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EACCES)
+# A disk is full, read-only or broken, or a path leads nowhere that can be written.
+DISK_ERRORS = tuple(
+    getattr(errno, name)
+    for name in (
+        *("ENOSPC", "EDQUOT", "EFBIG", "EIO", "EROFS", "EACCES", "EPERM", "ESTALE", "ENODEV"),
+        *("ENOTDIR", "EISDIR", "ENAMETOOLONG", "ELOOP", "EBUSY"),
+    )
+    if hasattr(errno, name)
+)
 _TEMPORARY = re.compile(r"\.refgs-[0-9a-f]{16}\.tmp")
 
 
@@ -82,7 +93,7 @@ def write_text(file: Path, text: str, durable: bool = True) -> None:
 def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
     """Turn disk errors in a `with` block into InputErrors that name the folder: the disk is full, read-only or gone.
 
-    `again` is added to the message: it tells the user how to continue when the disk works again.
+    The folders must exist; without folders, files may be read in the block, too. `again` is added to the message: it tells the user how to continue when the disk works again.
     """
     try:
         yield
@@ -92,15 +103,40 @@ def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
         if gone := next((folder for folder in folders if not folder.is_dir()), None):
             raise InputError(f"{gone} is no longer there: put its disk back, then {again}") from error
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
-            why = f"{error.filename or folders[0]} cannot be written ({error.strerror})"
+            where = error.filename or next(iter(folders), "the disk")
+            why = f"{where} cannot be {'written' if folders else 'read or written'} ({error.strerror})"
             raise InputError(f"{why}: mend that, then {again}; files written before are complete") from error
         raise
 
 
+def make_folders(folders: list[Path]) -> None:
+    """Make folders that are missing, and their parents. Raise InputError if that fails."""
+    for folder in folders:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder}: the folder cannot be made ({error.strerror}): choose another") from None
+
+
 def check_folder(folder: Path) -> None:
-    """Raise InputError if the folder of a capture does not exist."""
+    """Raise InputError if the folder of a capture does not exist, or if its path is not Unicode."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder. Name the folder that holds the capture.")
+    check_unicode(folder)
+
+
+def check_unicode(path: Path) -> None:
+    """Raise InputError if a path is not Unicode: most systems allow that, but JSON, TOML and HTML cannot name it."""
+    try:
+        str(path.resolve()).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"{path.resolve()}: this name is not Unicode: rename the file or folder") from None
+
+
+def command_line(*words: object) -> str:
+    """Return a command for the user to type: words are quoted where the shell needs it."""
+    join = subprocess.list2cmdline if sys.platform == "win32" else shlex.join
+    return join([str(word) for word in words])
 
 
 def clone_root() -> Path:

@@ -9,7 +9,7 @@ from typing import Any
 from refgs import __version__
 from refgs.errors import InputError
 from refgs.lock import LOCK, PROGRESS, STOP
-from refgs.paths import is_leftover, write_text
+from refgs.paths import check_unicode, command_line, is_leftover, write_text
 from refgs.settings import Settings, recorded_settings
 
 PHOTOS = "photos"  # a folder of reduced photos, while they are trained on
@@ -22,10 +22,11 @@ _KEPT = (PHOTOS, "log.txt", LOCK, PROGRESS, STOP)  # does no harm to a new run
 
 
 def check_free(folder: Path) -> None:
-    """Raise InputError if a new run cannot be created in the folder, because it holds a run or files of the user, or is a file.
+    """Raise InputError if a new run cannot be created in the folder: it holds a run or files of the user, is a file, or is not named in Unicode.
 
     A run that has not learned anything, for its training was killed before its first checkpoint, does not count.
     """
+    check_unicode(folder)
     if folder.exists() and not (folder.is_dir() and _nothing_learned(folder)):
         what = "holds another run" if (folder / "run.toml").exists() else "is not empty"
         raise InputError(f"{folder} {what}: choose another folder with --out, or resume that run with --resume")
@@ -63,9 +64,8 @@ def check_finished(folder: Path) -> tuple[dict, Settings]:
     """
     facts, settings = read_run_facts(folder)
     if not (folder / SPLATS).exists():
-        raise InputError(
-            f"{folder}: the training has not ended: resume it with `refgs train … --out {folder} --resume`"
-        )
+        again = f"refgs train … {command_line('--out', folder, '--resume')}"
+        raise InputError(f"{folder}: the training has not ended: resume it with `{again}`")
     return facts, settings
 
 

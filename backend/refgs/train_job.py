@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from refgs.errors import InputError
 from refgs.events import Report
 from refgs.lock import RunLock
-from refgs.memory import trim
-from refgs.paths import check_folder, disk_errors_named
+from refgs.memory import shortage_named, trim
+from refgs.paths import check_folder, command_line, disk_errors_named
 from refgs.run_folder import (
     CHECKPOINTS,
     PHOTOS,
@@ -80,6 +80,7 @@ def train(
         facts, settings = _new_settings(out, preset, changes)
     with ExitStack() as held:
         held.enter_context(_removed_if_empty(out))
+        held.enter_context(shortage_named(_less(settings)))
         held.enter_context(lock)
         if resume:
             _check_unfinished(out)
@@ -137,6 +138,13 @@ def choose_device(device: str, report: Report) -> str:
     if device == "cuda" or why != cuda.NO_CARD:
         report("warning", {"what": f"training on the CPU: {why}"})
     return "cpu"
+
+
+def _less(settings: Settings) -> str:
+    """Say what to lower if main memory is full."""
+    side, budget = settings.image.max_side, settings.surfels.budget
+    parts = f"smaller photos (image.max_side, now {side}) or fewer surfels (surfels.budget, now {budget})"
+    return f"close other programs and resume, or train into a new folder with {parts}"
 
 
 def _check_device(device: str) -> None:
@@ -345,7 +353,7 @@ def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float 
     from refgs.train.measures import held_out_psnr
 
     state, quality = trainer.state, None
-    again = f"refgs train {state.capture.folder} --out {out} --resume --device cpu"
+    again = command_line("refgs", "train", state.capture.folder, "--out", out, "--resume", "--device", "cpu")
 
     def measure() -> None:
         nonlocal quality

@@ -9,11 +9,13 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Annotated, Any, Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
 
 from refgs import __version__, train_job
 from refgs.capture import read_capture
@@ -21,9 +23,11 @@ from refgs.capture.check import check, describe
 from refgs.capture.masks import make_masks
 from refgs.capture.motion import find_cameras
 from refgs.capture.video import extract_photos
-from refgs.errors import InputError, NoCameras
+from refgs.errors import InputError, NoCameras, one_line
 from refgs.export.export_job import export as export_run
 from refgs.kernels import cuda
+from refgs.memory import shortage_named
+from refgs.paths import disk_errors_named
 from refgs.settings import load_settings
 from refgs.train.live_view import write_preview
 from refgs.train.state import State
@@ -102,7 +106,37 @@ class Keep(_Command):
 COMMANDS = TypeAdapter(
     Annotated[Check | Frames | Poses | Masks | Train | Export | During | Keep, Field(discriminator="command")]
 )
+JOBS = (Check, Frames, Poses, Masks, Train, Export)
 CLOSED = None  # queued in place of a command: the input has ended
+
+
+@dataclass
+class Refused:
+    """Line of the input that is no command. `job` is the job that it asks for, None if it asks for none. `what` says what is wrong."""
+
+    job: str | None
+    what: str
+
+
+def read_command(line: bytes) -> _Command | Refused:
+    """Parse a line of the input."""
+    job = None
+    try:
+        message = json.loads(
+            line.decode()
+        )  # not by pydantic, which would refuse a lone surrogate before the job is known
+        name = message.get("command") if isinstance(message, dict) else None
+        job = next((kind.__name__.lower() for kind in JOBS if name == kind.__name__.lower()), None)
+        return COMMANDS.validate_python(message)
+    except ValidationError as error:
+        what = "; ".join(f"{'.'.join(map(str, e['loc']))} {_reason(e)}".strip() for e in error.errors())
+    except (ValueError, RecursionError) as error:  # no UTF-8, no JSON, or too deep
+        what = str(error)
+    return Refused(job, f"not a command of protocol {PROTOCOL}: {what}")
+
+
+def _reason(error: ErrorDetails) -> str:
+    return "is not Unicode: rename the file or folder" if error["type"] == "string_unicode" else error["msg"]
 
 
 class _Ended(Exception):
@@ -118,26 +152,24 @@ class Worker:
     def __init__(self, events: IO[str]):
         self._events = events
         # A signal handler may put while the queue is read: only SimpleQueue allows that.
-        self._commands: queue.SimpleQueue[_Command | None] = queue.SimpleQueue()
-        self._waiting: list[_Command] = []  # jobs that came during a training
+        self._commands: queue.SimpleQueue[_Command | Refused | None] = queue.SimpleQueue()
+        self._waiting: list[_Command | Refused] = []  # jobs that came during a training
         self._keep = False  # run jobs to their end after the input has closed
         self._attentive = True  # no job runs that cannot read commands
         self._open = True  # CLOSED has not been taken from the queue
         self._closed = False  # the input has ended; commands may still be queued
 
-    def listen(self, commands: IO[str]) -> None:
+    def listen(self, commands: IO[bytes]) -> None:
         """Read commands from the input and queue them, until the input ends. Runs in its own thread."""
-        for line in commands:
-            try:
-                command = COMMANDS.validate_json(line)
+        try:
+            for line in commands:
+                command = read_command(line)
                 if isinstance(command, Keep):
                     self._keep = command.on
                 else:
                     self._commands.put(command)
-            except ValidationError as error:
-                what = "; ".join(f"{'.'.join(map(str, e['loc']))} {e['msg']}".strip() for e in error.errors())
-                self.send("warning", {"what": f"not a command of protocol {PROTOCOL}: {what}"})
-        self.close()
+        finally:
+            self.close()
         if not self._attentive and not self._keep:
             _thread.interrupt_main()
 
@@ -160,8 +192,10 @@ class Worker:
         """Write an event to the output as a JSON line.
 
         If writing fails because nobody reads the output any more, act as if the input had ended. After a `Keep` command with `on` = True,
-        ignore the failure instead, so that jobs continue.
+        ignore the failure instead, so that jobs continue. The message `what` is written as one line.
         """
+        if "what" in facts:
+            facts = facts | {"what": one_line(facts["what"])}
         try:
             self._events.write(json.dumps({"event": event} | facts) + "\n")
             self._events.flush()
@@ -174,14 +208,8 @@ class Worker:
         why = cuda.unusable()
         card = torch.cuda.get_device_name() if why is None else None
         self.send("ready", {"protocol": PROTOCOL, "refgs": __version__, "card": card, "no_card": why})
-        jobs_of = {
-            Check: self._check,
-            Frames: self._frames,
-            Poses: self._poses,
-            Masks: self._masks,
-            Train: self._train,
-            Export: self._export,
-        }
+        jobs = (self._check, self._frames, self._poses, self._masks, self._train, self._export)
+        jobs_of = dict(zip(JOBS, jobs, strict=True))
         while self._open or (self._keep and self._waiting):
             if self._waiting and self._closed and not self._keep:
                 break  # the input has ended: drop the jobs that came during the training
@@ -190,6 +218,8 @@ class Worker:
                 break
             if type(command) in jobs_of:
                 self._run_job(command.command, jobs_of[type(command)], command)
+            elif isinstance(command, Refused):
+                self.send("failed", {"job": command.job, "what": command.what, "fault": False, "no_cameras": False})
             else:
                 self.send("warning", {"what": f"nothing to {command.command}: no job is running"})
 
@@ -197,7 +227,8 @@ class Worker:
         self.send("started", {"job": name})
         self._attentive = name == "train"
         try:
-            event, facts = job(command)
+            with shortage_named(), disk_errors_named([], "start the job again"):
+                event, facts = job(command)
         except InputError as error:
             event, facts = "failed", {"what": str(error), "fault": False, "no_cameras": isinstance(error, NoCameras)}
         except Exception as error:
@@ -284,6 +315,9 @@ class Worker:
                     return True
                 paused = False  # nobody is left to resume it
                 continue
+            if not isinstance(command, During):
+                self._waiting.append(command)
+                continue
             match command.command:
                 case "pause" | "resume":
                     paused = command.command == "pause"
@@ -295,8 +329,6 @@ class Worker:
                 case "stop":
                     state.total = state.iteration
                     return True
-                case _:
-                    self._waiting.append(command)
         return False
 
     def _export(self, command: Export) -> tuple[str, dict]:
@@ -310,9 +342,8 @@ def work() -> None:
     """Run the job protocol on stdin and stdout until the input ends. Other output of the program goes to stderr."""
     events = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
-    sys.stdin.reconfigure(encoding="utf-8")
     worker = Worker(events)
     for kind in (signal.SIGTERM, signal.SIGINT):
         signal.signal(kind, worker.interrupt)
-    threading.Thread(target=worker.listen, args=(sys.stdin,), daemon=True).start()
+    threading.Thread(target=worker.listen, args=(sys.stdin.buffer,), daemon=True).start()
     worker.run()

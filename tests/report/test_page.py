@@ -243,3 +243,11 @@ def test_decisions_are_shown_with_pictures(tmp_path):
     for kind in ("on", "off", "photo"):
         data = base64.b64encode((folder / "needs" / f"specular_{kind}.png").read_bytes()).decode()
         assert data in html
+
+
+@pytest.mark.parametrize("name", ["$5 to $7 {", "two\nlines"])
+def test_a_run_whose_name_is_no_formula(run, name):
+    """Check that a report is written of a run whose folder's name has two dollar signs, which matplotlib would read as a formula."""
+    renamed = run.rename(run.parent / name)
+    shown = name.replace("\n", "\\n")
+    assert f"vases/{shown}" in reported(renamed).text

@@ -2,9 +2,10 @@
 
 import pytest
 
-from refgs import train_job
+from refgs import commands, train_job
 from refgs.errors import InputError
 from refgs.export.export_job import export
+from refgs.report.page import write_report
 from tests.makers.disk import fill
 
 SMALL = ["surfels.start=500", "surfels.budget=500", "surfels.hull=48", "environment.resolution=16"]
@@ -57,17 +58,31 @@ def test_a_disk_that_is_full(ball_capture, small_disk):
     assert trainer.ended and (small_disk / "run" / "splats.ply").exists()
 
 
-def test_a_mesh_that_cannot_be_written(ball_capture, small_disk):
-    """Check that an export that fails on a full disk leaves the old mesh and textures unchanged."""
+def files(run):
+    """Read all files of a run folder: {path: content}."""
+    return {file: file.read_bytes() for file in run.rglob("*") if file.is_file()}
+
+
+def test_a_run_on_a_full_disk(ball_capture, small_disk):
+    """Check that exports, evaluations, reports and renderings on a full disk fail with one line, and leave the run as it was."""
     run = small_disk / "run"
     words = ["train.iterations=60", "mesh.resolution=32", "mesh.triangles=500"]
     train(ball_capture, run, lambda trainer: False, *SMALL, *words)
     given = [run, None, 64, None, None, True, lambda event, facts: None]
     export(*given)
-    before = {file: file.read_bytes() for file in [run / "mesh.glb", *(run / "textures").iterdir()]}
+    before = files(run)
     with pytest.raises(InputError, match=r"name that ends so"):
         export(run, run / "mesh.stl", *given[2:])
     fill(small_disk / "filler")
     with pytest.raises(InputError, match=r"No space left on device\): mend that, then export again"):
         export(*given)
-    assert before == {file: file.read_bytes() for file in [run / "mesh.glb", *(run / "textures").iterdir()]}
+    cameras = ball_capture / "transforms_test.json"
+    for again, job in {
+        "evaluate again": lambda: commands.evaluate(run, "test", None),
+        "write the report again": lambda: write_report([run], run / "report.html"),
+        "render again": lambda: commands.render(run, cameras, run / "rendered", ["color"], None, "exr"),
+    }.items():
+        with pytest.raises(InputError, match=rf"No space left on device\): mend that, then {again}") as said:
+            job()
+        assert "\n" not in str(said.value)
+    assert before == files(run)

@@ -33,7 +33,7 @@ from refgs.capture.stanford_orb import NOVEL, read_stanford_orb
 from refgs.capture.tensoir import is_tensoir, read_tensoir
 from refgs.capture.types import Z_UP, Capture, View
 from refgs.errors import InputError, NoCameras
-from refgs.paths import check_folder
+from refgs.paths import check_folder, check_unicode, command_line
 from refgs.settings import RegionSettings
 
 __all__ = [
@@ -131,7 +131,8 @@ def _check_layout(folder: Path) -> str:
     if layout is not None:
         return layout
     if photos := find_photos(folder):
-        raise NoCameras(f"{folder}: {len(photos)} photos, but no cameras. Find them first: refgs poses {folder}")
+        search = command_line("refgs", "poses", folder)
+        raise NoCameras(f"{folder}: {len(photos)} photos, but no cameras. Find them first: {search}")
     raise InputError(
         f"{folder}: no capture here. Looked for transforms_train.json (NeRF-Blender, Stanford-ORB), transforms.json "
         "(nerfstudio, instant-ngp), sparse/0 (COLMAP), 0-camera.pkl (NeRO), train_000/metadata.json (TensoIR), and for "
@@ -166,6 +167,7 @@ def _check_photos(views: list[View]) -> None:
     for (_, path), count in Counter((view.split, view.image_path) for view in views).items():
         if count > 1:
             raise InputError(f"{path}: the capture names this photo {count} times. Remove all of its frames but one.")
+        check_unicode(path)
 
 
 def _shared_photos(views: list[View]) -> list[str]:

@@ -11,8 +11,11 @@ from typing import TYPE_CHECKING, Any
 from refgs.errors import InputError, InputWarning
 from refgs.events import Report
 from refgs.lock import RunLock
-from refgs.paths import disk_errors_named
+from refgs.memory import shortage_named
+from refgs.paths import disk_errors_named, make_folders
 from refgs.run_folder import check_finished
+
+LESS = "close other programs, or export less: a smaller --texture, or train with a smaller mesh.resolution"
 
 if TYPE_CHECKING:
     from refgs.formats.splats import Splats
@@ -51,8 +54,8 @@ def export(
     _check_absent([*splats, *_mesh_files(target)], overwrite)
     run, source = _read_source(folder, is_run, report)
     folders = [file.parent for file in [*splats, target] if file]
-    _make_folders(folders)
-    with disk_errors_named(folders, "export again"):
+    make_folders(folders)
+    with shortage_named(LESS), disk_errors_named(folders, "export again"):
         _write_splats(run, source, splats_file, display_file, report)
         if target is None:
             return splats
@@ -100,14 +103,6 @@ def _read_source(folder: Path, is_run: bool, report: Report) -> "tuple[Run | Non
     for warning in caught:
         report("warning", {"what": str(warning.message)})
     return run, splats
-
-
-def _make_folders(folders: list[Path]) -> None:
-    try:
-        for folder in folders:
-            folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: the folder cannot be made ({error.strerror}): choose another") from None
 
 
 def _write_splats(run: "Run | None", source: "Splats", ours: Path | None, display: Path | None, report: Report) -> None:

@@ -43,6 +43,7 @@ def _drawing(width: float, height: float) -> Iterator[tuple[Figure, list[str]]]:
     """
     style = {"svg.fonttype": "none", "svg.hashsalt": "refgs", "font.family": "sans-serif", "font.size": 10}
     style |= dict.fromkeys(("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color"), INK)
+    style["text.parse_math"] = False  # runs' names may hold dollar signs
     made: list[str] = []
     with matplotlib.rc_context(style):
         figure = Figure(figsize=(width, height), layout="constrained")

@@ -25,9 +25,9 @@ import jinja2
 import numpy as np
 
 from refgs import __version__
-from refgs.errors import InputError
+from refgs.errors import InputError, one_line
 from refgs.formats import history
-from refgs.paths import whole
+from refgs.paths import disk_errors_named, make_folders, write_text
 from refgs.report.charts import PARTS, error_chart, parts_chart
 from refgs.report.curves import QUANTITIES, Curve, as_csv, curve, knee, levels, time_to
 from refgs.report.figures import DETAILS, HEADLINE, RELIT, Quantity, duration, flatten, is_number, relit_pair
@@ -73,7 +73,7 @@ class RunPage:
 def write_report(runs: list[Path], out: Path) -> None:
     """Write a report page about these run folders to `out`, and a CSV file with the numbers of its charts beside it.
 
-    Existing files are replaced. Raises InputError if a run folder does not exist.
+    Existing files are replaced. Raises InputError if a run folder does not exist, or if the disk is full or read-only.
     """
     pages = [_read_run(folder) for folder in runs]
     if len(pages) > 1:
@@ -104,10 +104,10 @@ def write_report(runs: list[Path], out: Path) -> None:
         parts_table=_parts_table(parts),
     )
     figures = as_csv({page.label: page.history for page in pages}, groups)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    for file, text in ((out, html), (out.with_suffix(".csv"), figures)):
-        with whole(file) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+    make_folders([out.parent])
+    with disk_errors_named([out.parent], "write the report again"):
+        for file, text in ((out, html), (out.with_suffix(".csv"), figures)):
+            write_text(file, text)
 
 
 def _read_run(folder: Path) -> RunPage:
@@ -136,7 +136,7 @@ def _read_run(folder: Path) -> RunPage:
     left_out = read("needs.json", json.loads, "what was left out of this scene is not known")
     rows = [item for item in left_out if isinstance(item, dict)] if isinstance(left_out, list) else []
     pictures = folder / "pictures"
-    name = "/".join(folder.resolve().parts[-2:]).lstrip("/")
+    name = one_line("/".join(folder.resolve().parts[-2:]).lstrip("/"))
     page = RunPage(
         name=name,
         label=name,
