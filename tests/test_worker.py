@@ -123,7 +123,7 @@ def test_messages_that_are_no_commands_fail(talk, tmp_path):
     """Check that each bad line is answered by `failed` with one line, and that the worker then hears the next, and ends with its input."""
     lines = {
         b'{"command": "check", "capture": "caf\xe9"}': (None, "can't decode byte 0xe9"),
-        b'{"command": "check", "capture": "caf\\udce9"}': ("check", "check.capture is not Unicode: rename"),
+        b'{"command": "check", "capture": "caf\\udce9"}': ("check", "caf\\udce9: there is no such folder"),
         b'{"command": "export", "run"': (None, "delimiter"),
         b"[" * 100_000: (None, "recursion"),
         b'{"command": ["train"]}': (None, "command"),

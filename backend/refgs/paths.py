@@ -93,7 +93,8 @@ def write_text(file: Path, text: str, durable: bool = True) -> None:
 def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
     """Turn disk errors in a `with` block into InputErrors that name the folder: the disk is full, read-only or gone.
 
-    The folders must exist; without folders, files may be read in the block, too. `again` is added to the message: it tells the user how to continue when the disk works again.
+    The folders must exist; without folders, files may be read in the block, too. `again` is added to the message: it tells the user how to
+    continue when the disk works again.
     """
     try:
         yield

@@ -15,7 +15,6 @@ from typing import IO, Annotated, Any, Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
-from pydantic_core import ErrorDetails
 
 from refgs import __version__, train_job
 from refgs.capture import read_capture
@@ -122,21 +121,15 @@ def read_command(line: bytes) -> _Command | Refused:
     """Parse a line of the input."""
     job = None
     try:
-        message = json.loads(
-            line.decode()
-        )  # not by pydantic, which would refuse a lone surrogate before the job is known
+        message = json.loads(line.decode())  # pydantic's parser refuses lone surrogates: names of folders hold them
         name = message.get("command") if isinstance(message, dict) else None
         job = next((kind.__name__.lower() for kind in JOBS if name == kind.__name__.lower()), None)
         return COMMANDS.validate_python(message)
     except ValidationError as error:
-        what = "; ".join(f"{'.'.join(map(str, e['loc']))} {_reason(e)}".strip() for e in error.errors())
+        what = "; ".join(f"{'.'.join(map(str, e['loc']))} {e['msg']}".strip() for e in error.errors())
     except (ValueError, RecursionError) as error:  # no UTF-8, no JSON, or too deep
         what = str(error)
     return Refused(job, f"not a command of protocol {PROTOCOL}: {what}")
-
-
-def _reason(error: ErrorDetails) -> str:
-    return "is not Unicode: rename the file or folder" if error["type"] == "string_unicode" else error["msg"]
 
 
 class _Ended(Exception):

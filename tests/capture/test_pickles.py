@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -80,3 +81,20 @@ def test_lists_within_lists_are_not_followed(tmp_path):
     for _ in range(30):
         value = [value] * 10
     refused(tmp_path / "a.pkl", pickle.dumps((value, PAIR[1])), "a list of something else")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"Nr\x00\xe1\xf5\x05.",  # LONG_BINPUT: the memo's place 100 million
+        b"\x8e" + (1 << 33).to_bytes(8, "little") + b".",  # BINBYTES8: 8 GB of bytes
+        b"\x95" + (1 << 33).to_bytes(8, "little") + b".",  # FRAME
+    ],
+)
+def test_a_few_bytes_reserve_little_memory(tmp_path, data):
+    tracemalloc.start()
+    try:
+        refused(tmp_path / "a.pkl", data, "not a pickle of arrays")
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()

@@ -21,8 +21,11 @@ from refgs.capture.reduce import encode, reduced
 from refgs.capture.types import View
 from refgs.errors import InputError
 from refgs.formats.exr import read_exr, read_exr_header
+from refgs.formats.pixels import check_pixels
+from refgs.memory import is_shortage
 
 register_heif_opener()  # Pillow opens HEIC then
+Image.MAX_IMAGE_PIXELS = None  # `check_pixels` has the limit
 
 # The JPEG decoder leaves a photo at least this many times as large as wanted. It averages encoded values, which darkens highlights: at 2,
 # a photo differs by 0.6 of 255 on average from one reduced in linear light (49 dB); at 1, by 1.7 (41 dB).
@@ -261,11 +264,15 @@ def _divisor(shrink: int, width: int, height: int) -> int:
 
 def _open(path: Path) -> Image.Image:
     try:
-        return Image.open(path)
+        picture = Image.open(path)
     except FileNotFoundError:
         raise InputError(f"{path}: the image is missing. Put it back, or remove it from the capture.") from None
     except Exception as error:
+        if is_shortage(error):
+            raise
         raise InputError(f"{path}: this is not an image that can be read ({_reason(error)}). Replace it.") from error
+    check_pixels(path, *picture.size)
+    return picture
 
 
 def _turns(picture: Image.Image) -> int:
@@ -293,6 +300,8 @@ def _decode(picture: Image.Image, path: Path) -> Image.Image:
     except InputError:
         raise
     except Exception as error:
+        if is_shortage(error):
+            raise
         raise InputError(f"{path}: the image is truncated or broken ({_reason(error)}). Replace it.") from error
 
 

@@ -5,6 +5,7 @@ and functions that pickled arrays need. It replaces them by its own, which only 
 from these later. A file that names any other class or function is refused.
 """
 
+import io
 import pickle
 from pathlib import Path
 
@@ -21,11 +22,10 @@ def read_pair(file: Path) -> tuple[np.ndarray | list[int | str], np.ndarray | li
     try:
         with file.open("rb") as source:
             data = source.read(LARGEST + 1)
-            if len(data) > LARGEST:
-                raise InputError(f"{file}: larger than a camera or a split can be. Download the data set again.")
-            source.seek(0)
-            first, second = _Arrays(source).load()
-            return _plain(first), _plain(second)
+        if len(data) > LARGEST:
+            raise InputError(f"{file}: larger than a camera or a split can be. Download the data set again.")
+        first, second = _Arrays(io.BytesIO(data)).load()
+        return _plain(first), _plain(second)
     except InputError:
         raise
     except FileNotFoundError:
@@ -94,7 +94,9 @@ for _core in ("numpy.core", "numpy._core"):
     _NAMES[f"{_core}.numeric", "_frombuffer"] = _from_buffer
 
 
-class _Arrays(pickle.Unpickler):
+class _Arrays(pickle._Unpickler):
+    """Read a pickle in Python, by the classes and functions of `_NAMES` alone. Reading in C, a few bytes could reserve gigabytes."""
+
     def find_class(self, module: str, name: str):
         try:
             return _NAMES[module, name]

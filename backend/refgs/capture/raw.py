@@ -90,6 +90,8 @@ def _reading(path: Path) -> Iterator[None]:
         raise InputError(
             f"{path}: LibRaw does not know this camera's RAW, or the file is broken. Copy it again, or save it as DNG or 16-bit TIFF."
         ) from error
+    except rawpy.LibRawUnsufficientMemoryError as error:
+        raise MemoryError from error
     except rawpy.LibRawError as error:
         said = error.args[0] if error.args else type(error).__name__
         said = said.decode() if isinstance(said, bytes) else said

@@ -8,6 +8,7 @@ import numpy as np
 import OpenEXR
 
 from refgs.errors import InputError
+from refgs.formats.pixels import check_pixels
 from refgs.paths import whole
 
 # Chromaticities x, y of Rec.709 / sRGB: red, green, blue, D65 white (ITU-R BT.709-6, table 1).
@@ -55,6 +56,7 @@ def read_exr_header(path: str | os.PathLike) -> tuple[int, int, bool]:
     if not np.array_equal(data, display):
         raise InputError(f"{path} holds a part of the picture: save it without a crop or overscan")
     width, height = (data[1] - data[0] + 1).tolist()
+    check_pixels(path, width, height)
     return width, height, "A" in names[part]
 
 
@@ -68,10 +70,16 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
     if not path.is_file():
         raise InputError(f"{path} is missing")
     try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            windows = [np.array(part.header["dataWindow"]) for part in file.parts]
+        for low, high in windows:  # every part is decoded
+            check_pixels(path, *(high - low + 1).tolist())
         with OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [file.channels(i) for i in range(len(file.parts))]
             part = next((part for part in parts if {"R", "G", "B"} <= part.keys()), parts[0])
             channels = {name: channel.pixels for name, channel in part.items()}
+    except (InputError, MemoryError):
+        raise
     except Exception:  # the binding raises RuntimeError, ValueError or its own errors
         raise _broken(path) from None
     if {"R", "G", "B"} <= channels.keys():

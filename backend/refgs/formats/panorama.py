@@ -1,6 +1,7 @@
 """Read and sample equirectangular panoramas of radiance, in Blender's orientation (see `directions`)."""
 
 import os
+import re
 import warnings
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from refgs.errors import InputError, InputWarning
 from refgs.formats.exr import read_exr
+from refgs.formats.pixels import check_pixels
 
 
 def read_environment(path: str | os.PathLike) -> np.ndarray:
@@ -32,6 +34,9 @@ def _read_radiance(path: Path) -> np.ndarray:
 
     if not path.is_file():
         raise InputError(f"{path} is missing")
+    with path.open("rb") as file:  # the size is in the header's last line
+        if size := re.search(rb"\n[-+]Y +(\d{1,9}) +[-+]X +(\d{1,9})\n", file.read(1 << 16)):
+            check_pixels(path, int(size[2]), int(size[1]))
     try:
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error:  # an empty file

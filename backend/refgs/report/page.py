@@ -23,10 +23,12 @@ from pathlib import Path
 import cv2
 import jinja2
 import numpy as np
+from PIL import Image
 
 from refgs import __version__
 from refgs.errors import InputError, one_line
 from refgs.formats import history
+from refgs.formats.pixels import check_pixels
 from refgs.paths import disk_errors_named, make_folders, write_text
 from refgs.report.charts import PARTS, error_chart, parts_chart
 from refgs.report.curves import QUANTITIES, Curve, as_csv, curve, knee, levels, time_to
@@ -220,7 +222,12 @@ def _pictures(folder: Path, kinds: dict[str, str], most: int) -> dict[str, dict[
 
 def _embed(path: Path) -> str:
     """Return a picture as a data URL, scaled down to LARGEST_SIDE pixels. Return "" if the picture is missing or broken."""
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.exists() else None
+    try:
+        with Image.open(path) as picture:
+            check_pixels(path, *picture.size)
+    except Exception:  # Pillow's have no common class
+        return ""
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None:
         return ""
     scale = LARGEST_SIDE / max(image.shape[:2])

@@ -1,0 +1,19 @@
+"""Refuse pictures by the size that they declare, before memory is taken for their pixels."""
+
+from pathlib import Path
+
+from refgs.errors import InputError
+
+MOST = 256_000_000  # pixels; cameras take up to 200 million, or 240 by shifting the sensor. Decoding takes 7 bytes or more a pixel
+# A larger picture in a file so small that this many pixels share a byte is taken for a broken one. A PNG of one colour has 1032 to 8256, by
+# deflate's limit, and a JPEG at most 341.
+SMALL, MOST_PER_BYTE = 100_000_000, 10_000
+
+
+def check_pixels(path: Path, width: int, height: int) -> None:
+    """Raise InputError if a picture's file declares more pixels than are read, or far more than it can hold."""
+    size = f"{path}: {width}×{height} pixels"
+    if width * height > MOST:
+        raise InputError(f"{size} are more than the {MOST // 1_000_000} million that are read. Save it smaller.")
+    if width * height > max(SMALL, MOST_PER_BYTE * path.stat().st_size):
+        raise InputError(f"{size} do not fit into so small a file: it is broken. Replace it, or save it as PNG.")

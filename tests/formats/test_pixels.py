@@ -1,0 +1,82 @@
+"""Test that pictures are refused by the size that they declare, before they are decoded, and that large photos are not."""
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from refgs.capture.images import read_header, read_image, read_mask
+from refgs.errors import InputError
+from refgs.formats.exr import read_exr, write_exr
+from refgs.formats.panorama import read_environment
+from tests.makers.captures import write_as_phone
+
+SIDE = 64  # pixels of the files whose size is then replaced
+
+
+def patched(path, side, edits):
+    """Replace numbers in a file: each of `edits` is a format of `struct`, and the numbers that it holds before; SIDE becomes `side`."""
+    data = path.read_bytes()
+    for kind, *numbers in edits:
+        old = struct.pack(kind, *numbers)
+        assert old in data
+        data = data.replace(
+            old, struct.pack(kind, *(n + side - SIDE if n in (SIDE, SIDE - 1) else n for n in numbers)), 1
+        )
+    if data[12:16] == b"IHDR":
+        data = data[:29] + zlib.crc32(data[12:29]).to_bytes(4, "big") + data[33:]
+    path.write_bytes(data)
+
+
+def photo(path):
+    write_as_phone(path, np.zeros((SIDE, SIDE, 3), np.uint8))
+
+
+FILES = {  # a writer, a reader, and where the size is
+    "a.jpg": (photo, read_image, [(">HH", SIDE, SIDE)]),
+    "a.png": (photo, read_mask, [(">II", SIDE, SIDE)]),
+    "a.heic": (photo, read_image, [(">II", SIDE, SIDE)]),
+    "a.tif": (photo, read_image, [("<HHII", 256, 4, 1, SIDE), ("<HHII", 257, 4, 1, SIDE)]),
+    "a.exr": (lambda path: write_exr(path, np.zeros((SIDE, SIDE, 3))), read_exr, [("<4i", 0, 0, SIDE - 1, SIDE - 1)]),
+    "light.exr": (
+        lambda path: write_exr(path, np.zeros((SIDE, SIDE))),
+        read_environment,
+        [("<4i", 0, 0, SIDE - 1, SIDE - 1)],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize(
+    ("side", "says"), [(20_000, "more than the 256 million"), (13_000, "do not fit into so small a file")]
+)
+def test_declared_sizes(tmp_path, name, side, says):
+    path, (write, read, edits) = tmp_path / name, FILES[name]
+    write(path)
+    patched(path, side, edits)
+    with pytest.raises(InputError, match=f"{side}×{side} pixels .*{says}") as error:
+        read(path)
+    assert "\n" not in str(error.value) and str(path) in str(error.value)
+
+
+def test_declared_size_of_a_radiance_picture(tmp_path):
+    path = tmp_path / "light.hdr"
+    path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 20000 +X 40000\n" + bytes(100))
+    with pytest.raises(InputError, match="40000×20000 pixels are more than"):
+        read_environment(path)
+
+
+def test_photos_of_two_hundred_megapixels(tmp_path):
+    Image.new("1", (16320, 12240)).save(tmp_path / "a.png")
+    assert read_header(tmp_path / "a.png").upright == (16320, 12240)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".webp", ".heic", ".dng", ".exr"])
+def test_empty_files(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.touch()
+    with pytest.raises(InputError, match=f"a{suffix}") as error:
+        read_image(path)
+    assert "\n" not in str(error.value)
