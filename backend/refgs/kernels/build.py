@@ -7,13 +7,17 @@ import hashlib
 import importlib.metadata
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import platformdirs
+from filelock import FileLock
 
 from refgs.errors import InputError
 
@@ -91,29 +95,55 @@ def build(target: Target, cache: Path) -> Path:
         return library
     try:
         cache.mkdir(parents=True, exist_ok=True)
-        scratch = tempfile.TemporaryDirectory(prefix="build-", dir=cache)
+        with _sole_build(cache):
+            if not library.exists():  # another process may have made it meanwhile
+                _compile(target, library)
     except OSError as error:
         raise unwritable(cache, error) from None
-    with scratch:
-        made = Path(scratch.name) / library.name
-        command = [
-            sys.executable,
-            "-m",
-            "ziglang",
-            "c++",
-            *FLAGS,
-            "-target",
-            target.platform,
-            f"-mcpu={target.processor}",
-        ]
+    return library
+
+
+@contextmanager
+def _sole_build(cache: Path) -> Iterator[None]:
+    """Wait until no other process builds in `cache`. Remove what killed builds have left there."""
+    file = cache / "build.lock"
+    lock = FileLock(file)
+    try:
+        lock.acquire()
+    except OSError:  # a file system without locks, or one that cannot be written
+        yield
+        return
+    try:
+        for left in cache.glob("build-*"):
+            shutil.rmtree(left, ignore_errors=True)
+        yield
+    finally:
+        with suppress(OSError):  # Windows deletes no open file: there filelock deletes it
+            file.unlink()
+        lock.release()
+
+
+def _compile(target: Target, library: Path) -> None:
+    """Compile the kernels in a folder beside `library`, then move them there."""
+    with tempfile.TemporaryDirectory(prefix="build-", dir=library.parent, ignore_cleanup_errors=True) as scratch:
+        made = Path(scratch) / library.name
+        command = [sys.executable, "-m", "ziglang", "c++", *FLAGS]
+        command += ["-target", target.platform, f"-mcpu={target.processor}"]
         if target.extension != "dll":
             command.append("-fPIC")
         # Zig's own cache is deleted with the scratch folder: it takes tens of megabytes and saves nothing the next time.
-        environment = os.environ | {"ZIG_LOCAL_CACHE_DIR": scratch.name, "ZIG_GLOBAL_CACHE_DIR": scratch.name}
-        done = subprocess.run(
-            [*command, *SOURCES, "-o", str(made)], cwd=HERE, env=environment, capture_output=True, text=True
-        )
-        if done.returncode != 0:
-            raise RuntimeError(f"compiling the kernels for {target} failed:\n{done.stderr}")
+        environment = os.environ | {"ZIG_LOCAL_CACHE_DIR": scratch, "ZIG_GLOBAL_CACHE_DIR": scratch}
+        with subprocess.Popen(
+            [sys.executable, str(HERE / "with_parent.py"), *command, *SOURCES, "-o", str(made)],
+            cwd=HERE,
+            env=environment,
+            stdin=subprocess.PIPE,  # closed when this process ends
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+        ) as compiler:
+            said = compiler.stdout.read()
+        if compiler.returncode != 0:
+            raise RuntimeError(f"compiling the kernels for {target} failed:\n{said}")
         os.replace(made, library)
-    return library

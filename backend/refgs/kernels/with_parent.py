@@ -1,0 +1,33 @@
+"""Run a program that ends with its parent, even if that is killed: `python with_parent.py PROGRAM ARGUMENT…`.
+
+The parent holds the other end of this process's standard input, which the system closes when the parent ends. Then the program and all
+processes that it has started are killed. On Windows only the program itself is.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+
+def main() -> None:
+    """Run the program, and exit with its status."""
+    if os.name == "posix":
+        os.setsid()  # the group of all processes that are started below
+    process = subprocess.Popen(sys.argv[1:], stdin=subprocess.DEVNULL)
+    threading.Thread(target=_end_with_input, args=(process,), daemon=True).start()
+    os._exit(process.wait())  # without waiting for the thread
+
+
+def _end_with_input(process: subprocess.Popen) -> None:
+    while os.read(0, 1024):
+        pass
+    if os.name == "posix":
+        os.killpg(0, signal.SIGKILL)
+    process.kill()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()
