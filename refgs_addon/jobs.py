@@ -211,7 +211,13 @@ class Job:
         elif self._stopped and not self.ended:
             self.state, self.line = "cancelled", "Stopped"
         elif not self.ended:
-            self._fail(f"{self.program} ended unexpectedly (status {status}): see its log")
+            # Linux kills the largest program when memory is full.
+            why = (
+                "killed, perhaps as memory was full: use smaller photos or fewer splats"
+                if status == -9
+                else "see its log"
+            )
+            self._fail(f"{self.program} ended unexpectedly (status {status}): {why}")
 
     def stop(self) -> None:
         """Stop the job cleanly. A training stops after its current iteration and writes a checkpoint."""

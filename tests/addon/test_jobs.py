@@ -182,6 +182,13 @@ def test_a_trainer_that_dies(start):
     until(lambda: next_one.state == "done")
 
 
+def test_a_trainer_that_the_system_kills(start):
+    job = start("slow", mesh=False)
+    until(lambda: job.progress)
+    job._process.kill()
+    assert final_state(job) == "failed" and "memory was full" in job.line and "\n" not in job.line
+
+
 def test_a_trainer_that_is_newer(start, monkeypatch):
     monkeypatch.setenv("FAKE", "newer")
     job = start()
