@@ -7,6 +7,7 @@ import secrets
 import shlex
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -117,6 +118,12 @@ def make_folders(folders: list[Path]) -> None:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{folder}: the folder cannot be made ({error.strerror}): choose another") from None
+
+
+def check_room(folder: Path) -> None:
+    """Raise OSError if a file of eight megabytes cannot be written to a folder."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(bytes(8 << 20))
 
 
 def check_folder(folder: Path) -> None:

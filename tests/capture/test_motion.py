@@ -2,7 +2,10 @@
 
 import multiprocessing
 import sqlite3
+import subprocess
+import sys
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,8 +18,10 @@ from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.color import srgb_decode
 from refgs.errors import InputError, NoCameras
 from tests.makers.captures import look_at, write, write_as_phone
+from tests.makers.disk import fill
 from tests.makers.dng import write_dng
 from tests.makers.speckled import FOCAL, HEIGHT, WIDTH, pose_errors, speckled
+from tests.makers.waiting import until
 
 POSES = [
     look_at(np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.8 + 0.5 * np.sin(3 * angle)]), np.array([0, 0, 0.4]))
@@ -261,3 +266,41 @@ def test_what_stands_still_contradicts_what_turns():
         both = [contradicted(poses, *of_block), contradicted(poses, *of_room)]
         assert np.concatenate(both).mean() > UNEXPLAINED
         assert both[0 if poses is around else 1].mean() == 0
+
+
+def test_a_search_on_a_full_disk(small_disk):
+    for number in range(3):
+        write(small_disk / f"{number}.png", np.random.default_rng(number).integers(0, 255, (48, 64, 3), np.uint8))
+    fill(small_disk / "filler")
+    with pytest.raises(
+        InputError, match=r"disk cannot be written \(No space left on device\): .* search again"
+    ) as error:
+        find_cameras(small_disk, lambda event, facts: None)
+    assert "\n" not in str(error.value)
+
+
+CHILD = """
+import multiprocessing, os, time
+from refgs.capture.motion import end_with_parent
+
+def child():
+    end_with_parent()
+    print(os.getpid(), flush=True)
+    time.sleep(600)
+
+if __name__ == "__main__":
+    process = multiprocessing.get_context("spawn").Process(target=child)
+    process.start()
+    process.join()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for a process in /proc")
+def test_a_search_ends_with_its_process(tmp_path):
+    """Check that the child process in which COLMAP runs ends when its parent is killed."""
+    (tmp_path / "search.py").write_text(CHILD)
+    with subprocess.Popen([sys.executable, tmp_path / "search.py"], stdout=subprocess.PIPE, text=True) as parent:
+        child = Path("/proc") / parent.stdout.readline().strip()
+        assert child.exists()
+        parent.kill()
+    until(lambda: not child.exists() or "Z" in (child / "stat").read_text().rpartition(")")[2], 60)

@@ -15,8 +15,10 @@ has few strong features, so weaker ones count there. Without masks, the user get
 
 import hashlib
 import multiprocessing
+import os
 import shutil
 import signal
+import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -36,6 +38,7 @@ from refgs.capture.files import Masks, find_photos
 from refgs.capture.images import read_header, read_mask
 from refgs.capture.region import WHITE_MASKS, empty_masks
 from refgs.errors import InputError
+from refgs.paths import check_room, disk_errors_named
 
 UNEXPLAINED = 0.2  # part of the matches, above which the cameras are not trusted
 DOUBTED = "as happens if an object turns in front of still surroundings: look at the cameras before you train (Show Cameras in Blender)"
@@ -98,7 +101,8 @@ def find_cameras(folder: Path, report: Callable[[str, dict[str, Any]], None]) ->
         if not path.name.startswith(database.name):
             _remove(path)
     model = work / "0"
-    found = _run_colmap_in_child(photos, masks, database, model, report)
+    with disk_errors_named([folder], "search again"):
+        found = _run_colmap_in_child(photos, masks, database, model, report)
     placed = found.placed
     if found.apart and len(found.apart) >= len(placed) / 2 and len(placed | found.apart) >= 0.75 * len(photos):
         shutil.rmtree(work)
@@ -196,14 +200,28 @@ def _run_colmap_in_child(
                 report("progress", event)
     except EOFError:
         process.join()
+        check_room(database.parent)  # COLMAP does not say that the disk is full
+        if process.exitcode == -9:
+            raise MemoryError from None  # Linux kills the largest program when memory is full
         raise RuntimeError(f"COLMAP ended with status {process.exitcode}") from None
     finally:
         process.kill()
         process.join()
 
 
+def end_with_parent() -> None:
+    """Make this process, a child by `multiprocessing`, end as soon as its parent does, whatever it is doing then."""
+
+    def wait() -> None:
+        multiprocessing.parent_process().join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 def _child(photos: list[Path], masks: list[Path], database: Path, model: Path, events: Connection) -> None:
-    """Run `_run_colmap`, and send an InputError to the pipe `events`."""
+    """Run `_run_colmap`, and send an InputError to the pipe `events`. End with the parent, even if that is killed."""
+    end_with_parent()
     try:
         _run_colmap(photos, masks, database, model, events)
     except InputError as error:
