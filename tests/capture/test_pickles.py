@@ -89,6 +89,7 @@ def test_lists_within_lists_are_not_followed(tmp_path):
         b"Nr\x00\xe1\xf5\x05.",  # LONG_BINPUT: the memo's place 100 million
         b"\x8e" + (1 << 33).to_bytes(8, "little") + b".",  # BINBYTES8: 8 GB of bytes
         b"\x95" + (1 << 33).to_bytes(8, "little") + b".",  # FRAME
+        b"\x96" + (1 << 30).to_bytes(8, "little") + b".",  # BYTEARRAY8
     ],
 )
 def test_a_few_bytes_reserve_little_memory(tmp_path, data):

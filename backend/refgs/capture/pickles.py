@@ -97,6 +97,11 @@ for _core in ("numpy.core", "numpy._core"):
 class _Arrays(pickle._Unpickler):
     """Read a pickle in Python, by the classes and functions of `_NAMES` alone. Reading in C, a few bytes could reserve gigabytes."""
 
+    def load_bytearray8(self) -> None:
+        self.append(bytearray(self.read(int.from_bytes(self.read(8), "little"))))  # `pickle` reserves the bytes first
+
+    dispatch = pickle._Unpickler.dispatch | {pickle.BYTEARRAY8[0]: load_bytearray8}
+
     def find_class(self, module: str, name: str):
         try:
             return _NAMES[module, name]
