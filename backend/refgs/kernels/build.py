@@ -22,6 +22,7 @@ from filelock import FileLock
 from refgs.errors import InputError
 
 HERE = Path(__file__).parent
+WITH_PARENT = str(HERE / "with_parent.py")  # runs a program that ends with this process
 SOURCES, HEADERS = (sorted(file.name for file in HERE.glob(pattern)) for pattern in ("*.cpp", "*.h"))
 # -ffp-contract=on fuses a product and a sum within an expression, never across: a formula rounds the same wherever it is inlined.
 FLAGS = ["-shared", "-s", "-O3", "-std=c++20", "-fno-exceptions", "-fno-rtti", "-nostdlib", "-fvisibility=hidden"]
@@ -134,7 +135,7 @@ def _compile(target: Target, library: Path) -> None:
         # Zig's own cache is deleted with the scratch folder: it takes tens of megabytes and saves nothing the next time.
         environment = os.environ | {"ZIG_LOCAL_CACHE_DIR": scratch, "ZIG_GLOBAL_CACHE_DIR": scratch}
         with subprocess.Popen(
-            [sys.executable, str(HERE / "with_parent.py"), *command, *SOURCES, "-o", str(made)],
+            [sys.executable, WITH_PARENT, *command, *SOURCES, "-o", str(made)],
             cwd=HERE,
             env=environment,
             stdin=subprocess.PIPE,  # closed when this process ends
