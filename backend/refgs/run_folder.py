@@ -22,7 +22,7 @@ _KEPT = (PHOTOS, "log.txt", LOCK, PROGRESS, STOP)  # does no harm to a new run
 
 
 def check_free(folder: Path) -> None:
-    """Raise InputError if a new run cannot be created in the folder: it holds a run or files of the user, is a file, or is not named in Unicode.
+    """Raise InputError if a new run cannot be created in a folder: it holds a run or other files, is a file, or its name is not Unicode.
 
     A run that has not learned anything, for its training was killed before its first checkpoint, does not count.
     """
