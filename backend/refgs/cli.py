@@ -1,7 +1,9 @@
 """Parse the command line. Each command imports its own modules, so that help and wrong arguments are answered at once."""
 
+import os
 import signal
 import sys
+import threading
 import traceback
 import warnings
 from pathlib import Path
@@ -10,12 +12,26 @@ from typing import Annotated
 import typer
 
 import refgs
-from refgs.errors import InputError, InputWarning, one_line
+from refgs.errors import TRY_AGAIN, InputError, InputWarning, TryAgain, one_line
 from refgs.memory import shortage_named
 from refgs.paths import disk_errors_named
 
-app = typer.Typer(help=refgs.__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+STATUSES = (
+    "Exit status: 0 done; 1 a fault of the program; 2 the input is wrong, a retry is useless; "
+    "75 try again: full disk, card that fails, run in use, SIGTERM; 130 Ctrl-C."
+)
+app = typer.Typer(
+    help=refgs.__doc__,
+    epilog=STATUSES,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
 RunFolder = Annotated[Path, typer.Argument(help="run folder, made by `refgs train`")]
+Once = Annotated[
+    bool,
+    typer.Option("--once", help="do only what is left to do, if anything: a scheduler can repeat the command"),
+]
 
 
 @app.command()
@@ -41,11 +57,14 @@ def frames(
 
 
 @app.command()
-def poses(photos: Annotated[Path, typer.Argument(help="folder with photos, in it or in its folder images")]) -> None:
+def poses(
+    photos: Annotated[Path, typer.Argument(help="folder with photos, in it or in its folder images")],
+    once: Once = False,
+) -> None:
     """Find the cameras of the photos in a folder, and write them to PHOTOS/sparse/0. Then the folder is a capture."""
     from refgs import commands
 
-    commands.poses(photos)
+    commands.poses(photos, once)
 
 
 @app.command()
@@ -58,11 +77,12 @@ def masks(
     model: Annotated[
         Path | None, typer.Option(help="your own model of salient-object segmentation, an ONNX file")
     ] = None,
+    once: Once = False,
 ) -> None:
     """Make masks of the photos and write them to CAPTURE/masks. Strokes in CAPTURE/strokes correct them; your own masks are kept."""
     from refgs import commands
 
-    commands.masks(capture, changes or [], model)
+    commands.masks(capture, changes or [], model, once)
 
 
 @app.command()
@@ -84,11 +104,15 @@ def train(
     resume: Annotated[bool, typer.Option(help="resume the run in --out")] = False,
     run: Annotated[Path | None, typer.Option("--from", help="finished run to continue in --out, with --hints")] = None,
     hints: Annotated[Path | None, typer.Option(help="JSON file: which parts of that run are metal or paint")] = None,
+    once: Annotated[
+        bool,
+        typer.Option("--once", help="start, or resume, or do nothing where it is done: a scheduler can repeat it"),
+    ] = False,
 ) -> None:
     """Train surfels, materials and light from a capture."""
     from refgs import commands
 
-    commands.train(capture, out, preset, device, minutes, changes or [], resume, run, hints)
+    commands.train(capture, out, preset, device, minutes, changes or [], resume, run, hints, once)
 
 
 @app.command()
@@ -116,11 +140,12 @@ def evaluate(
         Path | None,
         typer.Option(help="folder with light.exr, mesh.ply, relight/, and normal/, albedo/ … of the views, as EXR"),
     ] = None,
+    once: Once = False,
 ) -> None:
     """Compare renderings with held-out photos; write metrics.json and pictures/."""
     from refgs import commands
 
-    commands.evaluate(run, split, ground_truth)
+    commands.evaluate(run, split, ground_truth, once)
 
 
 @app.command()
@@ -136,11 +161,12 @@ def export(
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option(help="replace files that exist")] = False,
+    once: Once = False,
 ) -> None:
     """Export the textured mesh: fuse depth, simplify, unwrap, bake. With a splats option, export a mesh only if --mesh is given too."""
     from refgs import commands
 
-    commands.export(run, mesh, texture, splats, display_splats, overwrite)
+    commands.export(run, mesh, texture, splats, display_splats, overwrite, once)
 
 
 @app.command()
@@ -200,8 +226,17 @@ def worker() -> None:
     worker.work()
 
 
-def _interrupt(*_) -> None:
-    raise KeyboardInterrupt
+def _terminate(*_) -> None:
+    """Handle SIGTERM: end with the status TRY_AGAIN. `commands.train` has a handler of its own, which writes a checkpoint first."""
+    os.write(2, b"refgs: terminated: run the command again\n")  # print may be at work already
+    sys.exit(TRY_AGAIN)
+
+
+def _end_with_input() -> None:
+    """End this process as SIGTERM does when its standard input closes: what started it has died, and waits for it no longer."""
+    while os.read(0, 1024):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _one_line(show):
@@ -217,17 +252,22 @@ def _one_line(show):
 
 
 def main() -> None:
-    """Run a command. Exit status: 0 success, 1 internal error (prints a traceback), 2 wrong input (prints one line), 130 interrupted."""
+    """Run a command. Its exit status is one of STATUSES; an error prints one line, a fault of the program a traceback.
+
+    If the environment has REFGS_END_WITH_INPUT, the command also ends when its standard input closes. `refgs batch` starts commands so.
+    """
     for stream in (sys.stdout, sys.stderr):  # a path may hold what the terminal's encoding lacks
         stream.reconfigure(errors="backslashreplace")
     warnings.showwarning = _one_line(warnings.showwarning)
-    signal.signal(signal.SIGTERM, _interrupt)
+    signal.signal(signal.SIGTERM, _terminate)
+    if "REFGS_END_WITH_INPUT" in os.environ:
+        threading.Thread(target=_end_with_input, daemon=True).start()
     try:
         with shortage_named(), disk_errors_named([], "run the command again"):
             app(standalone_mode=True)
     except InputError as error:
         print(f"refgs: {one_line(error)}", file=sys.stderr)
-        sys.exit(2)
+        sys.exit(TRY_AGAIN if isinstance(error, TryAgain) else 2)
     except KeyboardInterrupt:
         print("refgs: interrupted", file=sys.stderr)
         sys.exit(130)

@@ -1,8 +1,11 @@
 """Run the commands of the command line. There is one function for each command."""
 
+import os
 import runpy
 import signal
 import sys
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,12 +13,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from refgs import train_job
-from refgs.errors import InputError, one_line
+from refgs.errors import TRY_AGAIN, InputError, one_line
 from refgs.export.export_job import export as export_run
 from refgs.paths import clone_root, command_line, disk_errors_named, make_folders
-from refgs.run_folder import check_finished, update_metrics
+from refgs.run_folder import check_finished, read_metrics, update_metrics
 
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)  # paths are printed as they are
+CHECKPOINT_BY, END_BY = 7.0, 9.5  # seconds after SIGTERM: give up the checkpoint, give up everything
 PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha", "visibility")
 
 
@@ -75,10 +79,17 @@ def frames(video: Path, out: Path, count: int) -> None:
     )
 
 
-def poses(folder: Path) -> None:
-    """Find the cameras of the photos in a folder. If the search is interrupted, running the command again resumes it."""
+def poses(folder: Path, once: bool = False) -> None:
+    """Find the cameras of the photos in a folder. If the search is interrupted, running the command again resumes it.
+
+    With `once`, a folder that has cameras is left as it is.
+    """
+    from refgs.capture import find_layout
     from refgs.capture.motion import find_cameras
 
+    if once and find_layout(folder) is not None:
+        console.print(f"done before: {folder} has cameras")
+        return
     with job_report("finding cameras") as report:
         found = find_cameras(folder, report)
     console.print(
@@ -88,14 +99,19 @@ def poses(folder: Path) -> None:
         console.print("The object turned in front of still surroundings: only the pixels inside the masks were used.")
 
 
-def masks(folder: Path, changes: list[str], model: Path | None = None) -> None:
+def masks(folder: Path, changes: list[str], model: Path | None = None, once: bool = False) -> None:
     """Make masks of a capture's photos, and write them to its folder `masks`.
 
-    `changes` set the box about the object. `model` is an ONNX file that judges pixels in place of their colours.
+    `changes` set the box about the object. `model` is an ONNX file that judges pixels in place of their colours. With `once`, a capture in
+    which some photos have masks is left as it is, as by a training.
     """
+    from refgs.capture import read_capture
     from refgs.capture.masks import make_masks
     from refgs.settings import load_settings
 
+    if once and any(view.masked for view in read_capture(folder).views):
+        console.print(f"done before: {folder} has masks")
+        return
     with job_report("making masks") as report:
         found = make_masks(folder, load_settings("standard", changes).region, report, model)
     kept = f", {found['kept']} of yours kept" if found["kept"] else ""
@@ -113,18 +129,29 @@ def train(
     resume: bool,
     run: Path | None = None,
     hints: Path | None = None,
+    once: bool = False,
 ) -> None:
     """Train on a capture and write a run folder. With a finished `run` and a file of `hints` about it, continue its training.
 
-    Ctrl-C ends the training with a checkpoint, from which `resume` continues. A second Ctrl-C ends it at once.
+    Ctrl-C ends the training with a checkpoint, from which `resume` continues. A second Ctrl-C ends it at once. SIGTERM ends it with a
+    checkpoint if that takes no longer than CHECKPOINT_BY; otherwise the last one counts.
+
+    With `once`, the training is started, or resumed, or left as it is if it has ended. It must be asked for as it was before.
     """
-    stopped, hinted = [], train_job.hinted(run, hints, resume)
-    with progress_bar("training", 1) as bar:
+    hinted = train_job.hinted(run, hints, resume)
+    if once:
+        left = train_job.unfinished(out, preset, minutes, changes)
+        if left is None:
+            console.print(f"done before: {out}")
+            return
+        if left:
+            resume, changes, hinted = True, [], None
+    with progress_bar("training", 1) as bar, _signals_to_stop() as stopped:
 
         def report(event: str, facts: dict) -> None:
             if event == "progress" and "stage" in facts:  # of masks
                 if stopped:
-                    raise KeyboardInterrupt
+                    _end(stopped)
                 bar(facts["done"], f"making masks: {facts['stage']}", facts["total"])
             elif event == "progress":
                 note = f"loss {facts['loss']:.4f}  {facts['psnr']:.2f} dB  {facts['splats']:,} surfels"
@@ -132,24 +159,53 @@ def train(
             elif event != "measured":
                 print_event(event, facts)
 
-        def stop(*_) -> None:
-            if stopped:
-                raise KeyboardInterrupt
-            stopped.append(True)  # the training ends after this iteration, with a checkpoint
-
-        before = signal.signal(signal.SIGINT, stop)
-        try:
-            trainer, quality = train_job.train(
-                capture_folder, out, preset, device, minutes, changes, resume, report, lambda _: bool(stopped), hinted
-            )
-        finally:
-            signal.signal(signal.SIGINT, before)
+        trainer, quality = train_job.train(
+            capture_folder, out, preset, device, minutes, changes, resume, report, lambda _: bool(stopped), hinted
+        )
     if not trainer.ended:
         again = command_line("refgs", "train", capture_folder, "--out", out, "--resume")
         console.print(f"stopped at iteration {trainer.iteration}; resume with: {again}")
-        raise KeyboardInterrupt
+        _end(stopped)
     held_out = "" if quality is None else f", {quality:.2f} dB on {len(trainer.capture.test_views)} held-out views"
     console.print(f"trained {trainer.iteration} iterations in {trainer.seconds:.0f} s{held_out}: {out}")
+
+
+@contextmanager
+def _signals_to_stop() -> Iterator[list[int]]:
+    """Collect the signals SIGINT and SIGTERM of a `with` block in a list, which is yielded. A second one ends the block at once.
+
+    SIGTERM counts as a second one after CHECKPOINT_BY seconds. After END_BY seconds the process ends, whatever it does.
+    """
+    stopped, timers = [], []
+
+    def stop(number: int, _) -> None:
+        if stopped:
+            _end([number])
+        stopped.append(number)  # the training ends after this iteration, with a checkpoint
+        if number == signal.SIGTERM:
+            after(CHECKPOINT_BY, lambda: os.kill(os.getpid(), signal.SIGTERM))
+            after(END_BY, lambda: os._exit(TRY_AGAIN))
+
+    def after(seconds: float, what: Callable[[], None]) -> None:
+        timers.append(threading.Timer(seconds, what))
+        timers[-1].daemon = True
+        timers[-1].start()
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stopped
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for timer in timers:
+            timer.cancel()
+
+
+def _end(signals: list[int]) -> None:
+    """End the process as the first of these signals does, or as Ctrl-C if there is none."""
+    if signals and signals[0] == signal.SIGTERM:
+        sys.exit(TRY_AGAIN)
+    raise KeyboardInterrupt
 
 
 def render(folder: Path, cameras: Path, out: Path, passes: list[str], hdri: Path | None, format: str) -> None:
@@ -219,14 +275,17 @@ def _relight(run, hdri: Path):
     return light
 
 
-def evaluate(folder: Path, split: str, ground_truth: Path | None) -> None:
+def evaluate(folder: Path, split: str, ground_truth: Path | None, once: bool = False) -> None:
     """Compare renderings with held-out photos, and with ground truth if it is given or if the photos' data set has it.
 
-    Writes metrics.json and the folder pictures.
+    Writes metrics.json and the folder pictures. With `once`, a run that has been evaluated is left as it is.
     """
     if split not in ("test", "train"):
         raise InputError(f"--split {split}: take test or train")
     check_finished(folder)  # before torch is imported
+    if once and read_metrics(folder).get("split") == split:
+        console.print(f"done before: {folder} has the metrics of its {split} views")
+        return
     from refgs.capture import read_capture
     from refgs.compare.published import published_truth
     from refgs.compare.truth import GroundTruth
@@ -260,8 +319,15 @@ def export(
     splats_file: Path | None = None,
     display_file: Path | None = None,
     overwrite: bool = False,
+    once: bool = False,
 ) -> None:
-    """Export a run as a textured mesh or as splats, and print the files written."""
+    """Export a run as a textured mesh or as splats, and print the files written. With `once`, files that all exist are left as they are."""
+    if once:
+        files = [file for file in (mesh_file, splats_file, display_file) if file] or [folder / "mesh.glb"]
+        if all(file.exists() for file in files):  # textures, written before the mesh, may be those of a killed process
+            console.print(f"done before: {', '.join(map(str, files))}")
+            return
+        overwrite = True
     with job_report("exporting") as report:
         files = export_run(folder, mesh_file, texture, splats_file, display_file, overwrite, report)
     for file in files:

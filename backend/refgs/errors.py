@@ -2,6 +2,9 @@
 
 import re
 
+TRY_AGAIN = 75
+"""Exit status of a command that may succeed if it is repeated: EX_TEMPFAIL of sysexits.h, which schedulers know."""
+
 # Control characters, line separators and lone surrogates: names of files may hold them.
 _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
@@ -16,6 +19,13 @@ class InputError(Exception):
 
     The message is one line for the user: what is wrong, where, and what to do. The command line prints only this line and exits with status
     2. Any other exception is a bug of the program: it exits with status 1, and the traceback is written to log.txt.
+    """
+
+
+class TryAgain(InputError):
+    """Error that is not the input's fault: a full disk, a card that fails, a run that another process works in.
+
+    The same command may succeed later. The command line exits with the status TRY_AGAIN.
     """
 
 

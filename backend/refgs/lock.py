@@ -11,7 +11,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from refgs.errors import InputError
+from refgs.errors import TryAgain
 from refgs.paths import remove_leftovers, write_text
 
 LOCK, PROGRESS, STOP = "run.lock", "progress.json", "stop"
@@ -19,7 +19,7 @@ EVERY = 1.0  # seconds between looks
 
 
 class RunLock:
-    """Lock a run folder for this process during a `with` block. Raises InputError if another process has locked it.
+    """Lock a run folder for this process during a `with` block. Raises TryAgain if another process has locked it.
 
     What killed processes left half-written in the folder is removed. A folder that does not exist is made.
     """
@@ -32,7 +32,7 @@ class RunLock:
             self._lock.acquire(timeout=1)  # a process that only tests the lock holds it for a moment
         except Timeout:
             what = "another process trains it, or makes its mesh: wait until that has ended, or stop it"
-            raise InputError(f"{self._folder} is in use: {what}") from None
+            raise TryAgain(f"{self._folder} is in use: {what}") from None
         except OSError:  # a file system without locks
             pass
         self._tidy()

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from refgs.errors import InputError
+from refgs.errors import InputError, TryAgain
 
 PACKAGE = Path(__file__).resolve().parent
 ROOT = PACKAGE.parents[1]
@@ -92,7 +92,7 @@ def write_text(file: Path, text: str, durable: bool = True) -> None:
 
 @contextmanager
 def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
-    """Turn disk errors in a `with` block into InputErrors that name the folder: the disk is full, read-only or gone.
+    """Raise TryAgain for disk errors in a `with` block. The message names the folder whose disk is full, read-only or gone.
 
     The folders must exist; without folders, files may be read in the block, too. `again` is added to the message: it tells the user how to
     continue when the disk works again.
@@ -103,11 +103,11 @@ def disk_errors_named(folders: list[Path], again: str) -> Iterator[None]:
         raise
     except Exception as error:
         if gone := next((folder for folder in folders if not folder.is_dir()), None):
-            raise InputError(f"{gone} is no longer there: put its disk back, then {again}") from error
+            raise TryAgain(f"{gone} is no longer there: put its disk back, then {again}") from error
         if isinstance(error, OSError) and error.errno in DISK_ERRORS:
             where = error.filename or next(iter(folders), "the disk")
             why = f"{where} cannot be {'written' if folders else 'read or written'} ({error.strerror})"
-            raise InputError(f"{why}: mend that, then {again}; files written before are complete") from error
+            raise TryAgain(f"{why}: mend that, then {again}; files written before are complete") from error
         raise
 
 

@@ -10,7 +10,7 @@ from refgs import __version__
 from refgs.errors import InputError
 from refgs.lock import LOCK, PROGRESS, STOP
 from refgs.paths import check_unicode, command_line, is_leftover, write_text
-from refgs.settings import Settings, recorded_settings
+from refgs.settings import Settings, load_settings, recorded_settings
 
 PHOTOS = "photos"  # a folder of reduced photos, while they are trained on
 CHECKPOINTS = "checkpoints"
@@ -89,6 +89,27 @@ def read_run_facts(folder: Path) -> tuple[dict, Settings]:
         raise InputError(f"{file} is broken ({error}): train again") from None
 
 
+def check_asked(folder: Path, preset: str | None, minutes: float | None, changes: list[str]) -> None:
+    """Raise InputError if the run in a folder was asked for with other settings than these, which are those of `refgs train`."""
+    facts, settings = read_run_facts(folder)
+    another = "choose another folder with --out, or ask for the same"
+    if preset is None and minutes is not None:
+        if facts["preset"] != (asked := f"{minutes:g} minutes"):
+            raise InputError(f"{folder} was trained by {facts['preset']}, not for {asked}: {another}")
+        return  # its settings were chosen
+    tables = settings.model_dump(mode="json")
+    changed = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8")).get("changed", {})
+    for key, row in changed.items():
+        section, name = key.split(".")
+        tables[section][name] = row["asked"]
+    wanted = load_settings(preset or "standard", changes).model_dump(mode="json")
+    for section, table in wanted.items():
+        for name, value in table.items():
+            if value != (was := tables[section][name]):
+                what = f"{section}.{name} = {was}, and not {value}"
+                raise InputError(f"{folder} was trained with {what}: {another}")
+
+
 def _release(version: str) -> tuple[int, ...]:
     return tuple(int(number) for number in version.split(".")[:2])  # a patch release changes no file format
 
@@ -100,6 +121,10 @@ def update_metrics(folder: Path, facts: dict[str, Any]) -> None:
         both = {key: merged(known[key], new[key]) for key in new if isinstance(known.get(key), dict)}
         return known | new | both
 
+    write_text(folder / "metrics.json", json.dumps(merged(read_metrics(folder), facts), indent=1))
+
+
+def read_metrics(folder: Path) -> dict[str, Any]:
+    """Read a run's metrics.json. Returns {} if there is none."""
     file = folder / "metrics.json"
-    known = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
-    write_text(file, json.dumps(merged(known, facts), indent=1))
+    return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from refgs.errors import InputError
+from refgs.errors import InputError, TryAgain
 from refgs.events import Report
 from refgs.lock import RunLock
 from refgs.memory import shortage_named, trim
@@ -20,6 +20,7 @@ from refgs.run_folder import (
     CHECKPOINTS,
     PHOTOS,
     SPLATS,
+    check_asked,
     check_finished,
     check_free,
     clear,
@@ -120,6 +121,21 @@ def hinted(run: Path | None, file: Path | None, resume: bool) -> Hinted | None:
     if resume:
         raise InputError("--resume continues the run in --out, which knows its hints: leave out --from and --hints")
     return Hinted(run, file)
+
+
+def unfinished(out: Path, preset: str | None, minutes: float | None, changes: list[str]) -> bool | None:
+    """Say what is left of a training that may have been started before: for `refgs train --once`.
+
+    Returns False if it must be started, True if it must be resumed, None if it has ended. Raises InputError if `out` holds a training with
+    other settings than those asked for, and TryAgain if another process works in it.
+    """
+    if not (out / "run.toml").exists():
+        return False
+    check_asked(out, preset, minutes, changes)
+    if (out / "splats.ply").exists():
+        return None
+    with RunLock(out):
+        return True
 
 
 def choose_device(device: str, report: Report) -> str:
@@ -398,15 +414,22 @@ def _costs(trainer: "Trainer") -> dict[str, Any]:
 
 @contextmanager
 def _card_memory(what: str | None = None) -> Iterator[None]:
-    """Raise InputError if a `with` block runs out of GPU memory. `what` is the message; None is the usual message."""
+    """Raise TryAgain if a `with` block runs out of GPU memory, or if the card fails.
+
+    `what` is the message about the memory; None is the usual message.
+    """
     import torch
 
+    from refgs.kernels.cuda import CardError
     from refgs.train.densify import full_card
 
     try:
         yield
     except torch.OutOfMemoryError:
-        raise (InputError(what) if what else full_card()) from None
+        raise (TryAgain(what) if what else full_card()) from None
+    except (CardError, torch.AcceleratorError) as error:
+        why = str(error).splitlines()[0]
+        raise TryAgain(f"the card failed ({why}): resume with --resume, or with --device cpu too") from error
 
 
 @contextmanager

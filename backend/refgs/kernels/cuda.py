@@ -59,13 +59,18 @@ def unusable() -> str | None:
     return None
 
 
+class CardError(RuntimeError):
+    """Error of a CUDA card that cannot go on: it was lost, or what it ran went wrong."""
+
+
 def _check(result: tuple, what: str):
     """Raise an error if a CUDA call failed; the message begins with `what`. Return the call's results without the status."""
     status, *values = result
     if status.name == "CUDA_ERROR_OUT_OF_MEMORY":
         raise torch.OutOfMemoryError(what)
     if int(status):
-        raise RuntimeError(f"{what}: {status.name}")
+        error = CardError if status.name.startswith("CUDA_ERROR") else RuntimeError
+        raise error(f"{what}: {status.name}")
     return values[0] if len(values) == 1 else values
 
 

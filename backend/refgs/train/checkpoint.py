@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from refgs.errors import InputError
+from refgs.errors import InputError, TryAgain
 from refgs.events import Report
 from refgs.paths import whole
 
@@ -32,7 +32,7 @@ class NoCheckpoint(InputError):
 def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[str, Any]) -> None:
     """Write the tensors of an iteration to a safetensors file, and its other values, `facts`, to a TOML file.
 
-    The checkpoint is complete once its TOML file is there. Older checkpoints than the last two are removed. Raises InputError when the disk
+    The checkpoint is complete once its TOML file is there. Older checkpoints than the last two are removed. Raises TryAgain when the disk
     is full; earlier checkpoints then stay complete.
     """
     folder.mkdir(exist_ok=True)
@@ -53,7 +53,7 @@ def save(folder: Path, iteration: int, tensors: dict[str, Tensor], facts: dict[s
         ):
             last = complete(folder)
             kept = f"the checkpoint of iteration {last[-1]} is whole" if last else "there is no earlier checkpoint"
-            raise InputError(f"{folder}: the disk is full; {kept}: free some space, then train with --resume") from None
+            raise TryAgain(f"{folder}: the disk is full; {kept}: free some space, then train with --resume") from None
         raise
     for old in complete(folder)[:-KEPT]:
         for file in reversed(_files(folder, old)):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from refgs.errors import InputError
+from refgs.errors import TryAgain
 from refgs.model.adam import Adam
 from refgs.model.surfels import Parameters, activate, axes
 from refgs.settings import DensifySettings, PropagationSettings, RateSettings
@@ -154,15 +154,15 @@ def thin(parameters: Parameters, optimizer: Adam, count: int) -> None:
     take(parameters, optimizer, parameters["opacity"].topk(count).indices.sort().values)
 
 
-def full_card() -> InputError:
-    """Return the InputError to raise if the graphics card has too little memory. Its message tells the user what to do."""
-    return InputError("the card's memory is too small: close what else uses it, or take --device cpu")
+def full_card() -> TryAgain:
+    """Return the TryAgain to raise if the graphics card has too little memory. Its message tells the user what to do."""
+    return TryAgain("the card's memory is too small: close what else uses it, or take --device cpu")
 
 
 def fewer_surfels(state: State) -> None:
     """Keep only the most opaque surfels, the fraction FEWER of all, because the graphics card's memory is full.
 
-    The surfel budget is lowered to the same number. Raises InputError if fewer than LEAST_SURFELS would be left.
+    The surfel budget is lowered to the same number. Raises TryAgain if fewer than LEAST_SURFELS would be left.
     """
     budget = int(FEWER * len(state.parameters["position"]))
     if budget < LEAST_SURFELS:
