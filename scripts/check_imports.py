@@ -31,6 +31,7 @@ FLOORS = (
     ("train",),
     ("export",),
     ("report",),
+    ("batch",),
     ("cli", "commands", "demo", "train_job", "worker"),
 )
 FORBIDDEN = {"backend": ("bpy", "refgs_addon"), "refgs_addon": ("torch", "refgs")}

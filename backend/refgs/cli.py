@@ -183,6 +183,28 @@ def report(
 
 
 @app.command()
+def batch(
+    source: Annotated[Path, typer.Argument(help="list of captures, a TOML file, or a folder of captures")],
+    out: Annotated[Path, typer.Option(help="folder for the runs, and for the page about them, index.html")],
+    preset: Annotated[str | None, typer.Option(help="as for train, where the list does not say")] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.05, help="as for train, where the list does not say")] = None,
+    changes: Annotated[list[str] | None, typer.Option("--set", help="as for train; the list's come after")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu or cuda")] = "auto",
+    cores: Annotated[int | None, typer.Option(min=1, help="cores of each step", show_default="as fit")] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="steps at once on this machine", show_default="as fit")
+    ] = None,
+    address: Annotated[
+        str | None, typer.Option(help="HOST:PORT of a Ray cluster's head", show_default="this machine")
+    ] = None,
+) -> None:
+    """Train many captures: find cameras, make masks, train, evaluate and export each. Run it again to go on, or to add captures."""
+    from refgs import commands
+
+    commands.batch(source, out, preset, minutes, changes or [], device, cores, workers, address)
+
+
+@app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="folder for all results")] = Path("demo"),
 ) -> None:

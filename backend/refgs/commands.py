@@ -334,6 +334,67 @@ def export(
         console.print(f"wrote {file}")
 
 
+def batch(
+    source: Path,
+    out: Path,
+    preset: str | None,
+    minutes: float | None,
+    changes: list[str],
+    device: str,
+    cores: int | None,
+    workers: int | None,
+    address: str | None,
+) -> None:
+    """Train many captures, on this machine or on a cluster, and write a page about them.
+
+    Ctrl-C and SIGTERM end all commands, each training with a checkpoint. The same command resumes them.
+    """
+    from refgs.batch.batch import Batch
+    from refgs.batch.engine import started
+    from refgs.batch.listing import LOGS, Ask
+    from refgs.batch.page import PAGE
+    from refgs.lock import RunLock
+
+    train_job.check_device(device)
+    with _batch_bars() as report:
+        work = Batch(source, out, Ask(preset=preset, minutes=minutes, set=changes), device, report)
+        with started(address, cores, workers) as engine, disk_errors_named([out], "run the same command again"):
+            (out / LOGS).mkdir(parents=True, exist_ok=True)
+            with RunLock(out / LOGS) as lock, _signals_to_stop() as stopped:
+                status = work.run(engine, lambda *facts: lock.attend(*facts) or bool(stopped))
+    console.print(f"the page about all runs: {out / PAGE}")
+    if stopped and status:
+        _end(stopped)
+    sys.exit(status)
+
+
+@contextmanager
+def _batch_bars() -> Iterator[Callable[[str, dict], None]]:
+    """Show a bar for all trainings of a batch and one for each step that runs, for a `with` block.
+
+    Yields the function report(event, facts).
+    """
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}")
+    with Progress(*columns, console=console, transient=True) as progress:
+        whole, bars = progress.add_task("all", total=None, note=""), {}
+
+        def report(event: str, facts: dict) -> None:
+            if event != "progress":
+                print_event(event, facts)
+                return
+            note = f"{facts['failed']} failed" if facts["failed"] else ""
+            progress.update(whole, completed=facts["done"], total=facts["total"], note=note)
+            working = {f"{one['run']} {one['step']}": one for one in facts["working"]}
+            for name in bars.keys() - working.keys():
+                progress.remove_task(bars.pop(name))
+            for name, one in working.items():
+                if name not in bars:
+                    bars[name] = progress.add_task(name, total=None, note="")
+                progress.update(bars[name], completed=one["done"], total=one["total"] or None)
+
+        yield report
+
+
 def bench(what: str, options: list[str]) -> None:
     """Run the benchmark `what` from the repository. `options` are its own command-line options."""
     _run_module("benchmarks", [what, *options])

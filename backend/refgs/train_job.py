@@ -71,7 +71,7 @@ def train(
     None then, or if there are no held-out views.
     """
     plan, lock = Plan(minutes), RunLock(out)
-    _check_device(device)
+    check_device(device)
     hints: list[Hint] = []
     if resume:
         facts, settings = _resumed_settings(out, changes)
@@ -143,7 +143,7 @@ def choose_device(device: str, report: Report) -> str:
 
     If a GPU was asked for or found but cannot be used, report a warning and return "cpu".
     """
-    _check_device(device)
+    check_device(device)
     if device == "cpu":
         return "cpu"
     from refgs.kernels import cuda
@@ -163,7 +163,8 @@ def _less(settings: Settings) -> str:
     return f"close other programs and resume, or train into a new folder with {parts}"
 
 
-def _check_device(device: str) -> None:
+def check_device(device: str) -> None:
+    """Raise InputError unless `device` is one that `--device` takes."""
     if device not in ("auto", "cpu", "cuda"):
         raise InputError(f"--device {device}: take auto, cpu or cuda")
 

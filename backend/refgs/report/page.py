@@ -83,10 +83,7 @@ def write_report(runs: list[Path], out: Path) -> None:
             page.label = label
     groups = _error_curves(pages)
     parts = {page.label: spent for page in pages if (spent := _seconds_by_work(page))}
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
-    html = environment.get_template("template.html").render(
+    html = template(Path(__file__).with_name("template.html")).render(
         runs=pages,
         version=__version__,
         headline=_columns(pages, HEADLINE),
@@ -110,6 +107,15 @@ def write_report(runs: list[Path], out: Path) -> None:
     with disk_errors_named([out.parent], "write the report again"):
         for file, text in ((out, html), (out.with_suffix(".csv"), figures)):
             write_text(file, text)
+
+
+def template(file: Path) -> jinja2.Template:
+    """Load a page's template. It may include files that lie beside it, and those of the report, such as style.html."""
+    folders = [file.parent, Path(__file__).parent]
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(folders), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.get_template(file.name)
 
 
 def _read_run(folder: Path) -> RunPage:

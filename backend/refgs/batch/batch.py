@@ -1,0 +1,179 @@
+"""Train all captures of a batch: hand their steps to the engine, follow them, and write a page about them."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from refgs.batch.engine import Engine
+from refgs.batch.graph import Node, steps_of
+from refgs.batch.listing import Ask, Job, read_jobs
+from refgs.batch.page import Row, write_page
+from refgs.batch.resources import card_share, memory
+from refgs.batch.steps import Outcome, Step, recorded
+from refgs.errors import TRY_AGAIN, InputError
+from refgs.events import Report
+from refgs.lock import PROGRESS
+
+REREAD_EVERY = 5.0  # seconds between looks for new captures
+SETTLED = 10.0  # seconds without a change after which a new capture's files are taken to be complete
+
+
+@dataclass
+class _Run:
+    """Hold a training of the batch: its steps by name, and the outcomes of those that have ended."""
+
+    job: Job
+    nodes: dict[str, Node]
+    outcomes: dict[str, Outcome] = field(default_factory=dict)
+
+    @property
+    def ended(self) -> bool:
+        return len(self.outcomes) == len(self.nodes)
+
+    @property
+    def failed(self) -> tuple[str, Outcome] | None:
+        """Return the first step that failed, with its outcome. Masks count only if the training failed, too."""
+        bad = [(name, found) for name in self.nodes if (found := self.outcomes.get(name)) and found.status]
+        optional = {name for node in self.nodes.values() for name in node.may_fail}
+        return next((pair for pair in bad if pair[0] not in optional), None)
+
+    @property
+    def seconds(self) -> float:
+        return sum(outcome.seconds for outcome in self.outcomes.values())
+
+
+class Batch:
+    """Follow the trainings of a list, or of a folder of captures, from their first step to the page about all of them."""
+
+    def __init__(self, source: Path, out: Path, ask: Ask, device: str, report: Report):
+        """Read and check the list. Raises InputError if it is wrong."""
+        self._source, self._out, self._ask, self._device, self._report = source, out, ask, device, report
+        self._runs: dict[str, _Run] = {}
+        self._references: dict[Step, Any] = {}  # trainings of one capture share its first steps
+        self._outcomes: dict[Step, Outcome] = {}
+        self._looked, self._state, self._said = time.monotonic(), None, ""
+        self._jobs = read_jobs(source, out, ask)
+
+    def run(self, engine: Engine, stop: Callable[[int, int, float], bool]) -> int:
+        """Run all steps. Returns the exit status: 0 if all is done, otherwise what the worst of the failures calls for.
+
+        `stop(done, total, seconds)` is called about once a second. If it returns True, all commands are ended, with checkpoints.
+        Captures that are added meanwhile are trained, too.
+        """
+        if self._device == "cuda" and not engine.cards:
+            raise InputError("--device cuda: no machine here has a CUDA card that Ray knows of: take auto or cpu")
+        card = engine.card_bytes() if engine.cards and self._device != "cpu" else None
+        begun, stopped = time.time(), False
+        for job in self._jobs:
+            self._submit(job, engine, card)
+        while not all(run.ended for run in self._runs.values()):
+            for step, outcome in engine.ended(1.0):
+                self._outcomes[step] = outcome
+                for run in self._runs.values():
+                    if step.name in run.nodes and run.nodes[step.name].step == step:
+                        self._note(run, step.name, outcome)
+            self._tell()
+            done = sum(run.ended for run in self._runs.values())
+            if not stopped and stop(done, len(self._runs), time.time() - begun):
+                stopped = True
+                engine.cancel()
+            if not stopped and time.monotonic() > self._looked + REREAD_EVERY:
+                for job in self._added():
+                    self._submit(job, engine, card)
+        self.write_page(time.time() - begun)
+        return self._status(stopped)
+
+    def write_page(self, seconds: float) -> None:
+        """Write the page about all runs, in the folder of the runs."""
+        rows = []
+        for run in self._runs.values():
+            failed = run.failed
+            state = "failed" if failed else "done" if run.ended and self._complete(run) else "stopped"
+            what, log = (f"{failed[0]}: {failed[1].what}", run.nodes[failed[0]].step.log) if failed else ("", None)
+            rows.append(Row(run.job.name, run.job.capture, state, run.seconds, what, log))
+        write_page(self._out, rows, seconds)
+
+    def _complete(self, run: _Run) -> bool:
+        return all(outcome.status is not None for outcome in run.outcomes.values())
+
+    def _submit(self, job: Job, engine: Engine, card: int | None) -> None:
+        """Hand the steps of a training to the engine, except those that were done before."""
+        run = _Run(job, {node.step.name: node for node in steps_of(job, self._out, self._device)})
+        self._runs[job.name] = run
+        settings = job.settings()
+        share = card_share(settings, card) if card else 0.0
+        for name, node in run.nodes.items():
+            step = node.step
+            if step not in self._references and (outcome := recorded(step)) is not None:
+                self._references[step] = self._outcomes[step] = outcome
+            elif step not in self._references:
+                before = [(self._references[run.nodes[other].step], False) for other in node.after]
+                before += [(self._references[run.nodes[other].step], True) for other in node.may_fail]
+                self._references[step] = engine.submit(
+                    step, memory(settings), share if name == "train" else 0.0, before
+                )
+            if step in self._outcomes:
+                run.outcomes[name] = self._outcomes[step]
+        if run.ended:
+            self._report("ended", {"run": job.name, "what": f"{job.name}: done before"})
+
+    def _note(self, run: _Run, name: str, outcome: Outcome) -> None:
+        run.outcomes[name] = outcome
+        if not run.ended:
+            return
+        if failed := run.failed:
+            what = f"{failed[0]} failed: {failed[1].what}"
+        else:
+            what = f"done in {run.seconds:.0f} s" if self._complete(run) else "stopped"
+        self._report("ended", {"run": run.job.name, "what": f"{run.job.name}: {what}"})
+
+    def _tell(self) -> None:
+        """Report how many runs have ended, and what is being done for the others."""
+        working = []
+        for run in self._runs.values():
+            for name, node in run.nodes.items():
+                if name not in run.outcomes and node.step.running.exists():
+                    done, total = _progress(self._out / run.job.name) if name == "train" else (0, 0)
+                    working.append({"run": run.job.name, "step": name, "done": done, "total": total})
+        ended = [run for run in self._runs.values() if run.ended]
+        facts = {"done": len(ended), "total": len(self._runs), "failed": sum(run.failed is not None for run in ended)}
+        self._report("progress", facts | {"working": working})
+
+    def _added(self) -> list[Job]:
+        """Read the list again, and return the trainings that were added. If it is wrong now, warn once."""
+        self._looked = time.monotonic()
+        try:
+            jobs = read_jobs(self._source, self._out, self._ask)
+        except InputError as error:
+            if str(error) != self._said:
+                self._said = str(error)
+                self._report("warning", {"what": f"{error}; what was read before goes on"})
+            return []
+        return [job for job in jobs if job.name not in self._runs and _settled(job.capture)]
+
+    def _status(self, stopped: bool) -> int:
+        statuses = {run.failed[1].status for run in self._runs.values() if run.failed}
+        if stopped or TRY_AGAIN in statuses:
+            return TRY_AGAIN
+        return next((status for status in (1, 2) if status in statuses), 0)
+
+
+def _progress(run: Path) -> tuple[int, int]:
+    """Return the iteration of a training that runs in a folder, and their total. Both are 0 if that is not known."""
+    try:
+        facts = json.loads((run / PROGRESS).read_text(encoding="utf-8"))
+        return int(facts["iteration"]), int(facts["total"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0, 0
+
+
+def _settled(capture: Path) -> bool:
+    """Return whether nothing in a folder has changed for SETTLED seconds, so that its files are not being copied still."""
+    try:
+        changed = max(path.stat().st_mtime for path in [capture, *capture.rglob("*")])
+    except OSError:
+        return False
+    return time.time() - changed > SETTLED

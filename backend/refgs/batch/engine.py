@@ -1,0 +1,184 @@
+"""Start Ray on this machine, or reach a cluster, and give it the steps of a batch."""
+
+import atexit
+import importlib.metadata
+import logging
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from refgs.batch.steps import Outcome, Step, TryLater, run_step
+from refgs.errors import TRY_AGAIN, InputError, TryAgain
+
+VERSION = "2.60.0"  # pyproject.toml's
+TRIES = 8  # more than once for a step whose worker died, or that said "try again"
+PAUSE = 5.0  # seconds before such a step is tried again
+STARTS = 4  # attempts to start Ray here: on a busy machine its parts wait for each other no longer than 15 seconds
+HEALTH = 30.0  # seconds for a cluster to answer
+STORE = 80 << 20  # bytes of Ray's object store: steps hand on files, not objects
+ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",  # tell nobody
+    "RAY_worker_niceness": "0",  # commands run as fast as without Ray
+    "RAY_task_oom_retries": "3",  # for ever otherwise
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+}
+
+
+class Engine:
+    """Run steps by Ray. A step starts when those before it have ended and a machine has what it needs."""
+
+    def __init__(self, ray: Any, cores: int):
+        """Look at the machines of a Ray that has been started. `cores` is the number of cores of each step."""
+        self._ray = ray
+        self._steps: dict[Any, Step] = {}
+        self._run = ray.remote(run_step)
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        self._cores = min(cores, int(max(node.get("CPU", 0) for node in nodes)))
+        self._memory = int(max(node.get("memory", 0) for node in nodes))
+        self.cards = int(max(node.get("GPU", 0) for node in nodes))
+
+    def card_bytes(self) -> int:
+        """Return the memory of a card of the cluster, in bytes."""
+        return self._ray.get(self._ray.remote(_card_bytes).options(num_gpus=0.01).remote())
+
+    def submit(self, step: Step, memory: int, card: float, before: list[tuple[Any, bool]]) -> Any:
+        """Hand a step to Ray. Returns a reference to its outcome.
+
+        `memory` is what it needs, in bytes, and `card` the share of a CUDA card, 0 … 1. `before` lists what it waits for: references or
+        outcomes, and whether those steps are optional. A step that needs more memory than any machine has asks for what one has.
+        """
+        how = {
+            "num_cpus": self._cores,
+            "memory": min(memory, int(0.9 * self._memory)),
+            "num_gpus": card,
+            "max_retries": TRIES,
+            "retry_exceptions": [TryLater],
+            "name": f"{step.run} {step.name}",
+        }
+        outcomes, optional = zip(*before, strict=True) if before else ((), ())
+        reference = self._run.options(**how).remote(step, self._cores, PAUSE, optional, *outcomes)
+        self._steps[reference] = step
+        return reference
+
+    def ended(self, seconds: float) -> Iterator[tuple[Step, Outcome]]:
+        """Wait for steps to end, for some seconds at most. Yields those that did."""
+        if not self._steps:
+            return
+        references, _ = self._ray.wait(list(self._steps), timeout=seconds, num_returns=1)
+        if references:  # and all others that have ended by now
+            references, _ = self._ray.wait(list(self._steps), timeout=0, num_returns=len(self._steps))
+        for reference in references:
+            yield self._steps.pop(reference), self._outcome(reference)
+
+    def _outcome(self, reference: Any) -> Outcome:
+        from ray import exceptions
+
+        try:
+            return self._ray.get(reference)
+        except exceptions.TaskCancelledError:
+            return Outcome(None)
+        except exceptions.RayTaskError as error:
+            if isinstance(error.cause, TryLater):
+                return Outcome(TRY_AGAIN, what=f"{error.cause} (tried {TRIES + 1} times)")
+            return Outcome(1, what=f"a fault of ours: {error.cause!r}")
+        except exceptions.RayError as error:  # its worker or machine died
+            why = type(error).__name__
+            return Outcome(TRY_AGAIN, what=f"its worker died {TRIES + 1} times ({why}): see that memory suffices")
+
+    def cancel(self) -> None:
+        """End all steps: those that run write a checkpoint first."""
+        for reference in self._steps:
+            self._ray.cancel(reference)
+
+
+def _card_bytes() -> int:
+    import torch
+
+    return torch.cuda.get_device_properties(0).total_memory
+
+
+@contextmanager
+def started(address: str | None, cores: int | None, workers: int | None) -> Iterator[Engine]:
+    """Start Ray on this machine for a `with` block, or join the cluster at `address`, HOST:PORT of its head.
+
+    `cores` is the number of cores of each step, one if it is None. `workers` steps run at once here, as many as there are cores for if it
+    is None.
+
+    Raises InputError if Ray is missing or another version, or if no cluster is there, and TryAgain if Ray cannot start here.
+    """
+    if address and workers:
+        raise InputError("--workers is for this machine: on a cluster, each machine says how many cores it lends")
+    folder = None if address else Path(tempfile.mkdtemp(prefix="refgs-", dir="/tmp" if os.name == "posix" else None))
+    if folder:  # before Ray is imported: at exit, Ray first ends what a failed start has left
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    ray, cores = _import_ray(), cores or 1
+    quiet = {"include_dashboard": False, "log_to_driver": False, "logging_level": logging.CRITICAL}
+    try:
+        if address:
+            _join(ray, address)
+        else:
+            lent = workers * cores if workers else max(os.cpu_count() or 1, cores)
+            _start(ray, quiet | {"num_cpus": lent, "object_store_memory": STORE, "_temp_dir": str(folder)})
+        yield Engine(ray, cores)
+    finally:
+        ray.shutdown()
+
+
+def _import_ray() -> Any:
+    os.environ.update({name: value for name, value in ENVIRONMENT.items() if name not in os.environ})
+    try:
+        found = importlib.metadata.version("ray")
+    except importlib.metadata.PackageNotFoundError:
+        raise InputError("refgs batch needs Ray: pip install 'refgs[farm]'") from None
+    if found != VERSION:
+        raise InputError(f"Ray {found} is installed, and refgs batch needs {VERSION}: pip install 'refgs[farm]'")
+    import ray
+
+    return ray
+
+
+def _start(ray: Any, how: dict[str, Any]) -> None:
+    for attempt in range(STARTS):
+        try:
+            ray.init(address="local", **how)
+            return
+        except Exception as error:  # Ray raises whatever its parts meet
+            ray.shutdown()
+            why = str(error).splitlines()[0]
+            if attempt == STARTS - 1:
+                raise TryAgain(f"Ray does not start here ({why}): wait until the machine is less busy") from None
+
+
+def _join(ray: Any, address: str) -> None:
+    host, _, port = address.rpartition(":")
+    nobody = f"--address {address}: no Ray cluster is there"
+    if not host or not port.isdigit():
+        raise InputError(f"--address {address}: write it as HOST:PORT, as `ray start --head` names it")
+    check = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--skip-version-check", "--address", address]
+    try:
+        socket.create_connection((host, int(port)), timeout=5).close()
+        # Connecting to what is not Ray takes minutes.
+        found = subprocess.run(check, capture_output=True, timeout=HEALTH).returncode == 0
+    except subprocess.TimeoutExpired:
+        found = False
+    except (OSError, OverflowError) as error:
+        raise InputError(f"{nobody} ({error}): start one with ray start --head") from None
+    if not found:
+        raise InputError(f"{nobody}: start one with ray start --head")
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
+    except Exception as error:
+        why = " ".join(str(error).split())
+        if "ersion mismatch" in why:
+            why = f"its version of Ray or Python is not {VERSION} and {sys.version.split()[0]}"
+            raise InputError(f"--address {address}: {why}: install the same on all machines") from None
+        raise InputError(
+            f"{nobody} that this machine is part of ({why[:200]}): run this on one of its machines"
+        ) from None

@@ -1,0 +1,53 @@
+"""Make the steps of a training: find cameras, make masks, train, evaluate, export. Each is a command line that can be repeated."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from refgs.batch.listing import LOGS, Job
+from refgs.batch.steps import Step
+from refgs.capture import find_layout
+
+SHARED = ("poses", "masks")  # steps of a capture: its trainings by several settings share them
+
+
+class Node(NamedTuple):
+    """Hold a step, and the names of the steps that it follows: those that must succeed, and one that may fail."""
+
+    step: Step
+    after: tuple[str, ...] = ()
+    may_fail: tuple[str, ...] = ()
+
+
+def steps_of(job: Job, out: Path, device: str) -> list[Node]:
+    """List the steps of a training into `out`, each after those that it follows.
+
+    Masks may fail: the training then takes all that the photos show, as `refgs train` does.
+    """
+    run, capture = (out / job.name).resolve(), str(job.capture)
+    logs = run.parent / LOGS
+
+    def step(name: str, *words: str, made: Path | None = None) -> Step:
+        owner = job.capture_name if name in SHARED else job.name
+        return Step(name, owner, (name, *words, "--once"), logs / owner / f"{name}.log", made)
+
+    ask = job.ask
+    how = [
+        *(("--preset", ask.preset) if ask.preset else ()),
+        *(("--minutes", f"{ask.minutes:g}") if ask.minutes else ()),
+    ]
+    how += [word for change in ask.set for word in ("--set", change)]
+    nodes, before = [], ()
+    if find_layout(job.capture) is None:
+        nodes, before = [Node(step("poses", capture))], ("poses",)
+    masks: tuple[str, ...] = ()
+    settings = job.settings()
+    # A box is given in the frame without masks, which masks may move: there the training makes them, and moves the box.
+    if settings.image.masks == "auto" and not any(settings.region.size):
+        nodes, masks = [*nodes, Node(step("masks", capture), before)], ("masks",)
+    train = step("train", capture, "--out", str(run), "--device", device, *how, made=run / "splats.ply")
+    return [
+        *nodes,
+        Node(train, before, masks),
+        Node(step("evaluate", str(run), made=run / "metrics.json"), ("train",)),
+        Node(step("export", str(run), made=run / "mesh.glb"), ("train",)),
+    ]

@@ -1,0 +1,136 @@
+"""Read what a batch is to train: a list of captures and settings, or a folder of captures. It is checked before anything starts."""
+
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from refgs.capture import find_layout
+from refgs.capture.files import find_photos
+from refgs.errors import InputError
+from refgs.settings import Settings, load_settings
+
+LOGS = "logs"  # the folder in RUNS that holds what the steps print, and how they ended
+
+
+class Ask(BaseModel):
+    """Say how to train, as the options of `refgs train` do. A value that is None is decided by the line above."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    preset: str | None = None
+    minutes: Annotated[float, Field(ge=0.05)] | None = None
+    set: list[str] = []
+
+    def under(self, above: "Ask") -> "Ask":
+        """Return what this line asks for, and what the line `above` asks for where this one is silent."""
+        preset, minutes = self.preset or above.preset, self.minutes or above.minutes
+        return Ask(preset=preset, minutes=minutes, set=[*above.set, *self.set])
+
+
+class _CaptureLine(Ask):
+    folder: str
+    name: str | None = None
+
+
+class _SettingsLine(Ask):
+    name: str
+
+
+class _List(Ask):
+    include: list[str] = []
+    captures: list[_CaptureLine] = []
+    settings: list[_SettingsLine] = []
+
+
+class Job(NamedTuple):
+    """Describe a training of the batch: its `name` is that of the run folder, `capture` the capture's folder."""
+
+    name: str
+    capture: Path
+    capture_name: str
+    ask: Ask
+
+    def settings(self) -> Settings:
+        """Load the settings of the training. Those that are chosen for a time are not known: the preset `standard` stands for them."""
+        return load_settings(self.ask.preset or "standard", self.ask.set)
+
+
+def read_jobs(source: Path, out: Path, ask: Ask) -> list[Job]:
+    """Read the trainings of a batch from a list or from a folder of captures, and check them.
+
+    `ask` says how to train where the list does not. Raises InputError if a capture is listed twice, if two trainings would have one run
+    folder, if a folder is missing, if lists include each other in a circle, or if settings are wrong.
+    """
+    jobs = list(_jobs_of_folder(source, out, ask) if source.is_dir() else _jobs_of_list(source, ask, ()))
+    if not jobs:
+        raise InputError(f"{source}: no captures in it: put each into a folder of its own, or list them")
+    _check_unique(source, out, jobs)
+    for how in {repr(job.ask): job for job in jobs}.values():
+        try:
+            how.settings()
+        except InputError as error:
+            raise InputError(f"{source}: {how.name}: {error}") from None
+    return jobs
+
+
+def _jobs_of_folder(source: Path, out: Path, ask: Ask) -> Iterator[Job]:
+    if find_layout(source) is not None or find_photos(source):
+        raise InputError(f"{source} is a capture itself: name the folder that it is in, or take refgs train")
+    for folder in sorted(source.iterdir()):
+        if folder.is_dir() and not folder.name.startswith("."):
+            if folder.resolve() == out.resolve():
+                raise InputError(f"--out {out} is in the folder of the captures: choose another place for the runs")
+            yield Job(folder.name, folder.resolve(), folder.name, ask)
+
+
+def _jobs_of_list(file: Path, ask: Ask, above: tuple[Path, ...]) -> Iterator[Job]:
+    """Make the trainings of a list and of those that it includes. `above` are the lists that include it. Folders are beside the list."""
+    file = file.resolve()
+    if file in above:
+        raise InputError(f"{above[-1]} includes {file}, which includes it: take one of them out")
+    found = _read(file)
+    for name in found.include:
+        yield from _jobs_of_list(file.parent / name, ask, (*above, file))
+    whole = found.under(ask)
+    for line in found.captures:
+        folder = (file.parent / line.folder).resolve()
+        if not folder.is_dir():
+            raise InputError(f"{file}: {line.folder}: there is no such folder")
+        name = line.name or folder.name
+        if not found.settings:
+            yield Job(name, folder, name, line.under(whole))
+        for settings in found.settings:
+            yield Job(f"{name}-{settings.name}", folder, name, line.under(settings.under(whole)))
+
+
+def _read(file: Path) -> _List:
+    try:
+        tables: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
+        return _List.model_validate(tables)
+    except FileNotFoundError:
+        raise InputError(f"{file}: there is no such list, nor a folder of captures") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part + 1) if isinstance(part, int) else part for part in first["loc"])
+        raise InputError(f"{file}: {key}: {first['msg'].lower()}") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file}: cannot be read as TOML ({error}): mend the file") from None
+
+
+def _check_unique(source: Path, out: Path, jobs: list[Job]) -> None:
+    """Check the names of runs, and that each capture is one line and each run one training."""
+    names: dict[Path, str] = {}
+    runs: dict[str, Job] = {}
+    for job in jobs:
+        for name in (job.name, job.capture_name):
+            if name.lower() == LOGS or name.startswith(".") or any(c in name for c in '/\\:*?"<>|'):
+                raise InputError(f"{source}: {name!r} cannot be the name of a run's folder: give the capture another")
+        if (other := runs.setdefault(job.name.lower(), job)) is not job:
+            if other.capture == job.capture:
+                raise InputError(f"{source}: {job.capture} is listed twice: take one line out, or use [[settings]]")
+            both = f"{other.capture} and {job.capture}"
+            raise InputError(f"{source}: {both} would both be trained into {out / job.name}: give one a name")
+        if names.setdefault(job.capture, job.capture_name) != job.capture_name:
+            raise InputError(f"{source}: {job.capture} is listed twice: take one line out, or use [[settings]]")

@@ -1,0 +1,123 @@
+"""Run a step of a batch, which is a command line of refgs, in a process of its own, and record how it ended.
+
+Ray's workers import this module. It imports little, so that they start soon.
+"""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from refgs.paths import write_text
+
+PATIENCE = 15.0  # seconds for a command to end after its input was closed
+FAILED = (1, 2)  # exit statuses after which a retry is useless
+
+
+class Step(NamedTuple):
+    """Describe a step: its `name`, such as "train", the `run` it belongs to, and the `words` of its command after `refgs`.
+
+    `log` is the file for what it prints; the record is beside it. `made` is a file that is there once it is done, if there is one.
+    """
+
+    name: str
+    run: str
+    words: tuple[str, ...]
+    log: Path
+    made: Path | None = None
+
+    @property
+    def running(self) -> Path:
+        """Return the file that is there while the step runs."""
+        return self.log.with_suffix(".running")
+
+
+class Outcome(NamedTuple):
+    """Say how a step ended: its exit status, its seconds, the machine, and one line if it failed.
+
+    The status is None if the step was not run, because one before it failed.
+    """
+
+    status: int | None
+    seconds: float = 0.0
+    node: str = ""
+    what: str = ""
+
+
+class TryLater(Exception):
+    """Raised for a step that may succeed if it is run again. Ray does so, on any machine."""
+
+
+def recorded(step: Step) -> Outcome | None:
+    """Return the outcome of a step that was done before, None if it is not done, or if its command was another."""
+    try:
+        facts = json.loads(step.log.with_suffix(".json").read_text(encoding="utf-8"))
+        outcome = Outcome(facts["status"], facts["seconds"], facts["node"])
+        same = facts["words"] == list(step.words)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    there = step.made is None or step.made.exists()
+    return outcome if same and there and outcome.status == 0 else None
+
+
+def run_step(step: Step, cores: int, pause: float, optional: tuple[bool, ...], *before: Outcome) -> Outcome:
+    """Run a step and record its outcome beside its log. A step that follows a failed one is not run.
+
+    `cores` is the number of threads. `before` are the outcomes of the steps that it follows, and `optional` says which of these may fail.
+    If the command says that it may succeed later, or if it was killed, wait `pause` seconds and raise TryLater.
+    """
+    if any(outcome.status != 0 and not may_fail for outcome, may_fail in zip(before, optional, strict=True)):
+        return Outcome(None)
+    begun, node = time.time(), platform.node()
+    step.log.parent.mkdir(parents=True, exist_ok=True)
+    step.running.touch()
+    try:
+        with open(step.log, "a+b") as log:
+            status, printed = _call(step, cores, log)
+    finally:
+        step.running.unlink(missing_ok=True)
+    what = "" if status == 0 else _line(printed, status)
+    outcome = Outcome(status, time.time() - begun, node, what)
+    if status and status not in FAILED:
+        time.sleep(pause)
+        raise TryLater(what)
+    facts = outcome._asdict() | {"words": step.words}
+    write_text(step.log.with_suffix(".json"), json.dumps(facts, indent=1))
+    return outcome
+
+
+def _call(step: Step, cores: int, log) -> tuple[int, str]:
+    """Run the command of a step, and return its exit status and what it printed. However this call ends, the command ends with it.
+
+    The command ends when its input closes, which the system does if this process is killed.
+    """
+    log.write(f"$ refgs {' '.join(step.words)}\n".encode())
+    log.flush()
+    start = log.tell()
+    environment = os.environ | {"REFGS_END_WITH_INPUT": "1", "OMP_NUM_THREADS": str(cores), "PYTHONUNBUFFERED": "1"}
+    command = [sys.executable, "-m", "refgs.cli", *step.words]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, env=environment)
+    try:
+        while process.poll() is None:
+            time.sleep(0.1)  # and not `wait`: Ray interrupts Python code alone
+    finally:
+        process.stdin.close()
+        try:
+            process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+    log.seek(start)
+    return process.returncode, log.read().decode(errors="replace")
+
+
+def _line(printed: str, status: int) -> str:
+    """Return the one line that says why a command failed: the last that begins with "refgs: ", as the command line prints errors."""
+    lines = [line.removeprefix("refgs: ") for line in printed.splitlines() if line.startswith("refgs: ")]
+    if status < 0:
+        return f"killed by signal {-status}"
+    return lines[-1] if lines else f"ended with status {status}"

@@ -1,0 +1,120 @@
+"""Test batches of small captures with Ray: stopped, resumed, killed, and added to while they run."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from refgs import commands
+from tests.makers import processes
+from tests.makers.training import TINY
+
+pytest.importorskip("ray")
+pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self"), reason="needs /proc")
+CHANGES = [*TINY, "environment.resolution=16", "train.iterations=300", "indirect.start=0.9"]
+CHANGES += ["mesh.resolution=32", "mesh.triangles=500", "mesh.texture=64"]
+PATIENCE = 240.0  # seconds
+MADE = ("splats.ply", "environment.exr", "mesh.glb", "cameras.json")
+
+
+def batch(source, out, *words) -> subprocess.Popen:
+    command = [sys.executable, "-m", "refgs.cli", "batch", source, "--out", out, "--device", "cpu", *words]
+    return subprocess.Popen(
+        list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+
+
+def until(process, condition):
+    """Wait until `condition()` is true and return its value. The batch must not have ended before."""
+    end = time.monotonic() + PATIENCE
+    while not (found := condition()):
+        assert process.poll() is None, process.stdout.read()
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    return found
+
+
+def ended(process) -> tuple[int, str]:
+    """Wait for a batch to end. Check that no process of its session is left. Return its exit status and what it printed."""
+    said, _ = process.communicate(timeout=PATIENCE)
+    end = time.monotonic() + 30
+    while left := processes.of_session(process.pid):
+        assert time.monotonic() < end, left
+        time.sleep(0.1)
+    return process.returncode, said
+
+
+@pytest.fixture
+def shelf(ball_capture, tmp_path):
+    """Make two captures, one of which has a broken photo, and a list of them. Return the folder."""
+    for name in ("ball", "broken"):
+        shutil.copytree(ball_capture, tmp_path / name)
+    next((tmp_path / "broken").rglob("*.png")).write_bytes(b"no picture")
+    changes = ", ".join(f'"{change}"' for change in CHANGES)
+    lines = [f'[[captures]]\nfolder = "{name}"\n' for name in ("ball", "broken")]
+    (tmp_path / "list.toml").write_text(f'preset = "quick"\nset = [{changes}]\n' + "".join(lines))
+    return tmp_path
+
+
+def test_stopped_resumed_killed_and_added_to(shelf, ball_capture):
+    """Check that each asset is the one of a plain training, bit for bit, whatever happened to the processes that made it."""
+    out, training = shelf / "runs", (shelf / "runs" / "ball" / "progress.json")
+    stopped = batch(shelf / "list.toml", out)
+    until(stopped, training.exists)
+    stopped.send_signal(signal.SIGTERM)
+    status, said = ended(stopped)
+    assert status == 75, said
+    assert list((out / "ball" / "checkpoints").glob("*.toml")) and not (out / "ball" / "splats.ply").exists()
+    assert "stopped" in (out / "index.html").read_text()
+
+    again = batch(shelf / "list.toml", out)
+    [(_, worker)] = until(again, lambda: training.exists() and processes.commands("refgs.cli train", str(out / "ball")))
+    os.kill(worker, signal.SIGKILL)
+    late = shutil.copytree(ball_capture, shelf / "late")
+    for path in [late, *late.rglob("*")]:
+        os.utime(path, (1e9, 1e9))
+    with open(shelf / "list.toml", "a") as file:
+        file.write('[[captures]]\nfolder = "late"\n')
+    status, said = ended(again)
+    assert status == 2, said
+    assert re.search(r"broken: train failed: .*\.png: this is not an image", said), said
+    page = (out / "index.html").read_text()
+    assert page.count("data:image/jpeg") == 2 and page.count('class="failed"') == 1 and "not an image" in page
+    for name in ("ball", "late"):
+        masks = (out / "logs" / name / "masks.log").read_text()
+        assert masks.count("$ refgs masks") == 1  # done once, and not again by the batch that went on
+
+    commands.train(ball_capture, shelf / "plain", "quick", "cpu", None, CHANGES, resume=False)
+    commands.export(shelf / "plain")
+    for file in MADE:
+        plain = (shelf / "plain" / file).read_bytes()
+        assert all((out / name / file).read_bytes() == plain for name in ("ball", "late")), file
+
+
+def test_a_batch_whose_process_is_killed_leaves_no_process(shelf):
+    out = shelf / "runs"
+    process = batch(shelf / "list.toml", out)
+    until(process, (out / "ball" / "progress.json").exists)
+    process.kill()
+    ended(process)
+    assert list((out / "ball" / "checkpoints").glob("*.toml"))
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--address", "127.0.0.1:1"], "no Ray cluster is there \\(.*refused"),
+        (["--address", "nobody"], "write it as HOST:PORT"),
+        (["--address", "127.0.0.1:6379", "--workers", "2"], "--workers is for this machine"),
+        (["--device", "gpu"], "auto, cpu or cuda"),
+    ],
+)
+def test_bad_words_give_one_line_and_leave_nothing(shelf, words, says):
+    status, said = ended(batch(shelf / "list.toml", shelf / "runs", *words))
+    assert status == 2 and re.search(says, said) and len(said.strip().splitlines()) == 1
+    assert not (shelf / "runs").exists()

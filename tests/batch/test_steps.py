@@ -1,0 +1,79 @@
+"""Test how a step of a batch ends: done, failed for good, or to be tried again."""
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from refgs.batch.steps import Outcome, Step, TryLater, recorded, run_step
+from refgs.train import checkpoint
+from tests.makers.captures import nerfstudio
+from tests.makers.processes import commands
+from tests.makers.training import TINY
+
+
+def step(tmp_path, *words) -> Step:
+    return Step(words[0], "cup", tuple(map(str, words)), tmp_path / "logs" / "cup" / f"{words[0]}.log")
+
+
+def test_a_step_is_recorded_and_known_again(tmp_path):
+    capture = nerfstudio(tmp_path / "cup", 8)
+    done = step(tmp_path, "poses", capture, "--once")
+    outcome = run_step(done, 1, 0.0, ())
+    assert outcome.status == 0 and outcome.seconds > 0 and outcome.what == ""
+    assert f"$ refgs poses {capture} --once\ndone before" in done.log.read_text() and not done.running.exists()
+    assert recorded(done)[:3] == outcome[:3]
+    assert recorded(done._replace(words=("poses", "elsewhere"))) is None
+    assert recorded(done._replace(made=tmp_path / "cameras")) is None
+    done.log.with_suffix(".json").write_text("{")
+    assert recorded(done) is None
+
+
+def test_wrong_input_is_not_tried_again(tmp_path):
+    outcome = run_step(step(tmp_path, "evaluate", tmp_path / "none"), 1, 0.0, ())
+    assert outcome.status == 2 and outcome.what.startswith(f"{tmp_path / 'none'} is not a run folder")
+    assert json.loads((tmp_path / "logs" / "cup" / "evaluate.json").read_text())["status"] == 2
+
+
+@pytest.mark.parametrize(
+    ("before", "may_fail", "runs"),
+    [(0, False, True), (2, False, False), (2, True, True), (None, False, False)],
+)
+def test_a_step_follows_others(tmp_path, before, may_fail, runs):
+    wrong = step(tmp_path, "trian")
+    outcome = run_step(wrong, 1, 0.0, (may_fail,), Outcome(before))
+    assert (outcome.status, wrong.log.exists()) == ((2, True) if runs else (None, False))
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+@pytest.mark.parametrize("victim", ["the command", "the worker"])
+def test_a_killed_command_is_tried_again(ball_capture, tmp_path, victim):
+    """Kill a training, or the process that started it. Check that the step asks for another try, and that no process is left."""
+    words = ["train", ball_capture, "--out", tmp_path / "run", "--preset", "quick", "--device", "cpu", "--once"]
+    words += [word for change in (*TINY, "train.iterations=100000") for word in ("--set", change)]
+    work = multiprocessing.get_context("spawn").Process(target=_run, args=(step(tmp_path, *words), tmp_path / "said"))
+    work.start()
+    while not (tmp_path / "run" / "progress.json").exists():
+        assert work.is_alive()
+        time.sleep(0.1)
+    [(command, parent)] = commands("refgs.cli train", str(tmp_path))
+    assert parent == work.pid
+    os.kill(command if victim == "the command" else parent, signal.SIGKILL)
+    work.join()
+    if victim == "the command":
+        assert (tmp_path / "said").read_text() == "killed by signal 9"
+    while commands("refgs.cli train", str(tmp_path)):
+        time.sleep(0.1)
+    assert victim == "the command" or checkpoint.complete(tmp_path / "run" / "checkpoints")
+    assert not (tmp_path / "logs" / "cup" / "train.json").exists()
+
+
+def _run(step: Step, said: Path) -> None:
+    try:
+        run_step(step, 1, 0.0, ())
+    except TryLater as error:
+        said.write_text(str(error))
