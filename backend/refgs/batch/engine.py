@@ -4,6 +4,7 @@ import atexit
 import importlib.metadata
 import logging
 import os
+import secrets
 import shutil
 import socket
 import subprocess
@@ -21,7 +22,8 @@ VERSION = "2.60.0"  # pyproject.toml's
 TRIES = 8  # more than once for a step whose worker died, or that said "try again"
 PAUSE = 5.0  # seconds before such a step is tried again
 STARTS = 4  # attempts to start Ray here: on a busy machine its parts wait for each other no longer than 15 seconds
-HEALTH = 30.0  # seconds for a cluster to answer
+PATIENCE = 60.0  # seconds for a cluster to answer
+JOIN = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False, logging_level='CRITICAL')"
 STORE = 80 << 20  # bytes of Ray's object store: steps hand on files, not objects
 ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",  # tell nobody
@@ -87,7 +89,8 @@ class Engine:
         except exceptions.RayTaskError as error:
             if isinstance(error.cause, TryLater):
                 return Outcome(TRY_AGAIN, what=f"{error.cause} (tried {TRIES + 1} times)")
-            return Outcome(1, what=f"a fault of ours: {error.cause!r}")
+            why = str(error.cause).strip().splitlines()[:1]  # the rest is a traceback
+            return Outcome(1, what=f"Ray could not run it ({''.join(why)}): see that all machines have the same refgs")
         except exceptions.RayError as error:  # its worker or machine died
             why = type(error).__name__
             return Outcome(TRY_AGAIN, what=f"its worker died {TRIES + 1} times ({why}): see that memory suffices")
@@ -124,6 +127,8 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
         if address:
             _join(ray, address)
         else:
+            # Nobody else may use this Ray, and no token need be kept for it.
+            os.environ.update({"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)})
             lent = workers * cores if workers else max(os.cpu_count() or 1, cores)
             _start(ray, quiet | {"num_cpus": lent, "object_store_memory": STORE, "_temp_dir": str(folder)})
         yield Engine(ray, cores)
@@ -140,7 +145,10 @@ def _import_ray() -> Any:
     if found != VERSION:
         raise InputError(f"Ray {found} is installed, and refgs batch needs {VERSION}: pip install 'refgs[farm]'")
     import ray
+    import ray._private.worker
 
+    # It prints what its own processes log when a worker dies. The steps have logs, and their last lines are reported.
+    ray._private.worker.print_to_stdstream = lambda *_, **__: None
     return ray
 
 
@@ -161,24 +169,20 @@ def _join(ray: Any, address: str) -> None:
     nobody = f"--address {address}: no Ray cluster is there"
     if not host or not port.isdigit():
         raise InputError(f"--address {address}: write it as HOST:PORT, as `ray start --head` names it")
-    check = [sys.executable, "-m", "ray.scripts.scripts", "health-check", "--skip-version-check", "--address", address]
     try:
         socket.create_connection((host, int(port)), timeout=5).close()
-        # Connecting to what is not Ray takes minutes.
-        found = subprocess.run(check, capture_output=True, timeout=HEALTH).returncode == 0
+        # First in another process: with what is not Ray, this takes minutes, in which it cannot be interrupted.
+        tried = subprocess.run([sys.executable, "-c", JOIN, address], capture_output=True, text=True, timeout=PATIENCE)
     except subprocess.TimeoutExpired:
-        found = False
+        raise InputError(f"{nobody} that answers: start one with ray start --head") from None
     except (OSError, OverflowError) as error:
         raise InputError(f"{nobody} ({error}): start one with ray start --head") from None
-    if not found:
-        raise InputError(f"{nobody}: start one with ray start --head")
-    try:
-        ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)
-    except Exception as error:
-        why = " ".join(str(error).split())
-        if "ersion mismatch" in why:
-            why = f"its version of Ray or Python is not {VERSION} and {sys.version.split()[0]}"
-            raise InputError(f"--address {address}: {why}: install the same on all machines") from None
+    if "ersion mismatch" in tried.stderr:
+        here = f"{VERSION} and {sys.version.split()[0]}"
+        raise InputError(f"--address {address}: Ray or Python is another version there than here, {here}: install one")
+    if tried.returncode:
+        why = next(reversed(tried.stderr.strip().splitlines()), "")[:200]
         raise InputError(
-            f"{nobody} that this machine is part of ({why[:200]}): run this on one of its machines"
-        ) from None
+            f"--address {address}: this machine cannot join ({why}): run this on one of the cluster's, with its token"
+        )
+    ray.init(address=address, log_to_driver=False, logging_level=logging.CRITICAL)

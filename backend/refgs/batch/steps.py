@@ -100,7 +100,11 @@ def _call(step: Step, cores: int, log) -> tuple[int, str]:
     start = log.tell()
     environment = os.environ | {"REFGS_END_WITH_INPUT": "1", "OMP_NUM_THREADS": str(cores), "PYTHONUNBUFFERED": "1"}
     command = [sys.executable, "-m", "refgs.cli", *step.words]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, env=environment)
+    # In a group of its own: Ray kills the whole group of a worker that dies, and a training could write no checkpoint.
+    group = 0 if os.name == "posix" else None
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, env=environment, process_group=group
+    )
     try:
         while process.poll() is None:
             time.sleep(0.1)  # and not `wait`: Ray interrupts Python code alone
