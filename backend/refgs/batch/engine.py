@@ -27,6 +27,7 @@ JOIN = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False, logg
 STORE = 80 << 20  # bytes of Ray's object store: steps hand on files, not objects
 ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",  # tell nobody
+    "RAY_BACKEND_LOG_LEVEL": "error",
     "RAY_worker_niceness": "0",  # commands run as fast as without Ray
     "RAY_task_oom_retries": "3",  # for ever otherwise
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
@@ -121,14 +122,12 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
     folder = None if address else Path(tempfile.mkdtemp(prefix="refgs-", dir="/tmp" if os.name == "posix" else None))
     if folder:  # before Ray is imported: at exit, Ray first ends what a failed start has left
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    ray, cores = _import_ray(), cores or 1
+    ray, cores = _import_ray(bool(address)), cores or 1
     quiet = {"include_dashboard": False, "log_to_driver": False, "logging_level": logging.CRITICAL}
     try:
         if address:
             _join(ray, address)
         else:
-            # Nobody else may use this Ray, and no token need be kept for it.
-            os.environ.update({"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)})
             lent = workers * cores if workers else max(os.cpu_count() or 1, cores)
             _start(ray, quiet | {"num_cpus": lent, "object_store_memory": STORE, "_temp_dir": str(folder)})
         yield Engine(ray, cores)
@@ -136,8 +135,11 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
         ray.shutdown()
 
 
-def _import_ray() -> Any:
+def _import_ray(cluster: bool) -> Any:
+    """Import Ray, which reads the environment then."""
     os.environ.update({name: value for name, value in ENVIRONMENT.items() if name not in os.environ})
+    if not cluster:  # nobody else may use this Ray, and no token need be kept for it
+        os.environ.update({"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)})
     try:
         found = importlib.metadata.version("ray")
     except importlib.metadata.PackageNotFoundError:
