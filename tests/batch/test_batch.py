@@ -40,10 +40,13 @@ def until(process, condition):
 
 
 def ended(process) -> tuple[int, str]:
-    """Wait for a batch to end. Check that no process of its session is left. Return its exit status and what it printed."""
+    """Wait for a batch to end. Check that no process of its session is left, and no command.
+
+    Return its exit status and what it printed.
+    """
     said, _ = process.communicate(timeout=PATIENCE)
     end = time.monotonic() + 30
-    while left := processes.of_session(process.pid):
+    while left := processes.of_session(process.pid) + processes.commands("refgs.cli", str(process.args[4])):
         assert time.monotonic() < end, left
         time.sleep(0.1)
     return process.returncode, said

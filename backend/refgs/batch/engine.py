@@ -27,7 +27,6 @@ JOIN = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False, logg
 STORE = 80 << 20  # bytes of Ray's object store: steps hand on files, not objects
 ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",  # tell nobody
-    "RAY_BACKEND_LOG_LEVEL": "error",
     "RAY_worker_niceness": "0",  # commands run as fast as without Ray
     "RAY_task_oom_retries": "3",  # for ever otherwise
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",

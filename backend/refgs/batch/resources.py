@@ -2,7 +2,7 @@
 
 from refgs.settings import Settings
 
-# Fitted to the peak memory of 30 trainings by `quick` at 256 to 1,600 pixels (0.9 to 3.1 GB), which it meets within a fifth.
+# Fitted to the peak memory of 30 trainings by `quick` at 256 to 1,600 pixels (0.9 to 3.1 GB), which it meets within a quarter.
 BASE, PER_PIXEL, PER_SURFEL = 0.85e9, 850.0, 2500.0  # bytes: libraries; of a photo; with derivatives, moments and tiles
 
 
