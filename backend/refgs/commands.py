@@ -358,9 +358,13 @@ def batch(
     train_job.check_device(device)
     with _batch_bars() as report:
         work = Batch(source, out, Ask(preset=preset, minutes=minutes, set=changes), device, report)
-        with started(address, cores, workers) as engine, disk_errors_named([out], "run the same command again"):
-            (out / LOGS).mkdir(parents=True, exist_ok=True)
-            with RunLock(out / LOGS) as lock, _signals_to_stop() as stopped:
+        with started(address, cores, workers) as engine:
+            try:
+                (out / LOGS).mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise InputError(f"{out}: the folder cannot be made ({error.strerror}): choose another") from None
+            again = disk_errors_named([out], "run the same command again")
+            with RunLock(out / LOGS) as lock, again, _signals_to_stop() as stopped:
                 status = work.run(engine, lambda *facts: lock.attend(*facts) or bool(stopped))
     console.print(f"the page about all runs: {out / PAGE}")
     if stopped and status:

@@ -7,10 +7,14 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 
 import pytest
 
 from refgs import commands
+from refgs.batch import engine
+from refgs.errors import InputError
+from refgs.paths import ROOT
 from tests.makers import processes
 from tests.makers.training import TINY
 
@@ -46,7 +50,7 @@ def ended(process) -> tuple[int, str]:
     """
     said, _ = process.communicate(timeout=PATIENCE)
     end = time.monotonic() + 30
-    while left := processes.of_session(process.pid) + processes.commands("refgs.cli", str(process.args[4])):
+    while left := processes.of_session(process.pid) + processes.commands("refgs.cli", str(process.args[6])):
         assert time.monotonic() < end, left
         time.sleep(0.1)
     return process.returncode, said
@@ -125,3 +129,14 @@ def test_bad_words_give_one_line_and_leave_nothing(shelf, words, says):
     status, said = ended(batch(shelf / "list.toml", shelf / "runs", *words))
     assert status == 2 and re.search(says, said) and len(said.strip().splitlines()) == 1
     assert not (shelf / "runs").exists()
+
+
+def test_another_ray_is_refused(monkeypatch):
+    pinned = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]["farm"]
+    assert pinned == [f"ray=={engine.VERSION}"]
+    monkeypatch.setattr(engine, "VERSION", "1.0.0")
+    with (
+        pytest.raises(InputError, match=r"Ray 2\.60\.0 is installed, and refgs batch needs 1\.0\.0"),
+        engine.started(None, 1, 1),
+    ):
+        pass
