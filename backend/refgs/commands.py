@@ -16,7 +16,7 @@ from refgs import train_job
 from refgs.errors import TRY_AGAIN, InputError, one_line
 from refgs.export.export_job import export as export_run
 from refgs.paths import clone_root, command_line, disk_errors_named, make_folders
-from refgs.run_folder import check_finished, read_metrics, update_metrics
+from refgs.run_folder import check_finished, run_metrics, update_metrics
 
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)  # paths are printed as they are
 CHECKPOINT_BY, END_BY = 7.0, 9.5  # seconds after SIGTERM: give up the checkpoint, give up everything
@@ -283,7 +283,7 @@ def evaluate(folder: Path, split: str, ground_truth: Path | None, once: bool = F
     if split not in ("test", "train"):
         raise InputError(f"--split {split}: take test or train")
     check_finished(folder)  # before torch is imported
-    if once and read_metrics(folder).get("split") == split:
+    if once and run_metrics(folder).get("split") == split:
         console.print(f"done before: {folder} has the metrics of its {split} views")
         return
     from refgs.capture import read_capture

@@ -121,10 +121,10 @@ def update_metrics(folder: Path, facts: dict[str, Any]) -> None:
         both = {key: merged(known[key], new[key]) for key in new if isinstance(known.get(key), dict)}
         return known | new | both
 
-    write_text(folder / "metrics.json", json.dumps(merged(read_metrics(folder), facts), indent=1))
+    write_text(folder / "metrics.json", json.dumps(merged(run_metrics(folder), facts), indent=1))
 
 
-def read_metrics(folder: Path) -> dict[str, Any]:
+def run_metrics(folder: Path) -> dict[str, Any]:
     """Read a run's metrics.json. Returns {} if there is none."""
     file = folder / "metrics.json"
     return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import cv2
 
 from refgs import __version__
+from refgs.errors import InputError
 from refgs.paths import write_text
 from refgs.report.figures import HEADLINE, duration, flatten
 from refgs.report.page import template
-from refgs.run_folder import read_metrics
+from refgs.run_folder import run_metrics
 
 PAGE = "index.html"
 SIDE = 128  # pixels of a row's picture, so that thousands of rows stay one file that opens
@@ -62,8 +63,8 @@ def write_page(out: Path, rows: list[Row], seconds: float) -> None:
 def _figures(run: Path) -> dict[str, float]:
     """Read a run's metrics as a flat dict. A broken file counts as none: the run's own report says more."""
     try:
-        return dict(flatten(read_metrics(run)))
-    except (OSError, ValueError):
+        return dict(flatten(run_metrics(run)))
+    except (OSError, ValueError, InputError):
         return {}
 
 
