@@ -79,7 +79,7 @@ build.build(build.target("linux", "x86_64", "sse4"), build.cache_folder())
         builder.send_signal(kind)
     until(lambda: not compilers(tmp_path), 100)
     subprocess.run([*command, "stack.cpp"], env=environment, check=True)
-    assert [file.suffix for file in tmp_path.iterdir()] == [".so"]
+    assert {file.suffix for file in tmp_path.iterdir()} == {".so"}  # two, if the signal came just too late
 
 
 def test_cache_that_cannot_be_written(tmp_path):
