@@ -21,6 +21,9 @@ class InputError(Exception):
     2. Any other exception is a bug of the program: it exits with status 1, and the traceback is written to log.txt.
     """
 
+    def __str__(self) -> str:
+        return one_line(super().__str__())
+
 
 class TryAgain(InputError):
     """Error that is not the input's fault: a full disk, a card that fails, a run that another process works in.

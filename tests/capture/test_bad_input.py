@@ -51,10 +51,10 @@ def test_folder_without_a_capture(tmp_path):
     [
         ('{"frames": [\n{"file_path": "a",,}]}', "line 2"),
         ("", "line 1"),
-        ("[1, 2]", "frames"),
+        ("[1, 2]", "should be a table"),
         ('{"frames": 3}', "frames"),
         ('{"frames": [{"transform_matrix": []}]}', "file_path"),
-        ('{"frames": ["a"]}', "file_path"),
+        ('{"frames": ["a"]}', "frames.0 should be a table"),
         ('{"frames": []}', "0 training views"),
     ],
 )
@@ -127,7 +127,7 @@ def _pose_entry(row, column, value):
     [
         (_pose_entry(1, 3, float("nan")), "NaN"),
         (_pose_entry(0, 0, float("inf")), "NaN or infinity"),
-        (_pose_entry(0, 0, "abc"), "4×4"),
+        (_pose_entry(0, 0, "abc"), "transform_matrix.0.0 should be a valid number"),
         (lambda m: m.pop(), None),  # 3×4 is read
         (lambda m: m.pop(0) and m.pop(0), "4×4"),
         (lambda m: [row.__setitem__(0, 0.0) for row in m], "inverted"),
@@ -153,7 +153,7 @@ def test_poses(tmp_path, change, says):
     [
         ({"fl_x": 0}, "focal length"),
         ({"fl_x": float("nan")}, "focal length"),
-        ({"fl_x": "wide"}, "fl_x is not a number"),
+        ({"fl_x": "wide"}, "fl_x should be a valid number"),
         ({"fl_x": None, "fl_y": None}, "no focal length"),
         ({"fl_x": None, "fl_y": None, "camera_angle_x": 0}, "focal length"),
         ({"k1": float("inf")}, "distortion"),
@@ -301,10 +301,13 @@ def test_published_normals_of_another_size(tmp_path):
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda data: data.pop("cam_transform_mat"), "cam_transform_mat is not 16 numbers"),
+        (lambda data: data.pop("cam_transform_mat"), "cam_transform_mat is missing"),
         (lambda data: data.update(cam_transform_mat="1,2,3"), "cam_transform_mat is not 16 numbers"),
-        (lambda data: data.update(cam_transform_mat=",".join("x" * 16)), "not a 4×4 matrix of numbers"),
-        (lambda data: data.update(cam_angle_x="wide"), "camera_angle_x is not a number"),
+        (
+            lambda data: data.update(cam_transform_mat=",".join("x" * 16)),
+            "cam_transform_mat.0.0 should be a valid number",
+        ),
+        (lambda data: data.update(cam_angle_x="wide"), "cam_angle_x should be a valid number"),
         (lambda data: data.update(imw=100), "the photo has 64×64"),
     ],
 )

@@ -9,9 +9,10 @@ from refgs.camera import Camera
 from refgs.capture.files import find_image
 from refgs.capture.images import read_header
 from refgs.capture.poses import OPENGL_TO_OPENCV, in_frame
-from refgs.capture.transforms import frame_camera, read_frames
+from refgs.capture.transforms import frame_camera, where
 from refgs.capture.types import Capture
 from refgs.errors import InputError
+from refgs.formats.transforms import read_run_transforms, read_transforms
 from refgs.paths import write_text
 
 
@@ -23,16 +24,16 @@ def read_cameras(file: Path) -> list[Camera]:
     transformed to the capture's coordinates. Raises InputError.
     """
     file = Path(file)
-    shared, frames = read_frames(file)
-    if not frames:
+    found = read_transforms(file)
+    if not found.frames:
         raise InputError(f"{file}: there are no frames in it. Export the cameras again.")
     cameras = []
-    for frame in frames:
-        image = None if "w" in frame.values and "h" in frame.values else find_image(file.parent / frame.path)
-        camera, lens = frame_camera(frame, read_header(image)[:2] if image else None)
-        cameras.append(lens.pinhole(camera, frame.where) if lens else camera)
-    if "to_capture" in shared:
-        to_capture = _similarity(shared["to_capture"], file)
+    for frame in found.frames:
+        image = find_image(file.parent / frame.path) if None in (frame.w, frame.h) else None
+        camera, lens = frame_camera(frame, where(file, frame), read_header(image)[:2] if image else None)
+        cameras.append(lens.pinhole(camera, where(file, frame)) if lens else camera)
+    if found.to_capture is not None:
+        to_capture = _similarity(found.to_capture, file)
         cameras = [in_frame(camera, to_capture) for camera in cameras]
     return cameras
 
@@ -93,21 +94,22 @@ def read_run_cameras(file: Path) -> tuple[list[Camera], list[str], np.ndarray, l
     and blue (1 if the file has none).
     """
     file = Path(file)
-    shared, frames = read_frames(file)
-    cameras = [frame_camera(frame)[0] for frame in frames]
+    found = read_run_transforms(file)
+    if not any(frame.split == "train" for frame in found.frames):
+        raise InputError(f"{file}: there are no training frames in it. Use the file that the training wrote.")
     return (
-        cameras,
-        [frame.values.get("split", "train") for frame in frames],
-        _similarity(shared.get("to_capture"), file),
-        [frame.values.get("exposure", 1.0) for frame in frames],
-        any(frame.values.get("refined", False) for frame in frames),
+        [frame_camera(frame, where(file, frame))[0] for frame in found.frames],
+        [frame.split for frame in found.frames],
+        _similarity(found.to_capture, file),
+        [frame.exposure if isinstance(frame.exposure, float) else list(frame.exposure) for frame in found.frames],
+        any(frame.refined for frame in found.frames),
     )
 
 
-def _similarity(matrix: object, file: Path) -> np.ndarray:
+def _similarity(rows: list[list[float]], file: Path) -> np.ndarray:
     try:
-        matrix = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+        matrix = np.array(rows, dtype=np.float64)
+    except ValueError:  # rows of different lengths
         matrix = np.empty(0)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) <= 0:
         raise InputError(f'{file}: "to_capture" is not a similarity. Use the file that the training wrote.')

@@ -1,5 +1,6 @@
 """Find the photos and masks of a capture on disk, and combine each photo with its camera in a View."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,12 +20,15 @@ def find_image(path: Path, any_suffix: bool = False) -> Path | None:
 
     With `any_suffix`, an image suffix of `path` may also be replaced by another one.
     """
-    if path.is_file():
+    # Not Path.is_file, which raises OSError for a name that is too long.
+    if os.path.isfile(path):
         return path
+    if not path.name:  # the root
+        return None
     if any_suffix and path.suffix.lower() in IMAGE_SUFFIXES:
         path = path.with_suffix("")
     names = (path.with_name(path.name + suffix) for suffix in IMAGE_SUFFIXES + tuple(map(str.upper, IMAGE_SUFFIXES)))
-    return next((name for name in names if name.is_file()), None)
+    return next((name for name in names if os.path.isfile(name)), None)
 
 
 def find_photos(folder: Path) -> list[Path]:
@@ -74,14 +78,14 @@ class Masks:
             if path.suffix.lower() in IMAGE_SUFFIXES
         }
 
-    def find(self, image: Path, named: object, where: str) -> Path | None:
+    def find(self, image: Path, named: str | None, where: str) -> Path | None:
         """Return the mask file of the photo `image`, None if it has none.
 
         `named` is the mask's path, relative to the capture's folder, if the capture's JSON file gives one. If `named` is empty, the mask is
         found by the photo's name. Raises InputError if the mask `named` is missing. `where` is a name for the camera in the error message.
         """
         if named:
-            path = find_image(self.folder / str(named).replace("\\", "/"))
+            path = find_image(self.folder / named.replace("\\", "/"))
             if path is None:
                 raise InputError(f"{where}: the mask {named} is missing. Put it back, or remove its mask_path.")
             return path
@@ -91,7 +95,7 @@ class Masks:
             if mask is not None:
                 return mask
         beside = image.with_name(f"{image.stem}_alpha.png")
-        return beside if beside.is_file() else None
+        return beside if os.path.isfile(beside) else None
 
 
 def photo_view(

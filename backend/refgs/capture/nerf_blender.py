@@ -14,9 +14,10 @@ import numpy as np
 
 from refgs.capture.images import read_alpha, read_image
 from refgs.capture.reduce import reduced_map
-from refgs.capture.transforms import read_frames, read_views
+from refgs.capture.transforms import read_views
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
+from refgs.formats.transforms import read_transforms
 
 
 def read_nerf_blender(folder: Path) -> list[View]:
@@ -54,6 +55,6 @@ def published_normals(view: View, max_side: int | None = None) -> tuple[np.ndarr
 
 
 def _read(file: Path, split: Split) -> list[View]:
-    views = read_views(file, [(frame, split) for frame in read_frames(file)[1]])
+    views = read_views(file, [(frame, split) for frame in read_transforms(file).frames])
     normals = [view.image_path.with_name(f"{view.image_path.stem}_normal.png") for view in views]
     return [replace(v, normal_path=n) if n.is_file() else v for v, n in zip(views, normals, strict=True)]

@@ -7,12 +7,13 @@
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData
 
 from refgs.capture.files import find_image
-from refgs.capture.transforms import Frame, read_frames, read_views
+from refgs.capture.transforms import read_views
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
+from refgs.formats.ply import read_ply
+from refgs.formats.transforms import Frame, Transforms, read_transforms
 
 
 def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.ndarray | None, list[str]]:
@@ -21,33 +22,32 @@ def read_nerfstudio(folder: Path) -> tuple[list[View], np.ndarray | None, np.nda
     Everything is in the capture's coordinates. Points and colours are None if the capture names no file of points. Raises InputError.
     """
     file = folder / "transforms.json"
-    shared, frames = read_frames(file)
-    train = shared.get("train_filenames")
-    test = shared.get("test_filenames") or shared.get("val_filenames") or []
+    found = read_transforms(file)
+    train = None if found.train_filenames is None else set(found.train_filenames)
+    test = set(found.test_filenames or found.val_filenames or ())
 
     def split(frame: Frame) -> Split | None:
-        name = frame.values["file_path"]
-        if name in test:
+        if frame.file_path in test:
             return "test"
-        return "train" if train is None or name in train else None
+        return "train" if train is None or frame.file_path in train else None
 
-    frames, warnings = _without_deleted(shared, frames, file)
+    frames, warnings = _without_deleted(found, file)
     chosen = [(frame, split(frame)) for frame in frames]
     views = read_views(file, [(frame, which) for frame, which in chosen if which is not None])
-    named = shared.get("ply_file_path")
-    points, colors = _read_points(folder / named) if named else (None, None)
+    points, colors = _read_points(folder / found.ply_file_path) if found.ply_file_path else (None, None)
     return views, points, colors, warnings
 
 
-def _without_deleted(shared: dict, frames: list[Frame], file: Path) -> tuple[list[Frame], list[str]]:
+def _without_deleted(found: Transforms, file: Path) -> tuple[list[Frame], list[str]]:
     """Drop frames whose photos are missing, but only from instant-ngp's files. Return the frames that are left, and warnings.
 
-    Users of instant-ngp delete blurred photos and leave their frames in the file; instant-ngp ignores these frames. Its files have the key
-    `aabb_scale`. All frames are returned if the file is another program's, or if more than half of the photos are missing; the caller then
+    Users of instant-ngp delete blurred photos and leave their frames in the file; instant-ngp ignores these frames. All frames are
+    returned if the file is another program's, or if more than half of the photos are missing; the caller then
     raises an error that names a missing photo.
     """
+    frames = found.frames
     missing = [frame.path for frame in frames if find_image(file.parent / frame.path) is None]
-    if "aabb_scale" not in shared or not missing or 2 * len(missing) > len(frames):
+    if not found.of_instant_ngp or not missing or 2 * len(missing) > len(frames):
         return frames, []
     kept = [frame for frame in frames if frame.path not in set(missing)]
     warning = f"{len(missing)} of the {len(frames)} images in {file.name} are missing and left out, first {missing[0]}"
@@ -56,13 +56,13 @@ def _without_deleted(shared: dict, frames: list[Frame], file: Path) -> tuple[lis
 
 def _read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
-        vertices = PlyData.read(path)["vertex"]
+        vertices = read_ply(path)["vertex"]
         points = np.stack([vertices[name] for name in "xyz"], axis=1).astype(np.float64)
-        names = [prop.name for prop in vertices.properties]
         colors = np.full_like(points, 0.5)
-        if "red" in names:
-            colors = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1) / 255.0
-    except Exception as error:
-        raise InputError(f"{path}: the points cannot be read ({error}). Remove ply_file_path to do without.") from error
+        if "red" in (prop.name for prop in vertices.properties):
+            colors = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1).astype(np.float64) / 255
+    except (KeyError, ValueError, TypeError) as error:
+        what = f"it has no points with x, y and z ({error})"
+        raise InputError(f"{path}: {what}. Export them again, or remove ply_file_path to do without.") from None
     good = np.isfinite(points).all(axis=1)
     return points[good], colors[good]

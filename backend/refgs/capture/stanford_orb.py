@@ -9,12 +9,14 @@ NeRF-Blender's, and more:
     ../../ground_truth/SCENE/       true maps and lights of a scene's test photos, see `refgs.compare.published`
 """
 
+import os
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from refgs.capture.transforms import Frame, read_frames, read_views
+from refgs.capture.transforms import read_views, where
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
+from refgs.formats.transforms import Frame, read_transforms
 
 NOVEL = "transforms_novel.json"
 
@@ -31,13 +33,13 @@ def novel_views(folder: Path) -> list[tuple[str, View]]:
     """
     file = folder / NOVEL
     frames, scenes = [], []
-    for frame in read_frames(file)[1]:
-        scene = frame.values.get("scene_name")
-        if not isinstance(scene, str):
-            raise InputError(f"{frame.where}: there is no scene_name. Download the data set again.")
-        if (folder.parent / scene).is_dir():
-            path = {"file_path": f"../{scene}/{PurePosixPath(frame.path)}"}
-            frames.append((_masked(replace(frame, values=frame.values | path)), "test"))
+    for frame in read_transforms(file).frames:
+        scene = frame.scene_name
+        if scene is None:
+            raise InputError(f"{where(file, frame)}: there is no scene_name. Download the data set again.")
+        if os.path.isdir(folder.parent / scene):
+            path = f"../{scene}/{PurePosixPath(frame.path)}"
+            frames.append((_masked(frame.model_copy(update={"file_path": path})), "test"))
             scenes.append(scene)
     return [
         (scene, replace(view, camera=replace(view.camera, name=f"{scene}_{view.camera.name}")))
@@ -46,10 +48,10 @@ def novel_views(folder: Path) -> list[tuple[str, View]]:
 
 
 def _read(file: Path, split: Split) -> list[View]:
-    return read_views(file, [(_masked(frame), split) for frame in read_frames(file)[1]])
+    return read_views(file, [(_masked(frame), split) for frame in read_transforms(file).frames])
 
 
 def _masked(frame: Frame) -> Frame:
     """Add the path of the frame's mask."""
     path = PurePosixPath(frame.path)
-    return replace(frame, values=frame.values | {"mask_path": f"{path.parent}_mask/{path.stem}.png"})
+    return frame.model_copy(update={"mask_path": f"{path.parent}_mask/{path.stem}.png"})

@@ -19,9 +19,10 @@ from pathlib import Path
 
 from refgs.capture.files import photo_view, report_missing
 from refgs.capture.images import read_header
-from refgs.capture.transforms import Frame, frame_camera, read_json
+from refgs.capture.transforms import frame_camera
 from refgs.capture.types import Split, View
-from refgs.errors import InputError
+from refgs.formats.tensoir import read_metadata
+from refgs.formats.transforms import Frame
 
 LIGHTS = ("bridge", "city", "fireplace", "forest", "night")  # that TensoIR relights with
 PHOTOS = ("rgba.png", "rgba_sunset.png", "rgba_sunset_000.png")  # the first that is there
@@ -62,19 +63,13 @@ def _photo(folder: Path) -> Path | None:
 
 def _view(folder: Path, split: Split) -> View:
     file, photo = folder / "metadata.json", _photo(folder)
-    data = read_json(file)
-    text = data.get("cam_transform_mat") if isinstance(data, dict) else None
-    numbers = str(text).split(",")
-    if len(numbers) != 16:
-        raise InputError(
-            f"{file}: cam_transform_mat is not 16 numbers with commas between. Download the data set again."
-        )
-    values = {
-        "file_path": folder.name,
-        "transform_matrix": [numbers[row : row + 4] for row in range(0, 16, 4)],
-        "camera_angle_x": data.get("cam_angle_x"),
-        "w": data.get("imw"),
-        "h": data.get("imh"),
-    }
-    camera = frame_camera(Frame(values, file), read_header(photo)[:2])
+    found = read_metadata(file)
+    frame = Frame(
+        file_path=folder.name,
+        transform_matrix=found.cam_transform_mat,
+        camera_angle_x=found.cam_angle_x,
+        w=found.imw,
+        h=found.imh,
+    )
+    camera = frame_camera(frame, str(file), read_header(photo)[:2])
     return photo_view(photo, camera, split, None, str(file))

@@ -1,14 +1,9 @@
-"""Read the JSON format that NeRF-Blender, instant-ngp and nerfstudio share: a list `frames`, each with a `transform_matrix`.
+"""Read cameras and photos from the JSON format that NeRF-Blender, instant-ngp and nerfstudio share (`refgs.formats.transforms`).
 
-Poses are camera-to-world with OpenGL's axes. Intrinsics (`fl_x fl_y cx cy w h`, or `camera_angle_x` and `camera_angle_y` in radians) and
-distortion (`k1 k2 k3 k4 p1 p2`) are given for all frames at the file's top level, or in a frame. If both are given, the frame's value is
-used. The format is documented in nerfstudio's "Data conventions" and instant-ngp's "Tips for training NeRF models". instant-ngp's keys
-`aabb_scale`, `scale` and `offset` are ignored: they only place the scene in its unit cube.
+Poses are camera-to-world with OpenGL's axes.
 """
 
-import json
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,88 +15,40 @@ from refgs.capture.lens import Lens
 from refgs.capture.poses import OPENGL_TO_OPENCV, world_to_camera
 from refgs.capture.types import Split, View
 from refgs.errors import InputError
+from refgs.formats.transforms import Frame
 
 
-@dataclass(frozen=True)
-class Frame:
-    """One camera of a transforms JSON: an entry of its list `frames`.
-
-    `values` are the entry's keys and values. Keys that the entry lacks are taken from the file's top level.
-    """
-
-    values: dict
-    file: Path
-
-    @property
-    def path(self) -> str:
-        """Return the photo's path as the file gives it, with forward slashes. It is relative to the file's folder."""
-        return str(self.values["file_path"]).replace("\\", "/")
-
-    @property
-    def where(self) -> str:
-        return f"{self.file}, frame {self.path}"
-
-    def number(self, key: str) -> float | None:
-        """Return the number stored under a key, None if it is absent. Raises InputError if the value is not a number."""
-        value = self.values.get(key)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InputError(f"{self.where}: {key} is not a number. Correct the file.")
-        return float(value)
+def where(file: Path, frame: Frame) -> str:
+    """Name a frame of a file for error messages."""
+    return f"{file}, frame {frame.path}"
 
 
-def read_json(file: Path) -> object:
-    """Read a JSON file. Raises InputError naming the file if it is missing or not JSON."""
-    try:
-        return json.loads(file.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file. Name a transforms JSON.") from None
-    except json.JSONDecodeError as error:
-        raise InputError(f"{file}: not JSON: line {error.lineno}: {error.msg}. Export the file again.") from error
-    except (UnicodeDecodeError, OSError) as error:
-        raise InputError(f"{file}: cannot be read as text ({error}). Export the file again.") from error
-
-
-def read_frames(file: Path) -> tuple[dict, list[Frame]]:
-    """Read a transforms JSON. Return its top-level keys and values as a dict, and its frames. Raises InputError for another format."""
-    data = read_json(file)
-    frames = data.get("frames") if isinstance(data, dict) else None
-    if not isinstance(frames, list):
-        raise InputError(f'{file}: there is no list "frames" in it. Export the cameras again.')
-    shared = {key: value for key, value in data.items() if key != "frames"}
-    for number, frame in enumerate(frames):
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
-            raise InputError(f"{file}: frame {number} has no file_path. Export the cameras again.")
-    return shared, [Frame({**shared, **frame}, file) for frame in frames]
-
-
-def frame_camera(frame: Frame, image_size: tuple[int, int] | None = None) -> tuple[Camera, Lens | None]:
+def frame_camera(frame: Frame, where: str, image_size: tuple[int, int] | None = None) -> tuple[Camera, Lens | None]:
     """Return the camera of a frame in the file's coordinates, and its lens model. The lens is None if the frame has no distortion.
 
-    `image_size` (width, height) is used if the frame gives no size. Raises InputError naming the frame.
+    `image_size` (width, height) is used if the frame gives no size. Raises InputError, which begins with `where`, a name for the frame.
     """
-    if frame.values.get("is_fisheye") or str(frame.values.get("camera_model", "")).upper() in _NOT_PERSPECTIVE:
-        raise InputError(f"{frame.where}: the camera is not a perspective one. Undistort the photos to pinholes first.")
-    width, height = frame.number("w"), frame.number("h")
+    if frame.is_fisheye or (frame.camera_model or "").upper() in _NOT_PERSPECTIVE:
+        raise InputError(f"{where}: the camera is not a perspective one. Undistort the photos to pinholes first.")
+    width, height = frame.w, frame.h
     if width is None or height is None:
         if image_size is None:
-            raise InputError(f"{frame.where}: no image size. Add w and h (pixels) to the file.")
+            raise InputError(f"{where}: no image size. Add w and h (pixels) to the file.")
         width, height = image_size
-    fx = _focal(frame, "fl_x", "camera_angle_x", width)
-    fy = _focal(frame, "fl_y", "camera_angle_y", height)
+    fx = _focal(frame.fl_x, frame.camera_angle_x, width)
+    fy = _focal(frame.fl_y, frame.camera_angle_y, height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None:
-        raise InputError(f"{frame.where}: no focal length. Add fl_x (pixels) or camera_angle_x (radians) to the file.")
-    cx, cy = frame.number("cx"), frame.number("cy")
-    cx, cy = width / 2 if cx is None else cx, height / 2 if cy is None else cy
-    if not all(math.isfinite(x) for x in (fx, fy, cx, cy, width, height)) or min(fx, fy, width, height) <= 0:
-        raise InputError(f"{frame.where}: focal length or size is zero, negative or NaN. Correct the file.")
-    pose = world_to_camera(_from_opengl(frame), frame.where)
+        raise InputError(f"{where}: no focal length. Add fl_x (pixels) or camera_angle_x (radians) to the file.")
+    cx, cy = width / 2 if frame.cx is None else frame.cx, height / 2 if frame.cy is None else frame.cy
+    finite = all(math.isfinite(x) for x in (fx, fy, cx, cy, width, height))
+    if not finite or min(fx, fy) <= 0 or round(min(width, height)) < 1:
+        raise InputError(f"{where}: focal length or size is zero, negative or NaN. Correct the file.")
+    pose = world_to_camera(_from_opengl(frame), where)
     camera = Camera(camera_name(frame.path), round(width), round(height), fx, fy, cx, cy, pose)
-    k1, k2, k3, k4, p1, p2 = (frame.number(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    k1, k2, k3, k4, p1, p2 = (value or 0.0 for value in (frame.k1, frame.k2, frame.k3, frame.k4, frame.p1, frame.p2))
     if not all(math.isfinite(x) for x in (k1, k2, k3, k4, p1, p2)):
-        raise InputError(f"{frame.where}: a distortion coefficient is NaN or infinite. Correct the file.")
+        raise InputError(f"{where}: a distortion coefficient is NaN or infinite. Correct the file.")
     if not any((k1, k2, k3, k4, p1, p2)):
         return camera, None
     return camera, Lens(fx, fy, cx, cy, (k1, k2, k3, k4), (p1, p2))
@@ -118,9 +65,10 @@ def read_views(file: Path, frames: list[tuple[Frame, Split]]) -> list[View]:
     masks = Masks(folder)
     views = []
     for frame, split, image in found:
-        mask = masks.find(image, frame.values.get("mask_path"), frame.where)
-        camera = frame_camera(frame, read_header(image)[:2])
-        views.append(photo_view(image, camera, split, mask, frame.where))
+        named = where(file, frame)
+        mask = masks.find(image, frame.mask_path, named)
+        camera = frame_camera(frame, named, read_header(image)[:2])
+        views.append(photo_view(image, camera, split, mask, named))
     return views
 
 
@@ -134,19 +82,16 @@ def camera_name(path: str) -> str:
 _NOT_PERSPECTIVE = {"OPENCV_FISHEYE", "FISHEYE", "FISHEYE624", "EQUIRECTANGULAR", "ORTHOPHOTO"}
 
 
-def _focal(frame: Frame, focal: str, angle: str, size: float) -> float | None:
-    value = frame.number(focal)
-    if value is not None:
-        return value
-    radians = frame.number(angle)
-    if radians is None:
-        return None
-    return size / 2 / math.tan(radians / 2) if 0 < radians < math.pi else math.nan
+def _focal(focal: float | None, angle: float | None, size: float) -> float | None:
+    """Return a focal length in pixels, of itself or of the angle of view in radians over `size` pixels; None if neither is given."""
+    if focal is not None or angle is None:
+        return focal
+    return size / 2 / math.tan(angle / 2) if 0 < angle < math.pi else math.nan
 
 
-def _from_opengl(frame: Frame) -> object:
+def _from_opengl(frame: Frame) -> np.ndarray | None:
     try:
         with np.errstate(invalid="ignore"):  # `world_to_camera` reports infinity
-            return np.array(frame.values.get("transform_matrix"), dtype=np.float64) @ OPENGL_TO_OPENCV
-    except (TypeError, ValueError):
+            return np.array(frame.transform_matrix, dtype=np.float64) @ OPENGL_TO_OPENCV
+    except ValueError:  # rows of different lengths, or not of four
         return None

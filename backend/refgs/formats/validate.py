@@ -1,0 +1,114 @@
+"""Read JSON and TOML files into validated models.
+
+What is wrong with a file becomes an InputError of one line: the file, the field, what is wrong with it, and what to do.
+"""
+
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from refgs.errors import InputError
+
+LARGEST = 64 << 20  # bytes of a text file; Python takes up to 20 times as much memory for what it holds
+
+Number = Annotated[float, Field(strict=True)]
+"""Number, which may be NaN or infinite. Neither text nor a boolean is one."""
+Finite = Annotated[FiniteFloat, Field(strict=True)]
+Vector = tuple[Finite, Finite, Finite]
+Matrix = list[list[float]]
+"""Numbers of any shape. Text that is a number is one, too."""
+
+
+class Model(BaseModel):
+    """Describe the fields of a file that are read. All others are ignored."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def read_json(file: Path, model: type[M], again: str) -> M:
+    """Read a JSON file into a model. `again` says what to do about a file that is missing or wrong: it ends the InputError's message."""
+    return validated(parse(json.loads, read_text(file, again), str(file), "JSON", again), model, str(file), again)
+
+
+def read_toml(file: Path, model: type[M], again: str) -> M:
+    """Read a TOML file into a model. `again` says what to do about a file that is missing or wrong: it ends the InputError's message."""
+    return validated(read_tables(file, again), model, str(file), again)
+
+
+def read_tables(file: Path, again: str) -> dict[str, Any]:
+    """Read a TOML file as nested dicts. Raises InputError, which ends with `again`, if it is missing or no TOML."""
+    return parse(tomllib.loads, read_text(file, again), str(file), "TOML", again)
+
+
+def read_text(file: Path, again: str) -> str:
+    """Read a text file in UTF-8. Raises InputError, which ends with `again`, if it is missing, no file of text, or larger than LARGEST."""
+    try:
+        if file.exists() and not file.is_file():  # a folder; a pipe or device, which may have no end
+            raise InputError(f"{file}: this is not a file. {again}")
+        with file.open("rb") as source:
+            data = source.read(LARGEST + 1)
+        if len(data) > LARGEST:
+            raise InputError(f"{file}: larger than such a file can be. {again}")
+        return data.decode("utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{file}: there is no such file. {again}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: cannot be read as text, which must be UTF-8 ({error.reason}). {again}") from None
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}). {again}") from None
+
+
+def parse(loads: Callable[[str], Any], text: str, source: str, kind: str, again: str) -> Any:
+    """Parse text by `loads`. Raises InputError, which names the `source` and the `kind` of text, such as "JSON", and ends with `again`."""
+    try:
+        return loads(text)
+    except json.JSONDecodeError as error:
+        why = f"line {error.lineno}: {error.msg}"
+    except RecursionError:
+        why = "it is nested too deeply"
+    except ValueError as error:  # of TOML; or a number of thousands of digits
+        why = str(error)[:200]
+    raise InputError(f"{source}: not {kind}: {why}. {again}")
+
+
+def validated(data: Any, model: type[M], source: str, again: str) -> M:
+    """Make a model of what `json` or `tomllib` returned. Raises InputError, which begins with the `source` and ends with `again`."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where, field = _place(first["loc"], data)
+        raise InputError(f"{', '.join([source, *where])}: {field} {_problem(first)}. {again}") from None
+    except RecursionError:
+        raise InputError(f"{source}: it is nested too deeply. {again}") from None
+
+
+def _place(location: tuple[str | int, ...], data: Any) -> tuple[list[str], str]:
+    """Describe where a field is: the frame whose `file_path` is above it, if there is one, and the field's keys joined by dots."""
+    where, keys = [], []
+    for part in location:
+        keys.append(str(part))
+        known = isinstance(data, dict | list) and (part in data if isinstance(data, dict) else isinstance(part, int))
+        data = data[part] if known else None
+        if isinstance(data, dict) and isinstance(data.get("file_path"), str):
+            where, keys = [f"frame {data['file_path']}"], []
+    return where, ".".join(keys) or "its content"
+
+
+def _problem(error: Any) -> str:
+    if error["type"] == "missing":
+        return "is missing"
+    if error["type"] == "value_error":
+        return str(error["ctx"]["error"])
+    if error["type"].startswith(("model_", "dict_")):
+        return "should be a table of keys and values"
+    message = error["msg"]
+    start = "Input should be "
+    return f"should be {message.removeprefix(start)}" if message.startswith(start) else f"is wrong: {message.lower()}"
