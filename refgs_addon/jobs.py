@@ -9,6 +9,7 @@ finishes without Blender. A worker locks the run folder in which it works, so th
 
 import contextlib
 import json
+import math
 import os
 import queue
 import subprocess
@@ -21,6 +22,7 @@ from pathlib import Path
 
 from . import installation
 from .errors import InputError
+from .json_file import read_json
 
 if sys.platform == "win32":
     import msvcrt
@@ -439,9 +441,11 @@ def run_progress(folder: Path) -> dict:
     the mesh is made.
     """
     try:
-        return json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = read_json(folder / PROGRESS)
+        known = {key: float(found[key]) for key in ("iteration", "total", "seconds_left")}
+    except (InputError, KeyError, TypeError, ValueError, OverflowError):  # not there, or not by this release
         return {}
+    return known if all(map(math.isfinite, known.values())) else {}
 
 
 def stop_run(folder: Path) -> None:

@@ -40,6 +40,8 @@ def refgs(tmp_path, *words) -> tuple[int, str, set[str]]:
         (WRONG, "train photos --out run", "photos: there is no such folder"),
         (WRONG, "train . --out run", ".: no capture here"),
         (WRONG, "train photos --out full", "full is not empty"),
+        (WRONG, "train . --out run --minutes nan", "--minutes nan: take a number"),
+        (WRONG, "train . --out run --minutes inf", "--minutes inf: take a number"),
         (WRONG, "train photos --out run --resume", "run is not a run folder"),
         (WRONG, "train photos --out stopped --resume", "photos: there is no such folder"),
         (WRONG, "train . --out run --from full", "--from and --hints go together"),
@@ -64,7 +66,9 @@ def test_torch_is_not_imported(tmp_path, status, words, says):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").touch()
     (tmp_path / "stopped").mkdir()
-    facts = {"run": {"refgs": "0.2.0"}, "settings": load_settings("quick").model_dump(mode="json")}
+    run = {"refgs": "0.2.0", "capture": "photos", "fingerprint": "", "preset": "quick"}
+    run |= {"centre": [0.0, 0.0, 0.0], "radius": 1.0, "bounded": True}
+    facts = {"run": run, "settings": load_settings("quick").model_dump(mode="json")}
     (tmp_path / "stopped" / "run.toml").write_text(tomli_w.dumps(facts))
     got, said, imported = refgs(tmp_path, *words.split())
     assert got == status and not imported, said

@@ -1,6 +1,7 @@
 import json
 
 import pytest
+import tomli_w
 
 from refgs.errors import InputError
 from refgs.run_folder import read_run_facts
@@ -36,6 +37,8 @@ def test_set_changes_one_value():
         ("region.size=1", ["region.size", "tuple"]),
         ("region.centre=[0, 0]", ["region.centre.2"]),
         ("region.up=[0, 0, nan]", ["region.up.2", "finite"]),
+        (f"region.up={'[' * 50_000}", ["nested too deeply"]),
+        (f"train.iterations={'9' * 5000}", ["train.iterations", "integer"]),
     ],
 )
 def test_a_wrong_change_is_named(change, words):
@@ -60,6 +63,7 @@ def test_a_file_may_start_from_a_preset(tmp_path):
         ("[train]\niterations = 3\n", "missing"),
         ('base = "nothing"\n', "nothing"),
         ("[train\n", "TOML"),
+        (f"base = {'[' * 50_000}", "nested too deeply"),
         ('base = "quick"\n[loss]\nlambda = 1\n', "loss.lambda"),
         ('base = "quick"\nloss = 3\n', "loss"),
     ],
@@ -93,14 +97,58 @@ def test_a_run_of_before_a_setting_still_opens():
 
 @pytest.mark.parametrize(
     ("made_by", "says"),
-    [("0.9.0", "update RefGS"), ("1.0.0", "update RefGS"), *((wrong, "is broken") for wrong in ("0.2.9", "one", 5))],
+    [
+        ("0.9.0", "update RefGS"),
+        ("1.0.0", "update RefGS"),
+        ("0.2.9", "run.capture is missing"),
+        ("one", "run.refgs"),
+        (5, "run.refgs"),
+    ],
 )
 def test_a_run_of_a_newer_release_is_not_read(tmp_path, made_by, says):
     """Check that results of a newer minor or major release are refused with "update RefGS". A newer patch release is accepted.
 
-    The file in this test has no settings. If its release is accepted, reading therefore fails later, with the error "is broken". A version
-    number that cannot be read gives the same error.
+    The file in this test has nothing else. If its release is accepted, reading therefore fails later.
     """
     (tmp_path / "run.toml").write_text(f"[run]\nrefgs = {json.dumps(made_by)}\n")
     with pytest.raises(InputError, match=says):
         read_run_facts(tmp_path)
+
+
+RUN = {
+    "refgs": "0.1.0",
+    "capture": "/a",
+    "fingerprint": "f",
+    "preset": "quick",
+    "centre": [0.0, 1.0, 2.0],
+    "radius": 1.5,
+}
+RUN |= {"bounded": True}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"radius": -1.0}, "run.radius should be greater than 0"),
+        ({"radius": float("nan")}, "run.radius should be a finite number"),
+        ({"centre": [0.0, 1.0]}, "run.centre.2 is missing"),
+        ({"capture": 3}, "run.capture should be a valid string"),
+        ({"bounded": []}, "run.bounded should be a valid boolean"),
+    ],
+)
+def test_a_wrong_value_of_run_toml_is_named(tmp_path, change, says):
+    settings = load_settings("quick").model_dump(mode="json")
+    file = tmp_path / "run.toml"
+    file.write_text(tomli_w.dumps({"run": RUN, "settings": settings}))
+    assert read_run_facts(tmp_path)[0].centre == (0.0, 1.0, 2.0)
+    file.write_text(tomli_w.dumps({"run": RUN | change, "settings": settings}))
+    with pytest.raises(InputError, match=says) as error:
+        read_run_facts(tmp_path)
+    assert str(error.value).startswith(f"{file}: ") and "\n" not in str(error.value)
+
+
+def test_a_link_to_a_device_is_no_preset(tmp_path):
+    """Check that reading ends at once: a device may have no end."""
+    (tmp_path / "mine.toml").symlink_to("/dev/zero")
+    with pytest.raises(InputError, match="not a file"):
+        load_settings(str(tmp_path / "mine.toml"))

@@ -38,3 +38,8 @@ class NoCameras(InputError):
 
 class InputWarning(UserWarning):
     """Warning that part of the user's input was wrong and was ignored. The message is one line, as for InputError."""
+
+
+def reason(error: Exception) -> str:
+    """Return what another library's error says, short enough to be quoted in a message. Its type's name if it says nothing."""
+    return " ".join(str(error).split())[:120] or type(error).__name__

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from refgs.errors import InputError, TryAgain
 
+LARGEST = 64 << 20  # bytes of a text file; Python takes up to 20 times as much memory for what it holds
 PACKAGE = Path(__file__).resolve().parent
 ROOT = PACKAGE.parents[1]
 PRESETS = PACKAGE / "presets" if (PACKAGE / "presets").is_dir() else ROOT / "presets"  # in a wheel, in a clone
@@ -88,6 +89,24 @@ def write_text(file: Path, text: str, durable: bool = True) -> None:
     """Write a text file completely or not at all, by `whole`."""
     with whole(file, durable) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def read_text(file: Path, again: str) -> str:
+    """Read a text file in UTF-8. Raises InputError, which ends with `again`, if it is missing, no file of text, or larger than LARGEST."""
+    try:
+        if file.exists() and not file.is_file():  # a folder; a pipe or device, which may have no end
+            raise InputError(f"{file}: this is not a file. {again}")
+        with file.open("rb") as source:
+            data = source.read(LARGEST + 1)
+        if len(data) > LARGEST:
+            raise InputError(f"{file}: larger than such a file can be. {again}")
+        return data.decode("utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{file}: there is no such file. {again}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file}: cannot be read as text, which must be UTF-8 ({error.reason}). {again}") from None
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}). {again}") from None
 
 
 @contextmanager

@@ -4,7 +4,6 @@ Rendering, evaluation, export and Blender read only the run folder.
 """
 
 import platform
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,7 +18,9 @@ from refgs.capture.contents import write_hashes
 from refgs.errors import InputError
 from refgs.formats.mesh import read_mesh
 from refgs.formats.panorama import read_environment
+from refgs.formats.run_toml import RunFile
 from refgs.formats.splats import Splats, read_splats
+from refgs.formats.validate import read_tables, validated
 from refgs.geometry.visibility import Occluder
 from refgs.model.environment import Environment
 from refgs.model.surfels import Surfels, from_splats
@@ -162,10 +163,11 @@ def record_changes(folder: Path, rows: dict[str, dict]) -> None:
     """
     if not rows:
         return
-    tables = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
-    known = tables.get("changed", {})
-    rows = {key: row | {"asked": known.get(key, row)["asked"]} for key, row in rows.items()}
-    write_text(folder / "run.toml", tomli_w.dumps(tables | {"changed": known | rows}))
+    file, again = folder / "run.toml", "Train again."
+    tables = read_tables(file, again)
+    known = validated(tables, RunFile, str(file), again).changed
+    rows = {key: row | ({"asked": known[key].asked} if key in known else {}) for key, row in rows.items()}
+    write_text(file, tomli_w.dumps(tables | {"changed": tables.get("changed", {}) | rows}))
 
 
 def open_run(folder: Path) -> Run:
@@ -184,12 +186,12 @@ def open_run(folder: Path) -> Run:
     return Run(
         folder=folder,
         settings=settings,
-        capture_folder=Path(facts["capture"]),
-        fingerprint=facts["fingerprint"],
-        centre=np.array(facts["centre"]),
-        radius=facts["radius"],
-        bounded=facts["bounded"],
-        near=near_plane(facts["radius"]),
+        capture_folder=Path(facts.capture),
+        fingerprint=facts.fingerprint,
+        centre=np.array(facts.centre),
+        radius=facts.radius,
+        bounded=facts.bounded,
+        near=near_plane(facts.radius),
         cameras=cameras,
         splits=splits,
         to_capture=to_capture,

@@ -1,13 +1,16 @@
 """Check run folders, read run.toml and update metrics.json. This module does not import torch."""
 
 import json
+import os
 import shutil
-import tomllib
 from pathlib import Path
 from typing import Any
 
 from refgs import __version__
 from refgs.errors import InputError
+from refgs.formats.metrics import read_metrics
+from refgs.formats.run_toml import Made, RunFile, Trained
+from refgs.formats.validate import read_tables, validated
 from refgs.lock import LOCK, PROGRESS, STOP
 from refgs.paths import check_unicode, command_line, is_leftover, write_text
 from refgs.settings import Settings, load_settings, recorded_settings
@@ -57,7 +60,7 @@ def _nothing_learned(folder: Path) -> bool:
     return all(file.name in own or is_leftover(file) for file in folder.iterdir())
 
 
-def check_finished(folder: Path) -> tuple[dict, Settings]:
+def check_finished(folder: Path) -> tuple[Trained, Settings]:
     """Raise InputError if the folder is no run folder, or if its training has not ended.
 
     Otherwise return what `read_run_facts` returns: the table [run] and the settings.
@@ -69,24 +72,20 @@ def check_finished(folder: Path) -> tuple[dict, Settings]:
     return facts, settings
 
 
-def read_run_facts(folder: Path) -> tuple[dict, Settings]:
-    """Read run.toml. Return its table [run] as a dict, and the settings of the training.
+def read_run_facts(folder: Path) -> tuple[Trained, Settings]:
+    """Read run.toml. Return its table [run], and the settings of the training.
 
     Raises InputError if there is no run.toml, or if a newer release has written it.
     """
-    file = folder / "run.toml"
-    try:
-        facts = tomllib.loads(file.read_text(encoding="utf-8"))
-        made_by = facts["run"]["refgs"]
-        if _release(made_by) > _release(__version__):
-            raise InputError(
-                f"{folder} was made by RefGS {made_by}, which is newer than this, {__version__}: update RefGS"
-            )
-        return facts["run"], recorded_settings(facts["settings"], str(file))
-    except FileNotFoundError:
-        raise InputError(f"{folder} is not a run folder: there is no run.toml in it") from None
-    except (OSError, KeyError, TypeError, AttributeError, ValueError) as error:
-        raise InputError(f"{file} is broken ({error}): train again") from None
+    file, again = folder / "run.toml", "Train again."
+    if not os.path.lexists(file):
+        raise InputError(f"{folder} is not a run folder: there is no run.toml in it")
+    tables = read_tables(file, again)
+    made_by = validated(tables, Made, str(file), again).run.refgs
+    if _release(made_by) > _release(__version__):
+        raise InputError(f"{folder} was made by RefGS {made_by}, which is newer than this, {__version__}: update RefGS")
+    found = validated(tables, RunFile, str(file), again)
+    return found.run, recorded_settings(found.settings, str(file))
 
 
 def check_asked(folder: Path, preset: str | None, minutes: float | None, changes: list[str]) -> None:
@@ -94,11 +93,11 @@ def check_asked(folder: Path, preset: str | None, minutes: float | None, changes
     facts, settings = read_run_facts(folder)
     another = "choose another folder with --out, or ask for the same"
     if preset is None and minutes is not None:
-        if facts["preset"] != (asked := f"{minutes:g} minutes"):
+        if facts.preset != (asked := f"{minutes:g} minutes"):
             raise InputError(f"{folder} was trained by {facts['preset']}, not for {asked}: {another}")
         return  # its settings were chosen
     tables = settings.model_dump(mode="json")
-    changed = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8")).get("changed", {})
+    changed = read_tables(folder / "run.toml", "Train again.").get("changed", {})
     for key, row in changed.items():
         section, name = key.split(".")
         tables[section][name] = row["asked"]
@@ -127,4 +126,4 @@ def update_metrics(folder: Path, facts: dict[str, Any]) -> None:
 def run_metrics(folder: Path) -> dict[str, Any]:
     """Read a run's metrics.json. Returns {} if there is none."""
     file = folder / "metrics.json"
-    return json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    return read_metrics(file)[0] if file.exists() else {}

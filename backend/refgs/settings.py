@@ -1,5 +1,7 @@
 """Declare all settings: keys, ranges and descriptions. Values are in presets/*.toml; docs/settings.md lists all settings."""
 
+import os
+import reprlib
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -7,7 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from refgs.errors import InputError
-from refgs.paths import PRESETS
+from refgs.paths import PRESETS, read_text
 
 Length = Annotated[FiniteFloat, Field(ge=0)]
 Part = Annotated[float, Field(ge=0, le=1)]
@@ -341,12 +343,12 @@ def validate(tables: dict[str, Any], source: str) -> Settings:
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             known = _known_keys(first["loc"][:-1])
-            raise InputError(f"{source}: unknown key {key}; known here: {', '.join(known)}") from None
+            raise InputError(f"{source}: unknown key {key[:100]}; known here: {', '.join(known)}") from None
         if first["type"] == "missing":
             raise InputError(f'{source}: {key} is missing; add it, or start the file with base = "standard"') from None
         if first["type"] == "value_error":
             raise InputError(f"{source}: {key}: {first['ctx']['error']}") from None
-        raise InputError(f"{source}: {key} = {first['input']!r}: {first['msg'].lower()}") from None
+        raise InputError(f"{source}: {key} = {reprlib.repr(first['input'])}: {first['msg'].lower()}") from None
 
 
 def _known_keys(location: tuple) -> list[str]:
@@ -359,17 +361,21 @@ def _known_keys(location: tuple) -> list[str]:
 def _parse(value: str) -> Any:
     try:
         return tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, KeyError):  # no TOML, a number of thousands of digits, or more than a value
         return value.strip()  # a bare word is a string
+    except RecursionError:
+        raise InputError(f"--set {value[:60]}…: this is nested too deeply") from None
 
 
 def _read_preset(preset: str) -> dict[str, Any]:
     file = PRESETS / f"{preset}.toml" if preset in preset_names() else Path(preset)
+    if not os.path.lexists(file):
+        raise InputError(f"no preset {preset}: take one of {', '.join(preset_names())}, or a TOML file")
     try:
-        tables = tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"no preset {preset}: take one of {', '.join(preset_names())}, or a TOML file") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        tables = tomllib.loads(read_text(file, "Mend the file."))
+    except RecursionError:
+        raise InputError(f"{file}: cannot be read as TOML (it is nested too deeply): mend the file") from None
+    except ValueError as error:
         raise InputError(f"{file}: cannot be read as TOML ({error}): mend the file") from None
     base = tables.pop("base", None)
     if base is None:

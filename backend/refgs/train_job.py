@@ -3,6 +3,7 @@
 Importing torch takes seconds. So the arguments are checked before it is imported, where possible.
 """
 
+import math
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from refgs.errors import InputError, TryAgain
 from refgs.events import Report
+from refgs.formats.run_toml import Trained
 from refgs.lock import RunLock
 from refgs.memory import shortage_named, trim
 from refgs.paths import check_folder, command_line, disk_errors_named
@@ -72,6 +74,8 @@ def train(
     """
     plan, lock = Plan(minutes), RunLock(out)
     check_device(device)
+    if minutes is not None and not math.isfinite(minutes):
+        raise InputError(f"--minutes {minutes}: take a number of minutes, e.g. 5")
     hints: list[Hint] = []
     if resume:
         facts, settings = _resumed_settings(out, changes)
@@ -100,7 +104,7 @@ def train(
                 trainer = _resume(capture, settings, out, plan, device, report)
             else:
                 if hinted is not None:
-                    how = facts["preset"], hinted.run, hints, out, plan, device, report
+                    how = facts.preset, hinted.run, hints, out, plan, device, report
                     trainer = _start_hinted(capture, settings, *how)
                 else:
                     trainer = _start(capture, settings, preset, changes, masked, out, plan, device, report)
@@ -175,7 +179,7 @@ def _new_settings(out: Path, preset: str | None, changes: list[str]) -> tuple[No
     return None, settings
 
 
-def _resumed_settings(out: Path, changes: list[str]) -> tuple[dict, Settings]:
+def _resumed_settings(out: Path, changes: list[str]) -> tuple[Trained, Settings]:
     facts, settings = read_run_facts(out)
     if changes:
         raise InputError("--set cannot change a run that is resumed: train into a new folder")
@@ -184,7 +188,7 @@ def _resumed_settings(out: Path, changes: list[str]) -> tuple[dict, Settings]:
 
 def _hinted_settings(
     hinted: Hinted, out: Path, preset: str | None, changes: list[str]
-) -> "tuple[dict, Settings, list[Hint]]":
+) -> "tuple[Trained, Settings, list[Hint]]":
     from refgs.formats.hints import read_hints
 
     facts, settings = check_finished(hinted.run)
@@ -203,13 +207,13 @@ def _check_unfinished(out: Path) -> None:
         raise InputError(f"{out}: this training has ended; there is nothing to resume")
 
 
-def _read_capture(folder: Path, settings: Settings, out: Path, facts: dict | None) -> "Capture":
+def _read_capture(folder: Path, settings: Settings, out: Path, facts: Trained | None) -> "Capture":
     check_folder(folder)  # before numpy is imported
     from refgs.capture import read_capture
 
     capture = read_capture(folder, settings.region)
     if facts is not None:
-        capture.check_unchanged(out, facts["fingerprint"])
+        capture.check_unchanged(out, facts.fingerprint)
     return capture
 
 

@@ -24,6 +24,8 @@ from refgs.capture.motion import find_cameras
 from refgs.capture.video import extract_photos
 from refgs.errors import InputError, NoCameras, one_line
 from refgs.export.export_job import export as export_run
+from refgs.formats.needs import Needs
+from refgs.formats.validate import read_json
 from refgs.kernels import cuda
 from refgs.memory import shortage_named
 from refgs.paths import disk_errors_named
@@ -69,7 +71,7 @@ class Train(_Command):
     out: str
     preset: str | None = None
     device: str = "auto"
-    minutes: Annotated[float, Field(ge=0.05)] | None = None
+    minutes: Annotated[float, Field(ge=0.05, allow_inf_nan=False)] | None = None
     settings: list[str] = []
     resume: bool = False
     run: Annotated[str | None, Field(alias="from")] = None
@@ -275,8 +277,8 @@ class Worker:
         facts = {"run": str(out.resolve()), "iteration": state.iteration, "seconds": state.seconds}
         if not state.ended:
             return "cancelled", facts
-        needs = json.loads((out / "needs.json").read_text(encoding="utf-8"))
-        left_out = [need for need in needs if not need.get("needed", False)]
+        needs = read_json(out / "needs.json", Needs, "Train again.").root
+        left_out = [need.model_dump(exclude_unset=True) for need in needs if not need.needed]
         return "done", facts | {"psnr": quality, "left_out": left_out}
 
     def _hear_training(self, event: str, facts: dict[str, Any]) -> None:

@@ -1,6 +1,5 @@
 """Make camera objects from cameras.json, look through them, and lay photos over their views."""
 
-import json
 import math
 from pathlib import Path
 
@@ -8,7 +7,9 @@ import bpy
 from mathutils import Matrix
 
 from ..errors import InputError
+from ..json_file import read_json
 
+LARGEST = 1e6  # pixels of a photo or of a focal length; Blender stores single-precision numbers
 SENSOR_WIDTH = 36.0  # mm, Blender's default
 PHOTO = "refgs_photo"  # custom property of a camera's data: the file of its photo
 
@@ -19,18 +20,22 @@ def read_cameras(path: Path, capture: Path | None) -> list[dict]:
     Each dictionary has the camera-to-world matrix with OpenGL's axes and the pinhole intrinsics. Its key `photo` is the path of the photo
     in the folder `capture`, or "" if `capture` is None. Raises InputError if the file cannot be read, or RefGS did not write it.
     """
+    data = read_json(path)
     try:
-        frames = json.loads(path.read_text(encoding="utf-8"))["frames"]
+        frames = data["frames"]
         for frame in frames:
             matrix = Matrix(frame["transform_matrix"])
             numbers = [frame[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")]
             if len(matrix) != 4 or not all(map(math.isfinite, [*numbers, *(x for row in matrix for x in row)])):
                 raise ValueError
+            if (
+                not all(0 < frame[key] < LARGEST for key in ("fl_x", "fl_y", "w", "h"))
+                or min(frame["w"], frame["h"]) < 1
+            ):
+                raise ValueError
             frame["name"] = Path(frame["file_path"]).stem
             frame["photo"] = str(capture / frame["photo"]) if capture and "photo" in frame else ""
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, OverflowError):
         raise InputError(f"{path} is not the cameras.json of a RefGS run: export the run again") from None
     return frames
 
@@ -40,7 +45,9 @@ def light_of(path: Path) -> str:
 
     If the light turned with the camera, it had another rotation in each photo. Then the run's panorama fits only the named photo.
     """
-    return Path(json.loads(path.read_text(encoding="utf-8")).get("light_of", "")).stem
+    found = read_json(path)
+    name = found.get("light_of", "") if isinstance(found, dict) else ""
+    return Path(name).stem if isinstance(name, str) else ""
 
 
 def add_camera(frame: dict, collection: bpy.types.Collection) -> bpy.types.Object:

@@ -1,12 +1,12 @@
 """Read what a training decided about a scene, with pictures of both answers, and train again the other way."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 
 from ..errors import InputError
+from ..json_file import read_json
 
 ON_OFF = ("on", "off")  # words of the trainer's settings [needs]
 
@@ -54,14 +54,21 @@ def decisions(folder: Path) -> list[Decision]:
 def _parse(folder: Path, file: Path) -> list[Decision]:
     found = []
     try:
-        for row in json.loads(file.read_text(encoding="utf-8")):
+        for row in read_json(file):
             if shown := row.get("pictures"):
                 files = {kind: folder / shown[kind] for kind in (*ON_OFF, "photo")}
                 psnr = {kind: float(shown[f"psnr_{kind}"]) for kind in ON_OFF}
                 found.append(
                     Decision(row["need"], row["what"], row["why"], bool(row["needed"]), shown["view"], files, psnr)
                 )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # of another release, or half copied
+    except (
+        InputError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+    ):  # of another release, or half copied
         return []
     return found
 

@@ -1,6 +1,5 @@
 """Import a run folder, the result of a training: its splats, mesh and cameras, and the light recovered from the photos."""
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import bpy
 from mathutils import Matrix
 
 from ..errors import InputError
+from ..json_file import read_json
 from ..nodes.world_diffuse import add_world_diffuse
 from . import run_parts
 from .camera_objects import add_camera, frame_camera, light_of, read_cameras
@@ -170,8 +170,8 @@ def add_mesh(path: Path, name: str, collection: bpy.types.Collection) -> list[bp
 def _doubt_words(folder: Path) -> str:
     """Read the trainer's words on where a run's photos do not tell, from its metrics.json. Returns "" if there are none."""
     try:
-        return str(json.loads((folder / "metrics.json").read_text(encoding="utf-8"))["doubt"]["what"])
-    except (OSError, ValueError, KeyError, TypeError):  # not there, of an older release, or half copied
+        return str(read_json(folder / "metrics.json")["doubt"]["what"])
+    except (InputError, KeyError, TypeError):  # not there, of an older release, or half copied
         return ""
 
 

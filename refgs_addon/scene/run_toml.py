@@ -16,9 +16,9 @@ def capture_of(run: Path) -> Path | None:
 def up_was_chosen(run: Path) -> bool:
     """Check whether the artist chose a new up direction for the run. The run is then rotated relative to the capture's cameras."""
     try:
-        x, y, z = _table(run, "settings")["region"]["up"]
+        x, y, z = map(float, _table(run, "settings")["region"]["up"])
         return math.hypot(x, y) > 1e-3 * z and any((x, y, z))
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         return False
 
 
@@ -39,6 +39,6 @@ def _release(version: str) -> tuple[int, ...]:
 def _table(run: Path, name: str) -> dict:
     try:
         table = tomllib.loads((run / "run.toml").read_text(encoding="utf-8")).get(name)
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return table if isinstance(table, dict) else {}

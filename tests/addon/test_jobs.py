@@ -154,6 +154,14 @@ def test_a_blender_that_is_killed_leaves_nothing_running(killed):
         jobs.stop_run(run)
 
 
+@pytest.mark.parametrize(
+    "text", ["[" * 50_000, "[]", '{"iteration": 1, "total": 2, "seconds_left": NaN}', '{"total": "x"}']
+)
+def test_a_broken_progress_is_none(tmp_path, text):
+    (tmp_path / jobs.PROGRESS).write_text(text)
+    assert jobs.run_progress(tmp_path) == {}
+
+
 def test_a_training_that_a_killed_blender_left_is_found_and_stopped(killed):
     run = killed("kept")
     before = jobs.run_progress(run)["iteration"]

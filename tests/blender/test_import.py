@@ -405,8 +405,9 @@ def replacing(old, new):
     return lambda path: path.write_bytes(path.read_bytes().replace(old, new))
 
 
-def bent_camera(path):
-    path.write_text(json.dumps({"frames": [{**FRAMES[0], "transform_matrix": [[1, 2], [3, 4]]}]}))
+def changed_camera(**values):
+    """Return a function that writes a cameras.json of one camera, with these values changed."""
+    return lambda path: path.write_text(json.dumps({"frames": [FRAMES[0] | values]}))
 
 
 @pytest.mark.parametrize(
@@ -424,8 +425,12 @@ def bent_camera(path):
         ("splats.ply", not_json, "not a binary little-endian PLY"),
         ("splats.ply", infinite, "has no splat with finite values"),
         ("splats.ply", without_materials, "has no metallic, roughness"),
-        ("cameras.json", not_json, "not the cameras.json"),
-        ("cameras.json", bent_camera, "not the cameras.json"),
+        ("cameras.json", not_json, "no whole JSON file"),
+        ("cameras.json", lambda path: path.write_text('{"frames": ' + "[" * 50_000), "no whole JSON file"),
+        ("cameras.json", changed_camera(transform_matrix=[[1, 2], [3, 4]]), "not the cameras.json"),
+        ("cameras.json", changed_camera(w=0), "not the cameras.json"),
+        ("cameras.json", changed_camera(fl_y=-1.0), "not the cameras.json"),
+        ("cameras.json", changed_camera(cx=10**400), "not the cameras.json"),
         ("environment.exr", not_json, "not a complete EXR"),
         ("mesh.glb", cut, "glTF"),
     ],

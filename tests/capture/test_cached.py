@@ -68,6 +68,18 @@ def test_half_a_file_does_not_count(views, tmp_path):
         check_same(loaded, load_view(view, SIDE))
 
 
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[:200], lambda data: b"", lambda data: data.replace(b"|u1", b"|i1")]
+)
+def test_a_damaged_file_is_made_anew(views, tmp_path, damage):
+    load_views(views, SIDE, tmp_path)
+    for file in tmp_path.glob("*.npy"):
+        file.write_bytes(damage(file.read_bytes()))
+    for view, loaded in zip(views, load_views(views, SIDE, tmp_path), strict=True):
+        assert mapped(loaded.image)
+        check_same(loaded, load_view(view, SIDE))
+
+
 def test_a_full_disk_leaves_photos_in_memory(views, tmp_path, monkeypatch):
     monkeypatch.setattr(cached.shutil, "disk_usage", lambda folder: type("", (), {"free": 0}))
     for view, loaded in zip(views, load_views(views, SIDE, tmp_path / "photos"), strict=True):
@@ -82,10 +94,11 @@ def test_mapped_photos_leave_the_processs_memory_and_come_back(views, tmp_path):
         return 1024 * int(status.partition("RssFile:")[2].split()[0])
 
     large = np.random.default_rng(0).integers(0, 255, (3000, 4000, 3), np.uint8)
-    view = cached._cached(LoadedView(large, None, views[0].camera), tmp_path, "large")
+    camera = views[0].camera.resized(4000, 3000)
+    view = cached._cached(LoadedView(large, None, camera), tmp_path, "large")
     assert view.image.sum() == large.sum()
     before = mapped_bytes()
-    release_memory([view, LoadedView(large, None, views[0].camera)])
+    release_memory([view, LoadedView(large, None, camera)])
     assert before - mapped_bytes() > 30e6
     np.testing.assert_array_equal(view.image, large)
     before = mapped_bytes()

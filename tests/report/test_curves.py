@@ -8,6 +8,7 @@ Test also the names that the report gives to runs.
 import numpy as np
 import pytest
 
+from refgs.formats.run_toml import Summary
 from refgs.report.curves import QUANTITIES, Curve, curve, front, knee, levels, time_to
 from refgs.report.labels import labels
 
@@ -78,7 +79,7 @@ def facts(preset="quick", device="cpu", capture="/a/car", **settings):
     for name, value in settings.items():
         section, key = name.split("__")
         tables[section] = tables[section] | {key: value}
-    return {"run": {"preset": preset, "device": device, "capture": capture}, "settings": tables}
+    return Summary(run={"preset": preset, "device": device, "capture": capture}, settings=tables)
 
 
 def test_runs_are_called_by_what_differs():
@@ -95,4 +96,4 @@ def test_runs_that_are_alike_are_called_by_their_folders():
     assert labels(["r/1", "r/2", "r/3"], [facts(), facts(), facts()]) == ["r/1", "r/2", "r/3"]
     found = labels(["r/1", "r/2", "r/3"], [facts(), facts(), facts(device="H200")])
     assert found == ["cpu (r/1)", "cpu (r/2)", "H200"]
-    assert labels(["r/1", "r/2"], [{}, facts()])[0] == "r/1"
+    assert labels(["r/1", "r/2"], [Summary(), facts()])[0] == "r/1"

@@ -216,6 +216,26 @@ def test_figures_that_are_no_numbers_are_left_out(tmp_path):
     assert "views 8" in text and "PSNR" not in text and "nan" not in text and "flag" not in text
 
 
+def test_values_that_no_release_wrote_are_shown_or_left_out(run):
+    (run / "metrics.json").write_text(json.dumps({"psnr": 10**400, "views": 8, "split": "\ud800"}))
+    (run / "run.toml").write_text('[run]\ncapture = "/a/urn"\n[settings]\nx = 3\n')
+    (run / "history.jsonl").write_text(
+        "".join(f'{{"iteration": [], "seconds": {s}, "psnr_test": {-s}e307}}\n' for s in range(1, 9))
+    )
+    page = reported(run)
+    assert "views 8" in page.text and "PSNR" not in page.text
+    assert "run.toml cannot be read" in page.text and "settings.x should be" in page.text
+
+
+def test_pictures_of_other_folders_are_not_shown(run):
+    picture(run.parent / "private.png", 33)
+    shown = {kind: "../private.png" for kind in ("on", "off", "photo")} | {"view": "a", "psnr_on": 1, "psnr_off": 2}
+    row = {"need": "specular", "what": "specular shading", "why": "it shines", "pictures": shown}
+    (run / "needs.json").write_text(json.dumps([row]))
+    page = reported(run)
+    assert "specular shading" in page.text and not any("with" in caption for caption, _ in page.images)
+
+
 def test_large_pictures_are_made_smaller(tmp_path):
     picture(tmp_path / "pictures/test/photo/a.png", 90, side=1600)
     assert pixels(dict(reported(tmp_path).images)["photo"]).shape == (512, 512, 3)

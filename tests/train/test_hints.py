@@ -185,13 +185,13 @@ def test_what_cannot_be_continued(plastic, ball_capture, tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("metal", "has no hints"),
-        ('{"hints": []}', "has no hints"),
-        ('{"hints": [{"kind": "metal"}]}', "has no hints"),
-        ('{"hints": [{"kind": "wood", "points": [[0, 0, 0]]}]}', "'wood': take metal or paint"),
-        ('{"hints": [{"kind": "metal", "points": []}]}', "at least one"),
-        ('{"hints": [{"kind": "metal", "points": [[0, 0, NaN]]}]}', "positions of splats"),
-        ('{"hints": [{"kind": "metal", "points": [[0, 0]]}]}', "has no hints"),
+        ("metal", "not JSON"),
+        ('{"hints": []}', "at least 1 item"),
+        ('{"hints": [{"kind": "metal"}]}', "hints.0.points is missing"),
+        ('{"hints": [{"kind": "wood", "points": [[0, 0, 0]]}]}', "hints.0.kind should be 'metal' or 'paint'"),
+        ('{"hints": [{"kind": "metal", "points": []}]}', "hints.0.points is wrong: .* at least 1 item"),
+        ('{"hints": [{"kind": "metal", "points": [[0, 0, NaN]]}]}', "hints.0.points.0.2 should be a finite number"),
+        ('{"hints": [{"kind": "metal", "points": [[0, 0]]}]}', "hints.0.points.0.2 is missing"),
     ],
 )
 def test_a_file_that_has_no_hints(tmp_path, text, says):

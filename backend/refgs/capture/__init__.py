@@ -206,7 +206,9 @@ def _unique_names(views: list[View]) -> list[View]:
     If several photos have the same file name, their cameras' names get the folder's path in front. Raises InputError if that does not help.
     """
     names = Counter((view.split, view.camera.name) for view in views)
-    top = os.path.commonpath([view.image_path.parent for view in views])
+    top = os.path.commonpath(
+        [os.path.abspath(view.image_path.parent) for view in views]
+    )  # a file may name some absolutely
 
     def name(view: View) -> str:
         if names[view.split, view.camera.name] == 1:

@@ -86,16 +86,25 @@ def _name(view: View, max_side: int) -> str:
 
 
 def _read(camera: Camera, folder: Path, name: str) -> LoadedView | None:
-    """Map the files of a cached photo, whose camera is `camera`. Return None if there are none."""
+    """Map the files of a cached photo, whose camera is `camera`. Return None if there are none, or if they are damaged."""
     image = next(folder.glob(f"{name}.image.*.npy"), None)
     if image is None:
         return None
-    alpha = folder / f"{name}.alpha.npy"
-    return LoadedView(_mapped(image), _mapped(alpha) if alpha.exists() else None, camera, int(image.name.split(".")[2]))
+    alpha, size = folder / f"{name}.alpha.npy", (camera.height, camera.width)
+    try:
+        pixels = _mapped(image, (*size, 3), np.uint8, np.uint16)
+        mask = _mapped(alpha, size, np.uint8) if alpha.exists() else None
+        return LoadedView(pixels, mask, camera, int(image.name.split(".")[2]))
+    except Exception:  # NumPy evaluates a file's header, and raises errors of many types
+        return None
 
 
-def _mapped(file: Path) -> np.ndarray:
-    return np.asarray(np.load(file, mmap_mode="c"))  # not "r", as torch warns of arrays that it must not write
+def _mapped(file: Path, shape: tuple[int, ...], *kinds: type) -> np.ndarray:
+    """Map an array from a file. Raises any exception if it is damaged, or not of this shape and of one of these types."""
+    values = np.asarray(np.load(file, mmap_mode="c"))  # not "r", as torch warns of arrays that it must not write
+    if values.shape != shape or values.dtype not in kinds:
+        raise ValueError("another array")
+    return values
 
 
 def _cached(view: LoadedView, folder: Path, name: str) -> LoadedView:
@@ -104,7 +113,7 @@ def _cached(view: LoadedView, folder: Path, name: str) -> LoadedView:
         _write(view, folder, name)
     except OSError:
         return view
-    return _read(view.camera, folder, name)
+    return _read(view.camera, folder, name) or view
 
 
 def _write(view: LoadedView, folder: Path, name: str) -> None:

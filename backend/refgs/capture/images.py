@@ -31,6 +31,9 @@ Image.MAX_IMAGE_PIXELS = None  # `check_pixels` has the limit
 # a photo differs by 0.6 of 255 on average from one reduced in linear light (49 dB); at 1, by 1.7 (41 dB).
 SPARE = 2
 
+# Pillow's names of what a photo's file may be, whatever its suffix. Of Pillow's other formats some start programs, as EPS does.
+FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "HEIF", "BMP", "AVIF", "GIF", "JPEG2000", "PPM", "TGA")
+
 ROWS = 128  # that are copied from a decoded picture at a time
 
 # Clockwise quarter turns that make a photo upright, by EXIF orientation. The mirrored orientations 2, 4, 5 and 7 are ignored: no camera
@@ -264,7 +267,7 @@ def _divisor(shrink: int, width: int, height: int) -> int:
 
 def _open(path: Path) -> Image.Image:
     try:
-        picture = Image.open(path)
+        picture = Image.open(path, formats=FORMATS)
     except FileNotFoundError:
         raise InputError(f"{path}: the image is missing. Put it back, or remove it from the capture.") from None
     except Exception as error:

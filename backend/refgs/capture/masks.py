@@ -18,6 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 from PIL import Image
+from pydantic import TypeAdapter
 
 from refgs.camera import Camera
 from refgs.capture import View, load_view, mask_files, read_capture
@@ -32,12 +33,13 @@ from refgs.capture.silhouettes import Photo, carve_object, cut_out
 from refgs.capture.triangulate import triangulate
 from refgs.capture.types import Z_UP, Capture
 from refgs.errors import InputError
-from refgs.paths import write_text
+from refgs.paths import read_text, write_text
 from refgs.settings import RegionSettings
 
 SIDE, FINE = 256, 400  # pixels on the longer side: for carving, for the edges
 CARVED_BY = 60  # photos at most
 MADE = "made.json"
+_HASHES = TypeAdapter(set[str])  # what is in it
 
 
 class ReadOnlyError(InputError):
@@ -224,8 +226,8 @@ def _hash(path: Path) -> str:
 
 def _hashes(root: Path) -> set[str]:
     try:
-        return set(json.loads((root / "masks" / MADE).read_text(encoding="utf-8")))
-    except (OSError, ValueError):  # without it, every mask is the artist's
+        return _HASHES.validate_json(read_text(root / "masks" / MADE, ""))
+    except (InputError, ValueError):  # without it, every mask is the artist's
         return set()
 
 

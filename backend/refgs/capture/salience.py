@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from refgs.errors import InputError
+from refgs.errors import InputError, reason
 
 SIDE = 1024  # pixels that a model of any size gets
 MEAN, DEVIATION = (
@@ -38,7 +38,7 @@ class SalienceModel:
         try:
             self._session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # its exceptions have no common class
-            raise InputError(f"{file}: ONNX Runtime cannot read it: {_line(error)}") from None
+            raise InputError(f"{file}: ONNX Runtime cannot read it: {reason(error)}") from None
         (self._input, *more), shape = self._session.get_inputs(), self._session.get_inputs()[0].shape
         if more or len(shape) != 4 or shape[1] not in (3, None) or self._input.type != "tensor(float)":
             raise InputError(
@@ -56,7 +56,7 @@ class SalienceModel:
         try:
             found = self._session.run([self._session.get_outputs()[0].name], {self._input.name: batch})[0]
         except Exception as error:
-            raise InputError(f"{self.file}: the model failed: {_line(error)}") from None
+            raise InputError(f"{self.file}: the model failed: {reason(error)}") from None
         shape, found = found.shape, np.asarray(found, np.float32).squeeze()
         if found.ndim != 2 or not np.isfinite(found).all():
             raise InputError(f"{self.file}: its first output, of shape {shape}, is not one map of finite values.")
@@ -65,7 +65,3 @@ class SalienceModel:
         elif found.max() > 1:
             found = (found - found.min()) / max(np.ptp(found), 1e-6)
         return cv2.resize(found, size, interpolation=cv2.INTER_LINEAR)
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]

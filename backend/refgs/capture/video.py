@@ -132,7 +132,7 @@ def _products(*pictures: np.ndarray) -> np.ndarray:
 def _opened(video: Path) -> av.container.InputContainer:
     """Open a video file. Raise InputError if it is not a video, or if its header is missing because it is truncated."""
     try:
-        container = av.open(str(video))
+        container = av.open(str(video), metadata_errors="replace")
     except (av.FFmpegError, OSError) as error:
         why = error.strerror or type(error).__name__
         raise InputError(

@@ -78,8 +78,12 @@ def read_points(file: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _parse(file: Path, binary: Callable[[Path], T], text: Callable[[Path], T]) -> T:
+    if not file.is_file():  # nor a device, which has no end
+        raise InputError(f"{file}: there is no such file. Export the sparse model again.")
     try:
         return (binary if file.suffix == ".bin" else text)(file)
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror}). Export the sparse model again.") from None
     except (struct.error, ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{file}: the file is truncated or not COLMAP's. Export the sparse model again.") from error
 
@@ -172,6 +176,8 @@ def _text_images(file: Path) -> list[Image]:
     images = []
     for line in _entries(file, lines_each=2):  # the second line holds keypoints
         _, *pose, camera_id, name = line.split(maxsplit=9)
+        if len(pose) != 7:
+            raise ValueError("numbers missing")
         images.append(Image(name.strip(), int(camera_id), tuple(map(float, pose))))
     return images
 

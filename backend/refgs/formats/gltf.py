@@ -8,8 +8,8 @@ import trimesh
 from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
-from refgs.errors import InputError
-from refgs.formats.mesh import Y_UP, Mesh
+from refgs.errors import InputError, reason
+from refgs.formats.mesh import Y_UP, Mesh, check_mesh
 from refgs.formats.tangents import vertex_tangents
 from refgs.formats.textures import FOLDER, Textures, write_textures
 from refgs.paths import whole
@@ -73,5 +73,9 @@ def read_glb(path: str | os.PathLike) -> Mesh:
         model = trimesh.load_mesh(path, file_type="glb", process=False, skip_materials=True)
         vertices, faces = np.asarray(model.vertices, np.float64), np.asarray(model.faces)
     except Exception as error:  # trimesh raises errors of many types
-        raise InputError(f"{path} is not a whole binary glTF file of a mesh ({error}): export it again") from None
-    return Mesh(vertices @ Y_UP, faces)
+        raise InputError(
+            f"{path} is not a whole binary glTF file of a mesh ({reason(error)}): export it again"
+        ) from None
+    mesh = Mesh(vertices @ Y_UP, faces)
+    check_mesh(path, mesh)
+    return mesh

@@ -2,11 +2,12 @@
 
 import json
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
+from pydantic import Field
 
-from refgs.errors import InputError
+from refgs.formats.validate import Model, Vector, read_json
 from refgs.paths import write_text
 
 FILE = "hints.json"  # in the folder of a run that was trained with hints
@@ -21,23 +22,20 @@ class Hint(NamedTuple):
     points: np.ndarray
 
 
+class _Part(Model):
+    kind: Kind
+    points: Annotated[list[Vector], Field(min_length=1)]
+
+
+class _Hints(Model):
+    hints: Annotated[list[_Part], Field(min_length=1)]
+
+
 def read_hints(file: Path) -> list[Hint]:
     """Read the hints in a JSON file. Raises InputError if the file cannot be read, is no file of hints, or has no hint."""
-    try:
-        listed = json.loads(file.read_text(encoding="utf-8"))["hints"]
-        hints = [Hint(hint["kind"], np.array(hint["points"], np.float64).reshape(-1, 3)) for hint in listed]
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError):
-        raise InputError(f'{file} has no hints: it must be JSON as {{"hints": [{{"kind": "metal", …}}]}}') from None
-    for hint in hints:
-        if hint.kind not in KINDS:
-            raise InputError(f"{file}: a hint is of the kind {hint.kind!r}: take {' or '.join(KINDS)}")
-        if len(hint.points) == 0 or not np.isfinite(hint.points).all():
-            raise InputError(f"{file}: the points of a hint must be positions of splats, at least one: choose a part")
-    if not hints:
-        raise InputError(f"{file} has no hints: say of one part at least what it is")
-    return hints
+    again = 'Hints are JSON as {"hints": [{"kind": "metal", "points": [[0.1, 0.2, 0.3]]}]}: say of one part at least what it is.'
+    found = read_json(file, _Hints, again)
+    return [Hint(part.kind, np.array(part.points, np.float64)) for part in found.hints]
 
 
 def write_hints(file: Path, run: Path, hints: list[Hint]) -> None:

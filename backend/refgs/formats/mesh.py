@@ -2,13 +2,16 @@
 
 import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import trimesh
 
-from refgs.errors import InputError
+from refgs.errors import InputError, reason
+from refgs.formats.ply import check_header
 from refgs.paths import whole
 
+FARTHEST = 1e30  # of a vertex, in world units: squares of single-precision numbers must be finite
 Y_UP = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # rotation from Z up to the Y up of glTF (2.0, 3.4) and OBJ
 
 
@@ -40,8 +43,28 @@ def write_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
 
 def read_mesh(path: str | os.PathLike) -> Mesh:
     """Read a mesh that `write_mesh` wrote. Raises InputError for a broken file."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path} is missing, or is no file: train again")
     try:
+        with open(path, "rb") as file:
+            check_header(file, path)
         mesh = trimesh.load_mesh(path, file_type="ply", process=False)
-        return Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces))
+        mesh = Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces))
+    except InputError:
+        raise
     except Exception as error:  # trimesh raises errors of many types
-        raise InputError(f"{path} is not a whole PLY file of a mesh ({error}): train again") from None
+        raise InputError(f"{path} is not a whole PLY file of a mesh ({reason(error)}): train again") from None
+    check_mesh(path, mesh)
+    return mesh
+
+
+def check_mesh(path: str | os.PathLike, mesh: Mesh) -> None:
+    """Raise InputError, which names the file `path`, if a mesh has no faces, vertices that are not finite, or faces of other vertices."""
+    vertices, faces = mesh.vertices, mesh.faces
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+        raise InputError(f"{path} has no triangles: write it again")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(f"{path} has triangles of vertices that are not there: write it again")
+    if not np.isfinite(vertices).all() or np.abs(vertices).max() > FARTHEST:
+        raise InputError(f"{path} has vertices that are not finite: write it again")

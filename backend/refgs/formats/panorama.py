@@ -39,7 +39,7 @@ def _read_radiance(path: Path) -> np.ndarray:
             check_pixels(path, int(size[2]), int(size[1]))
     try:
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    except cv2.error:  # an empty file
+    except (cv2.error, OSError):  # an empty file; a disk that fails
         pixels = None
     if pixels is None or pixels.dtype != np.float32:
         raise InputError(f"{path}: this is not a Radiance picture that can be read. Download it again.")

@@ -27,7 +27,7 @@ def read_ply(path: str | os.PathLike) -> PlyData:
     path = Path(path)
     try:
         with open(path, "rb") as file:
-            _check_header(file, path)
+            check_header(file, path)
         return PlyData.read(str(path))
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from None
@@ -41,7 +41,7 @@ def write_ply(path: str | os.PathLike, elements: list[PlyElement], comments: lis
         PlyData(elements, byte_order="<", comments=list(comments)).write(str(temporary))
 
 
-def _check_header(file, path: Path) -> None:
+def check_header(file, path: Path) -> None:
     """Check that a PLY file is as long as its header says. Raises InputError if it is not a PLY file, truncated, or too long."""
     header = file.read(LONGEST_HEADER)
     end = _END.search(header)

@@ -12,8 +12,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from refgs.errors import InputError
-
-LARGEST = 64 << 20  # bytes of a text file; Python takes up to 20 times as much memory for what it holds
+from refgs.paths import read_text
 
 Number = Annotated[float, Field(strict=True)]
 """Number, which may be NaN or infinite. Neither text nor a boolean is one."""
@@ -34,7 +33,7 @@ M = TypeVar("M", bound=BaseModel)
 
 def read_json(file: Path, model: type[M], again: str) -> M:
     """Read a JSON file into a model. `again` says what to do about a file that is missing or wrong: it ends the InputError's message."""
-    return validated(parse(json.loads, read_text(file, again), str(file), "JSON", again), model, str(file), again)
+    return validated(parse_json(read_text(file, again), str(file), again), model, str(file), again)
 
 
 def read_toml(file: Path, model: type[M], again: str) -> M:
@@ -44,29 +43,20 @@ def read_toml(file: Path, model: type[M], again: str) -> M:
 
 def read_tables(file: Path, again: str) -> dict[str, Any]:
     """Read a TOML file as nested dicts. Raises InputError, which ends with `again`, if it is missing or no TOML."""
-    return parse(tomllib.loads, read_text(file, again), str(file), "TOML", again)
+    return parse_toml(read_text(file, again), str(file), again)
 
 
-def read_text(file: Path, again: str) -> str:
-    """Read a text file in UTF-8. Raises InputError, which ends with `again`, if it is missing, no file of text, or larger than LARGEST."""
-    try:
-        if file.exists() and not file.is_file():  # a folder; a pipe or device, which may have no end
-            raise InputError(f"{file}: this is not a file. {again}")
-        with file.open("rb") as source:
-            data = source.read(LARGEST + 1)
-        if len(data) > LARGEST:
-            raise InputError(f"{file}: larger than such a file can be. {again}")
-        return data.decode("utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file. {again}") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file}: cannot be read as text, which must be UTF-8 ({error.reason}). {again}") from None
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}). {again}") from None
+def parse_json(text: str, source: str, again: str) -> Any:
+    """Parse JSON. Raises InputError, which begins with the `source` and ends with `again`."""
+    return _parsed(json.loads, text, source, "JSON", again)
 
 
-def parse(loads: Callable[[str], Any], text: str, source: str, kind: str, again: str) -> Any:
-    """Parse text by `loads`. Raises InputError, which names the `source` and the `kind` of text, such as "JSON", and ends with `again`."""
+def parse_toml(text: str, source: str, again: str) -> dict[str, Any]:
+    """Parse TOML as nested dicts. Raises InputError, which begins with the `source` and ends with `again`."""
+    return _parsed(tomllib.loads, text, source, "TOML", again)
+
+
+def _parsed(loads: Callable[[str], Any], text: str, source: str, kind: str, again: str) -> Any:
     try:
         return loads(text)
     except json.JSONDecodeError as error:
@@ -84,22 +74,25 @@ def validated(data: Any, model: type[M], source: str, again: str) -> M:
         return model.model_validate(data)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
-        where, field = _place(first["loc"], data)
+        where, field = _place(first, data)
         raise InputError(f"{', '.join([source, *where])}: {field} {_problem(first)}. {again}") from None
     except RecursionError:
         raise InputError(f"{source}: it is nested too deeply. {again}") from None
 
 
-def _place(location: tuple[str | int, ...], data: Any) -> tuple[list[str], str]:
+def _place(error: Any, data: Any) -> tuple[list[str], str]:
     """Describe where a field is: the frame whose `file_path` is above it, if there is one, and the field's keys joined by dots."""
     where, keys = [], []
-    for part in location:
+    for part in error["loc"]:
+        known = range(len(data)) if isinstance(data, list) else data if isinstance(data, dict) else ()
+        if part in known:
+            data = data[part]
+        elif error["type"] != "missing":  # pydantic's name of a type that was tried
+            break
         keys.append(str(part))
-        known = isinstance(data, dict | list) and (part in data if isinstance(data, dict) else isinstance(part, int))
-        data = data[part] if known else None
         if isinstance(data, dict) and isinstance(data.get("file_path"), str):
             where, keys = [f"frame {data['file_path']}"], []
-    return where, ".".join(keys) or "its content"
+    return where, ".".join(keys)[:200] or "its content"
 
 
 def _problem(error: Any) -> str:

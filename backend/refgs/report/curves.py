@@ -27,7 +27,8 @@ class Quantity(NamedTuple):
     decibels: bool = False
 
     def error(self, value: float) -> float:
-        return 10 ** (-value / 20) if self.decibels else value
+        """Return the error of a measured value, 1e300 at most."""
+        return 10 ** (-max(value, -6000.0) / 20) if self.decibels else value
 
     def text(self, error: float) -> str:
         """Format an error for the report: in decibels if it comes from a PSNR, otherwise as a plain number."""
@@ -64,12 +65,16 @@ def curve(run: str, history: list[dict], quantity: Quantity) -> Curve:
     Lines without this measure are skipped. So are errors and times that are not positive, as they have no logarithm.
     """
     found = [
-        (line.get("iteration", 0), line["seconds"], quantity.error(line[quantity.key]))
+        (_iteration(line), line["seconds"], quantity.error(line[quantity.key]))
         for line in history
         if is_number(line.get(quantity.key)) and line["seconds"] > 0
     ]
     rows = np.array(sorted((row for row in found if row[2] > 0), key=lambda row: row[1]), dtype=float).reshape(-1, 3)
     return Curve(run, quantity, *rows.T)
+
+
+def _iteration(line: dict) -> float:
+    return line["iteration"] if is_number(line.get("iteration")) else 0
 
 
 def front(curves: list[Curve]) -> list[np.ndarray]:

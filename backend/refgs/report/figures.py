@@ -1,6 +1,6 @@
 """Name the metrics of metrics.json, such as PSNR, and format them for the console and the report page."""
 
-import math
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
@@ -70,7 +70,9 @@ DETAILS = [
 
 
 def is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Tell whether a value is a number that a float can hold: finite, and no integer of hundreds of digits."""
+    most = sys.float_info.max
+    return isinstance(value, int | float) and not isinstance(value, bool) and -most <= value <= most
 
 
 def flatten(values: object, prefix: str = "") -> Iterator[tuple[str, float]]:

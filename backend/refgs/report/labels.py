@@ -3,6 +3,8 @@
 from collections import Counter, defaultdict
 from collections.abc import Hashable
 
+from refgs.formats.run_toml import Summary
+
 MOST = 4  # settings that a label names
 BY_NAME = {  # in this order; other settings follow, under their own names
     "run.capture": "{}",
@@ -17,14 +19,14 @@ BY_NAME = {  # in this order; other settings follow, under their own names
 }
 
 
-def labels(names: list[str], facts: list[dict]) -> list[str]:
+def labels(names: list[str], facts: list[Summary]) -> list[str]:
     """Make a unique label for each run from the settings in which the runs differ.
 
-    `facts` are the contents of the runs' run.toml. `names` are their folders' names, which are added where labels are equal or empty. If a
+    `facts` are what the runs' run.toml say. `names` are their folders' names, which are added where labels are equal or empty. If a
     setting differs only because the presets differ, the label has the name of the preset instead. Settings are named without their section,
     unless another section has a setting with the same name.
     """
-    known = [_settings(tables) for tables in facts]
+    known = [_settings(summary) for summary in facts]
     groups = defaultdict(list)
     for settings in known:
         groups[settings.get("run.preset")].append(settings)
@@ -41,20 +43,27 @@ def labels(names: list[str], facts: list[dict]) -> list[str]:
     short = {key: key if last[key.rsplit(".", 1)[-1]] > 1 else key.rsplit(".", 1)[-1] for key in keys}
     found = []
     for name, settings in zip(names, known, strict=True):
-        words = [BY_NAME.get(key, f"{short[key]}={{}}").format(settings[key]) for key in named if key in settings]
+        words = [_words(key, short[key], settings[key]) for key in named if key in settings]
         more = [f"and {len(words) - MOST} more"] if len(words) > MOST else []
         found.append(", ".join(words[:MOST] + more) or name)
     count = Counter(found)
     return [label if count[label] == 1 else f"{label} ({name})" for label, name in zip(found, names, strict=True)]
 
 
-def _settings(tables: dict) -> dict[str, Hashable]:
-    """Collect the values from run.toml by which a label can tell runs apart: {"section.setting": value}."""
-    found = {f"run.{key}": value for key, value in tables.get("run", {}).items() if f"run.{key}" in BY_NAME}
+def _words(key: str, short: str, value: Hashable) -> str:
+    if key not in BY_NAME:
+        return f"{short}={value}"
+    pattern = BY_NAME[key]
+    return pattern.format(value) if isinstance(value, int) or ":" not in pattern else f"{value}"
+
+
+def _settings(summary: Summary) -> dict[str, Hashable]:
+    """Collect the values by which a label can tell runs apart: {"section.setting": value}."""
+    found = {f"run.{key}": value for key, value in summary.run.items() if f"run.{key}" in BY_NAME}
     for name in ("run.capture", "run.preset"):  # only the last part of a path
         if name in found:
             found[name] = str(found[name]).replace("\\", "/").rstrip("/").rsplit("/", 1)[-1]
-    for section, values in tables.get("settings", {}).items():
-        for key, value in values.items() if isinstance(values, dict) else ():
+    for section, values in summary.settings.items():
+        for key, value in values.items():
             found[f"{section}.{key}"] = tuple(value) if isinstance(value, list) else value
     return found

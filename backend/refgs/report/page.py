@@ -14,8 +14,7 @@ It reads these files of a run folder. If a file is missing, its section is left 
 """
 
 import base64
-import json
-import tomllib
+import os
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,8 +27,12 @@ from PIL import Image
 from refgs import __version__
 from refgs.errors import InputError, one_line
 from refgs.formats import history
+from refgs.formats.metrics import Metrics, read_metrics
+from refgs.formats.needs import Needs, Row
 from refgs.formats.pixels import check_pixels
-from refgs.paths import disk_errors_named, make_folders, write_text
+from refgs.formats.run_toml import Summary
+from refgs.formats.validate import parse_toml, read_json, validated
+from refgs.paths import disk_errors_named, make_folders, read_text, write_text
 from refgs.report.charts import PARTS, error_chart, parts_chart
 from refgs.report.curves import QUANTITIES, Curve, as_csv, curve, knee, levels, time_to
 from refgs.report.figures import DETAILS, HEADLINE, RELIT, Quantity, duration, flatten, is_number, relit_pair
@@ -60,11 +63,11 @@ class RunPage:
     label: str
     figures: dict[str, float]
     history: list[dict]
-    left_out: list[dict]
+    left_out: list[Row]
     decisions: list[dict]
     ambiguities: list[str]
     settings: str
-    facts: dict
+    facts: Summary
     trained_on: str
     views: dict[str, dict[str, str]]
     relit: dict[str, dict[str, str]]
@@ -103,6 +106,7 @@ def write_report(runs: list[Path], out: Path) -> None:
         parts_table=_parts_table(parts),
     )
     figures = as_csv({page.label: page.history for page in pages}, groups)
+    html, figures = (text.encode(errors="replace").decode() for text in (html, figures))  # without lone surrogates
     make_folders([out.parent])
     with disk_errors_named([out.parent], "write the report again"):
         for file, text in ((out, html), (out.with_suffix(".csv"), figures)):
@@ -125,24 +129,20 @@ def _read_run(folder: Path) -> RunPage:
 
     def read(file: str, parse, without: str):
         path = folder / file
-        try:
-            return parse(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
+        if not os.path.lexists(path):
             missing.append(f"{file} is not there: {without}")
-        except (OSError, ValueError) as error:  # JSON's, TOML's and Unicode's errors are ValueErrors
+            return None
+        try:
+            return parse(path)
+        except (InputError, OSError, ValueError) as error:
             missing.append(f"{file} cannot be read ({error}): {without}")
-        return None
+            return None
 
-    settings = read("run.toml", str, "its settings are not shown") or ""
-    try:
-        facts = tomllib.loads(settings)
-        trained_on = Path(facts["run"]["capture"]).name
-    except (KeyError, TypeError, tomllib.TOMLDecodeError):
-        facts, trained_on = {}, ""
-    metrics = read("metrics.json", json.loads, "there are no figures") or {}
+    settings, facts = read("run.toml", _settings, "its settings are not shown") or ("", Summary())
+    metrics, known = read("metrics.json", read_metrics, "there are no figures") or ({}, Metrics())
     lines = _history(folder, missing)
-    left_out = read("needs.json", json.loads, "what was left out of this scene is not known")
-    rows = [item for item in left_out if isinstance(item, dict)] if isinstance(left_out, list) else []
+    needs = read("needs.json", _needs, "what was left out of this scene is not known")
+    rows = needs.root if needs else []
     pictures = folder / "pictures"
     name = one_line("/".join(folder.resolve().parts[-2:]).lstrip("/"))
     page = RunPage(
@@ -152,10 +152,10 @@ def _read_run(folder: Path) -> RunPage:
         history=lines,
         left_out=rows,
         decisions=_decisions(folder, rows),
-        ambiguities=_ambiguities(metrics),
+        ambiguities=known.said(),
         settings=settings,
         facts=facts,
-        trained_on=trained_on,
+        trained_on=Path(str(facts.run.get("capture", ""))).name,
         views=_pictures(pictures / "test", PASSES, MOST_VIEWS),
         relit=_pictures(pictures / "relight", RELIT, MOST_RELIT),
         light={kind: _embed(pictures / f"{kind}.png") for kind in ("environment", "environment_truth")},
@@ -170,29 +170,29 @@ def _read_run(folder: Path) -> RunPage:
     return page
 
 
-def _ambiguities(metrics: dict) -> list[str]:
-    """Collect the sentences of metrics.json about what the photos cannot tell apart: changes to the scene, and metal from paint."""
-    found = metrics.get("ambiguities")
-    known = [*(found.values() if isinstance(found, dict) else ()), metrics.get("doubt")]
-    return [facts["what"] for facts in known if isinstance(facts, dict) and "what" in facts]
+def _settings(file: Path) -> tuple[str, Summary]:
+    """Read run.toml: its text, and what it says of the run. Raises InputError if it cannot be read."""
+    again = "Copy the run folder again."
+    text = read_text(file, again)
+    return text, validated(parse_toml(text, str(file), again), Summary, str(file), again)
 
 
-def _decisions(folder: Path, rows: list[dict]) -> list[dict]:
-    """Read the pictures of needs.json's decisions as data URLs, with a line of figures for each decision. Skip broken rows."""
+def _needs(file: Path) -> Needs:
+    return read_json(file, Needs, "Copy the run folder again.")
+
+
+def _decisions(folder: Path, rows: list[Row]) -> list[dict]:
+    """Read the pictures of needs.json's decisions as data URLs, with a line of figures for each decision. Skip rows without pictures."""
     found = []
     for row in rows:
-        shown = row.get("pictures")
-        try:
-            pictures = [
-                (caption, _embed(folder / shown[kind]))
-                for kind, caption in (("on", "with"), ("off", "without"), ("photo", "photo"))
-            ]
-            figures = f"with {shown['psnr_on']:.1f} dB, without {shown['psnr_off']:.1f} dB, of photo {shown['view']}"
-        except (KeyError, TypeError, ValueError):
+        if (shown := row.pictures) is None:
             continue
+        files = ((shown.on, "with"), (shown.off, "without"), (shown.photo, "photo"))
+        pictures = [(caption, _embed(folder / file)) for file, caption in files]
+        figures = f"with {shown.psnr_on:.1f} dB, without {shown.psnr_off:.1f} dB, of photo {shown.view}"
         if all(url for _, url in pictures):
-            answer = "kept" if row.get("needed") else "left out"
-            found.append({"what": f"{row.get('what', '')}: {answer}", "figures": figures, "pictures": pictures})
+            answer = "kept" if row.needed else "left out"
+            found.append({"what": f"{row.what}: {answer}", "figures": figures, "pictures": pictures})
     return found
 
 

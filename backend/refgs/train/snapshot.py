@@ -6,7 +6,9 @@ import numpy as np
 import torch
 
 from refgs.errors import InputError
+from refgs.formats.checkpoint import Facts
 from refgs.formats.mesh import Mesh
+from refgs.formats.validate import validated
 from refgs.geometry.visibility import Occluder
 from refgs.train import checkpoint, coarse, needs, poses
 from refgs.train.state import State, why_not_traced
@@ -46,9 +48,11 @@ def restore(state: State, run: Path) -> None:
 
     Raises `checkpoint.NoCheckpoint` if there is none, and InputError if another release of RefGS wrote it.
     """
-    tensors, facts = checkpoint.load(run / "checkpoints", state.report)
-    state.total = facts["total"]
-    needs.restore(state, facts.get("needs", {}))
+    tensors, tables = checkpoint.load(run / "checkpoints", state.report)
+    facts = validated(tables, Facts, str(run / "checkpoints"), "Train again into a new folder.")
+    _check_tensors(tensors, run)
+    state.total = facts.total
+    needs.restore(state, {name: found.model_dump(exclude_unset=True) for name, found in facts.needs.items()})
     for name in state.constant:  # left out after this checkpoint, where the training goes back to it
         if f"parameter.{name}" in tensors:
             tensors[f"constant.{name}"] = tensors[f"parameter.{name}"][:1]
@@ -62,13 +66,13 @@ def restore(state: State, run: Path) -> None:
         raise InputError(f"{run} was begun by another release of RefGS: train again into a new folder")
     mesh = {name: tensors.pop(name).numpy() for name in list(tensors) if name.startswith("occluder.")}
     tensors = {name: value.to(state.device) for name, value in tensors.items()}
-    state.iteration, state.seconds = facts["iteration"], facts["seconds"]
-    state.clock.resume(facts.get("parts", {}))
-    state.plan.before = facts.get("spent", state.seconds)
-    state.processor_seconds = facts.get("processor_seconds", 0.0)
-    state.initial, state.metals_set = facts.get("initial", state.initial), facts.get("metals_set", True)
-    state.poses_judged = facts.get("poses_judged", True)
-    for about, what in facts.get("decided", {}).items():
+    state.iteration, state.seconds = facts.iteration, facts.seconds
+    state.clock.resume(facts.parts)
+    state.plan.before = state.seconds if facts.spent is None else facts.spent
+    state.processor_seconds = facts.processor_seconds
+    state.initial = state.initial if facts.initial is None else facts.initial
+    state.metals_set, state.poses_judged = facts.metals_set, facts.poses_judged
+    for about, what in facts.decided.items():
         state.announce(about, what)
     state.motion.total, state.motion.views = tensors["motion.total"], tensors["motion.views"]
     state.optimizer.state.clear()
@@ -91,8 +95,27 @@ def restore(state: State, run: Path) -> None:
             state.optimizer.state[value] = moments | {"step": int(moments["step"])}
     state.light_shown = tensors.get("mirrored")
     poses.restore(state, tensors["poses"].cpu() if "poses" in tensors else None)
-    coarse.set_factor(state, facts.get("reduced", 1))
+    coarse.set_factor(state, facts.reduced)
     state.constant = {name: tensors[f"constant.{name}"] for name in state.constant}
     state.occluder = None
     if mesh and not why_not_traced(state):
         state.occluder = Occluder(Mesh(mesh["occluder.vertices"], mesh["occluder.faces"]))
+
+
+def _check_tensors(tensors: dict[str, torch.Tensor], run: Path) -> None:
+    """Raise InputError if tensors of a checkpoint are missing, or do not belong together: they have other rows or types."""
+    fine = {"environment", "motion.total", "motion.views", "parameter.position"} <= tensors.keys()
+    rows = tensors["parameter.position"].shape[:1] if fine else ()
+    for name, value in tensors.items():
+        kind, _, rest = name.partition(".")
+        if kind in ("parameter", "constant", "motion"):
+            fine &= value.shape[:1] == ((1,) if kind == "constant" else rows)
+        if kind in ("parameter", "constant", "environment", "exposure"):
+            fine &= value.dtype == torch.float32
+        if kind == "adam":
+            of, _, moment = rest.rpartition(".")
+            learned = tensors.get(of if of in ("environment", "exposure") else f"parameter.{of}")
+            fine &= all(f"adam.{of}.{each}" in tensors for each in ("step", "exp_avg", "exp_avg_sq"))
+            fine &= learned is not None and (value.numel() == 1 if moment == "step" else value.shape == learned.shape)
+    if not fine:
+        raise InputError(f"{run / 'checkpoints'}: the tensors of the checkpoint do not belong together: train again")

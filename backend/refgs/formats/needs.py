@@ -1,0 +1,58 @@
+"""Describe needs.json: the optional parts of a training that a scene needed, and those that were left out (docs/run-folder.md)."""
+
+from pathlib import PurePosixPath
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, ConfigDict, RootModel, ValidationError, field_validator
+
+from refgs.formats.validate import Finite, Model
+
+
+def _inside(path: str) -> str:
+    parts = PurePosixPath(path).parts
+    if not parts or parts[0] == "/" or ".." in parts or any(sign in path for sign in ":\\\0"):
+        raise ValueError("is not a path in the run folder")
+    return path
+
+
+Inside = Annotated[str, AfterValidator(_inside)]
+"""Path of a file in the run folder, relative to it, with forward slashes. No file elsewhere can be named: a page may show its content."""
+
+
+class Pictures(Model):
+    """Name the pictures of both answers, files in the run folder, and the photo beside them. PSNRs are in dB."""
+
+    on: Inside
+    off: Inside
+    photo: Inside
+    view: str
+    psnr_on: Finite
+    psnr_off: Finite
+
+
+class Row(Model):
+    """Hold one part, `why` it was kept or left out, and in words what leaving it out saved and cost."""
+
+    model_config = ConfigDict(extra="allow")  # the figures behind the words
+
+    what: str
+    why: str
+    needed: bool = False
+    saved: str = ""
+    cost: str = ""
+    pictures: Pictures | None = None
+
+    @field_validator("pictures", mode="wrap")
+    @classmethod
+    def _whole(cls, value: Any, handler: Any) -> Pictures | None:
+        """Leave out pictures that are not whole: a row is of use without them."""
+        try:
+            return handler(value)
+        except ValidationError:
+            return None
+
+
+class Needs(RootModel[list[Row]]):
+    """Hold a needs.json."""
+
+    model_config = ConfigDict(frozen=True)

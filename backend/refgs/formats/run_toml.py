@@ -1,0 +1,54 @@
+"""Describe run.toml: how a run was trained (docs/run-folder.md)."""
+
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from refgs.formats.validate import Finite, Model, Vector
+
+Release = Annotated[str, Field(pattern=r"^[0-9]{1,9}\.[0-9]{1,9}(\..*)?$")]
+Value = bool | int | float | str
+
+
+class Maker(Model):
+    """Hold the release of RefGS that made a run."""
+
+    refgs: Release
+
+
+class Made(Model):
+    """Hold what is read first of run.toml: a newer release may have written the rest differently."""
+
+    run: Maker
+
+
+class Trained(Maker):
+    """Hold what a run was trained on. `centre` and `radius` are its region of interest, in the run's frame."""
+
+    capture: str
+    fingerprint: str
+    preset: str
+    centre: Vector
+    radius: Annotated[Finite, Field(gt=0)]
+    bounded: bool
+
+
+class Change(Model):
+    """Hold a changed setting: the value that the user asked for."""
+
+    asked: Any
+
+
+class RunFile(Model):
+    """Hold a run.toml. The settings are checked by `refgs.settings`."""
+
+    run: Trained
+    settings: dict[str, Any]
+    changed: dict[str, Change] = Field(default_factory=dict)
+
+
+class Summary(Model):
+    """Hold what the report page shows of a run.toml, by which runs are told apart: values of any release."""
+
+    run: dict[str, Value] = Field(default_factory=dict)
+    settings: dict[str, dict[str, Value | list[Value]]] = Field(default_factory=dict)

@@ -1,0 +1,19 @@
+"""Read JSON files that other programs wrote."""
+
+import json
+from pathlib import Path
+
+from .errors import InputError
+
+
+def read_json(path: Path) -> dict | list:
+    """Read a JSON file that holds a dictionary or a list. Raises InputError if it is missing, broken or holds something else."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    except (ValueError, RecursionError):  # the latter if it is nested too deeply
+        found = None
+    if not isinstance(found, dict | list):
+        raise InputError(f"{path} is no whole JSON file: copy or write it again")
+    return found
