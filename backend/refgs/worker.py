@@ -340,5 +340,7 @@ def work() -> None:
     worker = Worker(events)
     for kind in (signal.SIGTERM, signal.SIGINT):
         signal.signal(kind, worker.interrupt)
-    threading.Thread(target=worker.listen, args=(sys.stdin.buffer,), daemon=True).start()
+    # Unbuffered: a buffer is locked while the thread waits for input, and Python, ending, would wait for the lock.
+    commands = open(0, "rb", buffering=0, closefd=False)
+    threading.Thread(target=worker.listen, args=(commands,), daemon=True).start()
     worker.run()

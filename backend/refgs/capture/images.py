@@ -19,7 +19,7 @@ from refgs.camera import Camera
 from refgs.capture import raw
 from refgs.capture.reduce import encode, reduced
 from refgs.capture.types import View
-from refgs.errors import InputError
+from refgs.errors import InputError, reason
 from refgs.formats.exr import read_exr, read_exr_header
 from refgs.formats.pixels import check_pixels
 from refgs.memory import is_shortage
@@ -273,7 +273,7 @@ def _open(path: Path) -> Image.Image:
     except Exception as error:
         if is_shortage(error):
             raise
-        raise InputError(f"{path}: this is not an image that can be read ({_reason(error)}). Replace it.") from error
+        raise InputError(f"{path}: this is not an image that can be read ({reason(error)}). Replace it.") from error
     check_pixels(path, *picture.size)
     return picture
 
@@ -305,7 +305,7 @@ def _decode(picture: Image.Image, path: Path) -> Image.Image:
     except Exception as error:
         if is_shortage(error):
             raise
-        raise InputError(f"{path}: the image is truncated or broken ({_reason(error)}). Replace it.") from error
+        raise InputError(f"{path}: the image is truncated or broken ({reason(error)}). Replace it.") from error
 
 
 def _as_array(picture: Image.Image) -> np.ndarray:
@@ -331,10 +331,6 @@ def _decode_16_bit(picture: Image.Image, path: Path) -> np.ndarray | None:
         return None
     channels = {2: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGBA}
     return cv2.cvtColor(pixels, channels[pixels.ndim if pixels.ndim == 2 else pixels.shape[2]])
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())[:120] or type(error).__name__
 
 
 def _as_bytes(codes: np.ndarray, white: int) -> np.ndarray:
