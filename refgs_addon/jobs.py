@@ -214,12 +214,8 @@ class Job:
             self.state, self.line = "cancelled", "Stopped"
         elif not self.ended:
             # Linux kills the largest program when memory is full.
-            why = (
-                "killed, perhaps as memory was full: use smaller photos or fewer splats"
-                if status == -9
-                else "see its log"
-            )
-            self._fail(f"{self.program} ended unexpectedly (status {status}): {why}")
+            killed = "killed, perhaps as memory was full; " if status == -9 else ""
+            self._fail(f"{self.program} ended unexpectedly (status {status}): {killed}see its log")
 
     def stop(self) -> None:
         """Stop the job cleanly. A training stops after its current iteration and writes a checkpoint."""

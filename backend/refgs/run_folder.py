@@ -94,7 +94,7 @@ def check_asked(folder: Path, preset: str | None, minutes: float | None, changes
     another = "choose another folder with --out, or ask for the same"
     if preset is None and minutes is not None:
         if facts.preset != (asked := f"{minutes:g} minutes"):
-            raise InputError(f"{folder} was trained by {facts['preset']}, not for {asked}: {another}")
+            raise InputError(f"{folder} was trained by {facts.preset}, not for {asked}: {another}")
         return  # its settings were chosen
     tables = settings.model_dump(mode="json")
     changed = read_tables(folder / "run.toml", "Train again.").get("changed", {})

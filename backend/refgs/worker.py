@@ -1,11 +1,11 @@
 """Speak the job protocol (docs/job-protocol.md): read commands on stdin, write events to stdout, one JSON object a line."""
 
 import _thread
+import io
 import json
 import os
 import queue
 import signal
-import sys
 import threading
 import traceback
 from collections.abc import Callable
@@ -341,6 +341,6 @@ def work() -> None:
     for kind in (signal.SIGTERM, signal.SIGINT):
         signal.signal(kind, worker.interrupt)
     # Unbuffered: a buffer is locked while the thread waits for input, and Python, ending, would wait for the lock.
-    commands = open(0, "rb", buffering=0, closefd=False)
+    commands = io.FileIO(0, closefd=False)
     threading.Thread(target=worker.listen, args=(commands,), daemon=True).start()
     worker.run()

@@ -7,7 +7,7 @@ import json
 import tempfile
 from collections.abc import Callable
 from functools import cache
-from io import StringIO
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -374,7 +374,8 @@ READERS: dict[str, Reader] = {
        for name, kind in {"run.toml": "toml", "cameras.json": "json", "splats.ply": "bytes", "occluder.ply": "bytes",
                           "environment.exr": "bytes"}.items()},
     **{f"{name}, reported": _reported(name, kind)
-       for name, kind in {"run.toml": "toml", "metrics.json": "json", "needs.json": "json", "history.jsonl": "lines"}.items()},
+       for name, kind in {"run.toml": "toml", "metrics.json": "json", "needs.json": "json", "history.jsonl": "lines",
+                          "needs/on.png": "bytes", "pictures/test/color/a.png": "bytes"}.items()},
     "a checkpoint's facts": Reader(
         _checkpoint, "run/checkpoints/00000004.toml", "toml", lambda f: snapshot.restore(_training().state, f / "run"), 0.1
     ),
@@ -390,6 +391,6 @@ READERS: dict[str, Reader] = {
     ),
     "commands of a worker": Reader(
         lambda f: (f / "commands").write_text("".join(json.dumps(line) + "\n" for line in COMMANDS)), "commands", "lines",
-        lambda f: Worker(StringIO()).listen(StringIO(_stream(f / "commands"))),
+        lambda f: Worker(StringIO()).listen(BytesIO(_stream(f / "commands").encode(errors="surrogateescape"))),
     ),
 }  # fmt: skip

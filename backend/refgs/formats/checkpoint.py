@@ -20,8 +20,8 @@ class Decision(Model):
     seconds: Finite = 0.0
     megabytes: Finite = 0.0
     decibels: Finite = 0.0
-    side: Count = 0
-    total: Count = 0
+    side: Annotated[Finite, Field(ge=0)] = 0.0
+    total: Annotated[Finite, Field(ge=0)] = 0.0
 
 
 class Facts(Model):
