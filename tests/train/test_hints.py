@@ -15,7 +15,7 @@ from refgs.run_folder import read_run_facts
 from refgs.train import checkpoint, metals, needs
 from refgs.train.asset import write_asset
 from refgs.train.densify import densify
-from refgs.train.hints import AGAIN, continue_with_hints, hinted_kinds
+from refgs.train.hints import AGAIN, AT_MOST, continue_with_hints, hinted_kinds
 from refgs.train.measures import held_out_psnr
 from tests.makers.training import TINY, put, trained, trainer
 
@@ -162,6 +162,17 @@ def test_a_time_shortens_what_is_repeated(plastic, ball_capture, tmp_path):
     )
     first, whole = total[0]
     assert abs(first / whole - AGAIN) < 0.1
+
+
+def test_what_would_take_too_long_is_shortened(ball_capture, tmp_path):
+    """Check that a time is set where none is asked for, and that the run's own seconds do not count for it."""
+    made = trained(ball_capture, tmp_path / "slow", *TINY, total=12)
+    made.state.seconds = 600.0
+    made.save()
+    again = trainer(ball_capture, tmp_path / "again", *TINY, total=12)
+    continue_with_hints(again.state, made.state.folder, of_splats(made.state.folder))
+    assert again.state.plan.minutes == AT_MOST and again.state.plan.spent < 60
+    assert again.state.total - again.state.iteration == pytest.approx(60 * AT_MOST / (600 / 12), abs=2)
 
 
 def test_what_cannot_be_continued(plastic, ball_capture, tmp_path):

@@ -19,6 +19,7 @@ from refgs.train.start import start_appearance
 from refgs.train.state import State
 
 AGAIN = 0.4  # part of the training from which it is repeated: surfels lie on the surface, light and materials still learn fast
+AT_MOST = 1.8  # minutes, unless another time is asked for: an artist who clicks on a part waits, two minutes with the start of the program
 # Hinted metals start as what is hard to tell from paint: bright and smooth.
 MIRROR = {"albedo": 0.8, "roughness": 0.1}
 
@@ -60,16 +61,20 @@ def hinted_kinds(state: State, splats: np.ndarray, hints: list[Hint]) -> torch.T
 
 
 def _go_back(state: State) -> None:
-    """Set the iteration back to AGAIN of the training, or to where the rest takes the time that is given. Start its clocks anew."""
-    count = (1 - AGAIN) * state.total
-    if state.plan.minutes is not None:
-        pace = state.seconds / max(state.iteration, 1)
-        count = (60 * state.plan.minutes - state.plan.spent) / max(pace, 1e-9)
+    """Set the iteration back to AGAIN of the training, or to where the rest takes the time that is given. Start its clocks anew.
+
+    If no time is given and the rest would take longer than AT_MOST, that is the time.
+    """
+    count, pace, plan = (1 - AGAIN) * state.total, state.seconds / max(state.iteration, 1), state.plan
+    state.seconds = state.processor_seconds = plan.before = 0.0
+    state.clock.resume({})
+    if plan.minutes is None and count * pace > 60 * AT_MOST - plan.spent:
+        plan.minutes = AT_MOST
+    if plan.minutes is not None:
+        count = (60 * plan.minutes - plan.spent) / max(pace, 1e-9)
     count = max(round(count), 1)
     state.iteration = round(count * AGAIN / (1 - AGAIN))
     state.total = state.iteration + count
-    state.seconds = state.processor_seconds = state.plan.before = 0.0
-    state.clock.resume({})
 
 
 @torch.no_grad()
