@@ -131,19 +131,11 @@ def test_a_damaged_checkpoint_and_history_cost_a_line_each(ball_capture, whole, 
     check_same(run, whole)
 
 
-def command(capture, run, resume):
-    """Run `refgs train` as the command line does, in a process of its own."""
-    sys.argv = ["refgs", "train", str(capture), "--out", str(run)]
-    if resume:
-        sys.argv += ["--resume"]
-    else:
-        sys.argv += [
-            "--preset",
-            "quick",
-            "--device",
-            "cpu",
-            *(word for change in CHANGES for word in ("--set", change)),
-        ]
+def command(capture, run):
+    """Run `refgs train --once` as the command line does, in a process of its own."""
+    changes = [word for change in CHANGES for word in ("--set", change)]
+    sys.argv = ["refgs", "train", str(capture), "--out", str(run), "--once", "--preset", "quick", "--device", "cpu"]
+    sys.argv += changes
     with open(run.with_suffix(".said"), "a") as said:
         os.dup2(said.fileno(), 1)
         os.dup2(said.fileno(), 2)
@@ -173,7 +165,7 @@ def test_killed_at_random_moments_it_ends_the_same(ball_capture, whole, tmp_path
     found = Counter()
     while killed < kills or run.exists():
         begun = time.monotonic()
-        process = context.Process(target=command, args=(ball_capture, run, (run / "run.toml").exists()))
+        process = context.Process(target=command, args=(ball_capture, run))
         process.start()
         process.join(moments.uniform(0, longest) if longest and killed < kills else None)
         if process.exitcode is None:
