@@ -104,7 +104,7 @@ def test_stopped_resumed_killed_and_added_to(shelf, ball_capture):
 
 
 def test_a_batch_whose_process_is_killed_leaves_no_command(shelf):
-    """Kill a batch. Check that its commands end, a training with a checkpoint. Ray's own processes end within about a minute."""
+    """Kill a batch. Check that its commands end: Ray kills them. Ray's own processes end within about a minute."""
     out = shelf / "runs"
     process = batch(shelf / "list.toml", out)
     until(process, (out / "ball" / "progress.json").exists)
@@ -113,7 +113,6 @@ def test_a_batch_whose_process_is_killed_leaves_no_command(shelf):
     while processes.commands("refgs.cli", str(out)):
         assert time.monotonic() < end
         time.sleep(0.1)
-    assert list((out / "ball" / "checkpoints").glob("*.toml"))
 
 
 @pytest.mark.parametrize(
