@@ -10,7 +10,7 @@ from refgs import __version__
 from refgs.errors import InputError
 from refgs.formats.metrics import read_metrics
 from refgs.formats.run_toml import Made, RunFile, Trained
-from refgs.formats.validate import read_tables, validated
+from refgs.formats.validate import read_tables, read_toml, validated
 from refgs.lock import LOCK, PROGRESS, STOP
 from refgs.paths import check_unicode, command_line, is_leftover, write_text
 from refgs.settings import Settings, load_settings, recorded_settings
@@ -97,10 +97,9 @@ def check_asked(folder: Path, preset: str | None, minutes: float | None, changes
             raise InputError(f"{folder} was trained by {facts.preset}, not for {asked}: {another}")
         return  # its settings were chosen
     tables = settings.model_dump(mode="json")
-    changed = read_tables(folder / "run.toml", "Train again.").get("changed", {})
-    for key, row in changed.items():
+    for key, row in read_toml(folder / "run.toml", RunFile, "Train again.").changed.items():
         section, name = key.split(".")
-        tables[section][name] = row["asked"]
+        tables[section][name] = row.asked
     wanted = load_settings(preset or "standard", changes).model_dump(mode="json")
     for section, table in wanted.items():
         for name, value in table.items():

@@ -102,12 +102,10 @@ def train(
         with _card_memory():
             if resume:
                 trainer = _resume(capture, settings, out, plan, device, report)
+            elif hinted is not None:
+                trainer = _start_hinted(capture, settings, facts.preset, hinted.run, hints, out, plan, device, report)
             else:
-                if hinted is not None:
-                    how = facts.preset, hinted.run, hints, out, plan, device, report
-                    trainer = _start_hinted(capture, settings, *how)
-                else:
-                    trainer = _start(capture, settings, preset, changes, masked, out, plan, device, report)
+                trainer = _start(capture, settings, preset, changes, masked, out, plan, device, report)
             held.enter_context(disk_errors_named([out], "resume with --resume"))
             state = trainer.state
             trainer.run(lambda: attend(state) or lock.attend(state.iteration, state.total, state.seconds))

@@ -202,20 +202,20 @@ def test_colmap_focal_length_nan(tmp_path):
     refused(lambda: read_capture(colmap(tmp_path, True, model)), "0000.png", "focal length")
 
 
-def test_colmap_pose_nan(tmp_path):
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("1 nan 0 0 0 1 2 3 7 0000.png", ("0000.png", "NaN")),
+        ("1 1 0 0 0 7 0000.png", ("images.txt", "truncated or not COLMAP's")),
+    ],
+    ids=["NaN", "numbers missing"],
+)
+def test_colmap_pose(tmp_path, line, says):
     file = colmap(tmp_path, binary=False) / "sparse" / "0" / "images.txt"
     lines = file.read_text().splitlines()
-    lines[2] = "1 nan 0 0 0 1 2 3 7 0000.png"
+    lines[2] = line
     file.write_text("\n".join(lines))
-    refused(lambda: read_capture(tmp_path), "0000.png", "NaN")
-
-
-def test_colmap_pose_with_numbers_missing(tmp_path):
-    file = colmap(tmp_path, binary=False) / "sparse" / "0" / "images.txt"
-    lines = file.read_text().splitlines()
-    lines[2] = "1 1 0 0 0 7 0000.png"
-    file.write_text("\n".join(lines))
-    refused(lambda: read_capture(tmp_path), "images.txt", "truncated or not COLMAP's")
+    refused(lambda: read_capture(tmp_path), *says)
 
 
 def test_points_without_coordinates(tmp_path):

@@ -4,8 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -13,6 +11,7 @@ from refgs.errors import InputError
 from refgs.kernels import load
 from refgs.kernels.build import TARGETS, build, target
 from tests.makers.layouts import asserted
+from tests.makers.processes import commands
 from tests.makers.waiting import until
 
 # A usual test run compiles only the widest instruction set of each platform; each takes 20 seconds on one core.
@@ -52,17 +51,6 @@ print(build.build(build.target("linux", "x86_64", "sse4"), build.cache_folder())
     assert names[0] == names[1] and [str(p) for p in tmp_path.iterdir()] == names[:1]
 
 
-def compilers(folder) -> set[str]:
-    """Return the ids of the running processes whose command names a folder."""
-    commands = {file.parent.name: file for file in Path("/proc").glob("[0-9]*/cmdline")}
-    found = set()
-    for number, file in commands.items():
-        with suppress(OSError):  # it has ended
-            if os.fsencode(folder) in file.read_bytes():
-                found.add(number)
-    return found
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGINT])
 def test_a_build_that_is_killed(tmp_path, kind):
@@ -75,9 +63,9 @@ build.build(build.target("linux", "x86_64", "sse4"), build.cache_folder())
 """
     command, environment = [sys.executable, "-c", program], os.environ | {"REFGS_CACHE": str(tmp_path)}
     with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as builder:
-        until(lambda: compilers(tmp_path), 100)
+        until(lambda: commands(str(tmp_path)), 100)
         builder.send_signal(kind)
-    until(lambda: not compilers(tmp_path), 100)
+    until(lambda: not commands(str(tmp_path)), 100)
     subprocess.run([*command, "stack.cpp"], env=environment, check=True)
     assert {file.suffix for file in tmp_path.iterdir()} == {".so"}  # two, if the signal came just too late
 

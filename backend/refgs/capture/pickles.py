@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from refgs.errors import InputError
+from refgs.errors import InputError, reason
 
 LARGEST = 1 << 20  # bytes; a camera takes a few hundred, a split a few thousand
 KINDS = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
@@ -33,8 +33,7 @@ def read_pair(file: Path) -> tuple[np.ndarray | list[int | str], np.ndarray | li
     except _Refused as error:
         raise InputError(f"{file}: holds {error}, not only arrays, so it was not opened. Do not trust it.") from None
     except Exception as error:
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise InputError(f"{file}: not a pickle of arrays ({reason}). Download the data set again.") from error
+        raise InputError(f"{file}: not a pickle of arrays ({reason(error)}). Download the data set again.") from error
 
 
 class _Refused(Exception):
