@@ -2,7 +2,7 @@
 
 import ctypes
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -30,6 +30,7 @@ def visual_hull_points(
     resolution: int = 96,
     seed: int = 0,
     on_hull: int | None = None,
+    carve: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Spread `count` points on the visual hull of an object: the largest shape that fits into all masks.
 
@@ -41,7 +42,8 @@ def visual_hull_points(
 
     `alphas` are the masks (H, W), one for each camera, floats in 0..1 or uint8. The hull is carved twice, on a grid of
     `resolution`³ voxels: first in the cube of half-side `radius` about `centre`, then in the bounding box of the result. A view is left
-    out, with a warning, if its mask is empty or contradicts all other masks. Raises InputError if no hull is left.
+    out, with a warning, if its mask is empty or contradicts all other masks. `carve` may remove more: it is given the alphas of the voxels,
+    the corner of the first one, and the voxels' size, and returns how much of each is left. Raises InputError if no hull is left.
     """
     masks, views = [], []
     for alpha, camera in zip(alphas, cameras, strict=True):
@@ -79,6 +81,9 @@ def visual_hull_points(
     voxel = (high - low) / resolution
     low, high = low + (found.min(0) - 1) * voxel, low + (found.max(0) + 2) * voxel
     smallest, _, _ = _carve(masks, views, low, high, resolution)
+    voxel = (high - low) / resolution
+    if carve is not None:
+        smallest *= carve(smallest, low, voxel)
 
     # Pad with empty voxels, which close the hull where the cube cuts it.
     field = gaussian_filter(np.pad(smallest, 3), 0.8)
@@ -86,7 +91,6 @@ def visual_hull_points(
         raise InputError(
             f"the visual hull is thinner than {float(voxel.max()):.3g} world units: check the poses and the masks"
         )
-    voxel = (high - low) / resolution
     vertices, faces, _, _ = marching_cubes(field, 0.5)
     rng = np.random.default_rng(seed)
     on_hull = count if on_hull is None else on_hull

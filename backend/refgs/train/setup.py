@@ -31,6 +31,9 @@ def set_up(capture: Capture, effective: Effective, folder: Path, report: Report,
     with state.clock.part("start"):
         start, on_hull, source = start_parameters(capture, state.views, state.settings)
     _choose_light_frame(state, start, on_hull)
+    if state.from_hull and state.method.lit and state.settings.light.frame == "world":
+        with state.clock.part("start"):
+            start, on_hull, source = start_parameters(capture, state.views, state.settings, hollows=True)
     state.parameters = {name: value.detach().to(state.device).requires_grad_() for name, value in start.items()}
     report("stage", {"what": source})
     _start_learning(state)

@@ -1,13 +1,16 @@
 """Place the first surfels on the visual hull, on structure-from-motion points, or at random."""
 
 import math
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from refgs.capture import Box, Capture, LoadedView
 from refgs.errors import InputError
+from refgs.geometry.hollows import carve_hollows
 from refgs.geometry.hull import visual_hull_points
+from refgs.geometry.stereo import Photo
 from refgs.model.surfels import Parameters, initial_parameters
 from refgs.render.baselines import axes_of
 from refgs.settings import Settings, SurfelSettings
@@ -17,20 +20,23 @@ FAINT = 0.1  # opacity at the most, of points that may not lie on the surface
 AROUND = 0.5  # part of the surfels, at the most, that lie outside the region
 
 
-def start_parameters(capture: Capture, views: list[LoadedView], settings: Settings) -> tuple[Parameters, int, str]:
+def start_parameters(
+    capture: Capture, views: list[LoadedView], settings: Settings, hollows: bool = False
+) -> tuple[Parameters, int, str]:
     """Make the initial parameters of the surfels.
 
     Returns the parameters, the number of surfels on the visual hull, and a message for the user that says where the surfels start.
 
     If all photos have masks, most surfels start on the visual hull of the masks. Their rows come first in the parameters. The other surfels
-    start inside the hull, because masks do not show hollows. If any photo has no mask, surfels start at structure-from-motion points or at
-    random positions. The returned number then has no meaning.
+    start inside the hull, because masks do not show hollows. With `hollows`, the hull is first carved where photos see through it. That
+    needs a light that stands still (see `hollows.carve_hollows`). If any photo has no mask, surfels start at structure-from-motion points
+    or at random positions. The returned number then has no meaning.
     """
     count, seed = min(settings.surfels.start, settings.surfels.budget), settings.train.seed
     colours, opacity, shown = None, settings.surfels.opacity, count
     if all(view.alpha is not None for view in views):
-        positions, normals, spacing, shown = _hull_points(capture, views, count, settings)
-        source = "the visual hull of the masks"
+        positions, normals, spacing, shown = _hull_points(capture, views, count, settings, hollows)
+        source = "the visual hull of the masks" + (", less what photos see through" if hollows else "")
     else:
         opacity = min(opacity, FAINT)
         if _has_points(capture):
@@ -66,7 +72,7 @@ def _initial(positions, normals, spacing, colours, surfels: SurfelSettings, opac
     )
 
 
-def _hull_points(capture: Capture, views: list[LoadedView], count: int, settings: Settings):
+def _hull_points(capture: Capture, views: list[LoadedView], count: int, settings: Settings, hollows: bool):
     """Place `count` points: most on the visual hull of the masks, the others inside it.
 
     Returns positions, normals, the spacing of the points, and how many are on the hull. These come first.
@@ -74,11 +80,13 @@ def _hull_points(capture: Capture, views: list[LoadedView], count: int, settings
     alphas, cameras = [view.alpha for view in views], [view.camera for view in views]
     surfels, seed = settings.surfels, settings.train.seed
 
+    photos = [Photo(view.image, view.alpha, view.camera, view.white) for view in views]
+    carve = partial(carve_hollows, photos=photos) if hollows else None
+
     def within(radius: float) -> tuple:
         shown = max(1, count - round(surfels.inside * count))
-        found = visual_hull_points(
-            alphas, cameras, capture.centre, radius, count, resolution=surfels.hull, seed=seed, on_hull=shown
-        )
+        grid = {"resolution": surfels.hull, "seed": seed, "on_hull": shown, "carve": carve}
+        found = visual_hull_points(alphas, cameras, capture.centre, radius, count, **grid)
         return *found, np.arange(count) < shown
 
     if capture.box is None:

@@ -1,0 +1,49 @@
+"""Tell where masks show an object's surface, by how long the rays at its outlines touch the visual hull.
+
+A ray through a photo's outline touches the object somewhere. Where it touches the hull only near one point, the surface is there. Where it
+runs along the hull, as over a bowl's lid or along a flat face, the surface may be anywhere below.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from skimage.measure import find_contours
+
+from refgs.camera import Camera
+from refgs.geometry.stereo import Shape, rays_of
+
+STEP = 0.5  # voxels, along a ray
+ACROSS = 200  # pixels across the object, in the reduced masks
+
+
+def contact(shape: Shape, alphas: Sequence[np.ndarray], cameras: Sequence[Camera]) -> np.ndarray:
+    """Measure for each voxel half of the length for which a ray at an outline touches the shape there, the least of all rays.
+
+    Returns (X, Y, Z) in world units, infinite where no such ray passes.
+    """
+    centre, radius = shape.ball
+    step = STEP * float(shape.voxel.min())
+    along = np.arange(-radius, radius, step)
+    least = np.full(shape.solid.shape, np.inf, np.float32)
+    for alpha, full in zip(alphas, cameras, strict=True):
+        distance = float(np.linalg.norm(full.position - centre))
+        side = ACROSS * max(full.width, full.height) * distance / (2 * radius * full.fx)
+        camera = full.fitted(max(round(side), 16))
+        small = cv2.resize(alpha, (camera.width, camera.height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        outlines = find_contours(np.pad(small, 1), 0.5)  # a mask may be cut by the picture's border
+        if not outlines:
+            continue
+        rays = rays_of(camera, *np.concatenate(outlines).T - 1)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        middle = (centre - camera.position) @ rays.T
+        points = camera.position + rays[:, None] * (middle[:, None] + along)[..., None]
+        at = np.floor((points - shape.low) / shape.voxel).astype(np.int32)
+        touched = ((at >= 0) & (at < shape.solid.shape)).all(axis=-1)
+        at = at[touched]
+        ray = np.broadcast_to(np.arange(len(rays))[:, None], touched.shape)[touched]
+        in_shape = shape.solid[tuple(at.T)]
+        at, ray = at[in_shape], ray[in_shape]
+        length = step / 2 * np.bincount(ray, minlength=len(rays))
+        np.minimum.at(least, tuple(at.T), length[ray].astype(np.float32))
+    return least
