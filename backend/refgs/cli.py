@@ -6,8 +6,9 @@ import sys
 import threading
 import traceback
 import warnings
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -288,15 +289,20 @@ def main() -> None:
         with shortage_named(), disk_errors_named([], "run the command again"):
             app(standalone_mode=True)
     except InputError as error:
-        print(f"refgs: {one_line(error)}", file=sys.stderr)
-        sys.exit(TRY_AGAIN if isinstance(error, TryAgain) else 2)
+        _end(TRY_AGAIN if isinstance(error, TryAgain) else 2, f"refgs: {one_line(error)}\n")
     except KeyboardInterrupt:
-        print("refgs: interrupted", file=sys.stderr)
-        sys.exit(130)
+        _end(130, "refgs: interrupted\n")
     except Exception as error:
-        traceback.print_exc()
-        print(f"refgs: a fault of ours: {type(error).__name__}: {one_line(error)}", file=sys.stderr)
-        sys.exit(1)
+        what = f"refgs: a fault of ours: {type(error).__name__}: {one_line(error)}\n"
+        _end(1, traceback.format_exc() + what)
+
+
+def _end(status: int, said: str) -> NoReturn:
+    """Print to the standard error, and exit. What cannot be printed, for the disk of a log is full, does not change the status."""
+    with suppress(OSError):
+        sys.stderr.write(said)
+        sys.stderr.flush()
+    sys.exit(status)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from refgs.paths import write_text
+from refgs.errors import TryAgain
+from refgs.paths import disk_errors_named, write_text
 
 PATIENCE = 15.0  # seconds for a command to end after its input was closed
 FAILED = (1, 2)  # exit statuses after which a retry is useless
@@ -68,10 +69,25 @@ def run_step(step: Step, cores: int, pause: float, optional: tuple[bool, ...], *
     """Run a step and record its outcome beside its log. A step that follows a failed one is not run.
 
     `cores` is the number of threads. `before` are the outcomes of the steps that it follows, and `optional` says which of these may fail.
-    If the command says that it may succeed later, or if it was killed, wait `pause` seconds and raise TryLater.
+    If the command says that it may succeed later, if it was killed, or if the log or the record cannot be written, wait `pause` seconds and
+    raise TryLater.
     """
     if any(outcome.status != 0 and not may_fail for outcome, may_fail in zip(before, optional, strict=True)):
         return Outcome(None)
+    try:
+        with disk_errors_named([], "run the batch again"):
+            outcome = _run_and_record(step, cores)
+    except TryAgain as error:
+        time.sleep(pause)
+        raise TryLater(str(error)) from None
+    if outcome.status and outcome.status not in FAILED:
+        time.sleep(pause)
+        raise TryLater(outcome.what)
+    return outcome
+
+
+def _run_and_record(step: Step, cores: int) -> Outcome:
+    """Run the command of a step. Record its outcome, unless a retry may change it."""
     begun, node = time.time(), platform.node()
     step.log.parent.mkdir(parents=True, exist_ok=True)
     step.running.touch()
@@ -80,13 +96,10 @@ def run_step(step: Step, cores: int, pause: float, optional: tuple[bool, ...], *
             status, printed = _call(step, cores, log)
     finally:
         step.running.unlink(missing_ok=True)
-    what = "" if status == 0 else _line(printed, status)
-    outcome = Outcome(status, time.time() - begun, node, what)
-    if status and status not in FAILED:
-        time.sleep(pause)
-        raise TryLater(what)
-    facts = outcome._asdict() | {"words": step.words}
-    write_text(step.log.with_suffix(".json"), json.dumps(facts, indent=1))
+    outcome = Outcome(status, time.time() - begun, node, "" if status == 0 else _line(printed, status))
+    if status in (0, *FAILED):
+        facts = outcome._asdict() | {"words": step.words}
+        write_text(step.log.with_suffix(".json"), json.dumps(facts, indent=1))
     return outcome
 
 
