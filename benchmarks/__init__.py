@@ -15,5 +15,6 @@ BENCHMARKS = (
     "minutes",
     "look",
     "gpu",
+    "farm",
     "page",
 )
