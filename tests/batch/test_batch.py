@@ -4,8 +4,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
 import time
 import tomllib
 
@@ -16,44 +14,13 @@ from refgs.batch import engine
 from refgs.errors import InputError
 from refgs.paths import ROOT
 from tests.makers import processes
+from tests.makers.batches import MADE, PATIENCE, batch, ended, until
 from tests.makers.training import TINY
 
 pytest.importorskip("ray")
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self"), reason="needs /proc")
 CHANGES = [*TINY, "environment.resolution=16", "train.iterations=3000", "indirect.start=0.9"]
 CHANGES += ["mesh.resolution=32", "mesh.triangles=500", "mesh.texture=64"]
-PATIENCE = 240.0  # seconds
-MADE = ("splats.ply", "environment.exr", "mesh.glb", "cameras.json")
-
-
-def batch(source, out, *words) -> subprocess.Popen:
-    command = [sys.executable, "-m", "refgs.cli", "batch", source, "--out", out, "--device", "cpu", *words]
-    return subprocess.Popen(
-        list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
-    )
-
-
-def until(process, condition):
-    """Wait until `condition()` is true and return its value. The batch must not have ended before."""
-    end = time.monotonic() + PATIENCE
-    while not (found := condition()):
-        assert process.poll() is None, process.stdout.read()
-        assert time.monotonic() < end
-        time.sleep(0.05)
-    return found
-
-
-def ended(process) -> tuple[int, str]:
-    """Wait for a batch to end. Check that no process of its session is left, and no command.
-
-    Return its exit status and what it printed.
-    """
-    said, _ = process.communicate(timeout=PATIENCE)
-    end = time.monotonic() + 30
-    while left := processes.of_session(process.pid) + processes.commands("refgs.cli", str(process.args[6])):
-        assert time.monotonic() < end, left
-        time.sleep(0.1)
-    return process.returncode, said
 
 
 @pytest.fixture

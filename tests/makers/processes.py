@@ -17,14 +17,16 @@ def commands(*words: str) -> list[tuple[int, int]]:
     return found
 
 
-def of_session(session: int) -> list[str]:
-    """List the command lines of the processes of a session, except those that have ended."""
-    found = []
+def of_session(session: int) -> dict[int, str]:
+    """Return the command lines of the processes of a session by their numbers, except those that have ended."""
+    found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             state, _, _, of = (folder / "stat").read_text().rpartition(")")[2].split()[:4]
             if int(of) == session and state != "Z":
-                found.append((folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace"))
+                found[int(folder.name)] = (
+                    (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+                )
         except OSError:  # it has ended
             continue
     return found

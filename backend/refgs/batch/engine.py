@@ -10,10 +10,13 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from refgs.batch.steps import Outcome, Step, TryLater, run_step
 from refgs.errors import TRY_AGAIN, InputError, TryAgain
@@ -23,6 +26,8 @@ TRIES = 8  # more than once for a step whose worker died, or that said "try agai
 PAUSE = 5.0  # seconds before such a step is tried again
 STARTS = 4  # attempts to start Ray here: on a busy machine its parts wait for each other no longer than 15 seconds
 PATIENCE = 60.0  # seconds for a cluster to answer
+SILENCE = 20.0  # seconds without an answer after which the head is taken to be dead: after 60, Ray ends the process
+LOCKED, NEW = "refgs.lock", 60.0  # a file in Ray's folder, and the seconds that a batch has to lock it
 JOIN = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False, logging_level='CRITICAL')"
 STORE = 80 << 20  # bytes of Ray's object store: steps hand on files, not objects
 ENVIRONMENT = {
@@ -41,6 +46,8 @@ class Engine:
         self._ray = ray
         self._steps: dict[Any, Step] = {}
         self._run = ray.remote(run_step)
+        host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
+        self._head, self._heard = (host, int(port)), time.monotonic()
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         self._cores = min(cores, int(max(node.get("CPU", 0) for node in nodes)))
         self._memory = int(max(node.get("memory", 0) for node in nodes))
@@ -70,14 +77,26 @@ class Engine:
         return reference
 
     def ended(self, seconds: float) -> Iterator[tuple[Step, Outcome]]:
-        """Wait for steps to end, for some seconds at most. Yields those that did."""
+        """Wait for steps to end, for some seconds at most. Yields those that did. Raises TryAgain if Ray's head has died."""
         if not self._steps:
             return
+        self._check_head()
         references, _ = self._ray.wait(list(self._steps), timeout=seconds, num_returns=1)
         if references:  # and all others that have ended by now
             references, _ = self._ray.wait(list(self._steps), timeout=0, num_returns=len(self._steps))
         for reference in references:
             yield self._steps.pop(reference), self._outcome(reference)
+
+    def _check_head(self) -> None:
+        try:
+            socket.create_connection(self._head, timeout=1).close()
+            self._heard = time.monotonic()
+        except OSError as error:
+            if time.monotonic() > self._heard + SILENCE:
+                what = f"Ray's head, {self._head[0]}:{self._head[1]}, has died ({error})"
+                raise TryAgain(
+                    f"{what}: run the same command again; where --address is given, start the head first"
+                ) from None
 
     def _outcome(self, reference: Any) -> Outcome:
         from ray import exceptions
@@ -118,9 +137,9 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
     """
     if address and workers:
         raise InputError("--workers is for this machine: on a cluster, each machine says how many cores it lends")
-    folder = None if address else Path(tempfile.mkdtemp(prefix="refgs-", dir="/tmp" if os.name == "posix" else None))
-    if folder:  # before Ray is imported: at exit, Ray first ends what a failed start has left
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    folder = (
+        None if address else _make_folder()
+    )  # before Ray is imported: at exit, Ray first ends what a failed start left
     ray, cores = _import_ray(bool(address)), cores or 1
     quiet = {"include_dashboard": False, "log_to_driver": False, "logging_level": logging.CRITICAL}
     try:
@@ -132,6 +151,22 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
         yield Engine(ray, cores)
     finally:
         ray.shutdown()
+
+
+def _make_folder() -> Path:
+    """Make a folder for Ray's sockets and logs, which is removed at exit. Remove those that killed batches have left."""
+    parent = Path("/tmp" if os.name == "posix" else tempfile.gettempdir())  # names of sockets must be short
+    for file in parent.glob(f"refgs-*/{LOCKED}"):
+        with suppress(OSError, Timeout):
+            if time.time() > file.stat().st_mtime + NEW:
+                with FileLock(file, timeout=0):  # its batch has ended
+                    shutil.rmtree(file.parent, ignore_errors=True)
+    folder = Path(tempfile.mkdtemp(prefix="refgs-", dir=parent))
+    lock = FileLock(folder / LOCKED)
+    lock.acquire()
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    atexit.register(lock.release)  # which runs before the line above, and keeps the lock until then
+    return folder
 
 
 def _import_ray(cluster: bool) -> Any:

@@ -1,0 +1,41 @@
+"""Start batches in processes of their own, and wait for them."""
+
+import subprocess
+import sys
+import time
+
+from tests.makers import processes
+
+PATIENCE = 240.0  # seconds
+MADE = ("splats.ply", "environment.exr", "mesh.glb", "cameras.json")
+
+
+def batch(source, out, *words) -> subprocess.Popen:
+    """Start `refgs batch` in a session of its own, on the CPU. Its output is in its pipe `stdout`."""
+    command = [sys.executable, "-m", "refgs.cli", "batch", source, "--out", out, "--device", "cpu", *words]
+    return subprocess.Popen(
+        list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+    )
+
+
+def until(process, condition):
+    """Wait until `condition()` is true and return its value. The batch must not have ended before."""
+    end = time.monotonic() + PATIENCE
+    while not (found := condition()):
+        assert process.poll() is None, process.stdout.read()
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    return found
+
+
+def ended(process, patience: float = PATIENCE, grace: float = 30) -> tuple[int, str]:
+    """Wait for a batch to end, `patience` seconds at most. Check that no process of its session is left, and no command.
+
+    Those have `grace` seconds to end after it. Return its exit status and what it printed.
+    """
+    said, _ = process.communicate(timeout=patience)
+    end = time.monotonic() + grace
+    while left := [*processes.of_session(process.pid).values(), *processes.commands("refgs.cli", str(process.args[6]))]:
+        assert time.monotonic() < end, left
+        time.sleep(0.1)
+    return process.returncode, said
