@@ -15,6 +15,7 @@ BENCHMARKS = (
     "minutes",
     "look",
     "gpu",
+    "many",
     "farm",
     "page",
 )

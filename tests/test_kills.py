@@ -24,6 +24,14 @@ WRONG = ("lost", "differing", "stale locks", "leftovers", "orphans")
 CAPTURES = 2  # of a batch
 
 
+def orphans(session: int, grace: float) -> list[str]:
+    """Wait for the processes of a session to end, `grace` seconds at most. Return the command lines of those that do not."""
+    end = time.monotonic() + grace
+    while (left := processes.of_session(session)) and time.monotonic() < end:
+        time.sleep(0.02)
+    return list(left.values())
+
+
 class Train:
     """Repeat `refgs train --once`, as schedulers do."""
 
@@ -45,12 +53,9 @@ class Train:
     def locked(self) -> bool:
         return is_locked(self.run)
 
-    def orphans(self, session: int, grace: float = GRACE) -> int:
-        """Wait for the processes of a session to end, and return the number of those that do not."""
-        end = time.monotonic() + grace
-        while (left := processes.of_session(session)) and time.monotonic() < end:
-            time.sleep(0.02)
-        return len(left)
+    def left(self, session: int) -> dict[str, int]:
+        """Count what a kill has left: processes that do not end, and whether the run is locked still."""
+        return {"orphans": len(orphans(session, GRACE)), "stale locks": self.locked()}
 
 
 class Export(Train):
@@ -107,9 +112,9 @@ class Batches(Train):
     def locked(self) -> bool:
         return any(is_locked(file.parent) for file in self.run.rglob("run.lock"))
 
-    def orphans(self, session: int, grace: float = 0) -> int:
-        """Count no process before the end: the same command is given at once, while Ray's own processes still end."""
-        return super().orphans(session, grace) if grace else 0
+    def left(self, session: int) -> dict[str, int]:
+        """Count nothing yet. The same command is given at once, while commands and Ray's own processes still end."""
+        return {}
 
 
 VICTIMS = {"train": Train, "export": Export, "worker": Worker, "batch": Batches}
@@ -131,8 +136,7 @@ def kill(victim: Train, kills: int, moments: random.Random) -> Counter:
             found["kills"] += 1
             found["of the parent"] += process.kill(moments) == "parent"
             sessions.append(process.session)
-            found["orphans"] += victim.orphans(process.session)
-            found["stale locks"] += victim.locked()
+            found.update(victim.left(process.session))
             continue
         if whole is None:
             assert status == 0, victim.said.read_text()
@@ -147,7 +151,7 @@ def kill(victim: Train, kills: int, moments: random.Random) -> Counter:
         found["stale locks"] += victim.locked()
         names += [name for name in {*made, *whole} if made.get(name, 0) != whole.get(name, 0)]
         victim.clear()
-    found["orphans"] += sum(victim.orphans(session, RAY) for session in sessions)
+    found["orphans"] += sum(len(orphans(session, RAY)) for session in sessions)
     found["seconds"] = round(longest)
     if any(found[what] for what in WRONG):
         print(names, victim.said.exists() and victim.said.read_text()[-3000:])

@@ -221,7 +221,7 @@ def bench(
     what: Annotated[
         str,
         typer.Argument(
-            help="kernels, truth, real, cameras, paper, needs, poses, minutes, look, gpu or page; another word lists them"
+            help="kernels, truth, real, cameras, paper, needs, poses, minutes, look, gpu, many, farm or page; another word lists them"
         ),
     ] = "kernels",
 ) -> None:

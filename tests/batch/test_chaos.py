@@ -96,9 +96,12 @@ def test_chaos_changes_no_asset(shelf, small_disk, capsys):
     while status == TRY_AGAIN:
         chaos.seen["batches"] += 1
         process = batch(shelf / "list.toml", out, "--workers", "2")
-        while process.poll() is None:
-            chaos.disturb(process.pid)
-            time.sleep(0.5)
+        try:
+            while process.poll() is None:
+                chaos.disturb(process.pid)
+                time.sleep(0.5)
+        finally:
+            process.kill()
         status, said = ended(process, grace=150)  # without its head, Ray takes a minute and more
     assert status == 2, said
     assert [line for line in said.splitlines() if "failed" in line] == [
