@@ -4,10 +4,13 @@ import os
 import re
 import shutil
 import signal
+import tempfile
 import time
 import tomllib
+from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from refgs import commands
 from refgs.batch import engine
@@ -95,6 +98,21 @@ def test_bad_words_give_one_line_and_leave_nothing(shelf, words, says):
     status, said = ended(batch(shelf / "list.toml", shelf / "runs", *words))
     assert status == 2 and re.search(says, said) and len(said.strip().splitlines()) == 1
     assert not (shelf / "runs").exists()
+
+
+def test_folders_of_killed_batches_are_removed():
+    """Make folders as batches do: of one that was killed, one that works, and one that is about to lock its folder."""
+    folders = [Path(tempfile.mkdtemp(prefix="refgs-", dir="/tmp")) for _ in range(3)]
+    for folder, age in zip(folders, (100, 100, 0), strict=True):
+        (folder / engine.LOCKED).touch()
+        os.utime(folder / engine.LOCKED, (time.time() - age, time.time() - age))
+    try:
+        with FileLock(folders[1] / engine.LOCKED):
+            made = engine._make_folder()
+        assert [folder.exists() for folder in (*folders, made)] == [False, True, True, True]
+    finally:
+        for folder in folders:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def test_another_ray_is_refused(monkeypatch):

@@ -12,6 +12,7 @@ import pytest
 from refgs.batch.steps import Outcome, Step, TryLater, recorded, run_step
 from refgs.train import checkpoint
 from tests.makers.captures import nerfstudio
+from tests.makers.disk import fill
 from tests.makers.processes import commands
 from tests.makers.training import TINY
 
@@ -47,6 +48,23 @@ def test_a_step_follows_others(tmp_path, before, may_fail, runs):
     wrong = step(tmp_path, "trian")
     outcome = run_step(wrong, 1, 0.0, (may_fail,), Outcome(before))
     assert (outcome.status, wrong.log.exists()) == ((2, True) if runs else (None, False))
+
+
+def test_a_full_disk_is_tried_again(tmp_path, small_disk):
+    """Check that a step whose log cannot be written asks for another try, and so does one whose command cannot print."""
+    there = step(small_disk, "poses", nerfstudio(tmp_path / "cup", 8), "--once")
+    there.log.parent.mkdir(parents=True)
+    there.log.touch()
+    fill(small_disk / "filler")
+    with pytest.raises(TryLater, match="No space left"):
+        run_step(there, 1, 0.0, ())
+    with open(small_disk / "filler", "r+b") as file:
+        file.truncate(file.seek(0, os.SEEK_END) - 4096)  # room for the command's own line, and not for what it says
+    there.log.write_bytes(bytes(4096 - len(f"$ refgs {' '.join(there.words)}\n")))
+    with pytest.raises(TryLater, match="75"):
+        run_step(there, 1, 0.0, ())
+    (small_disk / "filler").unlink()
+    assert run_step(there, 1, 0.0, ()).status == 0
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
