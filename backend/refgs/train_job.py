@@ -381,7 +381,7 @@ def _finish(trainer: "Trainer", out: Path, plan: Plan, report: Report) -> float 
         quality = held_out_psnr(state, most=len(state.test))
         trim()
         trades = ambiguities(state)
-        update_metrics(out, {"ambiguities": trades, "total_seconds": plan.spent})
+        update_metrics(out, _most_memory() | {"ambiguities": trades, "total_seconds": plan.spent})
         for facts in trades.values():
             if "what" in facts:
                 report("stage", {"what": facts["what"]})
@@ -408,11 +408,15 @@ def _costs(trainer: "Trainer") -> dict[str, Any]:
     state = trainer.state
     costs = {"training_seconds": state.seconds, "processor_seconds": state.processor_seconds}
     costs["steps_left_out"] = trainer.guard.left_out
-    if peak := peak_memory():
-        costs["peak_memory_bytes"] = peak
+    costs |= _most_memory()
     if state.device.type == "cuda":
         costs["peak_card_memory_bytes"] = torch.cuda.max_memory_allocated()
     return costs
+
+
+def _most_memory() -> dict[str, int]:
+    peak = peak_memory()
+    return {"peak_memory_bytes": peak} if peak else {}
 
 
 @contextmanager

@@ -47,7 +47,7 @@ class Engine:
         self._steps: dict[Any, Step] = {}
         self._run = ray.remote(run_step)
         host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
-        self._head, self._heard = (host, int(port)), time.monotonic()
+        self._head, self._heard = (host.strip("[]"), int(port)), time.monotonic()
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         self._cores = min(cores, int(max(node.get("CPU", 0) for node in nodes)))
         self._memory = int(max(node.get("memory", 0) for node in nodes))

@@ -2,8 +2,9 @@
 
 from refgs.settings import Settings
 
-# Fitted to the peak memory of 30 trainings by `quick` at 256 to 1,600 pixels (0.9 to 3.1 GB), which it meets within a quarter.
-BASE, PER_PIXEL, PER_SURFEL = 0.85e9, 850.0, 2500.0  # bytes: libraries; of a photo; with derivatives, moments and tiles
+# Fitted to the peak memory of 30 trainings by `quick` at 256 to 1,600 pixels (0.9 to 3.1 GB), which it meets within a quarter,
+# and of one by `standard` of 800 pixels and 130,000 surfels (2.1 GB).
+BASE, PER_PIXEL, PER_SURFEL = 0.85e9, 850.0, 5000.0  # bytes: libraries; of a photo; with derivatives, moments and tiles
 
 
 def memory(settings: Settings) -> int:
