@@ -15,7 +15,7 @@ import pytest
 from benchmarks.stability.cases import line
 from refgs.errors import TRY_AGAIN
 from tests.makers import processes
-from tests.makers.kills import CHANGES, Batch, Command, files, files_of_batch, is_locked
+from tests.makers.kills import CHANGES, Batch, Command, files, files_of_batch, is_locked, result
 
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self"), reason="needs /proc")
 SHARES = {"batch": 0.05, "worker": 0.15, "export": 0.3, "train": 0.5}  # of all kills: a batch takes longest
@@ -49,7 +49,7 @@ class Train:
         shutil.rmtree(self.run, ignore_errors=True)
 
     def made(self) -> dict[str, object]:
-        return files(self.run)
+        return result(self.run)
 
     def locked(self) -> bool:
         return is_locked(self.run)
@@ -121,11 +121,11 @@ class Batches(Train):
 VICTIMS = {"train": Train, "export": Export, "worker": Worker, "batch": Batches}
 
 
-def kill(victim: Train, kills: int, moments: random.Random) -> Counter:
+def kill(victim: Train, kills: int, moments: random.Random) -> tuple[Counter, list[str]]:
     """Start a command, and kill it at a random moment between its start and its end, until it was killed `kills` times.
 
     Start it again after each kill. Where it has ended, compare its files with those of an undisturbed one, and begin anew. Return how often
-    it was killed, how often it ended, and what was wrong.
+    it was killed, how often it ended, and what was wrong; and the files that differed, were missing, or too many.
     """
     found, sessions, whole, longest, names, ended = Counter(), [], None, None, [], False
     victim.clear()
@@ -156,9 +156,7 @@ def kill(victim: Train, kills: int, moments: random.Random) -> Counter:
         victim.clear()
     found["orphans"] += sum(len(orphans(session, RAY)) for session in sessions)
     found["seconds"] = round(longest)
-    if any(found[what] for what in WRONG):
-        print(names, victim.said.exists() and victim.said.read_text()[-3000:])
-    return found
+    return found, names
 
 
 def table_row(name: str, found: Counter) -> str:
@@ -167,8 +165,8 @@ def table_row(name: str, found: Counter) -> str:
 
 @pytest.mark.parametrize(("name", "kills"), [("train", 3), ("export", 2), ("worker", 2)])
 def test_killed_it_ends_the_same(ball_capture, tmp_path, name, kills):
-    found = kill(VICTIMS[name](ball_capture, tmp_path), kills, random.Random())
-    assert found["ended"] and not any(found[what] for what in WRONG), found
+    found, names = kill(VICTIMS[name](ball_capture, tmp_path), kills, random.Random())
+    assert found["ended"] and not any(found[what] for what in WRONG), (found, names)
 
 
 @pytest.mark.slow
@@ -179,11 +177,12 @@ def test_a_thousand_kills(ball_capture, tmp_path, capsys):
     for name, share in SHARES.items():
         (tmp_path / name).mkdir()
         begun = time.monotonic()
-        found = kill(VICTIMS[name](ball_capture, tmp_path / name), max(1, round(share * total)), random.Random(total))
+        victim = VICTIMS[name](ball_capture, tmp_path / name)
+        found, names = kill(victim, max(1, round(share * total)), random.Random())
         rows.append((name, found))
         with capsys.disabled():
             took = f"{time.monotonic() - begun:.0f} s, undisturbed {found['seconds']} s"
-            print(f"\n{table_row(name, found)} {took}", flush=True)
+            print(f"\n{table_row(name, found)} {took} {' '.join(names)}", flush=True)
     headings = ["command", "kills", "of them its parent", "ended", *WRONG]
     with capsys.disabled():
         print("\n" + "\n".join([line(headings), line(["---"] * len(headings)), *(table_row(*row) for row in rows)]))

@@ -39,12 +39,23 @@ def _read(file: Path) -> object:
     return file.read_bytes()
 
 
+def result(run: Path) -> dict[str, object]:
+    """Read the files of a run by `files`, without what its interruptions leave on purpose.
+
+    A training that was told to end has written a checkpoint and a line of history there. Of the checkpoints, the last counts.
+    """
+    found = files(run)
+    for name in sorted(name for name in found if fnmatch(name, "checkpoints/" + 8 * "[0-9]" + ".*"))[:-2]:
+        del found[name]
+    return found | {name: None for name in found if name == "history.jsonl"}
+
+
 def files_of_batch(out: Path) -> dict[str, object]:
     """Read the files of all runs of a batch, and those about it."""
-    runs = [file.parent for file in out.glob("*/run.toml")]
-    ours = {f"{run.name}/{name}": value for run in runs for name, value in files(run).items()}
-    whole = {file.relative_to(out).as_posix(): None for file in out.rglob("*") if not file.is_dir()}
-    return {name: None for name in whole if not name.endswith("/log.txt")} | ours
+    runs = {file.parent.name for file in out.glob("*/run.toml")}
+    found = {f"{run}/{name}": value for run in runs for name, value in result(out / run).items()}
+    others = [file.relative_to(out) for file in out.rglob("*") if not file.is_dir()]
+    return found | {file.as_posix(): None for file in others if file.parts[0] not in runs}
 
 
 def is_locked(run: Path) -> bool:
