@@ -87,7 +87,8 @@ class Worker(Train):
             "resume": begun,
         }
         export = {"command": "export", "run": str(self.run)}
-        return Command(self.said, ["worker"], (export,) if trained else (train | asked, export))
+        jobs = (*(() if trained else (train | asked,)), *(() if (self.run / "mesh.glb").exists() else (export,)))
+        return Command(self.said, ["worker"], jobs or ({"command": "check", "capture": str(self.capture)},))
 
 
 class Batches(Train):

@@ -179,6 +179,16 @@ def test_a_training_is_cancelled_while_it_makes_masks(talk, tmp_path):
     assert any(line.startswith("Object") for line in talk.until("done")["lines"])
 
 
+def test_a_mesh_is_made_after_an_export_that_was_killed(talk, ball_capture, tmp_path):
+    """Leave textures without a mesh, as a kill does. Check that they do not stop the export, and that a mesh does."""
+    run = trained(ball_capture, tmp_path / "run", *TINY, "mesh.resolution=32", total=20).state.folder
+    (run / "textures").mkdir()
+    for _ in range(2):
+        talk.tell("export", run=str(run), texture=64)
+    assert talk.until("done")["mesh"] == str(run / "mesh.glb")
+    assert "mesh.glb exists" in talk.until("failed")["what"]
+
+
 def test_a_run_is_continued_with_hints(talk, ball_capture, tmp_path):
     run, file, out = (
         trained(ball_capture, tmp_path / "run", *TINY, total=30).state.folder,

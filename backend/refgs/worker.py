@@ -329,7 +329,9 @@ class Worker:
     def _export(self, command: Export) -> tuple[str, dict]:
         display = None if command.display_splats is None else Path(command.display_splats)
         run = Path(command.run)
-        files = export_run(run, None, command.texture, None, display, overwrite=display is not None, report=self.send)
+        # Textures without a mesh are of an export that was killed: the mesh is written last.
+        overwrite = display is not None or not (run / "mesh.glb").exists()
+        files = export_run(run, None, command.texture, None, display, overwrite, report=self.send)
         return "done", {"mesh" if display is None else "display_splats": str(files[0].resolve())}
 
 
