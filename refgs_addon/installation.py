@@ -3,6 +3,8 @@
 Blender also runs this file as a separate process. That process reads one command, `install` or `remove`, from stdin, and prints events to
 stdout (docs/job-protocol.md). When Blender ends, stdin closes: the process then kills the program that it has started, and exits.
 
+What is installed is what was released: the zip has locks, which hold the version and the SHA-256 of every package.
+
 An interrupted installation does no harm. The last step writes a marker file, and without that file the trainer counts as not installed.
 Finished downloads stay in uv's cache for the next installation.
 """
@@ -18,6 +20,7 @@ import threading
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import urlsplit
 
 if sys.platform == "win32":
     import msvcrt
@@ -26,7 +29,7 @@ else:
 
 WHEELS = (
     Path(__file__).resolve().parents[1] / "wheels"
-)  # in a release's zip: the wheels of the trainer and of uv for this platform
+)  # in a release's zip: the wheels of the trainer and of uv for this platform, and the locks
 PYTHONS = ">=3.11,<3.14"  # as in pyproject.toml
 GB = 1e9
 NEEDED, NEEDED_WITH_CARD = 2 * GB, 7 * GB  # torch's CUDA builds include CUDA's libraries
@@ -49,6 +52,14 @@ def installed(home: Path) -> str:
     """Return the version of the trainer that is installed in the folder `home`, or "" if none is."""
     try:
         return _marker(home).read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
+def origin(home: Path) -> str:
+    """Return a sentence about where the installed packages came from and whether they are those of the release; "" if that is not known."""
+    try:
+        return (home / "origin").read_text(encoding="utf-8")
     except OSError:
         return ""
 
@@ -180,12 +191,67 @@ def _install(home: Path, uv: Path, trainer: Path) -> None:
         _run_uv(program, variables, home, "venv", "--python", PYTHONS, str(home / "env"))
     _emit("stage", what="Resolving the trainer's dependencies")
     # --no-build: the artist's machine may have no compiler.
-    _run_uv(program, variables, home, "pip", "install", "--no-build", "--python", str(python(home)), f"{trainer}[onnx]")
+    install = ["pip", "install", "--no-build", "--python", str(python(home))]
+    if trainer.with_name("lock.txt").is_file():
+        lock = _choose_lock(program, variables, home, trainer.parent)
+        _run_uv(program, variables, home, *install, "--require-hashes", "--requirements", str(lock))
+        _run_uv(program, variables, home, *install, "--no-deps", str(trainer))
+        said = _describe_origin(_resolve(program, variables, home, lock))
+    else:
+        said = "This add-on has no lock of a release: the packages were not checked"
+        _run_uv(program, variables, home, *install, f"{trainer}[onnx]")
+    _emit("stage", what=said, part=0.99)
+    print(said, file=sys.stderr, flush=True)  # the log
     _emit("stage", what="Starting the trainer for the first time", part=0.99)
     _start_trainer(python(home))
+    (home / "origin").write_text(said, encoding="utf-8")
     _marker(home).write_text(trainer.name.split("-")[1], encoding="utf-8")
     program.unlink()
     _delete(home / "cache")
+
+
+def _choose_lock(program: Path, variables: dict[str, str], home: Path, locks: Path) -> Path:
+    """Return the lock for the build of torch that uv takes for this machine. Without one, let `variables` say to take the package index's.
+
+    A build's name is in torch's version, such as 2.14.0+cpu. The package index has versions without.
+    """
+    lock, wanted = locks / "lock.txt", home / "torch.txt"
+    if "UV_TORCH_BACKEND" not in variables or not (pinned := re.search(r"^torch==\S+", lock.read_text(), re.M)):
+        return lock
+    wanted.write_text(pinned[0], encoding="utf-8")
+    try:
+        version, _ = _resolve(program, variables, home, wanted)["torch"]
+    finally:
+        wanted.unlink()
+    build = version.partition("+")[2]
+    if build and (locks / f"lock-{build}.txt").is_file():
+        variables["UV_TORCH_BACKEND"] = build
+        return locks / f"lock-{build}.txt"
+    del variables["UV_TORCH_BACKEND"]
+    if build:
+        what = f"torch's build {build} is not in the release's lock: taking torch from the package index"
+        _emit("stage", what=what)
+        print(what, file=sys.stderr, flush=True)  # the log
+    return lock
+
+
+def _resolve(program: Path, variables: dict[str, str], home: Path, requirements: Path) -> dict[str, tuple[str, str]]:
+    """Ask uv which version of each package in a file it takes for this machine, and from which index. Returns both by the package."""
+    how = ["--no-deps", "--no-header", "--no-annotate", "--emit-index-annotation", "--python", str(python(home))]
+    said = _run_uv(program, variables, home, "pip", "compile", *how, str(requirements))
+    return {name: (version, index) for name, version, index in re.findall(r"(?m)^(\S+)==(\S+)\n +# from (.+)$", said)}
+
+
+def _describe_origin(packages: dict[str, tuple[str, str]]) -> str:
+    """Say where packages came from. `packages` is what `_resolve` returns."""
+    hosts: dict[str, list[str]] = {}
+    for name, (version, index) in packages.items():
+        hosts.setdefault(urlsplit(index).hostname or index, []).append(f"{name} {version}")
+    torch = next((named for names in hosts.values() for named in names if named.startswith("torch ")), "")
+    listed = ", ".join(
+        f"{len(names)} from {host}{f' ({torch})' if torch in names else ''}" for host, names in hosts.items()
+    )
+    return f"All packages are those of the release, by their hashes: {listed}"
 
 
 def _remove(home: Path) -> None:
@@ -234,8 +300,11 @@ def _start(words: list[str], **how) -> subprocess.Popen:
     return _child
 
 
-def _run_uv(program: Path, variables: dict[str, str], home: Path, *arguments: str) -> None:
-    """Run uv with these command-line arguments and report its progress. Raises _Failed with a message for the artist if uv fails."""
+def _run_uv(program: Path, variables: dict[str, str], home: Path, *arguments: str) -> str:
+    """Run uv with these command-line arguments, report its progress, and return what it printed.
+
+    Raises _Failed with a message for the artist if uv fails.
+    """
     options = ["--color", "never", "--cache-dir", str(home / "cache")]
     process = _start([str(program), *options, *arguments], stderr=subprocess.STDOUT, env=variables, cwd=home)
     fetching: dict[str, str] = {}  # size by package
@@ -255,10 +324,11 @@ def _run_uv(program: Path, variables: dict[str, str], home: Path, *arguments: st
                 _emit("stage", what="Installing the packages", part=0.98)
     status = process.wait()
     ended.set()
+    text = "\n".join(said)
     if status != 0:
-        text = "\n".join(said)
         first = next((line for line in said if line.startswith("error: ")), f"error: uv ended with status {status}")
         raise _Failed(explain_uv_error(text, str(home)) or f"{first.removeprefix('error: ')}: see the log")
+    return text
 
 
 def _report_download(home: Path, fetching: dict[str, str], ended: threading.Event) -> None:
@@ -294,6 +364,9 @@ def _start_trainer(python: Path) -> None:
 def explain_uv_error(text: str, home: str) -> str:
     """Turn what uv printed into one error message for the artist. Returns "" for an error that the artist cannot fix."""
     lower = text.lower()
+    if wrong := re.search(r"Hash mismatch for `([^`]+)`", text):
+        what = f"{wrong[1]}: the file that was fetched is not the one that was released (its SHA-256 is another)"
+        return f"{what}: resume to fetch it again, and ask whoever runs the package mirror if this repeats"
     if re.search(r"no space left|os error (28|112|122)\b", lower):
         return f"the disk of {home} is full: free some space and resume"
     if re.search(r"permission denied|access is denied|os error (5|13|30|32)\b", lower):

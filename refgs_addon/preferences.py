@@ -221,6 +221,7 @@ def _draw_installation(box: bpy.types.UILayout, width: int) -> None:
     interrupted, outdated = installation.interrupted(home()), bundled not in ("", there)
     if there:
         wrapped_text(box, f"RefGS {there} is installed{f', this add-on contains {bundled}' if outdated else ''}", width)
+        wrapped_text(box, installation.origin(home()), width)
     elif interrupted:
         text = "An installation was interrupted. Resume it, unless another Blender is running it"
         wrapped_text(box, text, width)

@@ -2,33 +2,44 @@
 
     python scripts/build_extension.py [FOLDER]      # into dist/
 
-Each zip holds the add-on's code, the trainer as a Python wheel, and uv, a package installer, which later installs the trainer.
+Each zip holds the add-on's code, the trainer as a Python wheel, and uv, a package installer, which later installs the trainer. It also
+holds the locks: the version and the SHA-256 of every package that the trainer needs, on every platform and Python. They name no address.
 
-Blender's own tool builds and validates the zips. The tool comes with Blender's Python module (`pip install -e ".[blender]"`). There is no
-zip for macOS on Intel, because torch is no longer built for it.
+Blender's own tool builds and validates the zips. The tool comes with Blender's Python module, uv with the tests' packages
+(`pip install -e ".[test]"`). There is no zip for macOS on Intel, because torch is no longer built for it.
 
 To build a zip without the trainer, for any platform, run `blender --command extension build` instead.
 """
 
 import importlib.util
+import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import tomllib
+from importlib.metadata import version
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-UV = "uv==0.13.9"
 PLATFORMS = {"linux-x64": "manylinux2014_x86_64", "windows-x64": "win_amd64", "macos-arm64": "macosx_11_0_arm64"}
+TORCH_BUILDS = ("cpu", "cu126", "cu128", "cu129", "cu130", "cu132")  # as uv names them; each has an index of its own
 LARGEST = 60e6  # bytes of a zip, at most
+
+
+def call(*arguments: str | Path) -> tuple[int, str]:
+    """Run Python with these command-line arguments. Return its exit status and its output."""
+    environment = {name: value for name, value in os.environ.items() if name != "UV_TORCH_BACKEND"}
+    words = [sys.executable, *arguments]
+    done = subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
+    return done.returncode, done.stdout
 
 
 def run(*arguments: str | Path) -> None:
     """Run Python with these command-line arguments. If it fails, exit and show its output."""
-    done = subprocess.run([sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    if done.returncode != 0:
-        sys.exit(f"{' '.join(map(str, arguments))}\n{done.stdout}")
+    status, said = call(*arguments)
+    if status != 0:
+        sys.exit(f"{' '.join(map(str, arguments))}\n{said}")
 
 
 def blender_tool() -> Path:
@@ -49,6 +60,24 @@ def build_trainer(source: Path, wheels: Path) -> None:
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     run("-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", wheels, source)
+
+
+def write_locks(project: Path, folder: Path) -> None:
+    """Lock the packages that a `project`, a pyproject.toml with an extra `onnx`, needs now. Write the locks into a folder.
+
+    `lock.txt` is for torch of the package index, `lock-BUILD.txt` for a build of torch that has an index of its own. A build that does not
+    exist, or whose index cannot be reached, gets none: machines that it is for then take torch from the package index.
+    """
+    how = ["-m", "uv", "pip", "compile", project, "--extra", "onnx", "--universal", "--python-version", "3.11"]
+    how += ["--generate-hashes", "--only-binary", ":all:", "--no-header", "--no-annotate", "--quiet"]
+    run(*how, "--output-file", folder / "lock.txt")
+    for build in TORCH_BUILDS:
+        status, said = call(*how, "--output-file", folder / f"lock-{build}.txt", "--torch-backend", build)
+        if status != 0:
+            print(f"no lock for torch's build {build}: {said.partition(chr(10))[0]}")
+    for lock in folder.glob("lock*.txt"):
+        if "://" in lock.read_text(encoding="utf-8"):
+            sys.exit(f"{lock.name} names an address: let every package come from an index")
 
 
 def stage(folder: Path, wheels: Path) -> None:
@@ -79,8 +108,9 @@ def main() -> None:
         wheels = folder / "wheels"
         for tag in PLATFORMS.values():
             only = ("--only-binary", ":all:", "--platform", tag)
-            run("-m", "pip", "download", "--quiet", "--no-deps", *only, "--dest", wheels, UV)
+            run("-m", "pip", "download", "--quiet", "--no-deps", *only, "--dest", wheels, f"uv=={version('uv')}")
         build_trainer(folder / "trainer", wheels)
+        write_locks(ROOT / "pyproject.toml", wheels)
         stage(folder / "extension", wheels)
         built = folder / "built"
         built.mkdir()

@@ -3,6 +3,7 @@
 import platform
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -34,6 +35,16 @@ def archive(archives):
     return archives[name]
 
 
+def test_locks_hold_what_the_trainer_needs_and_no_address(archives):
+    needed = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    pinned = {line.partition(";")[0].strip().lower() for line in needed}
+    for archive in archives.values():
+        lock = zipfile.ZipFile(archive).read("wheels/lock.txt").decode()
+        lines = {line.partition(" ")[0] for line in lock.splitlines()}
+        assert pinned <= lines and "onnxruntime" in {line.partition("==")[0] for line in lines}
+        assert "://" not in lock
+
+
 def test_the_zips(archives):
     code = {str(path.relative_to(ROOT)) for path in (ROOT / "refgs_addon").rglob("*.py")}
     assert set(archives) == set(NAMES.values())
@@ -41,7 +52,9 @@ def test_the_zips(archives):
         names = set(zipfile.ZipFile(archive).namelist())
         wheels = sorted(name.split("-")[0] for name in names if name.endswith(".whl"))
         assert wheels == ["wheels/refgs", "wheels/uv"]
-        assert {name for name in names if not name.endswith(".whl")} == code | {
+        locks = {name for name in names if name.startswith("wheels/lock")}
+        assert "wheels/lock.txt" in locks
+        assert {name for name in names if not name.endswith(".whl")} == code | locks | {
             "__init__.py", "blender_manifest.toml", "LICENSE",
         }  # fmt: skip
 
@@ -67,9 +80,13 @@ def test_what_is_released_can_be_installed(archive, tmp_path, monkeypatch):
 
     until(done, seconds=2900)
     assert job.state == "done", job.line + "\n" + job.log.read_text()[-3000:]
-    print("\n".join(lines), f"\n{installation.folder_bytes(home) / installation.GB:.2f} GB")
+    print(
+        "\n".join(lines), f"\n{installation.folder_bytes(home) / installation.GB:.2f} GB\n{installation.origin(home)}"
+    )
     assert job.ready["refgs"] == installation.bundled_version() == installation.installed(home)
     assert any(line.startswith("Fetching ") for line in lines)
+    origin = installation.origin(home)
+    assert origin.startswith("All packages are those of the release, by their hashes") and "(torch 2." in origin
     asked = jobs.query_trainer(installation.python(home), tmp_path / "asked.txt")
     assert final_state(asked, seconds=200) == "done" and asked.ready == job.ready
     program = "from refgs.settings import load_settings; print(load_settings('quick').train.iterations)"
