@@ -1,38 +1,19 @@
 """Tests of masks by an ONNX model: tiny models that find red, made here."""
 
+import os
+import signal
 import sys
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper
 
 from refgs import commands
 from refgs.capture import silhouettes
 from refgs.capture.images import read_image
 from refgs.capture.salience import SalienceModel
 from refgs.errors import InputError
+from tests.makers.models import REDNESS, write_model
 from tests.makers.unmasked import SIZE, overlap, photograph, read_masks
-
-REDNESS = np.float32([2.0, -2.0, -1.0]).reshape(1, 3, 1, 1)  # of values normalised by ImageNet's mean and deviation
-
-
-def write_model(file, size, last="Identity", weights=REDNESS):
-    """Write a model whose output is `last` of a weighted sum of channels. `size` (height, width) is numbers or names."""
-    channels = weights.shape[:2]
-    nodes = [
-        helper.make_node("Conv", ["photo", "weights"], ["sum"]),
-        helper.make_node(last, ["sum"], ["found"]),
-    ]
-    graph = helper.make_graph(
-        nodes,
-        "red",
-        [helper.make_tensor_value_info("photo", TensorProto.FLOAT, [1, channels[1], *size])],
-        [helper.make_tensor_value_info("found", TensorProto.FLOAT, [1, channels[0], *size])],
-        [helper.make_tensor("weights", TensorProto.FLOAT, weights.shape, weights.ravel())],
-    )
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), file)
-    return file
 
 
 @pytest.mark.parametrize(("size", "last"), [((32, 40), "Identity"), (("h", "w"), "Sigmoid"), ((64, 64), "Exp")])
@@ -70,6 +51,7 @@ def test_masks_are_of_what_the_model_finds(tmp_path, monkeypatch):
         (lambda file: write_model(file, (8, 8), weights=np.ones((1, 4, 1, 1), np.float32)), "not one RGB photo"),
         (lambda file: write_model(file, (8, 8), weights=np.ones((2, 3, 1, 1), np.float32)), "not one map"),
         (lambda file: write_model(file, (8, 8), "Log", -REDNESS), "not one map of finite"),
+        (lambda file: write_model(file, (1 << 20, 8)), "wants photos of 8×1048576 pixels"),
     ],
 )
 def test_models_that_do_not_fit_are_an_error_of_one_line(tmp_path, make, what):
@@ -77,6 +59,23 @@ def test_models_that_do_not_fit_are_an_error_of_one_line(tmp_path, make, what):
     with pytest.raises(InputError, match=what) as error:
         SalienceModel(tmp_path / "model.onnx")(np.zeros((8, 8, 3), np.uint8))
     assert "\n" not in str(error.value)
+
+
+def test_a_model_that_ends_onnx_runtime_is_an_error_of_one_line(tmp_path):
+    """Check a model whose process dies as it would by a fault of ONNX Runtime, in the middle of its work."""
+    model = SalienceModel(write_model(tmp_path / "model.onnx", (8, 8)))
+    os.kill(model._process.pid, signal.SIGABRT)
+    with pytest.raises(InputError, match=r"ended while it used it \(status -6\): the file is damaged") as error:
+        model(np.zeros((8, 8, 3), np.uint8))
+    assert "\n" not in str(error.value)
+
+
+def test_a_models_process_ends_with_it(tmp_path):
+    model = SalienceModel(write_model(tmp_path / "model.onnx", (8, 8)))
+    process = model._process
+    del model
+    process.join(30)
+    assert process.exitcode == 0
 
 
 def test_missing_onnx_runtime_is_said_with_how_to_install_it(tmp_path, monkeypatch):

@@ -1,7 +1,4 @@
-"""List every kind of file and stream that the trainer reads: a valid sample, and how it is read.
-
-Models for `refgs masks --model` are not among them. They are programs, which ONNX Runtime runs: it ends the process for some damaged ones.
-"""
+"""List every kind of file and stream that the trainer reads: a valid sample, and how it is read."""
 
 import json
 import tempfile
@@ -25,6 +22,7 @@ from refgs.capture.images import load_view, read_codes, read_focal_length, read_
 from refgs.capture.nerf_blender import read_nerf_blender
 from refgs.capture.nerfstudio import read_nerfstudio
 from refgs.capture.nero import read_nero
+from refgs.capture.salience import SalienceModel
 from refgs.capture.stanford_orb import novel_views
 from refgs.capture.tensoir import read_tensoir
 from refgs.capture.types import View
@@ -54,6 +52,7 @@ from tests.makers.ball import BOX, write_run
 from tests.makers.captures import ring
 from tests.makers.dng import write_dng
 from tests.makers.films import film_ball
+from tests.makers.models import write_model
 from tests.makers.splats import make
 from tests.makers.training import TINY, trained, trainer
 
@@ -363,6 +362,10 @@ READERS: dict[str, Reader] = {
         lambda f: read_environment(f / "a.hdr"), 2,
     ),
     "a film": Reader(_film, "a.mp4", "bytes", _read_film, 0.05),
+    "a model of masks": Reader(
+        lambda f: write_model(f / "a.onnx", (8, 8)), "a.onnx", "bytes",
+        lambda f: SalienceModel(f / "a.onnx")(PHOTO), 0.005,  # each starts a process
+    ),
     "hints": Reader(
         lambda f: write_hints(f / "a.json", f, [Hint("metal", np.ones((2, 3)))]), "a.json", "json", lambda f: read_hints(f / "a.json")
     ),

@@ -1,7 +1,16 @@
-"""Run a model of the artist's own, an ONNX file, that tells the object from its surroundings in one photo."""
+"""Run a model of the artist's own, an ONNX file, that tells the object from its surroundings in one photo.
 
+ONNX Runtime runs in a child process, because it ends its process for some damaged files.
+"""
+
+import importlib.util
+import multiprocessing
+import signal
 import sys
+from contextlib import suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,48 +29,97 @@ class SalienceModel:
 
     Its input is (1, 3, height, width) float32 RGB, normalised as for ImageNet. Its first output is one map: probabilities; logits if some
     are negative; values of any scale if some are greater than 1. `side` is the longer side of its input, in pixels.
-    Raises InputError if the file is no such model, or if ONNX Runtime is not installed.
+    Raises InputError if the file is no such model, if it is damaged, or if ONNX Runtime is not installed.
     """
 
     def __init__(self, file: Path):
         self.file = Path(file)
         if not self.file.is_file():
             raise InputError(f"{file}: there is no such file. --model needs a model in ONNX format.")
-        try:
-            import onnxruntime
-        except ImportError:
+        if importlib.util.find_spec("onnxruntime") is None:
             raise InputError(
                 f"{file}: models need ONNX Runtime. Install it: {sys.executable} -m pip install onnxruntime"
-            ) from None
-        options = onnxruntime.SessionOptions()
-        options.log_severity_level = 4  # its warnings are about the graph, which the artist did not make
-        try:
-            self._session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # its exceptions have no common class
-            raise InputError(f"{file}: ONNX Runtime cannot read it: {reason(error)}") from None
-        (self._input, *more), shape = self._session.get_inputs(), self._session.get_inputs()[0].shape
-        if more or len(shape) != 4 or shape[1] not in (3, None) or self._input.type != "tensor(float)":
-            raise InputError(
-                f"{file}: its input is {self._input.type} {shape}, not one RGB photo (1, 3, height, width) of float32. "
-                "Take a model of salient-object segmentation."
             )
-        self._height, self._width = (size if isinstance(size, int) and size > 0 else SIDE for size in shape[2:])
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        # It ends when the pipe is closed, at the latest with this object.
+        self._process = context.Process(target=_child, args=(self.file, theirs), daemon=True)
+        self._process.start()
+        theirs.close()
+        self._height, self._width = self._answer()
         self.side = max(self._height, self._width)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the probability that each pixel shows the object, (H, W) float32, for a photo (H, W, 3) uint8 sRGB."""
-        size = image.shape[1::-1]
-        scaled = cv2.resize(image, (self._width, self._height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-        batch = np.ascontiguousarray(((scaled - MEAN) / DEVIATION).transpose(2, 0, 1)[None])
+        with suppress(OSError):  # `_answer` says why the pipe is closed
+            self._pipe.send(cv2.resize(image, (self._width, self._height), interpolation=cv2.INTER_AREA))
+        return cv2.resize(self._answer(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+
+    def _answer(self) -> Any:
         try:
-            found = self._session.run([self._session.get_outputs()[0].name], {self._input.name: batch})[0]
-        except Exception as error:
-            raise InputError(f"{self.file}: the model failed: {reason(error)}") from None
-        shape, found = found.shape, np.asarray(found, np.float32).squeeze()
-        if found.ndim != 2 or not np.isfinite(found).all():
-            raise InputError(f"{self.file}: its first output, of shape {shape}, is not one map of finite values.")
-        if found.min() < 0:
-            found = 1 / (1 + np.exp(-np.clip(found, -50, 50)))
-        elif found.max() > 1:
-            found = (found - found.min()) / max(np.ptp(found), 1e-6)
-        return cv2.resize(found, size, interpolation=cv2.INTER_LINEAR)
+            while not self._pipe.poll(0.2):  # short, because an interrupt does not wake it
+                pass
+            answer = self._pipe.recv()
+        except (EOFError, OSError):
+            self._process.join()
+            if self._process.exitcode == -9:
+                raise MemoryError from None  # Linux kills the largest program when memory is full
+            what = f"ONNX Runtime ended while it used it (status {self._process.exitcode})"
+            raise InputError(f"{self.file}: {what}: the file is damaged. Download it again.") from None
+        if isinstance(answer, InputError):
+            raise answer
+        return answer
+
+
+def _child(file: Path, pipe: Connection) -> None:
+    """Run a model: send the height and width of its input, then a map for each photo that comes; or an InputError."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends this process
+    try:
+        session, size = _load(file)
+        pipe.send(size)
+        while True:
+            pipe.send(_run(file, session, pipe.recv()))
+    except InputError as error:
+        pipe.send(error)
+    except (EOFError, OSError):  # the parent is gone, or has no more photos
+        pass
+
+
+def _load(file: Path) -> tuple[Any, tuple[int, int]]:
+    """Load a model. Return its session, and the height and width of its input."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4  # its warnings are about the graph, which the artist did not make
+    try:
+        session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+        (taken, *more), found = session.get_inputs(), session.get_outputs()
+    except Exception as error:  # its exceptions have no common class
+        raise InputError(f"{file}: ONNX Runtime cannot read it: {reason(error)}") from None
+    shape = taken.shape
+    if more or len(shape) != 4 or shape[1] not in (3, None) or taken.type != "tensor(float)" or not found:
+        raise InputError(
+            f"{file}: its input is {taken.type} {shape}, not one RGB photo (1, 3, height, width) of float32. "
+            "Take a model of salient-object segmentation."
+        )
+    height, width = (size if isinstance(size, int) and size > 0 else SIDE for size in shape[2:])
+    if max(height, width) > 1 << 13:
+        raise InputError(f"{file}: it wants photos of {width}×{height} pixels. Take a model for smaller ones.")
+    return session, (height, width)
+
+
+def _run(file: Path, session: Any, image: np.ndarray) -> np.ndarray:
+    """Return the probabilities (H, W) that a model finds in a photo (H, W, 3) uint8 of the size of its input."""
+    batch = np.ascontiguousarray(((image.astype(np.float32) / 255 - MEAN) / DEVIATION).transpose(2, 0, 1)[None])
+    try:
+        found = session.run([session.get_outputs()[0].name], {session.get_inputs()[0].name: batch})[0]
+        shape, found = np.shape(found), np.asarray(found, np.float32).squeeze()
+    except Exception as error:
+        raise InputError(f"{file}: the model failed: {reason(error)}") from None
+    if found.ndim != 2 or not np.isfinite(found).all():
+        raise InputError(f"{file}: its first output, of shape {shape}, is not one map of finite values.")
+    if found.min() < 0:
+        found = 1 / (1 + np.exp(-np.clip(found, -50, 50)))
+    elif found.max() > 1:
+        found = (found - found.min()) / max(np.ptp(found), 1e-6)
+    return found
