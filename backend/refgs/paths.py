@@ -1,6 +1,7 @@
 """Find the program's own files. Write files so that a failed write leaves no half-written file."""
 
 import errno
+import hashlib
 import os
 import re
 import secrets
@@ -8,7 +9,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -107,6 +108,12 @@ def read_text(file: Path, again: str) -> str:
         raise InputError(f"{file}: cannot be read as text, which must be UTF-8 ({error.reason}). {again}") from None
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}). {again}") from None
+
+
+def hash_file(file: Path, kind: Callable = hashlib.blake2b) -> "hashlib._Hash":
+    """Hash the content of a file. Returns hashlib's object, which can be updated further. Raises OSError if the file cannot be read."""
+    with open(file, "rb") as opened:
+        return hashlib.file_digest(opened, kind)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from refgs import __version__
 from refgs.errors import InputError
 from refgs.formats.metrics import read_metrics
 from refgs.formats.run_toml import Made, RunFile, Trained
-from refgs.formats.validate import read_tables, read_toml, validated
+from refgs.formats.validate import read_tables, validated
 from refgs.lock import LOCK, PROGRESS, STOP
 from refgs.paths import check_unicode, command_line, is_leftover, write_text
 from refgs.settings import Settings, load_settings, recorded_settings
@@ -77,6 +77,11 @@ def read_run_facts(folder: Path) -> tuple[Trained, Settings]:
 
     Raises InputError if there is no run.toml, or if a newer release has written it.
     """
+    found = _read_run(folder)
+    return found.run, recorded_settings(found.settings, str(folder / "run.toml"))
+
+
+def _read_run(folder: Path) -> RunFile:
     file, again = folder / "run.toml", "Train again."
     if not os.path.lexists(file):
         raise InputError(f"{folder} is not a run folder: there is no run.toml in it")
@@ -84,20 +89,19 @@ def read_run_facts(folder: Path) -> tuple[Trained, Settings]:
     made_by = validated(tables, Made, str(file), again).run.refgs
     if _release(made_by) > _release(__version__):
         raise InputError(f"{folder} was made by RefGS {made_by}, which is newer than this, {__version__}: update RefGS")
-    found = validated(tables, RunFile, str(file), again)
-    return found.run, recorded_settings(found.settings, str(file))
+    return validated(tables, RunFile, str(file), again)
 
 
 def check_asked(folder: Path, preset: str | None, minutes: float | None, changes: list[str]) -> None:
     """Raise InputError if the run in a folder was asked for with other settings than these, which are those of `refgs train`."""
-    facts, settings = read_run_facts(folder)
+    known = _read_run(folder)
     another = "choose another folder with --out, or ask for the same"
     if preset is None and minutes is not None:
-        if facts.preset != (asked := f"{minutes:g} minutes"):
-            raise InputError(f"{folder} was trained by {facts.preset}, not for {asked}: {another}")
+        if known.run.preset != (asked := f"{minutes:g} minutes"):
+            raise InputError(f"{folder} was trained by {known.run.preset}, not for {asked}: {another}")
         return  # its settings were chosen
-    tables = settings.model_dump(mode="json")
-    for key, row in read_toml(folder / "run.toml", RunFile, "Train again.").changed.items():
+    tables = recorded_settings(known.settings, str(folder / "run.toml")).model_dump(mode="json")
+    for key, row in known.changed.items():
         section, name = key.split(".")
         tables[section][name] = row.asked
     wanted = load_settings(preset or "standard", changes).model_dump(mode="json")

@@ -365,6 +365,6 @@ def test_missing_photos_of_tensoir(tmp_path):
 def test_missing_masks_and_scenes_of_stanford_orb(tmp_path):
     folder = stanford_orb(tmp_path)
     edit(folder / "transforms_novel.json", lambda data: data["frames"][1].pop("scene_name"))
-    refused(lambda: novel_views(folder), "transforms_novel.json", "test/0001", "no scene_name")
+    refused(lambda: novel_views(folder), "transforms_novel.json", "test/0001", "scene_name is missing")
     (folder / "train_mask" / "0003.png").unlink()
     refused(lambda: read_capture(folder), "train/0003", "train_mask/0003.png is missing")

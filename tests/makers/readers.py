@@ -15,6 +15,9 @@ from pillow_heif import register_heif_opener
 from plyfile import PlyData, PlyElement
 
 from benchmarks.scenes.analytic import write_ball_capture
+from refgs.batch import batch
+from refgs.batch.listing import Ask, read_jobs
+from refgs.batch.steps import Step, recorded
 from refgs.camera import Camera
 from refgs.capture import cached, load_depth, load_normals, masks, read_cameras, read_capture, read_run_cameras
 from refgs.capture.files import photo_view
@@ -41,6 +44,8 @@ from refgs.formats.panorama import read_environment
 from refgs.formats.splats import read_splats, write_display_splats, write_splats
 from refgs.formats.validate import read_json
 from refgs.geometry.visibility import Occluder
+from refgs.lock import PROGRESS
+from refgs.paths import write_text
 from refgs.report.page import write_report
 from refgs.run import open_run
 from refgs.run_folder import read_run_facts
@@ -271,6 +276,15 @@ COMMANDS = [
 ]
 
 
+def _listed(folder: Path) -> None:
+    for name in ("cup", "jar"):
+        (folder / name).mkdir()
+    (folder / "more.toml").write_text('[[captures]]\nfolder = "jar"\nname = "pot"\n')
+    lines = 'set = ["train.seed=1"]', 'include = ["more.toml"]', "minutes = 3.0"
+    tables = '[[settings]]\nname = "fast"\npreset = "quick"', '[[captures]]\nfolder = "cup"\nset = ["train.seed=2"]'
+    (folder / "list.toml").write_text("\n".join((*lines, *tables)))
+
+
 def _made(folder: Path) -> None:
     (folder / "masks").mkdir()
     (folder / "masks" / "made.json").write_text(json.dumps(["a" * 64]))
@@ -384,6 +398,17 @@ READERS: dict[str, Reader] = {
     ),
     "a checkpoint's tensors": Reader(
         _checkpoint, "run/checkpoints/00000004.safetensors", "bytes", lambda f: snapshot.restore(_training().state, f / "run"), 0.1
+    ),
+    "a batch's list": Reader(
+        _listed, "list.toml", "toml", lambda f: read_jobs(f / "list.toml", f / "runs", Ask()), 0.5
+    ),
+    "a batch's record of a step": Reader(
+        lambda f: write_text(f / "a.json", json.dumps({"status": 0, "seconds": 3.5, "node": "a", "words": ["train", "b"]})),
+        "a.json", "json", lambda f: recorded(Step("train", "b", ("train", "b"), f / "a.log")), 2,
+    ),
+    "a training's progress": Reader(
+        lambda f: write_text(f / PROGRESS, json.dumps({"iteration": 3, "total": 10, "seconds_left": 4.5})), PROGRESS, "json",
+        lambda f: batch._progress(f), 2,
     ),
     "a preset": Reader(
         lambda f: (f / "a.toml").write_text('base = "quick"\n[train]\niterations = 3\n[region]\nsize = [1, 2, 3]\n'),

@@ -1,6 +1,5 @@
 """Train all captures of a batch: hand their steps to the engine, follow them, and write a page about them."""
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,6 +14,8 @@ from refgs.batch.resources import card_share, memory
 from refgs.batch.steps import Outcome, Step, recorded
 from refgs.errors import TRY_AGAIN, InputError
 from refgs.events import Report
+from refgs.formats.progress import Progress
+from refgs.formats.validate import read_json
 from refgs.lock import PROGRESS
 
 REREAD_EVERY = 5.0  # seconds between looks for new captures
@@ -164,10 +165,10 @@ class Batch:
 def _progress(run: Path) -> tuple[int, int]:
     """Return the iteration of a training that runs in a folder, and their total. Both are 0 if that is not known."""
     try:
-        facts = json.loads((run / PROGRESS).read_text(encoding="utf-8"))
-        return int(facts["iteration"]), int(facts["total"])
-    except (OSError, ValueError, KeyError, TypeError):
+        facts = read_json(run / PROGRESS, Progress, "")
+    except InputError:
         return 0, 0
+    return facts.iteration, facts.total
 
 
 def _settled(capture: Path) -> bool:

@@ -1,15 +1,16 @@
 """Read what a batch is to train: a list of captures and settings, or a folder of captures. It is checked before anything starts."""
 
-import tomllib
+import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from refgs.capture import find_layout
 from refgs.capture.files import find_photos
 from refgs.errors import InputError
+from refgs.formats.validate import read_toml
 from refgs.settings import Settings, load_settings
 
 LOGS = "logs"  # the folder in RUNS that holds what the steps print, and how they ended
@@ -63,7 +64,7 @@ def read_jobs(source: Path, out: Path, ask: Ask) -> list[Job]:
     `ask` says how to train where the list does not. Raises InputError if a capture is listed twice, if two trainings would have one run
     folder, if a folder is missing, if lists include each other in a circle, or if settings are wrong.
     """
-    jobs = list(_jobs_of_folder(source, out, ask) if source.is_dir() else _jobs_of_list(source, ask, ()))
+    jobs = list(_jobs_of_folder(source, out, ask) if os.path.isdir(source) else _jobs_of_list(source, ask, ()))
     if not jobs:
         raise InputError(f"{source}: no captures in it: put each into a folder of its own, or list them")
     _check_unique(source, out, jobs)
@@ -87,16 +88,16 @@ def _jobs_of_folder(source: Path, out: Path, ask: Ask) -> Iterator[Job]:
 
 def _jobs_of_list(file: Path, ask: Ask, above: tuple[Path, ...]) -> Iterator[Job]:
     """Make the trainings of a list and of those that it includes. `above` are the lists that include it. Folders are beside the list."""
-    file = file.resolve()
+    file = Path(os.path.realpath(file))
     if file in above:
         raise InputError(f"{above[-1]} includes {file}, which includes it: take one of them out")
-    found = _read(file)
+    found = read_toml(file, _List, "Name a list of captures, docs/batch.md says how, or the folder that they are in.")
     for name in found.include:
-        yield from _jobs_of_list(file.parent / name, ask, (*above, file))
+        yield from _jobs_of_list(_beside(file, name), ask, (*above, file))
     whole = found.under(ask)
     for line in found.captures:
-        folder = (file.parent / line.folder).resolve()
-        if not folder.is_dir():
+        folder = _beside(file, line.folder)
+        if not os.path.isdir(folder):
             raise InputError(f"{file}: {line.folder}: there is no such folder")
         name = line.name or folder.name
         if not found.settings:
@@ -105,18 +106,11 @@ def _jobs_of_list(file: Path, ask: Ask, above: tuple[Path, ...]) -> Iterator[Job
             yield Job(f"{name}-{settings.name}", folder, name, line.under(settings.under(whole)))
 
 
-def _read(file: Path) -> _List:
-    try:
-        tables: dict[str, Any] = tomllib.loads(file.read_text(encoding="utf-8"))
-        return _List.model_validate(tables)
-    except FileNotFoundError:
-        raise InputError(f"{file}: there is no such list, nor a folder of captures") from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part + 1) if isinstance(part, int) else part for part in first["loc"])
-        raise InputError(f"{file}: {key}: {first['msg'].lower()}") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read as TOML ({error}): mend the file") from None
+def _beside(file: Path, name: str) -> Path:
+    """Return the path of a file or folder that a list names. It is relative to the list's folder."""
+    if "\0" in name:
+        raise InputError(f"{file}: {name!r} is no path: correct the list")
+    return Path(os.path.realpath(file.parent / name))  # and not Path.resolve, which raises for names that are too long
 
 
 def _check_unique(source: Path, out: Path, jobs: list[Job]) -> None:

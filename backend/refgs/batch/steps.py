@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from refgs.errors import TryAgain
+from refgs.errors import InputError, TryAgain
 from refgs.paths import disk_errors_named, write_text
 
 PATIENCE = 15.0  # seconds for a command to end after its input was closed
@@ -55,14 +55,16 @@ class TryLater(Exception):
 
 def recorded(step: Step) -> Outcome | None:
     """Return the outcome of a step that was done before, None if it is not done, or if its command was another."""
+    from refgs.formats.progress import Record
+    from refgs.formats.validate import read_json
+
     try:
-        facts = json.loads(step.log.with_suffix(".json").read_text(encoding="utf-8"))
-        outcome = Outcome(facts["status"], facts["seconds"], facts["node"])
-        same = facts["words"] == list(step.words)
-    except (OSError, ValueError, KeyError, TypeError):
+        found = read_json(step.log.with_suffix(".json"), Record, "")
+    except InputError:
         return None
     there = step.made is None or step.made.exists()
-    return outcome if same and there and outcome.status == 0 else None
+    same = found.words == [*step.words] and found.status == 0
+    return Outcome(found.status, found.seconds, found.node) if same and there else None
 
 
 def run_step(step: Step, cores: int, pause: float, optional: tuple[bool, ...], *before: Outcome) -> Outcome:

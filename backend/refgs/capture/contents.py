@@ -4,12 +4,13 @@ import hashlib
 import json
 import os
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
 from refgs.errors import InputError
-from refgs.paths import write_text
+from refgs.paths import hash_file, write_text
 
 FILE = "capture.json"  # in the run folder
 _HASHES = TypeAdapter(dict[str, str])
@@ -38,7 +39,6 @@ def changed_files(run: Path, hashes: dict[str, str]) -> list[str]:
 
 def _hash(file: Path) -> str:
     try:
-        with open(file, "rb") as opened:
-            return hashlib.file_digest(opened, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+        return hash_file(file, partial(hashlib.blake2b, digest_size=16)).hexdigest()
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror}") from None

@@ -33,7 +33,7 @@ from refgs.capture.silhouettes import Photo, carve_object, cut_out
 from refgs.capture.triangulate import triangulate
 from refgs.capture.types import Z_UP, Capture
 from refgs.errors import InputError
-from refgs.paths import read_text, write_text
+from refgs.paths import hash_file, read_text, write_text
 from refgs.settings import RegionSettings
 
 SIDE, FINE = 256, 400  # pixels on the longer side: for carving, for the edges
@@ -221,7 +221,7 @@ def _targets(root: Path, views: list[View]) -> dict[View, Path]:
 
 
 def _hash(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return hash_file(path, hashlib.sha256).hexdigest()
 
 
 def _hashes(root: Path) -> set[str]:

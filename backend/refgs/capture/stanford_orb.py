@@ -13,10 +13,9 @@ import os
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from refgs.capture.transforms import read_views, where
+from refgs.capture.transforms import read_views
 from refgs.capture.types import Split, View
-from refgs.errors import InputError
-from refgs.formats.transforms import Frame, read_transforms
+from refgs.formats.transforms import Frame, read_novel_transforms, read_transforms
 
 NOVEL = "transforms_novel.json"
 
@@ -33,10 +32,8 @@ def novel_views(folder: Path) -> list[tuple[str, View]]:
     """
     file = folder / NOVEL
     frames, scenes = [], []
-    for frame in read_transforms(file).frames:
+    for frame in read_novel_transforms(file).frames:
         scene = frame.scene_name
-        if scene is None:
-            raise InputError(f"{where(file, frame)}: there is no scene_name. Download the data set again.")
         if os.path.isdir(folder.parent / scene):
             path = f"../{scene}/{PurePosixPath(frame.path)}"
             frames.append((_masked(frame.model_copy(update={"file_path": path})), "test"))

@@ -44,7 +44,6 @@ class Frame(Intrinsics):
     file_path: str
     transform_matrix: Matrix
     mask_path: str | None = None
-    scene_name: str | None = None  # of Stanford-ORB
 
     @property
     def path(self) -> str:
@@ -100,9 +99,26 @@ class RunCameras(Transforms):
     to_capture: Matrix
 
 
+class NovelFrame(Frame):
+    """Hold a camera of Stanford-ORB's transforms_novel.json: its photo is in the folder `scene_name`."""
+
+    scene_name: str
+
+
+class NovelCameras(Transforms):
+    """Hold a transforms_novel.json of Stanford-ORB."""
+
+    frames: list[NovelFrame]
+
+
 def read_transforms(file: Path) -> Transforms:
     """Read cameras from a JSON file of this format. Raises InputError naming the file, the frame and the value that is wrong."""
     return read_json(file, Transforms, AGAIN)
+
+
+def read_novel_transforms(file: Path) -> NovelCameras:
+    """Read a transforms_novel.json. Raises InputError naming the file, the frame and the value that is wrong."""
+    return read_json(file, NovelCameras, "Download the data set again.")
 
 
 def read_run_transforms(file: Path) -> RunCameras:

@@ -85,10 +85,11 @@ def _place(error: Any, data: Any) -> tuple[list[str], str]:
     where, keys = [], []
     for part in error["loc"]:
         known = range(len(data)) if isinstance(data, list) else data if isinstance(data, dict) else ()
-        if part in known:
-            data = data[part]
-        elif error["type"] != "missing":  # pydantic's name of a type that was tried
-            break
+        if part not in known:
+            if error["type"] == "missing":
+                keys.append(str(part))
+            break  # otherwise it is pydantic's name of a type that was tried
+        data = data[part]
         keys.append(str(part))
         if isinstance(data, dict) and isinstance(data.get("file_path"), str):
             where, keys = [f"frame {data['file_path']}"], []
@@ -98,6 +99,8 @@ def _place(error: Any, data: Any) -> tuple[list[str], str]:
 def _problem(error: Any) -> str:
     if error["type"] == "missing":
         return "is missing"
+    if error["type"] == "extra_forbidden":
+        return "is not known"
     if error["type"] == "value_error":
         return str(error["ctx"]["error"])
     if error["type"].startswith(("model_", "dict_")):

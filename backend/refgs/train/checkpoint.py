@@ -4,7 +4,6 @@ The last two complete checkpoints are kept. The TOML file begins with a hash of 
 """
 
 import errno
-import hashlib
 import os
 import tomllib
 from contextlib import suppress
@@ -16,9 +15,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from refgs.errors import InputError, TryAgain
+from refgs.errors import InputError, TryAgain, reason
 from refgs.events import Report
-from refgs.paths import whole
+from refgs.paths import hash_file, whole
 
 KEPT = 2
 _HASH = "hash = "  # begins the TOML file's first line
@@ -80,8 +79,8 @@ def load(folder: Path, report: Report = lambda event, facts: None) -> tuple[dict
             for file in _files(folder, iteration):
                 with suppress(OSError):  # not there, or in a folder that is read-only
                     os.replace(file, file.with_name(file.name + DAMAGED))
-            why = " ".join(str(error).split())
-            what = f"{folder}: the checkpoint of iteration {iteration} is damaged and set aside as *{DAMAGED}: {why}"
+            damaged = f"the checkpoint of iteration {iteration} is damaged and set aside as *{DAMAGED}"
+            what = f"{folder}: {damaged}: {reason(error)}"
             report("warning", {"what": what})
     raise NoCheckpoint(f"{folder} holds no complete checkpoint: train without --resume into a new folder")
 
@@ -113,7 +112,6 @@ def _read(folder: Path, iteration: int) -> tuple[dict[str, Tensor], dict[str, An
 
 def _hash(data: Path, text: str) -> str:
     """Hash the contents of a checkpoint's two files, the second without its first line."""
-    with open(data, "rb") as file:
-        found = hashlib.file_digest(file, "blake2b")
+    found = hash_file(data)
     found.update(text.encode())
     return found.hexdigest()
