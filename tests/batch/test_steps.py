@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from refgs.batch.batch import _settled
 from refgs.batch.steps import Outcome, Step, TryLater, recorded, run_step
 from refgs.train import checkpoint
 from tests.makers.captures import nerfstudio
@@ -19,6 +20,15 @@ from tests.makers.training import TINY
 
 def step(tmp_path, *words) -> Step:
     return Step(words[0], "cup", tuple(map(str, words)), tmp_path / "logs" / "cup" / f"{words[0]}.log")
+
+
+def test_a_capture_is_complete_where_its_files_change_no_more_whatever_the_clock_says(tmp_path):
+    (tmp_path / "a.png").touch()
+    assert not _settled(tmp_path)
+    for moved in (-3600, 3600):  # a clock that goes back dates files into the future
+        for path in (tmp_path / "a.png", tmp_path):
+            os.utime(path, (time.time() + moved,) * 2)
+        assert _settled(tmp_path)
 
 
 def test_a_step_is_recorded_and_known_again(tmp_path):

@@ -1,11 +1,15 @@
 """Test disks that fill up or are removed during a training or an export."""
 
+import subprocess
+
 import pytest
 
 from refgs import commands, train_job
+from refgs.capture import read_capture
 from refgs.errors import InputError
 from refgs.export.export_job import export
 from refgs.report.page import write_report
+from tests.makers.ball import write_run
 from tests.makers.disk import fill
 
 SMALL = ["surfels.start=500", "surfels.budget=500", "surfels.hull=48", "environment.resolution=16"]
@@ -56,6 +60,26 @@ def test_a_disk_that_is_full(ball_capture, small_disk):
     filler.unlink()
     trainer, _ = train(ball_capture, small_disk / "run", lambda trainer: False, resume=True)
     assert trainer.ended and (small_disk / "run" / "splats.ply").exists()
+
+
+def test_a_read_only_disk(ball_capture, small_disk, tmp_path):
+    """Check that nothing that writes into a run, or makes one, ends otherwise than in one line where the disk is read-only."""
+    run = write_run(small_disk / "run", read_capture(ball_capture))
+    before = files(run)
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    cameras = ball_capture / "transforms_test.json"
+    jobs = [
+        lambda: train(ball_capture, small_disk / "new", lambda state: False, *SMALL),
+        lambda: export(run, None, 64, None, None, True, lambda event, facts: None),
+        lambda: commands.evaluate(run, "test", None),
+        lambda: write_report([run], run / "report.html"),
+        lambda: commands.render(run, cameras, run / "rendered", ["color"], None, "exr"),
+    ]
+    for job in jobs:
+        with pytest.raises(InputError, match="Read-only file system") as said:
+            job()
+        assert "\n" not in str(said.value)
+    assert files(run) == before
 
 
 def files(run):

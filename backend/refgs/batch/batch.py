@@ -67,7 +67,7 @@ class Batch:
         if self._device == "cuda" and not engine.cards:
             raise InputError("--device cuda: no machine here has a CUDA card that Ray knows of: take auto or cpu")
         card = engine.card_bytes() if engine.cards and self._device != "cpu" else None
-        begun, stopped = time.time(), False
+        begun, stopped = time.monotonic(), False
         for job in self._jobs:
             self._submit(job, engine, card)
         while not all(run.ended for run in self._runs.values()):
@@ -78,13 +78,13 @@ class Batch:
                         self._note(run, step.name, outcome)
             self._tell()
             done = sum(run.ended for run in self._runs.values())
-            if not stopped and stop(done, len(self._runs), time.time() - begun):
+            if not stopped and stop(done, len(self._runs), time.monotonic() - begun):
                 stopped = True
                 engine.cancel()
             if not stopped and time.monotonic() > self._looked + REREAD_EVERY:
                 for job in self._added():
                     self._submit(job, engine, card)
-        self.write_page(time.time() - begun)
+        self.write_page(time.monotonic() - begun)
         return self._status(stopped)
 
     def write_page(self, seconds: float) -> None:
@@ -177,4 +177,6 @@ def _settled(capture: Path) -> bool:
         changed = max(path.stat().st_mtime for path in [capture, *capture.rglob("*")])
     except OSError:
         return False
-    return time.time() - changed > SETTLED
+    return (
+        abs(time.time() - changed) > SETTLED
+    )  # a clock that went back, or another machine's, dates files into the future

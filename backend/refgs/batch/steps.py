@@ -90,7 +90,7 @@ def run_step(step: Step, cores: int, pause: float, optional: tuple[bool, ...], *
 
 def _run_and_record(step: Step, cores: int) -> Outcome:
     """Run the command of a step. Record its outcome, unless a retry may change it."""
-    begun, node = time.time(), platform.node()
+    begun, node = time.monotonic(), platform.node()
     step.log.parent.mkdir(parents=True, exist_ok=True)
     step.running.touch()
     try:
@@ -98,7 +98,7 @@ def _run_and_record(step: Step, cores: int) -> Outcome:
             status, printed = _call(step, cores, log)
     finally:
         step.running.unlink(missing_ok=True)
-    outcome = Outcome(status, time.time() - begun, node, "" if status == 0 else _line(printed, status))
+    outcome = Outcome(status, time.monotonic() - begun, node, "" if status == 0 else _line(printed, status))
     if status in (0, *FAILED):
         facts = outcome._asdict() | {"words": step.words}
         write_text(step.log.with_suffix(".json"), json.dumps(facts, indent=1))
