@@ -35,7 +35,9 @@ def found_in(folder: Path, count: int, seed: str) -> list[dict]:
     at.write_text("0")
     lost = []
     while True:
-        command = [sys.executable, "-m", "tests.makers.fuzz", str(folder), str(count), seed, str(start)]
+        # Not `-m`: the processes of multiprocessing would import all readers, too, as the main module does.
+        program = "from tests.makers.fuzz import run; run()"
+        command = [sys.executable, "-c", program, str(folder), str(count), seed, str(start)]
         with subprocess.Popen(command, cwd=ROOT) as process:
             seen, since = "", time.monotonic()
             while process.poll() is None:

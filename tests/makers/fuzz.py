@@ -145,5 +145,10 @@ def main(folder: Path, count: int, seed: str, start: int) -> None:
         at.write(b"%-12d" % DONE)
 
 
-if __name__ == "__main__":
+def run() -> None:
+    """Call `main` with the arguments of the command line."""
     main(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], int(sys.argv[4]) if len(sys.argv) > 4 else 0)
+
+
+if __name__ == "__main__":
+    run()

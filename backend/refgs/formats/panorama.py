@@ -34,10 +34,10 @@ def _read_radiance(path: Path) -> np.ndarray:
 
     if not path.is_file():
         raise InputError(f"{path} is missing")
-    with path.open("rb") as file:  # the size is in the header's last line
-        if size := re.search(rb"\n[-+]Y +(\d{1,9}) +[-+]X +(\d{1,9})\n", file.read(1 << 16)):
-            check_pixels(path, int(size[2]), int(size[1]))
     try:
+        with path.open("rb") as file:  # the size is in the header's last line
+            if size := re.search(rb"\n[-+]Y +(\d{1,9}) +[-+]X +(\d{1,9})\n", file.read(1 << 16)):
+                check_pixels(path, int(size[2]), int(size[1]))
         pixels = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     except (cv2.error, OSError):  # an empty file; a disk that fails
         pixels = None
