@@ -75,8 +75,13 @@ def python(home: Path) -> Path:
 
 
 def needed_bytes() -> float:
-    """Estimate the disk space in bytes for the trainer. A machine with nvidia-smi needs more, because it may get torch's CUDA build."""
-    return NEEDED_WITH_CARD if shutil.which("nvidia-smi") else NEEDED
+    """Estimate the disk space in bytes for the trainer.
+
+    A machine with nvidia-smi needs more, because it may get torch's CUDA build. So does Linux if only that was locked at release: the
+    package index has no other.
+    """
+    locked = sys.platform == "linux" and (WHEELS / "lock.txt").is_file() and not (WHEELS / "lock-cpu.txt").is_file()
+    return NEEDED_WITH_CARD if locked or shutil.which("nvidia-smi") else NEEDED
 
 
 def free_bytes(home: Path) -> float:

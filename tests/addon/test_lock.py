@@ -113,6 +113,14 @@ def test_a_build_of_torch_without_a_lock_is_not_taken(release, tmp_path, monkeyp
     assert asked == {"UV_TORCH_BACKEND": "cpu"}
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only there has the package index torch's CUDA build")
+def test_room_is_asked_for_what_is_locked(release, monkeypatch):
+    monkeypatch.setattr(installation.shutil, "which", lambda name: None)
+    assert installation.needed_bytes() == installation.NEEDED_WITH_CARD
+    (release[0] / "lock-cpu.txt").touch()
+    assert installation.needed_bytes() == installation.NEEDED
+
+
 def test_locks_have_hashes_and_no_address(release):
     wheels, index = release
     lock = (wheels / "lock.txt").read_text()
