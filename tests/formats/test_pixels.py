@@ -1,17 +1,19 @@
 """Test that pictures are refused by the size that they declare, before they are decoded, and that large photos are not."""
 
 import struct
+import sys
 import zlib
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from refgs.capture.images import read_header, read_image, read_mask
+from refgs.capture.images import read_codes, read_header, read_image, read_mask
 from refgs.errors import InputError
 from refgs.formats.exr import read_exr, write_exr
 from refgs.formats.panorama import read_environment
-from tests.makers.captures import write_as_phone
+from tests.makers import fuzz
+from tests.makers.captures import write, write_as_phone
 
 SIDE = 64  # pixels of the files whose size is then replaced
 
@@ -80,3 +82,18 @@ def test_empty_files(tmp_path, suffix):
     with pytest.raises(InputError, match=f"a{suffix}") as error:
         read_image(path)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is measured as Linux does")
+def test_a_chunk_that_is_longer_than_its_file_takes_no_memory(tmp_path):
+    """Check a PNG that Pillow decodes, and whose pixels are declared to take three gigabytes."""
+    file = tmp_path / "a.png"
+    write(file, np.full((12, 16, 3), 300, np.uint16))
+    data = file.read_bytes()
+    at = data.index(b"IDAT") - 4
+    file.write_bytes(data[:at] + struct.pack(">I", 0xB4000000) + data[at + 4 :])
+    fuzz.forget_peak()
+    before = fuzz.memory("VmRSS")
+    with pytest.raises(InputError, match=r"a\.png: the image is truncated or broken"):
+        read_codes(file)
+    assert fuzz.memory("VmHWM") - before < 100 << 20

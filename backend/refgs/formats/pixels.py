@@ -17,3 +17,20 @@ def check_pixels(path: Path, width: int, height: int) -> None:
         raise InputError(f"{size} are more than the {MOST // 1_000_000} million that are read. Save it smaller.")
     if width * height > max(SMALL, MOST_PER_BYTE * path.stat().st_size):
         raise InputError(f"{size} do not fit into so small a file: it is broken. Replace it, or save it as PNG.")
+
+
+def check_chunks(path: Path) -> None:
+    """Raise InputError if a PNG declares more bytes than it has. OpenCV would take memory for them. Other files are left alone.
+
+    A PNG is 8 bytes and then chunks: a length, a name, that many bytes of data, and a checksum (PNG specification, 5.3).
+    """
+    size = path.stat().st_size
+    with open(path, "rb") as file:
+        if file.read(8) != b"\x89PNG\r\n\x1a\n":
+            return
+        name = b""
+        while name != b"IEND" and len(head := file.read(8)) == 8:
+            length, name = int.from_bytes(head[:4], "big"), head[4:]
+            if file.tell() + length > size:
+                raise InputError(f"{path}: the image is truncated or broken. Replace it.")
+            file.seek(length + 4, 1)

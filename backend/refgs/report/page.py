@@ -29,7 +29,7 @@ from refgs.errors import InputError, one_line
 from refgs.formats import history
 from refgs.formats.metrics import Metrics, read_metrics
 from refgs.formats.needs import Needs, Row
-from refgs.formats.pixels import check_pixels
+from refgs.formats.pixels import check_chunks, check_pixels
 from refgs.formats.run_toml import Summary
 from refgs.formats.validate import parse_toml, read_json, validated
 from refgs.paths import disk_errors_named, make_folders, read_text, write_text
@@ -231,6 +231,7 @@ def _embed(path: Path) -> str:
     try:
         with Image.open(path) as picture:
             check_pixels(path, *picture.size)
+        check_chunks(path)
     except Exception:  # Pillow's have no common class
         return ""
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
