@@ -349,23 +349,18 @@ def batch(
 
     Ctrl-C and SIGTERM end all commands, each training with a checkpoint. The same command resumes them.
     """
-    from refgs.batch.batch import Batch
-    from refgs.batch.engine import started
-    from refgs.batch.listing import LOGS, Ask
+    from refgs.batch.batch import ready
+    from refgs.batch.listing import Ask
     from refgs.batch.page import PAGE
-    from refgs.lock import RunLock
 
     train_job.check_device(device)
-    with _batch_bars() as report:
-        work = Batch(source, out, Ask(preset=preset, minutes=minutes, set=changes), device, report)
-        with started(address, cores, workers) as engine:
-            try:
-                (out / LOGS).mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise InputError(f"{out}: the folder cannot be made ({error.strerror}): choose another") from None
-            again = disk_errors_named([out], "run the same command again")
-            with RunLock(out / LOGS) as lock, again, _signals_to_stop() as stopped:
-                status = work.run(engine, lambda *facts: lock.attend(*facts) or bool(stopped))
+    ask = Ask(preset=preset, minutes=minutes, set=changes)
+    with (
+        _batch_bars() as report,
+        ready(source, out, ask, device, report, cores, workers, address) as run,
+        _signals_to_stop() as stopped,
+    ):
+        status = run(lambda: bool(stopped))
     console.print(f"the page about all runs: {out / PAGE}")
     if stopped and status:
         _end(stopped)

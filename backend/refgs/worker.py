@@ -22,7 +22,7 @@ from refgs.capture.check import check, describe
 from refgs.capture.masks import make_masks
 from refgs.capture.motion import find_cameras
 from refgs.capture.video import extract_photos
-from refgs.errors import InputError, NoCameras, one_line
+from refgs.errors import TRY_AGAIN, InputError, NoCameras, one_line
 from refgs.export.export_job import export as export_run
 from refgs.formats.needs import Needs
 from refgs.formats.validate import read_json
@@ -85,10 +85,19 @@ class Export(_Command):
     display_splats: str | None = None
 
 
+class Batch(_Command):
+    command: Literal["batch"]
+    captures: str
+    out: str
+    preset: str | None = None
+    device: str = "auto"
+
+
 class During(_Command):
     """Command to the job that is running.
 
-    Two commands end a training: "stop" writes its results, "cancel" writes only a checkpoint, from which it can be resumed.
+    Two commands end a training: "stop" writes its results, "cancel" writes only a checkpoint, from which it can be resumed. Both stop a
+    batch, whose trainings write checkpoints.
     """
 
     command: Literal["preview", "pause", "resume", "stop", "cancel"]
@@ -105,9 +114,9 @@ class Keep(_Command):
 
 
 COMMANDS = TypeAdapter(
-    Annotated[Check | Frames | Poses | Masks | Train | Export | During | Keep, Field(discriminator="command")]
+    Annotated[Check | Frames | Poses | Masks | Train | Export | Batch | During | Keep, Field(discriminator="command")]
 )
-JOBS = (Check, Frames, Poses, Masks, Train, Export)
+JOBS = (Check, Frames, Poses, Masks, Train, Export, Batch)
 CLOSED = None  # queued in place of a command: the input has ended
 
 
@@ -139,7 +148,7 @@ class _Ended(Exception):
 
 
 class Worker:
-    """Run jobs (check, frames, poses, masks, train, export) one after another, as commands ask for them.
+    """Run jobs (check, frames, poses, masks, train, export, batch) one after another, as commands ask for them.
 
     Each job sends the event `started`, and at its end `done`, `cancelled` or `failed`.
     """
@@ -183,6 +192,11 @@ class Worker:
         if not self._attentive:
             raise KeyboardInterrupt
 
+    def take_signals(self) -> None:
+        """Let `interrupt` handle SIGTERM and SIGINT."""
+        for kind in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(kind, self.interrupt)
+
     def send(self, event: str, facts: dict[str, Any]) -> None:
         """Write an event to the output as a JSON line.
 
@@ -203,7 +217,7 @@ class Worker:
         why = cuda.unusable()
         card = torch.cuda.get_device_name() if why is None else None
         self.send("ready", {"protocol": PROTOCOL, "refgs": __version__, "card": card, "no_card": why})
-        jobs = (self._check, self._frames, self._poses, self._masks, self._train, self._export)
+        jobs = (self._check, self._frames, self._poses, self._masks, self._train, self._export, self._batch)
         jobs_of = dict(zip(JOBS, jobs, strict=True))
         while self._open or (self._keep and self._waiting):
             if self._waiting and self._closed and not self._keep:
@@ -220,7 +234,7 @@ class Worker:
 
     def _run_job(self, name: str, job: Callable[[Any], tuple[str, dict]], command: _Command) -> None:
         self.send("started", {"job": name})
-        self._attentive = name == "train"
+        self._attentive = name in ("train", "batch")
         try:
             with shortage_named(), disk_errors_named([], "start the job again"):
                 event, facts = job(command)
@@ -334,14 +348,48 @@ class Worker:
         files = export_run(run, None, command.texture, None, display, overwrite, report=self.send)
         return "done", {"mesh" if display is None else "display_splats": str(files[0].resolve())}
 
+    def _batch(self, command: Batch) -> tuple[str, dict]:
+        from refgs.batch.batch import ready
+        from refgs.batch.listing import Ask
+
+        train_job.check_device(command.device)
+        source, out, ask = Path(command.captures), Path(command.out), Ask(preset=command.preset)
+        counts = {}
+
+        def report(event: str, facts: dict[str, Any]) -> None:
+            if event == "progress":
+                counts.update((key, facts[key]) for key in ("done", "total", "failed"))
+                facts = {"stage": "batch"} | counts
+            self.send(event, facts)
+
+        with ready(source, out, ask, command.device, report) as run:
+            self.take_signals()  # Ray took them
+            status = run(self._batch_must_stop)
+        return "cancelled" if status == TRY_AGAIN else "done", {"out": str(out.resolve())} | counts
+
+    def _batch_must_stop(self) -> bool:
+        """Handle commands that came during a batch. Return True if it must stop."""
+        while not self._commands.empty():
+            command = self._commands.get()
+            if command is CLOSED:
+                self._open = False
+                if not self._keep:
+                    return True
+            elif not isinstance(command, During):
+                self._waiting.append(command)
+            elif command.command in ("stop", "cancel"):
+                return True
+            else:
+                self.send("warning", {"what": f"nothing to {command.command}: a batch can only be stopped"})
+        return False
+
 
 def work() -> None:
     """Run the job protocol on stdin and stdout until the input ends. Other output of the program goes to stderr."""
     events = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
     worker = Worker(events)
-    for kind in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(kind, worker.interrupt)
+    worker.take_signals()
     # Unbuffered: a buffer is locked while the thread waits for input, and Python, ending, would wait for the lock.
     commands = io.FileIO(0, closefd=False)
     threading.Thread(target=worker.listen, args=(commands,), daemon=True).start()

@@ -1,24 +1,28 @@
 """Train all captures of a batch: hand their steps to the engine, follow them, and write a page about them."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from refgs.batch.engine import Engine
+from refgs.batch.engine import Engine, started
 from refgs.batch.graph import Node, steps_of
-from refgs.batch.listing import Ask, Job, read_jobs
-from refgs.batch.page import Row, write_page
+from refgs.batch.listing import LOGS, Ask, Job, read_jobs
+from refgs.batch.page import Row, figures_of, picture_of, write_page, write_rows
 from refgs.batch.resources import card_share, memory
 from refgs.batch.steps import Outcome, Step, recorded
 from refgs.errors import TRY_AGAIN, InputError
 from refgs.events import Report
 from refgs.formats.progress import Progress
 from refgs.formats.validate import read_json
-from refgs.lock import PROGRESS
+from refgs.lock import PROGRESS, RunLock
+from refgs.paths import disk_errors_named
 
+ROWS = "rows.json"  # in LOGS: the table for other programs
 REREAD_EVERY = 5.0  # seconds between looks for new captures
+WRITE_EVERY = 1.0  # seconds between writes of the table
 SETTLED = 10.0  # seconds without a change after which a new capture's files are taken to be complete
 
 
@@ -29,6 +33,8 @@ class _Run:
     job: Job
     nodes: dict[str, Node]
     outcomes: dict[str, Outcome] = field(default_factory=dict)
+    figures: dict[str, float] = field(default_factory=dict)
+    picture: Path | None = None
 
     @property
     def ended(self) -> bool:
@@ -45,17 +51,25 @@ class _Run:
     def seconds(self) -> float:
         return sum(outcome.seconds for outcome in self.outcomes.values())
 
+    @property
+    def complete(self) -> bool:
+        return self.ended and all(outcome.status is not None for outcome in self.outcomes.values())
+
+    def working(self) -> list[str]:
+        """List the steps that run now."""
+        return [name for name, node in self.nodes.items() if name not in self.outcomes and node.step.running.exists()]
+
 
 class Batch:
     """Follow the trainings of a list, or of a folder of captures, from their first step to the page about all of them."""
 
     def __init__(self, source: Path, out: Path, ask: Ask, device: str, report: Report):
         """Read and check the list. Raises InputError if it is wrong."""
-        self._source, self._out, self._ask, self._device, self._report = source, out, ask, device, report
+        self._source, self._out, self._ask, self._device, self._report = source, out.resolve(), ask, device, report
         self._runs: dict[str, _Run] = {}
         self._references: dict[Step, Any] = {}  # trainings of one capture share its first steps
         self._outcomes: dict[Step, Outcome] = {}
-        self._looked, self._state, self._said = time.monotonic(), None, ""
+        self._looked, self._wrote, self._said = time.monotonic(), 0.0, ""
         self._jobs = read_jobs(source, out, ask)
 
     def run(self, engine: Engine, stop: Callable[[int, int, float], bool]) -> int:
@@ -70,6 +84,7 @@ class Batch:
         begun, stopped = time.monotonic(), False
         for job in self._jobs:
             self._submit(job, engine, card)
+        self._tell()
         while not all(run.ended for run in self._runs.values()):
             for step, outcome in engine.ended(1.0):
                 self._outcomes[step] = outcome
@@ -84,21 +99,27 @@ class Batch:
             if not stopped and time.monotonic() > self._looked + REREAD_EVERY:
                 for job in self._added():
                     self._submit(job, engine, card)
-        self.write_page(time.monotonic() - begun)
+        self._write_rows()
+        write_page(self._out, [self._row(run) for run in self._runs.values()], time.monotonic() - begun)
         return self._status(stopped)
 
-    def write_page(self, seconds: float) -> None:
-        """Write the page about all runs, in the folder of the runs."""
-        rows = []
-        for run in self._runs.values():
-            failed = run.failed
-            state = "failed" if failed else "done" if run.ended and self._complete(run) else "stopped"
-            what, log = (f"{failed[0]}: {failed[1].what}", run.nodes[failed[0]].step.log) if failed else ("", None)
-            rows.append(Row(run.job.name, run.job.capture, state, run.seconds, what, log))
-        write_page(self._out, rows, seconds)
+    def _row(self, run: _Run) -> Row:
+        failed, step, part = run.failed, "", None
+        if failed or run.ended:
+            state = "failed" if failed else "done" if run.complete else "stopped"
+        else:
+            working = run.working()
+            state, step = "running" if working else "waiting", next(iter(working), "")
+            done, total = _progress(self._out / run.job.name) if step == "train" else (0, 0)
+            part = done / total if total else None
+        what, log = (f"{failed[0]}: {failed[1].what}", run.nodes[failed[0]].step.log) if failed else ("", None)
+        known = run.figures, run.picture
+        return Row(run.job.name, run.job.capture, state, run.seconds, what, log, step, part, *known)
 
-    def _complete(self, run: _Run) -> bool:
-        return all(outcome.status is not None for outcome in run.outcomes.values())
+    def _write_rows(self) -> None:
+        """Write the table for other programs."""
+        self._wrote = time.monotonic()
+        write_rows(self._out / LOGS / ROWS, [self._row(run) for run in self._runs.values()])
 
     def _submit(self, job: Job, engine: Engine, card: int | None) -> None:
         """Hand the steps of a training to the engine, except those that were done before."""
@@ -118,30 +139,38 @@ class Batch:
                 )
             if step in self._outcomes:
                 run.outcomes[name] = self._outcomes[step]
+        self._look(run)
         if run.ended:
             self._report("ended", {"run": job.name, "what": f"{job.name}: done before"})
 
     def _note(self, run: _Run, name: str, outcome: Outcome) -> None:
         run.outcomes[name] = outcome
+        self._look(run)
         if not run.ended:
             return
         if failed := run.failed:
             what = f"{failed[0]} failed: {failed[1].what}"
         else:
-            what = f"done in {run.seconds:.0f} s" if self._complete(run) else "stopped"
+            what = f"done in {run.seconds:.0f} s" if run.complete else "stopped"
         self._report("ended", {"run": run.job.name, "what": f"{run.job.name}: {what}"})
 
+    def _look(self, run: _Run) -> None:
+        """Read what a run has to show by now."""
+        folder = self._out / run.job.name
+        run.figures, run.picture = figures_of(folder), picture_of(folder)
+
     def _tell(self) -> None:
-        """Report how many runs have ended, and what is being done for the others."""
+        """Report how many runs have ended, and what is being done for the others. Write the table every WRITE_EVERY seconds."""
         working = []
         for run in self._runs.values():
-            for name, node in run.nodes.items():
-                if name not in run.outcomes and node.step.running.exists():
-                    done, total = _progress(self._out / run.job.name) if name == "train" else (0, 0)
-                    working.append({"run": run.job.name, "step": name, "done": done, "total": total})
+            for name in run.working():
+                done, total = _progress(self._out / run.job.name) if name == "train" else (0, 0)
+                working.append({"run": run.job.name, "step": name, "done": done, "total": total})
         ended = [run for run in self._runs.values() if run.ended]
         facts = {"done": len(ended), "total": len(self._runs), "failed": sum(run.failed is not None for run in ended)}
         self._report("progress", facts | {"working": working})
+        if time.monotonic() > self._wrote + WRITE_EVERY:
+            self._write_rows()
 
     def _added(self) -> list[Job]:
         """Read the list again, and return the trainings that were added. If it is wrong now, warn once."""
@@ -160,6 +189,32 @@ class Batch:
         if stopped or TRY_AGAIN in statuses:
             return TRY_AGAIN
         return next((status for status in (1, 2) if status in statuses), 0)
+
+
+@contextmanager
+def ready(
+    source: Path,
+    out: Path,
+    ask: Ask,
+    device: str,
+    report: Report,
+    cores: int | None = None,
+    workers: int | None = None,
+    address: str | None = None,
+) -> Iterator[Callable[[Callable[[], bool]], int]]:
+    """Check a batch, start Ray and lock the folder of the runs, for a `with` block. The arguments are the options of `refgs batch`.
+
+    Yields the function run(stop), which runs the batch and returns its exit status. `stop()` is called about once a second. If it returns
+    True, all commands are ended, trainings with checkpoints. Raises InputError if something is wrong with the captures, Ray or the folder.
+    """
+    work = Batch(source, out, ask, device, report)
+    with started(address, cores, workers) as engine:
+        try:
+            (out / LOGS).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{out}: the folder cannot be made ({error.strerror}): choose another") from None
+        with RunLock(out / LOGS) as lock, disk_errors_named([out], "run the same command again"):
+            yield lambda stop: work.run(engine, lambda *facts: lock.attend(*facts) or stop())
 
 
 def _progress(run: Path) -> tuple[int, int]:

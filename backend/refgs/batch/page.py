@@ -1,7 +1,9 @@
-"""Write the page about a batch: a row for each run, with a picture, figures, seconds, and what failed in one line."""
+"""Write a batch's table, a row a run with its state, figures and what failed: as a page, and as JSON for other programs."""
 
 import base64
+import json
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,28 +22,47 @@ SHOWN = ("psnr", "ssim", "flip", "splats")
 
 
 class Row(NamedTuple):
-    """Hold what the page says of a run. `state` is "done", "failed" or "stopped"; `what` says in one line what failed, as `log` does."""
+    """Hold what the tables say of a run.
+
+    `state` is "waiting", "running", "done", "failed" or "stopped". A run that runs is at the `step`, of which `part`, 0 … 1, is done, or
+    None if that is not known. `what` says in one line what failed, as `log` does. `figures` are its metrics, `picture` its first held-out
+    view as rendered.
+    """
 
     name: str
     capture: Path
     state: str
     seconds: float
-    what: str = ""
-    log: Path | None = None
+    what: str
+    log: Path | None
+    step: str
+    part: float | None
+    figures: dict[str, float]
+    picture: Path | None
+
+
+def write_rows(file: Path, rows: list[Row]) -> None:
+    """Write the rows as JSON, in place of an earlier file. docs/batch.md describes it. A write that fails is ignored."""
+    facts = []
+    for row in rows:
+        figures = {key: row.figures[key] for key in SHOWN if key in row.figures}
+        facts.append(row._asdict() | {"figures": figures})
+    with suppress(OSError):  # a reader that has the file open on Windows, or a full disk, must not end the batch
+        write_text(file, json.dumps({"rows": facts}, default=str), durable=False)
 
 
 def write_page(out: Path, rows: list[Row], seconds: float) -> None:
     """Write the page `index.html` about runs in the folder `out`, in place of an earlier one. `seconds` is how long the batch took."""
-    metrics = [_figures(out / row.name) for row in rows]
     columns = [quantity for quantity in HEADLINE if quantity.key in SHOWN]
-    columns = [quantity for quantity in columns if any(quantity.key in known for known in metrics)]
+    columns = [quantity for quantity in columns if any(quantity.key in row.figures for row in rows)]
     table = []
-    for row, known in zip(rows, metrics, strict=True):
+    for row in rows:
+        known = row.figures
         figures = [(known.get(q.key), q.text(known[q.key]) if q.key in known else "–") for q in columns]
         table.append(
             {
                 "row": row,
-                "picture": _picture(out / row.name),
+                "picture": _small(row.picture),
                 "figures": figures,
                 "seconds": duration(row.seconds),
                 "link": row.name if (out / row.name).is_dir() else None,
@@ -60,7 +81,7 @@ def write_page(out: Path, rows: list[Row], seconds: float) -> None:
     write_text(out / PAGE, text)
 
 
-def _figures(run: Path) -> dict[str, float]:
+def figures_of(run: Path) -> dict[str, float]:
     """Read a run's metrics as a flat dict. A broken file counts as none: the run's own report says more."""
     try:
         return dict(flatten(run_metrics(run)))
@@ -68,9 +89,13 @@ def _figures(run: Path) -> dict[str, float]:
         return {}
 
 
-def _picture(run: Path) -> str:
-    """Return a small picture of a run, as a data URL: its first held-out view as rendered. Return "" if there is none."""
-    file = min((run / "pictures" / "test" / "color").glob("*.png"), default=None)
+def picture_of(run: Path) -> Path | None:
+    """Find a picture of a run: its first held-out view as rendered. Return None if there is none."""
+    return min((run / "pictures" / "test" / "color").glob("*.png"), default=None)
+
+
+def _small(file: Path | None) -> str:
+    """Return a picture, reduced to SIDE pixels, as a data URL. Return "" if there is none."""
     image = None if file is None else cv2.imread(str(file), cv2.IMREAD_COLOR)
     if image is None:
         return ""
