@@ -6,3 +6,8 @@ class InputError(Exception):
 
     Operators show the line in Blender. Programs without a window print it to stderr.
     """
+
+
+def missing_module(error: ModuleNotFoundError) -> str:
+    """Say that Blender's Python lacks a package. Debian's Blender may lack numpy, which is imported late."""
+    return f"Blender's Python lacks {error.name}: install it (on Debian, python3-{error.name})"

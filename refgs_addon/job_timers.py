@@ -5,13 +5,14 @@ from pathlib import Path
 import bpy
 
 from . import jobs
-from .scene import live_splats
+from .scene import batch_table, live_splats
 
 POLL_SECONDS = 0.2  # a poll without news costs microseconds
 PREVIEW_SECONDS = 4.0  # between the previews of a training
 OTHER_SECONDS = 2.0  # between looks at runs that other processes train
 
 _since_preview = 0.0
+_batch = Path()  # folder of the batch whose table is shown
 
 
 def follow_jobs() -> None:
@@ -51,6 +52,20 @@ def _poll_other_processes() -> float | None:
     return OTHER_SECONDS if any(jobs.run_state(folder) == "training" for folder in others) else None
 
 
+def follow_batch(folder: Path) -> None:
+    """Start a timer that reads the table of the batch in a folder, and again every two seconds until the batch ends."""
+    global _batch
+    _batch = folder
+    if not bpy.app.timers.is_registered(_poll_batch):
+        bpy.app.timers.register(_poll_batch, first_interval=0.0, persistent=True)
+
+
+def _poll_batch() -> float | None:
+    if batch_table.show_table(_batch):
+        redraw()
+    return OTHER_SECONDS if jobs.run_state(_batch / jobs.LOGS) == "training" else None
+
+
 def redraw() -> None:
     """Redraw the panel, the preferences and the status bar."""
     manager = bpy.context.window_manager
@@ -63,7 +78,7 @@ def redraw() -> None:
 
 def unregister() -> None:
     """Stop the timers and all jobs, except trainings that should continue after Blender closes."""
-    for timer in (_poll_jobs, _poll_other_processes):
+    for timer in (_poll_jobs, _poll_other_processes, _poll_batch):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     jobs.stop_all()

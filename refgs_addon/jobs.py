@@ -32,7 +32,9 @@ else:
 PROTOCOL = 1
 TRAINER, BLENDER = "the trainer", "Blender"  # programs that run jobs
 ENDED = ("done", "cancelled", "failed")
+_FIRST = {"train": "Reading the photos", "batch": "Starting Ray"}  # step of a job that has sent no progress yet
 LOCK, PROGRESS, STOP = "run.lock", "progress.json", "stop"  # files in a run folder, as in backend/refgs/lock.py
+LOGS = "logs"  # folder among the runs of a batch that has these files of it, as in backend/refgs/batch/listing.py
 
 
 @dataclass
@@ -47,7 +49,7 @@ class Job:
     python: Path
     commands: list[dict]
     log: Path
-    run: Path | None = None  # run folder that the job works in; such jobs run one at a time
+    run: Path | None = None  # run folder that the job works in, or a batch's LOGS; such jobs run one at a time
     arguments: tuple[str, ...] = ("-E", "-m", "refgs.cli", "worker")  # of that Python
     program: str = TRAINER
     state: str = "waiting"
@@ -71,6 +73,11 @@ class Job:
     _query_only: bool = False
     _process: subprocess.Popen | None = None
     _events: queue.SimpleQueue = field(default_factory=queue.SimpleQueue)
+
+    @property
+    def kind(self) -> str:
+        """Return the first command's name, such as "train". Return "" if the job only learns the trainer's version."""
+        return self.commands[0]["command"] if self.commands else ""
 
     @property
     def ended(self) -> bool:
@@ -155,7 +162,7 @@ class Job:
                     age = "older" if event["protocol"] < PROTOCOL else "newer"
                     self._fail(f"the trainer, {event['refgs']}, is {age} than this add-on: install the same release")
             case "started":
-                self.state, self.line = "running", {"train": "Reading the photos"}.get(event["job"], "")
+                self.state, self.line = "running", _FIRST.get(event["job"], "")
             case "stage":
                 self.line, self.fraction = event["what"], event.get("part", self.fraction)
             case "warning":
@@ -185,7 +192,8 @@ class Job:
                     self.state, self.line = "done", ""
                     self._close()
             case "cancelled":
-                self.state, self.line = "cancelled", f"Stopped at iteration {event['iteration']:,}"
+                at = f" at iteration {event['iteration']:,}" if "iteration" in event else ""
+                self.state, self.line = "cancelled", f"Stopped{at}"
                 self._close()
             case "failed":
                 self.no_cameras = event.get("no_cameras", False)
@@ -356,6 +364,20 @@ def train(
     return _add(Job(out.name, python, commands, log, out))
 
 
+def train_many(python: Path, captures: Path, out: Path, log: Path, preset: str) -> Job:
+    """Start a job that trains on all captures in the folder `captures`, by `refgs batch`. The runs are made in the folder `out`.
+
+    The job first waits until earlier trainings have ended. What an earlier batch did there is not done again. Raises InputError if
+    `captures` is missing, or a batch works in `out` already.
+    """
+    if not captures.exists():
+        raise InputError(f"{captures} does not exist: choose the folder that the captures are in")
+    if any(job.run == out / LOGS and not job.ended for job in JOBS) or run_state(out / LOGS) == "training":
+        raise InputError(f"{out}: captures are being trained into it already: wait for them, or stop that")
+    command = {"command": "batch", "captures": str(captures), "out": str(out), "preset": preset}
+    return _add(Job(out.name, python, [command], log, out / LOGS))
+
+
 def export(python: Path, run: Path, log: Path) -> Job:
     """Start a job that makes the mesh and textures of a run folder. It waits until earlier trainings have ended."""
     return _add(Job(run.name, python, [{"command": "export", "run": str(run)}], log, run))
@@ -370,13 +392,13 @@ def display_splats(python: Path, run: Path, file: Path, log: Path) -> Job:
     return _add(Job(file.name, python, [command], log))
 
 
-def render(blender: Path, arguments: tuple[str, ...], command: Mapping[str, object], log: Path) -> Job:
-    """Start a job that renders in another Blender process, which runs `render_worker`. It does not wait for other jobs.
+def in_blender(name: str, blender: Path, arguments: tuple[str, ...], command: Mapping[str, object], log: Path) -> Job:
+    """Start a job in another Blender process, which runs `render_worker`. It does not wait for other jobs.
 
     `arguments` are the command-line arguments of that Blender. `command` is the dictionary that `render_worker` then reads from stdin: what
-    to render. The finished job's `results["render"]["png"]` is the path of the picture.
+    to do. A finished job's `results["render"]["png"]` is the path of the picture, if it rendered one.
     """
-    return _add(Job(Path(command["png"]).name, blender, [dict(command)], log, arguments=arguments, program=BLENDER))
+    return _add(Job(name, blender, [dict(command)], log, arguments=arguments, program=BLENDER))
 
 
 def _add(job: Job) -> Job:

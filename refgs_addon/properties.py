@@ -11,6 +11,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from .scene.batch_table import forget_table
 from .scene.run_parts import ROOT
 
 
@@ -20,6 +21,40 @@ class KnownRun(bpy.types.PropertyGroup):
     folder: StringProperty(subtype="DIR_PATH")
     capture: StringProperty(subtype="DIR_PATH")
     confirmed: StringProperty(description="Decisions of the training that the artist keeps, as need=answer")
+
+
+PRESETS = [
+    ("quick", "Quick", "A few minutes on a laptop: photos of 400 pixels, a coarse mesh"),
+    ("standard", "Standard", "Finer light, mesh and textures, photos of 800 pixels; several times as long"),
+    ("paper", "Paper", "The published schedule of 58,000 iterations: for a graphics card"),
+]
+
+
+class Many(bpy.types.PropertyGroup):
+    """Store what the panel Train Many is set to."""
+
+    captures: StringProperty(
+        name="Captures",
+        description="Folder of captures: each folder in it has the photos of one",
+        subtype="DIR_PATH",
+    )
+    results: StringProperty(
+        name="Results",
+        description="Folder for the results, a run folder for each capture. If left empty, a folder beside the captures",
+        subtype="DIR_PATH",
+    )
+    preset: EnumProperty(name="Quality", items=PRESETS, default="quick")
+
+
+class BatchRow(bpy.types.PropertyGroup):
+    """Hold a row of a batch's table, as `scene.batch_table.Row` does. Blender files do not store it."""
+
+    name: StringProperty()
+    state: StringProperty()
+    words: StringProperty()
+    what: StringProperty()
+    log: StringProperty()
+    picture: StringProperty()
 
 
 class Training(bpy.types.PropertyGroup):
@@ -33,15 +68,7 @@ class Training(bpy.types.PropertyGroup):
         description="New or empty folder for the result. If left empty, a folder beside the capture",
         subtype="DIR_PATH",
     )
-    preset: EnumProperty(
-        name="Quality",
-        items=[
-            ("quick", "Quick", "A few minutes on a laptop: photos of 400 pixels, a coarse mesh"),
-            ("standard", "Standard", "Finer light, mesh and textures, photos of 800 pixels; several times as long"),
-            ("paper", "Paper", "The published schedule of 58,000 iterations: for a graphics card"),
-        ],
-        default="quick",
-    )
+    preset: EnumProperty(name="Quality", items=PRESETS, default="quick")
     limited: BoolProperty(
         name="Limit Time",
         description="Finish within a number of minutes: it chooses the splats, photo size and iterations in place of the quality",
@@ -115,13 +142,16 @@ class Training(bpy.types.PropertyGroup):
         poll=lambda self, item: item.type == "EMPTY",
     )
     runs: CollectionProperty(type=KnownRun)
+    many: PointerProperty(type=Many)
 
 
-CLASSES = (KnownRun, Training)
+CLASSES = (KnownRun, Many, BatchRow, Training)
 
 
 def register() -> None:
     bpy.types.Scene.refgs = PointerProperty(type=Training, name="RefGS")
+    bpy.types.WindowManager.refgs_rows = CollectionProperty(type=BatchRow)
+    bpy.types.WindowManager.refgs_row = IntProperty(name="Run", description="Selected run of the batch")
     bpy.types.Object.refgs_longest_side = FloatProperty(
         name="Longest Side",
         description="Size of the object: the longest side of a box around it. Photos do not tell it; type it in",
@@ -133,6 +163,8 @@ def register() -> None:
 
 
 def unregister() -> None:
+    forget_table()
+    del bpy.types.WindowManager.refgs_rows, bpy.types.WindowManager.refgs_row
     del bpy.types.Scene.refgs, bpy.types.Object.refgs_longest_side
 
 

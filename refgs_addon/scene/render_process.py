@@ -1,8 +1,8 @@
-"""Render in another Blender process, so that the artist can continue in this one."""
+"""Render, or do other slow work, in another Blender process, so that the artist can continue in this one."""
 
 import itertools
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import bpy
@@ -31,13 +31,22 @@ def render_in_background(
         raise InputError(f"cannot write {png}: its folder does not exist")
     copy = str(Path(bpy.app.tempdir) / f"refgs {next(_numbers)}.blend")  # Blender deletes the folder when it ends
     _save_copy(copy)
-    start = _START.format(root=str(ROOT))
-    program, words = bpy.app.binary_path, ("--factory-startup", "--background", copy, "--python-expr", start)
-    if not program:  # Blender runs as a Python module
-        program, words = sys.executable, ("-c", f"import bpy; bpy.ops.wm.open_mainfile(filepath={copy!r}); {start}")
     command = {"command": "render", "png": str(png), "hdris": [str(file) for file in hdris or ()]}
-    look = {"size": size, "samples": samples}
-    job = jobs.render(Path(program), words, command | look, log_file(f"render {png.stem}"))
+    return start_blender(png.name, f"render {png.stem}", command | {"size": size, "samples": samples}, copy)
+
+
+def start_blender(name: str, log: str, command: Mapping[str, object], file: str | None = None) -> jobs.Job:
+    """Start a job in another Blender process. That Blender opens `file`, a .blend, if it is given.
+
+    `name` is the job's, `log` the name of its log. `command` is what `render_worker` reads.
+    """
+    start = _START.format(root=str(ROOT))
+    words = ("--factory-startup", "--background", *([file] if file else []), "--python-expr", start)
+    program = bpy.app.binary_path
+    if not program:  # Blender runs as a Python module
+        opened = f"bpy.ops.wm.open_mainfile(filepath={file!r}); " if file else ""
+        program, words = sys.executable, ("-c", f"import bpy; {opened}{start}")
+    job = jobs.in_blender(name, Path(program), words, command, log_file(log))
     follow_jobs()
     return job
 

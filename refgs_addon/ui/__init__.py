@@ -12,6 +12,7 @@ from . import (
     hint_buttons,
     icons,
     light_panel,
+    many_panel,
     materials_panel,
     operators,
     panels,
@@ -33,6 +34,7 @@ _MODULES = (
     train_panel,
     strokes_panel,
     closing,
+    many_panel,
     panels,
     hint_buttons,
 )

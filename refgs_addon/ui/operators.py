@@ -8,7 +8,7 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, St
 from bpy_extras.io_utils import ExportHelper
 
 from .. import jobs
-from ..errors import InputError
+from ..errors import InputError, missing_module
 from ..preferences import hdri_folder, set_up
 from ..scene.asset import mark_asset
 from ..scene.camera_objects import PHOTO, next_camera, photo_shown, show_photo
@@ -36,9 +36,8 @@ class ReportsErrors:
         except InputError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        except ModuleNotFoundError as error:  # Debian's Blender may lack numpy, which is imported late
-            name = error.name
-            self.report({"ERROR"}, f"Blender's Python lacks {name}: install it (on Debian, python3-{name})")
+        except ModuleNotFoundError as error:
+            self.report({"ERROR"}, missing_module(error))
             return {"CANCELLED"}
         return {"FINISHED"}
 

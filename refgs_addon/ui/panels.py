@@ -99,7 +99,7 @@ class PreviewPanel(Tab, bpy.types.Panel):
         layout.operator(operators.ContactSheet.bl_idname, icon="IMGDISPLAY")
         layout.operator(operators.MarkAsset.bl_idname, icon="ASSET_MANAGER")
         for number, job in enumerate(jobs.JOBS):
-            if job.program == jobs.BLENDER:
+            if job.kind == "render":
                 self._render(layout.box(), number, job)
 
     def _render(self, box: bpy.types.UILayout, number: int, job: jobs.Job) -> None:

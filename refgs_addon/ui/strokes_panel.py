@@ -28,7 +28,7 @@ class StrokesPanel(bpy.types.Panel):
         layout.label(text="The mask leaves out what is red")
         layout.operator(SaveStrokes.bl_idname, icon="FILE_TICK")
         for number, job in enumerate(jobs.JOBS):
-            if job.commands and job.commands[0]["command"] == "masks":
+            if job.kind == "masks":
                 draw_job(layout.box(), context.scene, number, job, width)
 
 

@@ -181,7 +181,7 @@ class TrainPanel(Tab, bpy.types.Panel):
         row.operator(CheckCapture.bl_idname, icon="VIEWZOOM")
         row.operator(Train.bl_idname, icon="PLAY")
         for number, job in enumerate(jobs.JOBS):
-            if job.program == jobs.TRAINER and job not in preferences.own_jobs():
+            if job.program == jobs.TRAINER and job.kind != "batch" and job not in preferences.own_jobs():
                 draw_job(layout.box(), context.scene, number, job, width)
         for known in settings.runs:
             if not any(job.run == Path(known.folder) for job in jobs.JOBS):
@@ -196,7 +196,7 @@ def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: 
     if job.ended:
         head.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).number = number
     if job.active and (job.run or ("stage" in job.progress and not job.results)):
-        box.progress(factor=_fraction(job), text=_status(job).capitalize())
+        box.progress(factor=fraction(job), text=status_words(job).capitalize())
     if job.line:
         wrapped_text(box, job.line[0].upper() + job.line[1:], width)
     _draw_photos(box, scene, job, width)
@@ -222,14 +222,14 @@ def draw_job(box: bpy.types.UILayout, scene: bpy.types.Scene, number: int, job: 
     if job.run and job.state in ("running", "paused") and "train" not in job.results:
         row = box.row(align=True)
         command = "resume" if job.state == "paused" else "pause"
-        _command_button(row, number, command, command.title(), "PLAY" if command == "resume" else "PAUSE")
-        _command_button(row, number, "stop", "Finish", "CHECKMARK")
-        _command_button(row, number, "cancel", "Stop", "CANCEL")
+        command_button(row, number, command, command.title(), "PLAY" if command == "resume" else "PAUSE")
+        command_button(row, number, "stop", "Finish", "CHECKMARK")
+        command_button(row, number, "cancel", "Stop", "CANCEL")
         watched = live_splats.is_watched(job)
         icon = "HIDE_OFF" if watched else "HIDE_ON"
         box.operator(ShowLiveSplats.bl_idname, icon=icon, depress=watched).number = number
     elif not job.ended:
-        _command_button(box, number, "cancel", "Stop", "CANCEL")
+        command_button(box, number, "cancel", "Stop", "CANCEL")
     if job.run and not job.ended:
         icon = "CHECKBOX_HLT" if job.kept else "CHECKBOX_DEHLT"
         box.operator(KeepTraining.bl_idname, icon=icon, emboss=False).number = number
@@ -264,16 +264,16 @@ def draw_status(self, context: bpy.types.Context) -> None:
     if job is not None:
         row = self.layout.row()
         row.ui_units_x = 14
-        row.progress(factor=_fraction(job), text=f"{job.name}: {_status(job)}")
+        row.progress(factor=fraction(job), text=f"{job.name}: {status_words(job)}")
 
 
-def _fraction(job: jobs.Job) -> float:
+def fraction(job: jobs.Job) -> float:
     """Return how much of a job is done, 0..1. For a job with several stages, return how much of the present stage is done."""
     facts = job.progress
     return facts["done" if "stage" in facts else "iteration"] / max(facts["total"], 1) if facts else 0.0
 
 
-def _status(job: jobs.Job) -> str:
+def status_words(job: jobs.Job) -> str:
     """Describe the progress of a job in a few words, such as "paused" or "3:20 left"."""
     if job.state == "paused":
         return "paused"
@@ -283,6 +283,9 @@ def _status(job: jobs.Job) -> str:
         return "waiting" if job.state == "waiting" else "starting"
     if "stage" in job.progress:
         stage = job.progress["stage"]
+        if stage == "batch":
+            failed = job.progress["failed"]
+            return "{done} of {total} done".format(**job.progress) + (f", {failed} failed" if failed else "")
         if stage == "frames":
             return "{done} frames read, {kept} kept, {blurred} blurred".format(**job.progress)
         if stage in ("points", "reading", "carving", "edges"):
@@ -297,7 +300,8 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
-def _command_button(layout: bpy.types.UILayout, number: int, command: str, text: str, icon: str) -> None:
+def command_button(layout: bpy.types.UILayout, number: int, command: str, text: str, icon: str) -> None:
+    """Draw a button that sends a command to the job at the index `number`."""
     button = layout.operator(SendCommand.bl_idname, text=text, icon=icon)
     button.number, button.command = number, command
 

@@ -13,7 +13,7 @@ from refgs_addon import jobs, preferences
 from refgs_addon.errors import InputError
 from refgs_addon.scene import regions, strokes, training
 from refgs_addon.scene.capture_cameras import cameras_of, show_cameras
-from refgs_addon.ui.train_panel import _status
+from refgs_addon.ui.train_panel import status_words
 from tests.makers.waiting import final_state, until
 
 pytestmark = pytest.mark.usefixtures("fake_trainer")
@@ -67,7 +67,7 @@ def test_a_video_becomes_the_capture(addon, tmp_path):
     assert not addon.refgs.capture  # until the photos are there
     until(lambda: job.progress)
     assert final_state(job) == "done" and job.results["frames"]["photos"] == 37
-    assert _status(job) == "2 frames read, 2 kept, 1 blurred"
+    assert status_words(job) == "2 frames read, 2 kept, 1 blurred"
     assert addon.refgs.capture == str(tmp_path / "film 2") and (tmp_path / "film 2" / "images").is_dir()
     with pytest.raises(RuntimeError, match="images exists: choose another folder"):
         bpy.ops.refgs.photos_from_video(filepath=str(film), out=str(tmp_path / "film 2"))

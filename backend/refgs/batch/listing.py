@@ -14,6 +14,7 @@ from refgs.formats.validate import read_toml
 from refgs.settings import Settings, load_settings
 
 LOGS = "logs"  # the folder in RUNS that holds what the steps print, and how they ended
+LIBRARY = "library"  # the folder in RUNS in which Blender makes the runs assets
 
 
 class Ask(BaseModel):
@@ -119,7 +120,7 @@ def _check_unique(source: Path, out: Path, jobs: list[Job]) -> None:
     runs: dict[str, Job] = {}
     for job in jobs:
         for name in (job.name, job.capture_name):
-            if name.lower() == LOGS or name.startswith(".") or any(c in name for c in '/\\:*?"<>|'):
+            if name.lower() in (LOGS, LIBRARY) or name.startswith(".") or any(c in name for c in '/\\:*?"<>|'):
                 raise InputError(f"{source}: {name!r} cannot be the name of a run's folder: give the capture another")
         if (other := runs.setdefault(job.name.lower(), job)) is not job:
             if other.capture == job.capture:

@@ -1,0 +1,102 @@
+"""Make the runs of a batch assets: a folder of .blend files, one a run, which Blender's asset browser shows as a library."""
+
+from pathlib import Path
+
+import bpy
+
+from .. import jobs
+from ..errors import InputError
+from .atomic_file import atomic_write, unwritable
+from .batch_table import Row, read_rows
+
+LIBRARY = "library"  # folder among the runs, as in backend/refgs/batch/listing.py
+CATALOG = "RefGS"
+CATALOG_ID = "8f1f0b52-6a0c-4c34-9b59-4f0c3d3b7c21"
+_CATALOGS = "blender_assets.cats.txt"  # the file in which Blender looks for a library's catalogs
+_HEADER = "# This is an Asset Catalog Definition file for Blender.\n\nVERSION 1\n\n"
+
+
+def missing_assets(folder: Path) -> list[Row]:
+    """List the finished runs of the batch in a folder that are not in its library."""
+    return [row for row in read_rows(folder) if row.state == "done" and not asset_file(folder, row.name).exists()]
+
+
+def asset_file(folder: Path, name: str) -> Path:
+    """Return the path of the .blend file of a run's asset. `folder` is that of the batch."""
+    return folder / LIBRARY / f"{name}.blend"
+
+
+def library_name(folder: Path) -> str:
+    """Return the name of a batch's library in the asset browser."""
+    return f"{folder.name} {LIBRARY}"
+
+
+def import_as_assets(folder: Path) -> jobs.Job:
+    """Start a job that makes each finished run of a batch an asset, and then lists the library in Blender's preferences.
+
+    Files that are in the library already stay as they are. Another Blender process does it, so that the open file stays as it is. Raises
+    InputError if there is no run to import, or if this is being done already.
+    """
+    from .render_process import start_blender
+
+    rows = missing_assets(folder)
+    if not rows:
+        known = (folder / LIBRARY).is_dir()
+        what = "all finished runs are in the library" if known else "no run has finished"
+        raise InputError(f"{folder.name}: {what}: train more captures first")
+    if any(job.kind == "library" and job.commands[0]["folder"] == str(folder) and not job.ended for job in jobs.JOBS):
+        raise InputError(f"the assets of {folder.name} are being made already: wait for them")
+    jobs.JOBS[:] = [job for job in jobs.JOBS if not (job.ended and job.kind == "library")]
+    runs = [{"name": row.name, "picture": row.picture} for row in rows]
+    command = {"command": "library", "folder": str(folder), "runs": runs}
+    job = start_blender(library_name(folder), f"library {folder.name}", command)
+    job.then = lambda job: add_library(folder)
+    return job
+
+
+def write_asset(run: Path, picture: Path | None, file: Path) -> None:
+    """Import a run folder and write it as an asset into a .blend file. The open file is replaced by an empty one.
+
+    The asset is the run's collection, without its cameras and light. `picture` becomes its preview. Raises InputError if the run cannot be
+    read or the file not be written.
+    """
+    from .import_run import import_run
+    from .run_parts import cameras
+    from .world_light import correct_diffuse
+
+    bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
+    scene = bpy.context.scene
+    collection = import_run(run, scene).collection
+    if own := cameras(collection):
+        collection.children.unlink(own)
+    scene.world = None
+    correct_diffuse(scene)  # the next scene has another world
+    bpy.ops.file.pack_all()
+    collection.asset_mark()
+    collection.asset_data.catalog_id = CATALOG_ID
+    if picture is not None and picture.is_file():
+        with bpy.context.temp_override(id=collection):
+            bpy.ops.ed.lib_id_load_custom_preview(filepath=str(picture))
+    with atomic_write(file) as temporary:
+        bpy.data.libraries.write(str(temporary), {collection}, fake_user=True, compress=True)
+
+
+def add_catalog(library: Path) -> None:
+    """List the catalog in a library's file of catalogs, beside those that the artist has added there."""
+    file = library / _CATALOGS
+    try:
+        text = file.read_text(encoding="utf-8") if file.exists() else _HEADER
+        if CATALOG_ID not in text:
+            with atomic_write(file) as temporary:
+                temporary.write_text(f"{text.rstrip()}\n{CATALOG_ID}:{CATALOG}:{CATALOG}\n", encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise unwritable(file, error) from None
+
+
+def add_library(folder: Path) -> None:
+    """List the library of the batch in a folder among the asset libraries of Blender's preferences, unless it is there."""
+    preferences, path = bpy.context.preferences, (folder / LIBRARY).resolve()
+    known = preferences.filepaths.asset_libraries
+    if all(Path(bpy.path.abspath(library.path)).resolve() != path for library in known):
+        known.new(name=library_name(folder), directory=str(path))
+        preferences.is_dirty = True  # so that Blender saves them when it ends

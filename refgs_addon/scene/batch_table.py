@@ -1,0 +1,115 @@
+"""Read the table that a batch writes, with a row for each run, and hold it for the panel."""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import bpy
+
+from .. import jobs
+from ..errors import InputError
+from ..json_file import read_json
+
+ROWS = "rows.json"  # in the batch's LOGS, as in backend/refgs/batch/batch.py
+_STEPS = {
+    "poses": "finding cameras",
+    "masks": "making masks",
+    "train": "training",
+    "evaluate": "measuring",
+    "export": "making the mesh",
+}
+
+_shown: tuple[Path, object] | None = (
+    None  # the folder whose table the panel has, and what tells the table's versions apart
+)
+
+
+class Row(NamedTuple):
+    """Hold what a batch says of one run. `state` is "waiting", "running", "done", "failed" or "stopped".
+
+    `words` says how far the run is or what it reached, `what` which step failed and why. `log` and `picture` are paths, "" if there is
+    none.
+    """
+
+    name: str
+    state: str
+    words: str
+    what: str
+    log: str
+    picture: str
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """Read the rows of the batch whose runs are in a folder. There are none if there was no batch. Damaged rows are left out.
+
+    Of a batch that no process works on any more, runs that have not ended are "stopped".
+    """
+    try:
+        found = read_json(folder / jobs.LOGS / ROWS)["rows"]
+    except (InputError, KeyError, TypeError):
+        return []
+    going, rows = jobs.run_state(folder / jobs.LOGS) == "training", []
+    for facts in found if isinstance(found, list) else ():
+        try:
+            name, state, what = (str(facts[key]) for key in ("name", "state", "what"))
+            if state in ("waiting", "running") and not going:
+                state = "stopped"
+            files = (str(facts[key] or "") for key in ("log", "picture"))
+            rows.append(Row(name, state, _words(state, facts), what, *files))
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
+            continue
+    return rows
+
+
+def _words(state: str, facts: dict) -> str:
+    """Describe a run in a few words, such as "training, 42 %" or "31.2 dB, 3.4 min"."""
+    if state == "running":
+        part = facts["part"]
+        step = _STEPS.get(facts["step"], str(facts["step"]))
+        return step if part is None else f"{step}, {float(part):.0%}"
+    if state != "done":
+        return state
+    figures, minutes = facts["figures"], float(facts["seconds"]) / 60
+    psnr = float(figures["psnr"]) if "psnr" in figures else math.nan
+    return f"{psnr:.1f} dB, {minutes:.1f} min" if math.isfinite(psnr) else f"{minutes:.1f} min"
+
+
+def show_table(folder: Path) -> bool:
+    """Copy the rows of a batch into the list that the panel draws, if the file or the batch's state has changed. Returns True if it has."""
+    global _shown
+    try:
+        changed = (folder / jobs.LOGS / ROWS).stat().st_mtime_ns
+    except OSError:
+        changed = 0
+    version = folder, (changed, jobs.run_state(folder / jobs.LOGS))
+    if version == _shown:
+        return False
+    manager = bpy.context.window_manager
+    chosen = row.name if (row := chosen_row(folder)) is not None else ""
+    _shown, listed = version, manager.refgs_rows
+    listed.clear()
+    for row in read_rows(folder):
+        item = listed.add()
+        for key, value in row._asdict().items():
+            setattr(item, key, value)
+    names = [item.name for item in listed]
+    manager.refgs_row = names.index(chosen) if chosen in names else 0
+    return True
+
+
+def is_shown(folder: Path) -> bool:
+    """Return whether the panel's list has the rows of the batch in this folder."""
+    return _shown is not None and _shown[0] == folder
+
+
+def chosen_row(folder: Path) -> bpy.types.PropertyGroup | None:
+    """Return the row that is selected in the panel's list. Return None if the list is empty or that of another folder."""
+    manager = bpy.context.window_manager
+    rows = manager.refgs_rows if is_shown(folder) else ()
+    return rows[manager.refgs_row] if 0 <= manager.refgs_row < len(rows) else None
+
+
+def forget_table() -> None:
+    """Forget which table the panel has, as its list is removed."""
+    global _shown
+    _shown = None

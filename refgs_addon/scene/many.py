@@ -1,0 +1,39 @@
+"""Train all captures of a folder. The buttons of the Train Many panel call these functions."""
+
+from pathlib import Path
+
+import bpy
+
+from .. import jobs
+from ..errors import InputError
+from ..job_timers import follow_jobs
+from ..preferences import log_file, python
+
+
+def results_folder(scene: bpy.types.Scene) -> Path | None:
+    """Return the folder for the runs: the one that the artist chose, else one beside the captures. Return None if neither is chosen."""
+    settings = scene.refgs.many
+    if settings.results:
+        return Path(bpy.path.abspath(settings.results))
+    captures = _captures(scene)
+    return captures and captures.with_name(f"{captures.name} RefGS")
+
+
+def train_many(scene: bpy.types.Scene) -> jobs.Job:
+    """Start a job that trains on all captures of the scene's folder, or resumes that. `batch_table` has its progress.
+
+    Raises InputError if there is no trainer or no such folder, or if a batch works there already.
+    """
+    captures, out = _captures(scene), results_folder(scene)
+    if captures is None:
+        raise InputError("no captures are chosen: choose the folder that they are in")
+    trainer = python()
+    jobs.JOBS[:] = [job for job in jobs.JOBS if not (job.ended and job.run == out / jobs.LOGS)]
+    job = jobs.train_many(trainer, captures, out, log_file(f"many {out.name}"), scene.refgs.many.preset)
+    follow_jobs()
+    return job
+
+
+def _captures(scene: bpy.types.Scene) -> Path | None:
+    chosen = scene.refgs.many.captures
+    return Path(bpy.path.abspath(chosen)) if chosen else None

@@ -1,0 +1,177 @@
+"""Draw the panel Train Many, below Train: a folder of captures, and a table of their runs. Define its operators."""
+
+import time
+from pathlib import Path
+from typing import ClassVar
+
+import bpy
+
+from .. import jobs
+from ..job_timers import follow_batch
+from ..preferences import wrapped_text
+from ..scene import asset_library, batch_table, many
+from .closing import KeepTraining, StopRun
+from .icons import thumbnail
+from .operators import ReportsErrors, has_trainer
+from .panels import Tab
+from .train_panel import Dismiss, ImportTrained, TrainPanel, command_button, fraction, status_words
+
+ROWS = 5  # of the table, as it is drawn at first
+_ICONS = {"waiting": "SORTTIME", "running": "PLAY", "done": "CHECKMARK", "failed": "ERROR", "stopped": "PAUSE"}
+
+
+class TrainMany(ReportsErrors, bpy.types.Operator):
+    bl_idname = "refgs.train_many"
+    bl_label = "Train Many"
+    bl_description = (
+        "Find cameras, make masks, train, and make the mesh of each capture in the folder, in separate processes. "
+        "What is done already is not done again; what was stopped is resumed"
+    )
+    bl_options: ClassVar = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        if not has_trainer(cls):
+            return False
+        cls.poll_message_set("Choose the folder of the captures first")
+        return bool(context.scene.refgs.many.captures)
+
+    def work(self, context: bpy.types.Context) -> None:
+        many.train_many(context.scene)
+
+
+class ImportAsAssets(ReportsErrors, bpy.types.Operator):
+    bl_idname = "refgs.import_as_assets"
+    bl_label = "Import as Assets"
+    bl_description = (
+        "Make each finished run an asset, in an asset library among the results, which Blender's asset browser then "
+        "shows. Assets that are there already stay as they are"
+    )
+    bl_options: ClassVar = {"REGISTER"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        cls.poll_message_set("Choose the folder of the captures, or of their results, first")
+        return many.results_folder(context.scene) is not None
+
+    def work(self, context: bpy.types.Context) -> None:
+        job = asset_library.import_as_assets(many.results_folder(context.scene))
+        while bpy.app.background and not job.ended:  # there are no timers
+            jobs.poll()
+            time.sleep(0.05)
+
+
+class RunList(bpy.types.UIList):
+    """Draw the rows of a batch's table: a picture, the name, and how far the run is."""
+
+    bl_idname = "REFGS_UL_runs"
+
+    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index):
+        row = layout.row()
+        picture = thumbnail(Path(item.picture)) if item.picture else 0
+        if picture:
+            row.template_icon(icon_value=picture, scale=2)
+        else:
+            row.label(text="", icon=_ICONS.get(item.state, "QUESTION"))
+        column = row.column(align=True)
+        column.label(text=item.name)
+        column.label(text=item.words)
+
+
+class ManyPanel(Tab, bpy.types.Panel):
+    bl_idname = "REFGS_PT_many"
+    bl_label = "Train Many"
+    bl_parent_id = TrainPanel.bl_idname
+    bl_options: ClassVar = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, settings = self.layout, context.scene.refgs.many
+        width = int(context.region.width / (7 * context.preferences.system.ui_scale)) - 6  # letters
+        column = layout.column()
+        column.use_property_split, column.use_property_decorate = True, False
+        for name in ("captures", "results", "preset"):
+            column.prop(settings, name)
+        layout.operator(TrainMany.bl_idname, icon="PLAY")
+        for number, job in enumerate(jobs.JOBS):
+            if job.kind == "batch":
+                _draw_batch(layout.box(), number, job, width)
+        folder = many.results_folder(context.scene)
+        if folder is None:
+            return
+        follow_batch(folder)
+        if not any(job.run == folder / jobs.LOGS for job in jobs.JOBS):
+            _draw_other_process(layout, folder)
+        if batch_table.is_shown(folder) and context.window_manager.refgs_rows:
+            _draw_table(layout, context, folder, width)
+        for number, job in enumerate(jobs.JOBS):
+            if job.kind == "library":
+                _draw_library(layout.box(), number, job, width)
+
+
+def _draw_batch(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> None:
+    """Draw a batch that this Blender started. `width` is how many letters fit into a line."""
+    head = box.row()
+    icon = {"done": "CHECKMARK", "failed": "ERROR", "cancelled": "PAUSE"}.get(job.state, "SORTTIME")
+    head.label(text=job.name, icon=icon)
+    if job.ended:
+        head.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).number = number
+    if job.active or (job.ended and job.progress):
+        box.progress(factor=fraction(job), text=status_words(job).capitalize())
+    if job.line:
+        wrapped_text(box, job.line[0].upper() + job.line[1:], width)
+    for warning in job.warnings:
+        wrapped_text(box, warning[0].upper() + warning[1:], width, "ERROR")
+    if not job.ended:
+        command_button(box, number, "cancel", "Stop", "CANCEL")
+        icon = "CHECKBOX_HLT" if job.kept else "CHECKBOX_DEHLT"
+        box.operator(KeepTraining.bl_idname, icon=icon, emboss=False).number = number
+    if job.state == "failed":
+        box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
+
+
+def _draw_other_process(layout: bpy.types.UILayout, folder: Path) -> None:
+    """Draw the batch that another process, such as a terminal's, runs in a folder."""
+    logs = folder / jobs.LOGS
+    if jobs.run_state(logs) != "training":
+        return
+    facts, stopping = jobs.run_progress(logs), jobs.stop_requested(logs)
+    row = layout.row(align=True)
+    done, total = (int(facts.get(key, 0)) for key in ("iteration", "total"))
+    row.progress(factor=done / max(total, 1), text="Stopping" if stopping else f"{done} of {total} done")
+    if not stopping:
+        row.operator(StopRun.bl_idname, icon="CANCEL").folder = str(logs)
+
+
+def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, folder: Path, width: int) -> None:
+    """Draw the table, and below it the line on the selected run and its buttons."""
+    manager = context.window_manager
+    layout.template_list(RunList.bl_idname, "", manager, "refgs_rows", manager, "refgs_row", rows=ROWS)
+    row = batch_table.chosen_row(folder)
+    if row is not None and row.what:
+        wrapped_text(layout, f"{row.name}: {row.what}", width, "ERROR")
+        layout.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = row.log
+    elif row is not None and row.state == "done":
+        layout.operator(ImportTrained.bl_idname, text=f"Import {row.name}", icon="IMPORT").folder = str(
+            folder / row.name
+        )
+    layout.operator(ImportAsAssets.bl_idname, icon="ASSET_MANAGER")
+
+
+def _draw_library(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int) -> None:
+    """Draw the job that makes runs assets."""
+    row = box.row()
+    row.label(text=job.name, icon={"done": "CHECKMARK", "failed": "ERROR"}.get(job.state, "SORTTIME"))
+    row.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).number = number
+    for warning in job.warnings:
+        wrapped_text(box, warning[0].upper() + warning[1:], width, "ERROR")
+    if job.state == "done":
+        written = job.results["library"]["written"]
+        wrapped_text(box, f"{written} assets are in the asset browser: choose {job.name}", width)
+    elif job.state == "failed":
+        wrapped_text(box, job.line[0].upper() + job.line[1:], width)
+        box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
+    else:
+        box.progress(factor=job.fraction, text=job.line)
+
+
+CLASSES = (TrainMany, ImportAsAssets, RunList, ManyPanel)
