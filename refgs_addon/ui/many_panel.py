@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import bpy
+from bpy.props import IntProperty
 
 from .. import jobs
 from ..job_timers import follow_batch
@@ -61,21 +62,39 @@ class ImportAsAssets(ReportsErrors, bpy.types.Operator):
             time.sleep(0.05)
 
 
+class ChooseRun(ReportsErrors, bpy.types.Operator):
+    bl_idname = "refgs.choose_run"
+    bl_label = "Select Run"
+    bl_description = "Select this run: below the table is what it failed by, or a button that imports it"
+    bl_options: ClassVar = {"INTERNAL"}
+
+    index: IntProperty(name="Index", description="Of the row in the table")
+
+    def work(self, context: bpy.types.Context) -> None:
+        context.window_manager.refgs_row = self.index
+
+
 class RunList(bpy.types.UIList):
-    """Draw the rows of a batch's table: a picture, the name, and how far the run is."""
+    """Draw the rows of a batch's table: a picture, the name, and below it how far the run is."""
 
     bl_idname = "REFGS_UL_runs"
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index):
         row = layout.row()
+        cell = row.row()
+        cell.ui_units_x = 2
         picture = thumbnail(Path(item.picture)) if item.picture else 0
         if picture:
-            row.template_icon(icon_value=picture, scale=2)
+            cell.template_icon(icon_value=picture, scale=2)
         else:
-            row.label(text="", icon=_ICONS.get(item.state, "QUESTION"))
+            cell.label(text="")
         column = row.column(align=True)
         column.label(text=item.name)
-        column.label(text=item.words)
+        line = column.row()
+        line.alignment = "LEFT"
+        # Blender selects a row by a click on its first line only.
+        button = line.operator(ChooseRun.bl_idname, text=item.words, icon=_ICONS.get(item.state, "NONE"), emboss=False)
+        button.index = index
 
 
 class ManyPanel(Tab, bpy.types.Panel):
@@ -174,4 +193,4 @@ def _draw_library(box: bpy.types.UILayout, number: int, job: jobs.Job, width: in
         box.progress(factor=job.fraction, text=job.line)
 
 
-CLASSES = (TrainMany, ImportAsAssets, RunList, ManyPanel)
+CLASSES = (TrainMany, ImportAsAssets, ChooseRun, RunList, ManyPanel)
