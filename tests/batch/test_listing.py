@@ -2,6 +2,7 @@
 
 import pytest
 
+from refgs.batch.graph import steps_of
 from refgs.batch.listing import Ask, read_jobs
 from refgs.errors import InputError
 from tests.makers.captures import nerfstudio
@@ -29,6 +30,14 @@ def test_each_folder_is_a_capture(shelf):
         ("cup", shelf / "cup", "quick"),
         ("jar", shelf / "jar", "quick"),
     ]
+
+
+def test_no_two_steps_of_a_run_work_at_once(shelf):
+    """Check that each step follows the one before: `export` locks the run and removes what `evaluate` would be writing."""
+    nodes = steps_of(read_jobs(shelf, shelf.parent / "runs", Ask())[0], shelf.parent / "runs", "cpu")
+    names = [node.step.name for node in nodes]
+    assert names == ["poses", "masks", "train", "evaluate", "export"]
+    assert all(before in node.after + node.may_fail for before, node in zip(names, nodes[1:], strict=False))
 
 
 def test_captures_times_settings_and_a_line_overrides(shelf):

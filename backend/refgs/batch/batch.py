@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from refgs.batch.engine import Engine, started
-from refgs.batch.graph import Node, steps_of
+from refgs.batch.graph import OPTIONAL, Node, steps_of
 from refgs.batch.listing import LOGS, Ask, Job, read_jobs
 from refgs.batch.page import Row, figures_of, picture_of, write_page, write_rows
 from refgs.batch.resources import card_share, memory
@@ -44,8 +44,7 @@ class _Run:
     def failed(self) -> tuple[str, Outcome] | None:
         """Return the first step that failed, with its outcome. Masks count only if the training failed, too."""
         bad = [(name, found) for name in self.nodes if (found := self.outcomes.get(name)) and found.status]
-        optional = {name for node in self.nodes.values() for name in node.may_fail}
-        return next((pair for pair in bad if pair[0] not in optional), None)
+        return next((pair for pair in bad if pair[0] not in OPTIONAL), None)
 
     @property
     def seconds(self) -> float:

@@ -8,10 +8,11 @@ from refgs.batch.steps import Step
 from refgs.capture import find_layout
 
 SHARED = ("poses", "masks")  # steps of a capture: its trainings by several settings share them
+OPTIONAL = ("masks",)  # steps whose failure counts only if the training fails, too
 
 
 class Node(NamedTuple):
-    """Hold a step, and the names of the steps that it follows: those that must succeed, and one that may fail."""
+    """Hold a step, and the names of the steps that it follows: those that must succeed, and those that may fail."""
 
     step: Step
     after: tuple[str, ...] = ()
@@ -21,7 +22,8 @@ class Node(NamedTuple):
 def steps_of(job: Job, out: Path, device: str) -> list[Node]:
     """List the steps of a training into `out`, each after those that it follows.
 
-    Masks may fail: the training then takes all that the photos show, as `refgs train` does.
+    Masks may fail: the training then takes all that the photos show, as `refgs train` does. No two steps work in the run at once: each
+    that locks it removes what others are writing, as if killed processes had left it.
     """
     run, capture = (out / job.name).resolve(), str(job.capture)
     logs = run.parent / LOGS
@@ -49,5 +51,5 @@ def steps_of(job: Job, out: Path, device: str) -> list[Node]:
         *nodes,
         Node(train, before, masks),
         Node(step("evaluate", str(run), made=run / "metrics.json"), ("train",)),
-        Node(step("export", str(run), made=run / "mesh.glb"), ("train",)),
+        Node(step("export", str(run), made=run / "mesh.glb"), ("train",), ("evaluate",)),
     ]
