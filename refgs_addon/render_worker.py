@@ -76,13 +76,12 @@ def _library(command: dict, say) -> dict:
     except OSError as error:
         raise InputError(f"{folder / LIBRARY}: the folder cannot be made ({error.strerror})") from None
     add_catalog(folder / LIBRARY)
-    written = 0
+    failed = []
     for number, run in enumerate(runs):
         say("stage", what=run["name"], part=number / len(runs))
         try:
             picture = Path(run["picture"]) if run["picture"] else None
             write_asset(folder / run["name"], picture, asset_file(folder, run["name"]))
-            written += 1
         except InputError as error:  # of this run: the others may be whole
-            say("warning", what=f"{run['name']}: {error}")
-    return {"written": written}
+            failed.append(f"{run['name']}: {error}")
+    return {"written": len(runs) - len(failed), "failed": failed}

@@ -181,11 +181,11 @@ def _draw_library(box: bpy.types.UILayout, number: int, job: jobs.Job, width: in
     row = box.row()
     row.label(text=job.name, icon={"done": "CHECKMARK", "failed": "ERROR"}.get(job.state, "SORTTIME"))
     row.operator(Dismiss.bl_idname, text="", icon="X", emboss=False).number = number
-    for warning in job.warnings:
-        wrapped_text(box, warning[0].upper() + warning[1:], width, "ERROR")
     if job.state == "done":
-        written = job.results["library"]["written"]
-        wrapped_text(box, f"{written} assets are in the asset browser: choose {job.name}", width)
+        made = job.results["library"]
+        wrapped_text(box, f"{made['written']} assets were made: choose {job.name} in the asset browser", width)
+        for what in made["failed"]:
+            wrapped_text(box, what, width, "ERROR")
     elif job.state == "failed":
         wrapped_text(box, job.line[0].upper() + job.line[1:], width)
         box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)

@@ -284,8 +284,8 @@ def status_words(job: jobs.Job) -> str:
     if "stage" in job.progress:
         stage = job.progress["stage"]
         if stage == "batch":
-            failed = job.progress["failed"]
-            return "{done} of {total} done".format(**job.progress) + (f", {failed} failed" if failed else "")
+            done, total, failed = (job.progress[key] for key in ("done", "total", "failed"))
+            return f"{done - failed} of {total} done" + (f", {failed} failed" if failed else "")
         if stage == "frames":
             return "{done} frames read, {kept} kept, {blurred} blurred".format(**job.progress)
         if stage in ("points", "reading", "carving", "edges"):

@@ -3,6 +3,7 @@
 Arguments: the Python with the trainer, the list of captures, and the folder for the runs. stage.py shows the command line.
 """
 
+import importlib.util
 import sys
 
 import bpy
@@ -21,6 +22,7 @@ def artist():
 
     Each `yield` gives a function; the next step waits until this function returns true.
     """
+    report["numpy"] = importlib.util.find_spec("numpy") is not None
     install()
     open_panel()
     area().spaces.active.show_region_ui = True
@@ -46,7 +48,7 @@ def artist():
     photograph("failed")
     bpy.ops.refgs.import_as_assets()
     yield lambda: jobs()[-1].ended
-    report["assets"] = jobs()[-1].state, jobs()[-1].line, jobs()[-1].warnings
+    report["assets"] = jobs()[-1].state, jobs()[-1].line
     report["libraries"] = [library.path for library in bpy.context.preferences.filepaths.asset_libraries]
     yield after(2.0)
     photograph("assets")

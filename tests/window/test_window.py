@@ -20,6 +20,7 @@ import pytest
 from refgs_addon import jobs
 from tests.makers.films import film_ball
 from tests.makers.runs import write_run
+from tests.makers.training import TINY
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -128,6 +129,33 @@ def test_a_film_becomes_a_run(tmp_path):
     mask = cv2.imread(str(tmp_path / "ball" / "masks" / Path(report["strokes"]).name), cv2.IMREAD_GRAYSCALE)
     assert (mask[drawn] > 127).mean() < 0.1 and (mask > 127).mean() > 0.02
     assert report["corrected"] == report["trained"] == "done" and report["imported"] == ["FINISHED"]
+
+
+@pytest.mark.window
+def test_an_artist_trains_many(tmp_path, ball_capture):
+    """Check Train Many with the real trainer: the table while captures are trained, a run that fails, and the library of assets."""
+    for name in ("ball", "a museum piece with a long name", "broken"):
+        shutil.copytree(ball_capture, tmp_path / "shelf" / name)
+    next((tmp_path / "shelf" / "broken").rglob("*.png")).write_bytes(b"no picture")
+    changes = [*TINY, "environment.resolution=16", "train.iterations=1000", "mesh.resolution=32", "mesh.texture=64"]
+    captures = "".join(f'[[captures]]\nfolder = "{folder}"\n' for folder in sorted((tmp_path / "shelf").iterdir()))
+    (tmp_path / "list.toml").write_text(f"set = {json.dumps(changes)}\n{captures}")
+    results = tmp_path / "results"
+    report = in_window("many.py", tmp_path, sys.executable, tmp_path / "list.toml", results)
+    assert {name: state for name, state, _ in report["running"]}.keys() == {
+        file.name for file in (tmp_path / "shelf").iterdir()
+    }
+    assert report["ended"] == ["done", ""]
+    states = {name: state for name, state, _ in report["rows"]}
+    assert states == {"ball": "done", "a museum piece with a long name": "done", "broken": "failed"}
+    for name in ("running", "failed", "assets"):
+        assert cv2.imread(str(tmp_path / f"{name}.png")).std() > 5
+    if not report["numpy"]:
+        assert report["assets"][0] == "failed" and "lacks numpy" in report["assets"][1]
+        return
+    assert report["assets"] == ["done", ""] and str(results / "library") in report["libraries"]
+    files = {file.name for file in (results / "library").iterdir()}
+    assert files == {"ball.blend", "a museum piece with a long name.blend", "blender_assets.cats.txt"}
 
 
 @pytest.mark.window
