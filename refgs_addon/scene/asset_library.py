@@ -68,9 +68,10 @@ def write_asset(run: Path, picture: Path | None, file: Path) -> None:
     scene = bpy.context.scene
     collection = import_run(run, scene).collection
     if own := cameras(collection):
-        collection.children.unlink(own)
+        bpy.data.batch_remove([*own.objects, own])
     scene.world = None
     correct_diffuse(scene)  # the next scene has another world
+    bpy.data.orphans_purge(do_recursive=True)
     bpy.ops.file.pack_all()
     collection.asset_mark()
     collection.asset_data.catalog_id = CATALOG_ID
@@ -78,7 +79,8 @@ def write_asset(run: Path, picture: Path | None, file: Path) -> None:
         with bpy.context.temp_override(id=collection):
             bpy.ops.ed.lib_id_load_custom_preview(filepath=str(picture))
     with atomic_write(file) as temporary:
-        bpy.data.libraries.write(str(temporary), {collection}, fake_user=True, compress=True)
+        # A whole file: Blender 4.3 leaves out the preview where `bpy.data.libraries.write` writes the collection alone.
+        bpy.ops.wm.save_as_mainfile(filepath=str(temporary), compress=True, check_existing=False)
 
 
 def add_catalog(library: Path) -> None:

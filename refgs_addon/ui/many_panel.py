@@ -15,7 +15,7 @@ from .closing import KeepTraining, StopRun
 from .icons import thumbnail
 from .operators import ReportsErrors, has_trainer
 from .panels import Tab
-from .train_panel import Dismiss, ImportTrained, TrainPanel, command_button, fraction, status_words
+from .train_panel import Dismiss, ImportTrained, TrainPanel, command_button, count_words, fraction, status_words
 
 ROWS = 5  # of the table, as it is drawn at first
 _ICONS = {"waiting": "SORTTIME", "running": "PLAY", "done": "CHECKMARK", "failed": "ERROR", "stopped": "PAUSE"}
@@ -118,8 +118,9 @@ class ManyPanel(Tab, bpy.types.Panel):
         if folder is None:
             return
         follow_batch(folder)
-        if not any(job.run == folder / jobs.LOGS for job in jobs.JOBS):
-            _draw_other_process(layout, folder)
+        own = any(job.run == folder / jobs.LOGS and not job.ended for job in jobs.JOBS)
+        if not own and jobs.run_state(folder / jobs.LOGS) == "training":
+            _draw_other_process(layout.box(), context, folder)
         if batch_table.is_shown(folder) and context.window_manager.refgs_rows:
             _draw_table(layout, context, folder, width)
         for number, job in enumerate(jobs.JOBS):
@@ -148,17 +149,15 @@ def _draw_batch(box: bpy.types.UILayout, number: int, job: jobs.Job, width: int)
         box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(job.log)
 
 
-def _draw_other_process(layout: bpy.types.UILayout, folder: Path) -> None:
+def _draw_other_process(box: bpy.types.UILayout, context: bpy.types.Context, folder: Path) -> None:
     """Draw the batch that another process, such as a terminal's, runs in a folder."""
-    logs = folder / jobs.LOGS
-    if jobs.run_state(logs) != "training":
-        return
-    facts, stopping = jobs.run_progress(logs), jobs.stop_requested(logs)
-    row = layout.row(align=True)
-    done, total = (int(facts.get(key, 0)) for key in ("iteration", "total"))
-    row.progress(factor=done / max(total, 1), text="Stopping" if stopping else f"{done} of {total} done")
+    states = [row.state for row in context.window_manager.refgs_rows] if batch_table.is_shown(folder) else []
+    done, failed, stopping = states.count("done"), states.count("failed"), jobs.stop_requested(folder / jobs.LOGS)
+    text = "Stopping" if stopping else count_words(done, len(states), failed) if states else "Starting"
+    box.label(text=folder.name, icon="SORTTIME")
+    box.progress(factor=(done + failed) / max(len(states), 1), text=text)
     if not stopping:
-        row.operator(StopRun.bl_idname, icon="CANCEL").folder = str(logs)
+        box.operator(StopRun.bl_idname, icon="CANCEL").folder = str(folder / jobs.LOGS)
 
 
 def _draw_table(layout: bpy.types.UILayout, context: bpy.types.Context, folder: Path, width: int) -> None:

@@ -285,13 +285,18 @@ def status_words(job: jobs.Job) -> str:
         stage = job.progress["stage"]
         if stage == "batch":
             done, total, failed = (job.progress[key] for key in ("done", "total", "failed"))
-            return f"{done - failed} of {total} done" + (f", {failed} failed" if failed else "")
+            return count_words(done - failed, total, failed)
         if stage == "frames":
             return "{done} frames read, {kept} kept, {blurred} blurred".format(**job.progress)
         if stage in ("points", "reading", "carving", "edges"):
             return f"making masks: {stage}"
         return {"colours": "learning colours", "baking": "baking textures"}.get(stage, f"finding cameras: {stage}")
     return f"{_duration(job.progress['seconds_left'])} left"
+
+
+def count_words(done: int, total: int, failed: int) -> str:
+    """Describe the progress of a batch by its runs."""
+    return f"{done} of {total} done" + (f", {failed} failed" if failed else "")
 
 
 def _duration(seconds: float) -> str:
