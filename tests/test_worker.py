@@ -141,6 +141,13 @@ def test_messages_that_are_no_commands_fail(talk, tmp_path):
     assert talk.end() == 0
 
 
+def test_a_batch_of_what_is_no_shelf_fails_before_ray_starts(talk, ball_capture, tmp_path):
+    talk.tell("batch", captures=str(ball_capture), out=str(tmp_path / "runs"))
+    failed = talk.until("failed")
+    assert failed["job"] == "batch" and not failed["fault"] and "is a capture itself" in failed["what"]
+    assert not (tmp_path / "runs").exists()
+
+
 def test_a_training_is_paused_looked_at_cancelled_and_resumed(talk, ball_capture, run):
     talk.until("progress")
     talk.tell("pause")

@@ -1,5 +1,6 @@
 """Test batches of small captures with Ray: stopped, resumed, killed, and added to while they run."""
 
+import json
 import os
 import re
 import shutil
@@ -26,6 +27,11 @@ CHANGES = [*TINY, "environment.resolution=16", "train.iterations=3000", "indirec
 CHANGES += ["mesh.resolution=32", "mesh.triangles=500", "mesh.texture=64"]
 
 
+def rows(out) -> dict[str, dict]:
+    """Read the table that a batch writes for other programs. Return its rows by name."""
+    return {row["name"]: row for row in json.loads((out / "logs" / "rows.json").read_text())["rows"]}
+
+
 @pytest.fixture
 def shelf(ball_capture, tmp_path):
     """Make two captures, one of which has a broken photo, and a list of them. Return the folder."""
@@ -48,6 +54,7 @@ def test_stopped_resumed_killed_and_added_to(shelf, ball_capture):
     assert status == 75, said
     assert list((out / "ball" / "checkpoints").glob("*.toml")) and not (out / "ball" / "splats.ply").exists()
     assert "stopped" in (out / "index.html").read_text()
+    assert rows(out)["ball"]["state"] == "stopped"
 
     again = batch(shelf / "list.toml", out)
     [(_, worker)] = until(again, lambda: training.exists() and processes.commands("refgs.cli train", str(out / "ball")))
@@ -62,6 +69,10 @@ def test_stopped_resumed_killed_and_added_to(shelf, ball_capture):
     assert re.search(r"broken: train failed: .*\.png: this is not an image", said), said
     page = (out / "index.html").read_text()
     assert page.count("data:image/jpeg") == 2 and page.count('class="failed"') == 1 and "not an image" in page
+    table = rows(out)
+    assert {name: row["state"] for name, row in table.items()} == {"ball": "done", "broken": "failed", "late": "done"}
+    assert table["ball"]["figures"]["psnr"] > 10 and os.path.isfile(table["ball"]["picture"])
+    assert "not an image" in table["broken"]["what"] and os.path.isfile(table["broken"]["log"])
     for name in ("ball", "late"):
         masks = (out / "logs" / name / "masks.log").read_text()
         assert masks.count("$ refgs masks") == 1  # done once, and not again by the batch that went on
