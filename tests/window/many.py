@@ -37,6 +37,8 @@ def artist():
     report["running"] = rows()
     yield after(1.0)
     photograph("running")
+    for count in (1, 2, 3):  # a wait each: a busy machine takes minutes for all
+        yield lambda count=count: sum(state in ("done", "failed") for _, state, _ in rows()) >= count
     yield lambda: jobs()[-1].ended
     report["ended"] = jobs()[-1].state, jobs()[-1].line
     yield after(3.0)

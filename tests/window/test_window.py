@@ -137,7 +137,7 @@ def test_an_artist_trains_many(tmp_path, ball_capture):
     for name in ("ball", "a museum piece with a long name", "broken"):
         shutil.copytree(ball_capture, tmp_path / "shelf" / name)
     next((tmp_path / "shelf" / "broken").rglob("*.png")).write_bytes(b"no picture")
-    changes = [*TINY, "environment.resolution=16", "train.iterations=1000", "mesh.resolution=32", "mesh.texture=64"]
+    changes = [*TINY, "environment.resolution=16", "train.iterations=400", "mesh.resolution=32", "mesh.texture=64"]
     captures = "".join(f'[[captures]]\nfolder = "{folder}"\n' for folder in sorted((tmp_path / "shelf").iterdir()))
     (tmp_path / "list.toml").write_text(f"set = {json.dumps(changes)}\n{captures}")
     results = tmp_path / "results"
