@@ -3,7 +3,7 @@ import OpenEXR
 import pytest
 
 from refgs.errors import InputError
-from refgs.formats.exr import read_exr, write_exr
+from refgs.formats.exr import read_exr, read_exr_header, write_exr
 from refgs.formats.panorama import read_environment
 
 RNG = np.random.default_rng(5)
@@ -58,3 +58,15 @@ def test_bad_files_are_named(tmp_path):
     write_exr(path, np.ones((10, 10, 3)))
     with pytest.raises(InputError, match="10×10"):
         read_environment(path)
+
+
+def test_a_file_of_a_kilobyte_takes_no_memory_for_the_pixels_that_it_declares(tmp_path):
+    file = tmp_path / "light.exr"
+    write_exr(file, np.zeros((8, 8, 3), np.float32))
+    windows = np.array([0, 0, 7, 7], "<i4").tobytes()
+    claimed = np.array([0, 0, 9999, 4999], "<i4").tobytes()
+    file.write_bytes(file.read_bytes().replace(windows, claimed))
+    with pytest.raises(InputError, match="10000×5000 pixels do not fit into so small a file"):
+        read_exr(file)
+    with pytest.raises(InputError, match="do not fit"):
+        read_exr_header(file)

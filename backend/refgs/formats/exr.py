@@ -14,6 +14,9 @@ from refgs.paths import whole
 # Chromaticities x, y of Rec.709 / sRGB: red, green, blue, D65 white (ITU-R BT.709-6, table 1).
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
+# A larger picture than a panorama of 8192×4096, with so many pixels a byte, is taken for a broken one: deflate packs 1032 bytes into one.
+_FEWEST = 40_000_000, 1032
+
 
 def write_exr(path: str | os.PathLike, pixels: np.ndarray) -> None:
     """Write float pixels (linear Rec.709) as an EXR file: (H, W, 4) as premultiplied RGBA, (H, W, 3) as RGB, (H, W) as Y.
@@ -56,7 +59,7 @@ def read_exr_header(path: str | os.PathLike) -> tuple[int, int, bool]:
     if not np.array_equal(data, display):
         raise InputError(f"{path} holds a part of the picture: save it without a crop or overscan")
     width, height = (data[1] - data[0] + 1).tolist()
-    check_pixels(path, width, height)
+    check_pixels(path, width, height, *_FEWEST)
     return width, height, "A" in names[part]
 
 
@@ -73,7 +76,7 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
         with OpenEXR.File(str(path), header_only=True) as file:
             windows = [np.array(part.header["dataWindow"]) for part in file.parts]
         for low, high in windows:  # every part is decoded
-            check_pixels(path, *(high - low + 1).tolist())
+            check_pixels(path, *(high - low + 1).tolist(), *_FEWEST)
         with OpenEXR.File(str(path), separate_channels=True) as file:
             parts = [file.channels(i) for i in range(len(file.parts))]
             part = next((part for part in parts if {"R", "G", "B"} <= part.keys()), parts[0])

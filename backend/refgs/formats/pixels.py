@@ -10,12 +10,15 @@ MOST = 256_000_000  # pixels; cameras take up to 200 million, or 240 by shifting
 SMALL, MOST_PER_BYTE = 100_000_000, 10_000
 
 
-def check_pixels(path: Path, width: int, height: int) -> None:
-    """Raise InputError if a picture's file declares more pixels than are read, or far more than it can hold."""
+def check_pixels(path: Path, width: int, height: int, small: int = SMALL, per_byte: int = MOST_PER_BYTE) -> None:
+    """Raise InputError if a picture's file declares more pixels than are read, or far more than it can hold.
+
+    That is more than `small` in all and more than `per_byte` for each byte of the file.
+    """
     size = f"{path}: {width}×{height} pixels"
     if width * height > MOST:
         raise InputError(f"{size} are more than the {MOST // 1_000_000} million that are read. Save it smaller.")
-    if width * height > max(SMALL, MOST_PER_BYTE * path.stat().st_size):
+    if width * height > max(small, per_byte * path.stat().st_size):
         raise InputError(f"{size} do not fit into so small a file: it is broken. Replace it, or save it as PNG.")
 
 
