@@ -27,14 +27,12 @@ def contact(shape: Shape, alphas: Sequence[np.ndarray], cameras: Sequence[Camera
     along = np.arange(-radius, radius, step)
     least = np.full(shape.solid.shape, np.inf, np.float32)
     for alpha, full in zip(alphas, cameras, strict=True):
-        distance = float(np.linalg.norm(full.position - centre))
-        side = ACROSS * max(full.width, full.height) * distance / (2 * radius * full.fx)
-        camera = full.fitted(max(round(side), 16))
+        camera = shape.fit(full, ACROSS)
         small = cv2.resize(alpha, (camera.width, camera.height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-        outlines = find_contours(np.pad(small, 1), 0.5)  # a mask may be cut by the picture's border
+        outlines = find_contours(small, 0.5)  # open where the picture's border cuts a mask
         if not outlines:
             continue
-        rays = rays_of(camera, *np.concatenate(outlines).T - 1)
+        rays = rays_of(camera, *np.concatenate(outlines).T)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         middle = (centre - camera.position) @ rays.T
         points = camera.position + rays[:, None] * (middle[:, None] + along)[..., None]

@@ -57,6 +57,13 @@ class Shape:
         first, last = self.low + voxels.min(axis=0) * self.voxel, self.low + (voxels.max(axis=0) + 1) * self.voxel
         return (first + last) / 2, float(np.linalg.norm(last - first)) / 2
 
+    def fit(self, camera: Camera, across: int) -> Camera:
+        """Return the camera for its picture reduced so that the shape's ball is `across` pixels wide. Smaller ones are left as they are."""
+        centre, radius = self.ball
+        distance = float(np.linalg.norm(camera.position - centre))
+        side = across * max(camera.width, camera.height) * distance / (2 * radius * camera.fx)
+        return camera.fitted(max(round(side), WINDOW))
+
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Tell which points (..., 3) lie in a solid voxel."""
         at = np.floor((points - self.low) / self.voxel).astype(np.int32)
@@ -97,7 +104,7 @@ def depth_maps(photos: Sequence[Photo], shape: Shape, unsure: np.ndarray) -> lis
     curved one seldom agrees, but what is mirrored in a flat one does.
     """
     centre, radius = shape.ball
-    reduced = [_reduced(photo, centre, radius) for photo in photos]
+    reduced = [_reduced(photo, shape) for photo in photos]
     near = _neighbours([photo.camera for photo in reduced], centre)
     chosen = [i for i, others in enumerate(near) if len(others) >= BEST]
     with ThreadPoolExecutor(torch.get_num_threads()) as threads:  # OpenCV works outside of Python's lock
@@ -107,16 +114,13 @@ def depth_maps(photos: Sequence[Photo], shape: Shape, unsure: np.ndarray) -> lis
         return list(threads.map(agreed, chosen))
 
 
-def _reduced(photo: Photo, centre: np.ndarray, radius: float) -> _Reduced:
-    """Reduce a photo so that the object, a ball, is about ACROSS pixels wide."""
-    camera, white = photo.camera, photo.white
-    distance = float(np.linalg.norm(camera.position - centre))
-    side = ACROSS * max(camera.width, camera.height) * distance / (2 * radius * camera.fx)
-    camera = camera.fitted(max(round(side), WINDOW))
+def _reduced(photo: Photo, shape: Shape) -> _Reduced:
+    """Reduce a photo so that the shape is ACROSS pixels wide."""
+    camera = shape.fit(photo.camera, ACROSS)
     size = camera.width, camera.height
-    image = cv2.resize(photo.image, size, interpolation=cv2.INTER_AREA)
-    alpha = cv2.resize(photo.alpha, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-    return _Reduced(cv2.cvtColor(image.astype(np.float32) / white, cv2.COLOR_RGB2GRAY) * alpha, alpha, camera)
+    image, alpha = (cv2.resize(map_, size, interpolation=cv2.INTER_AREA) for map_ in (photo.image, photo.alpha))
+    alpha = alpha.astype(np.float32) / 255
+    return _Reduced(cv2.cvtColor(image.astype(np.float32) / photo.white, cv2.COLOR_RGB2GRAY) * alpha, alpha, camera)
 
 
 def _neighbours(cameras: list[Camera], centre: np.ndarray) -> list[np.ndarray]:
