@@ -20,6 +20,7 @@ from refgs.run_folder import check_finished, run_metrics, update_metrics
 
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)  # paths are printed as they are
 CHECKPOINT_BY, END_BY = 7.0, 9.5  # seconds after SIGTERM: give up the checkpoint, give up everything
+BATCH_END_BY = 25.0  # the same for a batch: its commands need END_BY, and then it writes the page
 PASSES = ("color", "normal", "albedo", "roughness", "metallic", "depth", "alpha", "visibility")
 
 
@@ -171,10 +172,10 @@ def train(
 
 
 @contextmanager
-def _signals_to_stop() -> Iterator[list[int]]:
+def _signals_to_stop(repeat: float | None = CHECKPOINT_BY, end: float = END_BY) -> Iterator[list[int]]:
     """Collect the signals SIGINT and SIGTERM of a `with` block in a list, which is yielded. A second one ends the block at once.
 
-    SIGTERM counts as a second one after CHECKPOINT_BY seconds. After END_BY seconds the process ends, whatever it does.
+    SIGTERM counts as a second one after `repeat` seconds, unless that is None. After `end` seconds the process ends, whatever it does.
     """
     stopped, timers = [], []
 
@@ -183,8 +184,9 @@ def _signals_to_stop() -> Iterator[list[int]]:
             _end([number])
         stopped.append(number)  # the training ends after this iteration, with a checkpoint
         if number == signal.SIGTERM:
-            after(CHECKPOINT_BY, lambda: os.kill(os.getpid(), signal.SIGTERM))
-            after(END_BY, lambda: os._exit(TRY_AGAIN))
+            if repeat is not None:
+                after(repeat, lambda: os.kill(os.getpid(), signal.SIGTERM))
+            after(end, lambda: os._exit(TRY_AGAIN))
 
     def after(seconds: float, what: Callable[[], None]) -> None:
         timers.append(threading.Timer(seconds, what))
@@ -358,7 +360,7 @@ def batch(
     with (
         _batch_bars() as report,
         ready(source, out, ask, device, report, cores, workers, address) as run,
-        _signals_to_stop() as stopped,
+        _signals_to_stop(None, BATCH_END_BY) as stopped,
     ):
         status = run(lambda: bool(stopped))
     console.print(f"the page about all runs: {out / PAGE}")

@@ -84,6 +84,17 @@ def test_stopped_resumed_killed_and_added_to(shelf, ball_capture):
         assert all((out / name / file).read_bytes() == plain for name in ("ball", "late")), file
 
 
+def test_a_second_sigterm_ends_a_batch_at_once_with_75(shelf):
+    out = shelf / "runs"
+    process = batch(shelf / "list.toml", out)
+    until(process, (out / "ball" / "progress.json").exists)
+    process.send_signal(signal.SIGTERM)
+    time.sleep(1)  # the batch waits for its commands now
+    process.send_signal(signal.SIGTERM)
+    status, said = ended(process, grace=120)  # Ray's own processes take about a minute
+    assert status == 75, said
+
+
 def test_a_batch_whose_process_is_killed_leaves_no_command(shelf):
     """Kill a batch. Check that its commands end: Ray kills them. Ray's own processes end within about a minute."""
     out = shelf / "runs"

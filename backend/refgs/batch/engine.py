@@ -6,10 +6,12 @@ import logging
 import os
 import secrets
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -81,7 +83,10 @@ class Engine:
         if not self._steps:
             return
         self._check_head()
-        references, _ = self._ray.wait(list(self._steps), timeout=seconds, num_returns=1)
+        try:
+            references, _ = self._ray.wait(list(self._steps), timeout=seconds, num_returns=1)
+        except SystemExit:  # of SIGTERM: Ray makes 1 of whatever status a signal's handler ends with
+            sys.exit(TRY_AGAIN)
         if references:  # and all others that have ended by now
             references, _ = self._ray.wait(list(self._steps), timeout=0, num_returns=len(self._steps))
         for reference in references:
@@ -143,14 +148,34 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
     ray, cores = _import_ray(bool(address)), cores or 1
     quiet = {"include_dashboard": False, "log_to_driver": False, "logging_level": logging.CRITICAL}
     try:
-        if address:
-            _join(ray, address)
-        else:
-            lent = workers * cores if workers else max(os.cpu_count() or 1, cores)
-            _start(ray, quiet | {"num_cpus": lent, "object_store_memory": STORE, "_temp_dir": str(folder)})
+        with _signals(None):
+            if address:
+                _join(ray, address)
+            else:
+                lent = workers * cores if workers else max(os.cpu_count() or 1, cores)
+                _start(ray, quiet | {"num_cpus": lent, "object_store_memory": STORE, "_temp_dir": str(folder)})
         yield Engine(ray, cores)
     finally:
-        ray.shutdown()
+        with _signals(signal.SIG_IGN):  # stopped half way, Ray waits for a minute and ends this process with 1
+            ray.shutdown()
+
+
+@contextmanager
+def _signals(handler: Any) -> Iterator[None]:
+    """Let `handler`, unless it is None, handle SIGINT and SIGTERM in a `with` block. After it, their handlers are those of before.
+
+    Ray sets one for SIGTERM when it starts. Does nothing outside of the main thread.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+    before = {number: signal.getsignal(number) for number in numbers}
+    try:
+        if handler is not None:
+            for number in numbers:
+                signal.signal(number, handler)
+        yield
+    finally:
+        for number, one in before.items():
+            signal.signal(number, one)
 
 
 def _make_folder() -> Path:
