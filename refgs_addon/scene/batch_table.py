@@ -19,9 +19,8 @@ _STEPS = {
     "export": "making the mesh",
 }
 
-_shown: tuple[Path, object] | None = (
-    None  # the folder whose table the panel has, and what tells the table's versions apart
-)
+# The folder whose table the panel has, and what tells the table's versions apart.
+_shown: tuple[Path, object] | None = None
 
 
 class Row(NamedTuple):

@@ -231,6 +231,5 @@ def _settled(capture: Path) -> bool:
         changed = max(path.stat().st_mtime for path in [capture, *capture.rglob("*")])
     except OSError:
         return False
-    return (
-        abs(time.time() - changed) > SETTLED
-    )  # a clock that went back, or another machine's, dates files into the future
+    # A clock that went back, or another machine's, dates files into the future.
+    return abs(time.time() - changed) > SETTLED

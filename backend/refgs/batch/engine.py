@@ -142,9 +142,8 @@ def started(address: str | None, cores: int | None, workers: int | None) -> Iter
     """
     if address and workers:
         raise InputError("--workers is for this machine: on a cluster, each machine says how many cores it lends")
-    folder = (
-        None if address else _make_folder()
-    )  # before Ray is imported: at exit, Ray first ends what a failed start left
+    # Before Ray is imported: at exit, Ray then first ends what a failed start has left.
+    folder = None if address else _make_folder()
     ray, cores = _import_ray(bool(address)), cores or 1
     quiet = {"include_dashboard": False, "log_to_driver": False, "logging_level": logging.CRITICAL}
     try:
