@@ -1,5 +1,6 @@
 """Train all captures of a batch: hand their steps to the engine, follow them, and write a page about them."""
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ from refgs.paths import disk_errors_named
 
 ROWS = "rows.json"  # in LOGS: the table for other programs
 REREAD_EVERY = 5.0  # seconds between looks for new captures
+CANCEL_EVERY = 5.0  # seconds until what has not ended is told again: on a busy machine, Ray now and then loses it
 WRITE_EVERY = 1.0  # seconds between writes of the table
 SETTLED = 10.0  # seconds without a change after which a new capture's files are taken to be complete
 
@@ -80,7 +82,7 @@ class Batch:
         if self._device == "cuda" and not engine.cards:
             raise InputError("--device cuda: no machine here has a CUDA card that Ray knows of: take auto or cpu")
         card = engine.card_bytes() if engine.cards and self._device != "cpu" else None
-        begun, stopped = time.monotonic(), False
+        begun, stopped, cancelled = time.monotonic(), False, -math.inf
         for job in self._jobs:
             self._submit(job, engine, card)
         self._tell()
@@ -92,8 +94,9 @@ class Batch:
                         self._note(run, step.name, outcome)
             self._tell()
             done = sum(run.ended for run in self._runs.values())
-            if not stopped and stop(done, len(self._runs), time.monotonic() - begun):
-                stopped = True
+            stopped = stopped or stop(done, len(self._runs), time.monotonic() - begun)
+            if stopped and time.monotonic() > cancelled + CANCEL_EVERY:
+                cancelled = time.monotonic()
                 engine.cancel()
             if not stopped and time.monotonic() > self._looked + REREAD_EVERY:
                 for job in self._added():
