@@ -68,20 +68,8 @@ def write_locks(project: Path, folder: Path) -> None:
     `lock.txt` is for torch of the package index, `lock-BUILD.txt` for a build of torch that has an index of its own. A build that does not
     exist, or whose index cannot be reached, gets none: machines that it is for then take torch from the package index.
     """
-    how = [
-        "-m",
-        "uv",
-        "pip",
-        "compile",
-        project,
-        "--extra",
-        "farm",
-        "--extra",
-        "onnx",
-        "--universal",
-        "--python-version",
-        "3.11",
-    ]
+    how = ["-m", "uv", "pip", "compile", project, "--extra", "farm", "--extra", "onnx"]
+    how += ["--universal", "--python-version", "3.11"]
     how += ["--generate-hashes", "--only-binary", ":all:", "--no-header", "--no-annotate", "--quiet"]
     run(*how, "--output-file", folder / "lock.txt")
     for build in TORCH_BUILDS:

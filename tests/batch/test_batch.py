@@ -13,12 +13,13 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
+from benchmarks.many import MADE
 from refgs import commands
 from refgs.batch import engine
 from refgs.errors import InputError
 from refgs.paths import ROOT
 from tests.makers import processes
-from tests.makers.batches import MADE, PATIENCE, batch, ended, until
+from tests.makers.batches import PATIENCE, batch, ended, until
 from tests.makers.training import TINY
 
 pytest.importorskip("ray")

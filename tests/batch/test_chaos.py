@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.many import MADE
 from refgs.errors import TRY_AGAIN
 from tests.makers import processes
-from tests.makers.batches import MADE, batch, ended
+from tests.makers.batches import batch, ended
 from tests.makers.disk import fill
 
 pytest.importorskip("ray")

@@ -7,7 +7,6 @@ import time
 from tests.makers import processes
 
 PATIENCE = 240.0  # seconds
-MADE = ("splats.ply", "environment.exr", "mesh.glb", "cameras.json")
 
 
 def batch(source, out, *words) -> subprocess.Popen:

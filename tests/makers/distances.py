@@ -52,16 +52,21 @@ def around(count: int, size: int, distance: float = 4.5) -> list[Camera]:
     return [look_at(distance * ray, size, f"view{k}") for k, ray in enumerate(spread(count))]
 
 
+def rays_of(camera: Camera) -> np.ndarray:
+    """Return the rays (H, W, 3) through pixel centres, in the world's axes, one unit along the camera's axis."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    return rays @ camera.world_to_camera[:3, :3]
+
+
 def depth(camera: Camera, sdf) -> tuple[np.ndarray, np.ndarray]:
     """Sphere-trace a signed distance function along the rays through pixel centres.
 
     Return depth along the camera's axis (0 where a ray misses) and coverage (1 where it hits, else 0), (H, W) float32 each.
     """
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-    rays = rays @ camera.world_to_camera[:3, :3]
+    rays = rays_of(camera)
     length = np.linalg.norm(rays, axis=-1)
-    t = np.full(u.shape, 1.0)
+    t = np.full(length.shape, 1.0)
     for _ in range(80):
         t = t + sdf(camera.position + t[..., None] * rays) / length
     hit = np.abs(sdf(camera.position + t[..., None] * rays)) < 1e-3

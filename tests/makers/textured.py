@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from refgs.camera import Camera
 from refgs.capture.poses import OPENGL_TO_OPENCV
 from refgs.geometry.stereo import Photo, Shape
-from tests.makers.distances import depth, gradient
+from tests.makers.distances import depth, gradient, rays_of
 
 
 def bowl(p: np.ndarray) -> np.ndarray:
@@ -32,9 +32,7 @@ def speckles(points: np.ndarray, contrast: float = 1.0) -> np.ndarray:
 def photograph(camera: Camera, sdf, contrast: float = 1.0, mirror: bool = False) -> Photo:
     """Photograph a shape whose surface has speckles, or mirrors them at a distance, if `mirror` is true."""
     away, hit = depth(camera, sdf)
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-    rays = rays @ camera.world_to_camera[:3, :3]
+    rays = rays_of(camera)
     points = camera.position + rays * away[..., None]
     if mirror:
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)

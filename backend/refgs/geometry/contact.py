@@ -11,7 +11,8 @@ import numpy as np
 from skimage.measure import find_contours
 
 from refgs.camera import Camera
-from refgs.geometry.stereo import Shape, rays_of
+from refgs.geometry.project import pixel_rays
+from refgs.geometry.stereo import Shape
 
 STEP = 0.5  # voxels, along a ray
 ACROSS = 200  # pixels across the object, in the reduced masks
@@ -32,7 +33,7 @@ def contact(shape: Shape, alphas: Sequence[np.ndarray], cameras: Sequence[Camera
         outlines = find_contours(small, 0.5)  # open where the picture's border cuts a mask
         if not outlines:
             continue
-        rays = rays_of(camera, *np.concatenate(outlines).T)
+        rays = pixel_rays(camera, *np.concatenate(outlines).T)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         middle = (centre - camera.position) @ rays.T
         points = camera.position + rays[:, None] * (middle[:, None] + along)[..., None]

@@ -1,4 +1,4 @@
-"""Project world points into a camera's image, and interpolate the image at pixel positions."""
+"""Project world points into a camera's image and back along rays, and interpolate the image at pixel positions."""
 
 import cv2
 import numpy as np
@@ -17,6 +17,15 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     x, y, z = matrix[:, :3] @ np.asarray(points, np.float32).T + matrix[:, 3:]
     inverse = 1 / np.where(np.abs(z) > 1e-12, z, np.float32(1e-12))
     return np.stack([x * inverse, y * inverse], axis=1), z
+
+
+def pixel_rays(camera: Camera, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Return the rays (N, 3) through pixels (N,), in the world's axes. Each is one unit long along the camera's axis.
+
+    `rows` and `columns` are indices of pixels, and may be fractions: 0 is the centre of the first.
+    """
+    x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
+    return np.stack([x, y, np.ones(len(x))]).T @ camera.world_to_camera[:3, :3]
 
 
 def sample(image: np.ndarray, pixels: np.ndarray, clamp: bool = False) -> np.ndarray:

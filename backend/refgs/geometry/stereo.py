@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from refgs.camera import Camera
-from refgs.geometry.project import inside, project
+from refgs.geometry.project import inside, pixel_rays, project
 
 ACROSS = 90  # pixels across the object, in the reduced photos
 PLANES = 64
@@ -138,7 +138,7 @@ def _sweep(photo: _Reduced, others: list[_Reduced], shape: Shape, unsure: np.nda
     middle = float(camera.world_to_camera[2, :3] @ centre + camera.world_to_camera[2, 3])
     planes = 1 / np.linspace(1 / max(middle - radius, radius / 100), 1 / (middle + radius), PLANES)
     rows, columns = np.nonzero(photo.alpha > OPAQUE)
-    rays = rays_of(camera, rows, columns)
+    rays = pixel_rays(camera, rows, columns)
     within = shape.contains(camera.position + rays * planes[:, None, None])
     asked = replace(shape, solid=unsure).contains(_entry(camera, rays, planes, within, shape))
     rows, columns, within = rows[asked], columns[asked], within[:, asked]
@@ -210,17 +210,11 @@ def _intrinsics(camera: Camera) -> np.ndarray:
     return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]])
 
 
-def rays_of(camera: Camera, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the rays (N, 3) of pixels, in the world's axes, one unit along the camera's axis."""
-    x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
-    return np.stack([x, y, np.ones(len(x))], axis=1) @ camera.world_to_camera[:3, :3]
-
-
 def _agreed(i: int, near: list[np.ndarray], maps: dict[int, DepthMap], tolerance: float) -> DepthMap:
     """Return the map of photo `i` without the depths on which fewer than AGREE of its neighbours' maps agree."""
     camera, depth, weight = maps[i]
     rows, columns = np.nonzero(weight)
-    points = camera.position + rays_of(camera, rows, columns) * depth[rows, columns, None]
+    points = camera.position + pixel_rays(camera, rows, columns) * depth[rows, columns, None]
     agree = np.zeros(len(points), int)
     for j in near[i]:
         if j in maps:

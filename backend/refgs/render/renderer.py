@@ -6,6 +6,7 @@ from torch import Tensor
 
 from refgs.camera import Camera
 from refgs.clock import timed
+from refgs.geometry.project import pixel_rays
 from refgs.geometry.visibility import Occluder
 from refgs.kernels import load
 from refgs.model.environment import Environment
@@ -42,8 +43,7 @@ def _visibility(features: Tensor, alpha: Tensor, depth: Tensor, camera: Camera, 
     covered = np.flatnonzero(alpha.detach().numpy() > COVERED)
     mirrored = directions.numpy().reshape(-1, 3)[covered]
     row, column = np.divmod(covered, camera.width)
-    local = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))])
-    rays = local.T @ camera.world_to_camera[:3, :3]
+    rays = pixel_rays(camera, row, column)
     mean_depth = (depth / alpha).detach().numpy().reshape(-1, 1)[covered]
     points = rays * mean_depth + camera.position
     normals = mirrored - _unit(rays)  # half way back to the camera
