@@ -5,6 +5,7 @@ import secrets
 
 import pytest
 
+from refgs.errors import TRY_AGAIN
 from refgs.lock import RunLock
 from refgs.paths import whole, write_text
 from tests.makers.disk import fill
@@ -76,3 +77,20 @@ def test_the_next_start_removes_what_killed_writes_left(tmp_path):
     own.touch()
     with RunLock(run):
         assert len(left) == 2 and not any(file.exists() for file in left) and own.exists()
+
+
+@pytest.mark.parametrize(("when", "what"), [("begin", "remove_leftovers"), ("end", "RunLock._tidy")])
+def test_a_lock_that_a_signal_interrupts_is_not_left(tmp_path, monkeypatch, when, what):
+    def interrupted(*_):
+        raise SystemExit(TRY_AGAIN)
+
+    lock = RunLock(tmp_path)
+    if when == "end":
+        lock.__enter__()
+    monkeypatch.setattr(f"refgs.lock.{what}", interrupted)
+    with pytest.raises(SystemExit):
+        lock.__enter__() if when == "begin" else lock.__exit__(None, None, None)
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.undo()
+    with RunLock(tmp_path):
+        pass

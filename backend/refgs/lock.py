@@ -35,15 +35,19 @@ class RunLock:
             raise TryAgain(f"{self._folder} is in use: {what}") from None
         except OSError:  # a file system without locks
             pass
-        self._tidy()
-        remove_leftovers(self._folder)
+        try:
+            self._tidy()
+            remove_leftovers(self._folder)
+        except BaseException:  # also what the handler of a signal raises
+            self._release()
+            raise
         return self
 
     def __exit__(self, *_) -> None:
-        self._tidy()
-        with suppress(OSError):  # Windows deletes no open file: there filelock deletes it
-            (self._folder / LOCK).unlink()
-        self._lock.release()
+        try:
+            self._tidy()
+        finally:
+            self._release()
 
     def attend(self, iteration: int, total: int, seconds: float) -> bool:
         """Write the training's progress to progress.json. Return True if another process has asked this one to stop.
@@ -61,6 +65,11 @@ class RunLock:
         with suppress(OSError):
             write_text(self._folder / PROGRESS, json.dumps(facts), durable=False)
         return (self._folder / STOP).exists()
+
+    def _release(self) -> None:
+        with suppress(OSError):  # Windows deletes no open file: there filelock deletes it
+            (self._folder / LOCK).unlink()
+        self._lock.release()
 
     def _tidy(self) -> None:
         for name in (PROGRESS, STOP):
