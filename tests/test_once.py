@@ -10,7 +10,7 @@ import pytest
 
 from refgs import commands, train_job
 from refgs.errors import InputError, TryAgain
-from refgs.lock import RunLock
+from refgs.lock import LOCK, RunLock
 from refgs.train import checkpoint
 from tests.makers.captures import colmap
 from tests.makers.training import TINY
@@ -65,6 +65,10 @@ def test_each_step_is_done_once(ball_capture, tmp_path, capsys):
         before, _ = contents(run), capsys.readouterr()
         step()
         assert capsys.readouterr().out.startswith("done before: ") and contents(run) == before
+    for step in (lambda: train(ball_capture, run), lambda: commands.export(run, once=True)):
+        (run / LOCK).touch()  # of a process that was killed when it had done its work
+        step()
+        assert contents(run) == before
     with pytest.raises(InputError, match=r"trained with train\.iterations = 100000, and not 90000"):
         train(ball_capture, run, [*WORDS, "train.iterations=90000"])
     with pytest.raises(InputError, match=r"trained by quick, not for 1 minutes"):

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from refgs import train_job
 from refgs.errors import TRY_AGAIN, InputError, one_line
 from refgs.export.export_job import export as export_run
+from refgs.lock import remove_stale_lock
 from refgs.paths import clone_root, command_line, disk_errors_named, make_folders
 from refgs.run_folder import check_finished, run_metrics, update_metrics
 
@@ -327,6 +328,7 @@ def export(
     if once:
         files = [file for file in (mesh_file, splats_file, display_file) if file] or [folder / "mesh.glb"]
         if all(file.exists() for file in files):  # textures, written before the mesh, may be those of a killed process
+            remove_stale_lock(folder)
             console.print(f"done before: {', '.join(map(str, files))}")
             return
         overwrite = True

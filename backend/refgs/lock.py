@@ -75,3 +75,10 @@ class RunLock:
         for name in (PROGRESS, STOP):
             with suppress(OSError):
                 (self._folder / name).unlink()
+
+
+def remove_stale_lock(folder: Path) -> None:
+    """Remove what a process that was killed at the very end of its work has left: its lock, and what it had half-written."""
+    if (folder / LOCK).exists():
+        with suppress(TryAgain), RunLock(folder):
+            pass

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from refgs.errors import InputError, TryAgain
 from refgs.events import Report
 from refgs.formats.run_toml import Trained
-from refgs.lock import RunLock
+from refgs.lock import RunLock, remove_stale_lock
 from refgs.memory import shortage_named, trim
 from refgs.paths import check_folder, command_line, disk_errors_named
 from refgs.run_folder import (
@@ -135,6 +135,7 @@ def unfinished(out: Path, preset: str | None, minutes: float | None, changes: li
         return False
     check_asked(out, preset, minutes, changes)
     if (out / "splats.ply").exists():
+        remove_stale_lock(out)
         return None
     with RunLock(out):
         return True
